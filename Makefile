@@ -1,0 +1,43 @@
+# From a clone to a result: `make demo`, `make test`. Everything lives in .venv.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+SOURCES := needle_dynamics needle_controller needle_identification needle_insertion test setup.py
+
+.PHONY: demo test check format setup lock bags clean
+
+demo: setup
+	$(BIN)/needle demo
+
+test: setup
+	$(BIN)/python -m pytest
+
+check: setup
+	$(BIN)/ruff format --check $(SOURCES)
+	$(BIN)/ruff check $(SOURCES)
+	$(BIN)/mypy
+
+format: setup
+	$(BIN)/ruff check --fix $(SOURCES)
+	$(BIN)/ruff format $(SOURCES)
+
+setup: $(VENV)/.complete
+
+# The marker is written last: an interrupted set-up starts anew.
+$(VENV)/.complete: requirements.lock setup.py package.xml
+	$(PYTHON) -m venv --clear $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements.lock
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
+	touch $@
+
+# Pins for every supported Python at once; run after a change of dependencies in setup.py.
+lock:
+	uv pip compile --quiet --universal --python-version 3.10 --no-annotate --no-header \
+		--extra ros --extra dev setup.py requirements-build.in -o requirements.lock
+
+# The shipped friction recordings, made anew through real nodes.
+bags: setup
+	$(BIN)/needle experiment friction --repeats 4 --seed 2014 --rate 250 bags
+
+clean:
+	rm -rf $(VENV) build install log demo_output

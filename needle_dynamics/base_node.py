@@ -1,0 +1,316 @@
+"""
+What every node of this suite shares: lifecycle, parameters from dataclasses, diagnostics.
+
+A node's parameters are the fields of frozen dataclasses; `constant` gives each its unit,
+meaning and range, and the dataclass refuses what is not valid when it is made, so that a bad
+parameter file ends in a refused `configure` with one line that names the parameter.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import fields
+import signal
+import sys
+import time
+from types import FrameType
+from typing import Any, TypeVar
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from needle_dynamics.errors import NeedleError, ParameterError
+from needle_dynamics.parameters import as_number, unknown_name
+from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor, SetParametersResult
+import rclpy
+from rclpy.exceptions import ParameterException
+from rclpy.executors import Executor
+from rclpy.experimental.events_executor import EventsExecutor
+from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.parameter import Parameter
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from std_msgs.msg import String
+import yaml
+
+#: Latched topics: the last message reaches who comes late.
+LATCHED = QoSProfile(
+    depth=1,
+    reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.TRANSIENT_LOCAL,
+)
+
+#: Commands: only the newest counts, and it must arrive.
+COMMAND = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE)
+
+#: Sensor streams; a burst after a stall of the reader is not lost.
+SENSOR = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)
+
+_Settings = TypeVar('_Settings')
+_SUCCESS = TransitionCallbackReturn.SUCCESS
+
+
+class NeedleNode(LifecycleNode):
+    """
+    A lifecycle node that reads its parameters into dataclasses and says how it is.
+
+    A subclass declares its parameters in ``__init__`` (`declare_settings`), overrides
+    `configure`, `activate`, `deactivate` and `diagnose`, and raises `NeedleError` for whatever
+    makes a transition impossible: the transition is then refused and the reason logged.
+    """
+
+    def __init__(self, name: str, **node_options: Any) -> None:
+        super().__init__(name, **node_options)
+        self.failure: str | None = None
+        self._descriptions: dict[str, Mapping[str, Any]] = {}
+        self._configured = False
+        self.declare_text('autostart', True, 'configure and activate at start')
+        self._configuration = self.create_publisher(String, '~/configuration', LATCHED)
+        self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
+        self._last_level = DiagnosticStatus.OK
+        self._health_timer = self.create_timer(1.0, self.publish_diagnostics)
+        self.add_on_set_parameters_callback(self._check_change)
+
+    # What a subclass fills in.
+
+    def configure(self) -> None:
+        """Read the parameters and make what the node needs; raise `NeedleError` to refuse."""
+
+    def activate(self) -> None:
+        """Begin to act; raise `NeedleError` to refuse."""
+
+    def deactivate(self) -> None:
+        """Stop acting and leave the world safe."""
+
+    def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
+        """Return level, message and values for /diagnostics."""
+        return DiagnosticStatus.OK, 'active' if self.is_active else 'not active', {}
+
+    # Parameters.
+
+    def declare_text(self, name: str, default: str | bool | list[str], description: str) -> None:
+        """Declare a parameter that is not a number."""
+        self.declare_parameter(name, default, ParameterDescriptor(description=description))
+
+    def declare_settings(self, prefix: str, defaults: object) -> None:
+        """
+        Declare one parameter per field of a dataclass.
+
+        Parameters
+        ----------
+        prefix : str
+            Namespace of the parameters, ``''`` for none.
+        defaults : object
+            Instance of the dataclass that holds the default values.
+
+        """
+        for item in fields(defaults):  # type: ignore[arg-type]
+            meta = item.metadata
+            unit = f' [{meta["unit"]}]' if meta.get('unit') else ''
+            descriptor = ParameterDescriptor(
+                description=f'{meta.get("description", item.name)}{unit}',
+                # An integer is accepted where a float is meant; the dataclass checks the rest.
+                dynamic_typing=True,
+            )
+            if 'low' in meta:
+                descriptor.floating_point_range = [
+                    FloatingPointRange(from_value=meta['low'], to_value=meta['high'])
+                ]
+            self.declare_parameter(
+                f'{prefix}{item.name}', getattr(defaults, item.name), descriptor
+            )
+
+    def settings(self, prefix: str, kind: Callable[..., _Settings]) -> _Settings:
+        """
+        Read the parameters that `declare_settings` declared into the dataclass.
+
+        Raises
+        ------
+        ParameterError
+            Naming the parameter with its prefix.
+
+        """
+        values: dict[str, Any] = {}
+        for item in fields(kind):  # type: ignore[arg-type]
+            value = self.get_parameter(f'{prefix}{item.name}').value
+            values[item.name] = as_number(value) if 'unit' in item.metadata else value
+        try:
+            return kind(**values)
+        except ParameterError as error:
+            raise ParameterError(f'{prefix}{error}') from error
+
+    def text(self, name: str, valid: tuple[str, ...] = ()) -> str:
+        """
+        Read a text parameter, one of ``valid`` if that is given.
+
+        Raises
+        ------
+        ParameterError
+            Naming the parameter, what was found and what would be valid.
+
+        """
+        value = self.get_parameter(name).value
+        if not isinstance(value, str) or (valid and value not in valid):
+            raise ParameterError(f'{name} must be one of {", ".join(valid)}, got {value!r}')
+        return value
+
+    def configuration(self) -> str:
+        """Return all parameters as a ROS parameter file."""
+        values = {
+            name: parameter.value
+            for name, parameter in sorted(self._parameters.items())
+            if not name.startswith(('qos_overrides', 'start_type'))
+        }
+        document = {self.get_fully_qualified_name(): {'ros__parameters': values}}
+        return str(yaml.safe_dump(document, sort_keys=False))
+
+    def _check_overrides(self) -> None:
+        given = set(self._parameter_overrides)
+        known = set(self._parameters)
+        for name in sorted(given - known):
+            raise ParameterError(unknown_name(name, sorted(known)))
+        if given:
+            self.get_logger().info(f'{len(given)} of {len(given)} parameters given applied')
+
+    def _check_change(self, parameters: list[Parameter]) -> SetParametersResult:
+        if self._configured:
+            names = ', '.join(parameter.name for parameter in parameters)
+            return SetParametersResult(
+                successful=False,
+                reason=f'{names}: cannot change while configured; clean up the node first',
+            )
+        return SetParametersResult(successful=True)
+
+    # Lifecycle.
+
+    @property
+    def is_active(self) -> bool:
+        """True while the node acts."""
+        return bool(self._state_machine.current_state[1] == 'active')
+
+    def start(self) -> bool:
+        """Configure and activate; return whether that went well."""
+        return bool(self.trigger_configure() == _SUCCESS and self.trigger_activate() == _SUCCESS)
+
+    def stop(self) -> None:
+        """Deactivate if active."""
+        if self.is_active:
+            self.trigger_deactivate()
+
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Read the parameters; refuse what is not valid with one line that names it."""
+
+        def configure() -> None:
+            self._check_overrides()
+            self.configure()
+            self._configured = True
+            self._configuration.publish(String(data=self.configuration()))
+
+        return self._attempt(configure, super().on_configure, state)
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Begin to act."""
+        return self._attempt(self.activate, super().on_activate, state)
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Stop acting."""
+        return self._attempt(self.deactivate, super().on_deactivate, state)
+
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Make the parameters free to change."""
+        self._configured = False
+        return super().on_cleanup(state)
+
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Leave the world safe."""
+        return self._attempt(self.deactivate, super().on_shutdown, state)
+
+    def _attempt(
+        self,
+        action: Callable[[], None],
+        inherited: Callable[[LifecycleState], TransitionCallbackReturn],
+        state: LifecycleState,
+    ) -> TransitionCallbackReturn:
+        try:
+            action()
+        except NeedleError as error:
+            self.failure = str(error)
+            self.get_logger().error(self.failure)
+            return TransitionCallbackReturn.FAILURE
+        self.failure = None
+        return inherited(state)
+
+    # Diagnostics.
+
+    def publish_diagnostics(self) -> None:
+        """Publish the state of the node; called once a second and on change."""
+        level, message, values = self.diagnose()
+        if self.failure:
+            level, message = DiagnosticStatus.ERROR, self.failure
+        self._last_level = level
+        status = DiagnosticStatus(
+            level=level,
+            name=self.get_fully_qualified_name(),
+            message=message,
+            values=[KeyValue(key=key, value=str(value)) for key, value in values.items()],
+        )
+        array = DiagnosticArray(status=[status])
+        array.header.stamp = self.get_clock().now().to_msg()
+        self._diagnostics.publish(array)
+
+    def report_change(self) -> None:
+        """Publish diagnostics now if the level has changed."""
+        if self.diagnose()[0] != self._last_level:
+            self.publish_diagnostics()
+
+
+def run(kind: Callable[[], NeedleNode], arguments: list[str] | None = None) -> int:
+    """
+    Run one node until SIGINT or SIGTERM, then deactivate it while the graph still lives.
+
+    Parameters
+    ----------
+    kind : callable
+        Makes the node.
+    arguments : list of str, optional
+        Command line with ROS arguments; ``sys.argv`` if not given.
+
+    Returns
+    -------
+    int
+        Exit status: 0, or 2 if the node refused to start.
+
+    """
+    stopping = False
+
+    def stop(_signal: int, _frame: FrameType | None) -> None:
+        nonlocal stopping
+        stopping = True
+
+    # Not rclpy's handlers: they end the context before the node can leave the world safe.
+    rclpy.init(args=arguments, signal_handler_options=rclpy.signals.SignalHandlerOptions.NO)
+    previous = {name: signal.signal(name, stop) for name in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        try:
+            node = kind()
+        except (ParameterException, NeedleError) as error:
+            sys.stderr.write(f'error: {error}\n')
+            return 2
+        executor: Executor = EventsExecutor()
+        executor.add_node(node)
+        status = 0
+        if node.get_parameter('autostart').value and not node.start():
+            # Give the reason on /diagnostics a moment to leave, then end.
+            node.publish_diagnostics()
+            status = 2
+        while not stopping and status == 0:
+            executor.spin_once(timeout_sec=0.1)
+        node.stop()
+        # What was published last (a zero force, a latched result) is still on its way.
+        deadline = time.monotonic() + 0.1
+        while time.monotonic() < deadline:
+            executor.spin_once(timeout_sec=0.02)
+        executor.shutdown()
+        node.destroy_node()
+        return status
+    finally:
+        rclpy.utilities.try_shutdown()
+        for name, handler in previous.items():
+            signal.signal(name, handler)

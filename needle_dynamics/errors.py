@@ -1,0 +1,17 @@
+"""What can go wrong, as types: every error of this package is a `NeedleError`."""
+
+
+class NeedleError(Exception):
+    """Base of all errors raised on purpose; its message is one line for a person."""
+
+
+class ParameterError(NeedleError, ValueError):
+    """A parameter is unknown, missing, or outside its valid range."""
+
+
+class ShapeError(NeedleError, ValueError):
+    """An array does not have the shape the model needs."""
+
+
+class InsertedLengthError(NeedleError):
+    """The inserted length left the range in which the equations are regular."""

@@ -1,0 +1,356 @@
+r"""
+Equations of motion of the needle in tissue, one method per equation.
+
+The generalized coordinates are q = [d, theta, q1, q2] and the state is X = [q, q_dot]: eight
+numbers. d is the length of needle outside the tissue, so that insertion decreases it; the
+insertion force f_y is positive into the tissue. This is the `complete` formulation: every term
+of Euler-Lagrange on T - V, equation (12).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from math import copysign
+from typing import Final
+
+from needle_dynamics.errors import InsertedLengthError, ShapeError
+from needle_dynamics.modes import FloatArray, mode_shapes, MODES, ModeShapes
+from needle_dynamics.parameters import NeedleParameters
+import numpy as np
+from numpy.typing import ArrayLike
+
+#: Number of generalized coordinates.
+COORDINATES: Final = 2 + MODES
+
+#: Names of the generalized coordinates, in order.
+COORDINATE_NAMES: Final = ('d', 'theta', 'q1', 'q2')
+
+
+@dataclass(frozen=True)
+class NeedleModel:
+    """
+    The Lagrangian model of needle and tissue for one set of constants.
+
+    Attributes
+    ----------
+    parameters : NeedleParameters
+        Constants, SI units.
+    modes : ModeShapes
+        Shape modes of the needle.
+
+    """
+
+    parameters: NeedleParameters
+    modes: ModeShapes = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, 'modes', mode_shapes(self.parameters.length))
+
+    def checked_state(self, state: ArrayLike) -> FloatArray:
+        """
+        Return the state as an array, or say what is wrong with it.
+
+        Parameters
+        ----------
+        state : array_like, shape (8,)
+            X = [d, theta, q1, q2] and its rates, SI units.
+
+        Returns
+        -------
+        ndarray, shape (8,)
+            A copy.
+
+        Raises
+        ------
+        ShapeError
+            If the shape is wrong or a number is not finite.
+        InsertedLengthError
+            If the inserted length is outside its range.
+
+        """
+        checked = np.array(state, dtype=float)
+        if checked.shape != (2 * COORDINATES,):
+            raise ShapeError(f'state must have shape ({2 * COORDINATES},), got {checked.shape}')
+        if not np.isfinite(checked).all():
+            raise ShapeError(f'state must be finite, got {checked.tolist()}')
+        p = self.parameters
+        depth = p.length - checked[0]
+        if depth < p.minimum_depth or (p.hub_stop and checked[0] < 0.0):
+            raise InsertedLengthError(
+                f'inserted length {depth:.6g} m is outside '
+                f'[minimum_depth, length] = [{p.minimum_depth:g}, {p.length:g}] m'
+            )
+        return checked
+
+    def state_at(self, depth: float, tip_deflection: float = 0.0) -> FloatArray:
+        """
+        Return the state at rest with a given inserted length and tip deflection.
+
+        The shape is the one a lateral force at the tip would hold: the least elastic energy
+        for that deflection. (The source gives the deflection of the tip alone.)
+
+        Parameters
+        ----------
+        depth : float
+            Inserted length s [m].
+        tip_deflection : float
+            w(s) [m].
+
+        Returns
+        -------
+        ndarray, shape (8,)
+            State.
+
+        Raises
+        ------
+        InsertedLengthError
+            If ``depth`` is outside its range.
+
+        """
+        state = np.zeros(2 * COORDINATES)
+        state[0] = self.parameters.length - depth
+        state = self.checked_state(state)
+        shape = np.linalg.solve(self.stiffness_matrix(depth), self.modes.integrals(depth).value)
+        value = self.modes.integrals(depth).value
+        state[2:COORDINATES] = shape * (tip_deflection / (value @ shape))
+        return state
+
+    def stiffness_matrix(self, depth: float) -> FloatArray:
+        """
+        Modal stiffness E I_y H + k_a G of needle and tissue, from (12).
+
+        Parameters
+        ----------
+        depth : float
+            Inserted length s [m].
+
+        Returns
+        -------
+        ndarray, shape (2, 2)
+            Stiffness [N/m] for modal coordinates in m^3/2.
+
+        """
+        p, at = self.parameters, self.modes.integrals(depth)
+        return p.bending_stiffness * at.curvature_gram + p.tissue_stiffness * at.gram
+
+    def mass_matrix(self, state: ArrayLike) -> FloatArray:
+        """
+        Mass matrix M(q) of (13): symmetric, positive definite, block diagonal.
+
+        Parameters
+        ----------
+        state : array_like, shape (8,)
+            State.
+
+        Returns
+        -------
+        ndarray, shape (4, 4)
+            Mass matrix.
+
+        """
+        p, x = self.parameters, self.checked_state(state)
+        matrix = np.zeros((COORDINATES, COORDINATES))
+        matrix[0, 0] = p.moving_mass
+        matrix[1, 1] = 0.5 * p.rotary_inertia
+        matrix[2:, 2:] = p.linear_density * self.modes.integrals(p.length - x[0]).gram
+        return matrix
+
+    def bias_forces(self, state: ArrayLike) -> FloatArray:
+        """
+        Bias forces N(q, q_dot) of (13), complete: elastic, inertial and tissue damping.
+
+        Parameters
+        ----------
+        state : array_like, shape (8,)
+            State.
+
+        Returns
+        -------
+        ndarray, shape (4,)
+            N in M q_ddot + N = F - F_f.
+
+        """
+        p, x = self.parameters, self.checked_state(state)
+        at = self.modes.integrals(p.length - x[0])
+        modal, rate, d_rate = x[2:COORDINATES], x[COORDINATES + 2 :], x[COORDINATES]
+        tip_rate = at.value @ rate
+        bias = np.zeros(COORDINATES)
+        bias[0] = 0.5 * (
+            p.linear_density * tip_rate**2
+            - p.bending_stiffness * (at.curvature @ modal) ** 2
+            - p.tissue_stiffness * (at.value @ modal) ** 2
+        )
+        bias[2:] = (
+            -p.linear_density * d_rate * at.value * tip_rate
+            + self.stiffness_matrix(p.length - x[0]) @ modal
+            + p.tissue_damping * at.gram @ rate
+        )
+        return bias
+
+    def friction(self, speed: float, drive: float) -> float:
+        """
+        Friction on the needle along the insertion axis, equation (15), set-valued at rest.
+
+        Parameters
+        ----------
+        speed : float
+            Insertion speed s_dot [m/s], positive into the tissue.
+        drive : float
+            Sum of the other forces [N], positive into the tissue; it decides at rest.
+
+        Returns
+        -------
+        float
+            Friction force [N], positive against insertion.
+
+        """
+        p = self.parameters
+        if speed == 0.0:
+            return float(np.clip(drive, -p.coulomb_friction, p.coulomb_friction))
+        return copysign(p.coulomb_friction, speed) + p.viscous_friction * speed
+
+    def acceleration(
+        self, state: ArrayLike, force: float = 0.0, torque: float = 0.0
+    ) -> FloatArray:
+        """
+        Forward dynamics, equations (16)-(17).
+
+        Parameters
+        ----------
+        state : array_like, shape (8,)
+            State.
+        force : float
+            Insertion force f_y at the base [N], positive into the tissue.
+        torque : float
+            Torque tau about x [N m].
+
+        Returns
+        -------
+        ndarray, shape (4,)
+            q_ddot.
+
+        """
+        x = self.checked_state(state)
+        bias = self.bias_forces(x)
+        # Q_d = -f_y: what pushes the needle in shortens d.
+        drive = force + bias[0]
+        applied = np.array(
+            [self.friction(-x[COORDINATES], drive) - force, torque, *np.zeros(MODES)]
+        )
+        return np.asarray(np.linalg.solve(self.mass_matrix(x), applied - bias))
+
+    def derivative(self, state: ArrayLike, force: float = 0.0, torque: float = 0.0) -> FloatArray:
+        """
+        Right-hand side of the state equation (18), for any ODE solver.
+
+        Parameters
+        ----------
+        state : array_like, shape (8,)
+            State.
+        force : float
+            Insertion force f_y [N], positive into the tissue.
+        torque : float
+            Torque tau about x [N m].
+
+        Returns
+        -------
+        ndarray, shape (8,)
+            X_dot.
+
+        """
+        x = np.asarray(state, dtype=float)
+        return np.concatenate([x[COORDINATES:], self.acceleration(x, force, torque)])
+
+    def kinetic_energy(self, state: ArrayLike) -> float:
+        """
+        Kinetic energy T of (12).
+
+        Parameters
+        ----------
+        state : array_like, shape (8,)
+            State.
+
+        Returns
+        -------
+        float
+            Energy [J].
+
+        """
+        rate = self.checked_state(state)[COORDINATES:]
+        return float(0.5 * rate @ self.mass_matrix(state) @ rate)
+
+    def potential_energy(self, state: ArrayLike) -> float:
+        """
+        Potential energy V of needle and tissue, from (12).
+
+        Parameters
+        ----------
+        state : array_like, shape (8,)
+            State.
+
+        Returns
+        -------
+        float
+            Energy [J].
+
+        """
+        x = self.checked_state(state)
+        modal = x[2:COORDINATES]
+        return float(0.5 * modal @ self.stiffness_matrix(self.parameters.length - x[0]) @ modal)
+
+    def energy(self, state: ArrayLike) -> float:
+        """
+        Total energy T + V.
+
+        Parameters
+        ----------
+        state : array_like, shape (8,)
+            State.
+
+        Returns
+        -------
+        float
+            Energy [J].
+
+        """
+        return self.kinetic_energy(state) + self.potential_energy(state)
+
+    def tip_deflection(self, state: ArrayLike) -> float:
+        """
+        Deflection of the tip Y = w(s, t), the model's output.
+
+        Parameters
+        ----------
+        state : array_like, shape (8,)
+            State.
+
+        Returns
+        -------
+        float
+            Deflection [m] along z.
+
+        """
+        x = self.checked_state(state)
+        value = self.modes.integrals(self.parameters.length - x[0]).value
+        return float(value @ x[2:COORDINATES])
+
+    def shape(self, state: ArrayLike, points: int = 50) -> FloatArray:
+        """
+        Points of the inserted needle from the entry point to the tip, equation (10).
+
+        Parameters
+        ----------
+        state : array_like, shape (8,)
+            State.
+        points : int
+            Number of points, at least 2.
+
+        Returns
+        -------
+        ndarray, shape (points, 2)
+            y and w(y) [m].
+
+        """
+        x = self.checked_state(state)
+        y = np.linspace(0.0, self.parameters.length - x[0], points)
+        return np.column_stack([y, self.modes.values(y) @ x[2:COORDINATES]])

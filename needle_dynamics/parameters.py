@@ -1,0 +1,227 @@
+"""Constants of the needle and tissue: one frozen value, checked when it is made."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, fields, replace
+from difflib import get_close_matches
+from math import inf, isfinite
+from typing import Any, Final
+
+from needle_dynamics.errors import ParameterError
+
+
+def constant(
+    default: float,
+    unit: str,
+    description: str,
+    *,
+    low: float = 0.0,
+    high: float = inf,
+    open_low: bool = False,
+) -> Any:
+    """
+    Declare a numeric field with its unit, meaning and valid range.
+
+    Parameters
+    ----------
+    default : float
+        Default value [``unit``].
+    unit : str
+        SI unit as people write it, ``''`` for a pure number.
+    description : str
+        What the number is; becomes the description of the ROS parameter.
+    low, high : float
+        Valid range.
+    open_low : bool
+        True if ``low`` itself is not valid.
+
+    Returns
+    -------
+    Any
+        A dataclass field.
+
+    """
+    return field(
+        default=default,
+        metadata={
+            'unit': unit,
+            'description': description,
+            'low': low,
+            'high': high,
+            'open_low': open_low,
+        },
+    )
+
+
+def check_constants(values: object) -> None:
+    """
+    Refuse a numeric field that is not finite or is outside its declared range.
+
+    Parameters
+    ----------
+    values : object
+        A dataclass instance whose numeric fields were made by `constant`.
+
+    Raises
+    ------
+    ParameterError
+        Naming the field, the value found, and the valid range with its unit.
+
+    """
+    for item in fields(values):  # type: ignore[arg-type]
+        if 'unit' not in item.metadata:
+            continue
+        value = getattr(values, item.name)
+        meta = item.metadata
+        if isinstance(value, bool) or not isinstance(value, (int, float)):
+            raise ParameterError(f'{item.name} must be a number, got {value!r}')
+        too_low = value <= meta['low'] if meta['open_low'] else value < meta['low']
+        if not isfinite(value) or too_low or value > meta['high']:
+            sign = '>' if meta['open_low'] else '>='
+            upper = f' and <= {meta["high"]:g}' if isfinite(meta['high']) else ''
+            raise ParameterError(
+                f'{item.name} must be finite, {sign} {meta["low"]:g}{upper}'
+                f'{" " + meta["unit"] if meta["unit"] else ""}, got {value!r}'
+            )
+
+
+def as_number(value: Any) -> Any:
+    """Take an integer where a float is meant; leave all else as it is."""
+    return float(value) if isinstance(value, int) and not isinstance(value, bool) else value
+
+
+def unknown_name(name: str, valid: list[str]) -> str:
+    """Say that a name is unknown, with the nearest valid one or all of them."""
+    close = get_close_matches(name, valid, n=1)
+    hint = f'did you mean {close[0]!r}?' if close else f'valid: {", ".join(sorted(valid))}'
+    return f'unknown parameter {name!r}; {hint}'
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NeedleParameters:
+    """
+    Constants of a flexible needle in soft tissue, SI units.
+
+    The defaults are Table 3 and section 3.2.8 of [Boroomand2014]_ with Table 1 read as
+    0.3 N s/m (the preset `paper_si`).
+
+    References
+    ----------
+    .. [Boroomand2014] A. Boroomand, M. Tavakoli, R. Sloboda, N. Usmani, "Dynamical modeling
+       and controllability analysis of a flexible needle in soft tissue", 2014.
+
+    """
+
+    length: float = constant(0.2, 'm', 'needle length l', open_low=True)
+    density: float = constant(8000.0, 'kg/m^3', 'mass density rho of the needle', open_low=True)
+    area: float = constant(1.27e-6, 'm^2', 'effective cross-section A', open_low=True)
+    youngs_modulus: float = constant(200e9, 'Pa', "Young's modulus E", open_low=True)
+    area_moment: float = constant(
+        1.28e-13, 'm^4', 'second moment of area I_y of the cross-section', open_low=True
+    )
+    rotary_inertia: float = constant(
+        1.0626e-9, 'kg m^2', 'I_x, used as a mass moment of inertia about x', open_low=True
+    )
+    carriage_mass: float = constant(0.0, 'kg', 'mass moved along with the needle base')
+    tissue_stiffness: float = constant(520.0, 'N/m^2', 'tissue stiffness k_a per length')
+    tissue_damping: float = constant(0.0, 'N s/m^2', 'tissue damping c_a per length')
+    coulomb_friction: float = constant(0.56, 'N', 'Coulomb friction mu_s')
+    viscous_friction: float = constant(0.3, 'N s/m', 'viscous friction mu_v')
+    minimum_depth: float = constant(
+        1e-3, 'm', 'inserted length below which the model stops', open_low=True
+    )
+    hub_stop: bool = field(
+        default=True, metadata={'description': 'the hub stops on the skin (inelastic)'}
+    )
+
+    def __post_init__(self) -> None:
+        check_constants(self)
+        if not isinstance(self.hub_stop, bool):
+            raise ParameterError(f'hub_stop must be true or false, got {self.hub_stop!r}')
+        if self.minimum_depth >= self.length:
+            raise ParameterError(
+                f'minimum_depth must be < length = {self.length:g} m, got {self.minimum_depth!r}'
+            )
+
+    @property
+    def linear_density(self) -> float:
+        """Mass per length rho A [kg/m]."""
+        return self.density * self.area
+
+    @property
+    def bending_stiffness(self) -> float:
+        """Bending stiffness E I_y [N m^2]."""
+        return self.youngs_modulus * self.area_moment
+
+    @property
+    def moving_mass(self) -> float:
+        """Mass that moves along the insertion axis, rho A l plus the carriage [kg]."""
+        return self.linear_density * self.length + self.carriage_mass
+
+    @classmethod
+    def preset(cls, name: str, **changes: Any) -> NeedleParameters:
+        """
+        Return a named set of constants, with changes.
+
+        Parameters
+        ----------
+        name : str
+            One of `PRESETS`.
+        **changes : Any
+            Fields to replace.
+
+        Returns
+        -------
+        NeedleParameters
+            The constants.
+
+        Raises
+        ------
+        ParameterError
+            If the preset or a field is unknown, or a value is not valid.
+
+        """
+        if name not in PRESETS:
+            raise ParameterError(f'unknown preset {name!r}; valid: {", ".join(PRESETS)}')
+        return cls.from_mapping({**asdict(PRESETS[name]), **changes})
+
+    @classmethod
+    def from_mapping(cls, values: Mapping[str, Any]) -> NeedleParameters:
+        """
+        Make the constants from a mapping; what it leaves out takes its default.
+
+        Parameters
+        ----------
+        values : Mapping[str, Any]
+            Field names and values; integers are taken where a float is meant.
+
+        Returns
+        -------
+        NeedleParameters
+            The constants.
+
+        Raises
+        ------
+        ParameterError
+            If a name is unknown or a value is not valid.
+
+        """
+        valid = [item.name for item in fields(cls)]
+        for name in values:
+            if name not in valid:
+                raise ParameterError(unknown_name(name, valid))
+        return cls(**{name: as_number(value) for name, value in values.items()})
+
+
+_PAPER_SI = NeedleParameters()
+_PAPER_MM = replace(_PAPER_SI, viscous_friction=300.0)
+
+#: Named sets of constants. Table 1 prints mu_v = 0.3 without a unit: `paper_si` reads it as
+#: 0.3 N s/m, `paper_mm` as 0.3 N s/mm. `phantom` adds the tissue damping that the paper leaves
+#: out: 30 % of critical for the first mode at full insertion (an assumption).
+PRESETS: Final[Mapping[str, NeedleParameters]] = {
+    'paper_si': _PAPER_SI,
+    'paper_mm': _PAPER_MM,
+    'phantom': replace(_PAPER_MM, tissue_damping=1.6),
+}

@@ -1,0 +1,1 @@
+"""Command line, demo and reports: the composition of plant, controller and identification."""

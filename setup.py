@@ -1,0 +1,77 @@
+"""Package needle_insertion for pip and for ament; package.xml holds name and version."""
+
+from pathlib import Path
+import xml.etree.ElementTree as ET
+
+from setuptools import find_packages, setup
+
+ROOT = Path(__file__).parent
+MANIFEST = ET.parse(ROOT / 'package.xml').getroot()  # noqa: S314
+NAME = MANIFEST.findtext('name')
+NODES = {
+    'plant': 'needle_dynamics.plant_node',
+    'controller': 'needle_controller.controller_node',
+    'identification': 'needle_identification.identification_node',
+    'recorder': 'needle_identification.recorder_node',
+}
+
+
+def files(folder: str, pattern: str) -> list[str]:
+    """List files below a folder as paths from here, as setuptools wants them."""
+    return [str(path.relative_to(ROOT)) for path in sorted((ROOT / folder).glob(pattern))]
+
+
+setup(
+    name=NAME,
+    version=MANIFEST.findtext('version'),
+    description=MANIFEST.findtext('description'),
+    license=MANIFEST.findtext('license'),
+    maintainer=MANIFEST.findtext('maintainer'),
+    maintainer_email=MANIFEST.find('maintainer').get('email'),
+    long_description=(ROOT / 'README.md').read_text(encoding='utf-8'),
+    long_description_content_type='text/markdown',
+    python_requires='>=3.10',
+    packages=find_packages(include=['needle_*']),
+    package_data={'': ['py.typed']},
+    data_files=[
+        ('share/ament_index/resource_index/packages', ['resource/needle_insertion']),
+        (f'share/{NAME}', ['package.xml']),
+        (f'share/{NAME}/config', files('config', '*.yaml')),
+        # ros2 run looks here; pip puts the same nodes on PATH as needle-<name>.
+        (f'lib/{NAME}', [f'scripts/{node}' for node in NODES]),
+    ],
+    install_requires=[
+        'matplotlib>=3.6',
+        'mcap>=1.2',
+        'numba>=0.58',
+        'numpy>=1.24',
+        'PyYAML>=6.0',
+        'rosbags>=0.11',
+        'scipy>=1.11',
+        'tqdm>=4.64',
+    ],
+    extras_require={
+        # ROS 2 Jazzy from wheels; leave out on a machine that has ROS.
+        'ros': [
+            'ros-jazzy-common-interfaces>=5.3',
+            'ros-jazzy-lifecycle-msgs>=2.0',
+            'ros-jazzy-rclpy>=7.1.6',
+            'ros-jazzy-rmw-fastrtps-cpp>=8.4',
+        ],
+        'dev': [
+            'colcon-common-extensions>=0.3',
+            'hypothesis>=6.100',
+            'mypy>=1.14',
+            'pytest>=8.0',
+            'ros-jazzy-domain-coordinator>=0.12',
+            'ruff>=0.9',
+        ],
+    },
+    entry_points={
+        'console_scripts': [
+            'needle = needle_insertion.cli:main',
+            *(f'needle-{node} = {module}:main' for node, module in NODES.items()),
+        ]
+    },
+    zip_safe=False,
+)
