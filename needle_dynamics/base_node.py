@@ -18,7 +18,7 @@ from typing import Any, TypeVar
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from needle_dynamics.errors import NeedleError, ParameterError
-from needle_dynamics.parameters import as_number, unknown_name
+from needle_dynamics.parameters import as_number, NeedleParameters, PRESETS, unknown_name
 from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor, SetParametersResult
 import rclpy
 from rclpy.exceptions import ParameterException
@@ -116,6 +116,25 @@ class NeedleNode(LifecycleNode):
             self.declare_parameter(
                 f'{prefix}{item.name}', getattr(defaults, item.name), descriptor
             )
+
+    def declare_model(self) -> None:
+        """Declare ``model.preset`` and, with its values as defaults, every model constant."""
+        self.declare_text('model.preset', 'phantom', f'one of {", ".join(PRESETS)}')
+        preset = self.get_parameter('model.preset').value
+        self.declare_settings('model.', PRESETS.get(preset, NeedleParameters()))
+
+    def model_parameters(self) -> NeedleParameters:
+        """
+        Read the model constants.
+
+        Raises
+        ------
+        ParameterError
+            Naming the parameter.
+
+        """
+        self.text('model.preset', tuple(PRESETS))
+        return self.settings('model.', NeedleParameters)
 
     def settings(self, prefix: str, kind: Callable[..., _Settings]) -> _Settings:
         """
