@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass, replace
-from math import exp, expm1
 from typing import Protocol
 
 from needle_dynamics import NeedleParameters
-from needle_dynamics.integrators import slide
+from needle_dynamics.integrators import decay_means, slide
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -45,7 +44,9 @@ class Axis:
         """Return the linear part of the axis."""
         return replace(self, coulomb=0.0)
 
-    def propagate(self, position: float, speed: float, force: float, t: float) -> State:
+    def propagate(
+        self, position: float, speed: float, force: float, t: float
+    ) -> tuple[float, float]:
         """Return position and speed after a constant force for a time t [s], exactly."""
         end, moved = slide(speed, force, self.inertia, self.coulomb, self.viscous, t)
         return position + moved, end
@@ -62,18 +63,9 @@ class Axis:
 
         """
         x = self.viscous * t / self.inertia
-        if x < 1e-6:
-            return 1.0, t / self.inertia, t, 0.5 * t * t / self.inertia
-        mean = -expm1(-x) / x
-        return (
-            exp(-x),
-            mean * t / self.inertia,
-            mean * t,
-            (1.0 - mean) / x * t * t / self.inertia,
-        )
-
-
-State = tuple[float, float]
+        mean, ramp = decay_means(x)
+        push = t / self.inertia
+        return 1.0 - x * mean, mean * push, mean * t, ramp * t * push
 
 
 @dataclass(frozen=True, slots=True)

@@ -126,7 +126,7 @@ class MinimumJerk:
         top = max(limits.speed, abs(start.speed)) * (1.0 + 1e-9)
         ramp = max(limits.acceleration, abs(start.acceleration)) * (1.0 + 1e-9)
         while not at_rest and not self._within(top, ramp) and self.duration < 100.0 * shortest:
-            self._fit(1.05 * self.duration)
+            self._fit(1.1 * self.duration)
 
     def _fit(self, duration: float) -> None:
         """Take the quintic of this duration; its variable is time over duration."""
@@ -148,12 +148,8 @@ class MinimumJerk:
         self._acceleration = self._speed.deriv()
 
     def _within(self, top: float, ramp: float) -> bool:
-        grid = np.linspace(0.0, 1.0, 101)
         t = self.duration
-        return bool(
-            np.abs(self._speed(grid)).max() <= top * t
-            and np.abs(self._acceleration(grid)).max() <= ramp * t * t
-        )
+        return bool(_peak(self._speed) <= top * t and _peak(self._acceleration) <= ramp * t * t)
 
     def at(self, time: float) -> Setpoint:
         """Return where the reference is."""
@@ -168,6 +164,13 @@ class MinimumJerk:
             float(self._speed(x)) / t,
             float(self._acceleration(x)) / (t * t),
         )
+
+
+def _peak(curve: Polynomial) -> float:
+    """Return the largest modulus of a polynomial on [0, 1]."""
+    turns = curve.deriv().roots()
+    inside = turns.real[(abs(turns.imag) < 1e-9) & (turns.real > 0.0) & (turns.real < 1.0)]
+    return float(abs(curve(np.concatenate([[0.0, 1.0], inside]))).max())
 
 
 #: References by name.

@@ -82,6 +82,20 @@ def _constants(p: NeedleParameters) -> _Constants:
 
 
 @compiled
+def decay_means(x: float) -> tuple[float, float]:
+    """
+    Return the means over [0, 1] of exp(-x r) and of r -> mean of exp(-x r') over [0, r] times r.
+
+    They are (1 - exp(-x)) / x and (x - 1 + exp(-x)) / x^2, without cancellation at small x.
+    """
+    if x < 1e-4:
+        # Taylor: the next terms are below 1e-13.
+        return 1.0 - x * (0.5 - x / 6.0), 0.5 - x * (1.0 / 6.0 - x / 24.0)
+    mean = -expm1(-x) / x
+    return mean, (1.0 - mean) / x
+
+
+@compiled
 def _glide(u: float, a: float, b: float, t: float) -> tuple[float, float]:
     """
     Solve u_dot = a - b u for a time t.
@@ -89,13 +103,7 @@ def _glide(u: float, a: float, b: float, t: float) -> tuple[float, float]:
     Returns the final speed and the displacement.
     """
     x = b * t
-    if x < 1e-4:
-        # Taylor to x^2: the next terms are below 1e-12 relative.
-        mean = 1.0 - x * (0.5 - x / 6.0)
-        ramp = 0.5 - x * (1.0 / 6.0 - x / 24.0)
-    else:
-        mean = -expm1(-x) / x
-        ramp = (1.0 - mean) / x
+    mean, ramp = decay_means(x)
     return u * (1.0 - x * mean) + a * t * mean, t * (u * mean + a * t * ramp)
 
 

@@ -1,0 +1,195 @@
+"""A private ROS graph: nodes as processes on a domain of their own, watched from one node."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+import os
+from pathlib import Path
+import signal
+import subprocess
+import sys
+import time
+from types import TracebackType
+from typing import Any, IO
+
+from domain_coordinator import domain_id
+from needle_dynamics import NeedleError
+from rclpy.context import Context
+from rclpy.executors import Executor
+from rclpy.experimental.events_executor import EventsExecutor
+from rclpy.node import Node
+import yaml
+
+#: Modules of the nodes by name.
+MODULES: Mapping[str, str] = {
+    'plant': 'needle_dynamics.plant_node',
+    'controller': 'needle_controller.controller_node',
+    'identification': 'needle_identification.identification_node',
+    'recorder': 'needle_identification.recorder_node',
+}
+
+
+class GraphError(NeedleError):
+    """A node did not start, ended early, or what was waited for did not come."""
+
+
+class NodeProcess:
+    """
+    One node of the suite as a process.
+
+    Parameters
+    ----------
+    name : str
+        A key of `MODULES`.
+    parameters : Mapping[str, object]
+        Parameters by name.
+    environment : Mapping[str, str]
+        Environment with the domain.
+    log : file
+        Receives what the node prints.
+
+    """
+
+    def __init__(
+        self,
+        name: str,
+        parameters: Mapping[str, object],
+        environment: Mapping[str, str],
+        log: IO[str],
+    ) -> None:
+        self.name = name
+        self._log = log
+        settings = [
+            word
+            for key, value in parameters.items()
+            # One line of YAML, without the end-of-document mark of a bare scalar.
+            for word in ('-p', f'{key}:={yaml.safe_dump(value, width=10_000).splitlines()[0]}')
+        ]
+        self.process = subprocess.Popen(
+            [sys.executable, '-m', MODULES[name], '--ros-args', *settings],
+            env=dict(environment),
+            stdout=log,
+            stderr=subprocess.STDOUT,
+        )
+
+    def check(self) -> None:
+        """Raise `GraphError` with the node's last words if it has ended."""
+        status = self.process.poll()
+        if status is not None:
+            raise GraphError(
+                f'{self.name} ended early with status {status}: {self.last_words() or "no output"}'
+            )
+
+    def last_words(self) -> str:
+        """Return the last line the node printed."""
+        self._log.flush()
+        lines = Path(self._log.name).read_text(encoding='utf-8', errors='replace').splitlines()
+        return lines[-1] if lines else ''
+
+    def interrupt(self, timeout: float = 15.0) -> None:
+        """End the node as Ctrl-C does and wait; raise `GraphError` if it does not end well."""
+        self.process.send_signal(signal.SIGINT)
+        try:
+            status = self.process.wait(timeout)
+        except subprocess.TimeoutExpired as error:
+            raise GraphError(f'{self.name} did not end within {timeout:g} s') from error
+        if status != 0:
+            raise GraphError(f'{self.name} ended with status {status}: {self.last_words()}')
+
+
+class Graph:
+    """
+    A ROS graph on a free domain, on this machine only; leaving it ends all its processes.
+
+    Parameters
+    ----------
+    logs : Path
+        Folder for what the nodes print.
+    executor : type of executor
+        Spins the nodes in this process, in the caller's thread: an error in a callback is an
+        error of the caller.
+
+    """
+
+    def __init__(self, logs: Path, executor: Callable[..., Executor] = EventsExecutor) -> None:
+        self._logs = logs
+        self._executor_kind = executor
+        self._processes: list[NodeProcess] = []
+        self._files: list[IO[str]] = []
+        self._nodes: list[Node] = []
+
+    def __enter__(self) -> Graph:
+        self._domain = domain_id()
+        domain = self._domain.__enter__()
+        self.environment = {
+            **os.environ,
+            'ROS_DOMAIN_ID': str(domain),
+            'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
+        }
+        # The context of this process reads its discovery range from the environment too.
+        os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
+        self.context = Context()
+        self.context.init(domain_id=domain)
+        self.executor = self._executor_kind(context=self.context)
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        for started in self._processes:
+            if started.process.poll() is None:
+                started.process.kill()
+            started.process.wait()
+        for file in self._files:
+            file.close()
+        for node in self._nodes:
+            self.executor.remove_node(node)
+            node.destroy_node()
+        self.executor.shutdown()
+        self.context.try_shutdown()
+        self._domain.__exit__(kind, error, trace)
+
+    def add(self, kind: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
+        """Make a node in this process and spin it along."""
+        node = kind(*arguments, context=self.context, **options)
+        self._nodes.append(node)
+        self.executor.add_node(node)
+        return node
+
+    def node(self, name: str) -> Node:
+        """Make a plain node in this process, to watch and to command."""
+        node: Node = self.add(Node, name)
+        return node
+
+    def start(self, name: str, parameters: Mapping[str, object] | None = None) -> NodeProcess:
+        """Start a node of the suite as a process."""
+        self._logs.mkdir(parents=True, exist_ok=True)
+        # Closed with the graph: the process writes to it until then.
+        log = (self._logs / f'{name}.log').open('a', encoding='utf-8')
+        self._files.append(log)
+        process = NodeProcess(name, parameters or {}, self.environment, log)
+        self._processes.append(process)
+        return process
+
+    def spin_until(self, condition: Callable[[], Any], what: str, timeout: float = 30.0) -> None:
+        """
+        Spin until a condition holds.
+
+        Raises
+        ------
+        GraphError
+            If it does not within the timeout [s], or a process of the graph has ended.
+
+        """
+        deadline = time.monotonic() + timeout
+        while not condition():
+            for started in self._processes:
+                # One that was interrupted on purpose has ended well.
+                if started.process.poll() not in (None, 0):
+                    started.check()
+            if time.monotonic() > deadline:
+                raise GraphError(f'{what} did not come within {timeout:g} s')
+            self.executor.spin_once(timeout_sec=0.05)
