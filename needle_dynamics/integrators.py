@@ -287,7 +287,7 @@ def _advance(
     state: FloatArray,
     force: float,
     torque: float,
-    base_acceleration: float,
+    base_speed: float,
     moved: bool,
     h: float,
     steps: int,
@@ -296,7 +296,7 @@ def _advance(
     """
     Take ``steps`` steps in place under constant inputs; return how many were taken.
 
-    With ``moved`` the base follows its own speed plus ``base_acceleration`` whatever the force.
+    With ``moved`` the speed goes evenly to ``base_speed``, whatever force that takes.
     Fewer steps than asked for means that the inserted length fell below its minimum.
     """
     s = c.length - state[0]
@@ -308,6 +308,7 @@ def _advance(
     p1 = rho * (at[0] * state[6] + at[1] * state[7])
     p2 = rho * (at[1] * state[6] + at[2] * state[7])
     decay = exp(-0.5 * h * c.tissue_damping / rho)
+    change = (base_speed - u) / steps
     taken = 0
     while taken < steps:
         middle = s + 0.5 * h * u
@@ -319,7 +320,8 @@ def _advance(
         r1, r2, t1, t2, impulse = _rotate(c, at, q1, q2, p1, p2, h, decay, sums)
         drive = force - impulse / h
         if moved:
-            new_u = u + h * base_acceleration
+            # Counted from the end, so that a base that shall rest does so exactly.
+            new_u = base_speed - (steps - taken - 1) * change
             step = 0.5 * h * (u + new_u)
         else:
             new_u, step = slide(u, drive, c.moving_mass, c.coulomb, c.viscous, h)
@@ -467,22 +469,22 @@ class Integrator:
         """
         return self._run(duration, force, torque, 0.0, moved=False)
 
-    def advance_moved(self, duration: float, acceleration: float) -> Interval:
+    def advance_moved(self, duration: float, speed: float) -> Interval:
         """
-        Advance with the base moved at a constant acceleration, whatever force that takes.
+        Advance with the base brought evenly to a speed, whatever force that takes.
 
         Parameters
         ----------
         duration : float
             Time to advance [s].
-        acceleration : float
-            Acceleration of the base [m/s^2], positive into the tissue.
+        speed : float
+            Insertion speed at the end [m/s], positive into the tissue.
 
         Returns
         -------
         Interval
             Means over the interval; the axial force is what the motion took. While the base
-            rests, friction keeps the value within its bounds that is nearest to no force.
+            rests, friction takes the value within its bounds that asks for the least force.
 
         Raises
         ------
@@ -490,10 +492,10 @@ class Integrator:
             If the inserted length fell below its minimum; the state is the last valid one.
 
         """
-        return self._run(duration, 0.0, 0.0, acceleration, moved=True)
+        return self._run(duration, 0.0, 0.0, speed, moved=True)
 
     def _run(
-        self, duration: float, force: float, torque: float, acceleration: float, *, moved: bool
+        self, duration: float, force: float, torque: float, speed: float, *, moved: bool
     ) -> Interval:
         # A duration of a whole number of steps is not rounded up.
         steps = max(1, ceil(duration / self.step * (1.0 - 1e-9)))
@@ -507,7 +509,7 @@ class Integrator:
             self._state,
             force,
             torque,
-            acceleration,
+            speed,
             moved,
             duration / steps,
             steps,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import copysign, sqrt
+from typing import Final
 
 from needle_dynamics.errors import ParameterError
 from needle_dynamics.force_sensor import ForceSensor
@@ -12,6 +13,9 @@ from needle_dynamics.model import COORDINATES
 from needle_dynamics.modes import FloatArray
 from needle_dynamics.parameters import check_constants, constant
 import numpy as np
+
+#: Error at the end of a trajectory with which the base is content to rest [m].
+_SETTLED: Final = 1e-8
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -52,7 +56,7 @@ class BaseMotion:
         Parameters
         ----------
         start : float
-            Time at which it begins [s], on the clock of `acceleration`.
+            Time at which it begins [s], on the clock of `speed`.
         depth : float
             Inserted length at that time [m].
         times : ndarray, shape (n,)
@@ -79,9 +83,9 @@ class BaseMotion:
         self._times = start + np.concatenate([[0.0], times])
         self._depths = np.concatenate([[depth], depths])
 
-    def acceleration(self, time: float, depth: float, speed: float, interval: float) -> float:
+    def speed(self, time: float, depth: float, speed: float, interval: float) -> float:
         """
-        Return the acceleration that follows the trajectory over the next interval.
+        Return the speed to have after the next interval to follow the trajectory.
 
         Parameters
         ----------
@@ -95,19 +99,21 @@ class BaseMotion:
         Returns
         -------
         float
-            Acceleration [m/s^2] within the limits.
+            Speed [m/s], reached within the limits.
 
         """
         limits = self._limits
         now = float(np.interp(time, self._times, self._depths))
         ahead = float(np.interp(time + interval, self._times, self._depths))
+        change = limits.acceleration_limit * interval
         error = now - depth
+        if ahead == now and abs(error) < _SETTLED and abs(speed) <= change:
+            return 0.0
         # Close the error no faster than the base could brake; half the limit leaves a margin.
         closing = min(abs(error) / interval, sqrt(limits.acceleration_limit * abs(error)))
         wanted = (ahead - now) / interval + copysign(closing, error)
         wanted = min(max(wanted, -limits.speed_limit), limits.speed_limit)
-        change = limits.acceleration_limit * interval
-        return min(max(wanted - speed, -change), change) / interval
+        return min(max(wanted, speed - change), speed + change)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -195,10 +201,8 @@ class Plant:
         if self.base is None:
             seen = needle.advance(self.interval, force, torque)
         else:
-            acceleration = self.base.acceleration(
-                self.time, needle.depth, needle.speed, self.interval
-            )
-            seen = needle.advance_moved(self.interval, acceleration)
+            speed = self.base.speed(self.time, needle.depth, needle.speed, self.interval)
+            seen = needle.advance_moved(self.interval, speed)
         self._count += 1
         self.time = self._count * self.interval
         wrench = np.array([0.0, seen.axial_force, seen.lateral_force, seen.moment, 0.0, 0.0])

@@ -82,14 +82,10 @@ def record_friction_run(
             {'mode': 'robot', 'depth': START_DEPTH, 'rate': rate, 'seed': seed},
         )
         node = graph.node('friction_experiment')
-        latest: list[JointState] = []
-        node.create_subscription(
-            JointState, 'joint_states', lambda message: latest.__setitem__(slice(None), [message]),
-            SENSOR,
-        )  # fmt: skip
+        latest = graph.latest(node, JointState, 'joint_states', SENSOR)
         trajectory = node.create_publisher(JointTrajectory, 'joint_trajectory', COMMAND)
         # The recorder listens too: what it misses would not be in the bag.
-        graph.spin_until(lambda: latest, 'joint_states')
+        graph.spin_until(lambda: latest.message, 'joint_states')
         graph.spin_until(
             lambda: (
                 trajectory.get_subscription_count() == 2
@@ -101,9 +97,7 @@ def record_friction_run(
         message = JointTrajectory(joint_names=['insertion'])
         message.header.stamp = node.get_clock().now().to_msg()
         message.points = [
-            JointTrajectoryPoint(
-                positions=[depth], time_from_start=Duration(seconds=at).to_msg()
-            )
+            JointTrajectoryPoint(positions=[depth], time_from_start=Duration(seconds=at).to_msg())
             for at, depth in zip(times, depths, strict=True)
         ]
         trajectory.publish(message)

@@ -18,6 +18,7 @@ from rclpy.context import Context
 from rclpy.executors import Executor
 from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.node import Node
+from rclpy.qos import QoSProfile
 import yaml
 
 #: Modules of the nodes by name.
@@ -97,6 +98,17 @@ class NodeProcess:
             raise GraphError(f'{self.name} ended with status {status}: {self.last_words()}')
 
 
+class Latest:
+    """The newest message of a topic, None before the first."""
+
+    def __init__(self) -> None:
+        self.message: Any = None
+
+    def take(self, message: Any) -> None:
+        """Take a message."""
+        self.message = message
+
+
 class Graph:
     """
     A ROS graph on a free domain, on this machine only; leaving it ends all its processes.
@@ -163,6 +175,12 @@ class Graph:
         """Make a plain node in this process, to watch and to command."""
         node: Node = self.add(Node, name)
         return node
+
+    def latest(self, node: Node, kind: type, topic: str, qos: QoSProfile) -> Latest:
+        """Watch a topic for its newest message."""
+        latest = Latest()
+        node.create_subscription(kind, topic, latest.take, qos)
+        return latest
 
     def start(self, name: str, parameters: Mapping[str, object] | None = None) -> NodeProcess:
         """Start a node of the suite as a process."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -10,18 +10,32 @@ from needle_dynamics.base_node import NeedleNode
 from needle_insertion.graph import Graph
 import pytest
 from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.parameter import Parameter
 
 
 class RosGraph(Graph):
-    """The graph of one test; lifecycle nodes are started as they are added."""
+    """The graph of one test: nodes in its own thread, and processes."""
 
     def add(self, kind: type, *arguments: Any, **options: Any) -> Any:
-        """Make a node in the test's own thread; ``start=False`` leaves it unconfigured."""
+        """
+        Make a node; a node of the suite is started unless ``start`` is False.
+
+        ``parameters`` are its parameters by name.
+        """
         start = options.pop('start', True)
-        node = super().add(kind, *arguments, **options)
+        parameters: Mapping[str, object] = options.pop('parameters', {})
+        overrides = [Parameter(name, value=value) for name, value in parameters.items()]
+        node = super().add(kind, *arguments, parameter_overrides=overrides, **options)
         if start and isinstance(node, NeedleNode):
             assert node.start(), node.failure
         return node
+
+    def listen(self, node: Node, kind: type, topic: str, qos: Any) -> list[Any]:
+        """Return a list that fills with the messages of a topic."""
+        received: list[Any] = []
+        node.create_subscription(kind, topic, received.append, qos)
+        return received
 
 
 @pytest.fixture
