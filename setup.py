@@ -37,6 +37,7 @@ setup(
         ('share/ament_index/resource_index/packages', ['resource/needle_insertion']),
         (f'share/{NAME}', ['package.xml']),
         (f'share/{NAME}/config', files('config', '*.yaml')),
+        (f'share/{NAME}/launch', files('launch', '*.launch.py')),
         # ros2 run looks here; pip puts the same nodes on PATH as needle-<name>.
         (f'lib/{NAME}', [f'scripts/{node}' for node in NODES]),
     ],
@@ -54,6 +55,7 @@ setup(
         # ROS 2 Jazzy from wheels; leave out on a machine that has ROS.
         'ros': [
             'ros-jazzy-common-interfaces>=5.3',
+            'ros-jazzy-domain-coordinator>=0.12',
             'ros-jazzy-lifecycle-msgs>=2.0',
             'ros-jazzy-rclpy>=7.1.6',
             'ros-jazzy-rmw-fastrtps-cpp>=8.4',
@@ -63,7 +65,6 @@ setup(
             'hypothesis>=6.100',
             'mypy>=1.14',
             'pytest>=8.0',
-            'ros-jazzy-domain-coordinator>=0.12',
             'ruff>=0.9',
         ],
     },

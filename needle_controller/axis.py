@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Protocol
 
 from needle_dynamics import NeedleParameters
-from needle_dynamics.integrators import decay_means, slide
+from needle_dynamics.kernels import decay_means, slide
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -5,8 +5,7 @@ from __future__ import annotations
 from math import inf
 
 from needle_controller.axis import Law, SampledLoop, Setpoint
-from needle_dynamics import ParameterError
-from needle_dynamics.modes import FloatArray
+from needle_dynamics import FloatArray, ParameterError
 import numpy as np
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from needle_dynamics.errors import ParameterError
-from needle_dynamics.modes import FloatArray
+from needle_dynamics.kernels import FloatArray
 from needle_dynamics.parameters import check_constants, constant
 import numpy as np
 from scipy.signal import butter

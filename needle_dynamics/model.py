@@ -14,13 +14,17 @@ from math import copysign
 from typing import Final
 
 from needle_dynamics.errors import InsertedLengthError, ShapeError
-from needle_dynamics.modes import FloatArray, mode_shapes, MODES, ModeShapes
+from needle_dynamics.kernels import FloatArray, MODES
+from needle_dynamics.modes import mode_shapes, ModeShapes
 from needle_dynamics.parameters import NeedleParameters
 import numpy as np
 from numpy.typing import ArrayLike
 
 #: Number of generalized coordinates.
 COORDINATES: Final = 2 + MODES
+
+#: Rounding of an inserted length, relative to the needle's length.
+ROUNDING: Final = 1e-12
 
 #: Names of the generalized coordinates, in order.
 COORDINATE_NAMES: Final = ('d', 'theta', 'q1', 'q2')
@@ -44,7 +48,9 @@ class NeedleModel:
     modes: ModeShapes = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, 'modes', mode_shapes(self.parameters.length))
+        # Without the stop the needle may overshoot the hub by as much as its length.
+        reach = 1.0 if self.parameters.hub_stop else 2.0
+        object.__setattr__(self, 'modes', mode_shapes(self.parameters.length, reach))
 
     def checked_state(self, state: ArrayLike) -> FloatArray:
         """
@@ -75,10 +81,12 @@ class NeedleModel:
             raise ShapeError(f'state must be finite, got {checked.tolist()}')
         p = self.parameters
         depth = p.length - checked[0]
-        if depth < p.minimum_depth or (p.hub_stop and checked[0] < 0.0):
+        high = self.modes.reach * p.length
+        # The inserted length is a difference: its ends are met up to rounding.
+        if not p.minimum_depth - ROUNDING * p.length <= depth <= high:
             raise InsertedLengthError(
-                f'inserted length {depth:.6g} m is outside '
-                f'[minimum_depth, length] = [{p.minimum_depth:g}, {p.length:g}] m'
+                f'inserted length {depth:.6g} m is outside [{p.minimum_depth:g}, {high:g}] m '
+                '(minimum_depth to the hub)'
             )
         return checked
 
@@ -105,15 +113,17 @@ class NeedleModel:
         ------
         InsertedLengthError
             If ``depth`` is outside its range.
+        ShapeError
+            If a number is not finite.
 
         """
         state = np.zeros(2 * COORDINATES)
         state[0] = self.parameters.length - depth
         state = self.checked_state(state)
-        shape = np.linalg.solve(self.stiffness_matrix(depth), self.modes.integrals(depth).value)
         value = self.modes.integrals(depth).value
+        shape = np.linalg.solve(self.stiffness_matrix(depth), value)
         state[2:COORDINATES] = shape * (tip_deflection / (value @ shape))
-        return state
+        return self.checked_state(state)
 
     def stiffness_matrix(self, depth: float) -> FloatArray:
         """

@@ -15,28 +15,26 @@ from functools import cached_property, lru_cache
 from math import cos, cosh, factorial, pi
 from typing import Final
 
-from needle_dynamics._compile import compiled
 from needle_dynamics.errors import ParameterError
+from needle_dynamics.kernels import (
+    AREA,
+    COLUMNS,
+    CURVATURE,
+    CURVATURE_GRAM,
+    evaluate,
+    FloatArray,
+    GRAM,
+    INTEGRALS,
+    MODES,
+    MOMENT,
+    VALUE,
+)
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.optimize import brentq
 
-FloatArray = NDArray[np.float64]
-
-#: Number of modes n in (10), as in the paper.
-MODES: Final = 2
-
-#: Powers of (y/l)^4 kept: the first one left out is below 1e-17 of the sum at y = l.
-_TERMS: Final = 13
-
-# Columns of the series: where each quantity starts. Pairs count 11, 12, 22.
-_G: Final = 0
-_H: Final = 9
-_PHI: Final = 18
-_CURVATURE: Final = 22
-_MOMENT_0: Final = 26
-_MOMENT_1: Final = 30
-_COLUMNS: Final = 34
+#: The first term that a series leaves out is below this part of the sum.
+_TRUNCATION: Final = 1e-17
 
 
 @dataclass(frozen=True)
@@ -48,10 +46,14 @@ class ModeShapes:
     ----------
     length : float
         Needle length l [m].
+    reach : float
+        Largest inserted length over l for which integrals are wanted; above 1 the modes are
+        continued beyond the needle's length.
 
     """
 
     length: float
+    reach: float = 1.0
 
     @cached_property
     def wavenumbers(self) -> FloatArray:
@@ -129,22 +131,25 @@ class ModeShapes:
     @cached_property
     def series(self) -> FloatArray:
         """Coefficients of all quantities of `integrals` in powers of (y/l)^4; (terms, columns)."""
-        degree = 4 * _TERMS
+        # Products of two modes grow as (2 k y)^m / m!.
+        growth = 2.0 * float(self.wavenumbers[-1]) * self.length * self.reach
+        terms = next(m for m in range(1, 99) if growth ** (4 * m) < _TRUNCATION * factorial(4 * m))
+        degree = 4 * terms
         phi = np.zeros((MODES, degree))
         curvature = np.zeros((MODES, degree))
         for i in range(MODES):
             x, c, mu = self.wavenumbers[i] * self.length, self.scales[i], self.ratios[i]
-            for m in range(_TERMS):
+            for m in range(terms):
                 # sin - sinh and cos - cosh keep one power in four of the exponential series.
                 phi[i, 4 * m + 3] = -2.0 * c * x ** (4 * m + 3) / factorial(4 * m + 3)
                 phi[i, 4 * m + 2] = 2.0 * c * mu * x ** (4 * m + 2) / factorial(4 * m + 2)
             powers = np.arange(degree - 2)
             curvature[i, :-2] = phi[i, 2:] * (powers + 1) * (powers + 2) / self.length**2
-        table = np.zeros((_TERMS, _COLUMNS))
+        table = np.zeros((terms, COLUMNS))
 
         def put(column: int, series: FloatArray, first: int, parts: int) -> None:
             for part in range(parts):
-                picked = series[first + part :: 4][:_TERMS]
+                picked = series[first + part :: 4][:terms]
                 table[: picked.size, column + part] = picked
 
         def integral(series: FloatArray, power: int = 0) -> FloatArray:
@@ -155,13 +160,13 @@ class ModeShapes:
             )
 
         for pair, (i, j) in enumerate(((0, 0), (0, 1), (1, 1))):
-            put(_G + 3 * pair, integral(np.convolve(phi[i], phi[j])), 5, 3)
-            put(_H + 3 * pair, integral(np.convolve(curvature[i], curvature[j])), 1, 3)
+            put(GRAM + 3 * pair, integral(np.convolve(phi[i], phi[j])), 5, 3)
+            put(CURVATURE_GRAM + 3 * pair, integral(np.convolve(curvature[i], curvature[j])), 1, 3)
         for i in range(MODES):
-            put(_PHI + 2 * i, phi[i], 2, 2)
-            put(_CURVATURE + 2 * i, curvature[i], 0, 2)
-            put(_MOMENT_0 + 2 * i, integral(phi[i]), 3, 2)
-            put(_MOMENT_1 + 2 * i, integral(phi[i], 1), 4, 2)
+            put(VALUE + 2 * i, phi[i], 2, 2)
+            put(CURVATURE + 2 * i, curvature[i], 0, 2)
+            put(AREA + 2 * i, integral(phi[i]), 3, 2)
+            put(MOMENT + 2 * i, integral(phi[i], 1), 4, 2)
         table.setflags(write=False)
         return table
 
@@ -172,7 +177,7 @@ class ModeShapes:
         Parameters
         ----------
         depth : float
-            Inserted length s [m], in [0, l].
+            Inserted length s [m], in [0, reach l].
 
         Returns
         -------
@@ -182,15 +187,15 @@ class ModeShapes:
         Raises
         ------
         ParameterError
-            If ``depth`` is outside [0, l].
+            If ``depth`` is outside that range.
 
         """
-        if not 0.0 <= depth <= self.length:
+        if not 0.0 <= depth <= self.reach * self.length:
             raise ParameterError(
-                f'inserted length must be in [0, {self.length:g}] m, got {depth!r}'
+                f'inserted length must be in [0, {self.reach * self.length:g}] m, got {depth!r}'
             )
-        v = np.empty(COLUMNS_OUT)
-        evaluate(depth / self.length, self.series, np.empty(_COLUMNS), v)
+        v = np.empty(INTEGRALS)
+        evaluate(depth / self.length, self.series, np.empty(COLUMNS), v)
         return ModeIntegrals(
             gram=np.array([[v[0], v[1]], [v[1], v[2]]]),
             curvature_gram=np.array([[v[3], v[4]], [v[4], v[5]]]),
@@ -228,47 +233,6 @@ class ModeIntegrals:
 
 
 @lru_cache(maxsize=32)
-def mode_shapes(length: float) -> ModeShapes:
-    """Return the modes of a needle of the given length [m], made once."""
-    return ModeShapes(length)
-
-
-#: Length of the output of `evaluate`: G (11, 12, 22), H (11, 12, 22), then phi, phi'',
-#: the integral of phi and that of y phi, two each.
-COLUMNS_OUT: Final = 14
-
-
-@compiled
-def evaluate(xi: float, table: FloatArray, work: FloatArray, out: FloatArray) -> None:
-    """
-    Evaluate all series at the relative inserted length.
-
-    Parameters
-    ----------
-    xi : float
-        s / l.
-    table : ndarray, shape (terms, columns)
-        `ModeShapes.series`.
-    work : ndarray, shape (columns,)
-        Scratch.
-    out : ndarray, shape (14,)
-        Overwritten with the values, in the order of `COLUMNS_OUT`.
-
-    """
-    square = xi * xi
-    z = square * square
-    for j in range(_COLUMNS):
-        work[j] = table[_TERMS - 1, j]
-    for m in range(_TERMS - 2, -1, -1):
-        for j in range(_COLUMNS):
-            work[j] = work[j] * z + table[m, j]
-    for pair in range(3):
-        g, h = _G + 3 * pair, _H + 3 * pair
-        out[pair] = z * xi * (work[g] + xi * work[g + 1] + square * work[g + 2])
-        out[3 + pair] = xi * (work[h] + xi * work[h + 1] + square * work[h + 2])
-    for i in range(MODES):
-        j = 2 * i
-        out[6 + i] = square * (work[_PHI + j] + xi * work[_PHI + j + 1])
-        out[8 + i] = work[_CURVATURE + j] + xi * work[_CURVATURE + j + 1]
-        out[10 + i] = square * xi * (work[_MOMENT_0 + j] + xi * work[_MOMENT_0 + j + 1])
-        out[12 + i] = z * (work[_MOMENT_1 + j] + xi * work[_MOMENT_1 + j + 1])
+def mode_shapes(length: float, reach: float = 1.0) -> ModeShapes:
+    """Return the modes of a needle of the given length [m] and `ModeShapes.reach`, made once."""
+    return ModeShapes(length, reach)

@@ -9,8 +9,8 @@ from typing import Final
 from needle_dynamics.errors import ParameterError
 from needle_dynamics.force_sensor import ForceSensor
 from needle_dynamics.integrators import Integrator
+from needle_dynamics.kernels import FloatArray
 from needle_dynamics.model import COORDINATES
-from needle_dynamics.modes import FloatArray
 from needle_dynamics.parameters import check_constants, constant
 import numpy as np
 
@@ -25,6 +25,9 @@ class BaseParameters:
     speed_limit: float = constant(0.05, 'm/s', 'highest speed of the base', open_low=True)
     acceleration_limit: float = constant(
         0.5, 'm/s^2', 'highest acceleration of the base', open_low=True
+    )
+    position_gain: float = constant(
+        20.0, '1/s', 'rate at which the base closes a position error', open_low=True
     )
 
     def __post_init__(self) -> None:
@@ -110,7 +113,8 @@ class BaseMotion:
         if ahead == now and abs(error) < _SETTLED and abs(speed) <= change:
             return 0.0
         # Close the error no faster than the base could brake; half the limit leaves a margin.
-        closing = min(abs(error) / interval, sqrt(limits.acceleration_limit * abs(error)))
+        gain = min(limits.position_gain, 1.0 / interval)
+        closing = min(gain * abs(error), sqrt(limits.acceleration_limit * abs(error)))
         wanted = (ahead - now) / interval + copysign(closing, error)
         wanted = min(max(wanted, -limits.speed_limit), limits.speed_limit)
         return min(max(wanted, speed - change), speed + change)

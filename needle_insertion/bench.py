@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 import sys
 import time
 
-from needle_dynamics import Integrator, NeedleModel, NeedleParameters, simulate
-from needle_dynamics.modes import FloatArray
+from needle_dynamics import FloatArray, Integrator, NeedleModel, NeedleParameters, simulate
 from needle_insertion.report import table
 import numpy as np
 from scipy.integrate import solve_ivp
@@ -66,8 +66,7 @@ def dynamics() -> int:
         for tolerance in (1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8):
             found = error(scipy_run(method, tolerance))
             if found <= ACCURACY:
-                # Bound now: the loop variables change before the next measurement.
-                spent = _best_time(lambda m=method, r=tolerance: scipy_run(m, r), 1)
+                spent = _best_time(partial(scipy_run, method, tolerance), 1)
                 rows.append(_row(f'SciPy {method}', f'rtol {tolerance:g}', found, spent, ours))
                 break
     heads = ('solver', 'setting', 'error / peak', 'wall [ms]', 'wall / simulated', 'against ours')

@@ -12,9 +12,8 @@ from typing import Any
 
 from geometry_msgs.msg import PointStamped
 from matplotlib.figure import Figure
-from needle_dynamics import NeedleError
+from needle_dynamics import FloatArray, NeedleError
 from needle_dynamics.base_node import COMMAND, SENSOR
-from needle_dynamics.modes import FloatArray
 from needle_identification import (
     FrictionEstimate,
     FrictionSummary,
@@ -59,7 +58,7 @@ class Insertion:
     law : str
         Name of the control law.
     depth, aim, tip, force : ndarray, shape (2, n)
-        Times from the first sample [s], and inserted length [m], its reference [m], deflection
+        Times from the target [s], and inserted length [m], its reference [m], deflection
         of the tip [m] and commanded force [N] at these times.
     completeness : dict
         Messages in the bag over messages due, by topic of `COUNTED`.
@@ -115,10 +114,15 @@ def run(output: Path, bags: Path) -> int:
     checks += friction_checks('fresh recording', recordings[-1], summarize(estimates[-1:]), 4.0)
 
     pictures = [
-        Picture('insertion', 'Insertion under both controllers.', insertion_figure(insertions)),
+        Picture(
+            'insertion',
+            'Insertion under both controllers. Below, the tip rings down from '
+            f'{START_DEFLECTION * 1e3:g} mm at 2 kHz, seen by a sensor that averages over 1 ms.',
+            insertion_figure(insertions),
+        ),
         Picture(
             'friction',
-            'Friction from the fresh recording: steady motion and the fit of equation (15).',
+            'Friction, fresh recording: all samples, and the fit of (15) to the steady ones.',
             friction_figure(recordings[-1], estimates[-1]),
         ),
     ]
@@ -182,18 +186,19 @@ def record_insertion(law: str, bag: Path, logs: Path, progress: Callable[[float]
         controller = graph.start(
             'controller', {'law': law, 'rate': RATE, 'reference.speed': SPEED}
         )
-        plant = graph.start(
-            'plant', {'depth': START_DEPTH, 'tip_deflection': START_DEFLECTION, 'rate': RATE}
-        )
-        # Who shall hear: this node and the recorder, beside the node that answers.
+        start = {'depth': START_DEPTH, 'tip_deflection': START_DEFLECTION, 'rate': RATE}
+        plant = graph.start('plant', {'autostart': False, **start})
+        # The plant begins when the recorder listens to all: the bag holds every sample.
         listeners = {'target': 2, 'wrench_command': 2, 'reference': 2, 'joint_states': 3}
         graph.spin_until(
-            lambda: (
-                state.message
-                and all(node.count_subscribers(name) >= n for name, n in listeners.items())
+            lambda: all(
+                node.count_subscribers(name) >= listeners.get(name, 1)
+                for name in (*listeners, *COUNTED)
             ),
             'the nodes',
         )
+        graph.activate(node, 'plant')
+        graph.spin_until(lambda: aim.message, 'the controller')
         message = PointStamped()
         message.header.frame_id = 'needle_entry'
         message.header.stamp = node.get_clock().now().to_msg()
@@ -229,7 +234,7 @@ def read_insertion(law: str, bag: Path) -> Insertion:
     Returns
     -------
     Insertion
-        Arrays on times from the first sample.
+        Arrays on times from the target.
 
     Raises
     ------
@@ -255,10 +260,9 @@ def read_insertion(law: str, bag: Path) -> Insertion:
     for topic in COUNTED:
         stamps = series(topic, lambda _m: 0.0)[0]
         completeness[topic] = len(stamps) / ((stamps[-1] - stamps[0]) * RATE + 1.0)
-    # The reference begins when the target came: there the run begins.
-    start = curves['aim'][0, 0] - 0.2
+    target = series('target', lambda m: m.point.y)[0, 0]
     for curve in curves.values():
-        curve[0] -= start
+        curve[0] -= target
     return Insertion(law=law, completeness=completeness, **curves)
 
 
@@ -267,7 +271,7 @@ def insertion_checks(run: Insertion) -> list[Check]:
     law = run.law.replace('_', ' ')
     end, over = run.depth[1, -1] - TARGET_DEPTH, run.depth[1].max() - TARGET_DEPTH
     aim = np.interp(run.depth[0], run.aim[0], run.aim[1])
-    worst = np.abs(run.depth[1] - aim)[run.depth[0] > 0.2].max()
+    worst = np.abs(run.depth[1] - aim)[run.depth[0] > 0.0].max()
     topic, part = min(run.completeness.items(), key=lambda item: -abs(item[1] - 1.0))
     return [
         Check(
@@ -312,24 +316,27 @@ def friction_checks(
 
 
 def insertion_figure(runs: Sequence[Insertion]) -> Figure:
-    """Draw depth, tracking error, tip deflection and force of the insertions."""
-    figure = Figure(figsize=(9.0, 8.0), layout='constrained')
-    axes = figure.subplots(4, 1, sharex=True)
-    labels = ('inserted length [mm]', 'tracking error [mm]', 'tip deflection [mm]', 'force [N]')
+    """Draw depth, tracking error, force, and the tip deflection from the first sample."""
+    figure = Figure(figsize=(9.0, 9.0), layout='constrained')
+    axes = figure.subplots(4, 1)
+    labels = ('inserted length [mm]', 'tracking error [mm]', 'force [N]', 'tip deflection [mm]')
     for axis, label in zip(axes, labels, strict=True):
         axis.set_ylabel(label)
+        axis.set_xlabel('time from the target [s]')
         axis.grid(visible=True, alpha=0.3)
-    axes[0].plot(runs[0].aim[0], runs[0].aim[1] * 1e3, 'k--', label='reference')
+    axes[0].plot(runs[0].aim[0], runs[0].aim[1] * 1e3, 'k--', label='reference', zorder=3)
     for run in runs:
         name = run.law.replace('_', ' ')
         depth = np.interp(run.aim[0], *run.depth)
         axes[0].plot(run.depth[0], run.depth[1] * 1e3, label=name)
         axes[1].plot(run.aim[0], (run.aim[1] - depth) * 1e3)
-        axes[2].plot(run.tip[0], run.tip[1] * 1e3)
-        axes[3].plot(run.force[0], run.force[1])
+        axes[2].plot(run.force[0], run.force[1])
+        axes[3].plot((run.tip[0] - run.tip[0, 0]) * 1e3, run.tip[1] * 1e3)
+    for axis in axes[:3]:
+        axis.set_xlim(-0.2, runs[0].depth[0, -1])
+    axes[3].set_xlim(0.0, 60.0)
+    axes[3].set_xlabel('time from the start of the plant [ms]')
     axes[0].legend()
-    axes[-1].set_xlabel('time [s]')
-    axes[-1].set_xlim(left=0.0)
     return figure
 
 

@@ -6,10 +6,10 @@ from collections.abc import Callable
 from pathlib import Path
 import time
 
-from needle_dynamics.base_node import COMMAND, SENSOR
+from needle_dynamics import ForceSensorParameters
+from needle_dynamics.base_node import COMMAND
 from needle_insertion.graph import Graph
 from rclpy.duration import Duration
-from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 #: Inserted length at which the tip has passed the tissue, so that nothing is cut [m].
@@ -79,21 +79,27 @@ def record_friction_run(
         recorder = graph.start('recorder', {'path': str(bag), 'topics': list(TOPICS)})
         plant = graph.start(
             'plant',
-            {'mode': 'robot', 'depth': START_DEPTH, 'rate': rate, 'seed': seed},
+            {
+                'autostart': False,
+                'mode': 'robot',
+                'depth': START_DEPTH,
+                'rate': rate,
+                'seed': seed,
+                # A slow recording needs a filter that fits it.
+                'sensor.cutoff': min(ForceSensorParameters().cutoff, 0.25 * rate),
+            },
         )
         node = graph.node('friction_experiment')
-        latest = graph.latest(node, JointState, 'joint_states', SENSOR)
         trajectory = node.create_publisher(JointTrajectory, 'joint_trajectory', COMMAND)
-        # The recorder listens too: what it misses would not be in the bag.
-        graph.spin_until(lambda: latest.message, 'joint_states')
+        # The plant begins when the recorder listens: the bag holds every sample.
         graph.spin_until(
             lambda: (
                 trajectory.get_subscription_count() == 2
-                and node.count_subscribers('joint_states') == 2
-                and node.count_subscribers('base_wrench') == 1
+                and all(node.count_subscribers(topic) for topic in TOPICS)
             ),
             'the recorder',
         )
+        graph.activate(node, 'plant')
         message = JointTrajectory(joint_names=['insertion'])
         message.header.stamp = node.get_clock().now().to_msg()
         message.points = [

@@ -13,6 +13,8 @@ from types import TracebackType
 from typing import Any, IO
 
 from domain_coordinator import domain_id
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
 from needle_dynamics import NeedleError
 from rclpy.context import Context
 from rclpy.executors import Executor
@@ -60,12 +62,11 @@ class NodeProcess:
     ) -> None:
         self.name = name
         self._log = log
-        settings = [
-            word
-            for key, value in parameters.items()
+        settings = []
+        for key, value in parameters.items():
             # One line of YAML, without the end-of-document mark of a bare scalar.
-            for word in ('-p', f'{key}:={yaml.safe_dump(value, width=10_000).splitlines()[0]}')
-        ]
+            text = yaml.safe_dump(value, default_flow_style=True, width=10_000).splitlines()[0]
+            settings += ['-p', f'{key}:={text}']
         self.process = subprocess.Popen(
             [sys.executable, '-m', MODULES[name], '--ros-args', *settings],
             env=dict(environment),
@@ -191,6 +192,25 @@ class Graph:
         process = NodeProcess(name, parameters or {}, self.environment, log)
         self._processes.append(process)
         return process
+
+    def activate(self, node: Node, name: str) -> None:
+        """
+        Configure and activate a node that was started with ``autostart`` off.
+
+        Raises
+        ------
+        GraphError
+            If it refuses.
+
+        """
+        client = node.create_client(ChangeState, f'{name}/change_state')
+        self.spin_until(client.service_is_ready, f'the node {name}')
+        for transition in (Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_ACTIVATE):
+            request = ChangeState.Request(transition=Transition(id=transition))
+            answer = client.call_async(request)
+            self.spin_until(answer.done, f'the answer of {name}')
+            if not answer.result().success:
+                raise GraphError(f'{name} refused to start')
 
     def spin_until(self, condition: Callable[[], Any], what: str, timeout: float = 30.0) -> None:
         """

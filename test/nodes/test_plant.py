@@ -1,9 +1,11 @@
 """The plant as the graph sees it."""
 
+from pathlib import Path
 import signal
 
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PointStamped, WrenchStamped
+from needle_controller.controller_node import ControllerNode
 from needle_dynamics import ForceSensorParameters
 from needle_dynamics.base_node import COMMAND, LATCHED, SENSOR
 from needle_dynamics.plant_node import PlantNode
@@ -138,6 +140,15 @@ def test_its_configuration_is_a_parameter_file(ros_graph):
     assert values['model.coulomb_friction'] == 1
     assert values['model.viscous_friction'] == 300.0
     assert values['model.preset'] == 'phantom'
+
+
+@pytest.mark.parametrize('kind', [PlantNode, ControllerNode])
+def test_the_shipped_parameter_file_is_accepted(ros_graph, kind):
+    """Every name in config/insertion.yaml is known and every value valid."""
+    file = Path(__file__).parents[2] / 'config' / 'insertion.yaml'
+    node = ros_graph.add(kind, cli_args=['--ros-args', '--params-file', str(file)])
+    given = yaml.safe_load(file.read_text())[f'/**/{node.get_name()}']['ros__parameters']
+    assert {name: node.get_parameter(name).value for name in given} == given
 
 
 @pytest.mark.parametrize(

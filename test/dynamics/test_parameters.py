@@ -1,0 +1,219 @@
+"""Constants: published values, ranges, and errors a person can act on."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, fields, FrozenInstanceError, replace
+from typing import Any
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from needle_dynamics import NeedleError, NeedleParameters, ParameterError, PRESETS
+import numpy as np
+from numpy.testing import assert_allclose
+import pytest
+
+NUMBERS = [item.name for item in fields(NeedleParameters) if 'unit' in item.metadata]
+MAY_BE_ZERO = [
+    item.name
+    for item in fields(NeedleParameters)
+    if 'unit' in item.metadata and not item.metadata['open_low']
+]
+#: Table 3 and section 3.2.8 of the paper, in SI units.
+TABLE_3 = {
+    'youngs_modulus': 200e9,
+    'area_moment': 1.28e-13,
+    'rotary_inertia': 1.0626e-9,
+    'density': 8000.0,
+    'area': 1.27e-6,
+    'length': 0.2,
+    'tissue_stiffness': 520.0,
+    'coulomb_friction': 0.56,
+    'carriage_mass': 0.0,
+}
+
+
+@pytest.mark.parametrize(
+    ('name', 'viscous', 'damping'),
+    [('paper_si', 0.3, 0.0), ('paper_mm', 300.0, 0.0), ('phantom', 300.0, 1.6)],
+)
+def test_presets_hold_the_published_values(name: str, viscous: float, damping: float) -> None:
+    """Presets are Table 3, with mu_v = 0.3 N s/m or 0.3 N s/mm, and the assumed damping."""
+    values = asdict(NeedleParameters.preset(name))
+    assert {key: values[key] for key in TABLE_3} == TABLE_3
+    assert values['viscous_friction'] == viscous
+    assert values['tissue_damping'] == damping
+    assert values['hub_stop'] is True
+    assert NeedleParameters.preset(name) == PRESETS[name]
+
+
+def test_presets_are_three_and_the_default_is_the_paper() -> None:
+    """The presets are these, and no argument means paper_si."""
+    assert list(PRESETS) == ['paper_si', 'paper_mm', 'phantom']
+    assert NeedleParameters() == NeedleParameters.preset('paper_si')
+
+
+def test_damping_of_the_phantom_is_30_percent_of_critical() -> None:
+    """c_a = 1.6 is 0.3 times 2 rho A omega_1 at full insertion, as the preset says."""
+    p = NeedleParameters.preset('phantom')
+    # First clamped-free root; the tissue is a foundation of 520 N/m^2.
+    stiffness = p.bending_stiffness * (1.8751040687 / p.length) ** 4 + p.tissue_stiffness
+    critical = 2.0 * np.sqrt(stiffness * p.linear_density)
+    # 1.6 has two digits.
+    assert_allclose(p.tissue_damping / critical, 0.3, atol=0.005)
+
+
+def test_derived_quantities() -> None:
+    """Rho A, E I and the moving mass are products and a sum of the constants."""
+    p = NeedleParameters.preset('paper_si', carriage_mass=0.5)
+    assert_allclose(p.linear_density, 0.01016, rtol=1e-15)
+    assert_allclose(p.bending_stiffness, 0.0256, rtol=1e-15)
+    assert_allclose(p.moving_mass, 0.5 + 0.01016 * 0.2, rtol=1e-15)
+
+
+def test_every_number_declares_unit_meaning_and_range() -> None:
+    """What becomes a ROS parameter description is there, and defaults are within range."""
+    for item in fields(NeedleParameters):
+        assert item.metadata['description']
+    for name in NUMBERS:
+        meta = NeedleParameters.__dataclass_fields__[name].metadata
+        assert meta['unit']
+        assert meta['low'] <= getattr(NeedleParameters(), name) <= meta['high']
+    assert len(NUMBERS) == len(fields(NeedleParameters)) - 1
+
+
+@pytest.mark.parametrize('name', NUMBERS)
+@pytest.mark.parametrize('value', [np.nan, np.inf, -np.inf, -1.0, -1e-300])
+def test_number_out_of_range_is_refused_with_name_value_and_range(name: str, value: float) -> None:
+    """NaN, infinite and negative constants are refused; the message says what would be valid."""
+    meta = NeedleParameters.__dataclass_fields__[name].metadata
+    bound = '>' if name not in MAY_BE_ZERO else '>='
+    with pytest.raises(ParameterError) as caught:
+        NeedleParameters(**{name: value})
+    message = f'{name} must be finite, {bound} 0 {meta["unit"]}, got {value!r}'
+    assert str(caught.value) == message
+    with pytest.raises(ParameterError):
+        NeedleParameters.preset('phantom', **{name: value})
+
+
+@pytest.mark.parametrize('name', NUMBERS)
+def test_zero_is_valid_only_where_the_model_stays_regular(name: str) -> None:
+    """Friction, tissue and carriage may be switched off; geometry and inertia may not."""
+    if name in MAY_BE_ZERO:
+        assert getattr(NeedleParameters(**{name: 0.0}), name) == 0.0
+    else:
+        with pytest.raises(ParameterError, match=rf'^{name} must be finite, > 0 .*got 0\.0$'):
+            NeedleParameters(**{name: 0.0})
+
+
+def test_what_may_be_zero() -> None:
+    """These five and no other constants may be zero."""
+    assert MAY_BE_ZERO == [
+        'carriage_mass',
+        'tissue_stiffness',
+        'tissue_damping',
+        'coulomb_friction',
+        'viscous_friction',
+    ]
+
+
+@pytest.mark.parametrize('name', NUMBERS)
+@pytest.mark.parametrize('value', [True, False, '0.1', None, [0.1], 1j])
+def test_what_is_not_a_number_is_refused_by_name(name: str, value: Any) -> None:
+    """Booleans, strings, None and the like are not numbers, whatever float() makes of them."""
+    for make in (
+        lambda: NeedleParameters(**{name: value}),
+        lambda: NeedleParameters.from_mapping({name: value}),
+    ):
+        with pytest.raises(ParameterError) as caught:
+            make()
+        assert str(caught.value) == f'{name} must be a number, got {value!r}'
+
+
+@pytest.mark.parametrize('value', [1, 0, 'yes', None, 1.0])
+def test_hub_stop_must_be_a_truth_value(value: Any) -> None:
+    """hub_stop takes True and False only."""
+    with pytest.raises(ParameterError, match='hub_stop must be true or false, got'):
+        NeedleParameters(hub_stop=value)
+    assert NeedleParameters(hub_stop=False).hub_stop is False
+
+
+@pytest.mark.parametrize('value', [0.2, 0.3])
+def test_minimum_depth_must_be_less_than_the_length(value: float) -> None:
+    """There must be some range of depths left."""
+    with pytest.raises(ParameterError, match=r'minimum_depth must be < length = 0\.2 m, got'):
+        NeedleParameters(minimum_depth=value)
+
+
+def test_integers_are_taken_where_a_float_is_meant() -> None:
+    """A configuration file may say 8000 for 8000.0; the result is a float."""
+    made = NeedleParameters.from_mapping({'density': 8000, 'viscous_friction': 0})
+    assert made == replace(NeedleParameters(), viscous_friction=0.0)
+    assert type(made.density) is type(made.viscous_friction) is float
+    assert type(NeedleParameters.preset('phantom', density=7850).density) is float
+
+
+@given(
+    values=st.fixed_dictionaries(
+        {},
+        optional={
+            name: st.floats(0.0 if name in MAY_BE_ZERO else 1e-30, 1e30)
+            for name in NUMBERS
+            if name not in ('length', 'minimum_depth')
+        }
+        | {'length': st.floats(1e-2, 1e2), 'hub_stop': st.booleans()},
+    )
+)
+@settings(deadline=None, derandomize=True)
+def test_mapping_round_trip(values: dict[str, Any]) -> None:
+    """from_mapping takes what it is given, defaults for the rest, and asdict gives it back."""
+    made = NeedleParameters.from_mapping(values)
+    assert asdict(made) == asdict(NeedleParameters()) | values
+    assert NeedleParameters.from_mapping(asdict(made)) == made
+
+
+def test_unknown_key_is_named_with_the_nearest_valid_one() -> None:
+    """A misspelled constant is not ignored: the message names it and what was meant."""
+    with pytest.raises(ParameterError) as caught:
+        NeedleParameters.from_mapping({'viscous_fricton': 0.3})
+    assert str(caught.value) == (
+        "unknown parameter 'viscous_fricton'; did you mean 'viscous_friction'?"
+    )
+    with pytest.raises(ParameterError, match="did you mean 'density'"):
+        NeedleParameters.preset('phantom', desity=1.0)
+
+
+def test_unknown_key_like_no_other_lists_the_valid_ones() -> None:
+    """If nothing is near, all valid names are listed."""
+    with pytest.raises(ParameterError, match='xyzzy') as caught:
+        NeedleParameters.from_mapping({'xyzzy': 1.0})
+    for item in fields(NeedleParameters):
+        assert item.name in str(caught.value)
+
+
+def test_unknown_preset_lists_the_valid_ones() -> None:
+    """A preset that does not exist is named, with those that do."""
+    with pytest.raises(ParameterError, match=r"'papper'.*paper_si, paper_mm, phantom"):
+        NeedleParameters.preset('papper')
+
+
+def test_constants_are_frozen() -> None:
+    """Constants cannot be changed after they were checked, presets included."""
+    p = NeedleParameters()
+    with pytest.raises(FrozenInstanceError):
+        p.length = 0.3  # type: ignore[misc]
+    with pytest.raises(ParameterError):
+        replace(p, length=-1.0)
+    assert hash(p) == hash(NeedleParameters())
+
+
+def test_a_preset_with_changes_leaves_the_preset_alone() -> None:
+    """preset(name, key=value) is a new value."""
+    changed = NeedleParameters.preset('paper_mm', length=0.15)
+    assert changed == replace(PRESETS['paper_mm'], length=0.15)
+    assert PRESETS['paper_mm'].length == 0.2
+
+
+def test_errors_are_needle_errors_and_value_errors() -> None:
+    """Callers may catch our base class or Python's."""
+    assert issubclass(ParameterError, NeedleError)
+    assert issubclass(ParameterError, ValueError)

@@ -1,0 +1,211 @@
+"""The rules that keep mathematics apart from middleware, read from the source itself."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+import re
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+
+#: Which of our packages each of them may import.
+MAY_IMPORT = {
+    'needle_dynamics': set(),
+    'needle_controller': {'needle_dynamics'},
+    'needle_identification': {'needle_dynamics'},
+    'needle_insertion': {'needle_dynamics', 'needle_controller', 'needle_identification'},
+}
+#: The package that puts the others together may import anything outside.
+TOP = 'needle_insertion'
+ROS = re.compile(r'(rclpy|rcl_\w+|ros\w+_py|ament_\w+|launch(_\w+)?|\w+_(msgs|srvs|interfaces))$')
+BAGS = {'mcap', 'rosbags'}
+BAG_READER = 'needle_identification/bag_io.py'
+# In parts, so that this file passes its own test.
+FORBIDDEN = tuple('/'.join(parts) for parts in (('..', 'shared'), ('work', 'shared')))
+NOT_OURS = {
+    '.git',
+    '.hypothesis',
+    '.mypy_cache',
+    '.pytest_cache',
+    '.ruff_cache',
+    '.venv',
+    '__pycache__',
+    'build',
+    'demo_output',
+    'dist',
+    'install',
+    'log',
+}
+
+
+def imports(path: str, source: str) -> Iterator[tuple[int, str]]:
+    """Yield line and full name of all that a file imports, wherever in the file it does."""
+    package = path.removesuffix('.py').split('/')[:-1]
+    for node in ast.walk(ast.parse(source, path)):
+        if isinstance(node, ast.Import):
+            for alias in node.names:
+                yield node.lineno, alias.name
+        elif isinstance(node, ast.ImportFrom):
+            above = package[: len(package) - node.level + 1] if node.level else []
+            base = '.'.join([*above, *([node.module] if node.module else [])])
+            for alias in node.names:
+                yield node.lineno, f'{base}.{alias.name}'
+        elif isinstance(node, ast.Call) and node.args:
+            called = ast.unparse(node.func).rpartition('.')[2]
+            name = node.args[0]
+            if called in ('import_module', '__import__') and isinstance(name, ast.Constant):
+                yield node.lineno, str(name.value)
+
+
+def violations(path: str, source: str) -> list[str]:
+    """Say which rules a file of one of our packages breaks; the path is relative to the root."""
+    package = path.partition('/')[0]
+    is_node = path.endswith('_node.py')
+    found = []
+    for line, name in imports(path, source):
+        root, *parts = name.split('.')
+        where = f'{path}:{line}: '
+        if root in MAY_IMPORT and root != package and root not in MAY_IMPORT[package]:
+            found.append(f'{where}{package} must not import {root}')
+        if package == TOP:
+            continue
+        if not is_node and ROS.match(root):
+            found.append(f'{where}only *_node.py may import {root}')
+        if not is_node and root in MAY_IMPORT and any(part.endswith('_node') for part in parts):
+            found.append(f'{where}only *_node.py may import a node, {name}')
+        if root in BAGS and path != BAG_READER:
+            found.append(f'{where}only {BAG_READER} may import {root}')
+    return sorted(set(found))
+
+
+def forbidden_words(path: str, content: str) -> list[str]:
+    """Say which lines hold a word that must not leave this machine."""
+    return [
+        f'{path}:{number}: mentions {word}'
+        for number, line in enumerate(content.splitlines(), 1)
+        for word in FORBIDDEN
+        if word in line
+    ]
+
+
+def sources() -> list[Path]:
+    """List the Python files of our packages."""
+    return [path for package in MAY_IMPORT for path in sorted((ROOT / package).rglob('*.py'))]
+
+
+def texts() -> Iterator[Path]:
+    """List all files of the repository but what is generated."""
+    pending = [ROOT]
+    while pending:
+        for path in sorted(pending.pop().iterdir()):
+            if path.name in NOT_OURS or path.name.endswith('.egg-info') or path.is_symlink():
+                continue
+            if path.is_dir():
+                pending.append(path)
+            else:
+                yield path
+
+
+def test_imports_run_one_way() -> None:
+    """Packages import downwards only, and ROS and bags stay in the files made for them."""
+    broken = [
+        line
+        for path in sources()
+        for line in violations(path.relative_to(ROOT).as_posix(), path.read_text('utf-8'))
+    ]
+    assert not broken, '\n'.join(broken)
+
+
+def test_all_packages_are_looked_at() -> None:
+    """The rules cover every package there is, and each has files."""
+    there = {path.parent.name for path in ROOT.glob('needle_*/__init__.py')}
+    assert there == set(MAY_IMPORT)
+    assert there == {path.relative_to(ROOT).parts[0] for path in sources()}
+
+
+def test_no_file_mentions_a_forbidden_word() -> None:
+    """No file of the repository points to a place outside of it."""
+    seen, broken = set(), []
+    for path in texts():
+        name = path.relative_to(ROOT).as_posix()
+        seen.add(name)
+        broken += forbidden_words(name, path.read_text('utf-8', errors='replace'))
+    assert {'pyproject.toml', 'test/test_architecture.py', 'needle_dynamics/model.py'} <= seen
+    assert not broken, '\n'.join(broken)
+
+
+@pytest.mark.parametrize(
+    ('path', 'source', 'complaint'),
+    [
+        ('needle_dynamics/a.py', 'import needle_controller', 'not import needle_controller'),
+        ('needle_dynamics/a.py', 'import needle_insertion.cli', 'not import needle_insertion'),
+        (
+            'needle_controller/a.py',
+            'from needle_identification.estimate import fit',
+            'not import needle_identification',
+        ),
+        (
+            'needle_identification/a_node.py',
+            'import needle_controller as c',
+            'not import needle_controller',
+        ),
+        (
+            'needle_identification/sub/a.py',
+            'import needle_insertion',
+            'not import needle_insertion',
+        ),
+        ('needle_dynamics/a.py', 'import rclpy', 'may import rclpy'),
+        ('needle_dynamics/a.py', 'import numpy, rclpy.node', 'may import rclpy'),
+        ('needle_dynamics/a.py', 'def f():\n    from rclpy.node import Node', ':2: only'),
+        ('needle_dynamics/a.py', 'if TYPE_CHECKING:\n    import std_msgs.msg', 'import std_msgs'),
+        ('needle_controller/a.py', 'from std_srvs.srv import Trigger', 'may import std_srvs'),
+        (
+            'needle_controller/a.py',
+            'from builtin_interfaces.msg import Time',
+            'builtin_interfaces',
+        ),
+        ('needle_controller/node.py', 'import rclpy', 'may import rclpy'),
+        ('needle_dynamics/a.py', "importlib.import_module('rclpy')", 'may import rclpy'),
+        ('needle_dynamics/a.py', "__import__('sensor_msgs.msg')", 'may import sensor_msgs'),
+        ('needle_dynamics/__init__.py', 'from .plant_node import PlantNode', 'import a node'),
+        ('needle_dynamics/__init__.py', 'from . import plant_node', 'import a node'),
+        ('needle_controller/a.py', 'from needle_dynamics import base_node', 'import a node'),
+        ('needle_controller/a.py', 'import rosbags.rosbag2', 'may import rosbags'),
+        ('needle_identification/a_node.py', 'from mcap.reader import x', 'may import mcap'),
+    ],
+)
+def test_a_breach_is_found(path: str, source: str, complaint: str) -> None:
+    """The checker can fail: each rule, broken on purpose, is reported with its file and line."""
+    found = violations(path, source)
+    assert len(found) == 1
+    assert found[0].startswith(f'{path}:')
+    assert complaint in found[0]
+
+
+@pytest.mark.parametrize(
+    ('path', 'source'),
+    [
+        ('needle_dynamics/a.py', 'from needle_dynamics.modes import x\nfrom . import model'),
+        ('needle_controller/a.py', 'import needle_dynamics'),
+        ('needle_controller/a_node.py', 'import rclpy\nfrom needle_dynamics.base_node import x'),
+        ('needle_dynamics/base_node.py', 'from rcl_interfaces.msg import SetParametersResult'),
+        ('needle_identification/bag_io.py', 'import mcap\nfrom rosbags.typesys import Stores'),
+        ('needle_insertion/a.py', 'import rclpy, rosbags, needle_controller.controller_node'),
+        ('needle_dynamics/a.py', '"""import rclpy"""\nTEXT = "import rclpy"'),
+    ],
+)
+def test_what_is_allowed_is_not_reported(path: str, source: str) -> None:
+    """The checker does not cry wolf."""
+    assert violations(path, source) == []
+
+
+@pytest.mark.parametrize('word', FORBIDDEN)
+def test_a_forbidden_word_is_found(word: str) -> None:
+    """The word check can fail, too."""
+    assert forbidden_words('docs/a.md', f'one\nsee {word}/model.md') == [
+        f'docs/a.md:2: mentions {word}'
+    ]
+    assert forbidden_words('docs/a.md', 'shared work') == []
