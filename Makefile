@@ -37,7 +37,9 @@ lock:
 
 # The shipped friction recordings, made anew through real nodes.
 bags: setup
+	rm -rf bags/friction_*
 	$(BIN)/needle experiment friction --repeats 4 --seed 2014 --rate 250 bags
+	cd bags && sha256sum friction_*/* > SHA256SUMS
 
 clean:
 	rm -rf $(VENV) build install log demo_output

@@ -42,14 +42,16 @@ setup(
         (f'lib/{NAME}', [f'scripts/{node}' for node in NODES]),
     ],
     install_requires=[
+        'apsw>=3.46',
         'matplotlib>=3.6',
-        'mcap>=1.2',
+        'mcap>=1.5',
         'numba>=0.58',
         'numpy>=1.24',
         'PyYAML>=6.0',
         'rosbags>=0.11',
         'scipy>=1.11',
         'tqdm>=4.64',
+        'zstandard>=0.22',
     ],
     extras_require={
         # ROS 2 Jazzy from wheels; leave out on a machine that has ROS.

@@ -16,8 +16,10 @@ MANIFEST = ET.parse(ROOT / 'package.xml').getroot()  # noqa: S314
 
 #: rosdep keys by imported module, where they are not the module itself.
 KEYS = {
+    # Come with rosbags and with mcap.
+    'apsw': 'python3-rosbags-pip',
+    'zstandard': 'mcap-ros2-support',
     'matplotlib': 'python3-matplotlib',
-    # The key that installs the Python package mcap.
     'mcap': 'mcap-ros2-support',
     'numba': 'python3-numba',
     'numpy': 'python3-numpy',

@@ -1,0 +1,243 @@
+"""Node that records topics, as they are offered, into an MCAP bag."""
+
+from __future__ import annotations
+
+from functools import partial
+from importlib import import_module
+from pathlib import Path
+import sys
+import time
+from typing import Any, Final, NamedTuple
+
+from diagnostic_msgs.msg import DiagnosticStatus
+from needle_dynamics.base_node import NeedleNode, run
+from needle_identification.bag_io import BagWriter, COMPRESSIONS, OfferedQos
+from needle_identification.errors import RecordingError
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.subscription import Subscription
+from rclpy.topic_endpoint_info import TopicEndpointInfo
+from std_srvs.srv import Trigger
+
+#: Time between looks at the graph, and between writes that survive a crash [s].
+_DISCOVERY_PERIOD: Final = 0.1
+_FLUSH_PERIOD: Final = 0.5
+
+#: Messages of one topic that may wait while the recorder is busy.
+_DEPTH: Final = 5000
+
+_NOT_FOR_ALL: Final = ('/rosout', '/parameter_events')
+
+
+class _Taken(NamedTuple):
+    """A subscription and the quality of service it asks for."""
+
+    subscription: Subscription
+    best_effort: bool
+    latched: bool
+
+
+class RecorderNode(NeedleNode):
+    """
+    Records while active, each topic with the quality of service that its publishers offer.
+
+    Messages are stored as they came over the wire, under the time they were received. A second
+    recording of the same node (``~/stop``, ``~/start``) goes to ``path`` with ``_2`` appended.
+    """
+
+    def __init__(self, **node_options: Any) -> None:
+        super().__init__('recorder', **node_options)
+        self.declare_text('path', '', 'folder to record to; it must not exist')
+        self.declare_text('topics', ['*'], 'topics to record; * stands for all')
+        self.declare_text('compression', 'zstd', f'one of {", ".join(COMPRESSIONS)}')
+        self._bag: BagWriter | None = None
+        self._recordings = 0
+        self._taken: dict[str, _Taken] = {}
+        self._left_out: set[str] = set()
+        self.create_service(Trigger, '~/start', self._on_start)
+        self.create_service(Trigger, '~/stop', self._on_stop)
+        # A simulation that pauses must not pause the recorder.
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self.create_timer(_DISCOVERY_PERIOD, self._discover, clock=steady)
+        self.create_timer(_FLUSH_PERIOD, self._flush, clock=steady)
+
+    def configure(self) -> None:
+        """Read where to record to and what."""
+        path = self.text('path')
+        if not path:
+            raise RecordingError('path must name a folder to record to, got nothing')
+        self._path = Path(path)
+        self._compression = self.text('compression', tuple(COMPRESSIONS))
+        names = self.get_parameter('topics').value
+        self._all = '*' in names
+        self._names = {self.resolve_topic_name(name) for name in names if name != '*'}
+
+    def activate(self) -> None:
+        """Begin to record."""
+        self._begin()
+
+    def deactivate(self) -> None:
+        """Complete the bag."""
+        if self._bag is not None:
+            self._end(self._bag)
+
+    def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
+        """Report what has been recorded."""
+        if self._bag is None:
+            return DiagnosticStatus.OK, 'not recording', {}
+        counts = self._bag.counts
+        return (
+            DiagnosticStatus.OK,
+            f'recording to {self._bag.path}',
+            {'messages': sum(counts.values()), 'bytes': self._bag.size, **counts},
+        )
+
+    def _on_start(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        try:
+            if self._bag is not None or not self.is_active:
+                raise RecordingError('recording already' if self._bag else 'not active')
+            self._begin()
+            response.success, response.message = True, self.diagnose()[1]
+        except RecordingError as error:
+            response.message = str(error)
+        return response
+
+    def _on_stop(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        if self._bag is None:
+            response.message = 'not recording'
+        else:
+            response.message = self._end(self._bag)
+            response.success = self.failure is None
+        return response
+
+    def _begin(self) -> None:
+        number = self._recordings + 1
+        path = self._path.with_name(f'{self._path.name}_{number}') if number > 1 else self._path
+        self._bag = BagWriter(path, self._compression)
+        self._recordings = number
+        self._left_out.clear()
+        self.failure = None
+        self.get_logger().info(f'recording to {path}')
+        self._discover()
+
+    def _end(self, bag: BagWriter) -> str:
+        """Close the bag and say what it holds, or why it cannot be completed."""
+        self._release()
+        try:
+            bag.close()
+        except OSError as error:
+            return self._give_up(bag, error)
+        counts = bag.counts
+        result = f'recorded {sum(counts.values())} messages to {bag.path}'
+        lines = [f'{count:8d} {topic}' for topic, count in sorted(counts.items())]
+        self.get_logger().info('\n'.join([result, *lines]))
+        return result
+
+    def _release(self) -> None:
+        for taken in self._taken.values():
+            self.destroy_subscription(taken.subscription)
+        self._taken.clear()
+        self._bag = None
+
+    def _give_up(self, bag: BagWriter, error: OSError) -> str:
+        """Stop after an error of the disk; what is in the file stays readable."""
+        self._release()
+        bag.abort()
+        self.failure = f'recording to {bag.path} stopped: {error.strerror or error}'
+        self.get_logger().error(self.failure)
+        self.publish_diagnostics()
+        return self.failure
+
+    def _flush(self) -> None:
+        if self._bag is not None:
+            try:
+                self._bag.flush()
+            except OSError as error:
+                self._give_up(self._bag, error)
+
+    def _on_message(self, topic: str, data: bytes) -> None:
+        # The time the middleware received it would be better, but the events executor of
+        # rclpy 7.1 raises SystemError for callbacks that ask for it.
+        if self._bag is not None:
+            try:
+                self._bag.write(topic, data, time.time_ns())
+            except OSError as error:
+                self._give_up(self._bag, error)
+
+    def _discover(self) -> None:
+        for topic, types in self.get_topic_names_and_types():
+            if self._bag is not None and self._is_wanted(topic):
+                publishers = self.get_publishers_info_by_topic(topic)
+                if publishers:
+                    self._take(self._bag, topic, types, publishers)
+
+    def _is_wanted(self, topic: str) -> bool:
+        hidden = '/_' in topic or topic in _NOT_FOR_ALL
+        return topic not in self._left_out and (topic in self._names or (self._all and not hidden))
+
+    def _take(
+        self, bag: BagWriter, topic: str, types: list[str], publishers: list[TopicEndpointInfo]
+    ) -> None:
+        """Subscribe, or subscribe anew where a new publisher offers less than was asked for."""
+        offered = [publisher.qos_profile for publisher in publishers]
+        best_effort = any(q.reliability == ReliabilityPolicy.BEST_EFFORT for q in offered)
+        latched = all(q.durability == DurabilityPolicy.TRANSIENT_LOCAL for q in offered)
+        taken = self._taken.get(topic)
+        if taken and taken.best_effort >= best_effort and taken.latched <= latched:
+            return
+        try:
+            kind = _message_class(types)
+            if taken:
+                self.destroy_subscription(taken.subscription)
+            else:
+                bag.add_topic(topic, types[0], [_described(qos) for qos in offered])
+        except RecordingError as error:
+            self._left_out.add(topic)
+            self.get_logger().warning(f'{topic} left out: {error}')
+            return
+        except OSError as error:
+            self._give_up(bag, error)
+            return
+        reliability = ReliabilityPolicy.BEST_EFFORT if best_effort else ReliabilityPolicy.RELIABLE
+        durability = DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE
+        subscription = self.create_subscription(
+            kind,
+            topic,
+            partial(self._on_message, topic),
+            QoSProfile(depth=_DEPTH, reliability=reliability, durability=durability),
+            # By default a mismatch is logged as final; here it ends with the next look.
+            event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
+            raw=True,
+        )
+        self._taken[topic] = _Taken(subscription, best_effort, latched)
+
+
+def _message_class(types: list[str]) -> Any:
+    """Import the class of a message; rosidl_runtime_py, which does this, is not in the wheels."""
+    if len(types) > 1:
+        raise RecordingError(f'it has several types: {", ".join(types)}')
+    package, _, name = types[0].partition('/msg/')
+    try:
+        return getattr(import_module(f'{package}.msg'), name)
+    except (ImportError, AttributeError) as error:
+        raise RecordingError(f'{types[0]} is not installed') from error
+
+
+def _described(qos: QoSProfile) -> OfferedQos:
+    return OfferedQos(
+        reliability=qos.reliability.name.lower(),
+        durability=qos.durability.name.lower(),
+        history=qos.history.name.lower(),
+        depth=qos.depth,
+    )
+
+
+def main() -> int:
+    """Run the node."""
+    return run(RecorderNode)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

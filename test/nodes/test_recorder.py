@@ -1,0 +1,230 @@
+"""What is on the wire is in the bag, whatever ends the recorder."""
+
+import errno
+import time
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from nav_msgs.msg import Goals
+from needle_dynamics.base_node import COMMAND, LATCHED, SENSOR
+from needle_identification import BagWriter, message_counts, read_topic
+from needle_identification.recorder_node import RecorderNode
+import pytest
+from rcl_interfaces.msg import Log
+from rclpy.node import Node
+from rclpy.serialization import serialize_message
+from sensor_msgs.msg import JointState
+from std_msgs.msg import String
+from std_srvs.srv import Trigger
+import yaml
+
+
+@pytest.fixture
+def record(ros_graph):
+    """Return a function that makes an active recorder; its bag is closed in the end."""
+    nodes = []
+
+    def make(path, **parameters):
+        nodes.append(ros_graph.add(RecorderNode, parameters={'path': str(path), **parameters}))
+        return nodes[-1]
+
+    yield make
+    for node in nodes:
+        node.stop()
+
+
+def call(ros_graph, service):
+    client = ros_graph.node('caller').create_client(Trigger, service)
+    ros_graph.spin_until(client.service_is_ready, service)
+    answer = client.call_async(Trigger.Request())
+    ros_graph.spin_until(answer.done, 'answer')
+    return answer.result().success, answer.result().message
+
+
+def test_records_each_topic_as_it_is_offered(ros_graph, record, tmp_path):
+    """Best effort, reliable and latched topics are all complete, to the byte."""
+    probe = ros_graph.node('probe')
+    publishers = {
+        topic: probe.create_publisher(kind, topic, qos)
+        for topic, kind, qos in (
+            ('sensor', JointState, SENSOR),
+            ('command', String, COMMAND),
+            ('latched', String, LATCHED),
+        )
+    }
+    publishers['latched'].publish(String(data='before the recorder'))
+    node = record(tmp_path / 'bag')
+    ros_graph.spin_until(
+        lambda: all(p.get_subscription_count() for p in publishers.values()), 'subscriptions'
+    )
+    sent = [JointState(name=['insertion'], position=[i / 3.0]) for i in range(50)]
+    for message in sent:
+        publishers['sensor'].publish(message)
+    publishers['command'].publish(String(data='go'))
+    ros_graph.spin_until(
+        lambda: (
+            node.diagnose()[2].get('/sensor') == len(sent)
+            and node.diagnose()[2].get('/command')
+            and node.diagnose()[2].get('/latched')
+            and node.diagnose()[2].get('/recorder/configuration')
+        ),
+        'the messages',
+    )
+    node.stop()
+    assert [m.position[0] for _, m in read_topic(tmp_path / 'bag', '/sensor')] == [
+        message.position[0] for message in sent
+    ]
+    [(received, latched)] = read_topic(tmp_path / 'bag', '/latched')
+    assert latched.data == 'before the recorder'
+    assert abs(time.time_ns() - received) < 60e9
+    counts = message_counts(tmp_path / 'bag')
+    assert counts['/recorder/configuration'] == 1
+    assert not {'/rosout', '/parameter_events'} & set(counts)
+    information = yaml.safe_load((tmp_path / 'bag' / 'metadata.yaml').read_text())
+    offered = {
+        topic['topic_metadata']['name']: topic['topic_metadata']['offered_qos_profiles'][0]
+        for topic in information['rosbag2_bagfile_information']['topics_with_message_count']
+    }
+    assert offered['/sensor']['reliability'] == 'best_effort'
+    assert offered['/latched']['durability'] == 'transient_local'
+
+
+def test_stores_the_bytes_of_the_wire(ros_graph, record, tmp_path, monkeypatch):
+    """Nothing is decoded on the way to the bag."""
+    written = []
+    monkeypatch.setattr(BagWriter, 'write', lambda _bag, *what: written.append(what))
+    publisher = ros_graph.node('probe').create_publisher(String, 'text', COMMAND)
+    record(tmp_path / 'bag', topics=['text'])
+    ros_graph.spin_until(publisher.get_subscription_count, 'subscription')
+    publisher.publish(String(data='as it is'))
+    ros_graph.spin_until(lambda: written, 'the message')
+    assert written[0][:2] == ('/text', serialize_message(String(data='as it is')))
+
+
+def test_a_publisher_that_offers_less_is_recorded_too(ros_graph, record, tmp_path):
+    """A best-effort publisher that joins a reliable topic makes the recorder ask for less."""
+    probe = ros_graph.node('probe')
+    reliable = probe.create_publisher(String, 'text', COMMAND)
+    node = record(tmp_path / 'bag', topics=['text'])
+    ros_graph.spin_until(reliable.get_subscription_count, 'subscription')
+    weak = probe.create_publisher(String, 'text', SENSOR)
+    ros_graph.spin_until(weak.get_subscription_count, 'the new subscription')
+    started = time.monotonic()
+
+    def published() -> bool:
+        # Again and again: each publisher finds the new subscription in its own time.
+        weak.publish(String(data='weak'))
+        reliable.publish(String(data='strong'))
+        return time.monotonic() - started > 1.0
+
+    ros_graph.spin_until(published, 'a second')
+    node.stop()
+    assert {m.data for _, m in read_topic(tmp_path / 'bag', '/text')} == {'weak', 'strong'}
+
+
+def test_a_topic_of_a_type_it_cannot_describe_is_left_out_and_named_once(
+    ros_graph, record, tmp_path
+):
+    """What cannot be recorded is said once, and the rest is recorded."""
+    probe = ros_graph.node('probe')
+    logs = ros_graph.listen(probe, Log, '/rosout', 100)
+    goals = probe.create_publisher(Goals, 'goals', COMMAND)
+    text = probe.create_publisher(String, 'text', COMMAND)
+    node = record(tmp_path / 'bag', topics=['goals', 'text'])
+    ros_graph.spin_until(text.get_subscription_count, 'subscription')
+    started = time.monotonic()
+    ros_graph.spin_until(lambda: time.monotonic() - started > 0.5, 'a few more looks')
+    assert set(node.diagnose()[2]) == {'messages', 'bytes', '/text'}
+    assert goals.get_subscription_count() == 0
+    [said] = [log.msg for log in logs if 'left out' in log.msg]
+    assert said.startswith('/goals left out: no definition of nav_msgs/msg/Goals')
+
+
+def test_stops_and_starts_again_in_a_new_folder(ros_graph, record, tmp_path):
+    """Services end one recording, complete, and begin the next."""
+    record(tmp_path / 'bag')
+    assert call(ros_graph, 'recorder/start') == (False, 'recording already')
+    success, message = call(ros_graph, 'recorder/stop')
+    assert success
+    assert message.endswith(f'messages to {tmp_path / "bag"}')
+    assert (tmp_path / 'bag' / 'metadata.yaml').exists()
+    assert call(ros_graph, 'recorder/stop') == (False, 'not recording')
+    again = tmp_path / 'bag_2'
+    assert call(ros_graph, 'recorder/start') == (True, f'recording to {again}')
+    assert call(ros_graph, 'recorder/stop')[0]
+    assert (again / 'metadata.yaml').exists()
+
+
+@pytest.mark.parametrize(
+    ('parameters', 'complaint'),
+    [
+        ({}, 'path must name a folder to record to, got nothing'),
+        ({'path': 'here'}, 'here exists; a recording must go to a new folder'),
+        (
+            {'path': 'x', 'compression': 'zip'},
+            "compression must be one of zstd, lz4, none, got 'z",
+        ),
+    ],
+)
+def test_refuses_to_start_and_says_why(ros_graph, tmp_path, monkeypatch, parameters, complaint):
+    """A recorder that cannot record does not become active."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / 'here').mkdir()
+    node = ros_graph.add(RecorderNode, start=False, parameters=parameters)
+    assert not node.start()
+    assert complaint in node.failure
+
+
+def test_an_error_of_the_disk_ends_the_recording_and_is_reported(
+    ros_graph, record, tmp_path, monkeypatch
+):
+    """A full disk stops the recording, not the node, and /diagnostics says so."""
+    probe = ros_graph.node('probe')
+    publisher = probe.create_publisher(String, 'text', COMMAND)
+    reports = ros_graph.listen(probe, DiagnosticArray, '/diagnostics', 10)
+    node = record(tmp_path / 'bag', topics=['text'])
+    ros_graph.spin_until(publisher.get_subscription_count, 'subscription')
+
+    def full(*_arguments):
+        raise OSError(errno.ENOSPC, 'No space left on device')
+
+    monkeypatch.setattr(BagWriter, 'write', full)
+    publisher.publish(String(data='too much'))
+    ros_graph.spin_until(
+        lambda: any(r.status[0].level == DiagnosticStatus.ERROR for r in reports), 'the report'
+    )
+    expected = f'recording to {tmp_path / "bag"} stopped: No space left on device'
+    assert node.failure == reports[-1].status[0].message == expected
+    assert node.is_active
+    assert not (tmp_path / 'bag' / 'metadata.yaml').exists()
+
+
+def publish(ros_graph, node: Node, count: int) -> None:
+    """Publish numbers on /text at 100 Hz, once the recorder listens."""
+    publisher = node.create_publisher(String, 'text', COMMAND)
+    ros_graph.spin_until(publisher.get_subscription_count, 'the recorder')
+    for i in range(count):
+        publisher.publish(String(data=str(i)))
+        time.sleep(0.01)
+
+
+def test_what_was_recorded_survives_kill_9(ros_graph, tmp_path):
+    """After SIGKILL all is there but the last half second, and the folder is not complete."""
+    process = ros_graph.start('recorder', {'path': str(tmp_path / 'bag')}).process
+    publish(ros_graph, ros_graph.node('probe'), 200)
+    process.kill()
+    process.wait()
+    assert not (tmp_path / 'bag' / 'metadata.yaml').exists()
+    data = [message.data for _, message in read_topic(tmp_path / 'bag', '/text')]
+    assert data == [str(i) for i in range(len(data))]
+    # Half a second is 50 messages; as much again for a machine that is busy.
+    assert len(data) >= 100
+
+
+def test_ctrl_c_completes_the_bag(ros_graph, tmp_path):
+    """SIGINT ends the recorder with every message and the metadata in place."""
+    process = ros_graph.start('recorder', {'path': str(tmp_path / 'bag')})
+    publish(ros_graph, ros_graph.node('probe'), 50)
+    time.sleep(0.2)
+    process.interrupt()
+    assert (tmp_path / 'bag' / 'metadata.yaml').exists()
+    assert message_counts(tmp_path / 'bag')['/text'] == 50
