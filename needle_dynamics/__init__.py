@@ -6,19 +6,30 @@ Units are SI throughout; signs and frames are those of docs/architecture.md.
 
 from needle_dynamics.errors import InsertedLengthError, NeedleError, ParameterError, ShapeError
 from needle_dynamics.force_sensor import ForceSensor, ForceSensorParameters
-from needle_dynamics.integrators import Integrator, Interval, simulate, Trajectory
+from needle_dynamics.friction import Friction, FRICTION_LAWS
+from needle_dynamics.integrators import (
+    Batch,
+    Integrator,
+    Interval,
+    simulate,
+    simulate_batch,
+    Trajectory,
+)
 from needle_dynamics.kernels import FloatArray
-from needle_dynamics.model import COORDINATE_NAMES, COORDINATES, NeedleModel
+from needle_dynamics.model import NeedleModel
 from needle_dynamics.modes import mode_shapes, ModeIntegrals, ModeShapes
-from needle_dynamics.parameters import NeedleParameters, PRESETS
+from needle_dynamics.parameters import FORMULATIONS, NeedleParameters, PRESETS
+from needle_dynamics.tissue import Tissue
 
 __all__ = [
-    'COORDINATES',
-    'COORDINATE_NAMES',
+    'FORMULATIONS',
+    'FRICTION_LAWS',
     'PRESETS',
+    'Batch',
     'FloatArray',
     'ForceSensor',
     'ForceSensorParameters',
+    'Friction',
     'InsertedLengthError',
     'Integrator',
     'Interval',
@@ -29,7 +40,9 @@ __all__ = [
     'NeedleParameters',
     'ParameterError',
     'ShapeError',
+    'Tissue',
     'Trajectory',
     'mode_shapes',
     'simulate',
+    'simulate_batch',
 ]

@@ -113,9 +113,10 @@ class NeedleNode(LifecycleNode):
                 descriptor.floating_point_range = [
                     FloatingPointRange(from_value=meta['low'], to_value=meta['high'])
                 ]
-            self.declare_parameter(
-                f'{prefix}{item.name}', getattr(defaults, item.name), descriptor
-            )
+            default = getattr(defaults, item.name)
+            if isinstance(default, tuple):
+                default = list(default)
+            self.declare_parameter(f'{prefix}{item.name}', default, descriptor)
 
     def declare_model(self) -> None:
         """Declare ``model.preset`` and, with its values as defaults, every model constant."""
