@@ -22,6 +22,7 @@ from needle_identification import (
     summarize,
     write_result,
 )
+from needle_insertion import simulate
 from needle_insertion.report import table
 from tqdm import tqdm
 
@@ -100,6 +101,10 @@ def _parser() -> argparse.ArgumentParser:
         '--rate', type=float, default=1000.0, metavar='Hz', help='samples per second'
     )
     runs.set_defaults(command=_experiment_friction, input_errors=False)
+
+    open_loop = commands.add_parser('simulate', help='the open-loop needle, without ROS')
+    simulate.add_arguments(open_loop)
+    open_loop.set_defaults(command=simulate.run, input_errors=True)
 
     bench = commands.add_parser('bench', help='measure speed as ratios, side by side')
     bench.add_argument('what', choices=('dynamics',))
