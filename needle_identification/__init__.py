@@ -6,6 +6,7 @@ Reading, writing and mathematics, without ROS; the nodes are in ``*_node.py``.
 
 from needle_identification.bag_io import (
     BagWriter,
+    check_distinct,
     COMPRESSIONS,
     message_counts,
     OfferedQos,
@@ -35,6 +36,7 @@ __all__ = [
     'Recording',
     'RecordingError',
     'Statistic',
+    'check_distinct',
     'identify_friction',
     'message_counts',
     'read_friction_recording',
