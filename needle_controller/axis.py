@@ -99,6 +99,9 @@ class Law(Protocol):
     def linear(self) -> Law:
         """Return the same law without Coulomb friction, for its poles."""
 
+    def scaled(self, factor: float) -> Law:
+        """Return the same law with all gains times a factor."""
+
 
 class SampledLoop:
     """

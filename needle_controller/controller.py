@@ -28,6 +28,9 @@ class ControllerSettings:
     measurement_timeout: float = constant(
         0.1, 's', 'age at which a measurement no longer counts', open_low=True
     )
+    jump: float = constant(
+        2e-3, 'm', 'move during a fault after which the target no longer counts', open_low=True
+    )
 
     def __post_init__(self) -> None:
         check_constants(self)
@@ -172,6 +175,11 @@ class Controller:
             )
         self._target = depth
         self._planned = False
+
+    def forget(self) -> None:
+        """Let go and forget the target too."""
+        self.release()
+        self._target = None
 
     def release(self) -> None:
         """Let go: forget the motion; the next measurement starts anew from where the needle is."""

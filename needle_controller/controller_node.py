@@ -20,10 +20,13 @@ from needle_controller.pid import PidGains
 from needle_controller.reference import ReferenceLimits, REFERENCES
 from needle_dynamics import NeedleError, NeedleModel, ParameterError
 from needle_dynamics.base_node import COMMAND, NeedleNode, run, SENSOR
+from rclpy.subscription import Subscription
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
 _NANOSECONDS = 1_000_000_000
+
+_WAITING = 'no joint_states yet'
 
 #: Rotation by PID: a closed loop of 20 rad/s on the rotary inertia of the source's needle.
 _ROTATION_PID = PidGains(kp=2.1e-7, ki=0.0, kd=2.1e-8)
@@ -97,21 +100,31 @@ class ControllerNode(NeedleNode):
             limits=self.settings('reference.', ReferenceLimits),
         )
         self._model = NeedleModel(parameters)
+        self._truth: Subscription | None = None
         if self.text('deflection_feedback', ('none', 'ground_truth')) == 'ground_truth':
-            self.create_subscription(JointState, 'ground_truth', self._on_ground_truth, SENSOR)
+            self._truth = self.create_subscription(
+                JointState, 'ground_truth', self._on_ground_truth, SENSOR
+            )
+
+    def cleanup(self) -> None:
+        """Forget the ground truth."""
+        self._load = 0.0
+        if self._truth is not None:
+            self.destroy_subscription(self._truth)
 
     def activate(self) -> None:
         """Begin to answer measurements and to watch for their absence."""
-        self._fault = 'no joint_states yet'
+        self._fault = _WAITING
+        self._last_depth: float | None = None
         self._arrived = self._last_stamp = 0
         self._watchdog = self.create_timer(
             0.5 * self._settings.measurement_timeout, self._on_watchdog
         )
 
     def deactivate(self) -> None:
-        """Let go: zero force, and no memory of the motion."""
+        """Let go: zero force, and no memory of the motion nor of its target."""
         if self._controller is not None:
-            self._controller.release()
+            self._controller.forget()
         self._publish_wrench(0.0, 0.0)
         self.destroy_timer(self._watchdog)
 
@@ -144,7 +157,13 @@ class ControllerNode(NeedleNode):
     def _on_joint_states(self, message: JointState) -> None:
         """Answer a measurement at once; older ones than the last are not answered."""
         stamp = message.header.stamp.sec * _NANOSECONDS + message.header.stamp.nanosec
-        if not self.is_active or self._controller is None or stamp <= self._last_stamp:
+        if not self.is_active or self._controller is None:
+            return
+        age = (self.get_clock().now().nanoseconds - stamp) / _NANOSECONDS
+        if abs(age) > self._settings.measurement_timeout:
+            self._let_go(f'joint_states is stale: its stamp is {age:.3f} s old')
+            return
+        if stamp <= self._last_stamp:
             return
         self._last_stamp = stamp
         self._arrived = self.get_clock().now().nanoseconds
@@ -176,11 +195,25 @@ class ControllerNode(NeedleNode):
             self._publish_wrench(0.0, 0.0)
             return
         if self._fault is not None:
-            self._fault = None
-            self.publish_diagnostics()
+            self._resume(measured)
+        self._last_depth = measured.depth
         command = self._controller.command(measured, self._load)
         self._publish_wrench(command.force, command.torque)
         self._show(message, measured, command)
+
+    def _resume(self, measured: Measurement) -> None:
+        """Go on after a fault; not towards a target set for a needle that was elsewhere."""
+        self._fault = None
+        last = self._last_depth
+        if self._controller is not None and last is not None and self._controller.target:
+            moved = abs(measured.depth - last)
+            if moved > self._settings.jump:
+                self._controller.forget()
+                self.get_logger().error(
+                    f'the needle is {moved:.6f} m from where it was before the fault; the target '
+                    'is forgotten'
+                )
+        self.publish_diagnostics()
 
     def _on_watchdog(self) -> None:
         age = (self.get_clock().now().nanoseconds - self._arrived) / _NANOSECONDS
@@ -206,7 +239,7 @@ class ControllerNode(NeedleNode):
 
     def _let_go(self, fault: str) -> None:
         """Command zero force for a reason, said once when it begins."""
-        begins = self._fault is None
+        begins = self._fault in (None, _WAITING)
         self._fault = fault
         if self._controller is not None:
             self._controller.release()

@@ -77,3 +77,8 @@ class InverseDynamics:
     def linear(self) -> InverseDynamics:
         """Return the same law without Coulomb friction."""
         return replace(self, axis=self.axis.without_coulomb())
+
+    def scaled(self, factor: float) -> InverseDynamics:
+        """Return the same law with all gains times a factor."""
+        gains = self.gains
+        return replace(self, gains=replace(gains, kp=factor * gains.kp, kv=factor * gains.kv))

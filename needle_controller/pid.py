@@ -74,3 +74,9 @@ class Pid:
         return replace(
             self, axis=self.axis.without_coulomb(), gains=replace(self.gains, tolerance=0.0)
         )
+
+    def scaled(self, factor: float) -> Pid:
+        """Return the same law with all gains times a factor."""
+        gains = self.gains
+        kp, ki, kd = factor * gains.kp, factor * gains.ki, factor * gains.kd
+        return replace(self, gains=replace(gains, kp=kp, ki=ki, kd=kd))

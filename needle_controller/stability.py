@@ -97,8 +97,22 @@ def check_stability(law: Law, delay: int, name: str) -> None:
     for unmodeled in (0, 1):
         radius = spectral_radius(law, delay, unmodeled)
         if radius >= 1.0:
+            factor = _stable_factor(law, delay)
+            advice = (
+                f'all of them times {factor:.2g} would be'
+                if factor is not None
+                else 'no common factor makes them stable: a gain is zero or missing'
+            )
             raise ParameterError(
                 f'{name} cannot be stable at {1.0 / law.period:g} Hz with a delay of '
-                f'{delay + unmodeled} periods: spectral radius {radius:.3g} must be < 1; '
-                'lower the gains or raise the rate'
+                f'{delay + unmodeled} periods: spectral radius {radius:.6g} must be < 1; {advice}'
             )
+
+
+def _stable_factor(law: Law, delay: int) -> float | None:
+    """Return a factor on all gains, within a tenth of the largest, that makes the loop stable."""
+    for factor in 0.9 ** np.arange(1, 200):
+        scaled = law.scaled(float(factor))
+        if max(spectral_radius(scaled, delay, unmodeled) for unmodeled in (0, 1)) < 1.0:
+            return float(factor)
+    return None

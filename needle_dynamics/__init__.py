@@ -4,7 +4,13 @@ Mathematics of a flexible needle in soft tissue, and the plant node around it.
 Units are SI throughout; signs and frames are those of docs/architecture.md.
 """
 
-from needle_dynamics.errors import InsertedLengthError, NeedleError, ParameterError, ShapeError
+from needle_dynamics.errors import (
+    InsertedLengthError,
+    JobError,
+    NeedleError,
+    ParameterError,
+    ShapeError,
+)
 from needle_dynamics.force_sensor import ForceSensor, ForceSensorParameters
 from needle_dynamics.friction import Friction, FRICTION_LAWS
 from needle_dynamics.integrators import (
@@ -33,6 +39,7 @@ __all__ = [
     'InsertedLengthError',
     'Integrator',
     'Interval',
+    'JobError',
     'ModeIntegrals',
     'ModeShapes',
     'NeedleError',

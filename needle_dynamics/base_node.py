@@ -9,10 +9,13 @@ parameter file ends in a refused `configure` with one line that names the parame
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+import ctypes
 from dataclasses import fields
+import os
 import signal
 import sys
 import time
+import traceback
 from types import FrameType
 from typing import Any, TypeVar
 
@@ -43,6 +46,11 @@ COMMAND = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE)
 #: Sensor streams; a burst after a stall of the reader is not lost.
 SENSOR = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)
 
+#: Set in the environment of a node that shall not outlive the process that started it.
+END_WITH_PARENT = 'NEEDLE_END_WITH_PARENT'
+
+_PR_SET_PDEATHSIG = 1
+
 _Settings = TypeVar('_Settings')
 _SUCCESS = TransitionCallbackReturn.SUCCESS
 
@@ -69,6 +77,9 @@ class NeedleNode(LifecycleNode):
         self.add_on_set_parameters_callback(self._check_change)
 
     # What a subclass fills in.
+
+    def cleanup(self) -> None:
+        """Undo `configure`."""
 
     def configure(self) -> None:
         """Read the parameters and make what the node needs; raise `NeedleError` to refuse."""
@@ -120,7 +131,12 @@ class NeedleNode(LifecycleNode):
 
     def declare_model(self) -> None:
         """Declare ``model.preset`` and, with its values as defaults, every model constant."""
-        self.declare_text('model.preset', 'phantom', f'one of {", ".join(PRESETS)}')
+        # Fixed at start: the other defaults follow from it.
+        self.declare_parameter(
+            'model.preset',
+            'phantom',
+            ParameterDescriptor(description=f'one of {", ".join(PRESETS)}', read_only=True),
+        )
         preset = self.get_parameter('model.preset').value
         self.declare_settings('model.', PRESETS.get(preset, NeedleParameters()))
 
@@ -182,12 +198,14 @@ class NeedleNode(LifecycleNode):
         return str(yaml.safe_dump(document, sort_keys=False))
 
     def _check_overrides(self) -> None:
-        given = set(self._parameter_overrides)
-        known = set(self._parameters)
-        for name in sorted(given - known):
-            raise ParameterError(unknown_name(name, sorted(known)))
-        if given:
-            self.get_logger().info(f'{len(given)} of {len(given)} parameters given applied')
+        known = sorted(self._parameters)
+        unknown = sorted(set(self._parameter_overrides) - set(known))
+        if unknown:
+            count = len(self._parameter_overrides)
+            complaints = '; '.join(unknown_name(name, known) for name in unknown)
+            raise ParameterError(
+                f'{count - len(unknown)} of {count} parameters given are known: {complaints}'
+            )
 
     def _check_change(self, parameters: list[Parameter]) -> SetParametersResult:
         if self._configured:
@@ -221,6 +239,9 @@ class NeedleNode(LifecycleNode):
             self._check_overrides()
             self.configure()
             self._configured = True
+            if self._parameter_overrides:
+                count = len(self._parameter_overrides)
+                self.get_logger().info(f'{count} of {count} parameters given applied')
             self._configuration.publish(String(data=self.configuration()))
 
         return self._attempt(configure, super().on_configure, state)
@@ -236,11 +257,21 @@ class NeedleNode(LifecycleNode):
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Make the parameters free to change."""
         self._configured = False
-        return super().on_cleanup(state)
+        return self._attempt(self.cleanup, super().on_cleanup, state)
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Leave the world safe."""
-        return self._attempt(self.deactivate, super().on_shutdown, state)
+
+        def leave() -> None:
+            if state.label == 'active':
+                self.deactivate()
+
+        return self._attempt(leave, super().on_shutdown, state)
+
+    def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Return to unconfigured after an error that was not foreseen."""
+        self._configured = False
+        return super().on_error(state)
 
     def _attempt(
         self,
@@ -254,6 +285,11 @@ class NeedleNode(LifecycleNode):
             self.failure = str(error)
             self.get_logger().error(self.failure)
             return TransitionCallbackReturn.FAILURE
+        # rclpy would drop it without a word.
+        except Exception as error:  # noqa: BLE001
+            self.failure = f'{type(error).__name__}: {error}'
+            self.get_logger().error(traceback.format_exc())
+            return TransitionCallbackReturn.ERROR
         self.failure = None
         return inherited(state)
 
@@ -304,8 +340,16 @@ def run(kind: Callable[[], NeedleNode], arguments: list[str] | None = None) -> i
         nonlocal stopping
         stopping = True
 
-    # Not rclpy's handlers: they end the context before the node can leave the world safe.
-    rclpy.init(args=arguments, signal_handler_options=rclpy.signals.SignalHandlerOptions.NO)
+    if os.environ.get(END_WITH_PARENT):
+        # Linux sends the signal when the process that started this one ends, however it ends.
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+    try:
+        # Not rclpy's handlers: they end the context before the node can leave the world safe.
+        rclpy.init(args=arguments, signal_handler_options=rclpy.signals.SignalHandlerOptions.NO)
+    except RuntimeError as error:
+        # rcl could not read the arguments or the parameter file.
+        sys.stderr.write(f'error: {" ".join(str(error).split())}\n')
+        return 2
     previous = {name: signal.signal(name, stop) for name in (signal.SIGINT, signal.SIGTERM)}
     try:
         try:

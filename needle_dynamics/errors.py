@@ -5,6 +5,10 @@ class NeedleError(Exception):
     """Base of all errors raised on purpose; its message is one line for a person."""
 
 
+class JobError(NeedleError):
+    """A job failed though nothing was wrong with what it was given."""
+
+
 class ParameterError(NeedleError, ValueError):
     """A parameter is unknown, missing, or outside its valid range."""
 

@@ -43,11 +43,16 @@ class BaseMotion:
         Limits.
     depth : float
         Inserted length to hold until a trajectory comes [m].
+    reach : tuple of float
+        Least and largest inserted length [m].
 
     """
 
-    def __init__(self, parameters: BaseParameters, depth: float) -> None:
+    def __init__(
+        self, parameters: BaseParameters, depth: float, reach: tuple[float, float]
+    ) -> None:
         self._limits = parameters
+        self._range = reach
         self._times = np.array([0.0])
         self._depths = np.array([depth])
 
@@ -62,14 +67,14 @@ class BaseMotion:
         depth : float
             Inserted length at that time [m].
         times : ndarray, shape (n,)
-            Times of the points from the start [s], positive and increasing.
+            Times of the points from the start [s], increasing from zero or later.
         depths : ndarray, shape (n,)
             Inserted lengths [m].
 
         Raises
         ------
         ParameterError
-            If times do not increase or a number is not finite.
+            If times do not increase, or a depth is out of reach or not finite.
 
         """
         if times.shape != depths.shape or times.size == 0:
@@ -78,12 +83,18 @@ class BaseMotion:
             )
         if not (np.isfinite(times).all() and np.isfinite(depths).all()):
             raise ParameterError('trajectory must be finite')
-        if times[0] <= 0.0 or (np.diff(times) <= 0.0).any():
+        if times[0] < 0.0 or (np.diff(times) <= 0.0).any():
             raise ParameterError(
-                f'trajectory times must be positive and increasing, got {times.tolist()} s'
+                f'trajectory times must be >= 0 and increasing, got {times.tolist()} s'
             )
-        self._times = start + np.concatenate([[0.0], times])
-        self._depths = np.concatenate([[depth], depths])
+        low, high = self._range
+        if depths.min() < low or depths.max() > high:
+            raise ParameterError(
+                f'trajectory must stay in [{low:g}, {high:g}] m, got {depths.tolist()} m'
+            )
+        if times[0] > 0.0:
+            times, depths = np.append(0.0, times), np.append(depth, depths)
+        self._times, self._depths = start + times, depths
 
     def speed(self, time: float, depth: float, speed: float, interval: float) -> float:
         """

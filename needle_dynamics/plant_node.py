@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import isfinite
 import sys
 from typing import Any
 
@@ -11,13 +10,14 @@ from builtin_interfaces.msg import Time as TimeMessage
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PointStamped, WrenchStamped
 from needle_dynamics.base_node import COMMAND, NeedleNode, run, SENSOR
-from needle_dynamics.errors import InsertedLengthError, ParameterError
+from needle_dynamics.errors import NeedleError, ParameterError
 from needle_dynamics.force_sensor import ForceSensor, ForceSensorParameters
 from needle_dynamics.integrators import Integrator
 from needle_dynamics.model import NeedleModel
 from needle_dynamics.parameters import check_constants, constant
 from needle_dynamics.plant import BaseMotion, BaseParameters, Plant, Sample
 import numpy as np
+from rcl_interfaces.msg import IntegerRange, ParameterDescriptor
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory
 
@@ -30,11 +30,15 @@ class PlantSettings:
 
     rate: float = constant(1000.0, 'Hz', 'samples per second', low=1.0, high=10_000.0)
     depth: float = constant(0.02, 'm', 'inserted length at the start', open_low=True)
-    tip_deflection: float = constant(0.0, 'm', 'deflection of the tip at the start', low=-1.0)
-    step: float = constant(2e-5, 's', 'longest step of the integrator', open_low=True)
+    tip_deflection: float = constant(
+        0.0, 'm', 'deflection of the tip at the start', low=-0.1, high=0.1
+    )
+    step: float = constant(2e-5, 's', 'longest step of the integrator', low=1e-7, high=1e-2)
     command_timeout: float = constant(
         0.1, 's', 'age at which a command no longer counts', open_low=True
     )
+    force_limit: float = constant(1e3, 'N', 'largest force that a command may ask for')
+    torque_limit: float = constant(1.0, 'N m', 'largest torque that a command may ask for')
     backlog: float = constant(0.5, 's', 'delay beyond which samples are given up', open_low=True)
 
     def __post_init__(self) -> None:
@@ -54,7 +58,14 @@ class PlantNode(NeedleNode):
     def __init__(self, **node_options: Any) -> None:
         super().__init__('plant', **node_options)
         self.declare_text('mode', 'simulation', 'simulation or robot')
-        self.declare_parameter('seed', 1)
+        self.declare_parameter(
+            'seed',
+            1,
+            ParameterDescriptor(
+                description='seed of the sensor noise: the same seed gives the same noise',
+                integer_range=[IntegerRange(from_value=0, to_value=2**62)],
+            ),
+        )
         self.declare_settings('', PlantSettings())
         self.declare_model()
         self.declare_settings('sensor.', ForceSensorParameters())
@@ -90,8 +101,6 @@ class PlantNode(NeedleNode):
         settings = self.settings('', PlantSettings)
         parameters = self.model_parameters()
         seed = self.get_parameter('seed').value
-        if not isinstance(seed, int) or seed < 0:
-            raise ParameterError(f'seed must be an integer >= 0, got {seed!r}')
         sensor = ForceSensor(self.settings('sensor.', ForceSensorParameters), settings.rate, seed)
         model = NeedleModel(parameters)
         self._truth.name = list(model.coordinate_names)
@@ -99,7 +108,8 @@ class PlantNode(NeedleNode):
         integrator = Integrator(parameters, state, settings.step)
         base = None
         if self.text('mode', ('simulation', 'robot')) == 'robot':
-            base = BaseMotion(self.settings('base.', BaseParameters), settings.depth)
+            reach = parameters.minimum_depth, parameters.length
+            base = BaseMotion(self.settings('base.', BaseParameters), settings.depth, reach)
         self._settings = settings
         self._plant = Plant(integrator, sensor, settings.rate, base)
         # Compile, or load what was compiled, before time counts.
@@ -121,11 +131,13 @@ class PlantNode(NeedleNode):
 
     def _on_command(self, message: WrenchStamped) -> None:
         force, torque = message.wrench.force.y, message.wrench.torque.x
-        if not (isfinite(force) and isfinite(torque)):
+        limits = self._settings.force_limit, self._settings.torque_limit
+        # Written so that NaN is refused too.
+        if not (abs(force) <= limits[0] and abs(torque) <= limits[1]):
             self._bad_commands += 1
             self.get_logger().error(
-                f'wrench_command must be finite, got force.y = {force}, torque.x = {torque}; '
-                'no force is applied',
+                f'wrench_command must be within {limits[0]:g} N and {limits[1]:g} N m, got '
+                f'force.y = {force}, torque.x = {torque}; no force is applied',
                 throttle_duration_sec=1.0,
             )
             force = torque = 0.0
@@ -161,6 +173,10 @@ class PlantNode(NeedleNode):
         now = self.get_clock().now().nanoseconds
         rate = self._settings.rate
         due = int((now - self._start) * rate / _NANOSECONDS) - self._sampled
+        if self._start == 0 or due < 0:
+            # The first /clock has come, or the clock was set back: sample on from here.
+            self._start, self._sampled = now, 0
+            return
         most = max(1, int(self._settings.backlog * rate))
         if due > most:
             # Time that was given up is skipped, and said on /diagnostics.
@@ -183,7 +199,7 @@ class PlantNode(NeedleNode):
             self._force = self._torque = 0.0
         try:
             self._show(plant.advance(self._force, self._torque), stamp)
-        except InsertedLengthError as error:
+        except NeedleError as error:
             self._halted = str(error)
             self.get_logger().error(f'{error}; the plant stands still')
             self.report_change()

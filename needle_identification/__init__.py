@@ -6,6 +6,7 @@ Reading, writing and mathematics, without ROS; the nodes are in ``*_node.py``.
 
 from needle_identification.bag_io import (
     BagWriter,
+    check_distinct,
     COMPRESSIONS,
     encode,
     message_counts,
@@ -37,6 +38,7 @@ __all__ = [
     'Recording',
     'RecordingError',
     'Statistic',
+    'check_distinct',
     'encode',
     'identify_friction',
     'message_counts',

@@ -415,7 +415,8 @@ def _files(contents: _Contents) -> list[Path]:
     elif metadata.get('compression_mode') in ('FILE', 'MESSAGE', 'file', 'message'):
         return [path]
     else:
-        listed = {Path(name).name for name in metadata.get('relative_file_paths', [])}
+        paths = metadata.get('relative_file_paths')
+        listed = {Path(str(name)).name for name in paths} if isinstance(paths, list) else set()
         for name in sorted(listed - {file.name for file in found}):
             contents.losses.append(f'{name} is missing')
     if not found:
@@ -496,6 +497,23 @@ def message_counts(path: Path) -> dict[str, int]:
     """
     contents = _scan(path, lambda _name, _kind: False)
     return {name: topic.count for name, topic in sorted(contents.topics.items())}
+
+
+def check_distinct(paths: Sequence[Path]) -> None:
+    """
+    Refuse to count a recording twice: it would make the errors look smaller than they are.
+
+    Raises
+    ------
+    RecordingError
+        Naming the recording.
+
+    """
+    seen: set[Path] = set()
+    for path in paths:
+        if path.resolve() in seen:
+            raise RecordingError(f'{path} is given twice; each recording counts once')
+        seen.add(path.resolve())
 
 
 def read_topic(path: Path, topic: str) -> list[tuple[int, Any]]:

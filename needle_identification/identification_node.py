@@ -11,7 +11,7 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from needle_dynamics.base_node import LATCHED, NeedleNode, run
 from needle_dynamics.errors import NeedleError
-from needle_identification.bag_io import read_friction_recording
+from needle_identification.bag_io import check_distinct, read_friction_recording
 from needle_identification.friction import (
     FrictionEstimate,
     FrictionSettings,
@@ -74,6 +74,7 @@ class IdentificationNode(NeedleNode):
         return response
 
     def _identify(self) -> FrictionSummary:
+        check_distinct(self._bags)
         estimates: list[FrictionEstimate] = []
         for bag in self._bags:
             recording = read_friction_recording(

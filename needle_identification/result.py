@@ -57,9 +57,12 @@ def write_result(path: Path, summary: FrictionSummary) -> None:
         If the file cannot be written.
 
     """
+    if not path.name or path.is_dir():
+        raise IdentificationError(f'cannot write {path}: it is not the name of a file')
     draft = path.with_name(f'{path.name}.tmp')
     try:
         draft.write_text(result_yaml(summary), encoding='utf-8')
         draft.replace(path)
     except OSError as error:
+        draft.unlink(missing_ok=True)
         raise IdentificationError(f'cannot write {path}: {error.strerror}') from error

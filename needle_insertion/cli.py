@@ -13,8 +13,9 @@ import tempfile
 from types import FrameType
 from typing import Any, NoReturn
 
-from needle_dynamics import NeedleError
+from needle_dynamics import JobError, NeedleError, ParameterError
 from needle_identification import (
+    check_distinct,
     FrictionSettings,
     FrictionSummary,
     identify_friction,
@@ -25,6 +26,8 @@ from needle_identification import (
 from needle_insertion import simulate
 from needle_insertion.report import table
 from tqdm import tqdm
+
+_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 #: Recordings shipped with the source tree.
 SHIPPED_BAGS = Path(__file__).parent.parent / 'bags'
@@ -45,22 +48,43 @@ def main(arguments: Sequence[str] | None = None) -> int:
         Exit status.
 
     """
-    options = _parser().parse_args(arguments)
-    # As Ctrl-C does: what was started is ended on the way out.
-    signal.signal(signal.SIGTERM, _terminate)
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    options = _parser().parse_args(_joined(words))
+    # What was started is ended on the way out, whatever ends the command.
+    previous = {name: signal.signal(name, _interrupt) for name in _SIGNALS}
     try:
         status: int = options.command(options)
-    except NeedleError as error:
+    except JobError as error:
         sys.stderr.write(f'error: {error}\n')
-        return 2 if options.input_errors else 1
+        return 1
+    except (NeedleError, OSError) as error:
+        sys.stderr.write(f'error: {error}\n')
+        return 2
     except KeyboardInterrupt:
         sys.stderr.write('interrupted\n')
         return 130
+    finally:
+        for name, handler in previous.items():
+            signal.signal(name, handler)
     return status
 
 
-def _terminate(_signal: int, _frame: FrameType | None) -> NoReturn:
+def _interrupt(_signal: int, _frame: FrameType | None) -> NoReturn:
+    # Once is enough: another signal must not break off the tidying up.
+    for name in _SIGNALS:
+        signal.signal(name, signal.SIG_IGN)
     raise KeyboardInterrupt
+
+
+def _joined(words: list[str]) -> list[str]:
+    """Join ``--force-axis -y``, which argparse would take for two options."""
+    joined: list[str] = []
+    for word in words:
+        if joined and joined[-1] == '--force-axis' and word in ('-x', '-y', '-z'):
+            joined[-1] += f'={word}'
+        else:
+            joined.append(word)
+    return joined
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -70,7 +94,7 @@ def _parser() -> argparse.ArgumentParser:
     demo = commands.add_parser('demo', help='insertion, recording, identification, one report')
     demo.add_argument('-o', '--output', type=Path, default=Path('demo_output'), help='folder')
     demo.add_argument('--bags', type=Path, default=SHIPPED_BAGS, help='shipped recordings')
-    demo.set_defaults(command=_demo, input_errors=False)
+    demo.set_defaults(command=_demo)
 
     identify = commands.add_parser('identify', help='fit parameters to recordings')
     what = identify.add_subparsers(required=True, metavar='WHAT')
@@ -89,7 +113,7 @@ def _parser() -> argparse.ArgumentParser:
             metavar=item.metadata['unit'],
             help=f'{item.metadata["description"]} (default {item.default:g})',
         )
-    friction.set_defaults(command=_identify_friction, input_errors=True)
+    friction.set_defaults(command=_identify_friction)
 
     experiment = commands.add_parser('experiment', help='record an experiment on the stand-in')
     which = experiment.add_subparsers(required=True, metavar='WHICH')
@@ -100,15 +124,15 @@ def _parser() -> argparse.ArgumentParser:
     runs.add_argument(
         '--rate', type=float, default=1000.0, metavar='Hz', help='samples per second'
     )
-    runs.set_defaults(command=_experiment_friction, input_errors=False)
+    runs.set_defaults(command=_experiment_friction)
 
     open_loop = commands.add_parser('simulate', help='the open-loop needle, without ROS')
     simulate.add_arguments(open_loop)
-    open_loop.set_defaults(command=simulate.run, input_errors=True)
+    open_loop.set_defaults(command=simulate.run)
 
     bench = commands.add_parser('bench', help='measure speed as ratios, side by side')
     bench.add_argument('what', choices=('dynamics',))
-    bench.set_defaults(command=_bench, input_errors=False)
+    bench.set_defaults(command=_bench)
     return parser
 
 
@@ -125,9 +149,21 @@ def _demo(options: argparse.Namespace) -> int:
 
 
 def _experiment_friction(options: argparse.Namespace) -> int:
-    from needle_insertion.experiment import record_friction_run
+    from needle_insertion.experiment import RATES, record_friction_run
 
     runs = range(options.repeats)
+    if options.repeats < 1:
+        raise ParameterError(f'--repeats must be >= 1, got {options.repeats}')
+    if options.seed < 0:
+        raise ParameterError(f'--seed must be >= 0, got {options.seed}')
+    if not RATES[0] <= options.rate <= RATES[1]:
+        raise ParameterError(
+            f'--rate must be in [{RATES[0]:g}, {RATES[1]:g}] Hz, got {options.rate}'
+        )
+    for k in runs:
+        bag = options.output / f'friction_{k + 1}'
+        if bag.exists():
+            raise ParameterError(f'{bag} exists; name another folder')
     with tempfile.TemporaryDirectory() as logs:
         for k in tqdm(runs, desc='friction runs', disable=None):
             bag = options.output / f'friction_{k + 1}'
@@ -139,6 +175,7 @@ def _identify_friction(options: argparse.Namespace) -> int:
     settings = FrictionSettings(
         **{item.name: getattr(options, item.name) for item in fields(FrictionSettings)}
     )
+    check_distinct(options.bags)
     estimates = []
     for bag in tqdm(options.bags, desc='bags', disable=None, leave=False):
         recording = read_friction_recording(

@@ -92,7 +92,9 @@ def run(output: Path, bags: Path) -> int:
     """
     shipped = sorted(path for path in bags.glob('friction_*') if path.is_dir())
     if not shipped:
-        raise DemoError(f'{bags} holds no friction recordings (friction_*)')
+        raise DemoError(
+            f'{bags} holds no friction recordings (friction_*); run from a clone or give --bags'
+        )
     _clear(output)
     insertions = []
     for law in ('inverse_dynamics', 'pid'):
@@ -198,7 +200,7 @@ def record_insertion(law: str, bag: Path, logs: Path, progress: Callable[[float]
             'the nodes',
         )
         graph.activate(node, 'plant')
-        graph.spin_until(lambda: aim.message, 'the controller')
+        graph.spin_until(lambda: aim.message and state.message, 'plant and controller')
         message = PointStamped()
         message.header.frame_id = 'needle_entry'
         message.header.stamp = node.get_clock().now().to_msg()

@@ -22,6 +22,9 @@ SPEEDS = (0.002, 0.005, 0.010, 0.015, 0.020)
 STROKE_TIME = 1.0
 REST_TIME = 0.2
 
+#: Sample rates at which the strokes are resolved [Hz].
+RATES = (50.0, 5000.0)
+
 #: Topics that identification needs.
 TOPICS = ('/base_wrench', '/joint_states', '/joint_trajectory', '/plant/configuration')
 

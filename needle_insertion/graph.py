@@ -15,7 +15,8 @@ from typing import Any, IO
 from domain_coordinator import domain_id
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
-from needle_dynamics import NeedleError
+from needle_dynamics import JobError
+from needle_dynamics.base_node import END_WITH_PARENT
 from rclpy.context import Context
 from rclpy.executors import Executor
 from rclpy.experimental.events_executor import EventsExecutor
@@ -32,7 +33,7 @@ MODULES: Mapping[str, str] = {
 }
 
 
-class GraphError(NeedleError):
+class GraphError(JobError):
     """A node did not start, ended early, or what was waited for did not come."""
 
 
@@ -138,6 +139,7 @@ class Graph:
             **os.environ,
             'ROS_DOMAIN_ID': str(domain),
             'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
+            END_WITH_PARENT: '1',
         }
         # The context of this process reads its discovery range from the environment too.
         os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
@@ -152,9 +154,11 @@ class Graph:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
+        # All before any: a second interrupt may come while waiting.
         for started in self._processes:
             if started.process.poll() is None:
                 started.process.kill()
+        for started in self._processes:
             started.process.wait()
         for file in self._files:
             file.close()
@@ -210,7 +214,8 @@ class Graph:
             answer = client.call_async(request)
             self.spin_until(answer.done, f'the answer of {name}')
             if not answer.result().success:
-                raise GraphError(f'{name} refused to start')
+                said = [p.last_words() for p in self._processes if p.name == name]
+                raise GraphError(f'{name} refused to start: {"".join(said[-1:])}')
 
     def spin_until(self, condition: Callable[[], Any], what: str, timeout: float = 30.0) -> None:
         """

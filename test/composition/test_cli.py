@@ -8,6 +8,7 @@ from needle_dynamics.plant_node import PlantNode
 from needle_insertion.cli import main, SHIPPED_BAGS
 import pytest
 from rclpy.context import Context
+from rclpy.lifecycle import TransitionCallbackReturn
 import yaml
 
 BAGS = [str(path) for path in sorted(SHIPPED_BAGS.glob('friction_*'))]
@@ -43,8 +44,7 @@ def test_the_result_runs_the_plant(tmp_path):
     context.init(args=[])
     plant = PlantNode(context=context, cli_args=['--ros-args', '--params-file', str(file)])
     try:
-        assert plant.trigger_configure()
-        assert plant.failure is None
+        assert plant.trigger_configure() == TransitionCallbackReturn.SUCCESS
         assert plant.model_parameters().viscous_friction == given['model.viscous_friction']
         assert plant.model_parameters().coulomb_friction == given['model.coulomb_friction']
     finally:
@@ -54,7 +54,11 @@ def test_the_result_runs_the_plant(tmp_path):
 
 @pytest.mark.parametrize(
     ('content', 'complaint'),
-    [(None, 'does not exist'), (b'not a bag at all', 'mcap'), (b'', 'mcap')],
+    [
+        (None, 'does not exist'),
+        (b'not a bag at all', 'MCAP'),
+        (b'', 'MCAP'),
+    ],
     ids=['missing', 'corrupt', 'empty'],
 )
 def test_bad_bags_end_in_one_line(tmp_path, capsys, content, complaint):
@@ -107,3 +111,52 @@ def test_the_checksums_of_the_shipped_bags_hold():
     for path in files:
         name = str(Path(path).relative_to(SHIPPED_BAGS))
         assert sha256(path.read_bytes()).hexdigest() == listed[name]
+
+
+@pytest.mark.parametrize(
+    ('words', 'complaint'),
+    [
+        (['--repeats', '0'], '--repeats must be >= 1'),
+        (['--seed', '-3'], '--seed must be >= 0'),
+        (['--rate', 'nan'], '--rate must be in'),
+        (['--rate', '-5'], '--rate must be in'),
+    ],
+)
+def test_an_experiment_is_refused_before_anything_is_written(tmp_path, capsys, words, complaint):
+    """Bad numbers are named, with exit status 2, and leave no folder behind."""
+    assert main(['experiment', 'friction', str(tmp_path / 'out'), *words]) == 2
+    assert complaint in capsys.readouterr().err
+    assert not (tmp_path / 'out').exists()
+
+
+def test_an_experiment_does_not_write_over_another(tmp_path, capsys):
+    """A run that is already there is named before the first is recorded."""
+    (tmp_path / 'friction_2').mkdir()
+    assert main(['experiment', 'friction', str(tmp_path), '--repeats', '2']) == 2
+    assert 'friction_2 exists' in capsys.readouterr().err
+    assert not (tmp_path / 'friction_1').exists()
+
+
+@pytest.mark.parametrize('output', ['.', '/', ''])
+def test_a_result_needs_the_name_of_a_file(output, capsys):
+    """A folder as output is refused in one line."""
+    assert main(['identify', 'friction', BAGS[0], '-o', output]) == 2
+    assert 'it is not the name of a file' in capsys.readouterr().err
+
+
+def test_a_bag_counts_once(capsys):
+    """The same recording twice would feign a smaller error: it is refused."""
+    assert main(['identify', 'friction', BAGS[0], BAGS[0] + '/']) == 2
+    assert 'is given twice' in capsys.readouterr().err
+
+
+def test_a_signed_axis_is_taken_as_it_is_written(capsys):
+    """``--force-axis -y`` turns the force around, which makes friction negative: refused."""
+    assert main(['identify', 'friction', BAGS[0], '--force-axis', '-y']) == 2
+    assert 'friction must not be negative' in capsys.readouterr().err
+
+
+def test_a_place_that_cannot_be_written_ends_in_one_line(capsys):
+    """An error of the operating system is told in one line."""
+    assert main(['demo', '-o', '/dev/null/demo']) == 2
+    assert capsys.readouterr().err.count('\n') == 1

@@ -7,6 +7,8 @@ from needle_controller.controller_node import ControllerNode
 from needle_dynamics.base_node import COMMAND, SENSOR
 from needle_dynamics.plant_node import PlantNode
 import pytest
+from rclpy.duration import Duration
+from rclpy.lifecycle import TransitionCallbackReturn
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
@@ -165,3 +167,44 @@ def test_parameters_cannot_change_while_configured(ros_graph):
     result = controller.set_parameters([parameter])[0]
     assert not result.successful
     assert 'clean up the node first' in result.reason
+
+
+@pytest.mark.parametrize('offset', [-10.0, 3600.0, None], ids=['old', 'ahead', 'not stamped'])
+def test_lets_go_of_stamps_that_are_not_now(ros_graph, offset):
+    """A measurement stamped long ago, in the future or not at all is answered with zero force."""
+    bench = Bench(ros_graph)
+    bench.aim(0.1)
+    assert bench.push() > 0.5
+    message = JointState(name=['insertion'], position=[0.02], velocity=[0.0])
+    if offset is not None:
+        moment = bench.node.get_clock().now() + Duration(seconds=offset)
+        message.header.stamp = moment.to_msg()
+    bench.states.publish(message)
+    ros_graph.spin_until(lambda: bench.commands[-1].wrench.force.y == 0.0, 'zero force')
+    assert 'stale' in bench.controller.diagnose()[1]
+    # Good measurements are answered again.
+    assert bench.push() > 0.5
+
+
+def test_forgets_the_target_when_the_needle_is_elsewhere_after_a_fault(ros_graph):
+    """A needle that comes back at another depth is not pushed towards the old target."""
+    bench = Bench(ros_graph, measurement_timeout=0.2)
+    bench.aim(0.1)
+    assert bench.push() > 0.5
+    ros_graph.spin_until(lambda: bench.commands[-1].wrench.force.y == 0.0, 'zero force')
+    assert [bench.measure(0.05) for _ in range(5)] == [0.0] * 5
+    assert bench.controller.diagnose()[2]['target [m]'] is None
+
+
+def test_configuring_again_doubles_nothing(ros_graph):
+    """Clean up and configure as often as one likes: one subscription to the ground truth."""
+    controller = ros_graph.add(
+        ControllerNode, parameters={**SLOW, 'deflection_feedback': 'ground_truth'}
+    )
+    for _ in range(3):
+        assert controller.trigger_deactivate() == TransitionCallbackReturn.SUCCESS
+        assert controller.trigger_cleanup() == TransitionCallbackReturn.SUCCESS
+        assert controller.start()
+    topics = [subscription.topic_name for subscription in controller.subscriptions]
+    assert topics.count('/ground_truth') == 1
+    assert topics.count('/joint_states') == 1

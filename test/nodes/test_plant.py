@@ -2,6 +2,8 @@
 
 from pathlib import Path
 import signal
+import subprocess
+import sys
 
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PointStamped, WrenchStamped
@@ -12,6 +14,8 @@ from needle_dynamics.plant_node import PlantNode
 from needle_insertion.graph import GraphError
 import numpy as np
 import pytest
+from rclpy.lifecycle import TransitionCallbackReturn
+from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
@@ -79,14 +83,15 @@ def test_moves_under_a_command_and_stops_without_it(ros_graph):
     ros_graph.spin_until(lambda: states[-1].velocity[0] == 0.0, 'the stop after the timeout')
 
 
-def test_a_command_that_is_not_finite_is_no_force(ros_graph):
-    """A NaN in a command is refused, counted, and leaves the needle where it is."""
+@pytest.mark.parametrize('force', [float('nan'), float('inf'), -1e300])
+def test_a_command_that_no_robot_could_mean_is_no_force(ros_graph, force):
+    """NaN, infinity and absurd forces are refused, counted, and leave the needle where it is."""
     probe = ros_graph.node('probe')
     states = ros_graph.listen(probe, JointState, 'joint_states', SENSOR)
     commands = probe.create_publisher(WrenchStamped, 'wrench_command', COMMAND)
     plant = ros_graph.add(PlantNode, parameters=RATE)
     ros_graph.spin_until(lambda: states and commands.get_subscription_count(), 'discovery')
-    commands.publish(wrench(float('nan')))
+    commands.publish(wrench(force))
     ros_graph.spin_until(lambda: plant.diagnose()[2]['commands refused'] == 1, 'the refusal')
     seen = len(states)
     ros_graph.spin_until(lambda: len(states) > seen + 20, 'further samples')
@@ -162,7 +167,8 @@ def test_the_shipped_parameter_file_is_accepted(ros_graph, kind):
         ({'model.density': -1.0}, 'model.density'),
         ({'step': float('nan')}, 'step'),
         ({'depth': 0.3}, 'inserted length 0.3 m is outside'),
-        ({'seed': -1}, 'seed must be an integer >= 0'),
+        ({'seed': -1}, 'seed out of range'),
+        ({'step': 1e-13}, 'step out of range'),
     ],
 )
 def test_bad_parameters_end_the_process_with_one_line(ros_graph, parameters, complaint):
@@ -184,3 +190,71 @@ def test_signals_end_it_well(ros_graph, name):
     plant.process.send_signal(name)
     assert plant.process.wait(30) == 0
     assert 'Traceback' not in plant.last_words()
+
+
+@pytest.mark.parametrize(
+    'arguments',
+    [['--params-file', 'missing.yaml'], ['-p', 'depth']],
+    ids=['no such file', 'no value'],
+)
+def test_arguments_that_ros_cannot_read_end_in_one_line(tmp_path, arguments):
+    """An unreadable command line is told in one line, with exit status 2."""
+    ended = subprocess.run(
+        [sys.executable, '-m', 'needle_dynamics.plant_node', '--ros-args', *arguments],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert ended.returncode == 2
+    assert ended.stderr.splitlines()[-1].startswith('error: ')
+    assert 'Traceback' not in ended.stderr
+
+
+def test_beyond_its_range_without_hub_stop_it_stands_still(ros_graph):
+    """Pushed through by more than its length the plant stops and reports; it does not die."""
+    probe = ros_graph.node('probe')
+    reports = ros_graph.listen(probe, DiagnosticArray, '/diagnostics', 10)
+    commands = probe.create_publisher(WrenchStamped, 'wrench_command', COMMAND)
+    free = {'model.hub_stop': False, 'model.preset': 'paper_si', 'depth': 0.1}
+    ros_graph.add(PlantNode, parameters={**RATE, **free})
+    ros_graph.spin_until(commands.get_subscription_count, 'discovery')
+
+    def reported() -> bool:
+        commands.publish(wrench(20.0))
+        return any('inserted length' in report.status[0].message for report in reports)
+
+    ros_graph.spin_until(reported, 'the report')
+
+
+def test_the_preset_is_fixed_at_start(ros_graph):
+    """The defaults follow from the preset, so it cannot change afterwards."""
+    plant = ros_graph.add(PlantNode, start=False)
+    changed = plant.set_parameters([Parameter('model.preset', value='paper_si')])[0]
+    assert not changed.successful
+
+
+@pytest.mark.parametrize('kind', [PlantNode, ControllerNode])
+@pytest.mark.parametrize('configured', [False, True])
+def test_it_can_be_shut_down_before_it_was_active(ros_graph, kind, configured):
+    """Shutdown is granted from unconfigured and from inactive."""
+    node = ros_graph.add(kind, start=False)
+    if configured:
+        assert node.trigger_configure() == TransitionCallbackReturn.SUCCESS
+    assert node.trigger_shutdown() == TransitionCallbackReturn.SUCCESS
+
+
+def test_a_trajectory_out_of_reach_is_refused(ros_graph):
+    """The base stays where it is when a point lies before the skin or beyond the hub."""
+    probe = ros_graph.node('probe')
+    states = ros_graph.listen(probe, JointState, 'joint_states', SENSOR)
+    trajectories = probe.create_publisher(JointTrajectory, 'joint_trajectory', COMMAND)
+    ros_graph.add(PlantNode, parameters={**RATE, 'mode': 'robot', 'depth': 0.1})
+    ros_graph.spin_until(lambda: states and trajectories.get_subscription_count(), 'discovery')
+    for depth in (-0.01, 0.3, float('nan')):
+        point = JointTrajectoryPoint(positions=[depth])
+        point.time_from_start.sec = 1
+        trajectories.publish(JointTrajectory(joint_names=['insertion'], points=[point]))
+    seen = len(states)
+    ros_graph.spin_until(lambda: len(states) > seen + 50, 'further samples')
+    assert {message.position[0] for message in states[seen:]} == {0.1}

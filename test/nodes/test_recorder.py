@@ -3,7 +3,7 @@
 import errno
 import time
 
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from nav_msgs.msg import Goals
 from needle_dynamics.base_node import COMMAND, LATCHED, SENSOR
 from needle_identification import BagWriter, message_counts, read_topic
@@ -223,8 +223,13 @@ def test_what_was_recorded_survives_kill_9(ros_graph, tmp_path):
 def test_ctrl_c_completes_the_bag(ros_graph, tmp_path):
     """SIGINT ends the recorder with every message and the metadata in place."""
     process = ros_graph.start('recorder', {'path': str(tmp_path / 'bag')})
-    publish(ros_graph, ros_graph.node('probe'), 50)
-    time.sleep(0.2)
+    probe = ros_graph.node('probe')
+    reports = ros_graph.listen(probe, DiagnosticArray, '/diagnostics', 10)
+    publish(ros_graph, probe, 50)
+    counted = KeyValue(key='/text', value='50')
+    ros_graph.spin_until(
+        lambda: any(counted in status.values for r in reports for status in r.status), 'all of it'
+    )
     process.interrupt()
     assert (tmp_path / 'bag' / 'metadata.yaml').exists()
     assert message_counts(tmp_path / 'bag')['/text'] == 50
