@@ -2,9 +2,9 @@ r"""
 Linearization (19) of the model at an operating point, and what it can steer and see.
 
 A rank of [B, AB, A^2 B, ...] in SI units says nothing here: its columns span more decades than
-double precision has digits. The tests below work on the pair in natural units, `LinearSystem.scaled`,
-with orthogonal transformations only: a staircase finds what the inputs reach, and the smallest
-singular value of the Hautus (PBH) pencil [A - lambda I, B] says how far that is from being lost.
+double precision has digits. The tests below work on the pair in natural units (`scaled`), with
+orthogonal transformations only: a staircase finds what the inputs reach, and the smallest singular
+value of the Hautus (PBH) pencil [A - lambda I, B] says how far that is from being lost.
 
 The only equilibria of the model are straight needles. Elsewhere (19) holds along a motion, with
 its coefficients frozen at the instant that is looked at.
@@ -22,8 +22,10 @@ from needle_dynamics.kernels import FloatArray
 from needle_dynamics.model import NeedleModel
 from needle_dynamics.parameters import NeedleParameters
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import eigh
+
+ComplexArray = NDArray[np.complex128]
 
 #: Ways to slide, with the sign of the insertion speed.
 SLIDING: Final = {'insertion': 1.0, 'withdrawal': -1.0}
@@ -334,7 +336,7 @@ class Structure:
     rank: int
     lost: tuple[str, ...]
     combined: tuple[str, ...]
-    eigenvalues: FloatArray
+    eigenvalues: ComplexArray
     distances: FloatArray
     margin: float
     weakest: str
@@ -465,13 +467,13 @@ def observability(
         If shapes do not fit or a number is not finite.
 
     """
-    dual = None if transform is None else np.linalg.inv(transform).T
+    dual = None if transform is None else np.linalg.inv(np.asarray(transform, dtype=float)).T
     a, c = np.asarray(a, dtype=float), np.asarray(c, dtype=float)
     return controllability(a.T, c.T, names, dual, scaled_names)
 
 
 def _staircase(a: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return orthonormal bases of what the inputs reach and of the rest; shapes (N, r), (N, N - r)."""
+    """Return orthonormal bases, as columns, of what the inputs reach and of the rest."""
     kept = np.zeros((a.shape[0], 0))
     fresh, size, norm = b, np.linalg.norm(b), np.linalg.norm(a)
     while fresh.size:
@@ -485,15 +487,15 @@ def _staircase(a: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray]:
     return kept, full[:, kept.shape[1] :]
 
 
-def _hautus(a: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _hautus(a: FloatArray, b: FloatArray) -> tuple[ComplexArray, FloatArray, ComplexArray]:
     """Return eigenvalues, least singular values of [A - lambda I, B], and their left vectors."""
-    eigenvalues = np.linalg.eigvals(a)
+    eigenvalues = np.linalg.eigvals(a).astype(complex)
     order = a.shape[0]
     pencils = np.empty((order, order, order + b.shape[1]), dtype=complex)
     pencils[:, :, :order] = a - eigenvalues[:, np.newaxis, np.newaxis] * np.eye(order)
     pencils[:, :, order:] = b
     left, sizes, _ = np.linalg.svd(pencils, full_matrices=False)
-    return eigenvalues, sizes[:, -1], left[:, :, -1]
+    return eigenvalues, np.asarray(sizes[:, -1], dtype=float), left[:, :, -1]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -511,8 +513,8 @@ class Analysis:
         Whether the tip deflection can be steered. With one output the matrix
         [CB, CAB, ..., D] needs rank 1: the number of outputs, not of inputs.
     output_gain : float
-        Tip deflection over base travel, each the most that inputs of one energy reach within
-        a period of the slowest mode; 0 if not output controllable.
+        Tip deflection per base travel, the slope |w'(s)| of the needle at its tip: what a move
+        of the base does to the output before the bending answers.
 
     """
 
@@ -545,33 +547,12 @@ def analyze(system: LinearSystem) -> Analysis:
     )
     kept, _ = _staircase(a, b)
     steers = bool(np.linalg.norm(c @ kept) > RANK_TOLERANCE * np.linalg.norm(c))
-    gain = 0.0
-    if steers:
-        gramian = _gramian(a, b, 2.0 * np.pi)
-        gain = float(np.sqrt((c @ gramian @ c.T)[0, 0] / gramian[0, 0]))
     return Analysis(
-        state=state, observed=observed, output_controllable=steers, output_gain=gain
+        state=state,
+        observed=observed,
+        output_controllable=steers,
+        output_gain=abs(float(system.C[0, 0])),
     )
-
-
-def _gramian(a: FloatArray, b: FloatArray, duration: float) -> FloatArray:
-    """Integrate exp(A t) B B^T exp(A^T t) over a duration, by doubling."""
-    doublings = max(0, int(np.ceil(np.log2(4.0 * duration * np.linalg.norm(a)))))
-    step = duration / 2.0**doublings
-    # Power series of the integral and of exp(A t) over a step with |A| t <= 1/4: the first term
-    # that is left out is below 2^-15 / 16! of the sum.
-    flow, term = np.eye(a.shape[0]), np.eye(a.shape[0])
-    rate = step * b @ b.T
-    gramian = rate
-    for k in range(1, 15):
-        term = step / k * a @ term
-        flow = flow + term
-        rate = step / (k + 1) * (a @ rate + rate @ a.T)
-        gramian = gramian + rate
-    for _ in range(doublings):
-        gramian = gramian + flow @ gramian @ flow.T
-        flow = flow @ flow
-    return np.asarray(gramian)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -588,7 +569,7 @@ class ControllabilityMap:
     observed_rank, observed_margin : ndarray
         Observability: rank, and distance of what is seen from losing more.
     output_gain : ndarray
-        Tip deflection over base travel.
+        Tip deflection per base travel.
 
     """
 

@@ -23,7 +23,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from math import ceil, inf, isfinite, sqrt
+from math import inf, isfinite, sqrt
 import os
 from typing import Final
 
@@ -44,6 +44,7 @@ from needle_dynamics.kernels import (
     SUM_RESISTANCE,
     SUM_TIP,
     SUMS,
+    Tables,
 )
 from needle_dynamics.model import NeedleModel, ROUNDING
 from needle_dynamics.parameters import NeedleParameters
@@ -53,8 +54,8 @@ from numpy.typing import ArrayLike
 #: Default step [s]. The tip deflection of the source's open-loop run is then good to 2e-4.
 DEFAULT_STEP: Final = 1e-5
 
-#: Steps of one interval at which a tolerance is given up.
-_MOST_STEPS: Final = 1_000_000
+#: Step at which a tolerance is given up [s].
+_SHORTEST_STEP: Final = 1e-10
 
 
 def _constants(model: NeedleModel) -> Constants:
@@ -79,10 +80,17 @@ def _constants(model: NeedleModel) -> Constants:
         smoothing_speed=friction.smoothing_speed,
         swelling=tissue.swelling,
         swelling_time=tissue.swelling_time,
-        layer_start=np.array(tissue.starts),
-        layer_stiffness=np.array(tissue.stiffnesses),
-        layer_offset=tissue.offsets(model.modes),
+    )
+
+
+def _tables(model: NeedleModel) -> Tables:
+    return Tables(
+        series=model.modes.series,
+        terms=model.modes.terms,
         modes=model.modes.constants,
+        layer_start=np.array(model.tissue.starts),
+        layer_stiffness=np.array(model.tissue.stiffnesses),
+        layer_offset=model.tissue.offsets(model.modes),
     )
 
 
@@ -138,6 +146,9 @@ class Integrator:
     tolerance : float, optional
         If given, the step is halved until the end of each call to `advance` changes by less
         than this part of the energy and of the needle's length.
+    graded : bool
+        Let the step grow with the inserted length once that exceeds a tenth of the needle's: the
+        modes slow down as its square.
 
     Raises
     ------
@@ -154,6 +165,8 @@ class Integrator:
         state: ArrayLike,
         step: float = DEFAULT_STEP,
         tolerance: float | None = None,
+        *,
+        graded: bool = False,
     ) -> None:
         if not 0.0 < step < inf:
             raise ParameterError(f'step must be positive and finite, got {step!r} s')
@@ -162,12 +175,13 @@ class Integrator:
         self.model = NeedleModel(parameters)
         self.step = step
         self.tolerance = tolerance
+        self.graded = graded
         self.time = 0.0
         self._constants = _constants(self.model)
-        self._table = self.model.modes.series
+        self._tables = _tables(self.model)
         self._sums = np.zeros(SUMS)
         self._state = self.model.checked_state(state)
-        self._refinement = 1
+        self._refinement = 1.0
 
     @property
     def state(self) -> FloatArray:
@@ -191,7 +205,7 @@ class Integrator:
         Parameters
         ----------
         duration : float
-            Time to advance [s], taken in equal steps no longer than the step.
+            Time to advance [s], taken in steps no longer than the step.
         force : float
             Insertion force f_y [N], positive into the tissue.
         torque : float
@@ -244,30 +258,28 @@ class Integrator:
             if not isfinite(value):
                 raise ParameterError(f'{name} must be finite, got {value!r}')
         before = self._state.copy()
-        steps = _steps(duration, self.step) * self._refinement
 
-        def take(steps: int) -> None:
-            self._take(duration, (force, torque, speed), steps, moved=moved)
+        def take(longest: float) -> None:
+            self._take(duration, (force, torque, speed), longest, moved=moved)
 
         if self.tolerance is None:
-            take(steps)
+            take(self.step)
         else:
-            self._refine(take, steps, self.tolerance)
+            self._refine(take, min(duration, self.step / self._refinement), self.tolerance)
         self.time += duration
         return self._interval(before, duration, force, torque, moved=moved)
 
     def _take(
-        self, duration: float, inputs: tuple[float, float, float], steps: int, *, moved: bool
+        self, duration: float, inputs: tuple[float, float, float], longest: float, *, moved: bool
     ) -> None:
-        """Take equal steps under constant inputs: force, torque, and speed of a moved base."""
+        """Take steps under constant inputs: force, torque, and speed of a moved base."""
         self._sums[:] = 0.0
-        h = duration / steps
-        taken = advance(
-            self._constants, self._table, self._state, self.time,
-            *inputs, moved, h, steps, self._sums,
+        left = advance(
+            self._constants, self._tables, self._state, self.time,
+            *inputs, moved, longest, self.graded, duration, self._sums,
         )  # fmt: skip
-        if taken < steps:
-            self.time += taken * h
+        if left > 0.0:
+            self.time += duration - left
             p = self.model.parameters
             limit = (
                 f'minimum_depth = {p.minimum_depth:g} m while withdrawing'
@@ -276,22 +288,22 @@ class Integrator:
             )
             raise InsertedLengthError(f'inserted length {self.depth:.6g} m reached {limit}')
 
-    def _refine(self, take: Callable[[int], None], steps: int, tolerance: float) -> None:
+    def _refine(self, take: Callable[[float], None], longest: float, tolerance: float) -> None:
         """Halve the step until the end of the interval no longer depends on it."""
-        start, first = self._state.copy(), steps
-        take(steps)
+        start = self._state.copy()
+        take(longest)
         change = inf
-        while change > tolerance and steps < _MOST_STEPS:
+        while change > tolerance and longest > _SHORTEST_STEP:
             coarse = self._state.copy()
             self._state[:] = start
-            steps *= 2
-            take(steps)
+            longest *= 0.5
+            take(longest)
             # The finer run is kept; second order makes its error a third of the difference.
             change = self._distance(coarse, self._state) / 3.0
-        # The next interval begins with half the steps of this one, or a quarter where the error
-        # would allow it: a step twice as long has four times the error.
-        growth = steps / first / (4.0 if change < tolerance / 32.0 else 2.0)
-        self._refinement = max(1, round(self._refinement * growth))
+        # The next interval begins with the step before the last one, or one more before where
+        # the error allows it: a step twice as long has four times the error.
+        growth = 4.0 if change < tolerance / 32.0 else 2.0
+        self._refinement = max(1.0, self.step / (growth * longest))
 
     def _distance(self, one: FloatArray, two: FloatArray) -> float:
         """Return how far apart two states are: energy of the difference, and depth."""
@@ -338,12 +350,6 @@ class Integrator:
         )
 
 
-def _steps(duration: float, longest: float) -> int:
-    """Return how many equal steps a duration takes."""
-    # A duration of a whole number of steps is not rounded up.
-    return max(1, ceil(duration / longest * (1.0 - 1e-9)))
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Trajectory:
     """
@@ -361,6 +367,8 @@ class Trajectory:
         Force over each interval [N].
     step : float
         Longest step of the integrator [s].
+    graded : bool
+        As in `Integrator`.
 
     """
 
@@ -369,6 +377,7 @@ class Trajectory:
     states: FloatArray
     forces: FloatArray
     step: float
+    graded: bool = False
 
     @property
     def tip_deflection(self) -> FloatArray:
@@ -407,7 +416,7 @@ class Trajectory:
         rest = time - self.time[k]
         if rest <= 0.0:
             return np.array(self.states[k])
-        integrator = Integrator(self.parameters, self.states[k], self.step)
+        integrator = Integrator(self.parameters, self.states[k], self.step, graded=self.graded)
         integrator.time = float(self.time[k])
         integrator.advance(rest, self.forces[k])
         return integrator.state
@@ -422,6 +431,7 @@ def simulate(
     interval: float,
     step: float = DEFAULT_STEP,
     tolerance: float | None = None,
+    graded: bool = False,
 ) -> Trajectory:
     """
     Simulate the needle under a force that is constant over each interval.
@@ -442,6 +452,8 @@ def simulate(
         Longest step of the integrator [s].
     tolerance : float, optional
         As in `Integrator`.
+    graded : bool
+        As in `Integrator`.
 
     Returns
     -------
@@ -454,7 +466,7 @@ def simulate(
         If the needle leaves its range.
 
     """
-    integrator = Integrator(parameters, state, step, tolerance)
+    integrator = Integrator(parameters, state, step, tolerance, graded=graded)
     count = _count(duration, interval)
     time = np.arange(count + 1, dtype=np.float64) * interval
     forces = np.array([force(t) if callable(force) else force for t in time[:-1]])
@@ -463,7 +475,7 @@ def simulate(
     for i in range(count):
         integrator.advance(interval, forces[i])
         states[i + 1] = integrator.state
-    return Trajectory(parameters, time, states, forces, step)
+    return Trajectory(parameters, time, states, forces, step, graded)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -495,6 +507,7 @@ def simulate_batch(
     duration: float,
     interval: float,
     step: float = DEFAULT_STEP,
+    graded: bool = False,
     keep: bool = True,
     workers: int | None = None,
 ) -> Batch:
@@ -511,6 +524,8 @@ def simulate_batch(
         Insertion force [N], constant over each interval.
     duration, interval, step : float
         As in `simulate` [s].
+    graded : bool
+        As in `Integrator`.
     keep : bool
         Keep the states at all samples, or only at the end.
     workers : int, optional
@@ -547,20 +562,17 @@ def simulate_batch(
         raise ParameterError(f'step must be positive and finite, got {step!r} s')
     runs = sizes.pop() if sizes else 1
     models = [NeedleModel(p) for p in each]
-    tables = [(_constants(model), model.modes.series) for model in models]
+    tables = [(_constants(model), _tables(model)) for model in models]
     starts = np.array(
         [models[i % len(models)].checked_state(starts[i % len(starts)]) for i in range(runs)]
     )
     result = np.full((runs, count + 1 if keep else 1, starts.shape[1]), np.nan)
     completed = np.empty(runs)
-    torques = np.zeros(count)
 
     def one(i: int) -> None:
         constants, table = tables[i % len(tables)]
         push = np.ascontiguousarray(np.broadcast_to(pushes[i % len(pushes)], (count,)))
-        done = run(
-            constants, table, starts[i], push, torques, interval, _steps(interval, step), result[i]
-        )
+        done = run(constants, table, starts[i], push, interval, step, graded, result[i])
         completed[i] = done * interval
         if not keep:
             result[i, 0] = starts[i]

@@ -8,7 +8,7 @@ changes, but not when that of a function which it calls does.
 from __future__ import annotations
 
 from collections.abc import Callable
-from math import cos, exp, expm1, inf, log1p, sin, sqrt, tanh
+from math import ceil, cos, exp, expm1, inf, log1p, sin, sqrt, tanh
 from typing import cast, Final, NamedTuple, TypeAlias, TypeVar
 
 import numba
@@ -24,6 +24,12 @@ TANH: Final = 2
 
 #: Below this argument k_i s the series of a mode is used, above it the closed form.
 SERIES_END: Final = 2.0
+
+#: Resolution of `ModeShapes.terms` in the relative inserted length.
+TERMS_PER_LENGTH: Final = 32
+
+#: Relative inserted length from which on graded steps grow in proportion to it.
+GRADED_FROM: Final = 0.1
 
 # Slots of the running sums of `advance`.
 SUM_TIP: Final = 0
@@ -51,7 +57,7 @@ def compiled(function: _Function) -> _Function:
 
 
 class Constants(NamedTuple):
-    """What the compiled step needs of `NeedleParameters`, for n modes and m layers of tissue."""
+    """What the compiled step needs of `NeedleParameters`."""
 
     length: float
     linear_density: float
@@ -72,17 +78,26 @@ class Constants(NamedTuple):
     smoothing_speed: float
     swelling: float
     swelling_time: float
+
+
+class Tables(NamedTuple):
+    """The arrays that go with `Constants`; apart, since passing arrays on is not free."""
+
+    #: `ModeShapes.series`, `ModeShapes.terms` and `ModeShapes.constants`.
+    series: FloatArray
+    terms: FloatArray
+    modes: FloatArray
     #: Depths at which the layers begin, the first 0, and their stiffness; each shape (m,).
     layer_start: FloatArray
     layer_stiffness: FloatArray
     #: What the layers above add to k G, k int phi and k int y phi; shape (m, pairs + 2 n).
     layer_offset: FloatArray
-    #: `ModeShapes.constants`; shape (4, n).
-    modes: FloatArray
 
 
 @compiled
-def evaluate(xi: float, table: FloatArray, work: FloatArray, out: FloatArray) -> None:
+def evaluate(
+    xi: float, table: FloatArray, terms: FloatArray, work: FloatArray, out: FloatArray
+) -> None:
     """
     Evaluate the series of two modes at the relative inserted length.
 
@@ -92,6 +107,8 @@ def evaluate(xi: float, table: FloatArray, work: FloatArray, out: FloatArray) ->
         s / l.
     table : ndarray, shape (terms, 34)
         `ModeShapes.series`.
+    terms : ndarray
+        `ModeShapes.terms`: how many of them the depth needs.
     work : ndarray, shape (34,) or longer
         Scratch.
     out : ndarray, shape (14,)
@@ -101,7 +118,7 @@ def evaluate(xi: float, table: FloatArray, work: FloatArray, out: FloatArray) ->
     """
     square = xi * xi
     z = square * square
-    last = table.shape[0] - 1
+    last = int(terms[int(xi * TERMS_PER_LENGTH)]) - 1
     for j in range(34):
         work[j] = table[last, j]
     for m in range(last - 1, -1, -1):
@@ -233,13 +250,19 @@ def evaluate_many(
 
 @compiled
 def _integrals(
-    c: Constants, s: float, table: FloatArray, work: FloatArray, out: FloatArray
+    length: float,
+    s: float,
+    series: FloatArray,
+    terms: FloatArray,
+    modes: FloatArray,
+    work: FloatArray,
+    out: FloatArray,
 ) -> None:
     """Evaluate the modes and their integrals at an inserted length."""
-    if c.modes.shape[1] == 2:
-        evaluate(s / c.length, table, work, out)
+    if modes.shape[1] == 2:
+        evaluate(s / length, series, terms, work, out)
     else:
-        evaluate_many(s / c.length, c.length, c.modes, table, work, out)
+        evaluate_many(s / length, length, modes, series, work, out)
 
 
 @compiled
@@ -387,58 +410,42 @@ def _flow(c: Constants, u: float, drive: float, h: float) -> tuple[float, float]
 
 
 @compiled
-def _tissue(
-    c: Constants, at: FloatArray, s: float, time: float, layer: int, held: FloatArray
-) -> tuple[float, int]:
-    """
-    Write the modal stiffness and the tissue's reaction at a depth and time into ``held``.
-
-    ``held`` is E I_y H plus the integral of k phi phi^T (upper triangle by rows), then the
-    integrals of k phi and of k y phi. Returns the stiffness at the tip and its layer.
-    """
-    n = c.modes.shape[1]
-    pairs = n * (n + 1) // 2
-    while layer + 1 < c.layer_start.shape[0] and s >= c.layer_start[layer + 1]:
+def _layer(start: FloatArray, s: float, layer: int) -> int:
+    """Return the layer that holds a depth, looked for from the one given."""
+    while layer + 1 < start.shape[0] and s >= start[layer + 1]:
         layer += 1
-    while layer > 0 and s < c.layer_start[layer]:
+    while layer > 0 and s < start[layer]:
         layer -= 1
-    growth = 1.0
-    if c.swelling != 0.0:
-        growth = 1.0 - c.swelling * expm1(-time / c.swelling_time)
-    stiffness = growth * c.layer_stiffness[layer]
-    for i in range(pairs):
-        held[i] = (
-            c.bending_stiffness * at[pairs + i]
-            + stiffness * at[i]
-            + growth * c.layer_offset[layer, i]
-        )
-    for i in range(2 * n):
-        held[pairs + i] = (
-            stiffness * at[2 * pairs + 2 * n + i] + growth * c.layer_offset[layer, pairs + i]
-        )
-    return stiffness, layer
+    return layer
 
 
 @compiled
 def _rotate_two(
     c: Constants,
     at: FloatArray,
-    held: FloatArray,
+    offset: FloatArray,
+    layer: int,
     ka: float,
-    q: FloatArray,
-    z: FloatArray,
+    growth: float,
+    q1: float,
+    q2: float,
+    z1: float,
+    z2: float,
     h: float,
     decay: float,
     sums: FloatArray,
-) -> float:
+) -> tuple[float, float, float, float, float]:
     """
     Exact modal flow of two modes at frozen depth for a time h, between half steps of damping.
 
-    ``q`` and ``z`` (momenta, or rates in the formulation as printed) are changed in place; the
-    impulse of the modes on the insertion axis, against insertion, is returned [N s].
+    Returns the new q and z (momenta, or rates in the formulation as printed) and the impulse of
+    the modes on the insertion axis, against insertion [N s]. The tissue has the stiffness ``ka``
+    at the tip; ``offset`` of its layer, times ``growth``, is what the layers above add.
     """
     rho, ei = c.linear_density, c.bending_stiffness
-    q1, q2 = q[0], q[1]
+    k11 = ei * at[3] + ka * at[0] + growth * offset[layer, 0]
+    k12 = ei * at[4] + ka * at[1] + growth * offset[layer, 1]
+    k22 = ei * at[5] + ka * at[2] + growth * offset[layer, 2]
     # Cholesky factor of the modal mass rho A G = L L^T.
     l11 = sqrt(rho * at[0])
     l21 = rho * at[1] / l11
@@ -447,9 +454,9 @@ def _rotate_two(
     i22 = 1.0 / l22
     ratio = l21 * i11
     # Stiffness in the coordinates y = L^T q, where the mass is the identity.
-    b11 = held[0] * i11 * i11
-    b12 = (held[1] - ratio * held[0]) * i11 * i22
-    b22 = (held[2] - 2.0 * ratio * held[1] + ratio * ratio * held[0]) * i22 * i22
+    b11 = k11 * i11 * i11
+    b12 = (k12 - ratio * k11) * i11 * i22
+    b22 = (k22 - 2.0 * ratio * k12 + ratio * ratio * k11) * i22 * i22
     # One Jacobi rotation diagonalizes it.
     tau = (b22 - b11) / (2.0 * b12)
     tangent = (1.0 if tau >= 0.0 else -1.0) / (abs(tau) + sqrt(1.0 + tau * tau))
@@ -463,11 +470,11 @@ def _rotate_two(
     y1 = l11 * q1 + l21 * q2
     y2 = l22 * q2
     if c.as_printed:
-        v1 = l11 * z[0] + l21 * z[1]
-        v2 = l22 * z[1]
+        v1 = l11 * z1 + l21 * z2
+        v2 = l22 * z2
     else:
-        v1 = z[0] * i11
-        v2 = (z[1] - l21 * v1) * i22
+        v1 = z1 * i11
+        v2 = (z2 - l21 * v1) * i22
     a1 = cj * y1 - sj * y2
     a2 = sj * y1 + cj * y2
     b1 = cj * v1 - sj * v2
@@ -535,21 +542,27 @@ def _rotate_two(
     y2 = cj * e2 - sj * e1
     v1 = cj * f1 + sj * f2
     v2 = cj * f2 - sj * f1
-    q[1] = y2 * i22
-    q[0] = (y1 - l21 * q[1]) * i11
-    moved1 = c.tissue_damping * (q[0] - q1)
-    moved2 = c.tissue_damping * (q[1] - q2)
-    sums[SUM_REACTION] += held[3] * mean1 + held[4] * mean2 + at[10] * moved1 + at[11] * moved2
+    r2 = y2 * i22
+    r1 = (y1 - l21 * r2) * i11
+    moved1 = c.tissue_damping * (r1 - q1)
+    moved2 = c.tissue_damping * (r2 - q2)
+    # The tissue holds the needle by the integral of k w, and damps it by that of c_a w_dot.
+    sums[SUM_REACTION] += (
+        (ka * at[10] + growth * offset[layer, 3]) * mean1
+        + (ka * at[11] + growth * offset[layer, 4]) * mean2
+        + at[10] * moved1
+        + at[11] * moved2
+    )
     sums[SUM_REACTION_MOMENT] += (
-        held[5] * mean1 + held[6] * mean2 + at[12] * moved1 + at[13] * moved2
+        (ka * at[12] + growth * offset[layer, 5]) * mean1
+        + (ka * at[13] + growth * offset[layer, 6]) * mean2
+        + at[12] * moved1
+        + at[13] * moved2
     )
     if c.as_printed:
-        z[1] = v2 * i22
-        z[0] = (v1 - l21 * z[1]) * i11
-        return 0.0
-    z[0] = l11 * v1
-    z[1] = l21 * v1 + l22 * v2
-    return float(0.5 * (elastic - inertial))
+        z2 = v2 * i22
+        return r1, r2, (v1 - l21 * z2) * i11, z2, 0.0
+    return r1, r2, l11 * v1, l21 * v1 + l22 * v2, 0.5 * (elastic - inertial)
 
 
 @compiled
@@ -621,15 +634,17 @@ def _diagonalize(matrix: FloatArray, basis: FloatArray) -> None:
 def _rotate_many(  # noqa: C901
     c: Constants,
     at: FloatArray,
-    held: FloatArray,
+    offset: FloatArray,
+    layer: int,
     ka: float,
+    growth: float,
     q: FloatArray,
     z: FloatArray,
     h: float,
     decay: float,
     sums: FloatArray,
 ) -> float:
-    """Do what `_rotate_two` does for any number of modes."""
+    """Do what `_rotate_two` does for any number of modes, on ``q`` and ``z`` in place."""
     n = q.shape[0]
     pairs = n * (n + 1) // 2
     factor = np.zeros((n, n))
@@ -637,7 +652,9 @@ def _rotate_many(  # noqa: C901
     stiff = np.empty((n, n))
     for i in range(n):
         for j in range(i, n):
-            stiff[i, j] = held[i * n - i * (i - 1) // 2 + j - i]
+            pair = i * n - i * (i - 1) // 2 + j - i
+            tissue = ka * at[pair] + growth * offset[layer, pair]
+            stiff[i, j] = c.bending_stiffness * at[pairs + pair] + tissue
             stiff[j, i] = stiff[i, j]
     for i in range(n):
         _forward(factor, stiff[:, i])
@@ -693,20 +710,22 @@ def _rotate_many(  # noqa: C901
             shared = value[i] * value[j]
             bent = c.bending_stiffness * curvature[i] * curvature[j]
             impulse += 0.5 * ((bent + ka * shared) * aa - c.linear_density * shared * bb)
-    held_mean = np.zeros(n)
+    mean_q = np.zeros(n)
     for i in range(n):
         x[i] = v[i] = 0.0
         for j in range(n):
             x[i] += basis[i, j] * e[j]
             v[i] += basis[i, j] * f[j] * decay
-            held_mean[i] += basis[i, j] * mean[j]
+            mean_q[i] += basis[i, j] * mean[j]
     _backward(factor, x)
-    _backward(factor, held_mean)
+    _backward(factor, mean_q)
     for i in range(n):
         moved = c.tissue_damping * (x[i] - q[i])
-        force, moment = held[pairs + i], held[pairs + n + i]
-        sums[SUM_REACTION] += force * held_mean[i] + at[2 * pairs + 2 * n + i] * moved
-        sums[SUM_REACTION_MOMENT] += moment * held_mean[i] + at[2 * pairs + 3 * n + i] * moved
+        area, moment = at[2 * pairs + 2 * n + i], at[2 * pairs + 3 * n + i]
+        force = ka * area + growth * offset[layer, pairs + i]
+        torque = ka * moment + growth * offset[layer, pairs + n + i]
+        sums[SUM_REACTION] += force * mean_q[i] + area * moved
+        sums[SUM_REACTION_MOMENT] += torque * mean_q[i] + moment * moved
         q[i] = x[i]
     if c.as_printed:
         _backward(factor, v)
@@ -722,72 +741,95 @@ def _rotate_many(  # noqa: C901
 @compiled
 def advance(  # noqa: C901
     c: Constants,
-    table: FloatArray,
+    tables: Tables,
     state: FloatArray,
     time: float,
     force: float,
     torque: float,
     base_speed: float,
     moved: bool,
-    h: float,
-    steps: int,
+    longest: float,
+    graded: bool,
+    duration: float,
     sums: FloatArray,
-) -> int:
+) -> float:
     """
-    Take ``steps`` steps in place under constant inputs; return how many were taken.
+    Advance ``state`` in place under constant inputs; return the time that was left undone.
 
-    With ``moved`` the speed goes evenly to ``base_speed``, whatever force that takes.
-    Fewer steps than asked for means that the inserted length left its range.
+    Steps are no longer than ``longest`` [s]; with ``graded`` they grow with the inserted length
+    once it exceeds a tenth of the needle's, since the modes slow down. With ``moved`` the speed
+    goes evenly to ``base_speed``, whatever force that takes. Time is left undone when the
+    inserted length would leave its range.
     """
-    n = c.modes.shape[1]
+    series, terms, modes, layer_start, layer_stiffness, layer_offset = tables
+    n = modes.shape[1]
     pairs = n * (n + 1) // 2
-    work = np.empty(table.shape[1] + 4 * n)
+    work = np.empty(series.shape[1] + 4 * n)
     at = np.empty(2 * pairs + 4 * n)
-    held = np.empty(pairs + 2 * n)
     q, z = state[2 : 2 + n].copy(), state[4 + n :].copy()
-    q_before, z_before = np.empty(n), np.empty(n)
+    q_before, z_before = q.copy(), z.copy()
     s = c.length - state[0]
     u = -state[2 + n]
     if not c.as_printed:
         # From rates to momenta p = rho A G q_dot, in which dG/dt needs no term.
-        _integrals(c, s, table, work, at)
+        _integrals(c.length, s, series, terms, modes, work, at)
         for i in range(n):
             z[i] = 0.0
             for j in range(n):
                 low, high = min(i, j), max(i, j)
                 gram = at[low * n - low * (low - 1) // 2 + high - low]
                 z[i] += c.linear_density * gram * state[4 + n + j]
-    decay = exp(-0.5 * h * c.tissue_damping / c.linear_density)
-    change = (base_speed - u) / steps
+    q1, q2, z1, z2 = q[0], q[-1], z[0], z[-1]
+    gain = (base_speed - u) / duration
+    growth, decay, layer = 1.0, 1.0, 0
     sums[SUM_CONTACT] = -1.0
-    layer = 0
-    taken = 0
-    while taken < steps:
+    # A time of a whole number of steps is not rounded up.
+    count = ceil(duration / longest * (1.0 - 1e-9))
+    h = duration / count
+    left = duration
+    while left > 0.0:
+        if graded:
+            wanted = longest * max(1.0, s / (GRADED_FROM * c.length))
+            count = ceil(left / wanted * (1.0 - 1e-9))
+            h = left / count
+        count -= 1
+        rest = left - h if count > 0 else 0.0
         middle = s + 0.5 * h * u
         if c.hub_stop and middle > c.length:
             middle = c.length
         if not c.minimum_depth <= middle <= c.maximum_depth:
             break
-        _integrals(c, middle, table, work, at)
-        ka, layer = _tissue(c, at, middle, time + (taken + 0.5) * h, layer, held)
-        for i in range(n):
-            q_before[i], z_before[i] = q[i], z[i]
+        _integrals(c.length, middle, series, terms, modes, work, at)
+        if layer_start.shape[0] > 1:
+            layer = _layer(layer_start, middle, layer)
+        if c.swelling != 0.0:
+            now = time + duration - left + 0.5 * h
+            growth = 1.0 - c.swelling * expm1(-now / c.swelling_time)
+        if c.tissue_damping != 0.0:
+            decay = exp(-0.5 * h * c.tissue_damping / c.linear_density)
+        ka = growth * layer_stiffness[layer]
         if n == 2:
-            impulse = _rotate_two(c, at, held, ka, q, z, h, decay, sums)
+            r1, r2, y1, y2, impulse = _rotate_two(
+                c, at, layer_offset, layer, ka, growth, q1, q2, z1, z2, h, decay, sums
+            )
         else:
-            impulse = _rotate_many(c, at, held, ka, q, z, h, decay, sums)
+            q_before[:], z_before[:] = q, z
+            impulse = _rotate_many(c, at, layer_offset, layer, ka, growth, q, z, h, decay, sums)
         drive = force - impulse / h
         if moved:
             # Counted from the end, so that a base that shall rest does so exactly.
-            new_u = base_speed - (steps - taken - 1) * change
+            new_u = base_speed - rest * gain
             step = 0.5 * h * (u + new_u)
         else:
             new_u, step = _flow(c, u, drive, h)
         stopped = c.hub_stop and s + step >= c.length
         if s + step < c.minimum_depth or (s + step > c.maximum_depth and not stopped):
             # The last valid state is the one before this step.
-            q, z = q_before, z_before
+            if n != 2:
+                q[:], z[:] = q_before, z_before
             break
+        if n == 2:
+            q1, q2, z1, z2 = r1, r2, y1, y2
         if stopped:
             step = c.length - s
             if step > 0.0:
@@ -796,7 +838,7 @@ def advance(  # noqa: C901
                 for _ in range(60):
                     trial = 0.5 * (early + late)
                     if moved:
-                        gone = trial * (u + 0.5 * trial / h * (new_u - u))
+                        gone = trial * (u + 0.5 * trial * gain)
                     else:
                         _, gone = _flow(c, u, drive, trial)
                     if gone < step:
@@ -804,10 +846,10 @@ def advance(  # noqa: C901
                     else:
                         late = trial
                 if moved:
-                    new_u = u + late / h * (new_u - u)
+                    new_u = u + late * gain
                 else:
                     new_u, _ = _flow(c, u, drive, late)
-                sums[SUM_CONTACT] = time + taken * h + late
+                sums[SUM_CONTACT] = time + duration - left + late
                 sums[SUM_IMPACT] += 0.5 * c.moving_mass * new_u * new_u
             else:
                 new_u = 0.0
@@ -834,35 +876,37 @@ def advance(  # noqa: C901
         if stopped:
             s = c.length
             u = 0.0
-        taken += 1
+        left = rest
+    if n == 2:
+        q[0], q[1], z[0], z[1] = q1, q2, z1, z2
     if not c.as_printed:
-        _integrals(c, s, table, work, at)
+        _integrals(c.length, s, series, terms, modes, work, at)
         factor = np.zeros((n, n))
         _cholesky(c, at, factor)
         _forward(factor, z)
         _backward(factor, z)
-    duration = taken * h
+    done = duration - left
     turn = 2.0 * torque / c.rotary_inertia
-    turned = (state[3 + n] + 0.5 * turn * duration) * duration
+    turned = (state[3 + n] + 0.5 * turn * done) * done
     sums[SUM_INPUT_WORK] += torque * turned
     state[0] = c.length - s
     state[1] += turned
     state[2 : 2 + n] = q
     state[2 + n] = -u
-    state[3 + n] += turn * duration
+    state[3 + n] += turn * done
     state[4 + n :] = z
-    return taken
+    return left
 
 
 @compiled
 def run(
     c: Constants,
-    table: FloatArray,
+    tables: Tables,
     state: FloatArray,
     forces: FloatArray,
-    torques: FloatArray,
     interval: float,
-    steps: int,
+    longest: float,
+    graded: bool,
     states: FloatArray,
 ) -> int:
     """
@@ -875,11 +919,12 @@ def run(
     keep = states.shape[0] > 1
     if keep:
         states[0] = state
-    h = interval / steps
     for k in range(forces.shape[0]):
-        force, torque = forces[k], torques[k]
-        taken = advance(c, table, state, k * interval, force, torque, 0.0, False, h, steps, sums)
-        if taken < steps:
+        left = advance(
+            c, tables, state, k * interval, forces[k], 0.0, 0.0, False, longest, graded,
+            interval, sums,
+        )  # fmt: skip
+        if left > 0.0:
             return k
         if keep:
             states[k + 1] = state

@@ -21,6 +21,7 @@ from needle_dynamics.kernels import (
     evaluate_many,
     FloatArray,
     SERIES_END,
+    TERMS_PER_LENGTH,
 )
 import numpy as np
 from numpy.typing import ArrayLike
@@ -169,7 +170,7 @@ class ModeShapes:
         """
         # Products of two modes grow as (2 k y)^m / m!; beyond SERIES_END the series is not used.
         growth = 2.0 * self.reach * self.arguments[-1] if self.count == 2 else 2.0 * SERIES_END
-        terms = next(m for m in range(1, 99) if growth ** (4 * m) < _TRUNCATION * factorial(4 * m))
+        terms = _terms(growth)
         n, degree = self.count, 4 * terms
         phi = np.zeros((n, degree))
         curvature = np.zeros((n, degree))
@@ -214,6 +215,18 @@ class ModeShapes:
         table.setflags(write=False)
         return table
 
+    @cached_property
+    def terms(self) -> FloatArray:
+        """Terms of `series` that the relative inserted length needs, by its 32nds."""
+        steps = round(self.reach * TERMS_PER_LENGTH) + 1
+        needed = np.empty(steps)
+        for k in range(steps):
+            growth = 2.0 * self.arguments[-1] * (k + 1) / TERMS_PER_LENGTH
+            needed[k] = _terms(growth)
+        needed = np.minimum(needed, len(self.series))
+        needed.setflags(write=False)
+        return needed
+
     def condition(self, depth: float) -> float:
         """Return cond(G) at an inserted length [m]: how far the modes can be told apart."""
         return float(np.linalg.cond(self.integrals(depth).gram))
@@ -254,7 +267,7 @@ class ModeShapes:
         work = np.empty(self.series.shape[1] + 4 * n)
         xi = depth / self.length
         if n == 2:
-            evaluate(xi, self.series, work, out)
+            evaluate(xi, self.series, self.terms, work, out)
         else:
             evaluate_many(xi, self.length, self.constants, self.series, work, out)
         return out
@@ -344,3 +357,8 @@ def mode_shapes(length: float, count: int = 2, reach: float = 1.0) -> ModeShapes
 
     """
     return ModeShapes(length, count, reach)
+
+
+def _terms(growth: float) -> int:
+    """Return after how many powers of (y/l)^4 a series that grows as growth^m / m! has ended."""
+    return next(m for m in range(1, 99) if growth ** (4 * m) < _TRUNCATION * factorial(4 * m))
