@@ -402,11 +402,11 @@ def controllability(
     order = len(names)
     if a.shape != (order, order) or b.ndim != 2 or b.shape[0] != order:
         raise ShapeError(
-            f'A and B must have shapes ({order}, {order}) and ({order}, M) for {order} names, '
-            f'got {a.shape} and {b.shape}'
+            f'A and B, or the transposes of A and C, must have shapes ({order}, {order}) and '
+            f'({order}, M) for {order} names, got {a.shape} and {b.shape}'
         )
     if not (np.isfinite(a).all() and np.isfinite(b).all()):
-        raise ShapeError('A and B must be finite')
+        raise ShapeError('A and B, or A and C, must be finite')
     rows = np.eye(order) if transform is None else np.asarray(transform, dtype=float)
     kept, rest = _staircase(a, b)
     sizes = np.linalg.norm(rows, axis=1)
@@ -414,13 +414,13 @@ def controllability(
     # w^T z with w in the rest is what no input changes: its coefficients on the named states.
     shares = np.linalg.norm(np.linalg.solve(rows.T, rest), axis=1) * sizes
     involved = shares > RANK_TOLERANCE * shares.max(initial=0.0)
-    eigenvalues, distances, _ = _hautus(a, b)
-    weakest, margin = 'none', 0.0
-    if kept.size:
+    eigenvalues, distances, directions = _hautus(a, b)
+    inner = distances
+    if 0 < kept.shape[1] < order:
         _, inner, directions = _hautus(kept.T @ a @ kept, kept.T @ b)
-        least = int(np.argmin(inner))
-        leading = np.argmax(np.abs(kept @ directions[least]))
-        weakest, margin = (scaled_names or names)[leading], float(inner[least])
+        directions = directions @ kept.T
+    least = int(np.argmin(inner))
+    leading = (scaled_names or names)[np.argmax(np.abs(directions[least]))]
     return Structure(
         order=order,
         rank=kept.shape[1],
@@ -432,8 +432,8 @@ def controllability(
         ),
         eigenvalues=eigenvalues,
         distances=distances,
-        margin=margin,
-        weakest=weakest,
+        margin=float(inner[least]) if kept.size else 0.0,
+        weakest=leading if kept.size else 'none',
     )
 
 

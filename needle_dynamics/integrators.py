@@ -326,10 +326,11 @@ class Integrator:
         self, before: FloatArray, duration: float, force: float, torque: float, *, moved: bool
     ) -> Interval:
         p, after, sums = self.model.parameters, self._state, self._sums
-        m, now = self.model.coordinates, self.model.modes.integrals
-        start, end = now(p.length - before[0]), now(p.length - after[0])
-        momentum = end.area @ after[m + 2 :] - start.area @ before[m + 2 :]
-        angular = end.moment @ after[m + 2 :] - start.moment @ before[m + 2 :]
+        m, n = self.model.coordinates, self.model.modes.count
+        # Integrals of phi and of y phi are the last 2 n.
+        start = self.model.modes.packed(p.length - before[0])[-2 * n :].reshape(2, n)
+        end = self.model.modes.packed(p.length - after[0])[-2 * n :].reshape(2, n)
+        momentum, angular = end @ after[m + 2 :] - start @ before[m + 2 :]
         lateral = (p.linear_density * momentum + sums[SUM_REACTION]) / duration
         about_entry = (p.linear_density * angular + sums[SUM_REACTION_MOMENT]) / duration
         gain = (before[m] - after[m]) / duration

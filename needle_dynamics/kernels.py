@@ -421,7 +421,10 @@ def _layer(start: FloatArray, s: float, layer: int) -> int:
 
 @compiled
 def _rotate_two(
-    c: Constants,
+    rho: float,
+    ei: float,
+    damping: float,
+    as_printed: bool,
     at: FloatArray,
     offset: FloatArray,
     layer: int,
@@ -442,7 +445,6 @@ def _rotate_two(
     the modes on the insertion axis, against insertion [N s]. The tissue has the stiffness ``ka``
     at the tip; ``offset`` of its layer, times ``growth``, is what the layers above add.
     """
-    rho, ei = c.linear_density, c.bending_stiffness
     k11 = ei * at[3] + ka * at[0] + growth * offset[layer, 0]
     k12 = ei * at[4] + ka * at[1] + growth * offset[layer, 1]
     k22 = ei * at[5] + ka * at[2] + growth * offset[layer, 2]
@@ -469,7 +471,7 @@ def _rotate_two(
 
     y1 = l11 * q1 + l21 * q2
     y2 = l22 * q2
-    if c.as_printed:
+    if as_printed:
         v1 = l11 * z1 + l21 * z2
         v2 = l22 * z2
     else:
@@ -544,8 +546,8 @@ def _rotate_two(
     v2 = cj * f2 - sj * f1
     r2 = y2 * i22
     r1 = (y1 - l21 * r2) * i11
-    moved1 = c.tissue_damping * (r1 - q1)
-    moved2 = c.tissue_damping * (r2 - q2)
+    moved1 = damping * (r1 - q1)
+    moved2 = damping * (r2 - q2)
     # The tissue holds the needle by the integral of k w, and damps it by that of c_a w_dot.
     sums[SUM_REACTION] += (
         (ka * at[10] + growth * offset[layer, 3]) * mean1
@@ -559,7 +561,7 @@ def _rotate_two(
         + at[12] * moved1
         + at[13] * moved2
     )
-    if c.as_printed:
+    if as_printed:
         z2 = v2 * i22
         return r1, r2, (v1 - l21 * z2) * i11, z2, 0.0
     return r1, r2, l11 * v1, l21 * v1 + l22 * v2, 0.5 * (elastic - inertial)
@@ -768,6 +770,8 @@ def advance(  # noqa: C901
     at = np.empty(2 * pairs + 4 * n)
     q, z = state[2 : 2 + n].copy(), state[4 + n :].copy()
     q_before, z_before = q.copy(), z.copy()
+    rho, ei = c.linear_density, c.bending_stiffness
+    damping, printed = c.tissue_damping, c.as_printed
     s = c.length - state[0]
     u = -state[2 + n]
     if not c.as_printed:
@@ -782,6 +786,7 @@ def advance(  # noqa: C901
     q1, q2, z1, z2 = q[0], q[-1], z[0], z[-1]
     gain = (base_speed - u) / duration
     growth, decay, layer = 1.0, 1.0, 0
+    pull = 0.0
     sums[SUM_CONTACT] = -1.0
     # A time of a whole number of steps is not rounded up.
     count = ceil(duration / longest * (1.0 - 1e-9))
@@ -795,11 +800,17 @@ def advance(  # noqa: C901
         count -= 1
         rest = left - h if count > 0 else 0.0
         middle = s + 0.5 * h * u
+        if graded:
+            # Mean depth of the step if it speeds up as the last one did: a steadier phase.
+            middle += h * h * pull / 6.0
         if c.hub_stop and middle > c.length:
             middle = c.length
         if not c.minimum_depth <= middle <= c.maximum_depth:
             break
-        _integrals(c.length, middle, series, terms, modes, work, at)
+        if n == 2:
+            evaluate(middle / c.length, series, terms, work, at)
+        else:
+            evaluate_many(middle / c.length, c.length, modes, series, work, at)
         if layer_start.shape[0] > 1:
             layer = _layer(layer_start, middle, layer)
         if c.swelling != 0.0:
@@ -810,8 +821,9 @@ def advance(  # noqa: C901
         ka = growth * layer_stiffness[layer]
         if n == 2:
             r1, r2, y1, y2, impulse = _rotate_two(
-                c, at, layer_offset, layer, ka, growth, q1, q2, z1, z2, h, decay, sums
-            )
+                rho, ei, damping, printed,
+                at, layer_offset, layer, ka, growth, q1, q2, z1, z2, h, decay, sums,
+            )  # fmt: skip
         else:
             q_before[:], z_before[:] = q, z
             impulse = _rotate_many(c, at, layer_offset, layer, ka, growth, q, z, h, decay, sums)
@@ -820,6 +832,8 @@ def advance(  # noqa: C901
             # Counted from the end, so that a base that shall rest does so exactly.
             new_u = base_speed - rest * gain
             step = 0.5 * h * (u + new_u)
+        elif c.friction_law == COULOMB:
+            new_u, step = slide(u, drive, c.moving_mass, c.coulomb, c.viscous, h, c.withdrawal)
         else:
             new_u, step = _flow(c, u, drive, h)
         stopped = c.hub_stop and s + step >= c.length
@@ -872,6 +886,7 @@ def advance(  # noqa: C901
             sums[SUM_INPUT_WORK] += force * step
         sums[SUM_FRICTION_WORK] += lost
         s += step
+        pull = (new_u - u) / h
         u = new_u
         if stopped:
             s = c.length

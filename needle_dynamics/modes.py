@@ -217,7 +217,9 @@ class ModeShapes:
 
     @cached_property
     def terms(self) -> FloatArray:
-        """Terms of `series` that the relative inserted length needs, by its 32nds."""
+        """Terms of `series` that two modes need at a relative inserted length, by its 32nds."""
+        if self.count != 2:
+            return np.zeros(1)
         steps = round(self.reach * TERMS_PER_LENGTH) + 1
         needed = np.empty(steps)
         for k in range(steps):

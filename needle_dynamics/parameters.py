@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from difflib import get_close_matches
 from itertools import pairwise
-from math import inf, isfinite
+from math import ceil, inf, isfinite
 from typing import Any, Final
 
 from needle_dynamics.errors import ParameterError
@@ -226,7 +226,8 @@ class NeedleParameters:
             raise ParameterError(
                 f'{n} modes cannot be told apart at minimum_depth = {self.minimum_depth:g} m: '
                 f'cond(G) = {found:.1e} must be <= {LARGEST_CONDITION:.0e}; minimum_depth >= '
-                f'{shapes.least_depth(LARGEST_CONDITION):.2g} m or fewer modes would do'
+                f'{ceil(1e4 * shapes.least_depth(LARGEST_CONDITION)) / 1e4:g} m or fewer modes '
+                'would do'
             )
 
     @property

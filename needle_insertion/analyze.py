@@ -227,6 +227,10 @@ def _structure(found: Structure) -> dict[str, Any]:
 
 def _write_map(parameters: NeedleParameters, options: argparse.Namespace) -> list[Path]:
     """Write the map as a table and a picture."""
+    try:
+        options.output.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise _unwritable(options.output, error) from error
     length, largest = parameters.length, max(abs(value) for value in options.tip_deflection)
     rows = [
         controllability_map(
@@ -269,12 +273,15 @@ def _write(folder: Path, name: str, content: bytes) -> Path:
     path = folder / name
     draft = path.with_name(f'{name}.{os.getpid()}.tmp')
     try:
-        folder.mkdir(parents=True, exist_ok=True)
         draft.write_bytes(content)
         draft.replace(path)
     except OSError as error:
-        raise ParameterError(f'{path} cannot be written: {error.strerror}') from error
+        raise _unwritable(path, error) from error
     return path
+
+
+def _unwritable(path: Path, error: OSError) -> ParameterError:
+    return ParameterError(f'{path} cannot be written: {error.strerror}')
 
 
 def _figure(parameters: NeedleParameters, found: ControllabilityMap, speed: float) -> Figure:
@@ -296,7 +303,7 @@ def _figure(parameters: NeedleParameters, found: ControllabilityMap, speed: floa
         axes.title.set_fontsize('medium')
     figure.axes[0].set_ylabel('tip deflection [mm]')
     figure.suptitle(
-        f'{parameters.formulation}, {parameters.modes} modes, {1e3 * speed:g} mm/s, no dimension; '
+        f'{parameters.formulation}, {parameters.modes} modes, {1e3 * speed:g} mm/s, dimensionless; '
         'gray: straight needle, no input moves the bending'
     )
     return figure
