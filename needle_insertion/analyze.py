@@ -31,6 +31,7 @@ from needle_dynamics.analysis import (
     SLIDING,
     Structure,
 )
+from needle_insertion.options import constants
 from needle_insertion.report import table
 import numpy as np
 from tqdm import tqdm
@@ -94,7 +95,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='also map depth and deflection, up to the largest deflection given',
     )
     parser.add_argument('-o', '--output', type=Path, metavar='DIR', help='folder for the map')
-    parser.set_defaults(command=run, input_errors=True)
+    parser.set_defaults(command=run)
 
 
 def run(options: argparse.Namespace) -> int:
@@ -124,7 +125,7 @@ def run(options: argparse.Namespace) -> int:
         **{
             'formulation': options.formulation,
             'modes': options.modes,
-            **dict(_constant(text) for text in options.set),
+            **constants(options.set),
         },
     )
     model = NeedleModel(parameters)
@@ -154,17 +155,6 @@ def run(options: argparse.Namespace) -> int:
         for path in files:
             sys.stdout.write(f'wrote {path}\n')
     return 0
-
-
-def _constant(text: str) -> tuple[str, Any]:
-    """Read NAME=VALUE; a value is JSON, or else a word."""
-    name, sign, value = text.partition('=')
-    if not sign:
-        raise ParameterError(f'--set takes NAME=VALUE, got {text!r}')
-    try:
-        return name, json.loads(value)
-    except json.JSONDecodeError:
-        return name, value
 
 
 def _as_table(points: list[tuple[float, ...]], results: list[Analysis]) -> str:
@@ -303,7 +293,7 @@ def _figure(parameters: NeedleParameters, found: ControllabilityMap, speed: floa
         axes.title.set_fontsize('medium')
     figure.axes[0].set_ylabel('tip deflection [mm]')
     figure.suptitle(
-        f'{parameters.formulation}, {parameters.modes} modes, {1e3 * speed:g} mm/s, dimensionless; '
-        'gray: straight needle, no input moves the bending'
+        f'{parameters.formulation}, {parameters.modes} modes, {1e3 * speed:g} mm/s; '
+        'dimensionless; gray: straight needle, no input moves the bending'
     )
     return figure

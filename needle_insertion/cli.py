@@ -23,7 +23,7 @@ from needle_identification import (
     summarize,
     write_result,
 )
-from needle_insertion import simulate
+from needle_insertion import analyze, simulate
 from needle_insertion.report import table
 from tqdm import tqdm
 
@@ -129,6 +129,8 @@ def _parser() -> argparse.ArgumentParser:
     open_loop = commands.add_parser('simulate', help='the open-loop needle, without ROS')
     simulate.add_arguments(open_loop)
     open_loop.set_defaults(command=simulate.run)
+
+    analyze.add_arguments(commands.add_parser('analyze', help='controllability and observability'))
 
     bench = commands.add_parser('bench', help='measure speed as ratios, side by side')
     bench.add_argument('what', choices=('dynamics',))

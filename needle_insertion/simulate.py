@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import argparse
 import csv
-from dataclasses import fields
 import json
 from pathlib import Path
 import sys
-from typing import Any
 
 from matplotlib.figure import Figure
 from needle_dynamics import (
@@ -20,9 +18,9 @@ from needle_dynamics import (
     Trajectory,
 )
 from needle_identification import BagWriter, encode, message_type
+from needle_insertion.options import constants
 from needle_insertion.report import table
 import numpy as np
-import yaml
 
 _NANOSECONDS = 1_000_000_000
 
@@ -54,51 +52,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--json', action='store_true', help='print JSON instead of a table')
 
 
-def parameters_from(preset: str, changes: list[str]) -> NeedleParameters:
-    """
-    Return a preset with changes given as words.
-
-    Parameters
-    ----------
-    preset : str
-        Name of the preset.
-    changes : list of str
-        ``name=value`` each; the value is YAML.
-
-    Returns
-    -------
-    NeedleParameters
-        The constants.
-
-    Raises
-    ------
-    ParameterError
-        If a word is not of that form, or a name or value is not valid.
-
-    """
-    values: dict[str, Any] = {}
-    for change in changes:
-        name, equals, text = change.partition('=')
-        if not equals:
-            raise ParameterError(f'--set takes NAME=VALUE, got {change!r}')
-        value = yaml.safe_load(text)
-        kinds = {item.name: item for item in fields(NeedleParameters)}
-        if isinstance(value, str) and name in kinds and 'unit' in kinds[name].metadata:
-            # YAML takes 1e-3 for a word.
-            try:
-                value = float(value)
-            except ValueError:
-                raise ParameterError(f'{name} must be a number, got {text!r}') from None
-        values[name] = value
-    return NeedleParameters.preset(preset, **values)
-
-
 def run(options: argparse.Namespace) -> int:
     """Simulate, write what was asked for, and print a summary; return the exit status."""
     for path in options.output:
         if path.suffix not in ('', '.csv', '.png'):
             raise ParameterError(f'{path}: output must be .csv, .png or a folder for a bag')
-    parameters = parameters_from(options.preset, options.set)
+    parameters = NeedleParameters.preset(options.preset, **constants(options.set))
     model = NeedleModel(parameters)
     trajectory = simulate(
         parameters,

@@ -274,7 +274,7 @@ def test_work_of_swelling_closes_the_energy_balance(swelling: float) -> None:
             ]
             work += 0.25 * change * sum(held)
         gained = model.energy(it.state, 8e-3) - model.energy(start, 0.0)
-        assert abs(work) > 0.1 * model.energy(start, 0.0)
+        assert abs(work) > 0.05 * model.energy(start, 0.0)
         gaps.append(abs(gained - work) / abs(work))
     # Measured: slopes 2.00, last gap 1e-7.
     assert_allclose(np.log2(np.array(gaps[:-1]) / gaps[1:]), 2.0, atol=0.1)
@@ -386,15 +386,21 @@ def test_break_away_threshold_is_exact(
 
 
 def test_stribeck_jumps_once_it_has_broken_away() -> None:
-    """Just above break-away the needle speeds up to where friction has fallen, not by an inch."""
-    p = preset('paper_mm', friction_law='stribeck', breakaway_friction=2.0, stribeck_speed=1e-4)
+    """Just above break-away the needle speeds up to where friction has fallen."""
+    p = preset(
+        'paper_si',
+        viscous_friction=30.0,
+        friction_law='stribeck',
+        breakaway_friction=2.0,
+        stribeck_speed=1e-4,
+    )
     it = Integrator(p, NeedleModel(p).state_at(0.1))
-    push = 2.0 * 0.56 * (1.0 + 1e-6)
+    push = 2.0 * 0.56 * (1.0 + 1e-4)
     it.advance(0.02, push)
-    assert_allclose(it.speed, (push - 0.56) / 300.0, rtol=1e-6)
+    assert_allclose(it.speed, (push - 0.56) / 30.0, rtol=1e-9)
     # It goes on under a push that could not have moved it, and rests below mu_s.
     it.advance(0.02, 0.9)
-    assert_allclose(it.speed, (0.9 - 0.56) / 300.0, rtol=1e-6)
+    assert_allclose(it.speed, (0.9 - 0.56) / 30.0, rtol=1e-9)
     it.advance(0.02, 0.5)
     assert it.speed == 0.0
     it.advance(0.02, 0.9)
@@ -539,11 +545,11 @@ def test_smooth_friction_ends_between_its_start_and_its_steady_speed(
         balance = factor * (coulomb * np.tanh(middle / 1e-4) + viscous * middle)
         low, high = (low, middle) if balance > abs(drive) else (middle, high)
     steady = np.copysign(high, drive)
-    # A quarter of the way is what an implicit stage may overshoot by where friction turns.
-    slack = 0.25 * abs(steady - u) + 1e-12
+    # Rounding of the implicit stages.
+    slack = 1e-9 * (abs(u) + abs(steady)) + 1e-12
     assert min(u, steady) - slack <= new <= max(u, steady) + slack
     h = 10.0**exponent
-    assert min(u, steady) * h - slack * h <= gone <= max(u, steady) * h + slack * h
+    assert (min(u, steady) - slack) * h <= gone <= (max(u, steady) + slack) * h
 
 
 @pytest.mark.parametrize(
