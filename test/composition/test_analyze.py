@@ -21,7 +21,6 @@ def run(*words: str) -> int:
     parser = argparse.ArgumentParser()
     add_arguments(parser)
     options = parser.parse_args(words)
-    assert options.input_errors
     return int(options.command(options))
 
 
