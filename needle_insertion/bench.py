@@ -6,7 +6,7 @@ from collections.abc import Callable
 import sys
 import time
 
-from needle_insertion import bench_rods, bench_solvers, bench_step
+from needle_insertion import bench_batches, bench_rods, bench_solvers, bench_step
 from needle_insertion.bench_measure import Bar, environment
 from needle_insertion.report import table
 from tqdm import tqdm
@@ -16,6 +16,7 @@ QUESTIONS: tuple[Callable[[Callable[[str], None]], tuple[str, list[Bar]]], ...] 
     bench_step.compare,
     bench_solvers.compare,
     bench_rods.compare,
+    bench_batches.compare,
 )
 
 

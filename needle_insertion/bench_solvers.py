@@ -1,9 +1,10 @@
 """
 The source's open-loop run: our integrator beside SciPy's solvers, at equal error.
 
-Every candidate is judged at its own steps, so that no interpolation counts against it, and is
-timed for the bare solution without output in between. Each takes the loosest setting on a fine
-grid that meets the error.
+Every candidate is timed for the bare solution without output in between. SciPy's are judged at
+their own steps, so that no interpolation counts against them; ours, which does not show its
+steps, by a run in one call to each time of a grid, as the run that is timed is one call to the
+last. Each takes the loosest setting on a fine grid that meets the error.
 """
 
 from __future__ import annotations
@@ -12,10 +13,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, cast, Final, TypeVar
+from unittest import mock
 import warnings
 
-from needle_dynamics import FloatArray, Integrator, NeedleModel, NeedleParameters, simulate
-from needle_dynamics.kernels import evaluate, INTEGRALS
+from needle_dynamics import FloatArray, Integrator, NeedleModel, NeedleParameters
+from needle_dynamics.kernels import advance, evaluate, TERMS_PER_LENGTH
 from needle_insertion.bench_measure import Bar, geometric, least_times, seconds
 from needle_insertion.report import table
 import numba
@@ -32,7 +34,10 @@ METHODS: Final = ('RK45', 'DOP853', 'Radau', 'BDF', 'LSODA')
 
 #: Grids of settings, from loose to tight: ratio of neighbors.
 _TOLERANCE_RATIO: Final = 10.0**-0.125
-_STEPS_RATIO: Final = 2.0**0.125
+_STEP_RATIO: Final = 2.0**-0.0625
+
+#: Times at which ours is judged [s]: several in a period of the fastest mode.
+_GRID: Final = 1e-5
 
 #: Absolute tolerance over relative, where it is not in proportion to the peak of each number.
 _ABSOLUTE: Final = 1e-4
@@ -55,13 +60,20 @@ def _derivative(
     force: float,
     constants: tuple[float, float, float, float, float, float, float, float],
     series: FloatArray,
+    terms: FloatArray,
     work: FloatArray,
     at: FloatArray,
     out: FloatArray,
 ) -> None:
     """Write the time derivative of the state into ``out``, without torque."""
     length, rho, ei, ka, ca, mass, coulomb, viscous = constants
-    evaluate((length - x[0]) / length, series, work, at)
+    xi, reach = (length - x[0]) / length, (terms.shape[0] - 1) / TERMS_PER_LENGTH
+    # A trial of a solver may be anywhere, and no number at all.
+    if not xi >= 0.0:
+        xi = 0.0
+    elif xi > reach:
+        xi = reach
+    evaluate(xi, series, terms, work, at)
     q1, q2, r1, r2 = x[2], x[3], x[6], x[7]
     speed = -x[4]
     value = at[6] * q1 + at[7] * q2
@@ -119,12 +131,12 @@ def compiled_right_hand_side(model: NeedleModel, force: float) -> RightHandSide:
         p.coulomb_friction,
         p.viscous_friction,
     )
-    series = model.modes.series
-    work, at = np.empty(series.shape[1]), np.empty(INTEGRALS)
+    series, terms = model.modes.series, model.modes.terms
+    work, at = np.empty(series.shape[1]), np.empty(14)
 
     def right_hand_side(_time: float, x: FloatArray) -> FloatArray:
         out = np.empty(8)
-        _derivative(x, force, constants, series, work, at, out)
+        _derivative(x, force, constants, series, terms, work, at, out)
         return out
 
     return right_hand_side
@@ -286,26 +298,45 @@ class OpenLoop:
             atol=absolute,
         )
 
-    def integrate(self, step: float, _unused: RightHandSide) -> None:
-        """Run our integrator, which has its own equations."""
-        Integrator(self.parameters, self.start, step).advance(DURATION, FORCE)
+    def integrate(self, step: float, duration: float, *, graded: bool) -> FloatArray:
+        """Run our integrator from the start in one call; the state at the end."""
+        integrator = Integrator(self.parameters, self.start, step, graded=graded)
+        integrator.advance(duration, FORCE)
+        return integrator.state
 
-    def ours(self) -> Candidate:
+    def own_error(self, step: float, *, graded: bool) -> float:
+        """Return the error of our integrator at a step, over runs to each time of the grid."""
+        count = round(DURATION / _GRID)
+        time = np.linspace(0.0, DURATION, count + 1)[1:]
+        states = [self.integrate(step, end, graded=graded) for end in time]
+        return self.error(time, np.array(states).T)
+
+    def steps(self, step: float, *, graded: bool) -> int:
+        """Count the steps of our integrator, one evaluation of the modes each."""
+        source = cast(Any, advance).py_func
+        with (
+            mock.patch('needle_dynamics.integrators.advance', source),
+            mock.patch('needle_dynamics.kernels.evaluate', wraps=evaluate) as call,
+        ):
+            self.integrate(step, DURATION, graded=graded)
+        return call.call_count
+
+    def ours(self, *, graded: bool) -> Candidate:
         """Return our integrator at its longest step that meets the error."""
-        for number in geometric(500.0, 20000.0, _STEPS_RATIO):
-            steps = round(number)
-            step = DURATION / steps
-            run = simulate(
-                self.parameters, self.start, FORCE, duration=DURATION, interval=step, step=step
-            )
-            error = self.error(run.time, run.states.T)
+
+        def run(_unused: RightHandSide) -> None:
+            # It has its own equations.
+            self.integrate(step, DURATION, graded=graded)
+
+        for step in geometric(3e-5, 1e-6, _STEP_RATIO):
+            error = self.own_error(step, graded=graded)
             if error <= ACCURACY:
                 return Candidate(
-                    'Integrator',
-                    f'step {step:.3g} s',
+                    f'Integrator, {"graded" if graded else "uniform"}',
+                    f'step {step:.3g} s{", growing with depth" if graded else ""}',
                     error,
-                    steps,
-                    partial(self.integrate, step),
+                    self.steps(step, graded=graded),
+                    run,
                 )
         raise RuntimeError('the integrator does not reach the accuracy')
 
@@ -349,7 +380,7 @@ def compare(tick: Callable[[str], None]) -> tuple[str, list[Bar]]:
     """
     tick('reference')
     case = OpenLoop()
-    ours = case.ours()
+    ours, uniform = case.ours(graded=True), case.ours(graded=False)
     candidates = []
     for method in METHODS:
         tick(f'tolerance of {method}')
@@ -359,7 +390,10 @@ def compare(tick: Callable[[str], None]) -> tuple[str, list[Bar]]:
 
     tick('compiled right-hand side')
     compiled_times = least_times(
-        {item.name: partial(item.run, case.right_hand_side) for item in (ours, *candidates)},
+        {
+            item.name: partial(item.run, case.right_hand_side)
+            for item in (ours, uniform, *candidates)
+        },
         15,
     )
     tick('right-hand side of a user')
@@ -384,7 +418,7 @@ def compare(tick: Callable[[str], None]) -> tuple[str, list[Bar]]:
             f'{spent / own:.3g} x',
         )
 
-    rows = [row(ours, own, 'own steps')]
+    rows = [row(ours, own, 'own'), row(uniform, compiled_times[uniform.name], 'own')]
     rows += [row(item, compiled_times[item.name], 'compiled') for item in candidates]
     rows += [row(item, user_times[item.name], 'NumPy, Gauss') for item in candidates]
     rows.append(row(first, adaptive_time, 'NumPy, quad'))
@@ -393,7 +427,7 @@ def compare(tick: Callable[[str], None]) -> tuple[str, list[Bar]]:
         'right-hand side',
         'setting',
         'error / peak',
-        'calls',
+        'calls or steps',
         'wall [ms]',
         'wall / simulated',
         'against ours',

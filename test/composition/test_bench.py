@@ -6,7 +6,14 @@ from math import log1p, sin, sqrt
 from pathlib import Path
 
 from needle_dynamics import NeedleModel, NeedleParameters
-from needle_insertion import bench, bench_measure, bench_rods, bench_solvers, bench_step
+from needle_insertion import (
+    bench,
+    bench_batches,
+    bench_measure,
+    bench_rods,
+    bench_solvers,
+    bench_step,
+)
 from needle_insertion.bench_measure import Bar
 import numba
 import numpy as np
@@ -69,10 +76,32 @@ def test_the_error_of_a_run_is_that_of_its_tip(open_loop):
     assert open_loop.error(run.t[:-1], run.y[:, :-1]) == np.inf
 
 
+def test_a_trial_outside_the_range_is_survived(open_loop):
+    beyond = open_loop.start.copy()
+    for remaining in (-1.0, 0.3, np.nan):
+        beyond[0] = remaining
+        assert open_loop.right_hand_side(0.0, beyond).shape == (8,)
+
+
 def test_our_integrator_meets_the_error_it_is_timed_at(open_loop):
-    ours = open_loop.ours()
+    ours = open_loop.ours(graded=True)
     assert ours.error <= bench_solvers.ACCURACY
-    assert ours.evaluations > 0
+    assert 0 < ours.evaluations < open_loop.steps(2e-5, graded=False)
+
+
+def test_steps_are_counted(open_loop):
+    assert open_loop.steps(bench_solvers.DURATION / 300, graded=False) == 300
+
+
+def test_batches_do_not_depend_on_the_threads_and_keep_only_what_is_asked_for():
+    batches = bench_batches.Batches(40)
+    ends = [batches.run(workers).states for workers in (1, 2)]
+    assert np.array_equal(*ends)
+    # Each insertion has a friction of its own.
+    assert len(np.unique(ends[0], axis=0)) == 40
+    short, long = (batches.peak_memory(part, keep=False) for part in (0.1, 1.0))
+    kept = batches.peak_memory(1.0, keep=True)
+    assert long < 1.5 * short < kept
 
 
 def test_exact_frequency_solves_the_equation_of_the_beam():
@@ -132,6 +161,10 @@ def _arithmetic(x, values, n):
         total += values[i] * x
     if total > 0.0:
         values[0] = -abs(sqrt(evaluate(x)) / x)
+    scratch = np.empty(2)
+    scratch[:] = x
+    rest = scratch[1:].copy()
+    rest[0] *= x
     return _helper(sin(total)) - 2.0 * x
 
 
@@ -140,7 +173,7 @@ def test_operations_are_counted_as_they_are_done():
     counts = bench_step.count_operations(_arithmetic, (2.0, values, 3))
     assert dict(counts) == {
         'add': 4,
-        'multiply': 5,
+        'multiply': 6,
         'series multiply': 1,
         'series add': 1,
         'square root': 1,
@@ -152,7 +185,7 @@ def test_operations_are_counted_as_they_are_done():
 
 
 def test_operations_are_grouped_as_they_are_timed():
-    counts = bench_step.operations_of_a_step()
+    counts = bench_step.operations_of_a_step(20)
     groups = bench_step.grouped(counts)
     # Two modes turn: a sine and a cosine each; the axis glides: one exponential.
     assert groups['sine and cosine'] == 2
