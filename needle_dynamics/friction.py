@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from math import exp, tanh
 from typing import Final
 
+from needle_dynamics.errors import ParameterError
 import numpy as np
 
 #: Laws by name, in the order of their numbers in `needle_dynamics.kernels`.
@@ -42,6 +43,12 @@ class Friction:
     breakaway: float = 1.0
     stribeck_speed: float = 1e-3
     smoothing_speed: float = 1e-4
+
+    def __post_init__(self) -> None:
+        if self.law not in FRICTION_LAWS:
+            raise ParameterError(
+                f'law must be one of {", ".join(FRICTION_LAWS)}, got {self.law!r}'
+            )
 
     def force(self, speed: float, drive: float) -> float:
         """

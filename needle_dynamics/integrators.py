@@ -368,6 +368,8 @@ class Trajectory:
         Force over each interval [N].
     step : float
         Longest step of the integrator [s].
+    tolerance : float or None
+        As in `Integrator`.
     graded : bool
         As in `Integrator`.
 
@@ -378,6 +380,7 @@ class Trajectory:
     states: FloatArray
     forces: FloatArray
     step: float
+    tolerance: float | None = None
     graded: bool = False
 
     @property
@@ -417,7 +420,9 @@ class Trajectory:
         rest = time - self.time[k]
         if rest <= 0.0:
             return np.array(self.states[k])
-        integrator = Integrator(self.parameters, self.states[k], self.step, graded=self.graded)
+        integrator = Integrator(
+            self.parameters, self.states[k], self.step, self.tolerance, graded=self.graded
+        )
         integrator.time = float(self.time[k])
         integrator.advance(rest, self.forces[k])
         return integrator.state
@@ -474,9 +479,11 @@ def simulate(
     states = np.empty((count + 1, integrator.state.size))
     states[0] = integrator.state
     for i in range(count):
+        # Not the sum of the intervals, whose rounding would grow.
+        integrator.time = float(time[i])
         integrator.advance(interval, forces[i])
         states[i + 1] = integrator.state
-    return Trajectory(parameters, time, states, forces, step, graded)
+    return Trajectory(parameters, time, states, forces, step, tolerance, graded)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -551,7 +558,8 @@ def simulate_batch(
     if pushes.ndim < 2:
         pushes = pushes.reshape(-1, 1)
     count, sizes = _count(duration, interval), {len(each), len(starts), len(pushes)} - {1}
-    if len(sizes) > 1 or pushes.shape[1] not in (1, count):
+    shaped = starts.ndim == pushes.ndim == 2 and pushes.shape[1] in (1, count)
+    if len(sizes) > 1 or 0 in sizes or not shaped:
         raise ShapeError(
             f'parameters, states and forces must be for one number of runs and forces constant or '
             f'for {count} intervals, got {len(each)} parameters, states {starts.shape}, '
@@ -561,6 +569,8 @@ def simulate_batch(
         raise ParameterError('forces must be finite')
     if not 0.0 < step < inf:
         raise ParameterError(f'step must be positive and finite, got {step!r} s')
+    if workers is not None and workers < 1:
+        raise ParameterError(f'workers must be >= 1, got {workers!r}')
     runs = sizes.pop() if sizes else 1
     models = [NeedleModel(p) for p in each]
     tables = [(_constants(model), _tables(model)) for model in models]
@@ -575,7 +585,7 @@ def simulate_batch(
         push = np.ascontiguousarray(np.broadcast_to(pushes[i % len(pushes)], (count,)))
         done = run(constants, table, starts[i], push, interval, step, graded, result[i])
         completed[i] = done * interval
-        if not keep:
+        if not keep and done == count:
             result[i, 0] = starts[i]
 
     def share_of_runs(share: range) -> None:
@@ -598,4 +608,10 @@ def _count(duration: float, interval: float) -> int:
             f'interval and duration must be positive and finite with interval <= duration, got '
             f'interval = {interval!r} s, duration = {duration!r} s'
         )
-    return round(duration / interval)
+    count = round(duration / interval)
+    # Rounding of the quotient.
+    if abs(count * interval - duration) > 1e-9 * duration:
+        raise ParameterError(
+            f'duration must be a whole number of intervals, got {duration!r} s and {interval!r} s'
+        )
+    return count

@@ -366,7 +366,7 @@ def _dry(c: Constants, u: float) -> float:
 
 @compiled
 def _creep(c: Constants, u: float, drive: float, h: float) -> float:
-    """Solve M (w - u) = h (drive - friction(w)) for w under the smooth law: one implicit stage."""
+    """Solve M (w - u) = h (drive - friction(w)) for w under the smooth law."""
     # The residual grows with w: Newton, kept inside a bracket that always holds the root.
     inertia = c.moving_mass / h
     reach = (abs(drive) + c.coulomb * max(1.0, c.withdrawal)) / inertia + abs(u)
@@ -402,11 +402,9 @@ def _flow(c: Constants, u: float, drive: float, h: float) -> tuple[float, float]
         half, _ = slide(u, drive, mass, level, c.viscous, 0.5 * h, c.withdrawal, bearable / level)
         level = _dry(c, abs(half))
         return slide(u, drive, mass, level, c.viscous, h, c.withdrawal, bearable / level)
-    # Two implicit stages of second order, L-stable (R. Alexander, SIAM J. Numer. Anal. 14, 1977).
-    part = 1.0 - sqrt(0.5)
-    first = _creep(c, u, drive, part * h)
-    second = _creep(c, u + (1.0 - part) / part * (first - u), drive, part * h)
-    return second, h * ((1.0 - part) * first + part * second)
+    # Implicit Euler: of first order, but it never overshoots, however steep the law is.
+    end = _creep(c, u, drive, h)
+    return end, h * end
 
 
 @compiled
@@ -865,6 +863,11 @@ def advance(  # noqa: C901
                     new_u, _ = _flow(c, u, drive, late)
                 sums[SUM_CONTACT] = time + duration - left + late
                 sums[SUM_IMPACT] += 0.5 * c.moving_mass * new_u * new_u
+            elif u > 0.0:
+                # It started on the hub: all its speed is lost at once.
+                new_u = u
+                sums[SUM_CONTACT] = time + duration - left
+                sums[SUM_IMPACT] += 0.5 * c.moving_mass * u * u
             else:
                 new_u = 0.0
         gained = 0.5 * c.moving_mass * (new_u * new_u - u * u)

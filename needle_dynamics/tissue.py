@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from math import expm1
 
+from needle_dynamics.errors import ParameterError
 from needle_dynamics.kernels import FloatArray
 from needle_dynamics.modes import ModeShapes
 import numpy as np
@@ -37,6 +39,14 @@ class Tissue:
     damping: float = 0.0
     swelling: float = 0.0
     swelling_time: float = 1.0
+
+    def __post_init__(self) -> None:
+        ordered = all(low < high for low, high in pairwise(self.starts))
+        if len(self.starts) != len(self.stiffnesses) or self.starts[:1] != (0.0,) or not ordered:
+            raise ParameterError(
+                f'layers must start at 0 and go down, each with a stiffness, got starts '
+                f'{self.starts} and stiffnesses {self.stiffnesses}'
+            )
 
     def growth(self, time: float) -> float:
         """Return the factor by which the stiffness has grown at a time [s]."""

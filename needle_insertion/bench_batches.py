@@ -32,7 +32,7 @@ _INTERVAL: Final = 1e-4
 #: Rounds of the loop in all threads together: it lasts about as long as the insertions.
 _ROUNDS: Final = 100_000_000
 
-_REPEATS: Final = 15
+_REPEATS: Final = 30
 
 
 class Batches:

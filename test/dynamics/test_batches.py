@@ -137,7 +137,7 @@ def test_a_run_that_leaves_its_range_is_no_number_from_there_and_harms_no_other(
 ) -> None:
     """Pulled out of the tissue, one run ends; what it was before and the others stay."""
     p = preset('paper_si')
-    states = np.array([NeedleModel(p).state_at(s, 1e-4) for s in (0.05, 0.004, 0.06)])
+    states = np.array([NeedleModel(p).state_at(s, 1e-5) for s in (0.05, 0.004, 0.06)])
     forces = np.array([3.0, -1.0, 2.0])
     found = batch(p, states, forces, workers=workers)
     with pytest.raises(InsertedLengthError):
@@ -157,7 +157,7 @@ def test_a_run_that_leaves_its_range_is_no_number_from_there_and_harms_no_other(
 def test_the_last_state_of_a_run_that_left_its_range_is_no_number() -> None:
     """Without samples, too, a run that did not reach the end has no state at the end."""
     p = preset('paper_si')
-    states = np.array([NeedleModel(p).state_at(s, 1e-4) for s in (0.05, 0.004)])
+    states = np.array([NeedleModel(p).state_at(s, 1e-5) for s in (0.05, 0.004)])
     found = batch(p, states, [3.0, -1.0], keep=False)
     assert np.isfinite(found.states[0]).all()
     assert np.isnan(found.states[1]).all()
@@ -197,6 +197,20 @@ def test_shapes_that_do_not_fit_are_refused(which: str, shape: tuple[int, ...]) 
     arguments[which] = (
         constants[: shape[0]] if which == 'constants' else np.full(shape, 0.1)
     )
+    with pytest.raises(ShapeError, match='got'):
+        batch(*arguments.values())
+
+
+@pytest.mark.parametrize('empty', ['constants', 'states', 'forces'])
+def test_no_runs_are_refused(empty: str) -> None:
+    """A batch of none, with all else given once, is refused like other shapes."""
+    p = preset('paper_si')
+    arguments: dict[str, Any] = {
+        'constants': p,
+        'states': NeedleModel(p).state_at(0.05),
+        'forces': 3.0,
+    }
+    arguments[empty] = np.empty((0, 8)) if empty == 'states' else []
     with pytest.raises(ShapeError, match='got'):
         batch(*arguments.values())
 
