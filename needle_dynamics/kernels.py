@@ -402,9 +402,24 @@ def _flow(c: Constants, u: float, drive: float, h: float) -> tuple[float, float]
         half, _ = slide(u, drive, mass, level, c.viscous, 0.5 * h, c.withdrawal, bearable / level)
         level = _dry(c, abs(half))
         return slide(u, drive, mass, level, c.viscous, h, c.withdrawal, bearable / level)
-    # Implicit Euler: of first order, but it never overshoots, however steep the law is.
-    end = _creep(c, u, drive, h)
-    return end, h * end
+    # Two implicit stages of second order, L-stable (R. Alexander, SIAM J. Numer. Anal. 14, 1977).
+    part = 1.0 - sqrt(0.5)
+    first = _creep(c, u, drive, part * h)
+    end = _creep(c, u + (1.0 - part) / part * (first - u), drive, part * h)
+    step = h * ((1.0 - part) * first + part * end)
+    lost = drive * step - 0.5 * c.moving_mass * (end * end - u * u)
+    if lost < 0.0 or (drive - _smooth(c, end)) * (drive - _smooth(c, u)) < 0.0:
+        # Past the steady speed, or energy out of friction: implicit Euler, of first order, never.
+        end = _creep(c, u, drive, h)
+        step = h * end
+    return end, step
+
+
+@compiled
+def _smooth(c: Constants, u: float) -> float:
+    """Return friction under the smooth law."""
+    viscous = c.viscous * u * (1.0 if u >= 0.0 else c.withdrawal)
+    return viscous + (_dry(c, u) if u >= 0.0 else -_dry(c, u))
 
 
 @compiled
@@ -415,6 +430,17 @@ def _layer(start: FloatArray, s: float, layer: int) -> int:
     while layer > 0 and s < start[layer]:
         layer -= 1
     return layer
+
+
+@compiled
+def _time_to_layer(start: FloatArray, s: float, u: float) -> float:
+    """Return the time until the next border between layers at the speed now."""
+    soonest = inf
+    for i in range(1, start.shape[0]):
+        ahead = (start[i] - s) / u if u != 0.0 else inf
+        if 0.0 < ahead < soonest:
+            soonest = ahead
+    return soonest
 
 
 @compiled
@@ -786,17 +812,24 @@ def advance(  # noqa: C901
     growth, decay, layer = 1.0, 1.0, 0
     pull = 0.0
     sums[SUM_CONTACT] = -1.0
-    # A time of a whole number of steps is not rounded up.
-    count = ceil(duration / longest * (1.0 - 1e-9))
-    h = duration / count
+    count, whole, renew = 0, longest, True
     left = duration
     while left > 0.0:
-        if graded:
-            wanted = longest * max(1.0, s / (GRADED_FROM * c.length))
-            count = ceil(left / wanted * (1.0 - 1e-9))
-            h = left / count
+        if renew:
+            if graded:
+                whole = longest * max(1.0, s / (GRADED_FROM * c.length))
+            # A time of a whole number of steps is not rounded up.
+            count = ceil(left / whole * (1.0 - 1e-9))
+            even = left / count
+            renew = graded
+        h = even
         count -= 1
         rest = left - h if count > 0 else 0.0
+        if layer_start.shape[0] > 1:
+            border = _time_to_layer(layer_start, s, u)
+            if 1e-3 * h < border < h:
+                # A step ends where a layer does: its stiffness is that of one layer.
+                h, rest, renew = border, left - border, True
         middle = s + 0.5 * h * u
         if graded:
             # Mean depth of the step if it speeds up as the last one did: a steadier phase.
@@ -880,6 +913,8 @@ def advance(  # noqa: C901
                 dry = _dry(c, mean) * (u + new_u) / pace
             else:
                 bearable = c.coulomb * (c.breakaway if c.friction_law == STRIBECK else 1.0)
+                if c.friction_law == TANH:
+                    bearable = 0.0
                 dry = min(max(-impulse / h, -c.withdrawal * bearable), bearable)
             lost = (dry + viscous * mean) * step
             sums[SUM_INPUT_WORK] += lost + impulse / h * step + gained
