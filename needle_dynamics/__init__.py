@@ -10,6 +10,7 @@ from needle_dynamics.errors import (
     NeedleError,
     ParameterError,
     ShapeError,
+    ToleranceError,
 )
 from needle_dynamics.force_sensor import ForceSensor, ForceSensorParameters
 from needle_dynamics.friction import Friction, FRICTION_LAWS
@@ -48,6 +49,7 @@ __all__ = [
     'ParameterError',
     'ShapeError',
     'Tissue',
+    'ToleranceError',
     'Trajectory',
     'mode_shapes',
     'simulate',

@@ -27,7 +27,7 @@ from math import inf, isfinite, sqrt
 import os
 from typing import Final
 
-from needle_dynamics.errors import InsertedLengthError, ParameterError, ShapeError
+from needle_dynamics.errors import InsertedLengthError, ParameterError, ShapeError, ToleranceError
 from needle_dynamics.friction import FRICTION_LAWS
 from needle_dynamics.kernels import (
     advance,
@@ -54,8 +54,8 @@ from numpy.typing import ArrayLike
 #: Default step [s]. The tip deflection of the source's open-loop run is then good to 2e-4.
 DEFAULT_STEP: Final = 1e-5
 
-#: Step at which a tolerance is given up [s].
-_SHORTEST_STEP: Final = 1e-10
+#: Step at which a tolerance is given up [s]: rounding has taken over long before.
+_SHORTEST_STEP: Final = 1e-9
 
 
 def _constants(model: NeedleModel) -> Constants:
@@ -156,6 +156,8 @@ class Integrator:
         If ``step`` or ``tolerance`` is not positive and finite.
     ShapeError, InsertedLengthError
         If the state is not valid.
+    ToleranceError
+        By `advance`, if the tolerance cannot be met.
 
     """
 
@@ -293,7 +295,12 @@ class Integrator:
         start = self._state.copy()
         take(longest)
         change = inf
-        while change > tolerance and longest > _SHORTEST_STEP:
+        while change > tolerance:
+            if longest < _SHORTEST_STEP:
+                raise ToleranceError(
+                    f'tolerance {tolerance:g} cannot be met: {change:.1e} is left with steps of '
+                    f'{longest:.1e} s'
+                )
             coarse = self._state.copy()
             self._state[:] = start
             longest *= 0.5

@@ -433,12 +433,12 @@ def _layer(start: FloatArray, s: float, layer: int) -> int:
 
 
 @compiled
-def _time_to_layer(start: FloatArray, s: float, u: float) -> float:
-    """Return the time until the next border between layers at the speed now."""
+def _time_to_layer(start: FloatArray, stiffness: FloatArray, s: float, u: float) -> float:
+    """Return the time until the next border between unlike layers at the speed now."""
     soonest = inf
     for i in range(1, start.shape[0]):
         ahead = (start[i] - s) / u if u != 0.0 else inf
-        if 0.0 < ahead < soonest:
+        if 0.0 < ahead < soonest and stiffness[i] != stiffness[i - 1]:
             soonest = ahead
     return soonest
 
@@ -826,7 +826,7 @@ def advance(  # noqa: C901
         count -= 1
         rest = left - h if count > 0 else 0.0
         if layer_start.shape[0] > 1:
-            border = _time_to_layer(layer_start, s, u)
+            border = _time_to_layer(layer_start, layer_stiffness, s, u)
             if 1e-3 * h < border < h:
                 # A step ends where a layer does: its stiffness is that of one layer.
                 h, rest, renew = border, left - border, True

@@ -253,6 +253,99 @@ class NeedleModel:
         )
         return np.asarray(np.linalg.solve(self.mass_matrix(x), applied - bias))
 
+    def inverse_dynamics(
+        self, state: ArrayLike, acceleration: ArrayLike, time: float = 0.0
+    ) -> FloatArray:
+        """
+        Return the forces that bring about an acceleration, equation (16) the other way.
+
+        Parameters
+        ----------
+        state : array_like, shape (2 (2 + n),)
+            State.
+        acceleration : array_like, shape (2 + n,)
+            q_ddot. At rest friction acts against the motion that begins.
+        time : float
+            Time [s], for tissue that swells.
+
+        Returns
+        -------
+        ndarray, shape (2 + n,)
+            Insertion force f_y [N], positive into the tissue, torque tau [N m], and the
+            generalized force on each modal coordinate.
+
+        Raises
+        ------
+        ShapeError
+            If a shape is wrong or a number is not finite.
+
+        """
+        x, m = self.checked_state(state), self.coordinates
+        wanted = np.array(acceleration, dtype=float)
+        if wanted.shape != (m,) or not np.isfinite(wanted).all():
+            raise ShapeError(f'acceleration must be finite with shape ({m},), got {wanted}')
+        forces = self.mass_matrix(x) @ wanted + self.bias_forces(x, time)
+        speed = -x[m]
+        # At rest an endless drive decides: friction is what it can bear, in that direction.
+        drive = -np.sign(wanted[0]) * np.inf if wanted[0] != 0.0 else -forces[0]
+        forces[0] = -forces[0] + self.friction.force(speed, drive)
+        return np.asarray(forces)
+
+    def friction_power(self, state: ArrayLike) -> float:
+        """
+        Power that friction takes, f_f s_dot with (15).
+
+        Parameters
+        ----------
+        state : array_like, shape (2 (2 + n),)
+            State.
+
+        Returns
+        -------
+        float
+            Power [W], never negative.
+
+        """
+        speed = -self.checked_state(state)[self.coordinates]
+        return float(self.friction.force(speed, 0.0) * speed)
+
+    def base_reaction(
+        self, state: ArrayLike, force: float = 0.0, torque: float = 0.0, time: float = 0.0
+    ) -> FloatArray:
+        """
+        Return what the base exerts on the needle, by balance of momentum over the inserted part.
+
+        Parameters
+        ----------
+        state : array_like, shape (2 (2 + n),)
+            State.
+        force, torque : float
+            Insertion force [N], positive into the tissue, and torque [N m] on the carriage.
+        time : float
+            Time [s], for tissue that swells.
+
+        Returns
+        -------
+        ndarray, shape (3,)
+            Axial force along y [N], lateral force along z [N], moment about x at the base [N m].
+
+        """
+        p, x, m = self.parameters, self.checked_state(state), self.coordinates
+        n, depth, speed = self.modes.count, p.length - x[0], -x[m]
+        modal, rate = x[2:m], x[m + 2 :]
+        acceleration = self.acceleration(x, force, torque, time)
+        at, tissue = self.modes.integrals(depth), self.tissue
+        layer = max(int(np.searchsorted(tissue.starts, depth, side='right')) - 1, 0)
+        above = tissue.offsets(self.modes)[layer, -2 * n :].reshape(2, n)
+        integrals = np.array([at.area, at.moment])
+        held = tissue.growth(time) * (tissue.stiffnesses[layer] * integrals + above)
+        # The part that enters brings the momentum of the tip, at a lever of the depth.
+        entering = speed * (at.value @ rate) * np.array([1.0, depth])
+        inertia = p.linear_density * (integrals @ acceleration[2:] + entering)
+        lateral, about_entry = inertia + held @ modal + p.tissue_damping * integrals @ rate
+        axial = force + p.carriage_mass * acceleration[0]
+        return np.array([axial, lateral, about_entry + x[0] * lateral + torque])
+
     def derivative(
         self, state: ArrayLike, force: float = 0.0, torque: float = 0.0, time: float = 0.0
     ) -> FloatArray:

@@ -26,8 +26,8 @@ RUNS: Final = 2000
 #: Step [s] from which the steps grow.
 _STEP: Final = 1.4e-5
 
-#: Intervals of the runs whose memory is looked at.
-_INTERVAL: Final = 1e-4
+#: Interval of the runs whose memory is looked at [s].
+_INTERVAL: Final = DURATION / 300
 
 #: Rounds of the loop in all threads together: it lasts about as long as the insertions.
 _ROUNDS: Final = 100_000_000

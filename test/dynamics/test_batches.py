@@ -194,9 +194,7 @@ def test_shapes_that_do_not_fit_are_refused(which: str, shape: tuple[int, ...]) 
     """Numbers of runs, of intervals and of coordinates must agree; the message says what came."""
     constants, states, forces = study()
     arguments: dict[str, Any] = {'constants': constants, 'states': states, 'forces': forces}
-    arguments[which] = (
-        constants[: shape[0]] if which == 'constants' else np.full(shape, 0.1)
-    )
+    arguments[which] = constants[: shape[0]] if which == 'constants' else np.full(shape, 0.1)
     with pytest.raises(ShapeError, match='got'):
         batch(*arguments.values())
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import fields
 from functools import cache
 from typing import Any
 
@@ -59,7 +60,9 @@ def equations() -> tuple[Any, Any]:
     ]
     accelerations = sp.symbols('a0:4')
     named = [
-        sp.expand(row).subs({x.diff(T, 2): a for x, a in zip(COORDINATES, accelerations, strict=True)})
+        sp.expand(row).subs(
+            {x.diff(T, 2): a for x, a in zip(COORDINATES, accelerations, strict=True)}
+        )
         for row in rows
     ]
     mass = sp.Matrix(4, 4, lambda i, j: sp.expand(named[i]).coeff(accelerations[j]))
@@ -204,7 +207,7 @@ def test_model_is_the_derived_one() -> None:
 
 def test_printed_form_is_the_derived_one_less_two_terms() -> None:
     """Without row d, and without what holds d_dot in the modal rows, N is the printed one."""
-    mass, rest = equations()
+    _, rest = equations()
     printed = closed(rest)
     printed[0] = sp.Integer(0)
     printed = printed.subs(SPEEDS[0], 0)
@@ -278,3 +281,37 @@ def test_derivative_of_the_integrals_is_the_integrand_at_the_tip(i: int) -> None
     integral = sp.Integral(PHI[i](Y) ** 2, (Y, 0, TIP))
     assert integral.diff(COORDINATES[0]) == -(PHI[i](TIP) ** 2)
     assert integral.diff(T) == -(PHI[i](TIP) ** 2) * RATES[0]
+
+
+def test_gravity_is_not_in_the_equations() -> None:
+    """The derived equations hold the constants of needle and tissue only, and so does the code."""
+    mass, rest = equations()
+    constants = (mass.free_symbols | rest.free_symbols) - {T, Y}
+    assert constants == {L, RHO, EI, K, INERTIA}
+    assert not [item.name for item in fields(NeedleParameters) if 'gravity' in item.name]
+
+
+def test_table_3_is_a_round_needle_but_for_one_row() -> None:
+    """A and I_y are those of a round needle of 1.27 mm; I_x is none of its moments."""
+    p, diameter = MODEL.parameters, 1.27e-3
+    # Table 3 has three digits.
+    assert_allclose(p.area, np.pi / 4.0 * diameter**2, rtol=5e-3)
+    assert_allclose(p.area_moment, np.pi / 64.0 * diameter**4, rtol=5e-3)
+    polar = np.pi / 32.0 * diameter**4
+    about_axis = p.linear_density * p.length * diameter**2 / 8.0
+    about_base = p.linear_density * p.length**3 / 3.0
+    for moment in (p.area_moment, polar, about_axis, about_base):
+        assert not 0.5 < p.rotary_inertia / moment < 2.0
+    # Used as a mass moment: the acceleration under a torque is 2 tau / I_x, rad/s^2 of N m.
+    assert_allclose(MODEL.mass_matrix(MODEL.state_at(0.1))[1, 1], 0.5 * 1.0626e-9, rtol=1e-15)
+
+
+def test_curl_of_a_linear_field_is_the_antisymmetric_part() -> None:
+    """Of F = -k x the curl is k_zx - k_xz: none for a symmetric k, constant for any other."""
+    x, z, kxx, kxz, kzx, kzz = sp.symbols('x z k_xx k_xz k_zx k_zz', real=True)
+    stiffness = sp.Matrix([[kxx, kxz], [kzx, kzz]])
+    force = -stiffness * sp.Matrix([x, z])
+    assert force[0].diff(z) - force[1].diff(x) == kzx - kxz
+    half = (stiffness - stiffness.T) / 2
+    spring = -(stiffness - half) * sp.Matrix([x, z])
+    assert sp.simplify(spring[0].diff(z) - spring[1].diff(x)) == 0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import pairwise
 from typing import Any
 
 from hypothesis import given, settings
@@ -55,7 +56,7 @@ def by_layers(
     """Integrate k(y) times a function (points first) over the inserted part, layer by layer."""
     edges = [y for y in tissue.starts if y < depth] + [depth]
     total = 0.0
-    for low, high in zip(edges, edges[1:], strict=False):
+    for low, high in pairwise(edges):
         half = 0.5 * (high - low)
         y = low + half * (NODES + 1.0)
         total = total + half * tissue.stiffness(0.5 * (low + high)) * np.tensordot(
@@ -78,9 +79,7 @@ def test_tissue_matrix_is_the_integral_of_its_stiffness(
     starts: list[float], stiffnesses: list[float], depth: float, n: int
 ) -> None:
     """The modal stiffness of the tissue is int k(y) phi phi^T dy, for any layers."""
-    tissue = Tissue(
-        starts=(0.0, *starts), stiffnesses=tuple(stiffnesses[: len(starts) + 1])
-    )
+    tissue = Tissue(starts=(0.0, *starts), stiffnesses=tuple(stiffnesses[: len(starts) + 1]))
     modes = NeedleModel(preset('paper_si', modes=n, minimum_depth=0.02)).modes
     expected = by_layers(
         tissue, depth, lambda y: np.einsum('pi,pj->pij', modes.values(y), modes.values(y))
@@ -153,8 +152,8 @@ def test_energy_is_kept_at_second_order_across_a_boundary() -> None:
     steps = 1e-5 / 2.0 ** np.arange(4)
     depths = 0.055 + 1.3e-6 * np.arange(12)
     errors = [max(crossing(step, depth) for depth in depths) for step in steps]
-    # Measured slopes 1.97 to 2.02 and 9e-9 at the last step; one force for the whole of the step
-    # across the boundary would give order one and 8e-8.
+    # Measured: slopes within 0.03 of 2, and 9e-9 at the last step; one force for the whole of a
+    # step across the boundary would give order one and 8e-8.
     assert_allclose(np.log2(np.array(errors[:-1]) / errors[1:]), 2.0, atol=0.15)
     assert errors[-1] < 2e-8
 
@@ -276,7 +275,7 @@ def test_work_of_swelling_closes_the_energy_balance(swelling: float) -> None:
         gained = model.energy(it.state, 8e-3) - model.energy(start, 0.0)
         assert abs(work) > 0.05 * model.energy(start, 0.0)
         gaps.append(abs(gained - work) / abs(work))
-    # Measured: slopes 2.00, last gap 1e-7.
+    # Measured: slopes 2.000, last gaps 7e-8 and 1.4e-7.
     assert_allclose(np.log2(np.array(gaps[:-1]) / gaps[1:]), 2.0, atol=0.1)
     assert gaps[-1] < 1e-6
 
@@ -340,7 +339,7 @@ def test_tanh_tends_to_coulomb() -> None:
     for speed in (1e-1, 1e-2, 1e-3, 1e-4):
         smooth = preset('paper_si', friction_law='tanh', smoothing_speed=speed)
         gaps.append(abs(end(smooth, step=2e-6)[0] - reference))
-    # Measured ratios 4 to 12: the time spent below the smoothing speed, and the creep then.
+    # Measured 9e-5, 8e-6, 5e-7 and 2e-10 m: the time spent below the smoothing speed.
     assert np.all(np.diff(gaps) < 0.0)
     assert gaps[-1] < 1e-2 * gaps[0]
 
@@ -552,9 +551,7 @@ def test_smooth_friction_ends_between_its_start_and_its_steady_speed(
     assert (min(u, steady) - slack) * h <= gone <= (max(u, steady) + slack) * h
 
 
-@pytest.mark.parametrize(
-    ('law', 'turn'), [('coulomb', 1e-3), ('stribeck', 0.3), ('tanh', 0.3)]
-)
+@pytest.mark.parametrize(('law', 'turn'), [('coulomb', 1e-3), ('stribeck', 0.3), ('tanh', 0.3)])
 @pytest.mark.parametrize('withdrawal', [1.0, 0.6])
 @pytest.mark.parametrize('sign', [-1.0, 1.0])
 def test_every_law_is_of_second_order(
@@ -587,9 +584,9 @@ def test_every_law_is_of_second_order(
         it.advance(6e-3, 1.2 * sign)
         errors.append(np.abs((it.state - solved.y[:, -1])[[0, 4]]))
     slopes = np.log2(np.array(errors[:-1]) / errors[1:])
-    # Measured 1.97 to 2.05; the last depth is good to 1e-10 m.
+    # Measured 1.87 to 2.02, the former at an error of 1e-12 m/s; last depths to 5e-11 m.
     assert_allclose(slopes, 2.0, atol=0.2)
-    assert errors[-1][0] < 1e-8
+    assert errors[-1][0] < 1e-9
 
 
 @pytest.mark.parametrize('law', FRICTION_LAWS)
@@ -611,8 +608,8 @@ def test_energy_lost_is_the_work_of_each_law(law: str) -> None:
             assert part.friction_work >= 0.0
             balance += part.input_work - part.friction_work
             turned += abs(part.input_work)
-    # Second order in 11 and 22 kHz at 2 us: measured 2e-8 of the work.
-    assert_allclose(it.model.energy(it.state) - before, balance, atol=1e-6 * turned)
+    # Second order in 1 and 5 kHz at 2 us: measured 1.2e-9 of the work.
+    assert_allclose(it.model.energy(it.state) - before, balance, atol=1e-8 * turned)
 
 
 # --- what is refused ------------------------------------------------------------------------
@@ -621,7 +618,9 @@ def test_energy_lost_is_the_work_of_each_law(law: str) -> None:
 @pytest.mark.parametrize('law', ['', 'Coulomb', 'dahl', None, 0])
 def test_unknown_friction_law_is_refused(law: Any) -> None:
     """A law that does not exist is refused when the constants, or the law itself, are made."""
-    with pytest.raises(ParameterError, match='friction_law must be one of coulomb, stribeck, tanh'):
+    with pytest.raises(
+        ParameterError, match='friction_law must be one of coulomb, stribeck, tanh'
+    ):
         NeedleParameters(friction_law=law)
     with pytest.raises(ParameterError, match='law must be one of coulomb, stribeck, tanh'):
         Friction(law=law, coulomb=0.56, viscous=0.3)
@@ -633,8 +632,16 @@ def test_unknown_friction_law_is_refused(law: Any) -> None:
         ((0.05, 0.02), (1.0, 1.0), r'layer_depths must be > 0 and increase, got \[0.05, 0.02\]'),
         ((0.05, 0.05), (1.0, 1.0), 'layer_depths must be > 0 and increase'),
         ((0.0,), (1.0,), 'layer_depths must be > 0 and increase'),
-        ((0.05,), (), 'layer_stiffnesses must have one value for each of the 1 layer_depths, got 0'),
-        ((), (1.0,), 'layer_stiffnesses must have one value for each of the 0 layer_depths, got 1'),
+        (
+            (0.05,),
+            (),
+            'layer_stiffnesses must have one value for each of the 1 layer_depths, got 0',
+        ),
+        (
+            (),
+            (1.0,),
+            'layer_stiffnesses must have one value for each of the 0 layer_depths, got 1',
+        ),
         ((-0.05,), (1.0,), 'layer_depths must be finite and >= 0'),
         ((np.nan,), (1.0,), 'layer_depths must be finite and >= 0'),
         ((0.05,), (-1.0,), 'layer_stiffnesses must be finite and >= 0'),
