@@ -65,10 +65,14 @@ setup(
         'dev': [
             'colcon-common-extensions>=0.3',
             'hypothesis>=6.100',
+            'mpmath>=1.3',
             'mypy>=1.14',
             'pytest>=8.0',
             'ruff>=0.9',
+            'sympy>=1.12',
         ],
+        # What `needle bench dynamics` is measured beside.
+        'bench': ['mujoco>=3.2', 'pyelastica>=0.3.3'],
     },
     entry_points={
         'console_scripts': [

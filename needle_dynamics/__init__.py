@@ -10,21 +10,33 @@ from needle_dynamics.errors import (
     NeedleError,
     ParameterError,
     ShapeError,
+    ToleranceError,
 )
 from needle_dynamics.force_sensor import ForceSensor, ForceSensorParameters
-from needle_dynamics.integrators import Integrator, Interval, simulate, Trajectory
+from needle_dynamics.friction import Friction, FRICTION_LAWS
+from needle_dynamics.integrators import (
+    Batch,
+    Integrator,
+    Interval,
+    simulate,
+    simulate_batch,
+    Trajectory,
+)
 from needle_dynamics.kernels import FloatArray
-from needle_dynamics.model import COORDINATE_NAMES, COORDINATES, NeedleModel
+from needle_dynamics.model import NeedleModel
 from needle_dynamics.modes import mode_shapes, ModeIntegrals, ModeShapes
-from needle_dynamics.parameters import NeedleParameters, PRESETS
+from needle_dynamics.parameters import FORMULATIONS, NeedleParameters, PRESETS
+from needle_dynamics.tissue import Tissue
 
 __all__ = [
-    'COORDINATES',
-    'COORDINATE_NAMES',
+    'FORMULATIONS',
+    'FRICTION_LAWS',
     'PRESETS',
+    'Batch',
     'FloatArray',
     'ForceSensor',
     'ForceSensorParameters',
+    'Friction',
     'InsertedLengthError',
     'Integrator',
     'Interval',
@@ -36,7 +48,10 @@ __all__ = [
     'NeedleParameters',
     'ParameterError',
     'ShapeError',
+    'Tissue',
+    'ToleranceError',
     'Trajectory',
     'mode_shapes',
     'simulate',
+    'simulate_batch',
 ]

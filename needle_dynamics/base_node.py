@@ -8,6 +8,7 @@ parameter file ends in a refused `configure` with one line that names the parame
 
 from __future__ import annotations
 
+from array import array
 from collections.abc import Callable, Mapping
 import ctypes
 from dataclasses import fields
@@ -124,9 +125,10 @@ class NeedleNode(LifecycleNode):
                 descriptor.floating_point_range = [
                     FloatingPointRange(from_value=meta['low'], to_value=meta['high'])
                 ]
-            self.declare_parameter(
-                f'{prefix}{item.name}', getattr(defaults, item.name), descriptor
-            )
+            default = getattr(defaults, item.name)
+            if isinstance(default, tuple):
+                default = list(default)
+            self.declare_parameter(f'{prefix}{item.name}', default, descriptor)
 
     def declare_model(self) -> None:
         """Declare ``model.preset`` and, with its values as defaults, every model constant."""
@@ -165,6 +167,8 @@ class NeedleNode(LifecycleNode):
         values: dict[str, Any] = {}
         for item in fields(kind):  # type: ignore[arg-type]
             value = self.get_parameter(f'{prefix}{item.name}').value
+            if isinstance(value, (list, array)):
+                value = tuple(value)
             values[item.name] = as_number(value) if 'unit' in item.metadata else value
         try:
             return kind(**values)
@@ -188,11 +192,14 @@ class NeedleNode(LifecycleNode):
 
     def configuration(self) -> str:
         """Return all parameters as a ROS parameter file."""
-        values = {
-            name: parameter.value
-            for name, parameter in sorted(self._parameters.items())
-            if not name.startswith(('qos_overrides', 'start_type'))
-        }
+        values = {}
+        for name, parameter in sorted(self._parameters.items()):
+            value = parameter.value
+            if isinstance(value, (list, tuple, array)):
+                value = list(value)
+            # A parameter file cannot hold an empty list: where one is valid it is the default.
+            if not name.startswith(('qos_overrides', 'start_type')) and value not in ([], None):
+                values[name] = value
         document = {self.get_fully_qualified_name(): {'ros__parameters': values}}
         return str(yaml.safe_dump(document, sort_keys=False))
 

@@ -17,5 +17,9 @@ class ShapeError(NeedleError, ValueError):
     """An array does not have the shape the model needs."""
 
 
+class ToleranceError(NeedleError):
+    """An accuracy that was asked for cannot be reached."""
+
+
 class InsertedLengthError(NeedleError):
     """The inserted length left the range in which the equations are regular."""

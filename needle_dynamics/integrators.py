@@ -20,29 +20,33 @@ Integration", 2nd ed., 2006, sections II.5 and XIII (splitting, highly oscillato
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from math import ceil, inf, isfinite
+from math import inf, isfinite, sqrt
+import os
 from typing import Final
 
-from needle_dynamics.errors import InsertedLengthError, ParameterError
+from needle_dynamics.errors import InsertedLengthError, ParameterError, ShapeError, ToleranceError
+from needle_dynamics.friction import FRICTION_LAWS
 from needle_dynamics.kernels import (
     advance,
     Constants,
     FloatArray,
-    INTEGRALS,
-    SUM_AREA,
-    SUM_AREA_RATE,
+    run,
+    SUM_CONTACT,
     SUM_DAMPING_WORK,
     SUM_FRICTION_WORK,
+    SUM_IMPACT,
     SUM_INPUT_WORK,
-    SUM_MOMENT,
-    SUM_MOMENT_RATE,
+    SUM_REACTION,
+    SUM_REACTION_MOMENT,
     SUM_RESISTANCE,
     SUM_TIP,
     SUMS,
+    Tables,
 )
-from needle_dynamics.model import COORDINATES, NeedleModel, ROUNDING
+from needle_dynamics.model import NeedleModel, ROUNDING
 from needle_dynamics.parameters import NeedleParameters
 import numpy as np
 from numpy.typing import ArrayLike
@@ -50,20 +54,43 @@ from numpy.typing import ArrayLike
 #: Default step [s]. The tip deflection of the source's open-loop run is then good to 2e-4.
 DEFAULT_STEP: Final = 1e-5
 
+#: Step at which a tolerance is given up [s]: rounding has taken over long before.
+_SHORTEST_STEP: Final = 1e-9
 
-def _constants(p: NeedleParameters) -> Constants:
+
+def _constants(model: NeedleModel) -> Constants:
+    p, tissue, friction = model.parameters, model.tissue, model.friction
     return Constants(
-        p.length,
-        p.linear_density,
-        p.bending_stiffness,
-        p.tissue_stiffness,
-        p.tissue_damping,
-        p.moving_mass,
-        p.rotary_inertia,
-        p.coulomb_friction,
-        p.viscous_friction,
-        p.minimum_depth - ROUNDING * p.length,
-        p.hub_stop,
+        length=p.length,
+        linear_density=p.linear_density,
+        bending_stiffness=p.bending_stiffness,
+        tissue_damping=p.tissue_damping,
+        moving_mass=p.moving_mass,
+        rotary_inertia=p.rotary_inertia,
+        minimum_depth=p.minimum_depth - ROUNDING * p.length,
+        maximum_depth=model.modes.reach * p.length,
+        hub_stop=p.hub_stop,
+        as_printed=p.formulation == 'as_printed',
+        friction_law=FRICTION_LAWS.index(friction.law),
+        coulomb=friction.coulomb,
+        viscous=friction.viscous,
+        withdrawal=friction.withdrawal,
+        breakaway=friction.breakaway,
+        stribeck_speed=friction.stribeck_speed,
+        smoothing_speed=friction.smoothing_speed,
+        swelling=tissue.swelling,
+        swelling_time=tissue.swelling_time,
+    )
+
+
+def _tables(model: NeedleModel) -> Tables:
+    return Tables(
+        series=model.modes.series,
+        terms=model.modes.terms,
+        modes=model.modes.constants,
+        layer_start=np.array(model.tissue.starts),
+        layer_stiffness=np.array(model.tissue.stiffnesses),
+        layer_offset=model.tissue.offsets(model.modes),
     )
 
 
@@ -86,6 +113,10 @@ class Interval:
         Energy lost to friction and to tissue damping [J].
     input_work : float
         Work done by force and torque [J].
+    impact_loss : float
+        Energy lost on the hub [J].
+    contact_time : float or None
+        Time of the last contact with the hub [s], on the integrator's clock.
 
     """
 
@@ -96,47 +127,67 @@ class Interval:
     friction_work: float
     damping_work: float
     input_work: float
+    impact_loss: float
+    contact_time: float | None
 
 
 class Integrator:
     """
-    Advances one needle in time with its own scratch memory.
+    Advances one needle in time.
 
     Parameters
     ----------
     parameters : NeedleParameters
         Constants.
-    state : array_like, shape (8,)
+    state : array_like, shape (2 (2 + n),)
         Initial state.
     step : float
         Longest step [s].
+    tolerance : float, optional
+        If given, the step is halved until the end of each call to `advance` changes by less
+        than this part of the energy and of the needle's length.
+    graded : bool
+        Let the step grow with the inserted length once that exceeds a tenth of the needle's: the
+        modes slow down as its square.
 
     Raises
     ------
     ParameterError
-        If ``step`` is not positive and finite.
+        If ``step`` or ``tolerance`` is not positive and finite.
     ShapeError, InsertedLengthError
         If the state is not valid.
+    ToleranceError
+        By `advance`, if the tolerance cannot be met.
 
     """
 
     def __init__(
-        self, parameters: NeedleParameters, state: ArrayLike, step: float = DEFAULT_STEP
+        self,
+        parameters: NeedleParameters,
+        state: ArrayLike,
+        step: float = DEFAULT_STEP,
+        tolerance: float | None = None,
+        *,
+        graded: bool = False,
     ) -> None:
         if not 0.0 < step < inf:
             raise ParameterError(f'step must be positive and finite, got {step!r} s')
+        if tolerance is not None and not 0.0 < tolerance < inf:
+            raise ParameterError(f'tolerance must be positive and finite, got {tolerance!r}')
         self.model = NeedleModel(parameters)
         self.step = step
-        self._constants = _constants(parameters)
-        self._table = self.model.modes.series
-        self._work = np.empty(self._table.shape[1])
-        self._at = np.empty(INTEGRALS)
+        self.tolerance = tolerance
+        self.graded = graded
+        self.time = 0.0
+        self._constants = _constants(self.model)
+        self._tables = _tables(self.model)
         self._sums = np.zeros(SUMS)
         self._state = self.model.checked_state(state)
+        self._refinement = 1.0
 
     @property
     def state(self) -> FloatArray:
-        """State now, a copy; shape (8,)."""
+        """State now, a copy; shape (2 (2 + n),)."""
         return self._state.copy()
 
     @property
@@ -147,7 +198,7 @@ class Integrator:
     @property
     def speed(self) -> float:
         """Insertion speed s_dot [m/s]."""
-        return float(-self._state[COORDINATES])
+        return float(-self._state[self.model.coordinates])
 
     def advance(self, duration: float, force: float = 0.0, torque: float = 0.0) -> Interval:
         """
@@ -156,7 +207,7 @@ class Integrator:
         Parameters
         ----------
         duration : float
-            Time to advance [s], taken in equal steps no longer than the step.
+            Time to advance [s], taken in steps no longer than the step.
         force : float
             Insertion force f_y [N], positive into the tissue.
         torque : float
@@ -208,43 +259,88 @@ class Integrator:
         for name, value in (('force', force), ('torque', torque), ('speed', speed)):
             if not isfinite(value):
                 raise ParameterError(f'{name} must be finite, got {value!r}')
-        # A duration of a whole number of steps is not rounded up.
-        steps = max(1, ceil(duration / self.step * (1.0 - 1e-9)))
-        sums, before = self._sums, self._state.copy()
-        sums[:] = 0.0
-        taken = advance(
-            self._constants,
-            self._table,
-            self._work,
-            self._at,
-            self._state,
-            force,
-            torque,
-            speed,
-            moved,
-            duration / steps,
-            steps,
-            sums,
-        )
-        if taken < steps:
-            raise InsertedLengthError(
-                f'inserted length {self.depth:.6g} m reached minimum_depth = '
-                f'{self._constants.minimum_depth:g} m while withdrawing'
-            )
+        before = self._state.copy()
+
+        def take(longest: float) -> None:
+            self._take(duration, (force, torque, speed), longest, moved=moved)
+
+        if self.tolerance is None:
+            take(self.step)
+        else:
+            self._refine(take, min(duration, self.step / self._refinement), self.tolerance)
+        self.time += duration
         return self._interval(before, duration, force, torque, moved=moved)
+
+    def _take(
+        self, duration: float, inputs: tuple[float, float, float], longest: float, *, moved: bool
+    ) -> None:
+        """Take steps under constant inputs: force, torque, and speed of a moved base."""
+        self._sums[:] = 0.0
+        left = advance(
+            self._constants, self._tables, self._state, self.time,
+            *inputs, moved, longest, self.graded, duration, self._sums,
+        )  # fmt: skip
+        if left > 0.0:
+            self.time += duration - left
+            p = self.model.parameters
+            limit = (
+                f'minimum_depth = {p.minimum_depth:g} m while withdrawing'
+                if self.speed < 0.0
+                else f'{self._constants.maximum_depth:g} m beyond the hub'
+            )
+            raise InsertedLengthError(f'inserted length {self.depth:.6g} m reached {limit}')
+
+    def _refine(self, take: Callable[[float], None], longest: float, tolerance: float) -> None:
+        """Halve the step until the end of the interval no longer depends on it."""
+        start = self._state.copy()
+        take(longest)
+        change = inf
+        while change > tolerance:
+            if longest < _SHORTEST_STEP:
+                raise ToleranceError(
+                    f'tolerance {tolerance:g} cannot be met: {change:.1e} is left with steps of '
+                    f'{longest:.1e} s'
+                )
+            coarse = self._state.copy()
+            self._state[:] = start
+            longest *= 0.5
+            take(longest)
+            # The finer run is kept; second order makes its error a third of the difference.
+            change = self._distance(coarse, self._state) / 3.0
+        # The next interval begins with the step before the last one, or one more before where
+        # the error allows it: a step twice as long has four times the error.
+        growth = 4.0 if change < tolerance / 32.0 else 2.0
+        self._refinement = max(1.0, self.step / (growth * longest))
+
+    def _distance(self, one: FloatArray, two: FloatArray) -> float:
+        """Return how far apart two states are: energy of the difference, and depth."""
+        model, m = self.model, self.model.coordinates
+        depth = model.parameters.length - two[0]
+        gram = model.parameters.linear_density * model.modes.integrals(depth).gram
+        stiffness = model.stiffness_matrix(depth, self.time)
+        mass = model.parameters.moving_mass
+
+        def energy(x: FloatArray) -> float:
+            rate = x[m + 2 :]
+            elastic = x[2:m] @ stiffness @ x[2:m]
+            return float(0.5 * (elastic + rate @ gram @ rate + mass * x[m] ** 2))
+
+        scale = max(energy(one), energy(two))
+        part = sqrt(energy(two - one) / scale) if scale > 0.0 else 0.0
+        return max(part, float(abs(two[0] - one[0])) / model.parameters.length)
 
     def _interval(
         self, before: FloatArray, duration: float, force: float, torque: float, *, moved: bool
     ) -> Interval:
         p, after, sums = self.model.parameters, self._state, self._sums
-        rho, now = p.linear_density, self.model.modes.integrals
-        start, end = now(p.length - before[0]), now(p.length - after[0])
-        momentum = rho * (end.area @ after[6:] - start.area @ before[6:])
-        angular = rho * (end.moment @ after[6:] - start.moment @ before[6:])
-        k, c = p.tissue_stiffness, p.tissue_damping
-        lateral = (momentum + k * sums[SUM_AREA] + c * sums[SUM_AREA_RATE]) / duration
-        about_entry = (angular + k * sums[SUM_MOMENT] + c * sums[SUM_MOMENT_RATE]) / duration
-        gain = (before[4] - after[4]) / duration
+        m, n = self.model.coordinates, self.model.modes.count
+        # Integrals of phi and of y phi are the last 2 n.
+        start = self.model.modes.packed(p.length - before[0])[-2 * n :].reshape(2, n)
+        end = self.model.modes.packed(p.length - after[0])[-2 * n :].reshape(2, n)
+        momentum, angular = end @ after[m + 2 :] - start @ before[m + 2 :]
+        lateral = (p.linear_density * momentum + sums[SUM_REACTION]) / duration
+        about_entry = (p.linear_density * angular + sums[SUM_REACTION_MOMENT]) / duration
+        gain = (before[m] - after[m]) / duration
         if moved:
             force = p.linear_density * p.length * gain + sums[SUM_RESISTANCE] / duration
         else:
@@ -257,28 +353,86 @@ class Integrator:
             friction_work=float(sums[SUM_FRICTION_WORK]),
             damping_work=float(sums[SUM_DAMPING_WORK]),
             input_work=float(sums[SUM_INPUT_WORK]),
+            impact_loss=float(sums[SUM_IMPACT]),
+            contact_time=float(sums[SUM_CONTACT]) if sums[SUM_CONTACT] >= 0.0 else None,
         )
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Trajectory:
     """
-    A simulated run, sampled evenly.
+    A simulated run, sampled evenly, that can be evaluated at any time.
 
     Attributes
     ----------
-    time : ndarray, shape (n,)
+    parameters : NeedleParameters
+        Constants.
+    time : ndarray, shape (k + 1,)
         Time [s].
-    states : ndarray, shape (n, 8)
+    states : ndarray, shape (k + 1, 2 (2 + n))
         States.
-    tip_deflection : ndarray, shape (n,)
-        Deflection of the tip [m] at these times.
+    forces : ndarray, shape (k,)
+        Force over each interval [N].
+    step : float
+        Longest step of the integrator [s].
+    tolerance : float or None
+        As in `Integrator`.
+    graded : bool
+        As in `Integrator`.
 
     """
 
+    parameters: NeedleParameters
     time: FloatArray
     states: FloatArray
-    tip_deflection: FloatArray
+    forces: FloatArray
+    step: float
+    tolerance: float | None = None
+    graded: bool = False
+
+    @property
+    def tip_deflection(self) -> FloatArray:
+        """Deflection of the tip at the samples [m], shape (k + 1,)."""
+        model = NeedleModel(self.parameters)
+        return np.array([model.tip_deflection(x) for x in self.states])
+
+    @property
+    def depth(self) -> FloatArray:
+        """Inserted length at the samples [m], shape (k + 1,)."""
+        return np.asarray(self.parameters.length - self.states[:, 0])
+
+    def at(self, time: float) -> FloatArray:
+        """
+        State at any time of the run, by integrating on from the sample before (dense output).
+
+        Parameters
+        ----------
+        time : float
+            Time [s].
+
+        Returns
+        -------
+        ndarray, shape (2 (2 + n),)
+            State.
+
+        Raises
+        ------
+        ParameterError
+            If the time is outside the run.
+
+        """
+        if not self.time[0] <= time <= self.time[-1]:
+            raise ParameterError(f'time must be in [0, {self.time[-1]:g}] s, got {time!r}')
+        k = int(np.searchsorted(self.time, time, side='right')) - 1
+        rest = time - self.time[k]
+        if rest <= 0.0:
+            return np.array(self.states[k])
+        integrator = Integrator(
+            self.parameters, self.states[k], self.step, self.tolerance, graded=self.graded
+        )
+        integrator.time = float(self.time[k])
+        integrator.advance(rest, self.forces[k])
+        return integrator.state
 
 
 def simulate(
@@ -289,6 +443,8 @@ def simulate(
     duration: float,
     interval: float,
     step: float = DEFAULT_STEP,
+    tolerance: float | None = None,
+    graded: bool = False,
 ) -> Trajectory:
     """
     Simulate the needle under a force that is constant over each interval.
@@ -297,7 +453,7 @@ def simulate(
     ----------
     parameters : NeedleParameters
         Constants.
-    state : array_like, shape (8,)
+    state : array_like, shape (2 (2 + n),)
         Initial state.
     force : float or callable
         Insertion force [N], or a function of time [s] read at the start of each interval.
@@ -307,6 +463,10 @@ def simulate(
         Time between samples [s].
     step : float
         Longest step of the integrator [s].
+    tolerance : float, optional
+        As in `Integrator`.
+    graded : bool
+        As in `Integrator`.
 
     Returns
     -------
@@ -316,16 +476,149 @@ def simulate(
     Raises
     ------
     InsertedLengthError
-        If the needle leaves the tissue.
+        If the needle leaves its range.
 
     """
-    integrator = Integrator(parameters, state, step)
-    count = round(duration / interval)
+    integrator = Integrator(parameters, state, step, tolerance, graded=graded)
+    count = _count(duration, interval)
     time = np.arange(count + 1, dtype=np.float64) * interval
-    states = np.empty((count + 1, 2 * COORDINATES))
+    forces = np.array([force(t) if callable(force) else force for t in time[:-1]])
+    states = np.empty((count + 1, integrator.state.size))
     states[0] = integrator.state
     for i in range(count):
-        integrator.advance(interval, force(time[i]) if callable(force) else force)
+        # Not the sum of the intervals, whose rounding would grow.
+        integrator.time = float(time[i])
+        integrator.advance(interval, forces[i])
         states[i + 1] = integrator.state
-    tips = np.array([integrator.model.tip_deflection(x) for x in states])
-    return Trajectory(time, states, tips)
+    return Trajectory(parameters, time, states, forces, step, tolerance, graded)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Batch:
+    """
+    Many simulated runs.
+
+    Attributes
+    ----------
+    time : ndarray, shape (k + 1,)
+        Time of the samples [s].
+    states : ndarray, shape (runs, k + 1, 2 (2 + n)), or (runs, 1, ...) for the ends only
+        States; not a number after a run has left its range.
+    completed : ndarray, shape (runs,)
+        Time up to which each run is valid [s].
+
+    """
+
+    time: FloatArray
+    states: FloatArray
+    completed: FloatArray
+
+
+def simulate_batch(
+    parameters: NeedleParameters | Sequence[NeedleParameters],
+    states: ArrayLike,
+    forces: ArrayLike,
+    *,
+    duration: float,
+    interval: float,
+    step: float = DEFAULT_STEP,
+    graded: bool = False,
+    keep: bool = True,
+    workers: int | None = None,
+) -> Batch:
+    """
+    Simulate many insertions at once on all cores; the result does not depend on how many.
+
+    Parameters
+    ----------
+    parameters : NeedleParameters or sequence of them
+        Constants, for all runs or for each.
+    states : array_like, shape (runs, 2 (2 + n)) or (2 (2 + n),)
+        Initial states.
+    forces : array_like, shape (), (runs,) or (runs, k)
+        Insertion force [N], constant over each interval.
+    duration, interval, step : float
+        As in `simulate` [s].
+    graded : bool
+        As in `Integrator`.
+    keep : bool
+        Keep the states at all samples, or only at the end.
+    workers : int, optional
+        Threads; one per core if not given.
+
+    Returns
+    -------
+    Batch
+        Results.
+
+    Raises
+    ------
+    ShapeError
+        If the numbers of runs do not agree.
+    ParameterError, InsertedLengthError
+        If a value is not valid.
+
+    """
+    each = [parameters] if isinstance(parameters, NeedleParameters) else list(parameters)
+    starts = np.atleast_2d(np.array(states, dtype=float))
+    pushes = np.array(forces, dtype=float)
+    if pushes.ndim < 2:
+        pushes = pushes.reshape(-1, 1)
+    count, sizes = _count(duration, interval), {len(each), len(starts), len(pushes)} - {1}
+    shaped = starts.ndim == pushes.ndim == 2 and pushes.shape[1] in (1, count)
+    if len(sizes) > 1 or 0 in sizes or not shaped:
+        raise ShapeError(
+            f'parameters, states and forces must be for one number of runs and forces constant or '
+            f'for {count} intervals, got {len(each)} parameters, states {starts.shape}, '
+            f'forces {pushes.shape}'
+        )
+    if not np.isfinite(pushes).all():
+        raise ParameterError('forces must be finite')
+    if not 0.0 < step < inf:
+        raise ParameterError(f'step must be positive and finite, got {step!r} s')
+    if workers is not None and workers < 1:
+        raise ParameterError(f'workers must be >= 1, got {workers!r}')
+    runs = sizes.pop() if sizes else 1
+    models = [NeedleModel(p) for p in each]
+    tables = [(_constants(model), _tables(model)) for model in models]
+    starts = np.array(
+        [models[i % len(models)].checked_state(starts[i % len(starts)]) for i in range(runs)]
+    )
+    result = np.full((runs, count + 1 if keep else 1, starts.shape[1]), np.nan)
+    completed = np.empty(runs)
+
+    def one(i: int) -> None:
+        constants, table = tables[i % len(tables)]
+        push = np.ascontiguousarray(np.broadcast_to(pushes[i % len(pushes)], (count,)))
+        done = run(constants, table, starts[i], push, interval, step, graded, result[i])
+        completed[i] = done * interval
+        if not keep and done == count:
+            result[i, 0] = starts[i]
+
+    def share_of_runs(share: range) -> None:
+        for i in share:
+            one(i)
+
+    workers = workers or os.cpu_count() or 1
+    with ThreadPoolExecutor(workers) as pool:
+        # A thread takes its share at once: one task per run would cost more than short runs do.
+        shares = [range(k, runs, workers) for k in range(workers)]
+        list(pool.map(share_of_runs, shares))
+    time = np.arange(count + 1, dtype=np.float64) * interval
+    return Batch(time if keep else time[-1:], result, completed)
+
+
+def _count(duration: float, interval: float) -> int:
+    """Return how many intervals a duration has."""
+    if not 0.0 < interval <= duration < inf:
+        raise ParameterError(
+            f'interval and duration must be positive and finite with interval <= duration, got '
+            f'interval = {interval!r} s, duration = {duration!r} s'
+        )
+    count = round(duration / interval)
+    # Rounding of the quotient.
+    if abs(count * interval - duration) > 1e-9 * duration:
+        raise ParameterError(
+            f'duration must be a whole number of intervals, got {duration!r} s and {interval!r} s'
+        )
+    return count

@@ -1,5 +1,5 @@
 """
-Everything that is compiled: series of the modes, friction flow, modal flow, time step.
+Everything that is compiled: integrals of the modes, friction flow, modal flow, time step.
 
 One file for all: Numba keeps machine code on disk and renews it when the file of the function
 changes, but not when that of a function which it calls does.
@@ -8,7 +8,7 @@ changes, but not when that of a function which it calls does.
 from __future__ import annotations
 
 from collections.abc import Callable
-from math import cos, exp, expm1, inf, log1p, sin, sqrt
+from math import ceil, cos, exp, expm1, inf, log1p, sin, sqrt, tanh
 from typing import cast, Final, NamedTuple, TypeAlias, TypeVar
 
 import numba
@@ -17,29 +17,33 @@ from numpy.typing import NDArray
 
 FloatArray: TypeAlias = NDArray[np.float64]
 
-#: Number of modes n in (10), as in the paper.
-MODES: Final = 2
+#: Friction laws by number: set-valued Coulomb, set-valued Stribeck, smooth tanh.
+COULOMB: Final = 0
+STRIBECK: Final = 1
+TANH: Final = 2
 
-# Columns of the series: where each quantity starts. Pairs count 11, 12, 22.
-GRAM: Final = 0
-CURVATURE_GRAM: Final = 9
-VALUE: Final = 18
-CURVATURE: Final = 22
-AREA: Final = 26
-MOMENT: Final = 30
-COLUMNS: Final = 34
+#: Below this argument k_i s the series of a mode is used, above it the closed form.
+SERIES_END: Final = 2.0
+
+#: Resolution of `ModeShapes.terms` in the relative inserted length.
+TERMS_PER_LENGTH: Final = 32
+
+#: Relative inserted length from which on graded steps grow in proportion to it.
+GRADED_FROM: Final = 0.1
 
 # Slots of the running sums of `advance`.
 SUM_TIP: Final = 0
-SUM_AREA: Final = 1
-SUM_MOMENT: Final = 2
-SUM_AREA_RATE: Final = 3
-SUM_MOMENT_RATE: Final = 4
-SUM_FRICTION_WORK: Final = 5
-SUM_DAMPING_WORK: Final = 6
-SUM_INPUT_WORK: Final = 7
+#: Impulse of the tissue's reaction along z, and its moment about the entry point.
+SUM_REACTION: Final = 1
+SUM_REACTION_MOMENT: Final = 2
+SUM_FRICTION_WORK: Final = 3
+SUM_DAMPING_WORK: Final = 4
+SUM_INPUT_WORK: Final = 5
 #: Impulse of the base on the needle that a moved base takes, without that of its inertia.
-SUM_RESISTANCE: Final = 8
+SUM_RESISTANCE: Final = 6
+#: Energy lost on the hub, and time of the last contact from the start [s] (-1 for none).
+SUM_IMPACT: Final = 7
+SUM_CONTACT: Final = 8
 SUMS: Final = 9
 
 _Function = TypeVar('_Function', bound=Callable[..., object])
@@ -48,7 +52,8 @@ _Function = TypeVar('_Function', bound=Callable[..., object])
 def compiled(function: _Function) -> _Function:
     """Compile a function to machine code at its first call and keep it on disk."""
     # error_model: divide as C does; every divisor below is positive by construction.
-    return cast(_Function, numba.njit(cache=True, error_model='numpy')(function))
+    # nogil: batches run in threads.
+    return cast(_Function, numba.njit(cache=True, error_model='numpy', nogil=True)(function))
 
 
 class Constants(NamedTuple):
@@ -57,56 +62,207 @@ class Constants(NamedTuple):
     length: float
     linear_density: float
     bending_stiffness: float
-    tissue_stiffness: float
     tissue_damping: float
     moving_mass: float
     rotary_inertia: float
+    minimum_depth: float
+    maximum_depth: float
+    hub_stop: bool
+    as_printed: bool
+    friction_law: int
     coulomb: float
     viscous: float
-    minimum_depth: float
-    hub_stop: bool
+    withdrawal: float
+    breakaway: float
+    stribeck_speed: float
+    smoothing_speed: float
+    swelling: float
+    swelling_time: float
 
 
-#: Length of the output of `evaluate`: G (11, 12, 22), H (11, 12, 22), then phi, phi'',
-#: the integral of phi and that of y phi, two each.
-INTEGRALS: Final = 14
+class Tables(NamedTuple):
+    """The arrays that go with `Constants`; apart, since passing arrays on is not free."""
+
+    #: `ModeShapes.series`, `ModeShapes.terms` and `ModeShapes.constants`.
+    series: FloatArray
+    terms: FloatArray
+    modes: FloatArray
+    #: Depths at which the layers begin, the first 0, and their stiffness; each shape (m,).
+    layer_start: FloatArray
+    layer_stiffness: FloatArray
+    #: What the layers above add to k G, k int phi and k int y phi; shape (m, pairs + 2 n).
+    layer_offset: FloatArray
 
 
 @compiled
-def evaluate(xi: float, table: FloatArray, work: FloatArray, out: FloatArray) -> None:
+def evaluate(
+    xi: float, table: FloatArray, terms: FloatArray, work: FloatArray, out: FloatArray
+) -> None:
     """
-    Evaluate all series at the relative inserted length.
+    Evaluate the series of two modes at the relative inserted length.
 
     Parameters
     ----------
     xi : float
         s / l.
-    table : ndarray, shape (terms, columns)
+    table : ndarray, shape (terms, 34)
         `ModeShapes.series`.
-    work : ndarray, shape (columns,)
+    terms : ndarray
+        `ModeShapes.terms`: how many of them the depth needs.
+    work : ndarray, shape (34,) or longer
         Scratch.
     out : ndarray, shape (14,)
-        Overwritten with the values, in the order of `INTEGRALS`.
+        Overwritten with G (11, 12, 22), H (11, 12, 22), phi, phi'', the integral of phi and that
+        of y phi, two each.
 
     """
     square = xi * xi
     z = square * square
-    last = table.shape[0] - 1
-    for j in range(COLUMNS):
+    last = int(terms[int(xi * TERMS_PER_LENGTH)]) - 1
+    for j in range(34):
         work[j] = table[last, j]
     for m in range(last - 1, -1, -1):
-        for j in range(COLUMNS):
+        for j in range(34):
             work[j] = work[j] * z + table[m, j]
     for pair in range(3):
-        g, h = GRAM + 3 * pair, CURVATURE_GRAM + 3 * pair
+        g, h = 3 * pair, 9 + 3 * pair
         out[pair] = z * xi * (work[g] + xi * work[g + 1] + square * work[g + 2])
         out[3 + pair] = xi * (work[h] + xi * work[h + 1] + square * work[h + 2])
-    for i in range(MODES):
-        j = 2 * i
-        out[6 + i] = square * (work[VALUE + j] + xi * work[VALUE + j + 1])
-        out[8 + i] = work[CURVATURE + j] + xi * work[CURVATURE + j + 1]
-        out[10 + i] = square * xi * (work[AREA + j] + xi * work[AREA + j + 1])
-        out[12 + i] = z * (work[MOMENT + j] + xi * work[MOMENT + j + 1])
+    for i in range(2):
+        j = 18 + 2 * i
+        out[6 + i] = square * (work[j] + xi * work[j + 1])
+        out[8 + i] = work[j + 4] + xi * work[j + 5]
+        out[10 + i] = square * xi * (work[j + 8] + xi * work[j + 9])
+        out[12 + i] = z * (work[j + 12] + xi * work[j + 13])
+
+
+@compiled
+def mode_derivatives(
+    x: float, ratio: float, rest: float, end: float
+) -> tuple[float, float, float, float]:
+    """
+    Return phi and its first three derivatives, over c_i k_i^order, at the argument x = k_i y.
+
+    The growing exponentials of (11) nearly cancel: ``rest`` = (mu_i - 1) exp(k_i l) is what is
+    left of them at the end = k_i l, so that no mode is too high.
+    """
+    sine, cosine = sin(x), cos(x)
+    grow = 0.5 * rest * exp(x - end)
+    fall = 0.5 * (ratio + 1.0) * exp(-x)
+    return (
+        sine - ratio * cosine + grow + fall,
+        cosine + ratio * sine + grow - fall,
+        -sine + ratio * cosine + grow + fall,
+        -cosine - ratio * sine + grow - fall,
+    )
+
+
+@compiled
+def evaluate_many(
+    xi: float,
+    length: float,
+    modes: FloatArray,
+    table: FloatArray,
+    work: FloatArray,
+    out: FloatArray,
+) -> None:
+    """
+    Evaluate what `evaluate` does for any number of modes n.
+
+    Pairs of modes with small arguments come from the series, which does not cancel there, the
+    others from the boundary values of the antiderivatives: the fourth derivative of a mode is
+    k^4 times the mode.
+
+    Parameters
+    ----------
+    xi : float
+        s / l.
+    length : float
+        Needle length l [m].
+    modes : ndarray, shape (4, n)
+        `ModeShapes.constants`.
+    table : ndarray, shape (terms, columns)
+        `ModeShapes.series`.
+    work : ndarray, shape (columns + 4 n,)
+        Scratch.
+    out : ndarray, shape (n (n + 1) + 4 n,)
+        Overwritten with G and H (upper triangles by rows), phi, phi'', the integral of phi and
+        that of y phi.
+
+    """
+    n = modes.shape[1]
+    pairs = n * (n + 1) // 2
+    columns = table.shape[1]
+    square = xi * xi
+    z = square * square
+    last = table.shape[0] - 1
+    for j in range(columns):
+        work[j] = table[last, j]
+    for m in range(last - 1, -1, -1):
+        for j in range(columns):
+            work[j] = work[j] * z + table[m, j]
+    s = xi * length
+    for i in range(n):
+        end, ratio, rest, scale = modes[0, i], modes[1, i], modes[2, i], modes[3, i]
+        k = end / length
+        p0, p1, p2, p3 = mode_derivatives(end * xi, ratio, rest, end)
+        d = columns + 4 * i
+        work[d] = scale * p0
+        work[d + 1] = scale * k * p1
+        work[d + 2] = scale * k * k * p2
+        work[d + 3] = scale * k * k * k * p3
+        at = 2 * pairs + i
+        j = 6 * pairs + 2 * i
+        if end * xi < SERIES_END:
+            out[at] = square * (work[j] + xi * work[j + 1])
+            out[at + n] = work[j + 2 * n] + xi * work[j + 2 * n + 1]
+            out[at + 2 * n] = square * xi * (work[j + 4 * n] + xi * work[j + 4 * n + 1])
+            out[at + 3 * n] = z * (work[j + 6 * n] + xi * work[j + 6 * n + 1])
+        else:
+            k4 = k * k * k * k
+            # At the clamped end the second derivative is 2 c mu k^2 and the third -2 c k^3.
+            out[at] = work[d]
+            out[at + n] = work[d + 2]
+            out[at + 2 * n] = (work[d + 3] + 2.0 * scale * k * k * k) / k4
+            out[at + 3 * n] = (s * work[d + 3] - work[d + 2] + 2.0 * ratio * scale * k * k) / k4
+    pair = 0
+    for i in range(n):
+        a0, a1 = work[columns + 4 * i], work[columns + 4 * i + 1]
+        a2, a3 = work[columns + 4 * i + 2], work[columns + 4 * i + 3]
+        ki4 = (modes[0, i] / length) ** 4
+        for j in range(i, n):
+            if modes[0, j] * xi < SERIES_END:
+                g, h = 3 * pair, 3 * (pairs + pair)
+                out[pair] = z * xi * (work[g] + xi * work[g + 1] + square * work[g + 2])
+                out[pairs + pair] = xi * (work[h] + xi * work[h + 1] + square * work[h + 2])
+            else:
+                b0, b1 = work[columns + 4 * j], work[columns + 4 * j + 1]
+                b2, b3 = work[columns + 4 * j + 2], work[columns + 4 * j + 3]
+                if i == j:
+                    whole = s * (ki4 * a0 * a0 + a2 * a2 - 2.0 * a1 * a3)
+                    out[pair] = (whole - a1 * a2 + 3.0 * a0 * a3) / (4.0 * ki4)
+                else:
+                    kj4 = (modes[0, j] / length) ** 4
+                    out[pair] = (a3 * b0 - a2 * b1 + a1 * b2 - a0 * b3) / (ki4 - kj4)
+                out[pairs + pair] = a2 * b1 - a3 * b0 + ki4 * out[pair]
+            pair += 1
+
+
+@compiled
+def _integrals(
+    length: float,
+    s: float,
+    series: FloatArray,
+    terms: FloatArray,
+    modes: FloatArray,
+    work: FloatArray,
+    out: FloatArray,
+) -> None:
+    """Evaluate the modes and their integrals at an inserted length."""
+    if modes.shape[1] == 2:
+        evaluate(s / length, series, terms, work, out)
+    else:
+        evaluate_many(s / length, length, modes, series, work, out)
 
 
 @compiled
@@ -137,7 +293,14 @@ def _glide(u: float, a: float, b: float, t: float) -> tuple[float, float]:
 
 @compiled
 def slide(
-    u: float, drive: float, mass: float, coulomb: float, viscous: float, t: float
+    u: float,
+    drive: float,
+    mass: float,
+    coulomb: float,
+    viscous: float,
+    t: float,
+    withdrawal: float = 1.0,
+    breakaway: float = 1.0,
 ) -> tuple[float, float]:
     """
     Exact flow of the insertion axis under a constant force and friction (15).
@@ -152,6 +315,10 @@ def slide(
         Moving mass [kg], Coulomb friction [N], viscous friction [N s/m].
     t : float
         Duration [s].
+    withdrawal : float
+        Friction on withdrawal over that on insertion.
+    breakaway : float
+        Friction that rest can bear over Coulomb friction.
 
     Returns
     -------
@@ -161,11 +328,12 @@ def slide(
         Distance moved [m].
 
     """
-    b = viscous / mass
     distance = 0.0
     if u != 0.0:
         sign = 1.0 if u > 0.0 else -1.0
-        braking = (coulomb - drive * sign) / mass
+        factor = 1.0 if u > 0.0 else withdrawal
+        b = factor * viscous / mass
+        braking = (factor * coulomb - drive * sign) / mass
         stop = inf
         if braking > 0.0:
             stop = abs(u) / braking
@@ -175,31 +343,135 @@ def slide(
             return _glide(u, -sign * braking, b, t)
         _, distance = _glide(u, -sign * braking, b, stop)
         t -= stop
-    if abs(drive) <= coulomb:
+    bearable = breakaway * coulomb
+    if -withdrawal * bearable <= drive <= bearable:
         return 0.0, distance
-    excess = drive - coulomb if drive > 0.0 else drive + coulomb
-    speed, further = _glide(0.0, excess / mass, b, t)
+    factor = 1.0 if drive > 0.0 else withdrawal
+    excess = drive - coulomb if drive > 0.0 else drive + factor * coulomb
+    speed, further = _glide(0.0, excess / mass, factor * viscous / mass, t)
     return speed, distance + further
 
 
 @compiled
-def _rotate(
-    c: Constants,
+def _dry(c: Constants, u: float) -> float:
+    """Return the modulus of the dry part of friction at a speed."""
+    factor = 1.0 if u >= 0.0 else c.withdrawal
+    if c.friction_law == STRIBECK:
+        r = u / c.stribeck_speed
+        return factor * c.coulomb * (1.0 + (c.breakaway - 1.0) * exp(-r * r))
+    if c.friction_law == TANH:
+        return factor * c.coulomb * tanh(abs(u) / c.smoothing_speed)
+    return factor * c.coulomb
+
+
+@compiled
+def _creep(c: Constants, u: float, drive: float, h: float) -> float:
+    """Solve M (w - u) = h (drive - friction(w)) for w under the smooth law."""
+    # The residual grows with w: Newton, kept inside a bracket that always holds the root.
+    inertia = c.moving_mass / h
+    reach = (abs(drive) + c.coulomb * max(1.0, c.withdrawal)) / inertia + abs(u)
+    low, high = -reach, reach
+    w = u
+    for _ in range(100):
+        factor = 1.0 if w >= 0.0 else c.withdrawal
+        turned = tanh(w / c.smoothing_speed)
+        value = inertia * (w - u) - drive + factor * (c.coulomb * turned + c.viscous * w)
+        steep = c.coulomb * (1.0 - turned * turned) / c.smoothing_speed + c.viscous
+        if value > 0.0:
+            high = w
+        else:
+            low = w
+        following = w - value / (inertia + factor * steep)
+        if not low <= following <= high:
+            following = 0.5 * (low + high)
+        if abs(following - w) <= 1e-15 * reach:
+            return following
+        w = following
+    return w
+
+
+@compiled
+def _flow(c: Constants, u: float, drive: float, h: float) -> tuple[float, float]:
+    """Return speed and displacement of the insertion axis after a time h, for every law."""
+    if c.friction_law == COULOMB:
+        return slide(u, drive, c.moving_mass, c.coulomb, c.viscous, h, c.withdrawal)
+    if c.friction_law == STRIBECK:
+        # Dry friction is that at the speed in the middle of the step; rest bears the break-away.
+        mass, bearable = c.moving_mass, c.breakaway * c.coulomb
+        level = _dry(c, abs(u))
+        half, _ = slide(u, drive, mass, level, c.viscous, 0.5 * h, c.withdrawal, bearable / level)
+        level = _dry(c, abs(half))
+        return slide(u, drive, mass, level, c.viscous, h, c.withdrawal, bearable / level)
+    # Two implicit stages of second order, L-stable (R. Alexander, SIAM J. Numer. Anal. 14, 1977).
+    part = 1.0 - sqrt(0.5)
+    first = _creep(c, u, drive, part * h)
+    end = _creep(c, u + (1.0 - part) / part * (first - u), drive, part * h)
+    step = h * ((1.0 - part) * first + part * end)
+    lost = drive * step - 0.5 * c.moving_mass * (end * end - u * u)
+    if lost < 0.0 or (drive - _smooth(c, end)) * (drive - _smooth(c, u)) < 0.0:
+        # Past the steady speed, or energy out of friction: implicit Euler, of first order, never.
+        end = _creep(c, u, drive, h)
+        step = h * end
+    return end, step
+
+
+@compiled
+def _smooth(c: Constants, u: float) -> float:
+    """Return friction under the smooth law."""
+    viscous = c.viscous * u * (1.0 if u >= 0.0 else c.withdrawal)
+    return viscous + (_dry(c, u) if u >= 0.0 else -_dry(c, u))
+
+
+@compiled
+def _layer(start: FloatArray, s: float, layer: int) -> int:
+    """Return the layer that holds a depth, looked for from the one given."""
+    while layer + 1 < start.shape[0] and s >= start[layer + 1]:
+        layer += 1
+    while layer > 0 and s < start[layer]:
+        layer -= 1
+    return layer
+
+
+@compiled
+def _time_to_layer(start: FloatArray, stiffness: FloatArray, s: float, u: float) -> float:
+    """Return the time until the next border between unlike layers at the speed now."""
+    soonest = inf
+    for i in range(1, start.shape[0]):
+        ahead = (start[i] - s) / u if u != 0.0 else inf
+        if 0.0 < ahead < soonest and stiffness[i] != stiffness[i - 1]:
+            soonest = ahead
+    return soonest
+
+
+@compiled
+def _rotate_two(
+    rho: float,
+    ei: float,
+    damping: float,
+    as_printed: bool,
     at: FloatArray,
+    offset: FloatArray,
+    layer: int,
+    ka: float,
+    growth: float,
     q1: float,
     q2: float,
-    p1: float,
-    p2: float,
+    z1: float,
+    z2: float,
     h: float,
     decay: float,
     sums: FloatArray,
 ) -> tuple[float, float, float, float, float]:
     """
-    Exact modal flow at frozen depth for a time h, between two half steps of tissue damping.
+    Exact modal flow of two modes at frozen depth for a time h, between half steps of damping.
 
-    Returns q1, q2, p1, p2 and the impulse on the insertion axis [N s] against insertion.
+    Returns the new q and z (momenta, or rates in the formulation as printed) and the impulse of
+    the modes on the insertion axis, against insertion [N s]. The tissue has the stiffness ``ka``
+    at the tip; ``offset`` of its layer, times ``growth``, is what the layers above add.
     """
-    rho, ei, ka = c.linear_density, c.bending_stiffness, c.tissue_stiffness
+    k11 = ei * at[3] + ka * at[0] + growth * offset[layer, 0]
+    k12 = ei * at[4] + ka * at[1] + growth * offset[layer, 1]
+    k22 = ei * at[5] + ka * at[2] + growth * offset[layer, 2]
     # Cholesky factor of the modal mass rho A G = L L^T.
     l11 = sqrt(rho * at[0])
     l21 = rho * at[1] / l11
@@ -208,9 +480,6 @@ def _rotate(
     i22 = 1.0 / l22
     ratio = l21 * i11
     # Stiffness in the coordinates y = L^T q, where the mass is the identity.
-    k11 = ei * at[3] + ka * at[0]
-    k12 = ei * at[4] + ka * at[1]
-    k22 = ei * at[5] + ka * at[2]
     b11 = k11 * i11 * i11
     b12 = (k12 - ratio * k11) * i11 * i22
     b22 = (k22 - 2.0 * ratio * k12 + ratio * ratio * k11) * i22 * i22
@@ -226,8 +495,12 @@ def _rotate(
 
     y1 = l11 * q1 + l21 * q2
     y2 = l22 * q2
-    v1 = p1 * i11
-    v2 = (p2 - l21 * v1) * i22
+    if as_printed:
+        v1 = l11 * z1 + l21 * z2
+        v2 = l22 * z2
+    else:
+        v1 = z1 * i11
+        v2 = (z2 - l21 * v1) * i22
     a1 = cj * y1 - sj * y2
     a2 = sj * y1 + cj * y2
     b1 = cj * v1 - sj * v2
@@ -236,7 +509,6 @@ def _rotate(
     lost = b1 * b1 + b2 * b2
     b1 *= decay
     b2 *= decay
-    lost *= 1.0 - decay * decay
 
     cos1 = cos(omega1 * h)
     sin1 = sin(omega1 * h)
@@ -277,7 +549,6 @@ def _rotate(
         + 2.0 * (ei * m1 * m2 + ka * n1 * n2) * aa12
     )
     inertial = rho * (n1 * n1 * bb1 + n2 * n2 * bb2 + 2.0 * n1 * n2 * bb12)
-    impulse = 0.5 * (elastic - inertial)
 
     # Integral of q over the rotation, for the means that sensors take.
     s1 = (b1 - f1) / square1
@@ -287,13 +558,11 @@ def _rotate(
     y2 = cj * s2 - sj * s1
     mean2 = y2 * i22
     mean1 = (y1 - l21 * mean2) * i11
-    sums[SUM_AREA] += at[10] * mean1 + at[11] * mean2
-    sums[SUM_MOMENT] += at[12] * mean1 + at[13] * mean2
 
-    after = f1 * f1 + f2 * f2
+    lost += f1 * f1 + f2 * f2
     f1 *= decay
     f2 *= decay
-    sums[SUM_DAMPING_WORK] += 0.5 * (lost + after * (1.0 - decay * decay))
+    sums[SUM_DAMPING_WORK] += 0.5 * lost * (1.0 - decay * decay)
 
     y1 = cj * e1 + sj * e2
     y2 = cj * e2 - sj * e1
@@ -301,105 +570,415 @@ def _rotate(
     v2 = cj * f2 - sj * f1
     r2 = y2 * i22
     r1 = (y1 - l21 * r2) * i11
-    sums[SUM_AREA_RATE] += at[10] * (r1 - q1) + at[11] * (r2 - q2)
-    sums[SUM_MOMENT_RATE] += at[12] * (r1 - q1) + at[13] * (r2 - q2)
-    return r1, r2, l11 * v1, l21 * v1 + l22 * v2, impulse
+    moved1 = damping * (r1 - q1)
+    moved2 = damping * (r2 - q2)
+    # The tissue holds the needle by the integral of k w, and damps it by that of c_a w_dot.
+    sums[SUM_REACTION] += (
+        (ka * at[10] + growth * offset[layer, 3]) * mean1
+        + (ka * at[11] + growth * offset[layer, 4]) * mean2
+        + at[10] * moved1
+        + at[11] * moved2
+    )
+    sums[SUM_REACTION_MOMENT] += (
+        (ka * at[12] + growth * offset[layer, 5]) * mean1
+        + (ka * at[13] + growth * offset[layer, 6]) * mean2
+        + at[12] * moved1
+        + at[13] * moved2
+    )
+    if as_printed:
+        z2 = v2 * i22
+        return r1, r2, (v1 - l21 * z2) * i11, z2, 0.0
+    return r1, r2, l11 * v1, l21 * v1 + l22 * v2, 0.5 * (elastic - inertial)
 
 
 @compiled
-def advance(
+def _cholesky(c: Constants, at: FloatArray, factor: FloatArray) -> None:
+    """Write the lower Cholesky factor of the modal mass rho A G into ``factor``."""
+    n = factor.shape[0]
+    for j in range(n):
+        for i in range(j, n):
+            value = c.linear_density * at[j * n - j * (j - 1) // 2 + i - j]
+            for k in range(j):
+                value -= factor[i, k] * factor[j, k]
+            factor[i, j] = sqrt(value) if i == j else value / factor[j, j]
+
+
+@compiled
+def _forward(factor: FloatArray, x: FloatArray) -> None:
+    """Replace x by the solution of L y = x."""
+    for i in range(x.shape[0]):
+        value = x[i]
+        for k in range(i):
+            value -= factor[i, k] * x[k]
+        x[i] = value / factor[i, i]
+
+
+@compiled
+def _backward(factor: FloatArray, x: FloatArray) -> None:
+    """Replace x by the solution of L^T y = x."""
+    for i in range(x.shape[0] - 1, -1, -1):
+        value = x[i]
+        for k in range(i + 1, x.shape[0]):
+            value -= factor[k, i] * x[k]
+        x[i] = value / factor[i, i]
+
+
+@compiled
+def _diagonalize(matrix: FloatArray, basis: FloatArray) -> None:
+    """Diagonalize a positive definite matrix in place by Jacobi rotations; vectors in basis."""
+    n = matrix.shape[0]
+    for i in range(n):
+        for j in range(n):
+            basis[i, j] = 1.0 if i == j else 0.0
+    for _ in range(30):
+        largest = 0.0
+        for i in range(n):
+            for j in range(i + 1, n):
+                off = matrix[i, j]
+                scale = sqrt(matrix[i, i] * matrix[j, j])
+                largest = max(largest, abs(off) / scale)
+                if abs(off) <= 1e-17 * scale:
+                    continue
+                tau = (matrix[j, j] - matrix[i, i]) / (2.0 * off)
+                t = (1.0 if tau >= 0.0 else -1.0) / (abs(tau) + sqrt(1.0 + tau * tau))
+                cj = 1.0 / sqrt(1.0 + t * t)
+                sj = t * cj
+                for k in range(n):
+                    x, y = matrix[k, i], matrix[k, j]
+                    matrix[k, i], matrix[k, j] = cj * x - sj * y, sj * x + cj * y
+                for k in range(n):
+                    x, y = matrix[i, k], matrix[j, k]
+                    matrix[i, k], matrix[j, k] = cj * x - sj * y, sj * x + cj * y
+                for k in range(n):
+                    x, y = basis[k, i], basis[k, j]
+                    basis[k, i], basis[k, j] = cj * x - sj * y, sj * x + cj * y
+        if largest <= 1e-16:
+            break
+
+
+@compiled
+def _rotate_many(  # noqa: C901
     c: Constants,
-    table: FloatArray,
-    work: FloatArray,
     at: FloatArray,
+    offset: FloatArray,
+    layer: int,
+    ka: float,
+    growth: float,
+    q: FloatArray,
+    z: FloatArray,
+    h: float,
+    decay: float,
+    sums: FloatArray,
+) -> float:
+    """Do what `_rotate_two` does for any number of modes, on ``q`` and ``z`` in place."""
+    n = q.shape[0]
+    pairs = n * (n + 1) // 2
+    factor = np.zeros((n, n))
+    _cholesky(c, at, factor)
+    stiff = np.empty((n, n))
+    for i in range(n):
+        for j in range(i, n):
+            pair = i * n - i * (i - 1) // 2 + j - i
+            tissue = ka * at[pair] + growth * offset[layer, pair]
+            stiff[i, j] = c.bending_stiffness * at[pairs + pair] + tissue
+            stiff[j, i] = stiff[i, j]
+    for i in range(n):
+        _forward(factor, stiff[:, i])
+    for i in range(n):
+        _forward(factor, stiff[i, :])
+    basis = np.empty((n, n))
+    _diagonalize(stiff, basis)
+    x, v, tip, bend = np.zeros(n), np.zeros(n), np.empty(n), np.empty(n)
+    for i in range(n):
+        for k in range(i, n):
+            x[i] += factor[k, i] * q[k]
+            v[i] += factor[k, i] * z[k]
+        tip[i] = at[2 * pairs + i]
+        bend[i] = at[2 * pairs + n + i]
+    if not c.as_printed:
+        v[:] = z
+        _forward(factor, v)
+    _forward(factor, tip)
+    _forward(factor, bend)
+    a, b, value, curvature = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n)
+    for j in range(n):
+        for i in range(n):
+            a[j] += basis[i, j] * x[i]
+            b[j] += basis[i, j] * v[i]
+            value[j] += basis[i, j] * tip[i]
+            curvature[j] += basis[i, j] * bend[i]
+    e, f, mean = np.empty(n), np.empty(n), np.empty(n)
+    lost = 0.0
+    for j in range(n):
+        lost += b[j] * b[j]
+        b[j] *= decay
+        omega = sqrt(stiff[j, j])
+        co, si = cos(omega * h), sin(omega * h)
+        e[j] = a[j] * co + b[j] * si / omega
+        f[j] = b[j] * co - a[j] * omega * si
+        lost += f[j] * f[j]
+        mean[j] = (b[j] - f[j]) / stiff[j, j]
+        sums[SUM_TIP] += value[j] * mean[j]
+    sums[SUM_DAMPING_WORK] += 0.5 * lost * (1.0 - decay * decay)
+    impulse = 0.0
+    for i in range(n):
+        for j in range(i, n):
+            if i == j:
+                twice = (b[i] * b[i] + stiff[i, i] * a[i] * a[i]) * h
+                change = e[i] * f[i] - a[i] * b[i]
+                aa, bb = 0.5 * (twice - change) / stiff[i, i], 0.5 * (twice + change)
+            else:
+                one, two = e[i] * f[j] - a[i] * b[j], e[j] * f[i] - a[j] * b[i]
+                # Twice: the pair stands for both orders.
+                gap = 2.0 / (stiff[i, i] - stiff[j, j])
+                aa = (one - two) * gap
+                bb = (stiff[i, i] * one - stiff[j, j] * two) * gap
+            shared = value[i] * value[j]
+            bent = c.bending_stiffness * curvature[i] * curvature[j]
+            impulse += 0.5 * ((bent + ka * shared) * aa - c.linear_density * shared * bb)
+    mean_q = np.zeros(n)
+    for i in range(n):
+        x[i] = v[i] = 0.0
+        for j in range(n):
+            x[i] += basis[i, j] * e[j]
+            v[i] += basis[i, j] * f[j] * decay
+            mean_q[i] += basis[i, j] * mean[j]
+    _backward(factor, x)
+    _backward(factor, mean_q)
+    for i in range(n):
+        moved = c.tissue_damping * (x[i] - q[i])
+        area, moment = at[2 * pairs + 2 * n + i], at[2 * pairs + 3 * n + i]
+        force = ka * area + growth * offset[layer, pairs + i]
+        torque = ka * moment + growth * offset[layer, pairs + n + i]
+        sums[SUM_REACTION] += force * mean_q[i] + area * moved
+        sums[SUM_REACTION_MOMENT] += torque * mean_q[i] + moment * moved
+        q[i] = x[i]
+    if c.as_printed:
+        _backward(factor, v)
+        z[:] = v
+        return 0.0
+    for i in range(n):
+        z[i] = 0.0
+        for k in range(i + 1):
+            z[i] += factor[i, k] * v[k]
+    return impulse
+
+
+@compiled
+def advance(  # noqa: C901
+    c: Constants,
+    tables: Tables,
     state: FloatArray,
+    time: float,
     force: float,
     torque: float,
     base_speed: float,
     moved: bool,
-    h: float,
-    steps: int,
+    longest: float,
+    graded: bool,
+    duration: float,
     sums: FloatArray,
-) -> int:
+) -> float:
     """
-    Take ``steps`` steps in place under constant inputs; return how many were taken.
+    Advance ``state`` in place under constant inputs; return the time that was left undone.
 
-    With ``moved`` the speed goes evenly to ``base_speed``, whatever force that takes.
-    Fewer steps than asked for means that the inserted length fell below its minimum.
+    Steps are no longer than ``longest`` [s]; with ``graded`` they grow with the inserted length
+    once it exceeds a tenth of the needle's, since the modes slow down. With ``moved`` the speed
+    goes evenly to ``base_speed``, whatever force that takes. Time is left undone when the
+    inserted length would leave its range.
     """
+    series, terms, modes, layer_start, layer_stiffness, layer_offset = tables
+    n = modes.shape[1]
+    pairs = n * (n + 1) // 2
+    work = np.empty(series.shape[1] + 4 * n)
+    at = np.empty(2 * pairs + 4 * n)
+    q, z = state[2 : 2 + n].copy(), state[4 + n :].copy()
+    q_before, z_before = q.copy(), z.copy()
+    rho, ei = c.linear_density, c.bending_stiffness
+    damping, printed = c.tissue_damping, c.as_printed
     s = c.length - state[0]
-    u = -state[4]
-    q1 = state[2]
-    q2 = state[3]
-    rho = c.linear_density
-    evaluate(s / c.length, table, work, at)
-    p1 = rho * (at[0] * state[6] + at[1] * state[7])
-    p2 = rho * (at[1] * state[6] + at[2] * state[7])
-    decay = exp(-0.5 * h * c.tissue_damping / rho)
-    change = (base_speed - u) / steps
-    taken = 0
-    while taken < steps:
+    u = -state[2 + n]
+    if not c.as_printed:
+        # From rates to momenta p = rho A G q_dot, in which dG/dt needs no term.
+        _integrals(c.length, s, series, terms, modes, work, at)
+        for i in range(n):
+            z[i] = 0.0
+            for j in range(n):
+                low, high = min(i, j), max(i, j)
+                gram = at[low * n - low * (low - 1) // 2 + high - low]
+                z[i] += c.linear_density * gram * state[4 + n + j]
+    q1, q2, z1, z2 = q[0], q[-1], z[0], z[-1]
+    gain = (base_speed - u) / duration
+    growth, decay, layer = 1.0, 1.0, 0
+    pull = 0.0
+    sums[SUM_CONTACT] = -1.0
+    count, whole, renew = 0, longest, True
+    left = duration
+    while left > 0.0:
+        if renew:
+            if graded:
+                whole = longest * max(1.0, s / (GRADED_FROM * c.length))
+            # A time of a whole number of steps is not rounded up.
+            count = ceil(left / whole * (1.0 - 1e-9))
+            even = left / count
+            renew = graded
+        h = even
+        count -= 1
+        rest = left - h if count > 0 else 0.0
+        if layer_start.shape[0] > 1:
+            border = _time_to_layer(layer_start, layer_stiffness, s, u)
+            if 1e-3 * h < border < h:
+                # A step ends where a layer does: its stiffness is that of one layer.
+                h, rest, renew = border, left - border, True
         middle = s + 0.5 * h * u
+        if graded:
+            # Mean depth of the step if it speeds up as the last one did: a steadier phase.
+            middle += h * h * pull / 6.0
         if c.hub_stop and middle > c.length:
             middle = c.length
-        if middle < c.minimum_depth:
+        if not c.minimum_depth <= middle <= c.maximum_depth:
             break
-        evaluate(middle / c.length, table, work, at)
-        r1, r2, t1, t2, impulse = _rotate(c, at, q1, q2, p1, p2, h, decay, sums)
+        if n == 2:
+            evaluate(middle / c.length, series, terms, work, at)
+        else:
+            evaluate_many(middle / c.length, c.length, modes, series, work, at)
+        if layer_start.shape[0] > 1:
+            layer = _layer(layer_start, middle, layer)
+        if c.swelling != 0.0:
+            now = time + duration - left + 0.5 * h
+            growth = 1.0 - c.swelling * expm1(-now / c.swelling_time)
+        if c.tissue_damping != 0.0:
+            decay = exp(-0.5 * h * c.tissue_damping / c.linear_density)
+        ka = growth * layer_stiffness[layer]
+        if n == 2:
+            r1, r2, y1, y2, impulse = _rotate_two(
+                rho, ei, damping, printed,
+                at, layer_offset, layer, ka, growth, q1, q2, z1, z2, h, decay, sums,
+            )  # fmt: skip
+        else:
+            q_before[:], z_before[:] = q, z
+            impulse = _rotate_many(c, at, layer_offset, layer, ka, growth, q, z, h, decay, sums)
         drive = force - impulse / h
         if moved:
             # Counted from the end, so that a base that shall rest does so exactly.
-            new_u = base_speed - (steps - taken - 1) * change
+            new_u = base_speed - rest * gain
             step = 0.5 * h * (u + new_u)
+        elif c.friction_law == COULOMB:
+            new_u, step = slide(u, drive, c.moving_mass, c.coulomb, c.viscous, h, c.withdrawal)
         else:
-            new_u, step = slide(u, drive, c.moving_mass, c.coulomb, c.viscous, h)
-        if s + step < c.minimum_depth:
-            break
+            new_u, step = _flow(c, u, drive, h)
         stopped = c.hub_stop and s + step >= c.length
+        if s + step < c.minimum_depth or (s + step > c.maximum_depth and not stopped):
+            # The last valid state is the one before this step.
+            if n != 2:
+                q[:], z[:] = q_before, z_before
+            break
+        if n == 2:
+            q1, q2, z1, z2 = r1, r2, y1, y2
         if stopped:
             step = c.length - s
-        if moved or stopped:
-            lost = c.coulomb * abs(step) + c.viscous * 0.5 * (u + new_u) * step
-        else:
-            lost = drive * step - 0.5 * c.moving_mass * (new_u * new_u - u * u)
-        if moved:
-            gained = 0.0 if stopped else 0.5 * c.moving_mass * (new_u * new_u - u * u)
-            sums[SUM_INPUT_WORK] += lost + impulse / h * step + gained
-            pace = abs(u) + abs(new_u)
-            if pace > 0.0:
-                # Coulomb friction counts for the time spent in each direction.
-                push = impulse / h + c.coulomb * (u + new_u) / pace
+            if step > 0.0:
+                # Time and speed of the contact within the step, by bisection.
+                early, late = 0.0, h
+                for _ in range(60):
+                    trial = 0.5 * (early + late)
+                    if moved:
+                        gone = trial * (u + 0.5 * trial * gain)
+                    else:
+                        _, gone = _flow(c, u, drive, trial)
+                    if gone < step:
+                        early = trial
+                    else:
+                        late = trial
+                if moved:
+                    new_u = u + late * gain
+                else:
+                    new_u, _ = _flow(c, u, drive, late)
+                sums[SUM_CONTACT] = time + duration - left + late
+                sums[SUM_IMPACT] += 0.5 * c.moving_mass * new_u * new_u
+            elif u > 0.0:
+                # It started on the hub: all its speed is lost at once.
+                new_u = u
+                sums[SUM_CONTACT] = time + duration - left
+                sums[SUM_IMPACT] += 0.5 * c.moving_mass * u * u
             else:
-                push = impulse / h - min(max(impulse / h, -c.coulomb), c.coulomb)
-            sums[SUM_RESISTANCE] += push * h + c.viscous * step
+                new_u = 0.0
+        gained = 0.5 * c.moving_mass * (new_u * new_u - u * u)
+        if moved:
+            mean = 0.5 * (u + new_u)
+            pace = abs(u) + abs(new_u)
+            viscous = c.viscous * (1.0 if mean >= 0.0 else c.withdrawal)
+            if pace > 0.0:
+                # Dry friction counts for the time spent in each direction.
+                dry = _dry(c, mean) * (u + new_u) / pace
+            else:
+                bearable = c.coulomb * (c.breakaway if c.friction_law == STRIBECK else 1.0)
+                if c.friction_law == TANH:
+                    bearable = 0.0
+                dry = min(max(-impulse / h, -c.withdrawal * bearable), bearable)
+            lost = (dry + viscous * mean) * step
+            sums[SUM_INPUT_WORK] += lost + impulse / h * step + gained
+            sums[SUM_RESISTANCE] += (impulse / h + dry) * h + viscous * step
         else:
+            lost = drive * step - gained
             sums[SUM_INPUT_WORK] += force * step
         sums[SUM_FRICTION_WORK] += lost
-        q1, q2, p1, p2 = r1, r2, t1, t2
         s += step
+        pull = (new_u - u) / h
         u = new_u
         if stopped:
             s = c.length
             u = 0.0
-        taken += 1
-    evaluate(s / c.length, table, work, at)
-    # Back from momenta to rates, by the same Cholesky factor.
-    l11 = sqrt(rho * at[0])
-    l21 = rho * at[1] / l11
-    l22 = sqrt(rho * at[2] - l21 * l21)
-    v1 = p1 / l11
-    v2 = (p2 - l21 * v1) / l22
-    rate2 = v2 / l22
-    rate1 = (v1 - l21 * rate2) / l11
-    duration = taken * h
+        left = rest
+    if n == 2:
+        q[0], q[1], z[0], z[1] = q1, q2, z1, z2
+    if not c.as_printed:
+        _integrals(c.length, s, series, terms, modes, work, at)
+        factor = np.zeros((n, n))
+        _cholesky(c, at, factor)
+        _forward(factor, z)
+        _backward(factor, z)
+    done = duration - left
     turn = 2.0 * torque / c.rotary_inertia
-    sums[SUM_INPUT_WORK] += torque * (state[5] + 0.5 * turn * duration) * duration
+    turned = (state[3 + n] + 0.5 * turn * done) * done
+    sums[SUM_INPUT_WORK] += torque * turned
     state[0] = c.length - s
-    state[1] += (state[5] + 0.5 * turn * duration) * duration
-    state[2] = q1
-    state[3] = q2
-    state[4] = -u
-    state[5] += turn * duration
-    state[6] = rate1
-    state[7] = rate2
-    return taken
+    state[1] += turned
+    state[2 : 2 + n] = q
+    state[2 + n] = -u
+    state[3 + n] += turn * done
+    state[4 + n :] = z
+    return left
+
+
+@compiled
+def run(
+    c: Constants,
+    tables: Tables,
+    state: FloatArray,
+    forces: FloatArray,
+    interval: float,
+    longest: float,
+    graded: bool,
+    states: FloatArray,
+) -> int:
+    """
+    Advance ``state`` through intervals of constant force; return how many were completed.
+
+    ``states``, shape (k + 1, ...), is filled with the states at the ends of the intervals; with
+    a single row it is left alone, and only ``state`` is the result.
+    """
+    sums = np.zeros(SUMS)
+    keep = states.shape[0] > 1
+    if keep:
+        states[0] = state
+    for k in range(forces.shape[0]):
+        left = advance(
+            c, tables, state, k * interval, forces[k], 0.0, 0.0, False, longest, graded,
+            interval, sums,
+        )  # fmt: skip
+        if left > 0.0:
+            return k
+        if keep:
+            states[k + 1] = state
+    return len(forces)

@@ -1,33 +1,29 @@
 r"""
 Equations of motion of the needle in tissue, one method per equation.
 
-The generalized coordinates are q = [d, theta, q1, q2] and the state is X = [q, q_dot]: eight
-numbers. d is the length of needle outside the tissue, so that insertion decreases it; the
-insertion force f_y is positive into the tissue. This is the `complete` formulation: every term
-of Euler-Lagrange on T - V, equation (12).
+The generalized coordinates are q = [d, theta, q1, ..., qn] and the state is X = [q, q_dot]:
+eight numbers for n = 2. d is the length of needle outside the tissue, so that insertion
+decreases it; the insertion force f_y is positive into the tissue. The formulation `complete` has
+every term of Euler-Lagrange on T - V, equation (12); `as_printed` is the source's final form,
+which leaves out the row of d and what comes from dG/dt.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from math import copysign
 from typing import Final
 
 from needle_dynamics.errors import InsertedLengthError, ShapeError
-from needle_dynamics.kernels import FloatArray, MODES
+from needle_dynamics.friction import Friction
+from needle_dynamics.kernels import FloatArray
 from needle_dynamics.modes import mode_shapes, ModeShapes
 from needle_dynamics.parameters import NeedleParameters
+from needle_dynamics.tissue import Tissue
 import numpy as np
 from numpy.typing import ArrayLike
 
-#: Number of generalized coordinates.
-COORDINATES: Final = 2 + MODES
-
 #: Rounding of an inserted length, relative to the needle's length.
 ROUNDING: Final = 1e-12
-
-#: Names of the generalized coordinates, in order.
-COORDINATE_NAMES: Final = ('d', 'theta', 'q1', 'q2')
 
 
 @dataclass(frozen=True)
@@ -41,16 +37,35 @@ class NeedleModel:
         Constants, SI units.
     modes : ModeShapes
         Shape modes of the needle.
+    tissue : Tissue
+        Elastic foundation.
+    friction : Friction
+        Friction along the insertion axis.
 
     """
 
     parameters: NeedleParameters
     modes: ModeShapes = field(init=False, repr=False)
+    tissue: Tissue = field(init=False, repr=False)
+    friction: Friction = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
+        p = self.parameters
         # Without the stop the needle may overshoot the hub by as much as its length.
-        reach = 1.0 if self.parameters.hub_stop else 2.0
-        object.__setattr__(self, 'modes', mode_shapes(self.parameters.length, reach))
+        reach = 1.0 if p.hub_stop else 2.0
+        object.__setattr__(self, 'modes', mode_shapes(p.length, p.modes, reach))
+        object.__setattr__(self, 'tissue', p.tissue)
+        object.__setattr__(self, 'friction', p.friction)
+
+    @property
+    def coordinates(self) -> int:
+        """Number of generalized coordinates, 2 + n."""
+        return 2 + self.modes.count
+
+    @property
+    def coordinate_names(self) -> tuple[str, ...]:
+        """Names of the generalized coordinates, in order: d, theta, q1, ..., qn."""
+        return ('d', 'theta', *(f'q{i + 1}' for i in range(self.modes.count)))
 
     def checked_state(self, state: ArrayLike) -> FloatArray:
         """
@@ -58,12 +73,12 @@ class NeedleModel:
 
         Parameters
         ----------
-        state : array_like, shape (8,)
-            X = [d, theta, q1, q2] and its rates, SI units.
+        state : array_like, shape (2 (2 + n),)
+            X = [d, theta, q1, ..., qn] and its rates, SI units.
 
         Returns
         -------
-        ndarray, shape (8,)
+        ndarray, shape (2 (2 + n),)
             A copy.
 
         Raises
@@ -75,8 +90,10 @@ class NeedleModel:
 
         """
         checked = np.array(state, dtype=float)
-        if checked.shape != (2 * COORDINATES,):
-            raise ShapeError(f'state must have shape ({2 * COORDINATES},), got {checked.shape}')
+        if checked.shape != (2 * self.coordinates,):
+            raise ShapeError(
+                f'state must have shape ({2 * self.coordinates},), got {checked.shape}'
+            )
         if not np.isfinite(checked).all():
             raise ShapeError(f'state must be finite, got {checked.tolist()}')
         p = self.parameters
@@ -106,7 +123,7 @@ class NeedleModel:
 
         Returns
         -------
-        ndarray, shape (8,)
+        ndarray, shape (2 (2 + n),)
             State.
 
         Raises
@@ -117,15 +134,15 @@ class NeedleModel:
             If a number is not finite.
 
         """
-        state = np.zeros(2 * COORDINATES)
+        state = np.zeros(2 * self.coordinates)
         state[0] = self.parameters.length - depth
         state = self.checked_state(state)
         value = self.modes.integrals(depth).value
         shape = np.linalg.solve(self.stiffness_matrix(depth), value)
-        state[2:COORDINATES] = shape * (tip_deflection / (value @ shape))
+        state[2 : self.coordinates] = shape * (tip_deflection / (value @ shape))
         return self.checked_state(state)
 
-    def stiffness_matrix(self, depth: float) -> FloatArray:
+    def stiffness_matrix(self, depth: float, time: float = 0.0) -> FloatArray:
         """
         Modal stiffness E I_y H + k_a G of needle and tissue, from (12).
 
@@ -133,15 +150,17 @@ class NeedleModel:
         ----------
         depth : float
             Inserted length s [m].
+        time : float
+            Time [s], for tissue that swells.
 
         Returns
         -------
-        ndarray, shape (2, 2)
+        ndarray, shape (n, n)
             Stiffness [N/m] for modal coordinates in m^3/2.
 
         """
-        p, at = self.parameters, self.modes.integrals(depth)
-        return p.bending_stiffness * at.curvature_gram + p.tissue_stiffness * at.gram
+        bending = self.parameters.bending_stiffness * self.modes.integrals(depth).curvature_gram
+        return np.asarray(bending + self.tissue.matrix(self.modes, depth, time))
 
     def mass_matrix(self, state: ArrayLike) -> FloatArray:
         """
@@ -149,127 +168,209 @@ class NeedleModel:
 
         Parameters
         ----------
-        state : array_like, shape (8,)
+        state : array_like, shape (2 (2 + n),)
             State.
 
         Returns
         -------
-        ndarray, shape (4, 4)
+        ndarray, shape (2 + n, 2 + n)
             Mass matrix.
 
         """
         p, x = self.parameters, self.checked_state(state)
-        matrix = np.zeros((COORDINATES, COORDINATES))
+        matrix = np.zeros((self.coordinates, self.coordinates))
         matrix[0, 0] = p.moving_mass
         matrix[1, 1] = 0.5 * p.rotary_inertia
         matrix[2:, 2:] = p.linear_density * self.modes.integrals(p.length - x[0]).gram
         return matrix
 
-    def bias_forces(self, state: ArrayLike) -> FloatArray:
+    def bias_forces(self, state: ArrayLike, time: float = 0.0) -> FloatArray:
         """
-        Bias forces N(q, q_dot) of (13), complete: elastic, inertial and tissue damping.
+        Bias forces N(q, q_dot) of (13): elastic, inertial and tissue damping.
 
         Parameters
         ----------
-        state : array_like, shape (8,)
+        state : array_like, shape (2 (2 + n),)
             State.
+        time : float
+            Time [s], for tissue that swells.
 
         Returns
         -------
-        ndarray, shape (4,)
+        ndarray, shape (2 + n,)
             N in M q_ddot + N = F - F_f.
 
         """
-        p, x = self.parameters, self.checked_state(state)
-        at = self.modes.integrals(p.length - x[0])
-        modal, rate, d_rate = x[2:COORDINATES], x[COORDINATES + 2 :], x[COORDINATES]
-        tip_rate = at.value @ rate
-        bias = np.zeros(COORDINATES)
-        bias[0] = 0.5 * (
-            p.linear_density * tip_rate**2
-            - p.bending_stiffness * (at.curvature @ modal) ** 2
-            - p.tissue_stiffness * (at.value @ modal) ** 2
-        )
-        bias[2:] = (
-            -p.linear_density * d_rate * at.value * tip_rate
-            + self.stiffness_matrix(p.length - x[0]) @ modal
-            + p.tissue_damping * at.gram @ rate
-        )
+        p, x, m = self.parameters, self.checked_state(state), self.coordinates
+        depth = p.length - x[0]
+        at = self.modes.integrals(depth)
+        modal, rate, d_rate = x[2:m], x[m + 2 :], x[m]
+        bias = np.zeros(m)
+        bias[2:] = self.stiffness_matrix(depth, time) @ modal + p.tissue_damping * at.gram @ rate
+        if p.formulation == 'complete':
+            tip_rate = at.value @ rate
+            bias[0] = 0.5 * (
+                p.linear_density * tip_rate**2
+                - p.bending_stiffness * (at.curvature @ modal) ** 2
+                - self.tissue.stiffness(depth, time) * (at.value @ modal) ** 2
+            )
+            bias[2:] -= p.linear_density * d_rate * at.value * tip_rate
         return bias
 
-    def friction(self, speed: float, drive: float) -> float:
-        """
-        Friction on the needle along the insertion axis, equation (15), set-valued at rest.
-
-        Parameters
-        ----------
-        speed : float
-            Insertion speed s_dot [m/s], positive into the tissue.
-        drive : float
-            Sum of the other forces [N], positive into the tissue; it decides at rest.
-
-        Returns
-        -------
-        float
-            Friction force [N], positive against insertion.
-
-        """
-        p = self.parameters
-        if speed == 0.0:
-            return float(np.clip(drive, -p.coulomb_friction, p.coulomb_friction))
-        return copysign(p.coulomb_friction, speed) + p.viscous_friction * speed
-
     def acceleration(
-        self, state: ArrayLike, force: float = 0.0, torque: float = 0.0
+        self, state: ArrayLike, force: float = 0.0, torque: float = 0.0, time: float = 0.0
     ) -> FloatArray:
         """
         Forward dynamics, equations (16)-(17).
 
         Parameters
         ----------
-        state : array_like, shape (8,)
+        state : array_like, shape (2 (2 + n),)
             State.
         force : float
             Insertion force f_y at the base [N], positive into the tissue.
         torque : float
             Torque tau about x [N m].
+        time : float
+            Time [s], for tissue that swells.
 
         Returns
         -------
-        ndarray, shape (4,)
+        ndarray, shape (2 + n,)
             q_ddot.
 
         """
         x = self.checked_state(state)
-        bias = self.bias_forces(x)
+        bias = self.bias_forces(x, time)
         # Q_d = -f_y: what pushes the needle in shortens d.
         drive = force + bias[0]
         applied = np.array(
-            [self.friction(-x[COORDINATES], drive) - force, torque, *np.zeros(MODES)]
+            [
+                self.friction.force(-x[self.coordinates], drive) - force,
+                torque,
+                *np.zeros(self.modes.count),
+            ]
         )
         return np.asarray(np.linalg.solve(self.mass_matrix(x), applied - bias))
 
-    def derivative(self, state: ArrayLike, force: float = 0.0, torque: float = 0.0) -> FloatArray:
+    def inverse_dynamics(
+        self, state: ArrayLike, acceleration: ArrayLike, time: float = 0.0
+    ) -> FloatArray:
+        """
+        Return the forces that bring about an acceleration, equation (16) the other way.
+
+        Parameters
+        ----------
+        state : array_like, shape (2 (2 + n),)
+            State.
+        acceleration : array_like, shape (2 + n,)
+            q_ddot. At rest friction acts against the motion that begins.
+        time : float
+            Time [s], for tissue that swells.
+
+        Returns
+        -------
+        ndarray, shape (2 + n,)
+            Insertion force f_y [N], positive into the tissue, torque tau [N m], and the
+            generalized force on each modal coordinate.
+
+        Raises
+        ------
+        ShapeError
+            If a shape is wrong or a number is not finite.
+
+        """
+        x, m = self.checked_state(state), self.coordinates
+        wanted = np.array(acceleration, dtype=float)
+        if wanted.shape != (m,) or not np.isfinite(wanted).all():
+            raise ShapeError(f'acceleration must be finite with shape ({m},), got {wanted}')
+        forces = self.mass_matrix(x) @ wanted + self.bias_forces(x, time)
+        speed = -x[m]
+        # At rest an endless drive decides: friction is what it can bear, in that direction.
+        drive = -np.sign(wanted[0]) * np.inf if wanted[0] != 0.0 else -forces[0]
+        forces[0] = -forces[0] + self.friction.force(speed, drive)
+        return np.asarray(forces)
+
+    def friction_power(self, state: ArrayLike) -> float:
+        """
+        Power that friction takes, f_f s_dot with (15).
+
+        Parameters
+        ----------
+        state : array_like, shape (2 (2 + n),)
+            State.
+
+        Returns
+        -------
+        float
+            Power [W], never negative.
+
+        """
+        speed = -self.checked_state(state)[self.coordinates]
+        return float(self.friction.force(speed, 0.0) * speed)
+
+    def base_reaction(
+        self, state: ArrayLike, force: float = 0.0, torque: float = 0.0, time: float = 0.0
+    ) -> FloatArray:
+        """
+        Return what the base exerts on the needle, by balance of momentum over the inserted part.
+
+        Parameters
+        ----------
+        state : array_like, shape (2 (2 + n),)
+            State.
+        force, torque : float
+            Insertion force [N], positive into the tissue, and torque [N m] on the carriage.
+        time : float
+            Time [s], for tissue that swells.
+
+        Returns
+        -------
+        ndarray, shape (3,)
+            Axial force along y [N], lateral force along z [N], moment about x at the base [N m].
+
+        """
+        p, x, m = self.parameters, self.checked_state(state), self.coordinates
+        n, depth, speed = self.modes.count, p.length - x[0], -x[m]
+        modal, rate = x[2:m], x[m + 2 :]
+        acceleration = self.acceleration(x, force, torque, time)
+        at, tissue = self.modes.integrals(depth), self.tissue
+        layer = max(int(np.searchsorted(tissue.starts, depth, side='right')) - 1, 0)
+        above = tissue.offsets(self.modes)[layer, -2 * n :].reshape(2, n)
+        integrals = np.array([at.area, at.moment])
+        held = tissue.growth(time) * (tissue.stiffnesses[layer] * integrals + above)
+        # The part that enters brings the momentum of the tip, at a lever of the depth.
+        entering = speed * (at.value @ rate) * np.array([1.0, depth])
+        inertia = p.linear_density * (integrals @ acceleration[2:] + entering)
+        lateral, about_entry = inertia + held @ modal + p.tissue_damping * integrals @ rate
+        axial = force + p.carriage_mass * acceleration[0]
+        return np.array([axial, lateral, about_entry + x[0] * lateral + torque])
+
+    def derivative(
+        self, state: ArrayLike, force: float = 0.0, torque: float = 0.0, time: float = 0.0
+    ) -> FloatArray:
         """
         Right-hand side of the state equation (18), for any ODE solver.
 
         Parameters
         ----------
-        state : array_like, shape (8,)
+        state : array_like, shape (2 (2 + n),)
             State.
         force : float
             Insertion force f_y [N], positive into the tissue.
         torque : float
             Torque tau about x [N m].
+        time : float
+            Time [s], for tissue that swells.
 
         Returns
         -------
-        ndarray, shape (8,)
+        ndarray, shape (2 (2 + n),)
             X_dot.
 
         """
         x = np.asarray(state, dtype=float)
-        return np.concatenate([x[COORDINATES:], self.acceleration(x, force, torque)])
+        return np.concatenate([x[self.coordinates :], self.acceleration(x, force, torque, time)])
 
     def kinetic_energy(self, state: ArrayLike) -> float:
         """
@@ -277,7 +378,7 @@ class NeedleModel:
 
         Parameters
         ----------
-        state : array_like, shape (8,)
+        state : array_like, shape (2 (2 + n),)
             State.
 
         Returns
@@ -286,16 +387,16 @@ class NeedleModel:
             Energy [J].
 
         """
-        rate = self.checked_state(state)[COORDINATES:]
+        rate = self.checked_state(state)[self.coordinates :]
         return float(0.5 * rate @ self.mass_matrix(state) @ rate)
 
-    def potential_energy(self, state: ArrayLike) -> float:
+    def potential_energy(self, state: ArrayLike, time: float = 0.0) -> float:
         """
         Potential energy V of needle and tissue, from (12).
 
         Parameters
         ----------
-        state : array_like, shape (8,)
+        state : array_like, shape (2 (2 + n),)
             State.
 
         Returns
@@ -305,16 +406,17 @@ class NeedleModel:
 
         """
         x = self.checked_state(state)
-        modal = x[2:COORDINATES]
-        return float(0.5 * modal @ self.stiffness_matrix(self.parameters.length - x[0]) @ modal)
+        modal = x[2 : self.coordinates]
+        stiffness = self.stiffness_matrix(self.parameters.length - x[0], time)
+        return float(0.5 * modal @ stiffness @ modal)
 
-    def energy(self, state: ArrayLike) -> float:
+    def energy(self, state: ArrayLike, time: float = 0.0) -> float:
         """
         Total energy T + V.
 
         Parameters
         ----------
-        state : array_like, shape (8,)
+        state : array_like, shape (2 (2 + n),)
             State.
 
         Returns
@@ -323,7 +425,7 @@ class NeedleModel:
             Energy [J].
 
         """
-        return self.kinetic_energy(state) + self.potential_energy(state)
+        return self.kinetic_energy(state) + self.potential_energy(state, time)
 
     def tip_deflection(self, state: ArrayLike) -> float:
         """
@@ -331,7 +433,7 @@ class NeedleModel:
 
         Parameters
         ----------
-        state : array_like, shape (8,)
+        state : array_like, shape (2 (2 + n),)
             State.
 
         Returns
@@ -342,7 +444,7 @@ class NeedleModel:
         """
         x = self.checked_state(state)
         value = self.modes.integrals(self.parameters.length - x[0]).value
-        return float(value @ x[2:COORDINATES])
+        return float(value @ x[2 : self.coordinates])
 
     def shape(self, state: ArrayLike, points: int = 50) -> FloatArray:
         """
@@ -350,7 +452,7 @@ class NeedleModel:
 
         Parameters
         ----------
-        state : array_like, shape (8,)
+        state : array_like, shape (2 (2 + n),)
             State.
         points : int
             Number of points, at least 2.
@@ -363,4 +465,4 @@ class NeedleModel:
         """
         x = self.checked_state(state)
         y = np.linspace(0.0, self.parameters.length - x[0], points)
-        return np.column_stack([y, self.modes.values(y) @ x[2:COORDINATES]])
+        return np.column_stack([y, self.modes.values(y) @ x[2 : self.coordinates]])

@@ -5,10 +5,23 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from difflib import get_close_matches
-from math import inf, isfinite
+from itertools import pairwise
+from math import ceil, inf, isfinite
 from typing import Any, Final
 
 from needle_dynamics.errors import ParameterError
+from needle_dynamics.friction import Friction, FRICTION_LAWS
+from needle_dynamics.modes import mode_shapes
+from needle_dynamics.tissue import Tissue
+
+#: Formulations by name: every term of Euler-Lagrange, or the source's final form.
+FORMULATIONS: Final = ('complete', 'as_printed')
+
+#: Most modes: beyond it cond(G) is too large at any useful depth.
+MOST_MODES: Final = 12
+
+#: Largest condition number of G: beyond it the modal state carries less than five digits.
+LARGEST_CONDITION: Final = 1e11
 
 
 def constant(
@@ -28,7 +41,7 @@ def constant(
     default : float
         Default value [``unit``].
     unit : str
-        SI unit as people write it, ``''`` for a pure number.
+        SI unit as people write it, ``1`` for a pure number.
     description : str
         What the number is; becomes the description of the ROS parameter.
     low, high : float
@@ -125,9 +138,39 @@ class NeedleParameters:
     )
     carriage_mass: float = constant(0.0, 'kg', 'mass moved along with the needle base')
     tissue_stiffness: float = constant(520.0, 'N/m^2', 'tissue stiffness k_a per length')
+    layer_depths: tuple[float, ...] = field(
+        default=(), metadata={'description': 'depths at which further layers of tissue begin [m]'}
+    )
+    layer_stiffnesses: tuple[float, ...] = field(
+        default=(), metadata={'description': 'stiffness of each of these layers [N/m^2]'}
+    )
+    swelling: float = constant(
+        0.0, '1', 'growth of the tissue stiffness by swelling in the long run',
+        low=-1.0, open_low=True,
+    )  # fmt: skip
+    swelling_time: float = constant(1.0, 's', 'time constant of the swelling', open_low=True)
     tissue_damping: float = constant(0.0, 'N s/m^2', 'tissue damping c_a per length')
     coulomb_friction: float = constant(0.56, 'N', 'Coulomb friction mu_s')
     viscous_friction: float = constant(0.3, 'N s/m', 'viscous friction mu_v')
+    friction_law: str = field(
+        default='coulomb', metadata={'description': f'one of {", ".join(FRICTION_LAWS)}'}
+    )
+    withdrawal_friction: float = constant(
+        1.0, '1', 'friction on withdrawal over that on insertion'
+    )
+    breakaway_friction: float = constant(
+        1.0, '1', 'friction at rest over Coulomb friction (law stribeck)', low=1.0
+    )
+    stribeck_speed: float = constant(
+        1e-3, 'm/s', 'speed over which break-away friction falls (law stribeck)', open_low=True
+    )
+    smoothing_speed: float = constant(
+        1e-4, 'm/s', 'speed over which friction turns (law tanh)', open_low=True
+    )
+    modes: int = field(default=2, metadata={'description': 'number of shape modes n'})
+    formulation: str = field(
+        default='complete', metadata={'description': f'one of {", ".join(FORMULATIONS)}'}
+    )
     minimum_depth: float = constant(
         1e-3, 'm', 'inserted length below which the model stops', open_low=True
     )
@@ -139,10 +182,77 @@ class NeedleParameters:
         check_constants(self)
         if not isinstance(self.hub_stop, bool):
             raise ParameterError(f'hub_stop must be true or false, got {self.hub_stop!r}')
+        for name, valid in (('friction_law', FRICTION_LAWS), ('formulation', FORMULATIONS)):
+            if getattr(self, name) not in valid:
+                raise ParameterError(
+                    f'{name} must be one of {", ".join(valid)}, got {getattr(self, name)!r}'
+                )
         if self.minimum_depth >= self.length:
             raise ParameterError(
                 f'minimum_depth must be < length = {self.length:g} m, got {self.minimum_depth!r}'
             )
+        self._check_layers()
+        self._check_modes()
+
+    def _check_layers(self) -> None:
+        for name in ('layer_depths', 'layer_stiffnesses'):
+            try:
+                values = tuple(float(value) for value in getattr(self, name))
+            except (TypeError, ValueError):
+                raise ParameterError(
+                    f'{name} must be a list of numbers, got {getattr(self, name)!r}'
+                ) from None
+            if not all(isfinite(value) and value >= 0.0 for value in values):
+                raise ParameterError(f'{name} must be finite and >= 0, got {list(values)}')
+            object.__setattr__(self, name, values)
+        depths = (0.0, *self.layer_depths)
+        if len(self.layer_depths) != len(self.layer_stiffnesses):
+            raise ParameterError(
+                f'layer_stiffnesses must have one value for each of the {len(depths) - 1} '
+                f'layer_depths, got {len(self.layer_stiffnesses)}'
+            )
+        if any(low >= high for low, high in pairwise(depths)):
+            raise ParameterError(
+                f'layer_depths must be > 0 and increase, got {list(self.layer_depths)}'
+            )
+
+    def _check_modes(self) -> None:
+        n = self.modes
+        if isinstance(n, bool) or not isinstance(n, int) or not 1 <= n <= MOST_MODES:
+            raise ParameterError(f'modes must be an integer from 1 to {MOST_MODES}, got {n!r}')
+        shapes = mode_shapes(self.length, n)
+        found = shapes.condition(self.minimum_depth)
+        if found > LARGEST_CONDITION:
+            raise ParameterError(
+                f'{n} modes cannot be told apart at minimum_depth = {self.minimum_depth:g} m: '
+                f'cond(G) = {found:.1e} must be <= {LARGEST_CONDITION:.0e}; minimum_depth >= '
+                f'{ceil(1e4 * shapes.least_depth(LARGEST_CONDITION)) / 1e4:g} m or fewer modes '
+                'would do'
+            )
+
+    @property
+    def tissue(self) -> Tissue:
+        """The tissue along the needle."""
+        return Tissue(
+            starts=(0.0, *self.layer_depths),
+            stiffnesses=(self.tissue_stiffness, *self.layer_stiffnesses),
+            damping=self.tissue_damping,
+            swelling=self.swelling,
+            swelling_time=self.swelling_time,
+        )
+
+    @property
+    def friction(self) -> Friction:
+        """The friction law."""
+        return Friction(
+            law=self.friction_law,
+            coulomb=self.coulomb_friction,
+            viscous=self.viscous_friction,
+            withdrawal=self.withdrawal_friction,
+            breakaway=self.breakaway_friction,
+            stribeck_speed=self.stribeck_speed,
+            smoothing_speed=self.smoothing_speed,
+        )
 
     @property
     def linear_density(self) -> float:
@@ -207,11 +317,16 @@ class NeedleParameters:
             If a name is unknown or a value is not valid.
 
         """
-        valid = [item.name for item in fields(cls)]
+        known = {item.name: item for item in fields(cls)}
         for name in values:
-            if name not in valid:
-                raise ParameterError(unknown_name(name, valid))
-        return cls(**{name: as_number(value) for name, value in values.items()})
+            if name not in known:
+                raise ParameterError(unknown_name(name, list(known)))
+        return cls(
+            **{
+                name: as_number(value) if 'unit' in known[name].metadata else value
+                for name, value in values.items()
+            }
+        )
 
 
 _PAPER_SI = NeedleParameters()

@@ -10,7 +10,6 @@ from needle_dynamics.errors import ParameterError
 from needle_dynamics.force_sensor import ForceSensor
 from needle_dynamics.integrators import Integrator
 from needle_dynamics.kernels import FloatArray
-from needle_dynamics.model import COORDINATES
 from needle_dynamics.parameters import check_constants, constant
 import numpy as np
 
@@ -225,7 +224,7 @@ class Plant:
         return Sample(
             state=state,
             depth=needle.depth,
-            speed=float(-state[COORDINATES]),
+            speed=needle.speed,
             force=seen.axial_force,
             wrench=self._sensor.measure(wrench),
             tip_deflection=seen.tip_deflection,

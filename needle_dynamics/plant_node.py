@@ -13,7 +13,7 @@ from needle_dynamics.base_node import COMMAND, NeedleNode, run, SENSOR
 from needle_dynamics.errors import NeedleError, ParameterError
 from needle_dynamics.force_sensor import ForceSensor, ForceSensorParameters
 from needle_dynamics.integrators import Integrator
-from needle_dynamics.model import COORDINATE_NAMES, COORDINATES, NeedleModel
+from needle_dynamics.model import NeedleModel
 from needle_dynamics.parameters import check_constants, constant
 from needle_dynamics.plant import BaseMotion, BaseParameters, Plant, Sample
 import numpy as np
@@ -88,7 +88,7 @@ class PlantNode(NeedleNode):
         self.create_subscription(JointTrajectory, 'joint_trajectory', self._on_trajectory, COMMAND)
 
         self._joints = JointState(name=['insertion', 'rotation'])
-        self._truth = JointState(name=list(COORDINATE_NAMES))
+        self._truth = JointState()
         self._wrench = WrenchStamped()
         self._wrench.header.frame_id = 'needle_base'
         self._tip = PointStamped()
@@ -102,7 +102,9 @@ class PlantNode(NeedleNode):
         parameters = self.model_parameters()
         seed = self.get_parameter('seed').value
         sensor = ForceSensor(self.settings('sensor.', ForceSensorParameters), settings.rate, seed)
-        state = NeedleModel(parameters).state_at(settings.depth, settings.tip_deflection)
+        model = NeedleModel(parameters)
+        self._truth.name = list(model.coordinate_names)
+        state = model.state_at(settings.depth, settings.tip_deflection)
         integrator = Integrator(parameters, state, settings.step)
         base = None
         if self.text('mode', ('simulation', 'robot')) == 'robot':
@@ -205,14 +207,15 @@ class PlantNode(NeedleNode):
     def _show(self, sample: Sample, stamp: int) -> None:
         time = TimeMessage(sec=stamp // _NANOSECONDS, nanosec=stamp % _NANOSECONDS)
         state = sample.state
+        middle = len(state) // 2
         joints, truth, wrench, tip = self._joints, self._truth, self._wrench.wrench, self._tip
         for message in (joints, self._wrench, tip, truth):
             message.header.stamp = time
         joints.position = [sample.depth, state[1]]
-        joints.velocity = [sample.speed, state[COORDINATES + 1]]
+        joints.velocity = [sample.speed, state[middle + 1]]
         joints.effort = [sample.force, self._torque]
-        truth.position = state[:COORDINATES].tolist()
-        truth.velocity = state[COORDINATES:].tolist()
+        truth.position = state[:middle].tolist()
+        truth.velocity = state[middle:].tolist()
         force, torque = wrench.force, wrench.torque
         force.x, force.y, force.z, torque.x, torque.y, torque.z = sample.wrench.tolist()
         tip.point.y = sample.depth

@@ -104,6 +104,34 @@ def _jazzy() -> Typestore:
     return get_typestore(Stores.ROS2_JAZZY)
 
 
+def message_type(type_name: str) -> Any:
+    """
+    Return the class of a standard message, for `encode`; no ROS is needed.
+
+    Parameters
+    ----------
+    type_name : str
+        Such as ``sensor_msgs/msg/JointState``.
+
+    Raises
+    ------
+    RecordingError
+        If the type is not one of ROS 2 Jazzy's.
+
+    """
+    try:
+        return _jazzy().types[type_name]
+    except KeyError:
+        raise RecordingError(
+            f'no definition of {type_name}; those of ROS 2 Jazzy are known'
+        ) from None
+
+
+def encode(message: Any) -> bytes:
+    """Serialize a message made from a `message_type`."""
+    return bytes(_jazzy().serialize_cdr(message, message.__msgtype__))
+
+
 class BagWriter:
     """
     Writes serialized messages into a new rosbag2 folder, as they are.

@@ -3,102 +3,51 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 import sys
 import time
 
-from needle_dynamics import FloatArray, Integrator, NeedleModel, NeedleParameters, simulate
+from needle_insertion import bench_batches, bench_rods, bench_solvers, bench_step
+from needle_insertion.bench_measure import Bar, environment
 from needle_insertion.report import table
-import numpy as np
-from scipy.integrate import solve_ivp
+from tqdm import tqdm
 
-#: The open-loop run of the source: 3 N, 2 cm inserted, 0.5 mm deflection; it ends before the hub.
-FORCE, DEPTH, DEFLECTION, DURATION = 3.0, 0.02, 5e-4, 0.0285
-
-#: Error that counts as equal: this part of the peak tip deflection.
-ACCURACY = 1e-3
-
-_INTERVAL = 1e-4
+#: Questions, in order: each returns its text and what it says of the bars.
+QUESTIONS: tuple[Callable[[Callable[[str], None]], tuple[str, list[Bar]]], ...] = (
+    bench_step.compare,
+    bench_solvers.compare,
+    bench_rods.compare,
+    bench_batches.compare,
+)
 
 
 def dynamics() -> int:
     """
-    Compare the integrator with SciPy's solvers on the open-loop run, at equal accuracy.
+    Measure the integrator beside what else could be used, and print one table per question.
 
     Returns
     -------
     int
-        0.
+        0, whatever was measured.
 
     """
-    parameters = NeedleParameters.preset('paper_si')
-    model = NeedleModel(parameters)
-    start = model.state_at(DEPTH, DEFLECTION)
-    grid = np.arange(round(DURATION / _INTERVAL) + 1) * _INTERVAL
+    begin = time.perf_counter()
+    sys.stdout.write(f'{environment()}\n')
+    bars: list[Bar] = []
+    with tqdm(disable=None, leave=False, unit=' stages') as progress:
 
-    def scipy_run(method: str, tolerance: float) -> FloatArray:
-        solution = solve_ivp(
-            lambda _t, x: model.derivative(x, FORCE),
-            (0.0, grid[-1]),
-            start,
-            method=method,
-            rtol=tolerance,
-            atol=1e-4 * tolerance,
-            t_eval=grid,
-        )
-        return np.array([model.tip_deflection(x) for x in solution.y.T])
+        def tick(what: str) -> None:
+            progress.set_description(what, refresh=False)
+            progress.update()
 
-    exact = scipy_run('DOP853', 1e-11)
-    peak = np.abs(exact).max()
-
-    def error(tips: FloatArray) -> float:
-        return float(np.abs(tips - exact).max() / peak)
-
-    rows = []
-    step = max(
-        h for h in (4e-5, 3e-5, 2e-5, 1e-5, 5e-6) if error(_tips(parameters, start, h)) <= ACCURACY
-    )
-    ours = _best_time(lambda: Integrator(parameters, start, step).advance(DURATION, FORCE), 20)
-    rows.append(
-        _row('Integrator', f'step {step:g} s', error(_tips(parameters, start, step)), ours, ours)
-    )
-    for method in ('RK45', 'DOP853', 'Radau'):
-        for tolerance in (1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8):
-            found = error(scipy_run(method, tolerance))
-            if found <= ACCURACY:
-                spent = _best_time(partial(scipy_run, method, tolerance), 1)
-                rows.append(_row(f'SciPy {method}', f'rtol {tolerance:g}', found, spent, ours))
-                break
-    heads = ('solver', 'setting', 'error / peak', 'wall [ms]', 'wall / simulated', 'against ours')
+        for question in QUESTIONS:
+            text, found = question(tick)
+            bars += found
+            progress.clear()
+            sys.stdout.write(f'\n{text}\n')
+            sys.stdout.flush()
+    heads = ('figure', 'wanted', 'found', 'verdict')
     sys.stdout.write(
-        f'open-loop run: {FORCE:g} N, {DEPTH * 100:g} cm inserted, paper_si, '
-        f'{DURATION * 1e3:g} ms simulated, error <= {ACCURACY:.1%} of the peak\n'
-        f'{table(rows, heads)}\n'
+        f'\n{table([bar.row() for bar in bars], heads)}\n'
+        f'\n{time.perf_counter() - begin:.0f} s in all\n'
     )
     return 0
-
-
-def _tips(parameters: NeedleParameters, start: FloatArray, step: float) -> FloatArray:
-    run = simulate(parameters, start, FORCE, duration=DURATION, interval=_INTERVAL, step=step)
-    return run.tip_deflection
-
-
-def _best_time(job: Callable[[], object], repeats: int) -> float:
-    """Return the least wall time of a job [s]: noise of the machine only adds."""
-    best = np.inf
-    for _ in range(repeats):
-        begin = time.perf_counter()
-        job()
-        best = min(best, time.perf_counter() - begin)
-    return float(best)
-
-
-def _row(name: str, setting: str, error: float, spent: float, ours: float) -> tuple[str, ...]:
-    return (
-        name,
-        setting,
-        f'{error:.1e}',
-        f'{spent * 1e3:.3g}',
-        f'{spent / DURATION:.3g}',
-        f'{spent / ours:.3g} x',
-    )

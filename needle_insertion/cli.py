@@ -23,6 +23,7 @@ from needle_identification import (
     summarize,
     write_result,
 )
+from needle_insertion import analyze, simulate
 from needle_insertion.report import table
 from tqdm import tqdm
 
@@ -124,6 +125,12 @@ def _parser() -> argparse.ArgumentParser:
         '--rate', type=float, default=1000.0, metavar='Hz', help='samples per second'
     )
     runs.set_defaults(command=_experiment_friction)
+
+    open_loop = commands.add_parser('simulate', help='the open-loop needle, without ROS')
+    simulate.add_arguments(open_loop)
+    open_loop.set_defaults(command=simulate.run)
+
+    analyze.add_arguments(commands.add_parser('analyze', help='controllability and observability'))
 
     bench = commands.add_parser('bench', help='measure speed as ratios, side by side')
     bench.add_argument('what', choices=('dynamics',))

@@ -7,8 +7,6 @@ from typing import Any
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from needle_dynamics import (
-    COORDINATE_NAMES,
-    COORDINATES,
     FloatArray,
     InsertedLengthError,
     NeedleError,
@@ -50,8 +48,8 @@ def states(of: NeedleModel, count: int = 20) -> list[FloatArray]:
 
 def test_coordinates_are_named_in_order() -> None:
     """The four coordinates are d, theta, q1, q2."""
-    assert COORDINATES == len(COORDINATE_NAMES) == 4
-    assert COORDINATE_NAMES == ('d', 'theta', 'q1', 'q2')
+    assert model().coordinates == len(model().coordinate_names) == 4
+    assert model().coordinate_names == ('d', 'theta', 'q1', 'q2')
 
 
 def test_mass_matrix_is_symmetric_positive_definite_and_block_diagonal() -> None:
@@ -99,7 +97,7 @@ def test_equations_of_motion_are_those_of_the_lagrangian() -> None:
         return of.kinetic_energy(x) - of.potential_energy(x)
 
     def gradient(x: FloatArray, first: int, steps: FloatArray) -> FloatArray:
-        slopes = np.empty(COORDINATES)
+        slopes = np.empty(4)
         for i, step in enumerate(steps):
             ahead, behind = x.copy(), x.copy()
             ahead[first + i] += step
@@ -116,7 +114,7 @@ def test_equations_of_motion_are_those_of_the_lagrangian() -> None:
 
         def momentum(t: float, x: FloatArray = x, path: Any = path) -> FloatArray:
             # L is a quadratic form of the rates: a central difference has no truncation.
-            return gradient(path(t), COORDINATES, np.abs(x[4:]))
+            return gradient(path(t), 4, np.abs(x[4:]))
 
         # Along the path the momenta are smooth on the scale s / u > 10 ms: at 1 us, truncation
         # is 1e-8 and rounding eps / (omega 1 us) = 1e-13, amplified by sqrt(cond G) = 1e3.
@@ -166,7 +164,7 @@ def test_friction_opposes_motion(speed: float) -> None:
     of = model('paper_mm')
     expected = np.sign(speed) * 0.56 + 300.0 * speed
     for drive in (-5.0, 0.0, 5.0):
-        assert_allclose(of.friction(speed, drive), expected, rtol=1e-15)
+        assert_allclose(of.friction.force(speed, drive), expected, rtol=1e-15)
     state = of.state_at(0.05)
     state[4] = -speed
     # d shortens while the needle goes in: friction lengthens it again.
@@ -180,7 +178,7 @@ def test_friction_at_rest_holds_any_drive_up_to_its_bound(fraction: float) -> No
     """At rest a drive of at most mu_s is answered in full: no acceleration, no creep."""
     of = model()
     drive = fraction * of.parameters.coulomb_friction
-    assert of.friction(0.0, drive) == drive
+    assert of.friction.force(0.0, drive) == drive
     assert of.acceleration(of.state_at(0.05), force=drive)[0] == 0.0
 
 

@@ -16,8 +16,11 @@ NUMBERS = [item.name for item in fields(NeedleParameters) if 'unit' in item.meta
 MAY_BE_ZERO = [
     item.name
     for item in fields(NeedleParameters)
-    if 'unit' in item.metadata and not item.metadata['open_low']
+    if 'unit' in item.metadata and item.metadata['low'] == 0.0 and not item.metadata['open_low']
 ]
+#: Ends of the ranges.
+LOWEST = {name: NeedleParameters.__dataclass_fields__[name].metadata['low'] for name in NUMBERS}
+
 #: Table 3 and section 3.2.8 of the paper, in SI units.
 TABLE_3 = {
     'youngs_modulus': 200e9,
@@ -78,7 +81,15 @@ def test_every_number_declares_unit_meaning_and_range() -> None:
         meta = NeedleParameters.__dataclass_fields__[name].metadata
         assert meta['unit']
         assert meta['low'] <= getattr(NeedleParameters(), name) <= meta['high']
-    assert len(NUMBERS) == len(fields(NeedleParameters)) - 1
+    others = {
+        'layer_depths',
+        'layer_stiffnesses',
+        'friction_law',
+        'modes',
+        'formulation',
+        'hub_stop',
+    }
+    assert {*NUMBERS, *others} == {item.name for item in fields(NeedleParameters)}
 
 
 @pytest.mark.parametrize('name', NUMBERS)
@@ -86,10 +97,12 @@ def test_every_number_declares_unit_meaning_and_range() -> None:
 def test_number_out_of_range_is_refused_with_name_value_and_range(name: str, value: float) -> None:
     """NaN, infinite and negative constants are refused; the message says what would be valid."""
     meta = NeedleParameters.__dataclass_fields__[name].metadata
-    bound = '>' if name not in MAY_BE_ZERO else '>='
+    bound = '>' if meta['open_low'] else '>='
+    if meta['low'] < value < 0.0:
+        value = 1.5 * meta['low']
     with pytest.raises(ParameterError) as caught:
         NeedleParameters(**{name: value})
-    message = f'{name} must be finite, {bound} 0 {meta["unit"]}, got {value!r}'
+    message = f'{name} must be finite, {bound} {meta["low"]:g} {meta["unit"]}, got {value!r}'
     assert str(caught.value) == message
     with pytest.raises(ParameterError):
         NeedleParameters.preset('phantom', **{name: value})
@@ -98,21 +111,23 @@ def test_number_out_of_range_is_refused_with_name_value_and_range(name: str, val
 @pytest.mark.parametrize('name', NUMBERS)
 def test_zero_is_valid_only_where_the_model_stays_regular(name: str) -> None:
     """Friction, tissue and carriage may be switched off; geometry and inertia may not."""
-    if name in MAY_BE_ZERO:
+    meta = NeedleParameters.__dataclass_fields__[name].metadata
+    if name in MAY_BE_ZERO or meta['low'] < 0.0:
         assert getattr(NeedleParameters(**{name: 0.0}), name) == 0.0
     else:
-        with pytest.raises(ParameterError, match=rf'^{name} must be finite, > 0 .*got 0\.0$'):
+        with pytest.raises(ParameterError, match=rf'^{name} must be finite, >.*got 0\.0$'):
             NeedleParameters(**{name: 0.0})
 
 
 def test_what_may_be_zero() -> None:
-    """These five and no other constants may be zero."""
+    """These and no other constants have zero as the end of their range."""
     assert MAY_BE_ZERO == [
         'carriage_mass',
         'tissue_stiffness',
         'tissue_damping',
         'coulomb_friction',
         'viscous_friction',
+        'withdrawal_friction',
     ]
 
 
@@ -156,11 +171,11 @@ def test_integers_are_taken_where_a_float_is_meant() -> None:
     values=st.fixed_dictionaries(
         {},
         optional={
-            name: st.floats(0.0 if name in MAY_BE_ZERO else 1e-30, 1e30)
+            name: st.floats(0.0 if name in MAY_BE_ZERO else max(1e-30, LOWEST[name]), 1e30)
             for name in NUMBERS
             if name not in ('length', 'minimum_depth')
         }
-        | {'length': st.floats(1e-2, 1e2), 'hub_stop': st.booleans()},
+        | {'length': st.floats(1e-2, 1.0), 'hub_stop': st.booleans()},
     )
 )
 @settings(deadline=None, derandomize=True)

@@ -148,6 +148,19 @@ def test_its_configuration_is_a_parameter_file(ros_graph):
 
 
 @pytest.mark.parametrize('kind', [PlantNode, ControllerNode])
+def test_its_configuration_makes_it_anew(ros_graph, tmp_path, kind):
+    """A node started from the configuration of another has the same configuration."""
+    layers = {'model.layer_depths': [0.03, 0.06], 'model.layer_stiffnesses': [900.0, 200.0]}
+    for parameters in ({}, layers):
+        first = ros_graph.add(kind, parameters=parameters, start=False)
+        file = tmp_path / 'node.yaml'
+        file.write_text(first.configuration())
+        arguments = ['--ros-args', '--params-file', str(file)]
+        second = ros_graph.add(kind, cli_args=arguments)
+        assert second.configuration() == first.configuration()
+
+
+@pytest.mark.parametrize('kind', [PlantNode, ControllerNode])
 def test_the_shipped_parameter_file_is_accepted(ros_graph, kind):
     """Every name in config/insertion.yaml is known and every value valid."""
     file = Path(__file__).parents[2] / 'config' / 'insertion.yaml'

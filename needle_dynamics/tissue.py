@@ -1,0 +1,126 @@
+"""Tissue along the needle: layers of elastic foundation, swelling, damping; equation (7)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+from math import expm1
+
+from needle_dynamics.errors import ParameterError
+from needle_dynamics.kernels import FloatArray
+from needle_dynamics.modes import ModeShapes
+import numpy as np
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Tissue:
+    """
+    An elastic foundation k(y, t), piecewise constant in depth, that may swell.
+
+    A single layer without swelling is the homogeneous tissue (8) of the source.
+
+    Attributes
+    ----------
+    starts : tuple of float
+        Depths at which the layers begin [m]; the first is 0.
+    stiffnesses : tuple of float
+        Stiffness of each layer [N/m^2].
+    damping : float
+        Damping c_a per length (Kelvin-Voigt) [N s/m^2].
+    swelling : float
+        Growth of the stiffness in the long run, as a part of it.
+    swelling_time : float
+        Time constant of the growth [s].
+
+    """
+
+    starts: tuple[float, ...]
+    stiffnesses: tuple[float, ...]
+    damping: float = 0.0
+    swelling: float = 0.0
+    swelling_time: float = 1.0
+
+    def __post_init__(self) -> None:
+        ordered = all(low < high for low, high in pairwise(self.starts))
+        if len(self.starts) != len(self.stiffnesses) or self.starts[:1] != (0.0,) or not ordered:
+            raise ParameterError(
+                f'layers must start at 0 and go down, each with a stiffness, got starts '
+                f'{self.starts} and stiffnesses {self.stiffnesses}'
+            )
+
+    def growth(self, time: float) -> float:
+        """Return the factor by which the stiffness has grown at a time [s]."""
+        return 1.0 - self.swelling * expm1(-time / self.swelling_time)
+
+    def stiffness(self, depth: float, time: float = 0.0) -> float:
+        """
+        Stiffness k(y, t) of (7).
+
+        Parameters
+        ----------
+        depth : float
+            Distance y from the entry point [m].
+        time : float
+            Time [s].
+
+        Returns
+        -------
+        float
+            Stiffness per length [N/m^2].
+
+        """
+        layer = int(np.searchsorted(self.starts, depth, side='right')) - 1
+        return self.stiffnesses[max(layer, 0)] * self.growth(time)
+
+    def offsets(self, modes: ModeShapes) -> FloatArray:
+        """
+        Return what the layers above add to integrals that take k as that of the tip's layer.
+
+        Parameters
+        ----------
+        modes : ModeShapes
+            Shape modes.
+
+        Returns
+        -------
+        ndarray, shape (layers, pairs + 2 n)
+            For k phi phi^T (upper triangle by rows), k phi and k y phi.
+
+        """
+        n = modes.count
+        pairs = n * (n + 1) // 2
+        offsets = np.zeros((len(self.starts), pairs + 2 * n))
+        for m in range(1, len(self.starts)):
+            packed = modes.packed(min(self.starts[m], modes.reach * modes.length))
+            above = np.concatenate([packed[:pairs], packed[2 * pairs + 2 * n :]])
+            step = self.stiffnesses[m - 1] - self.stiffnesses[m]
+            offsets[m] = offsets[m - 1] + step * above
+        return offsets
+
+    def matrix(self, modes: ModeShapes, depth: float, time: float = 0.0) -> FloatArray:
+        """
+        Modal stiffness of the tissue, the integral of k phi phi^T over the inserted part.
+
+        Parameters
+        ----------
+        modes : ModeShapes
+            Shape modes.
+        depth : float
+            Inserted length s [m].
+        time : float
+            Time [s].
+
+        Returns
+        -------
+        ndarray, shape (n, n)
+            Stiffness; k_a G(s) in homogeneous tissue.
+
+        """
+        n = modes.count
+        layer = max(int(np.searchsorted(self.starts, depth, side='right')) - 1, 0)
+        upper = np.triu_indices(n)
+        offset = np.empty((n, n))
+        offset[upper] = self.offsets(modes)[layer, : n * (n + 1) // 2]
+        offset.T[upper] = offset[upper]
+        gram = modes.integrals(depth).gram
+        return np.asarray(self.growth(time) * (self.stiffnesses[layer] * gram + offset))

@@ -1,0 +1,299 @@
+"""What the inputs steer and the tip deflection shows, at operating points and as a map."""
+
+from __future__ import annotations
+
+import argparse
+from io import BytesIO
+from itertools import product
+import json
+import os
+from pathlib import Path
+import sys
+from typing import Any
+
+from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure
+from needle_dynamics import (
+    FORMULATIONS,
+    NeedleModel,
+    NeedleParameters,
+    ParameterError,
+    PRESETS,
+)
+from needle_dynamics.analysis import (
+    Analysis,
+    analyze,
+    controllability_map,
+    ControllabilityMap,
+    linearize,
+    LinearSystem,
+    operating_point,
+    SLIDING,
+    Structure,
+)
+from needle_insertion.options import constants
+from needle_insertion.report import table
+import numpy as np
+from tqdm import tqdm
+
+#: Grid of the map: depths from this part of the needle on, and points each way.
+SHALLOWEST, DEPTHS, DEFLECTIONS = 0.05, 41, 31
+
+#: Largest tip deflection of the map if none is given [m].
+LARGEST_DEFLECTION = 2e-3
+
+_PANELS = (
+    ('distance', 'distance from losing state controllability'),
+    ('output_gain', 'tip deflection per base travel'),
+    ('observed_margin', 'distance from seeing less of the state'),
+)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """
+    Declare the options of `needle analyze`, and `run` as its command.
+
+    Parameters
+    ----------
+    parser : ArgumentParser
+        Parser of the subcommand.
+
+    """
+    parser.add_argument('--preset', choices=tuple(PRESETS), default='phantom')
+    parser.add_argument('--formulation', choices=FORMULATIONS, default='complete')
+    parser.add_argument('--modes', type=int, default=2, metavar='N', help='shape modes')
+    parser.add_argument(
+        '--set',
+        action='append',
+        default=[],
+        metavar='NAME=VALUE',
+        help='any other constant of the preset, SI units; may be repeated',
+    )
+    points = parser.add_argument_group(
+        'operating points', 'every combination of the values given; SI units'
+    )
+    for name, unit, default, text in (
+        ('depth', 'm', [0.1], 'inserted lengths (default 0.1)'),
+        ('tip-deflection', 'm', [0.0, 5e-4], 'deflections of the tip (default 0 5e-4)'),
+        ('speed', 'm/s', [5e-3], 'insertion speeds, negative out of the tissue (default 5e-3)'),
+    ):
+        points.add_argument(
+            f'--{name}', type=float, nargs='+', default=default, metavar=unit, help=text
+        )
+    points.add_argument(
+        '--force', type=float, default=0.0, metavar='N', help='insertion force (default 0)'
+    )
+    points.add_argument(
+        '--sliding',
+        choices=tuple(SLIDING),
+        help='branch of dry friction at speed 0, where it has no derivative',
+    )
+    parser.add_argument('--json', action='store_true', help='print JSON instead of a table')
+    parser.add_argument(
+        '--map',
+        action='store_true',
+        help='also map depth and deflection, up to the largest deflection given',
+    )
+    parser.add_argument('-o', '--output', type=Path, metavar='DIR', help='folder for the map')
+    parser.set_defaults(command=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    """
+    Analyze the operating points and print what was found.
+
+    Parameters
+    ----------
+    options : Namespace
+        As declared by `add_arguments`.
+
+    Returns
+    -------
+    int
+        0.
+
+    Raises
+    ------
+    NeedleError
+        If an option is not valid.
+
+    """
+    if options.map and (options.output is None or len(options.speed) > 1):
+        raise ParameterError('--map needs a folder, -o DIR, and a single --speed')
+    parameters = NeedleParameters.preset(
+        options.preset,
+        **{
+            'formulation': options.formulation,
+            'modes': options.modes,
+            **constants(options.set),
+        },
+    )
+    model = NeedleModel(parameters)
+    points: list[tuple[float, ...]] = list(
+        product(options.depth, options.tip_deflection, options.speed)
+    )
+    systems = [
+        linearize(model, operating_point(model, *point), options.force, sliding=options.sliding)
+        for point in points
+    ]
+    results = [analyze(system) for system in systems]
+    files = _write_map(parameters, options) if options.map else []
+    if options.json:
+        found = {
+            'preset': options.preset,
+            'formulation': parameters.formulation,
+            'unit': 'SI',
+            'points': [
+                _as_json(*entry, options.force)
+                for entry in zip(points, systems, results, strict=True)
+            ],
+            'files': [str(path) for path in files],
+        }
+        sys.stdout.write(f'{json.dumps(found, indent=2)}\n')
+    else:
+        sys.stdout.write(f'{_as_table(points, results)}\n')
+        for path in files:
+            sys.stdout.write(f'wrote {path}\n')
+    return 0
+
+
+def _as_table(points: list[tuple[float, ...]], results: list[Analysis]) -> str:
+    rows = [
+        (
+            f'{1e2 * depth:g} cm, {1e3 * deflection:g} mm, {1e3 * speed:g} mm/s',
+            *_cells(result.state),
+            *_cells(result.observed),
+            f'{result.output_gain:.2g}' if result.output_controllable else 'not steered',
+        )
+        for (depth, deflection, speed), result in zip(points, results, strict=True)
+    ]
+    heads = (
+        'depth, tip, speed',
+        *('steered', 'not steered', 'margin', 'next to lose'),
+        *('seen', 'not seen', 'margin', 'next to lose'),
+        'tip / base travel',
+    )
+    return table(rows, heads)
+
+
+def _cells(found: Structure) -> tuple[str, ...]:
+    return f'{found.rank}/{found.order}', found.loss, f'{found.margin:.1e}', found.weakest
+
+
+def _as_json(
+    point: tuple[float, ...], system: LinearSystem, result: Analysis, force: float
+) -> dict[str, Any]:
+    return {
+        **dict(zip(('depth', 'tip_deflection', 'speed'), point, strict=True)),
+        'force': force,
+        'states': system.names,
+        'inputs': ('f_y', 'tau'),
+        **{name: getattr(system, name).tolist() for name in ('A', 'B', 'C', 'D', 'drift')},
+        'natural_frequencies': system.frequencies.tolist(),
+        'controllability': _structure(result.state),
+        'observability': _structure(result.observed),
+        'output_controllability': {
+            'controllable': result.output_controllable,
+            'gain': result.output_gain,
+        },
+    }
+
+
+def _structure(found: Structure) -> dict[str, Any]:
+    return {
+        'order': found.order,
+        'rank': found.rank,
+        'deficiency': found.deficiency,
+        'lost': found.lost,
+        'combined': found.combined,
+        'loss': found.loss,
+        'distance': found.distance,
+        'margin': found.margin,
+        'weakest': found.weakest,
+        'eigenvalues': [[value.real, value.imag] for value in found.eigenvalues.tolist()],
+        'distances': found.distances.tolist(),
+    }
+
+
+def _write_map(parameters: NeedleParameters, options: argparse.Namespace) -> list[Path]:
+    """Write the map as a table and a picture."""
+    try:
+        options.output.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise _unwritable(options.output, error) from error
+    length, largest = parameters.length, max(abs(value) for value in options.tip_deflection)
+    rows = [
+        controllability_map(
+            parameters,
+            [depth],
+            np.linspace(0.0, largest or LARGEST_DEFLECTION, DEFLECTIONS),
+            options.speed[0],
+            options.sliding,
+        )
+        for depth in tqdm(
+            np.linspace(max(SHALLOWEST * length, parameters.minimum_depth), length, DEPTHS),
+            desc='depths',
+            disable=None,
+            leave=False,
+        )
+    ]
+    names = ('rank', 'distance', 'observed_rank', 'observed_margin', 'output_gain')
+    whole = ControllabilityMap(
+        depths=np.concatenate([row.depths for row in rows]),
+        deflections=rows[0].deflections,
+        **{name: np.concatenate([getattr(row, name) for row in rows]) for name in names},
+    )
+    depths, deflections = np.meshgrid(whole.depths, whole.deflections, indexing='ij')
+    columns = (depths, deflections, *(getattr(whole, name) for name in names))
+    lines = [','.join(('depth_m', 'tip_deflection_m', *names))]
+    lines += [
+        ','.join(f'{value:.6g}' for value in line)
+        for line in zip(*(column.flat for column in columns), strict=True)
+    ]
+    picture = BytesIO()
+    _figure(parameters, whole, options.speed[0]).savefig(picture, format='png', dpi=120)
+    return [
+        _write(options.output, 'controllability.csv', '\n'.join([*lines, '']).encode()),
+        _write(options.output, 'controllability.png', picture.getvalue()),
+    ]
+
+
+def _write(folder: Path, name: str, content: bytes) -> Path:
+    """Write a file; it appears whole or not at all."""
+    path = folder / name
+    draft = path.with_name(f'{name}.{os.getpid()}.tmp')
+    try:
+        draft.write_bytes(content)
+        draft.replace(path)
+    except OSError as error:
+        raise _unwritable(path, error) from error
+    return path
+
+
+def _unwritable(path: Path, error: OSError) -> ParameterError:
+    return ParameterError(f'{path} cannot be written: {error.strerror}')
+
+
+def _figure(parameters: NeedleParameters, found: ControllabilityMap, speed: float) -> Figure:
+    figure = Figure(figsize=(13.0, 4.6), layout='constrained')
+    order = 2 * (2 + parameters.modes)
+    lost = found.rank < order
+    for axes, (name, title) in zip(figure.subplots(1, 3, sharey=True), _PANELS, strict=True):
+        shown = np.ma.masked_array(getattr(found, name), lost).T
+        axes.set_facecolor('0.75')
+        mesh = axes.pcolormesh(
+            1e2 * found.depths,
+            1e3 * found.deflections,
+            shown,
+            norm=LogNorm() if shown.count() else None,
+            shading='nearest',
+        )
+        figure.colorbar(mesh, ax=axes, location='bottom')
+        axes.set(title=title, xlabel='inserted length [cm]')
+        axes.title.set_fontsize('medium')
+    figure.axes[0].set_ylabel('tip deflection [mm]')
+    figure.suptitle(
+        f'{parameters.formulation}, {parameters.modes} modes, {1e3 * speed:g} mm/s; '
+        'dimensionless; gray: straight needle, no input moves the bending'
+    )
+    return figure

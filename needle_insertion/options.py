@@ -1,0 +1,41 @@
+"""Options that several commands share."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+import json
+from typing import Any
+
+from needle_dynamics import ParameterError
+
+
+def constants(words: Sequence[str]) -> dict[str, Any]:
+    """
+    Read model constants given as words.
+
+    Parameters
+    ----------
+    words : sequence of str
+        ``name=value`` each; the value is JSON, or a plain word.
+
+    Returns
+    -------
+    dict
+        Values by name, for `NeedleParameters.preset`.
+
+    Raises
+    ------
+    ParameterError
+        If a word is not of that form.
+
+    """
+    values: dict[str, Any] = {}
+    for word in words:
+        name, sign, text = word.partition('=')
+        if not sign:
+            raise ParameterError(f'--set takes NAME=VALUE, got {word!r}')
+        try:
+            values[name] = json.loads(text)
+        except json.JSONDecodeError:
+            values[name] = text
+    return values

@@ -1,0 +1,141 @@
+"""`needle analyze`: what it prints and writes, and how it refuses."""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+from pathlib import Path
+from typing import Any
+
+from matplotlib.image import imread
+from needle_dynamics import NeedleError, NeedleModel, NeedleParameters
+from needle_dynamics.analysis import analyze, linearize, operating_point
+from needle_insertion.analyze import add_arguments, DEFLECTIONS, DEPTHS
+import numpy as np
+from numpy.testing import assert_array_equal
+import pytest
+
+
+def run(*words: str) -> int:
+    parser = argparse.ArgumentParser()
+    add_arguments(parser)
+    options = parser.parse_args(words)
+    return int(options.command(options))
+
+
+def found_by(capsys: pytest.CaptureFixture[str], *words: str) -> dict[str, Any]:
+    assert run(*words, '--json') == 0
+    found: dict[str, Any] = json.loads(capsys.readouterr().out)
+    return found
+
+
+def test_json_holds_the_analysis_of_each_point(capsys: pytest.CaptureFixture[str]) -> None:
+    """Every combination of the values is there, with the matrices and figures of the library."""
+    words = ('--preset', 'paper_si', '--formulation', 'as_printed', '--modes', '1')
+    points = ('--depth', '0.05', '0.1', '--tip-deflection', '0', '1e-3', '--speed', '0.01')
+    found = found_by(capsys, *words, *points, '--force', '2')
+    assert [(point['depth'], point['tip_deflection']) for point in found['points']] == [
+        (0.05, 0.0),
+        (0.05, 1e-3),
+        (0.1, 0.0),
+        (0.1, 1e-3),
+    ]
+    model = NeedleModel(NeedleParameters.preset('paper_si', formulation='as_printed', modes=1))
+    for point in found['points']:
+        state = operating_point(model, point['depth'], point['tip_deflection'], 0.01)
+        system = linearize(model, state, 2.0)
+        result = analyze(system)
+        for name in ('A', 'B', 'C', 'D', 'drift'):
+            assert_array_equal(point[name], getattr(system, name))
+        assert point['states'] == list(system.names)
+        for name, part in (('controllability', result.state), ('observability', result.observed)):
+            assert point[name]['rank'] == part.rank
+            assert point[name]['lost'] == list(part.lost)
+            assert point[name]['distance'] == part.distance
+        assert point['output_controllability'] == {
+            'controllable': result.output_controllable,
+            'gain': result.output_gain,
+        }
+
+
+def test_table_says_in_words_what_is_lost(capsys: pytest.CaptureFixture[str]) -> None:
+    """One line a point: a straight and a deflected needle, out of the box."""
+    assert run() == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 4
+    straight, bent = lines[2:]
+    assert 'q1, q2, q1_dot, q2_dot' in straight
+    assert 'd, theta, d_dot, theta_dot' in straight
+    assert straight.endswith('not steered')
+    assert bent.startswith('10 cm, 0.5 mm, 5 mm/s')
+    assert '8/8' in bent
+    assert '6/8' in bent
+
+
+def test_constants_can_be_set(capsys: pytest.CaptureFixture[str]) -> None:
+    """Numbers, lists and words of any constant."""
+    words = ('--set', 'friction_law=tanh', '--set', 'layer_depths=[0.05]')
+    more = ('--set', 'layer_stiffnesses=[900]', '--set', 'minimum_depth=0.05', '--modes', '4')
+    # At rest only a smooth law of friction has a derivative.
+    found = found_by(capsys, *words, *more, '--speed', '0')
+    assert found['points'][0]['states'][:6] == ['d', 'theta', 'q1', 'q2', 'q3', 'q4']
+
+
+def test_map_is_a_table_and_a_picture(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The map covers the needle and goes up to the deflection given; its picture has content."""
+    folder = tmp_path / 'new' / 'folder'
+    found = found_by(capsys, '--tip-deflection', '0.001', '--map', '-o', str(folder))
+    assert found['files'] == [str(folder / f'controllability.{kind}') for kind in ('csv', 'png')]
+    assert sorted(path.name for path in folder.iterdir()) == [
+        'controllability.csv',
+        'controllability.png',
+    ]
+    with (folder / 'controllability.csv').open(encoding='utf-8') as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == DEPTHS * DEFLECTIONS
+    assert (float(rows[0]['depth_m']), float(rows[-1]['depth_m'])) == (0.01, 0.2)
+    assert float(rows[-1]['tip_deflection_m']) == 0.001
+    for row in rows:
+        bent = float(row['tip_deflection_m']) > 0.0
+        assert (row['rank'], row['observed_rank']) == (('8', '6') if bent else ('4', '4'))
+    picture = imread(folder / 'controllability.png')
+    assert picture.shape[0] > 400
+    assert len(np.unique(picture[:, :, :3].reshape(-1, 3), axis=0)) > 100
+
+
+@pytest.mark.parametrize(
+    ('words', 'complaint'),
+    [
+        (('--depth', '0.3'), 'inserted length 0.3 m is outside'),
+        (('--depth', '0'), 'inserted length 0 m is outside'),
+        (('--depth', 'nan'), 'must be finite'),
+        (('--tip-deflection', 'inf'), 'must be finite'),
+        (('--speed', 'nan'), 'must be finite'),
+        (('--force', 'nan'), 'force must be finite'),
+        (('--speed', '0'), 'the needle is at rest'),
+        (('--modes', '0'), 'modes must be an integer from 1'),
+        (('--modes', '4'), 'minimum_depth >='),
+        (('--set', 'lenght=1'), "did you mean 'length'"),
+        (('--set', 'length'), 'NAME=VALUE'),
+        (('--set', 'length=long'), 'length must be a number'),
+        (('--map',), '-o DIR'),
+        (('--map', '-o', '.', '--speed', '1', '2'), 'single --speed'),
+    ],
+)
+def test_bad_input_ends_in_one_line(
+    words: tuple[str, ...], complaint: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """What is wrong is named before anything is printed."""
+    with pytest.raises(NeedleError) as caught:
+        run(*words)
+    assert complaint in str(caught.value)
+    assert '\n' not in str(caught.value)
+    assert capsys.readouterr().out == ''
+
+
+def test_a_folder_that_cannot_be_made_is_named(tmp_path: Path) -> None:
+    """A file in the way is one line, too."""
+    (tmp_path / 'taken').write_text('')
+    with pytest.raises(NeedleError, match=r'taken.*cannot be written'):
+        run('--map', '-o', str(tmp_path / 'taken'))

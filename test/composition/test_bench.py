@@ -1,0 +1,266 @@
+"""The benchmark's own figures of correctness; never its times."""
+
+from __future__ import annotations
+
+from math import log1p, sin, sqrt
+from pathlib import Path
+
+from needle_dynamics import NeedleModel, NeedleParameters
+from needle_insertion import (
+    bench,
+    bench_batches,
+    bench_measure,
+    bench_rods,
+    bench_solvers,
+    bench_step,
+)
+from needle_insertion.bench_measure import Bar
+import numba
+import numpy as np
+from numpy.testing import assert_allclose
+import pytest
+from scipy.integrate import solve_bvp
+
+FORCE = 3.0
+
+
+@pytest.fixture(scope='module')
+def open_loop():
+    return bench_solvers.OpenLoop()
+
+
+def states():
+    """States from shallow to deep: under way, withdrawing, at rest under a push that moves it."""
+    random = np.random.default_rng(3)
+    for depth, speed in ((0.02, 1.0), (0.1, 8.0), (0.199, -0.5), (0.07, 0.0)):
+        modal = 1e-5 * random.standard_normal(2)
+        rates = 1e-2 * random.standard_normal(2)
+        yield np.array([0.2 - depth, 0.1, *modal, -speed, 0.3, *rates])
+
+
+@pytest.mark.parametrize('state', list(states()))
+@pytest.mark.parametrize('preset', ['paper_si', 'phantom'])
+@pytest.mark.parametrize('how', ['compiled', 'gauss', 'quad'])
+def test_every_solver_is_given_the_equations_of_the_model(state, preset, how):
+    model = NeedleModel(NeedleParameters.preset(preset))
+    if how == 'compiled':
+        right_hand_side = bench_solvers.compiled_right_hand_side(model, FORCE)
+    else:
+        right_hand_side = bench_solvers.user_right_hand_side(model, FORCE, adaptive=how == 'quad')
+    exact = model.derivative(state, FORCE)
+    # Quadrature of the shapes in sin and sinh loses some nine digits of the accelerations at
+    # shallow depth, in proportion to the largest of them.
+    scale = np.abs(exact).max()
+    assert_allclose(right_hand_side(0.0, state), exact, rtol=0.0, atol=1e-6 * scale)
+    if how == 'compiled':
+        assert_allclose(right_hand_side(0.0, state), exact, rtol=1e-9, atol=1e-12)
+
+
+def test_a_push_that_friction_holds_does_not_move_any_of_them():
+    model = NeedleModel(NeedleParameters.preset('paper_si'))
+    state = model.state_at(0.1, 0.0)
+    for right_hand_side in (
+        bench_solvers.compiled_right_hand_side(model, 0.5),
+        bench_solvers.user_right_hand_side(model, 0.5),
+    ):
+        assert_allclose(right_hand_side(0.0, state), np.zeros(8), atol=1e-15)
+
+
+def test_the_error_of_a_run_is_that_of_its_tip(open_loop):
+    run = open_loop.solve('DOP853', 1e-8, 1e-12, open_loop.right_hand_side)
+    assert open_loop.error(run.t, run.y) < 1e-6
+    wrong = run.y.copy()
+    wrong[2:4] *= 1.01
+    assert open_loop.error(run.t, wrong) == pytest.approx(0.01, rel=0.05)
+    # A run that gave up has no error to speak of.
+    assert open_loop.error(run.t[:-1], run.y[:, :-1]) == np.inf
+
+
+def test_a_trial_outside_the_range_is_survived(open_loop):
+    beyond = open_loop.start.copy()
+    for remaining in (-1.0, 0.3, np.nan):
+        beyond[0] = remaining
+        assert open_loop.right_hand_side(0.0, beyond).shape == (8,)
+
+
+def test_our_integrator_meets_the_error_it_is_timed_at(open_loop):
+    ours = open_loop.ours(graded=True)
+    assert ours.error <= bench_solvers.ACCURACY
+    assert 0 < ours.evaluations < open_loop.steps(2e-5, graded=False)
+
+
+def test_steps_are_counted(open_loop):
+    assert open_loop.steps(bench_solvers.DURATION / 300, graded=False) == 300
+
+
+def test_batches_do_not_depend_on_the_threads_and_keep_only_what_is_asked_for():
+    batches = bench_batches.Batches(40)
+    ends = [batches.run(workers).states for workers in (1, 2)]
+    assert np.array_equal(*ends)
+    # Each insertion has a friction of its own.
+    assert len(np.unique(ends[0], axis=0)) == 40
+    short, long = (batches.peak_memory(part, keep=False) for part in (0.1, 1.0))
+    kept = batches.peak_memory(1.0, keep=True)
+    assert long < 1.5 * short < kept
+
+
+def test_exact_frequency_solves_the_equation_of_the_beam():
+    stiffness, density, foundation, length = 0.0256, 0.01016, 520.0, 0.15
+
+    def beam(y, w, unknown):
+        # E I w'''' = (rho A omega^2 - k) w, in y / l.
+        load = (density * unknown[0] - foundation) * length**4 / stiffness
+        return np.vstack([w[1], w[2], w[3], load * w[0]])
+
+    def ends(left, right, _unknown):
+        return np.array([left[0], left[1], right[2], right[3], right[0] - 1.0])
+
+    y = np.linspace(0.0, 1.0, 41)
+    guess = np.vstack([y**2, 2.0 * y, 2.0 + 0.0 * y, 0.0 * y])
+    solution = solve_bvp(beam, ends, y, guess, p=[1e5], tol=1e-8)
+    assert solution.success
+    found = bench_rods.beam_frequency(length, stiffness, density, foundation)
+    assert (2.0 * np.pi * found) ** 2 == pytest.approx(solution.p[0], rel=1e-6)
+
+
+def test_without_tissue_it_is_the_frequency_of_the_textbooks():
+    # 1.875104... is the first root of cos x cosh x = -1.
+    found = bench_rods.beam_frequency(0.2, 2.0, 0.5)
+    assert found == pytest.approx(1.8751040687**2 / 0.04 * 2.0 / (2.0 * np.pi), rel=1e-9)
+
+
+def test_frequency_of_a_sinusoid_is_found_beside_a_higher_one():
+    time = np.linspace(0.0, 0.1, 301)
+    values = np.cos(250.0 * time + 0.4) + 0.05 * np.sin(1600.0 * time) + 3.0
+    found = bench_rods.measured_frequency(time, values, 38.0)
+    assert found == pytest.approx(250.0 / (2.0 * np.pi), rel=2e-3)
+
+
+@pytest.mark.parametrize('step', [1e-3, 1e-5])
+def test_two_modes_are_within_a_percent_of_the_beam_at_15_cm(step):
+    assert abs(bench_rods.needle(step).error) < bench_rods.FREQUENCY_ERROR
+    error = bench_rods.mode_error(NeedleModel(NeedleParameters.preset('paper_si')))
+    # From above, as Rayleigh has it.
+    assert 0.0 < error < bench_rods.FREQUENCY_ERROR
+
+
+@numba.njit
+def _helper(x):
+    return log1p(x) * x
+
+
+@numba.njit
+def evaluate(x):
+    return x * x + 1.0
+
+
+@numba.njit
+def _arithmetic(x, values, n):
+    total = 0.0
+    for i in range(n):
+        total += values[i] * x
+    if total > 0.0:
+        values[0] = -abs(sqrt(evaluate(x)) / x)
+    scratch = np.empty(2)
+    scratch[:] = x
+    rest = scratch[1:].copy()
+    rest[0] *= x
+    return _helper(sin(total)) - 2.0 * x
+
+
+def test_operations_are_counted_as_they_are_done():
+    values = np.array([1.0, 2.0, 3.0])
+    counts = bench_step.count_operations(_arithmetic, (2.0, values, 3))
+    assert dict(counts) == {
+        'add': 4,
+        'multiply': 6,
+        'series multiply': 1,
+        'series add': 1,
+        'square root': 1,
+        'divide': 1,
+        'sine': 1,
+        'log1p': 1,
+    }
+    assert_allclose(values, [1.0, 2.0, 3.0])
+
+
+def test_operations_are_grouped_as_they_are_timed():
+    counts = bench_step.operations_of_a_step(20)
+    groups = bench_step.grouped(counts)
+    # Two modes turn: a sine and a cosine each; the axis glides: one exponential.
+    assert groups['sine and cosine'] == 2
+    assert groups['expm1'] == 1
+    assert 'log1p' not in groups
+    assert groups['multiply-add, series'] == counts['series multiply']
+    assert groups['division'] == counts['divide']
+
+
+def test_a_bar_says_by_what_it_is_missed():
+    assert Bar('speed', '>= 100', 150.0, 100.0).verdict == 'met'
+    assert Bar('speed', '>= 100', 50.0, 100.0).verdict == 'missed by a factor 2.00'
+    assert Bar('cost', '<= 4', 5.0, 4.0, at_least=False).verdict == 'missed by a factor 1.25'
+    assert Bar('cost', '<= 4', 3.0, 4.0, at_least=False).verdict == 'met'
+
+
+def test_what_is_not_installed_is_said_and_the_rest_runs(monkeypatch):
+    monkeypatch.setattr(bench_rods, 'optional', lambda _name: None)
+    text, bars = bench_rods.compare(lambda _what: None)
+    assert text.count('not installed: pip install needle-insertion[bench]') == 2
+    assert [bar.found is None for bar in bars] == [True, True, False]
+    assert bars[0].row()[-1] == bench_measure.NOT_INSTALLED
+    assert bench_measure.version('no-such-tool') == 'no-such-tool not installed'
+    assert bench_measure.optional('no_such_tool') is None
+
+
+def test_settings_are_tried_from_loose_to_tight():
+    assert_allclose(bench_measure.geometric(1.0, 8.0, 2.0), [1.0, 2.0, 4.0, 8.0])
+    assert_allclose(bench_measure.geometric(1.0, 0.1, 0.5), [1.0, 0.5, 0.25, 0.125])
+
+
+def test_jobs_take_turns():
+    calls = []
+    jobs = {name: (lambda name=name: calls.append(name)) for name in 'ab'}
+    times = bench_measure.least_times(jobs, 2)
+    assert set(times) == {'a', 'b'}
+    # Once each to warm up, then in turns, each repeated.
+    assert calls[:2] == ['a', 'b']
+    turns = [name for i, name in enumerate(calls[2:], 2) if i == 2 or calls[i - 1] != name]
+    assert turns == ['a', 'b', 'a', 'b']
+
+
+def test_the_whole_is_one_table_per_question_and_one_of_bars(monkeypatch, capsys):
+    bars = [Bar('a', '>= 1', 2.0, 1.0), Bar('b', '>= 1', None, 1.0)]
+    monkeypatch.setattr(bench, 'QUESTIONS', (lambda tick: (tick('x') or 'a table', bars),))
+    assert bench.dynamics() == 0
+    printed = capsys.readouterr()
+    assert 'date: ' in printed.out
+    assert 'machine: ' in printed.out
+    assert 'a table\n' in printed.out
+    assert 'met' in printed.out
+    assert bench_measure.NOT_INSTALLED in printed.out
+
+
+def test_a_cable_of_mujoco_converges_to_its_beam():
+    mujoco = pytest.importorskip('mujoco')
+    libraries = list((Path(mujoco.__file__).parent / 'plugin').glob('*elasticity*'))
+    for library in libraries:
+        mujoco.mj_loadPluginLibrary(str(library))
+    _, _, _, exact = bench_rods._section()
+    errors = []
+    for elements in (5, 8):
+        cable = bench_rods._Cable(
+            mujoco, plugin=bool(libraries), elements=elements, how='Euler', step=2e-5
+        )
+        found = bench_rods.measured_frequency(*cable.sample(4.0 / exact), exact)
+        errors.append(abs(found / exact - 1.0))
+    # Half an element in the clamp: second order.
+    assert errors[1] < 0.6 * errors[0] < 0.012
+
+
+def test_a_rod_of_pyelastica_is_near_its_beam():
+    elastica = pytest.importorskip('elastica')
+    _, _, _, exact = bench_rods._section()
+    rod = bench_rods._Rod(elastica, 'PositionVerlet', 5, 1.9e-7)
+    time, tips = rod.sample(0.3 / exact)
+    # A quarter of a period to the first peak: near enough to tell a wrong section or clamp.
+    assert 1.0 / (4.0 * time[tips.argmax()]) == pytest.approx(exact, rel=0.03)

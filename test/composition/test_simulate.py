@@ -1,0 +1,73 @@
+"""`needle simulate`: the same run in a table, CSV, picture and bag."""
+
+import csv
+import json
+from pathlib import Path
+
+from needle_dynamics import NeedleModel, NeedleParameters, simulate
+from needle_identification import message_counts, read_topic
+from needle_insertion.cli import main
+import numpy as np
+from numpy.testing import assert_allclose
+import pytest
+
+SHORT = ['simulate', '--duration', '0.005', '--interval', '1e-4']
+
+
+def test_csv_and_bag_hold_the_run(tmp_path: Path) -> None:
+    """Both hold the states of `simulate` at every sample, exactly."""
+    outputs = [str(tmp_path / name) for name in ('run.csv', 'run.png', 'bag')]
+    words = [word for output in outputs for word in ('-o', output)]
+    assert main([*SHORT, *words]) == 0
+    p = NeedleParameters.preset('paper_si')
+    start = NeedleModel(p).state_at(0.02, 5e-4)
+    run = simulate(p, start, 3.0, duration=0.005, interval=1e-4, tolerance=1e-8)
+    with (tmp_path / 'run.csv').open() as file:
+        rows = list(csv.reader(file))
+    assert rows[0][:5] == ['time', 'd', 'theta', 'q1', 'q2']
+    values = np.array(rows[1:], dtype=float)
+    assert np.array_equal(values[:, 1:9], run.states)
+    assert np.array_equal(values[:, 9], run.tip_deflection)
+    truth = read_topic(tmp_path / 'bag', '/ground_truth')
+    states = np.array([[*m.position, *m.velocity] for _, m in truth])
+    assert np.array_equal(states, run.states)
+    stamps = [m.header.stamp.sec + 1e-9 * m.header.stamp.nanosec for _, m in truth]
+    # Whole nanoseconds.
+    assert_allclose(stamps, run.time, atol=1e-9)
+    assert set(message_counts(tmp_path / 'bag').values()) == {51}
+    assert (tmp_path / 'run.png').read_bytes().startswith(b'\x89PNG')
+
+
+def test_json_gives_the_summary(capsys: pytest.CaptureFixture[str]) -> None:
+    """The summary is machine-readable, and a changed constant changes it."""
+    ends = []
+    for change in (
+        [],
+        ['--set', 'coulomb_friction=1'],
+        ['--set', 'modes=3', '--set', 'minimum_depth=0.02'],
+    ):
+        assert main([*SHORT, '--json', *change]) == 0
+        ends.append(json.loads(capsys.readouterr().out)['inserted length at the end [m]'])
+    assert len(set(ends)) == 3
+
+
+@pytest.mark.parametrize(
+    ('words', 'complaint'),
+    [
+        (['--set', 'modes=7'], '7 modes cannot be told apart'),
+        (['--set', 'mass=1'], "unknown parameter 'mass'"),
+        (['--set', 'modes'], '--set takes NAME=VALUE'),
+        (['--depth', '0.3'], 'inserted length 0.3 m is outside'),
+        (['--interval', '0'], 'interval and duration must be positive'),
+        (['-o', 'run.xlsx'], 'output must be .csv, .png or a folder'),
+        (['--tolerance', '-1'], 'tolerance must be positive'),
+    ],
+)
+def test_bad_input_ends_in_one_line(
+    words: list[str], complaint: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """What is wrong is named, with exit status 2."""
+    assert main([*SHORT, *words]) == 2
+    captured = capsys.readouterr()
+    assert complaint in captured.err
+    assert captured.err.count('\n') == 1

@@ -1,0 +1,269 @@
+"""Batches: the same bits whatever the number of threads, and as one run after the other."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from needle_dynamics import (
+    Batch,
+    FloatArray,
+    InsertedLengthError,
+    Integrator,
+    NeedleError,
+    NeedleModel,
+    NeedleParameters,
+    ParameterError,
+    ShapeError,
+    simulate,
+    simulate_batch,
+)
+import numpy as np
+from numpy.testing import assert_allclose
+import pytest
+
+preset = NeedleParameters.preset
+RUNS, COUNT, INTERVAL = 7, 12, 1e-3
+
+
+def study(n: int = 2) -> tuple[list[NeedleParameters], FloatArray, FloatArray]:
+    """Return constants, initial states and forces that differ in every run."""
+    rng = np.random.default_rng(7)
+    laws = ('coulomb', 'stribeck', 'tanh')
+    constants = [
+        preset(
+            'paper_mm',
+            modes=n,
+            minimum_depth=1e-3 if n <= 2 else 0.05,
+            tissue_stiffness=rng.uniform(300.0, 3000.0),
+            tissue_damping=rng.uniform(0.0, 2.0),
+            coulomb_friction=rng.uniform(0.2, 0.8),
+            friction_law=laws[i % 3],
+            breakaway_friction=1.3,
+            swelling=0.3,
+            swelling_time=0.01,
+            layer_depths=[0.07 + 0.002 * i],
+            layer_stiffnesses=[4e3],
+            formulation=('complete', 'as_printed')[i % 2],
+        )
+        for i in range(RUNS)
+    ]
+    states = np.array(
+        [
+            NeedleModel(p).state_at(rng.uniform(0.06, 0.08), rng.uniform(-1e-3, 1e-3))
+            for p in constants
+        ]
+    )
+    return constants, states, rng.uniform(-1.0, 6.0, size=(RUNS, COUNT))
+
+
+def batch(*arguments: Any, **options: Any) -> Batch:
+    options = {'duration': COUNT * INTERVAL, 'interval': INTERVAL, **options}
+    return simulate_batch(*arguments, **options)
+
+
+@pytest.mark.parametrize('n', [1, 2, 4])
+def test_bits_do_not_depend_on_the_number_of_workers(n: int) -> None:
+    """One thread, two, three or more than there are runs: the same bits."""
+    arguments = study(n)
+    first = batch(*arguments, workers=1)
+    assert np.isfinite(first.states).all()
+    assert np.ptp(first.states[:, -1, 0]) > 1e-3
+    for workers in (2, 3, 20, None):
+        other = batch(*arguments, workers=workers)
+        assert np.array_equal(other.states, first.states)
+        assert np.array_equal(other.completed, first.completed)
+
+
+@pytest.mark.parametrize('n', [1, 2, 4])
+def test_a_batch_is_its_runs_one_by_one(n: int) -> None:
+    """Each run is what `simulate` gives for it, bit for bit, at every sample."""
+    constants, states, forces = study(n)
+    found = batch(constants, states, forces)
+    for i in range(RUNS):
+        course = forces[i]
+        alone = simulate(
+            constants[i],
+            states[i],
+            lambda t, course=course: course[round(t / INTERVAL)],
+            duration=COUNT * INTERVAL,
+            interval=INTERVAL,
+        )
+        assert np.array_equal(found.states[i], alone.states)
+        assert np.array_equal(found.time, alone.time)
+        assert_allclose(found.completed[i], COUNT * INTERVAL, rtol=1e-15)
+
+
+def test_a_batch_is_the_integrator_stepped_through_its_intervals() -> None:
+    """The same against the integrator itself, whose clock adds up the intervals."""
+    constants, states, forces = study()
+    found = batch(constants, states, forces)
+    for i in range(RUNS):
+        it = Integrator(constants[i], states[i])
+        for k in range(COUNT):
+            it.advance(INTERVAL, forces[i, k])
+        # The sum of intervals differs from a multiple in the last bit, and with it the swelling.
+        assert_allclose(it.state, found.states[i, -1], rtol=1e-9, atol=1e-15)
+
+
+def test_what_is_given_once_is_for_all_runs() -> None:
+    """One set of constants, one state or one force serves every run of the others."""
+    constants, states, forces = study()
+    p, x = constants[0], states[0]
+    assert batch(p, x, 3.0).states.shape == (1, COUNT + 1, 8)
+    each = batch(p, x, forces)
+    for i in range(RUNS):
+        assert np.array_equal(each.states[i], batch(p, x, forces[i : i + 1]).states[0])
+    level = batch(p, states, [1.0 + i for i in range(RUNS)])
+    for i in range(RUNS):
+        assert np.array_equal(level.states[i], batch(p, states[i], 1.0 + i).states[0])
+    several = batch(constants, x, 3.0)
+    for i in range(RUNS):
+        assert np.array_equal(several.states[i], batch(constants[i], x, 3.0).states[0])
+
+
+def test_keep_false_gives_the_last_state_only() -> None:
+    """Memory grows with what is asked for: the end of each run, with its time."""
+    arguments = study()
+    every, last = batch(*arguments), batch(*arguments, keep=False)
+    assert last.states.shape == (RUNS, 1, 8)
+    assert np.array_equal(last.states[:, 0], every.states[:, -1])
+    assert np.array_equal(last.time, every.time[-1:])
+    assert np.array_equal(last.completed, every.completed)
+
+
+@pytest.mark.parametrize('workers', [1, 2])
+def test_a_run_that_leaves_its_range_is_no_number_from_there_and_harms_no_other(
+    workers: int,
+) -> None:
+    """Pulled out of the tissue, one run ends; what it was before and the others stay."""
+    p = preset('paper_si')
+    states = np.array([NeedleModel(p).state_at(s, 1e-5) for s in (0.05, 0.004, 0.06)])
+    forces = np.array([3.0, -1.0, 2.0])
+    found = batch(p, states, forces, workers=workers)
+    with pytest.raises(InsertedLengthError):
+        simulate(p, states[1], -1.0, duration=COUNT * INTERVAL, interval=INTERVAL)
+    valid = round(found.completed[1] / INTERVAL)
+    assert 0 < valid < COUNT
+    assert np.isfinite(found.states[1, : valid + 1]).all()
+    assert np.isnan(found.states[1, valid + 1 :]).all()
+    alone = simulate(p, states[1], -1.0, duration=valid * INTERVAL, interval=INTERVAL)
+    assert np.array_equal(found.states[1, : valid + 1], alone.states)
+    for i in (0, 2):
+        single = batch(p, states[i], forces[i])
+        assert np.array_equal(found.states[i], single.states[0])
+        assert_allclose(found.completed[i], COUNT * INTERVAL, rtol=1e-15)
+
+
+def test_the_last_state_of_a_run_that_left_its_range_is_no_number() -> None:
+    """Without samples, too, a run that did not reach the end has no state at the end."""
+    p = preset('paper_si')
+    states = np.array([NeedleModel(p).state_at(s, 1e-5) for s in (0.05, 0.004)])
+    found = batch(p, states, [3.0, -1.0], keep=False)
+    assert np.isfinite(found.states[0]).all()
+    assert np.isnan(found.states[1]).all()
+    assert 0.0 < found.completed[1] < COUNT * INTERVAL
+
+
+def test_what_is_given_is_left_alone() -> None:
+    """Initial states and forces are not changed."""
+    constants, states, forces = study()
+    before = states.copy(), forces.copy()
+    batch(constants, states, forces)
+    batch(constants, states, forces, keep=False)
+    assert np.array_equal(states, before[0])
+    assert np.array_equal(forces, before[1])
+
+
+@pytest.mark.parametrize(
+    ('which', 'shape'),
+    [
+        ('states', (RUNS - 1, 8)),
+        ('states', (0, 8)),
+        ('states', (RUNS, 7)),
+        ('states', (7,)),
+        ('states', (RUNS, 1, 8)),
+        ('forces', (RUNS - 1,)),
+        ('forces', (RUNS, COUNT - 1)),
+        ('forces', (RUNS, COUNT, 1)),
+        ('forces', (0,)),
+        ('constants', (RUNS - 1,)),
+        ('constants', (0,)),
+    ],
+)
+def test_shapes_that_do_not_fit_are_refused(which: str, shape: tuple[int, ...]) -> None:
+    """Numbers of runs, of intervals and of coordinates must agree; the message says what came."""
+    constants, states, forces = study()
+    arguments: dict[str, Any] = {'constants': constants, 'states': states, 'forces': forces}
+    arguments[which] = constants[: shape[0]] if which == 'constants' else np.full(shape, 0.1)
+    with pytest.raises(ShapeError, match='got'):
+        batch(*arguments.values())
+
+
+@pytest.mark.parametrize('empty', ['constants', 'states', 'forces'])
+def test_no_runs_are_refused(empty: str) -> None:
+    """A batch of none, with all else given once, is refused like other shapes."""
+    p = preset('paper_si')
+    arguments: dict[str, Any] = {
+        'constants': p,
+        'states': NeedleModel(p).state_at(0.05),
+        'forces': 3.0,
+    }
+    arguments[empty] = np.empty((0, 8)) if empty == 'states' else []
+    with pytest.raises(ShapeError, match='got'):
+        batch(*arguments.values())
+
+
+@pytest.mark.parametrize(
+    'options',
+    [
+        {'step': 0.0},
+        {'step': np.nan},
+        {'interval': 0.0},
+        {'interval': -1e-3},
+        {'interval': np.nan},
+        {'duration': np.inf},
+        {'duration': 0.5e-3},
+        {'workers': 0},
+        {'workers': -1},
+    ],
+)
+def test_values_that_are_none_are_refused(options: dict[str, float]) -> None:
+    """Step, interval, duration and workers are checked before anything runs."""
+    with pytest.raises(ParameterError):
+        batch(*study(), **options)
+
+
+@pytest.mark.parametrize('interval', [0.7e-3, 0.6e-3])
+def test_a_duration_of_broken_intervals_is_refused(interval: float) -> None:
+    """A run ends when it was asked to, not at the nearest sample."""
+    p = preset('paper_si')
+    start = NeedleModel(p).state_at(0.05)
+    for call in (simulate, simulate_batch):
+        with pytest.raises(ParameterError, match='whole number of intervals'):
+            call(p, start, 0.0, duration=1e-3, interval=interval)
+
+
+def test_numbers_that_are_none_are_refused() -> None:
+    """A force or state that is not finite, or a state out of range, never enters the loop."""
+    constants, states, forces = study()
+    for bad in (np.nan, np.inf):
+        wrong = forces.copy()
+        wrong[3, 4] = bad
+        with pytest.raises(ParameterError, match='forces must be finite'):
+            batch(constants, states, wrong)
+        wrong = states.copy()
+        wrong[3, 4] = bad
+        with pytest.raises(ShapeError, match='must be finite'):
+            batch(constants, wrong, forces)
+    wrong = states.copy()
+    wrong[3, 0] = 0.2
+    with pytest.raises(InsertedLengthError):
+        batch(constants, wrong, forces)
+
+
+def test_runs_of_one_batch_share_their_number_of_modes() -> None:
+    """States of one length cannot serve models of several."""
+    constants, states, forces = study()
+    constants[2] = preset('paper_si', modes=1)
+    with pytest.raises(NeedleError, match=r'must have shape \(6,\), got \(8,\)'):
+        batch(constants, states, forces)

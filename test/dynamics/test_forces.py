@@ -1,0 +1,101 @@
+"""Inverse dynamics, power of friction and reaction of the base, for every formulation."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from needle_dynamics import Integrator, NeedleModel, NeedleParameters, ShapeError, ToleranceError
+import numpy as np
+from numpy.testing import assert_allclose
+import pytest
+
+KINDS: tuple[dict[str, Any], ...] = (
+    {},
+    {'formulation': 'as_printed'},
+    {'modes': 3, 'minimum_depth': 0.02, 'tissue_damping': 16.0},
+    {'layer_depths': (0.03, 0.06), 'layer_stiffnesses': (3e4, 2e3), 'carriage_mass': 0.01},
+    {'friction_law': 'stribeck', 'breakaway_friction': 1.5, 'withdrawal_friction': 0.7},
+)
+kinds = pytest.mark.parametrize('changes', KINDS)
+
+
+def moving(model: NeedleModel, seed: int, speed: float) -> np.ndarray:
+    """Return a bent needle under way."""
+    rng = np.random.default_rng(seed)
+    state = model.state_at(rng.uniform(0.04, 0.18), 5e-4)
+    m = model.coordinates
+    state[m] = -speed
+    state[m + 1 :] = rng.normal(size=m - 1) * 1e-2
+    return state
+
+
+@kinds
+@pytest.mark.parametrize('speed', [-0.3, 0.2])
+def test_inverse_dynamics_undoes_forward_dynamics(changes: dict[str, Any], speed: float) -> None:
+    """The forces that bring about the acceleration under some forces are those forces."""
+    model = NeedleModel(NeedleParameters.preset('paper_si', **changes))
+    for seed in range(5):
+        state = moving(model, seed, speed)
+        forces = model.inverse_dynamics(state, model.acceleration(state, 1.7, 2e-3))
+        expected = np.zeros(model.coordinates)
+        expected[:2] = 1.7, 2e-3
+        # Rounding of the elastic forces, which are up to 100 N/m^1/2, through cond(G) = 1e5.
+        assert_allclose(forces, expected, atol=1e-9)
+
+
+@pytest.mark.parametrize('sign', [-1.0, 1.0])
+def test_to_leave_rest_takes_what_friction_bears(sign: float) -> None:
+    """From rest the force is mass times acceleration plus Coulomb friction, in its direction."""
+    model = NeedleModel(NeedleParameters.preset('paper_si'))
+    wanted = np.array([-sign * 3.0, 0.0, 0.0, 0.0])
+    force = model.inverse_dynamics(model.state_at(0.1), wanted)[0]
+    assert_allclose(force, sign * (model.parameters.moving_mass * 3.0 + 0.56), rtol=1e-12)
+
+
+@kinds
+def test_friction_takes_power_either_way(changes: dict[str, Any]) -> None:
+    """The power is friction times speed, positive in and out of the tissue, zero at rest."""
+    model = NeedleModel(NeedleParameters.preset('paper_si', **changes))
+    for speed in (-0.2, -1e-6, 1e-6, 0.2):
+        power = model.friction_power(moving(model, 1, speed))
+        assert power > 0.0
+        assert_allclose(power, model.friction.force(speed, 0.0) * speed, rtol=1e-12)
+    assert model.friction_power(model.state_at(0.1)) == 0.0
+
+
+# As printed the modes do not feel the change of depth that the balance of momentum contains.
+@pytest.mark.parametrize('changes', [kind for kind in KINDS if 'formulation' not in kind])
+@pytest.mark.parametrize('speed', [-0.3, 0.2])
+def test_the_base_feels_what_the_integrator_averages(
+    changes: dict[str, Any], speed: float
+) -> None:
+    """Over a short time the mean load of the base is that at its middle."""
+    model = NeedleModel(NeedleParameters.preset('paper_si', **changes))
+    interval = 2e-7
+    for seed in range(3):
+        start = moving(model, seed, speed)
+        half = Integrator(model.parameters, start, 1e-8)
+        half.advance(0.5 * interval, 2.0, 1e-3)
+        seen = Integrator(model.parameters, start, 1e-8).advance(interval, 2.0, 1e-3)
+        axial, lateral, moment = model.base_reaction(half.state, 2.0, 1e-3)
+        # Curvature over the interval: (omega h)^2 / 24 = 1e-5 at the 10 kHz of these depths, and
+        # rounding of the momenta over the interval, 1e-16 cond(G) / 2e-7 s.
+        assert_allclose(seen.axial_force, axial, rtol=1e-4, atol=1e-6)
+        assert_allclose(seen.lateral_force, lateral, rtol=1e-4, atol=1e-5)
+        assert_allclose(seen.moment, moment, rtol=1e-4, atol=1e-6)
+
+
+def test_wrong_accelerations_are_refused() -> None:
+    """Shape and finiteness are checked."""
+    model = NeedleModel(NeedleParameters())
+    for wanted in (np.zeros(3), [0.0, np.nan, 0.0, 0.0]):
+        with pytest.raises(ShapeError, match='acceleration must be finite with shape'):
+            model.inverse_dynamics(model.state_at(0.1), wanted)
+
+
+def test_a_tolerance_that_rounding_forbids_is_said() -> None:
+    """What cannot be met is an error, not a silent best effort."""
+    p = NeedleParameters.preset('paper_si')
+    it = Integrator(p, NeedleModel(p).state_at(0.02, 5e-4), tolerance=1e-16)
+    with pytest.raises(ToleranceError, match='cannot be met'):
+        it.advance(1e-5, 3.0)
