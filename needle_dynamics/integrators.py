@@ -54,6 +54,9 @@ from numpy.typing import ArrayLike
 #: Default step [s]. The tip deflection of the source's open-loop run is then good to 2e-4.
 DEFAULT_STEP: Final = 1e-5
 
+#: Tolerance of `needle simulate`: a coast over the whole needle then keeps its energy to 1e-8.
+DEFAULT_TOLERANCE: Final = 1e-8
+
 #: Step at which a tolerance is given up [s]: rounding has taken over long before.
 _SHORTEST_STEP: Final = 1e-9
 

@@ -17,6 +17,7 @@ from needle_dynamics import (
     simulate,
     Trajectory,
 )
+from needle_dynamics.integrators import DEFAULT_TOLERANCE
 from needle_identification import BagWriter, encode, message_type
 from needle_insertion.options import constants
 from needle_insertion.report import table
@@ -40,7 +41,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--force', type=float, default=3.0, metavar='N', help='insertion force')
     parser.add_argument('--duration', type=float, default=0.05, metavar='s')
     parser.add_argument('--interval', type=float, default=1e-4, metavar='s', help='of samples')
-    parser.add_argument('--tolerance', type=float, default=1e-8, help='of each interval')
+    parser.add_argument(
+        '--tolerance', type=float, default=DEFAULT_TOLERANCE, help='of each interval'
+    )
     parser.add_argument(
         '-o',
         '--output',

@@ -12,6 +12,7 @@ from needle_dynamics import (
     NeedleParameters,
     ParameterError,
 )
+from needle_dynamics.integrators import DEFAULT_TOLERANCE
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest
@@ -169,14 +170,14 @@ def test_energy_of_a_full_insertion(capsys: pytest.CaptureFixture[str]) -> None:
     Through the whole length without friction, `complete` keeps its energy and `as_printed` not.
 
     The needle coasts from 2 cm to the hub with a deflection of 0.5 mm at first, at a tolerance
-    of 1e-8 over each 0.2 ms.
+    of 1e-8, the default of `needle simulate`, over each 0.2 ms.
     """
     worst = {}
     for name in FORMULATIONS:
         model = conservative(name)
         start = model.state_at(0.02, 5e-4)
         start[4] = -1.0
-        it = Integrator(model.parameters, start, tolerance=1e-8)
+        it = Integrator(model.parameters, start, tolerance=DEFAULT_TOLERANCE)
         before, seen = model.energy(start), []
         while it.depth < 0.199:
             it.advance(2e-4)
