@@ -588,6 +588,7 @@ def controllability_map(
     deflections: ArrayLike,
     speed: float,
     sliding: str | None = None,
+    force: float = 0.0,
 ) -> ControllabilityMap:
     """
     Analyze every pair of a depth and a tip deflection.
@@ -602,6 +603,8 @@ def controllability_map(
         Insertion speed [m/s], positive into the tissue.
     sliding : str, optional
         As for `linearize`.
+    force : float
+        Insertion force [N].
 
     Returns
     -------
@@ -625,7 +628,7 @@ def controllability_map(
     for i, depth in enumerate(depths):
         for j, deflection in enumerate(deflections):
             state = operating_point(model, depth, deflection, speed)
-            found = analyze(linearize(model, state, sliding=sliding))
+            found = analyze(linearize(model, state, force, sliding=sliding))
             results[:, i, j] = (
                 found.state.rank,
                 found.state.distance,

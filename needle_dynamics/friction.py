@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import exp, tanh
+from math import exp, inf, tanh
 from typing import Final
 
 from needle_dynamics.errors import ParameterError
@@ -49,6 +49,15 @@ class Friction:
             raise ParameterError(
                 f'law must be one of {", ".join(FRICTION_LAWS)}, got {self.law!r}'
             )
+        least = {'coulomb': 0.0, 'viscous': 0.0, 'withdrawal': 0.0, 'breakaway': 1.0}
+        for name, low in least.items():
+            value = getattr(self, name)
+            if not low <= value < inf:
+                raise ParameterError(f'{name} must be finite and >= {low:g}, got {value!r}')
+        for name in ('stribeck_speed', 'smoothing_speed'):
+            value = getattr(self, name)
+            if not 0.0 < value < inf:
+                raise ParameterError(f'{name} must be finite and > 0 m/s, got {value!r}')
 
     def force(self, speed: float, drive: float) -> float:
         """

@@ -27,7 +27,13 @@ from math import inf, isfinite, sqrt
 import os
 from typing import Final
 
-from needle_dynamics.errors import InsertedLengthError, ParameterError, ShapeError, ToleranceError
+from needle_dynamics.errors import (
+    InsertedLengthError,
+    NeedleError,
+    ParameterError,
+    ShapeError,
+    ToleranceError,
+)
 from needle_dynamics.friction import FRICTION_LAWS
 from needle_dynamics.kernels import (
     advance,
@@ -57,8 +63,12 @@ DEFAULT_STEP: Final = 1e-5
 #: Tolerance of `needle simulate`: a coast over the whole needle then keeps its energy to 1e-8.
 DEFAULT_TOLERANCE: Final = 1e-8
 
-#: Step at which a tolerance is given up [s]: rounding has taken over long before.
+#: Step at which a tolerance is given up, and shortest step taken [s]: rounding has taken over
+#: long before.
 _SHORTEST_STEP: Final = 1e-9
+
+#: Most intervals of a run: more would not fit into memory.
+_MOST_INTERVALS: Final = 100_000_000
 
 
 def _constants(model: NeedleModel) -> Constants:
@@ -147,8 +157,8 @@ class Integrator:
     step : float
         Longest step [s].
     tolerance : float, optional
-        If given, the step is halved until the end of each call to `advance` changes by less
-        than this part of the energy and of the needle's length.
+        If given, the step is halved until the estimated error of each call to `advance` is less
+        than this part of the state in the norm of energy, and of the needle's length.
     graded : bool
         Let the step grow with the inserted length once that exceeds a tenth of the needle's: the
         modes slow down as its square.
@@ -173,12 +183,10 @@ class Integrator:
         *,
         graded: bool = False,
     ) -> None:
-        if not 0.0 < step < inf:
-            raise ParameterError(f'step must be positive and finite, got {step!r} s')
+        self.step = _checked_step(step)
         if tolerance is not None and not 0.0 < tolerance < inf:
             raise ParameterError(f'tolerance must be positive and finite, got {tolerance!r}')
         self.model = NeedleModel(parameters)
-        self.step = step
         self.tolerance = tolerance
         self.graded = graded
         self.time = 0.0
@@ -262,6 +270,8 @@ class Integrator:
         for name, value in (('force', force), ('torque', torque), ('speed', speed)):
             if not isfinite(value):
                 raise ParameterError(f'{name} must be finite, got {value!r}')
+        # An integer would have the kernel compiled anew for it.
+        duration, force, torque, speed = map(float, (duration, force, torque, speed))
         before = self._state.copy()
 
         def take(longest: float) -> None:
@@ -283,33 +293,46 @@ class Integrator:
             self._constants, self._tables, self._state, self.time,
             *inputs, moved, longest, self.graded, duration, self._sums,
         )  # fmt: skip
+        if not (np.isfinite(self._state).all() and np.isfinite(self._sums).all()):
+            raise NeedleError(
+                'the motion is not finite: constants, state or inputs are out of proportion'
+            )
         if left > 0.0:
             self.time += duration - left
-            p = self.model.parameters
+            p, far = self.model.parameters, self._constants.maximum_depth
             limit = (
                 f'minimum_depth = {p.minimum_depth:g} m while withdrawing'
-                if self.speed < 0.0
-                else f'{self._constants.maximum_depth:g} m beyond the hub'
+                if self.depth - p.minimum_depth < far - self.depth
+                else f'the largest inserted length, {far:g} m'
             )
             raise InsertedLengthError(f'inserted length {self.depth:.6g} m reached {limit}')
 
     def _refine(self, take: Callable[[float], None], longest: float, tolerance: float) -> None:
         """Halve the step until the end of the interval no longer depends on it."""
-        start = self._state.copy()
-        take(longest)
-        change = inf
-        while change > tolerance:
-            if longest < _SHORTEST_STEP:
-                raise ToleranceError(
-                    f'tolerance {tolerance:g} cannot be met: {change:.1e} is left with steps of '
-                    f'{longest:.1e} s'
-                )
-            coarse = self._state.copy()
-            self._state[:] = start
+        start, clock = self._state.copy(), self.time
+
+        def attempt(longest: float) -> InsertedLengthError | None:
+            self._state[:], self.time = start, clock
+            try:
+                take(longest)
+            except InsertedLengthError as error:
+                return error
+            return None
+
+        left_range = attempt(longest)
+        while True:
+            coarse, left_before = self._state.copy(), left_range
             longest *= 0.5
-            take(longest)
+            if longest < _SHORTEST_STEP:
+                self._state[:], self.time = start, clock
+                raise ToleranceError(f'tolerance {tolerance:g} cannot be met at any step')
+            left_range = attempt(longest)
             # The finer run is kept; second order makes its error a third of the difference.
             change = self._distance(coarse, self._state) / 3.0
+            if change <= tolerance and (left_range is None) == (left_before is None):
+                break
+        if left_range is not None:
+            raise left_range
         # The next interval begins with the step before the last one, or one more before where
         # the error allows it: a step twice as long has four times the error.
         growth = 4.0 if change < tolerance / 32.0 else 2.0
@@ -485,7 +508,11 @@ def simulate(
     integrator = Integrator(parameters, state, step, tolerance, graded=graded)
     count = _count(duration, interval)
     time = np.arange(count + 1, dtype=np.float64) * interval
-    forces = np.array([force(t) if callable(force) else force for t in time[:-1]])
+    forces = _floats('force', [force(t) if callable(force) else force for t in time[:-1]])
+    if forces.shape != (count,) or not np.isfinite(forces).all():
+        raise ShapeError(
+            f'force must be one finite number at each of {count} times, got {force!r}'
+        )
     states = np.empty((count + 1, integrator.state.size))
     states[0] = integrator.state
     for i in range(count):
@@ -503,7 +530,7 @@ class Batch:
 
     Attributes
     ----------
-    time : ndarray, shape (k + 1,)
+    time : ndarray, shape (k + 1,), or (1,) for the ends only
         Time of the samples [s].
     states : ndarray, shape (runs, k + 1, 2 (2 + n)), or (runs, 1, ...) for the ends only
         States; not a number after a run has left its range.
@@ -521,6 +548,7 @@ def simulate_batch(
     parameters: NeedleParameters | Sequence[NeedleParameters],
     states: ArrayLike,
     forces: ArrayLike,
+    torques: ArrayLike = 0.0,
     *,
     duration: float,
     interval: float,
@@ -538,8 +566,8 @@ def simulate_batch(
         Constants, for all runs or for each.
     states : array_like, shape (runs, 2 (2 + n)) or (2 (2 + n),)
         Initial states.
-    forces : array_like, shape (), (runs,) or (runs, k)
-        Insertion force [N], constant over each interval.
+    forces, torques : array_like, shape (), (runs,) or (runs, k)
+        Insertion force [N] and torque [N m], constant over each interval.
     duration, interval, step : float
         As in `simulate` [s].
     graded : bool
@@ -563,24 +591,29 @@ def simulate_batch(
 
     """
     each = [parameters] if isinstance(parameters, NeedleParameters) else list(parameters)
-    starts = np.atleast_2d(np.array(states, dtype=float))
-    pushes = np.array(forces, dtype=float)
-    if pushes.ndim < 2:
-        pushes = pushes.reshape(-1, 1)
-    count, sizes = _count(duration, interval), {len(each), len(starts), len(pushes)} - {1}
-    shaped = starts.ndim == pushes.ndim == 2 and pushes.shape[1] in (1, count)
+    starts = np.atleast_2d(_floats('states', states))
+    pushes, turns = (
+        values.reshape(-1, 1) if values.ndim < 2 else values
+        for values in (_floats('forces', forces), _floats('torques', torques))
+    )
+    count, sizes = (
+        _count(duration, interval),
+        {len(each), len(starts), len(pushes), len(turns)} - {1},
+    )
+    shaped = starts.ndim == 2 and all(
+        values.ndim == 2 and values.shape[1] in (1, count) for values in (pushes, turns)
+    )
     if len(sizes) > 1 or 0 in sizes or not shaped:
         raise ShapeError(
-            f'parameters, states and forces must be for one number of runs and forces constant or '
+            f'parameters, states and inputs must be for one number of runs and inputs constant or '
             f'for {count} intervals, got {len(each)} parameters, states {starts.shape}, '
-            f'forces {pushes.shape}'
+            f'forces {pushes.shape}, torques {turns.shape}'
         )
-    if not np.isfinite(pushes).all():
-        raise ParameterError('forces must be finite')
-    if not 0.0 < step < inf:
-        raise ParameterError(f'step must be positive and finite, got {step!r} s')
-    if workers is not None and workers < 1:
-        raise ParameterError(f'workers must be >= 1, got {workers!r}')
+    if not (np.isfinite(pushes).all() and np.isfinite(turns).all()):
+        raise ParameterError('forces and torques must be finite')
+    step = _checked_step(step)
+    if workers is not None and (not isinstance(workers, int) or workers < 1):
+        raise ParameterError(f'workers must be an integer >= 1, got {workers!r}')
     runs = sizes.pop() if sizes else 1
     models = [NeedleModel(p) for p in each]
     tables = [(_constants(model), _tables(model)) for model in models]
@@ -592,8 +625,13 @@ def simulate_batch(
 
     def one(i: int) -> None:
         constants, table = tables[i % len(tables)]
-        push = np.ascontiguousarray(np.broadcast_to(pushes[i % len(pushes)], (count,)))
-        done = run(constants, table, starts[i], push, interval, step, graded, result[i])
+        push, turn = (
+            np.ascontiguousarray(np.broadcast_to(values[i % len(values)], (count,)))
+            for values in (pushes, turns)
+        )
+        done = run(
+            constants, table, starts[i], push, turn, float(interval), step, graded, result[i]
+        )
         completed[i] = done * interval
         if not keep and done == count:
             result[i, 0] = starts[i]
@@ -602,13 +640,30 @@ def simulate_batch(
         for i in share:
             one(i)
 
-    workers = workers or os.cpu_count() or 1
+    workers = min(workers or os.cpu_count() or 1, runs)
     with ThreadPoolExecutor(workers) as pool:
         # A thread takes its share at once: one task per run would cost more than short runs do.
         shares = [range(k, runs, workers) for k in range(workers)]
         list(pool.map(share_of_runs, shares))
-    time = np.arange(count + 1, dtype=np.float64) * interval
-    return Batch(time if keep else time[-1:], result, completed)
+    time = np.arange(count + 1 if keep else 1, dtype=np.float64) * interval
+    return Batch(time if keep else time + count * interval, result, completed)
+
+
+def _floats(name: str, values: object) -> FloatArray:
+    """Return values as an array of floats, or refuse them."""
+    try:
+        return np.array(values, dtype=float)
+    except (TypeError, ValueError):
+        raise ShapeError(f'{name} must be numbers, got {values!r}') from None
+
+
+def _checked_step(step: float) -> float:
+    """Return a longest step as a float, or refuse it."""
+    if isinstance(step, bool) or not isinstance(step, (int, float)):
+        raise ParameterError(f'step must be a number, got {step!r}')
+    if not _SHORTEST_STEP <= step < inf:
+        raise ParameterError(f'step must be finite and >= {_SHORTEST_STEP:g} s, got {step!r} s')
+    return float(step)
 
 
 def _count(duration: float, interval: float) -> int:
@@ -617,6 +672,11 @@ def _count(duration: float, interval: float) -> int:
         raise ParameterError(
             f'interval and duration must be positive and finite with interval <= duration, got '
             f'interval = {interval!r} s, duration = {duration!r} s'
+        )
+    if duration / interval > _MOST_INTERVALS:
+        raise ParameterError(
+            f'duration must be at most {_MOST_INTERVALS:g} intervals, got {duration!r} s and '
+            f'{interval!r} s'
         )
     count = round(duration / interval)
     # Rounding of the quotient.

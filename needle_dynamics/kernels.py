@@ -957,13 +957,14 @@ def run(
     tables: Tables,
     state: FloatArray,
     forces: FloatArray,
+    torques: FloatArray,
     interval: float,
     longest: float,
     graded: bool,
     states: FloatArray,
 ) -> int:
     """
-    Advance ``state`` through intervals of constant force; return how many were completed.
+    Advance ``state`` through intervals of constant inputs; return how many were completed.
 
     ``states``, shape (k + 1, ...), is filled with the states at the ends of the intervals; with
     a single row it is left alone, and only ``state`` is the result.
@@ -974,7 +975,7 @@ def run(
         states[0] = state
     for k in range(forces.shape[0]):
         left = advance(
-            c, tables, state, k * interval, forces[k], 0.0, 0.0, False, longest, graded,
+            c, tables, state, k * interval, forces[k], torques[k], 0.0, False, longest, graded,
             interval, sums,
         )  # fmt: skip
         if left > 0.0:

@@ -11,9 +11,10 @@ which leaves out the row of d and what comes from dG/dt.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from math import isfinite
 from typing import Final
 
-from needle_dynamics.errors import InsertedLengthError, ShapeError
+from needle_dynamics.errors import InsertedLengthError, ParameterError, ShapeError
 from needle_dynamics.friction import Friction
 from needle_dynamics.kernels import FloatArray
 from needle_dynamics.modes import mode_shapes, ModeShapes
@@ -89,7 +90,10 @@ class NeedleModel:
             If the inserted length is outside its range.
 
         """
-        checked = np.array(state, dtype=float)
+        try:
+            checked = np.array(state, dtype=float)
+        except (TypeError, ValueError):
+            raise ShapeError(f'state must be numbers, got {state!r}') from None
         if checked.shape != (2 * self.coordinates,):
             raise ShapeError(
                 f'state must have shape ({2 * self.coordinates},), got {checked.shape}'
@@ -241,6 +245,8 @@ class NeedleModel:
 
         """
         x = self.checked_state(state)
+        if not (isfinite(force) and isfinite(torque)):
+            raise ParameterError(f'force and torque must be finite, got {force!r} and {torque!r}')
         bias = self.bias_forces(x, time)
         # Q_d = -f_y: what pushes the needle in shortens d.
         drive = force + bias[0]
@@ -264,7 +270,8 @@ class NeedleModel:
         state : array_like, shape (2 (2 + n),)
             State.
         acceleration : array_like, shape (2 + n,)
-            q_ddot. At rest friction acts against the motion that begins.
+            q_ddot. From rest friction acts against the motion that begins; held at rest it
+            takes the value within its bounds that asks for the least force.
         time : float
             Time [s], for tissue that swells.
 
@@ -287,7 +294,7 @@ class NeedleModel:
         forces = self.mass_matrix(x) @ wanted + self.bias_forces(x, time)
         speed = -x[m]
         # At rest an endless drive decides: friction is what it can bear, in that direction.
-        drive = -np.sign(wanted[0]) * np.inf if wanted[0] != 0.0 else -forces[0]
+        drive = -np.sign(wanted[0]) * np.inf if wanted[0] != 0.0 else forces[0]
         forces[0] = -forces[0] + self.friction.force(speed, drive)
         return np.asarray(forces)
 
@@ -464,5 +471,7 @@ class NeedleModel:
 
         """
         x = self.checked_state(state)
+        if not isinstance(points, int) or points < 2:
+            raise ShapeError(f'points must be an integer >= 2, got {points!r}')
         y = np.linspace(0.0, self.parameters.length - x[0], points)
         return np.column_stack([y, self.modes.values(y) @ x[2 : self.coordinates]])

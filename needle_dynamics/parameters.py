@@ -24,6 +24,10 @@ MOST_MODES: Final = 12
 LARGEST_CONDITION: Final = 1e11
 
 
+#: Integers beyond it are no floats.
+_LARGEST_INTEGER: Final = 10**300
+
+
 def constant(
     default: float,
     unit: str,
@@ -89,6 +93,8 @@ def check_constants(values: object) -> None:
         meta = item.metadata
         if isinstance(value, bool) or not isinstance(value, (int, float)):
             raise ParameterError(f'{item.name} must be a number, got {value!r}')
+        if isinstance(value, int) and abs(value) > _LARGEST_INTEGER:
+            raise ParameterError(f'{item.name} must be finite, got an integer of too many digits')
         too_low = value <= meta['low'] if meta['open_low'] else value < meta['low']
         if not isfinite(value) or too_low or value > meta['high']:
             sign = '>' if meta['open_low'] else '>='
@@ -101,7 +107,8 @@ def check_constants(values: object) -> None:
 
 def as_number(value: Any) -> Any:
     """Take an integer where a float is meant; leave all else as it is."""
-    return float(value) if isinstance(value, int) and not isinstance(value, bool) else value
+    is_integer = isinstance(value, int) and not isinstance(value, bool)
+    return float(value) if is_integer and abs(value) <= _LARGEST_INTEGER else value
 
 
 def unknown_name(name: str, valid: list[str]) -> str:
@@ -180,6 +187,10 @@ class NeedleParameters:
 
     def __post_init__(self) -> None:
         check_constants(self)
+        for item in fields(self):
+            if 'unit' in item.metadata:
+                # An integer would have the kernel compiled anew for it.
+                object.__setattr__(self, item.name, float(getattr(self, item.name)))
         if not isinstance(self.hub_stop, bool):
             raise ParameterError(f'hub_stop must be true or false, got {self.hub_stop!r}')
         for name, valid in (('friction_law', FRICTION_LAWS), ('formulation', FORMULATIONS)):
@@ -197,6 +208,8 @@ class NeedleParameters:
     def _check_layers(self) -> None:
         for name in ('layer_depths', 'layer_stiffnesses'):
             try:
+                if isinstance(getattr(self, name), (str, Mapping)):
+                    raise TypeError
                 values = tuple(float(value) for value in getattr(self, name))
             except (TypeError, ValueError):
                 raise ParameterError(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import pairwise
-from math import expm1
+from math import expm1, inf
 
 from needle_dynamics.errors import ParameterError
 from needle_dynamics.kernels import FloatArray
@@ -48,8 +48,21 @@ class Tissue:
                 f'{self.starts} and stiffnesses {self.stiffnesses}'
             )
 
+        for name, low in (('damping', 0.0), ('swelling', -1.0), ('swelling_time', 0.0)):
+            value = getattr(self, name)
+            # Only damping may be at the end of its range.
+            if not low <= value < inf or (value == low and name != 'damping'):
+                raise ParameterError(f'{name} must be finite and above {low:g}, got {value!r}')
+        if not all(0.0 <= value < inf for value in (*self.starts, *self.stiffnesses)):
+            raise ParameterError(
+                f'layers must have finite starts and stiffnesses >= 0, got {self.starts} and '
+                f'{self.stiffnesses}'
+            )
+
     def growth(self, time: float) -> float:
-        """Return the factor by which the stiffness has grown at a time [s]."""
+        """Return the factor by which the stiffness has grown at a time >= 0 [s]."""
+        if not 0.0 <= time < inf:
+            raise ParameterError(f'time must be finite and >= 0 s, got {time!r}')
         return 1.0 - self.swelling * expm1(-time / self.swelling_time)
 
     def stiffness(self, depth: float, time: float = 0.0) -> float:

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import argparse
-from io import BytesIO
+from dataclasses import asdict
 from itertools import product
 import json
-import os
 from pathlib import Path
 import sys
 from typing import Any
@@ -32,7 +31,7 @@ from needle_dynamics.analysis import (
     Structure,
 )
 from needle_insertion.options import constants
-from needle_insertion.report import table
+from needle_insertion.report import png, table, write_whole
 import numpy as np
 from tqdm import tqdm
 
@@ -120,12 +119,18 @@ def run(options: argparse.Namespace) -> int:
     """
     if options.map and (options.output is None or len(options.speed) > 1):
         raise ParameterError('--map needs a folder, -o DIR, and a single --speed')
+    if options.output is not None and not options.map:
+        raise ParameterError('-o DIR is the folder of the map: it needs --map')
+    changes = constants(options.set)
+    for name in ('formulation', 'modes'):
+        if name in changes:
+            raise ParameterError(f'{name} is given by --{name}, not by --set')
     parameters = NeedleParameters.preset(
         options.preset,
         **{
             'formulation': options.formulation,
             'modes': options.modes,
-            **constants(options.set),
+            **changes,
         },
     )
     model = NeedleModel(parameters)
@@ -141,7 +146,7 @@ def run(options: argparse.Namespace) -> int:
     if options.json:
         found = {
             'preset': options.preset,
-            'formulation': parameters.formulation,
+            'parameters': asdict(parameters),
             'unit': 'SI',
             'points': [
                 _as_json(*entry, options.force)
@@ -220,7 +225,7 @@ def _write_map(parameters: NeedleParameters, options: argparse.Namespace) -> lis
     try:
         options.output.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise _unwritable(options.output, error) from error
+        raise ParameterError(f'{options.output} cannot be written: {error.strerror}') from error
     length, largest = parameters.length, max(abs(value) for value in options.tip_deflection)
     rows = [
         controllability_map(
@@ -229,6 +234,7 @@ def _write_map(parameters: NeedleParameters, options: argparse.Namespace) -> lis
             np.linspace(0.0, largest or LARGEST_DEFLECTION, DEFLECTIONS),
             options.speed[0],
             options.sliding,
+            options.force,
         )
         for depth in tqdm(
             np.linspace(max(SHALLOWEST * length, parameters.minimum_depth), length, DEPTHS),
@@ -250,28 +256,13 @@ def _write_map(parameters: NeedleParameters, options: argparse.Namespace) -> lis
         ','.join(f'{value:.6g}' for value in line)
         for line in zip(*(column.flat for column in columns), strict=True)
     ]
-    picture = BytesIO()
-    _figure(parameters, whole, options.speed[0]).savefig(picture, format='png', dpi=120)
-    return [
-        _write(options.output, 'controllability.csv', '\n'.join([*lines, '']).encode()),
-        _write(options.output, 'controllability.png', picture.getvalue()),
-    ]
-
-
-def _write(folder: Path, name: str, content: bytes) -> Path:
-    """Write a file; it appears whole or not at all."""
-    path = folder / name
-    draft = path.with_name(f'{name}.{os.getpid()}.tmp')
-    try:
-        draft.write_bytes(content)
-        draft.replace(path)
-    except OSError as error:
-        raise _unwritable(path, error) from error
-    return path
-
-
-def _unwritable(path: Path, error: OSError) -> ParameterError:
-    return ParameterError(f'{path} cannot be written: {error.strerror}')
+    contents = {
+        'controllability.csv': '\n'.join([*lines, '']).encode(),
+        'controllability.png': png(_figure(parameters, whole, options.speed[0])),
+    }
+    for name, content in contents.items():
+        write_whole(options.output / name, content)
+    return [options.output / name for name in contents]
 
 
 def _figure(parameters: NeedleParameters, found: ControllabilityMap, speed: float) -> Figure:
@@ -294,6 +285,6 @@ def _figure(parameters: NeedleParameters, found: ControllabilityMap, speed: floa
     figure.axes[0].set_ylabel('tip deflection [mm]')
     figure.suptitle(
         f'{parameters.formulation}, {parameters.modes} modes, {1e3 * speed:g} mm/s; '
-        'dimensionless; gray: straight needle, no input moves the bending'
+        'dimensionless; gray: the inputs do not move all of the state'
     )
     return figure

@@ -11,6 +11,7 @@ import os
 from pathlib import Path
 
 from matplotlib.figure import Figure
+from needle_dynamics import ParameterError
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,6 +48,38 @@ class Picture:
     name: str
     caption: str
     figure: Figure
+
+
+def write_whole(path: Path, content: bytes) -> None:
+    """
+    Write a file that appears whole or not at all.
+
+    Parameters
+    ----------
+    path : Path
+        File to write.
+    content : bytes
+        All of it.
+
+    Raises
+    ------
+    ParameterError
+        If it cannot be written.
+
+    """
+    draft = path.with_name(f'{path.name}.{os.getpid()}.tmp')
+    try:
+        draft.write_bytes(content)
+        draft.replace(path)
+    except OSError as error:
+        raise ParameterError(f'{path} cannot be written: {error.strerror}') from error
+
+
+def png(figure: Figure) -> bytes:
+    """Return a figure as a PNG."""
+    buffer = BytesIO()
+    figure.savefig(buffer, format='png', dpi=120)
+    return buffer.getvalue()
 
 
 def table(rows: Sequence[Sequence[str]], heads: Sequence[str]) -> str:
@@ -121,10 +154,9 @@ def write_page(
     )
     figures = []
     for picture in pictures:
-        buffer = BytesIO()
-        picture.figure.savefig(buffer, format='png', dpi=120)
-        (path.parent / f'{picture.name}.png').write_bytes(buffer.getvalue())
-        data = base64.b64encode(buffer.getvalue()).decode('ascii')
+        image = png(picture.figure)
+        write_whole(path.parent / f'{picture.name}.png', image)
+        data = base64.b64encode(image).decode('ascii')
         caption = escape(picture.caption)
         figures.append(
             f'<figure><img src="data:image/png;base64,{data}" alt="{caption}">'
@@ -137,6 +169,4 @@ def write_page(
         '<table><tr><th>what</th><th>true or wanted</th><th>found</th><th>verdict</th></tr>\n'
         f'{rows}</table>\n{"".join(figures)}</body></html>\n'
     )
-    draft = path.with_name(f'{path.name}.{os.getpid()}.tmp')
-    draft.write_text(page, encoding='utf-8')
-    draft.replace(path)
+    write_whole(path, page.encode())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import csv
+from io import StringIO
 import json
 from pathlib import Path
 import sys
@@ -20,7 +21,7 @@ from needle_dynamics import (
 from needle_dynamics.integrators import DEFAULT_TOLERANCE
 from needle_identification import BagWriter, encode, message_type
 from needle_insertion.options import constants
-from needle_insertion.report import table
+from needle_insertion.report import png, table, write_whole
 import numpy as np
 
 _NANOSECONDS = 1_000_000_000
@@ -60,6 +61,8 @@ def run(options: argparse.Namespace) -> int:
     for path in options.output:
         if path.suffix not in ('', '.csv', '.png'):
             raise ParameterError(f'{path}: output must be .csv, .png or a folder for a bag')
+        if not path.absolute().parent.is_dir() or (not path.suffix and path.exists()):
+            raise ParameterError(f'{path}: the folder it is in must exist, a bag must not')
     parameters = NeedleParameters.preset(options.preset, **constants(options.set))
     model = NeedleModel(parameters)
     trajectory = simulate(
@@ -74,7 +77,7 @@ def run(options: argparse.Namespace) -> int:
         if path.suffix == '.csv':
             _write_csv(trajectory, path)
         elif path.suffix == '.png':
-            figure(trajectory).savefig(path, dpi=120)
+            write_whole(path, png(figure(trajectory)))
         else:
             _write_bag(trajectory, path)
     tips = trajectory.tip_deflection
@@ -117,13 +120,12 @@ def figure(trajectory: Trajectory) -> Figure:
 
 def _write_csv(trajectory: Trajectory, path: Path) -> None:
     names = NeedleModel(trajectory.parameters).coordinate_names
-    draft = path.with_name(f'{path.name}.tmp')
-    with draft.open('w', newline='', encoding='utf-8') as file:
-        writer = csv.writer(file)
-        writer.writerow(['time', *names, *(f'{name}_dot' for name in names), 'tip_deflection'])
-        rows = np.column_stack([trajectory.time, trajectory.states, trajectory.tip_deflection])
-        writer.writerows(rows.tolist())
-    draft.replace(path)
+    text = StringIO(newline='')
+    writer = csv.writer(text)
+    writer.writerow(['time', *names, *(f'{name}_dot' for name in names), 'tip_deflection'])
+    rows = np.column_stack([trajectory.time, trajectory.states, trajectory.tip_deflection])
+    writer.writerows(rows.tolist())
+    write_whole(path, text.getvalue().encode())
 
 
 def _write_bag(trajectory: Trajectory, path: Path) -> None:

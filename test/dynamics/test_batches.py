@@ -249,7 +249,7 @@ def test_numbers_that_are_none_are_refused() -> None:
     for bad in (np.nan, np.inf):
         wrong = forces.copy()
         wrong[3, 4] = bad
-        with pytest.raises(ParameterError, match='forces must be finite'):
+        with pytest.raises(ParameterError, match='forces and torques must be finite'):
             batch(constants, states, wrong)
         wrong = states.copy()
         wrong[3, 4] = bad

@@ -4,7 +4,14 @@ from __future__ import annotations
 
 from typing import Any
 
-from needle_dynamics import Integrator, NeedleModel, NeedleParameters, ShapeError, ToleranceError
+from needle_dynamics import (
+    Integrator,
+    NeedleError,
+    NeedleModel,
+    NeedleParameters,
+    ShapeError,
+    ToleranceError,
+)
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest
@@ -99,3 +106,45 @@ def test_a_tolerance_that_rounding_forbids_is_said() -> None:
     it = Integrator(p, NeedleModel(p).state_at(0.02, 5e-4), tolerance=1e-16)
     with pytest.raises(ToleranceError, match='cannot be met'):
         it.advance(1e-5, 3.0)
+
+
+def test_a_needle_held_at_rest_takes_what_friction_does_not() -> None:
+    """Without acceleration of the base friction bears the bent needle, up to its bound."""
+    for tip, bends in ((1e-3, False), (6e-2, True)):
+        model = NeedleModel(NeedleParameters.preset('paper_si'))
+        state = model.state_at(0.05, tip)
+        still = model.acceleration(state)
+        still[0] = 0.0
+        held = model.inverse_dynamics(state, still)[0]
+        pull = model.bias_forces(state)[0]
+        assert (abs(pull) > 0.56) == bends
+        assert_allclose(held, -pull - np.clip(-pull, -0.56, 0.56), atol=1e-12)
+
+
+def test_an_error_leaves_the_integrator_where_it_was() -> None:
+    """After a tolerance that cannot be met, state and clock are those before the call."""
+    p = NeedleParameters.preset('paper_si')
+    it = Integrator(p, NeedleModel(p).state_at(0.02, 5e-4), tolerance=1e-30)
+    before = it.state
+    with pytest.raises(ToleranceError):
+        it.advance(1e-5, 3.0)
+    assert np.array_equal(it.state, before)
+    assert it.time == 0.0
+
+
+def test_a_tolerance_is_not_fooled_by_a_step_that_leaves_the_range() -> None:
+    """A withdrawal that friction stops at once is not taken for one that leaves the tissue."""
+    p = NeedleParameters.preset('paper_mm')
+    start = NeedleModel(p).state_at(0.02)
+    start[4] = 5.0
+    it = Integrator(p, start, step=1e-2, tolerance=1e-6)
+    it.advance(1e-2)
+    assert it.depth == pytest.approx(0.02, abs=1e-4)
+
+
+@pytest.mark.parametrize(('step', 'force'), [(1e-25, 3.0), (1e-5, 1e308)])
+def test_what_is_out_of_proportion_is_an_error(step: float, force: float) -> None:
+    """Steps below rounding and forces that overflow end in a typed error, not in a result."""
+    p = NeedleParameters.preset('paper_si')
+    with pytest.raises(NeedleError):
+        Integrator(p, NeedleModel(p).state_at(0.02, 5e-4), step).advance(1e-3, force)

@@ -903,7 +903,7 @@ def test_state_is_a_copy() -> None:
 @pytest.mark.parametrize('step', [0.0, -1e-5, np.nan, np.inf])
 def test_step_must_be_positive_and_finite(step: float) -> None:
     """A step that is not positive and finite is refused by name and value."""
-    with pytest.raises(ParameterError, match='step must be positive and finite, got'):
+    with pytest.raises(ParameterError, match='step must be finite and >= 1e-09 s, got'):
         needle(step=step)
 
 
