@@ -23,7 +23,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from math import inf, isfinite, sqrt
+from math import inf, isfinite, isnan, sqrt
 import os
 from typing import Final
 
@@ -293,7 +293,7 @@ class Integrator:
             self._constants, self._tables, self._state, self.time,
             *inputs, moved, longest, self.graded, duration, self._sums,
         )  # fmt: skip
-        if not (np.isfinite(self._state).all() and np.isfinite(self._sums).all()):
+        if isnan(left):
             raise NeedleError(
                 'the motion is not finite: constants, state or inputs are out of proportion'
             )

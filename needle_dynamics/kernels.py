@@ -8,7 +8,7 @@ changes, but not when that of a function which it calls does.
 from __future__ import annotations
 
 from collections.abc import Callable
-from math import ceil, cos, exp, expm1, inf, log1p, sin, sqrt, tanh
+from math import ceil, cos, exp, expm1, inf, log1p, nan, sin, sqrt, tanh
 from typing import cast, Final, NamedTuple, TypeAlias, TypeVar
 
 import numba
@@ -785,7 +785,7 @@ def advance(  # noqa: C901
     Steps are no longer than ``longest`` [s]; with ``graded`` they grow with the inserted length
     once it exceeds a tenth of the needle's, since the modes slow down. With ``moved`` the speed
     goes evenly to ``base_speed``, whatever force that takes. Time is left undone when the
-    inserted length would leave its range.
+    inserted length would leave its range; it is not a number when the motion is none.
     """
     series, terms, modes, layer_start, layer_stiffness, layer_offset = tables
     n = modes.shape[1]
@@ -948,7 +948,13 @@ def advance(  # noqa: C901
     state[2 + n] = -u
     state[3 + n] += turn * done
     state[4 + n :] = z
-    return left
+    size = 0.0
+    for value in state:
+        size += abs(value)
+    for value in sums:
+        size += abs(value)
+    # Not a number tells that the motion has left the numbers.
+    return left if size < inf else nan
 
 
 @compiled
@@ -978,7 +984,7 @@ def run(
             c, tables, state, k * interval, forces[k], torques[k], 0.0, False, longest, graded,
             interval, sums,
         )  # fmt: skip
-        if left > 0.0:
+        if left != 0.0:
             return k
         if keep:
             states[k + 1] = state
