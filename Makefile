@@ -35,11 +35,12 @@ lock:
 	uv pip compile --quiet --universal --python-version 3.10 --no-annotate --no-header \
 		--extra ros --extra dev setup.py requirements-build.in -o requirements.lock
 
-# The shipped friction recordings, made anew through real nodes.
+# The shipped recordings, made anew through real nodes.
 bags: setup
-	rm -rf bags/friction_*
-	$(BIN)/needle experiment friction --repeats 4 --seed 2014 --rate 250 bags
-	cd bags && sha256sum friction_*/* > SHA256SUMS
+	rm -rf bags/friction_* bags/stiffness_*
+	$(BIN)/needle experiment friction --rate 100 --speed 20 bags
+	$(BIN)/needle experiment stiffness --rate 40 --speed 40 bags
+	cd bags && sha256sum friction_*/* stiffness_*/* > SHA256SUMS
 
 clean:
 	rm -rf $(VENV) build install log demo_output

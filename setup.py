@@ -42,7 +42,7 @@ setup(
         (f'lib/{NAME}', [f'scripts/{node}' for node in NODES]),
     ],
     install_requires=[
-        'apsw>=3.46',
+        'lz4>=4.0',
         'matplotlib>=3.6',
         'mcap>=1.5',
         'numba>=0.58',
@@ -71,8 +71,8 @@ setup(
             'ruff>=0.9',
             'sympy>=1.12',
         ],
-        # What `needle bench dynamics` is measured beside.
-        'bench': ['mujoco>=3.2', 'pyelastica>=0.3.3'],
+        # What `needle bench` is measured beside.
+        'bench': ['mcap-ros2-support>=0.5.6', 'mujoco>=3.2', 'pyelastica>=0.3.3'],
     },
     entry_points={
         'console_scripts': [

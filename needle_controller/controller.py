@@ -124,29 +124,51 @@ class Controller:
         for name, valid in ((law, LAWS), (reference, tuple(REFERENCES))):
             if name not in valid:
                 raise ParameterError(f'unknown {name!r}; valid: {", ".join(valid)}')
-        self._parameters = parameters
+        self._name = law
+        self._gains = pid if law == 'pid' else inverse_dynamics
         self._limits = limits
         self._reference_kind = REFERENCES[reference]
         self._period = 1.0 / settings.rate
         self._delay = int(settings.delay)
-        axes = Axis.insertion(parameters), Axis.rotation(parameters)
-        force_limits = settings.force_limit, settings.torque_limit
-        loops = []
-        for i, axis_name in enumerate(('insertion', 'rotation')):
-            chosen: Law
-            if law == 'pid':
-                chosen = Pid(axis=axes[i], gains=pid[i], period=self._period)
-            else:
-                chosen = InverseDynamics(
-                    axis=axes[i], gains=inverse_dynamics[i], period=self._period
-                )
-            check_stability(chosen, self._delay, f'{law}.{axis_name} gains')
-            loops.append(SampledLoop(chosen, self._delay, force_limits[i]))
-        self._insertion, self._rotation = loops
+        insertion, rotation = self._laws(parameters)
+        self._parameters = parameters
+        self._insertion = SampledLoop(insertion, self._delay, settings.force_limit)
+        self._rotation = SampledLoop(rotation, self._delay, settings.torque_limit)
         self._target: float | None = None
         self._reference: Reference | None = None
         self._reference_start = 0.0
         self._planned = False
+
+    def _laws(self, parameters: NeedleParameters) -> tuple[Law, Law]:
+        """Return the laws of insertion and rotation, or refuse gains that cannot be stable."""
+        laws: list[Law] = []
+        axes = Axis.insertion(parameters), Axis.rotation(parameters)
+        for i, name in enumerate(('insertion', 'rotation')):
+            axis, gains = axes[i], self._gains[i]
+            if isinstance(gains, PidGains):
+                laws.append(Pid(axis=axis, gains=gains, period=self._period))
+            else:
+                laws.append(InverseDynamics(axis=axis, gains=gains, period=self._period))
+            check_stability(laws[-1], self._delay, f'{self._name}.{name} gains')
+        return laws[0], laws[1]
+
+    def change(self, parameters: NeedleParameters) -> None:
+        """
+        Believe other constants from now on; target, reference and memory stay.
+
+        Parameters
+        ----------
+        parameters : NeedleParameters
+            Needle and tissue.
+
+        Raises
+        ------
+        ParameterError
+            If the gains cannot be stable with them; the old ones then stay.
+
+        """
+        self._insertion.law, self._rotation.law = self._laws(parameters)
+        self._parameters = parameters
 
     @property
     def target(self) -> float | None:

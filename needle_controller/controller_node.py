@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 import sys
 from typing import Any
 
@@ -40,6 +41,8 @@ class ControllerNode(NeedleNode):
     measurements are stale or not finite, and after ``~/emergency_stop`` the command is zero.
     ``reference`` and ``tracking_error`` show what it aims at and how far off it is.
     """
+
+    LIVE = frozenset({'model.coulomb_friction', 'model.viscous_friction'})
 
     def __init__(self, **node_options: Any) -> None:
         super().__init__('controller', **node_options)
@@ -105,6 +108,13 @@ class ControllerNode(NeedleNode):
             self._truth = self.create_subscription(
                 JointState, 'ground_truth', self._on_ground_truth, SENSOR
             )
+
+    def change(self, changes: Mapping[str, Any]) -> None:
+        """Go on with other friction; refuse what the gains cannot be stable with."""
+        parameters = self.model_parameters(changes)
+        if self._controller is not None:
+            self._controller.change(parameters)
+            self._model = NeedleModel(parameters)
 
     def cleanup(self) -> None:
         """Forget the ground truth."""

@@ -14,6 +14,7 @@ from needle_dynamics.errors import (
 )
 from needle_dynamics.force_sensor import ForceSensor, ForceSensorParameters
 from needle_dynamics.friction import Friction, FRICTION_LAWS
+from needle_dynamics.indenter import Indenter, IndenterParameters
 from needle_dynamics.integrators import (
     Batch,
     Integrator,
@@ -37,6 +38,8 @@ __all__ = [
     'ForceSensor',
     'ForceSensorParameters',
     'Friction',
+    'Indenter',
+    'IndenterParameters',
     'InsertedLengthError',
     'Integrator',
     'Interval',

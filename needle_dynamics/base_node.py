@@ -18,7 +18,7 @@ import sys
 import time
 import traceback
 from types import FrameType
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from needle_dynamics.errors import NeedleError, ParameterError
@@ -63,7 +63,11 @@ class NeedleNode(LifecycleNode):
     A subclass declares its parameters in ``__init__`` (`declare_settings`), overrides
     `configure`, `activate`, `deactivate` and `diagnose`, and raises `NeedleError` for whatever
     makes a transition impossible: the transition is then refused and the reason logged.
+    Parameters that it names in `LIVE` may change while it is configured: `change` is then called.
     """
+
+    #: Names of the parameters that may change while the node is configured.
+    LIVE: ClassVar[frozenset[str]] = frozenset()
 
     def __init__(self, name: str, **node_options: Any) -> None:
         super().__init__(name, **node_options)
@@ -76,6 +80,7 @@ class NeedleNode(LifecycleNode):
         self._last_level = DiagnosticStatus.OK
         self._health_timer = self.create_timer(1.0, self.publish_diagnostics)
         self.add_on_set_parameters_callback(self._check_change)
+        self.add_post_set_parameters_callback(self._after_change)
 
     # What a subclass fills in.
 
@@ -90,6 +95,9 @@ class NeedleNode(LifecycleNode):
 
     def deactivate(self) -> None:
         """Stop acting and leave the world safe."""
+
+    def change(self, changes: Mapping[str, Any]) -> None:
+        """Go on with other values of parameters in `LIVE`; raise `NeedleError` to refuse them."""
 
     def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
         """Return level, message and values for /diagnostics."""
@@ -141,9 +149,9 @@ class NeedleNode(LifecycleNode):
         preset = self.get_parameter('model.preset').value
         self.declare_settings('model.', PRESETS.get(preset, NeedleParameters()))
 
-    def model_parameters(self) -> NeedleParameters:
+    def model_parameters(self, changes: Mapping[str, Any] | None = None) -> NeedleParameters:
         """
-        Read the model constants.
+        Read the model constants, but for the changes.
 
         Raises
         ------
@@ -152,11 +160,25 @@ class NeedleNode(LifecycleNode):
 
         """
         self.text('model.preset', tuple(PRESETS))
-        return self.settings('model.', NeedleParameters)
+        return self.settings('model.', NeedleParameters, changes)
 
-    def settings(self, prefix: str, kind: Callable[..., _Settings]) -> _Settings:
+    def settings(
+        self,
+        prefix: str,
+        kind: Callable[..., _Settings],
+        changes: Mapping[str, Any] | None = None,
+    ) -> _Settings:
         """
         Read the parameters that `declare_settings` declared into the dataclass.
+
+        Parameters
+        ----------
+        prefix : str
+            Namespace of the parameters.
+        kind : type
+            The dataclass.
+        changes : Mapping[str, Any], optional
+            Values to take instead, by the names of the parameters.
 
         Raises
         ------
@@ -166,7 +188,8 @@ class NeedleNode(LifecycleNode):
         """
         values: dict[str, Any] = {}
         for item in fields(kind):  # type: ignore[arg-type]
-            value = self.get_parameter(f'{prefix}{item.name}').value
+            name = f'{prefix}{item.name}'
+            value = (changes or {}).get(name, self.get_parameter(name).value)
             if isinstance(value, (list, array)):
                 value = tuple(value)
             values[item.name] = as_number(value) if 'unit' in item.metadata else value
@@ -214,13 +237,24 @@ class NeedleNode(LifecycleNode):
             )
 
     def _check_change(self, parameters: list[Parameter]) -> SetParametersResult:
-        if self._configured:
-            names = ', '.join(parameter.name for parameter in parameters)
+        if not self._configured:
+            return SetParametersResult(successful=True)
+        fixed = [parameter.name for parameter in parameters if parameter.name not in self.LIVE]
+        if fixed:
             return SetParametersResult(
                 successful=False,
-                reason=f'{names}: cannot change while configured; clean up the node first',
+                reason=f'{", ".join(fixed)}: cannot change while configured; clean up the node '
+                'first',
             )
+        try:
+            self.change({parameter.name: parameter.value for parameter in parameters})
+        except NeedleError as error:
+            return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
+
+    def _after_change(self, _parameters: list[Parameter]) -> None:
+        if self._configured:
+            self._configuration.publish(String(data=self.configuration()))
 
     # Lifecycle.
 

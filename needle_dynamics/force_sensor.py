@@ -1,85 +1,177 @@
-"""The base force-torque sensor (a JR3 in the source): noise, bias, low-pass filter, counts."""
+"""The base force-torque sensor (a JR3 in the source): noise, drift, filters, counts, tare."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections import deque
+from dataclasses import dataclass, field, fields
+from typing import Final
 
-from needle_dynamics.errors import ParameterError
-from needle_dynamics.kernels import FloatArray
+from needle_dynamics.errors import JobError, ParameterError
+from needle_dynamics.kernels import FloatArray, sense
 from needle_dynamics.parameters import check_constants, constant
 import numpy as np
 from scipy.signal import butter
 
+#: Filters of the sensor; each is fed by the one before.
+MOST_FILTERS: Final = 6
+
+#: Highest sample rate of the sensor [Hz].
+HIGHEST_RATE: Final = 8000.0
+
+#: Time over which readings are averaged to zero the sensor [s].
+TARE_TIME: Final = 0.1
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ForceSensorParameters:
-    """Constants of the sensor; zero switches each imperfection off."""
+    """
+    Constants of the sensor; zero switches each imperfection off.
 
-    force_noise: float = constant(0.02, 'N', 'standard deviation of white force noise')
-    torque_noise: float = constant(5e-4, 'N m', 'standard deviation of white torque noise')
-    force_bias: float = constant(0.0, 'N', 'constant offset of each force', low=-1e3)
-    torque_bias: float = constant(0.0, 'N m', 'constant offset of each torque', low=-1e2)
-    force_resolution: float = constant(0.0025, 'N', 'force per count')
-    torque_resolution: float = constant(1e-4, 'N m', 'torque per count')
-    force_range: float = constant(100.0, 'N', 'force at which the sensor saturates', open_low=True)
-    torque_range: float = constant(
-        5.0, 'N m', 'torque at which the sensor saturates', open_low=True
+    Those of forces and torques are one number, or three for x y z.
+    """
+
+    rate: float = constant(
+        HIGHEST_RATE, 'Hz', 'samples per second within the sensor', high=HIGHEST_RATE,
+        open_low=True,
+    )  # fmt: skip
+    filter: int = field(
+        default=2,
+        metadata={
+            'description': 'low-pass filter: 0 none, 1 with a cutoff of rate / 16 (500 Hz), '
+            f'each further one a quarter of that, up to {MOST_FILTERS}'
+        },
     )
-    cutoff: float = constant(125.0, 'Hz', 'low-pass filter (Butterworth, second order)')
+    force_noise: float | tuple[float, ...] = constant(
+        (0.05, 0.05, 0.05), 'N', 'standard deviation of the white noise of each sample'
+    )
+    torque_noise: float | tuple[float, ...] = constant(
+        (1.5e-3, 1.5e-3, 1.5e-3), 'N m', 'standard deviation of the white noise of each sample'
+    )
+    force_bias: float | tuple[float, ...] = constant(
+        (0.0, 0.0, 0.0), 'N', 'offset at the start', low=-1e3
+    )
+    torque_bias: float | tuple[float, ...] = constant(
+        (0.0, 0.0, 0.0), 'N m', 'offset at the start', low=-1e2
+    )
+    force_drift: float | tuple[float, ...] = constant(
+        (0.0, 0.0, 0.0), 'N/s^0.5', 'standard deviation of the random walk of the offset in 1 s'
+    )
+    torque_drift: float | tuple[float, ...] = constant(
+        (0.0, 0.0, 0.0), 'N m/s^0.5', 'standard deviation of the random walk of the offset in 1 s'
+    )
+    force_resolution: float | tuple[float, ...] = constant(
+        (0.0025, 0.0025, 0.0025), 'N', 'force per count'
+    )
+    torque_resolution: float | tuple[float, ...] = constant(
+        (1e-4, 1e-4, 1e-4), 'N m', 'torque per count'
+    )
+    force_range: float | tuple[float, ...] = constant(
+        (100.0, 100.0, 100.0), 'N', 'force at which the sensor saturates', open_low=True
+    )
+    torque_range: float | tuple[float, ...] = constant(
+        (5.0, 5.0, 5.0), 'N m', 'torque at which the sensor saturates', open_low=True
+    )
 
     def __post_init__(self) -> None:
         check_constants(self)
+        for item in fields(self):
+            value = getattr(self, item.name)
+            if isinstance(value, tuple) and len(value) != 3:
+                raise ParameterError(
+                    f'{item.name} must be one number or three, x y z, got {list(value)}'
+                )
+        chosen = self.filter
+        if (
+            isinstance(chosen, bool)
+            or not isinstance(chosen, int)
+            or not (0 <= chosen <= MOST_FILTERS)
+        ):
+            raise ParameterError(
+                f'filter must be an integer from 0 (none) to {MOST_FILTERS}, got {chosen!r}'
+            )
+
+    @property
+    def cutoffs(self) -> tuple[float, ...]:
+        """Cutoffs of the filters that are in use, the first fed first [Hz]."""
+        return tuple(self.rate / (16.0 * 4.0**k) for k in range(self.filter))
+
+    def per_axis(self, name: str) -> FloatArray:
+        """Return a constant of the forces x y z and of the torques x y z, shape (6,)."""
+        pair = (getattr(self, f'{kind}_{name}') for kind in ('force', 'torque'))
+        return np.concatenate([np.broadcast_to(value, 3) for value in pair], dtype=np.float64)
 
 
 class ForceSensor:
     """
-    Turns true wrenches into what the sensor reports, one sample at a time.
+    Turns true wrenches into what the sensor reports.
+
+    The sensor samples faster than it is read; over each interval the wrench goes in a straight
+    line. Each sample takes offset and noise, saturates, and passes the filters,
+    second-order Butterworth in a cascade; what is read is zeroed and rounded to counts.
 
     Parameters
     ----------
     parameters : ForceSensorParameters
         Constants.
     rate : float
-        Samples per second [Hz].
+        Readings per second [Hz].
     seed : int
         Seed of the noise: the same seed gives the same noise.
 
     Raises
     ------
     ParameterError
-        If the cutoff is not below half the rate.
+        If the sensor's rate is not a whole multiple of that of the readings.
 
     """
 
-    _BLOCK = 1024
+    #: Random numbers drawn at once.
+    _DRAWN = 16384
 
     def __init__(self, parameters: ForceSensorParameters, rate: float, seed: int) -> None:
         p = parameters
-        if p.cutoff >= rate / 2.0:
+        samples = round(p.rate / rate)
+        if samples < 1 or abs(samples * rate - p.rate) > 1e-9 * p.rate:
+            fits = max(1.0, HIGHEST_RATE // rate) * rate
             raise ParameterError(
-                f'cutoff must be < half the sample rate = {rate / 2.0:g} Hz (0 switches the '
-                f'filter off), got {p.cutoff:g} Hz'
+                f'rate of the force sensor must be a whole multiple of {rate:g} Hz, got '
+                f'{p.rate:g} Hz; {fits:g} Hz would do'
             )
         self._rng = np.random.default_rng(seed)
-        self._noise = np.repeat([p.force_noise, p.torque_noise], 3)
-        self._bias = np.repeat([p.force_bias, p.torque_bias], 3)
-        self._count = np.repeat([p.force_resolution, p.torque_resolution], 3)
-        self._range = np.repeat([p.force_range, p.torque_range], 3)
-        self._counts = self._count > 0.0
-        self._divisor = np.where(self._counts, self._count, 1.0)
-        self._filter = butter(2, p.cutoff, fs=rate) if p.cutoff > 0.0 else None
-        self._memory: FloatArray | None = None
-        self._drawn = np.empty((0, 6))
+        self._constants = np.array(
+            [
+                p.per_axis('noise'),
+                p.per_axis('drift') / np.sqrt(rate),
+                p.per_axis('range'),
+                p.per_axis('resolution'),
+            ]
+        )
+        self._offset = p.per_axis('bias')
+        self._zero = np.zeros(6)
+        sections = [butter(2, cutoff, fs=p.rate, output='sos')[0] for cutoff in p.cutoffs]
+        self._sections = np.array(sections).reshape(-1, 6)
+        self._memory = np.zeros((p.filter, 2, 6))
+        self._before: FloatArray | None = None
+        # One row more than samples: the step of the random walk.
+        self._block = max(1, self._DRAWN // (6 * (samples + 1))), samples + 1, 6
+        self._drawn = np.empty((0, samples + 1, 6))
         self._next = 0
+        self._resting: deque[FloatArray] = deque(maxlen=max(1, round(TARE_TIME * rate)))
 
-    def measure(self, wrench: FloatArray) -> FloatArray:
+    def measure(
+        self, wrench: FloatArray, *, start: FloatArray | None = None, moving: bool = False
+    ) -> FloatArray:
         """
         Return the next reading.
 
         Parameters
         ----------
         wrench : ndarray, shape (6,)
-            True force [N] and torque [N m], x y z each.
+            True force [N] and torque [N m] now, x y z each.
+        start : ndarray, shape (6,), optional
+            That just after the reading before, if the wrench jumped there.
+        moving : bool
+            Whether what it feels moves; such a reading is not used to zero it.
 
         Returns
         -------
@@ -87,22 +179,43 @@ class ForceSensor:
             What the sensor reports.
 
         """
+        wrench = np.array(wrench, dtype=np.float64)
         if self._next == len(self._drawn):
-            self._drawn = self._rng.normal(size=(self._BLOCK, 6)) * self._noise + self._bias
+            self._drawn = self._rng.standard_normal(self._block)
             self._next = 0
-        reading = np.clip(wrench + self._drawn[self._next], -self._range, self._range)
+        if self._before is None:
+            # The filters start in the steady state of the first value.
+            limit = self._constants[2]
+            first = np.clip(wrench + self._offset, -limit, limit)
+            b, a = self._sections[:, :3], self._sections[:, 3:]
+            self._memory[:, 0] = (1.0 - b[:, :1]) * first
+            self._memory[:, 1] = (b[:, 2:] - a[:, 2:]) * first
+            self._before = wrench
+        reading = np.empty(6)
+        sense(
+            self._before if start is None else start, wrench, self._drawn[self._next],
+            self._constants, self._sections, self._memory, self._offset, self._zero, reading,
+        )  # fmt: skip
         self._next += 1
-        if self._filter is not None:
-            reading = self._low_pass(reading)
-        counted = np.round(reading / self._divisor) * self._divisor
-        return np.asarray(np.where(self._counts, counted, reading))
+        self._before = wrench
+        if moving:
+            self._resting.clear()
+        else:
+            self._resting.append(reading)
+        return reading
 
-    def _low_pass(self, value: FloatArray) -> FloatArray:
-        """Filter in transposed direct form II, started in the steady state of the first value."""
-        b, a = self._filter  # type: ignore[misc]
-        if self._memory is None:
-            self._memory = np.array([(1.0 - b[0]) * value, (b[2] - a[2]) * value])
-        result = b[0] * value + self._memory[0]
-        self._memory[0] = b[1] * value - a[1] * result + self._memory[1]
-        self._memory[1] = b[2] * value - a[2] * result
-        return np.asarray(result)
+    def tare(self) -> None:
+        """
+        Zero the sensor on the mean of the readings of the last tenth of a second.
+
+        Raises
+        ------
+        JobError
+            If there are not as many readings at rest since the last motion or zeroing.
+
+        """
+        found, needed = len(self._resting), self._resting.maxlen
+        if found != needed:
+            raise JobError(f'{found} of {needed} readings at rest so far')
+        self._zero += np.mean(self._resting, axis=0)
+        self._resting.clear()

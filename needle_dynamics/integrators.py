@@ -23,7 +23,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from math import inf, isfinite, isnan, sqrt
+from math import copysign, inf, isfinite, isnan, sqrt
 import os
 from typing import Final
 
@@ -186,15 +186,36 @@ class Integrator:
         self.step = _checked_step(step)
         if tolerance is not None and not 0.0 < tolerance < inf:
             raise ParameterError(f'tolerance must be positive and finite, got {tolerance!r}')
-        self.model = NeedleModel(parameters)
         self.tolerance = tolerance
         self.graded = graded
         self.time = 0.0
-        self._constants = _constants(self.model)
-        self._tables = _tables(self.model)
         self._sums = np.zeros(SUMS)
-        self._state = self.model.checked_state(state)
         self._refinement = 1.0
+        self._take_on(parameters, state)
+
+    def _take_on(self, parameters: NeedleParameters, state: ArrayLike) -> None:
+        model = NeedleModel(parameters)
+        self._state = model.checked_state(state)
+        self.model = model
+        self._constants = _constants(model)
+        self._tables = _tables(model)
+
+    def change(self, parameters: NeedleParameters) -> None:
+        """
+        Go on with other constants from the state now.
+
+        Parameters
+        ----------
+        parameters : NeedleParameters
+            Constants.
+
+        Raises
+        ------
+        ShapeError, InsertedLengthError
+            If the state does not suit them; the old constants then stay.
+
+        """
+        self._take_on(parameters, self._state)
 
     @property
     def state(self) -> FloatArray:
@@ -261,6 +282,47 @@ class Integrator:
 
         """
         return self._run(duration, 0.0, 0.0, speed, moved=True)
+
+    def advance_pushed(self, duration: float, force: float, speed_limit: float) -> Interval:
+        """
+        Advance under a constant force of a base that goes no faster than a limit.
+
+        Parameters
+        ----------
+        duration : float
+            Time to advance [s].
+        force : float
+            Insertion force that the base applies while it is slow enough [N].
+        speed_limit : float
+            Highest speed of the base at the end [m/s].
+
+        Returns
+        -------
+        Interval
+            Means over the interval; at the limit the axial force is what that motion took.
+
+        Raises
+        ------
+        InsertedLengthError
+            If the inserted length fell below its minimum; the state is the last valid one.
+
+        """
+        before, clock, depth = self._state.copy(), self.time, self.depth
+        way = force
+        try:
+            seen = self.advance(duration, force)
+        except InsertedLengthError:
+            # At the limit it may stay within.
+            too_fast = True
+        else:
+            # The hub may have stopped what went too fast.
+            gone = abs(self.depth - depth)
+            too_fast = max(abs(self.speed), gone / duration) > speed_limit
+            way = self.speed or force
+        if too_fast:
+            self._state[:], self.time = before, clock
+            seen = self.advance_moved(duration, copysign(speed_limit, way))
+        return seen
 
     def _run(
         self, duration: float, force: float, torque: float, speed: float, *, moved: bool

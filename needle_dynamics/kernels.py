@@ -1,5 +1,5 @@
 """
-Everything that is compiled: integrals of the modes, friction flow, modal flow, time step.
+Everything that is compiled: integrals of the modes, friction and modal flow, step, force sensor.
 
 One file for all: Numba keeps machine code on disk and renews it when the file of the function
 changes, but not when that of a function which it calls does.
@@ -337,7 +337,8 @@ def slide(
         stop = inf
         if braking > 0.0:
             stop = abs(u) / braking
-            if b > 0.0:
+            if b * stop > 1e-16:
+                # Below, it is the same to rounding, and b may be too small to divide by.
                 stop = log1p(b * stop) / b
         if stop > t:
             return _glide(u, -sign * braking, b, t)
@@ -989,3 +990,58 @@ def run(
         if keep:
             states[k + 1] = state
     return len(forces)
+
+
+@compiled
+def sense(
+    before: FloatArray,
+    now: FloatArray,
+    drawn: FloatArray,
+    constants: FloatArray,
+    sections: FloatArray,
+    memory: FloatArray,
+    offset: FloatArray,
+    zero: FloatArray,
+    reading: FloatArray,
+) -> None:
+    """
+    Take the samples of a force sensor between two wrenches; read the last of them.
+
+    Parameters
+    ----------
+    before, now : ndarray, shape (6,)
+        True wrenches after the last reading and now; a straight line between them.
+    drawn : ndarray, shape (k + 1, 6)
+        Standard normal numbers: noise of each of the k samples, then the step of the offset.
+    constants : ndarray, shape (4, 6)
+        Standard deviations of noise and step, range, and resolution (0 for none) of each axis.
+    sections : ndarray, shape (filters, 6)
+        Second-order sections of the cascade, as SciPy has them.
+    memory : ndarray, shape (filters, 2, 6)
+        Their memory in transposed direct form II; renewed.
+    offset : ndarray, shape (6,)
+        Offset of the sensor; renewed.
+    zero : ndarray, shape (6,)
+        What the reading is zeroed on.
+    reading : ndarray, shape (6,)
+        Overwritten with the reading.
+
+    """
+    samples = drawn.shape[0] - 1
+    for i in range(6):
+        noise, limit, count = constants[0, i], constants[2, i], constants[3, i]
+        offset[i] += constants[1, i] * drawn[samples, i]
+        value = 0.0
+        for j in range(samples):
+            # The last sample is the wrench now, to the bit.
+            back = (samples - 1.0 - j) / samples
+            value = now[i] + back * (before[i] - now[i]) + offset[i] + noise * drawn[j, i]
+            value = min(max(value, -limit), limit)
+            for k in range(sections.shape[0]):
+                x = value
+                value = sections[k, 0] * x + memory[k, 0, i]
+                memory[k, 0, i] = sections[k, 1] * x - sections[k, 4] * value + memory[k, 1, i]
+                memory[k, 1, i] = sections[k, 2] * x - sections[k, 5] * value
+        value -= zero[i]
+        # Counts know no negative zero.
+        reading[i] = np.rint(value / count) * count + 0.0 if count > 0.0 else value

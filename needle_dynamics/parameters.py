@@ -29,7 +29,7 @@ _LARGEST_INTEGER: Final = 10**300
 
 
 def constant(
-    default: float,
+    default: float | tuple[float, ...],
     unit: str,
     description: str,
     *,
@@ -42,8 +42,8 @@ def constant(
 
     Parameters
     ----------
-    default : float
-        Default value [``unit``].
+    default : float or tuple of float
+        Default value [``unit``]; a tuple makes it a field of several numbers, each in the range.
     unit : str
         SI unit as people write it, ``1`` for a pure number.
     description : str
@@ -90,23 +90,30 @@ def check_constants(values: object) -> None:
         if 'unit' not in item.metadata:
             continue
         value = getattr(values, item.name)
-        meta = item.metadata
-        if isinstance(value, bool) or not isinstance(value, (int, float)):
-            raise ParameterError(f'{item.name} must be a number, got {value!r}')
-        if isinstance(value, int) and abs(value) > _LARGEST_INTEGER:
-            raise ParameterError(f'{item.name} must be finite, got an integer of too many digits')
-        too_low = value <= meta['low'] if meta['open_low'] else value < meta['low']
-        if not isfinite(value) or too_low or value > meta['high']:
-            sign = '>' if meta['open_low'] else '>='
-            upper = f' and <= {meta["high"]:g}' if isfinite(meta['high']) else ''
-            raise ParameterError(
-                f'{item.name} must be finite, {sign} {meta["low"]:g}{upper}'
-                f'{" " + meta["unit"] if meta["unit"] else ""}, got {value!r}'
-            )
+        several = isinstance(item.default, tuple) and isinstance(value, tuple)
+        for number in value if several else (value,):
+            _check_number(item.name, number, item.metadata)
+
+
+def _check_number(name: str, value: object, meta: Mapping[str, Any]) -> None:
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise ParameterError(f'{name} must be a number, got {value!r}')
+    if isinstance(value, int) and abs(value) > _LARGEST_INTEGER:
+        raise ParameterError(f'{name} must be finite, got an integer of too many digits')
+    too_low = value <= meta['low'] if meta['open_low'] else value < meta['low']
+    if not isfinite(value) or too_low or value > meta['high']:
+        sign = '>' if meta['open_low'] else '>='
+        upper = f' and <= {meta["high"]:g}' if isfinite(meta['high']) else ''
+        raise ParameterError(
+            f'{name} must be finite, {sign} {meta["low"]:g}{upper}'
+            f'{" " + meta["unit"] if meta["unit"] != "1" else ""}, got {value!r}'
+        )
 
 
 def as_number(value: Any) -> Any:
-    """Take an integer where a float is meant; leave all else as it is."""
+    """Take an integer where a float is meant, in a tuple too; leave all else as it is."""
+    if isinstance(value, tuple):
+        return tuple(as_number(number) for number in value)
     is_integer = isinstance(value, int) and not isinstance(value, bool)
     return float(value) if is_integer and abs(value) <= _LARGEST_INTEGER else value
 

@@ -2,19 +2,30 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from math import copysign, sqrt
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise, zip_longest
+from math import copysign, inf, sqrt
+from statistics import fmean
 from typing import Final
 
-from needle_dynamics.errors import ParameterError
+from needle_dynamics.errors import JobError, ParameterError
 from needle_dynamics.force_sensor import ForceSensor
-from needle_dynamics.integrators import Integrator
+from needle_dynamics.friction import Friction
+from needle_dynamics.integrators import Integrator, Interval
 from needle_dynamics.kernels import FloatArray
 from needle_dynamics.parameters import check_constants, constant
 import numpy as np
 
 #: Error at the end of a trajectory with which the base is content to rest [m].
 _SETTLED: Final = 1e-8
+
+#: Parts of a sample interval in each of which the force of a push is constant: friction lets the
+#: speed follow it at once, and a speed of now beside a mean force would be half an interval late.
+_PUSHES: Final = 4
+
+#: Speed below which the sensor may be zeroed [m/s].
+AT_REST: Final = 1e-6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -23,19 +34,76 @@ class BaseParameters:
 
     speed_limit: float = constant(0.05, 'm/s', 'highest speed of the base', open_low=True)
     acceleration_limit: float = constant(
-        0.5, 'm/s^2', 'highest acceleration of the base', open_low=True
+        0.5, 'm/s^2', 'highest acceleration of a base that is motion controlled', open_low=True
     )
     position_gain: float = constant(
         20.0, '1/s', 'rate at which the base closes a position error', open_low=True
     )
+    encoder_resolution: float = constant(1e-6, 'm', 'length per count of the joint position')
 
     def __post_init__(self) -> None:
         check_constants(self)
 
 
+def joint_values(
+    joint: str, joints: Sequence[str], values: Sequence[Sequence[float]]
+) -> list[float | None]:
+    """
+    Pick one joint from the points of a trajectory.
+
+    Parameters
+    ----------
+    joint : str
+        Name of the joint.
+    joints : sequence of str
+        Names of all joints of the trajectory.
+    values : sequence of sequence of float
+        Values of the joints at each point; may be empty.
+
+    Returns
+    -------
+    list of float or None
+        Value of the joint at each point, None where it has none.
+
+    Raises
+    ------
+    ParameterError
+        If the joint is not among them.
+
+    """
+    if joint not in joints:
+        raise ParameterError(f'needs the joint {joint!r}, got {list(joints)}')
+    index = list(joints).index(joint)
+    return [float(point[index]) if len(point) > index else None for point in values]
+
+
+def check_times(times: Sequence[float]) -> None:
+    """Refuse a trajectory without points, or whose times do not increase from zero or later."""
+    if not times:
+        raise ParameterError('trajectory has no points')
+    if times[0] < 0.0 or any(late <= early for early, late in pairwise(times)):
+        raise ParameterError(f'trajectory times must be >= 0 and increasing, got {list(times)} s')
+
+
+def on_grid(value: float, resolution: float) -> float:
+    """Return the nearest whole multiple of a resolution; a resolution of zero leaves the value."""
+    return round(value / resolution) / (1.0 / resolution) if resolution > 0.0 else value
+
+
+def _friction_gained(friction: Friction, before: float, after: float) -> float:
+    """
+    Return the friction at the end of an evenly accelerated interval over that of its middle.
+
+    The mean over the interval would be the force of half an interval ago, beside a speed of now.
+    """
+    if after == 0.0:
+        return 0.0
+    return friction.force(after, 0.0) - friction.force(0.5 * (before + after), 0.0)
+
+
 class BaseMotion:
     """
-    A base that follows a trajectory of inserted lengths within its limits.
+    A base that follows a trajectory of inserted lengths, or pushes, within its limits.
 
     Parameters
     ----------
@@ -45,20 +113,43 @@ class BaseMotion:
         Inserted length to hold until a trajectory comes [m].
     reach : tuple of float
         Least and largest inserted length [m].
+    force_limit : float
+        Largest force of a push [N].
 
     """
 
     def __init__(
-        self, parameters: BaseParameters, depth: float, reach: tuple[float, float]
+        self,
+        parameters: BaseParameters,
+        depth: float,
+        reach: tuple[float, float],
+        force_limit: float = inf,
     ) -> None:
-        self._limits = parameters
+        self.limits = parameters
         self._range = reach
+        self._force_limit = force_limit
+        #: Force of the push under way [N].
+        self._force = 0.0
+        # The line that ends at each point is a push or a motion; after the last it goes on.
         self._times = np.array([0.0])
         self._depths = np.array([depth])
+        self._forces = np.array([0.0])
+        self._pushes = np.array([False])
 
-    def follow(self, start: float, depth: float, times: FloatArray, depths: FloatArray) -> None:
+    def follow(
+        self,
+        start: float,
+        depth: float,
+        times: Sequence[float],
+        depths: Sequence[float | None],
+        forces: Sequence[float | None] = (),
+    ) -> None:
         """
         Take a new trajectory, straight lines in time between its points.
+
+        A point without an inserted length ends a push: until its time the force goes from that
+        of the point before, zero if that was no push, to its own. The line after a push begins
+        where the base then is. A new trajectory begins with the force of the push under way.
 
         Parameters
         ----------
@@ -66,35 +157,74 @@ class BaseMotion:
             Time at which it begins [s], on the clock of `speed`.
         depth : float
             Inserted length at that time [m].
-        times : ndarray, shape (n,)
+        times : sequence of float
             Times of the points from the start [s], increasing from zero or later.
-        depths : ndarray, shape (n,)
-            Inserted lengths [m].
+        depths : sequence of float or None
+            Inserted lengths [m], None where a push ends.
+        forces : sequence of float or None
+            Forces at the ends of pushes [N], positive into the tissue; other entries do not count.
 
         Raises
         ------
         ParameterError
-            If times do not increase, or a depth is out of reach or not finite.
+            If times do not increase, a depth is out of reach, or a point has neither.
 
         """
-        if times.shape != depths.shape or times.size == 0:
-            raise ParameterError(
-                f'trajectory needs as many times as depths, got {times.size} and {depths.size}'
-            )
-        if not (np.isfinite(times).all() and np.isfinite(depths).all()):
-            raise ParameterError('trajectory must be finite')
-        if times[0] < 0.0 or (np.diff(times) <= 0.0).any():
-            raise ParameterError(
-                f'trajectory times must be >= 0 and increasing, got {times.tolist()} s'
-            )
+        check_times(times)
         low, high = self._range
-        if depths.min() < low or depths.max() > high:
+        ends = [force for at, force in zip_longest(depths, forces) if at is None]
+        # Written so that NaN is refused too.
+        if not all(low <= at <= high for at in depths if at is not None):
             raise ParameterError(
-                f'trajectory must stay in [{low:g}, {high:g}] m, got {depths.tolist()} m'
+                f'trajectory must stay in [{low:g}, {high:g}] m, got {list(depths)} m'
             )
-        if times[0] > 0.0:
-            times, depths = np.append(0.0, times), np.append(depth, depths)
-        self._times, self._depths = start + times, depths
+        if None in ends:
+            raise ParameterError('each point needs a position or an effort')
+        if not all(abs(force) <= self._force_limit for force in ends if force is not None):
+            raise ParameterError(
+                f'a push must be within {self._force_limit:g} N, got {list(forces)} N'
+            )
+        # A point at the start itself replaces the one that stands for where the base is.
+        first = [] if times[0] == 0.0 else [(0.0, depth, self._force, False)]
+        points = [
+            (time, depth, force, True) if at is None else (time, at, 0.0, False)
+            for time, at, force in zip_longest(times, depths, forces)
+        ]
+        columns = zip(*first, *points, strict=True)
+        offsets, self._depths, self._forces, self._pushes = map(np.array, columns)
+        self._times = start + offsets
+
+    def push(self, time: float, depth: float, interval: float) -> float | None:
+        """
+        Return the force to apply over the next interval if the trajectory pushes then.
+
+        Parameters
+        ----------
+        time : float
+            Time now [s].
+        depth : float
+            Where the base is [m].
+        interval : float
+            Time until the next call [s].
+
+        Returns
+        -------
+        float or None
+            Mean force over the interval [N]; None if the base is motion controlled.
+
+        """
+        last = len(self._times) - 1
+        # Rounding of the clock must not make an interval too many.
+        k = int(np.searchsorted(self._times, time + 1e-6 * interval, side='right'))
+        if self._pushes[min(k, last)]:
+            middle = min(time + 0.5 * interval, float(self._times[min(k, last)]))
+            self._force = float(np.interp(middle, self._times, self._forces))
+            return self._force
+        if k > 0 and self._pushes[k - 1]:
+            # The push has ended: the line of inserted lengths begins here.
+            self._depths[k - 1], self._pushes[k - 1] = depth, False
+        self._force = 0.0
+        return None
 
     def speed(self, time: float, depth: float, speed: float, interval: float) -> float:
         """
@@ -115,7 +245,7 @@ class BaseMotion:
             Speed [m/s], reached within the limits.
 
         """
-        limits = self._limits
+        limits = self.limits
         now = float(np.interp(time, self._times, self._depths))
         ahead = float(np.interp(time + interval, self._times, self._depths))
         change = limits.acceleration_limit * interval
@@ -141,6 +271,8 @@ class Sample:
         Whole state.
     depth, speed : float
         Inserted length [m] and insertion speed [m/s].
+    joint_position : float
+        Inserted length as the encoder has it [m].
     force : float
         True axial force of the base on the needle [N], positive into the tissue.
     wrench : ndarray, shape (6,)
@@ -153,6 +285,7 @@ class Sample:
     state: FloatArray
     depth: float
     speed: float
+    joint_position: float
     force: float
     wrench: FloatArray
     tip_deflection: float
@@ -189,6 +322,61 @@ class Plant:
         self._sensor = sensor
         self._count = 0
 
+    @property
+    def report(self) -> dict[str, object]:
+        """Where the needle is, for people."""
+        return {'inserted length [m]': f'{self.integrator.depth:.6f}'}
+
+    def follow(
+        self,
+        joints: Sequence[str],
+        times: Sequence[float],
+        positions: Sequence[Sequence[float]],
+        efforts: Sequence[Sequence[float]],
+    ) -> None:
+        """
+        Have the base follow a trajectory of the joint `insertion`, from now.
+
+        Parameters
+        ----------
+        joints : sequence of str
+            Names of the joints.
+        times : sequence of float
+            Time of each point from now [s].
+        positions, efforts : sequence of sequence of float
+            Inserted length [m] of each point, or force [N] where a push ends.
+
+        Raises
+        ------
+        ParameterError
+            If there is no base, or it cannot follow.
+
+        """
+        if self.base is None:
+            raise ParameterError('is followed in the modes robot and indenter only')
+        self.base.follow(
+            self.time,
+            self.integrator.depth,
+            times,
+            joint_values('insertion', joints, positions),
+            joint_values('insertion', joints, efforts),
+        )
+
+    def tare(self) -> None:
+        """
+        Zero the sensor on the mean of its latest readings.
+
+        Raises
+        ------
+        JobError
+            If the needle moves, or has not rested long enough.
+
+        """
+        speed = self.integrator.speed
+        if abs(speed) > AT_REST:
+            raise JobError(f'the needle moves at {1e3 * speed:.3g} mm/s; it must rest')
+        self._sensor.tare()
+
     def advance(self, force: float = 0.0, torque: float = 0.0) -> Sample:
         """
         Advance by one sample interval.
@@ -211,21 +399,47 @@ class Plant:
             If the needle left the tissue.
 
         """
-        needle = self.integrator
-        if self.base is None:
-            seen = needle.advance(self.interval, force, torque)
+        needle, base, interval = self.integrator, self.base, self.interval
+        resolution = late = 0.0
+        if base is None:
+            seen = needle.advance(interval, force, torque)
         else:
-            speed = self.base.speed(self.time, needle.depth, needle.speed, self.interval)
-            seen = needle.advance_moved(self.interval, speed)
+            resolution = base.limits.encoder_resolution
+            push = base.push(self.time, needle.depth, interval / _PUSHES)
+            if push is None:
+                before = needle.speed
+                speed = base.speed(self.time, needle.depth, before, interval)
+                seen = needle.advance_moved(interval, speed)
+                late = _friction_gained(needle.model.friction, before, needle.speed)
+            else:
+                seen, late = self._pushed(base, push)
         self._count += 1
-        self.time = self._count * self.interval
-        wrench = np.array([0.0, seen.axial_force, seen.lateral_force, seen.moment, 0.0, 0.0])
-        state = needle.state
+        self.time = self._count * interval
+        axial = seen.axial_force + late
+        wrench = np.array([0.0, axial, seen.lateral_force, seen.moment, 0.0, 0.0])
+        start = wrench.copy()
+        start[1] -= 2.0 * late
+        depth, speed = needle.depth, needle.speed
         return Sample(
-            state=state,
-            depth=needle.depth,
-            speed=needle.speed,
-            force=seen.axial_force,
-            wrench=self._sensor.measure(wrench),
+            state=needle.state,
+            depth=depth,
+            speed=speed,
+            joint_position=on_grid(depth, resolution),
+            force=axial,
+            wrench=self._sensor.measure(wrench, start=start, moving=abs(speed) > AT_REST),
             tip_deflection=seen.tip_deflection,
         )
+
+    def _pushed(self, base: BaseMotion, force: float) -> tuple[Interval, float]:
+        """Push, as the force changes; return means and what it is more at the end."""
+        needle, part = self.integrator, self.interval / _PUSHES
+        limit = base.limits.speed_limit
+        parts = [needle.advance_pushed(part, force, limit)]
+        for k in range(1, _PUSHES):
+            push = base.push(self.time + k * part, needle.depth, part)
+            force = force if push is None else push
+            parts.append(needle.advance_pushed(part, force, limit))
+        names = ('tip_deflection', 'axial_force', 'lateral_force', 'moment')
+        means = {name: fmean(getattr(one, name) for one in parts) for name in names}
+        rise = (parts[-1].axial_force - parts[0].axial_force) * _PUSHES / (_PUSHES - 1)
+        return replace(parts[-1], **means), 0.5 * rise

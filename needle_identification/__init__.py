@@ -12,40 +12,75 @@ from needle_identification.bag_io import (
     message_counts,
     message_type,
     OfferedQos,
-    read_friction_recording,
     read_topic,
 )
 from needle_identification.errors import IdentificationError, RecordingError
+from needle_identification.estimate import ParameterEstimate, Statistic, statistic
 from needle_identification.friction import (
+    Comparison,
+    Fit,
     FrictionEstimate,
-    FrictionSettings,
     FrictionSummary,
     identify_friction,
-    Statistic,
     summarize,
 )
-from needle_identification.recording import Recording
+from needle_identification.friction_terms import FrictionSettings, TERMS
+from needle_identification.goodness import ResidualTest
+from needle_identification.reading import read_friction_recording, read_indentation_recording
+from needle_identification.recording import IndentationRecording, Recording
+from needle_identification.recursive import RecursiveFriction
+from needle_identification.regression import ESTIMATORS, regress, Regression
 from needle_identification.result import result_yaml, write_result
+from needle_identification.stiffness import (
+    identify_stiffness,
+    LevelEstimate,
+    LevelSummary,
+    Presses,
+    StiffnessEstimate,
+    StiffnessSettings,
+    StiffnessSummary,
+    summarize_stiffness,
+)
 
 __all__ = [
     'COMPRESSIONS',
+    'ESTIMATORS',
+    'TERMS',
     'BagWriter',
+    'Comparison',
+    'Fit',
     'FrictionEstimate',
     'FrictionSettings',
     'FrictionSummary',
     'IdentificationError',
+    'IndentationRecording',
+    'LevelEstimate',
+    'LevelSummary',
     'OfferedQos',
+    'ParameterEstimate',
+    'Presses',
     'Recording',
     'RecordingError',
+    'RecursiveFriction',
+    'Regression',
+    'ResidualTest',
     'Statistic',
+    'StiffnessEstimate',
+    'StiffnessSettings',
+    'StiffnessSummary',
     'check_distinct',
     'encode',
     'identify_friction',
+    'identify_stiffness',
     'message_counts',
     'message_type',
     'read_friction_recording',
+    'read_indentation_recording',
     'read_topic',
+    'regress',
     'result_yaml',
+    'statistic',
     'summarize',
+    'summarize_stiffness',
     'write_result',
 ]

@@ -1,34 +1,52 @@
 """
 Recordings on disk: writing MCAP bags, reading bags of any origin. No other file knows MCAP.
 
-A bag is a rosbag2 folder, as `ros2 bag` makes and plays it. Reading takes MCAP record by record
-from the start, so that a file whose end is missing gives all it has.
+A bag is a rosbag2 folder, as `ros2 bag` makes and plays it. Reading takes files from the start
+and in batches, so that one whose end is missing gives all it has, and a long one needs no more
+memory than a short one. The records in a chunk are found by compiled code: in Python that would
+take longer than all the rest.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
 from functools import lru_cache
+from io import BytesIO
 from pathlib import Path
 import re
+import sqlite3
 import struct
 from types import TracebackType
 from typing import Any, Final, NamedTuple
+import zlib
 
-import apsw
-from mcap.exceptions import EndOfFile, McapError
-from mcap.records import Channel, DataEnd, Message, Schema, Statistics
-from mcap.stream_reader import StreamReader
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.records import Channel, Schema, Statistics
 from mcap.writer import CompressionType, Writer
-from needle_dynamics import FloatArray
+from needle_dynamics.kernels import compiled
+from needle_identification.bag_sqlite import sqlite_batches
 from needle_identification.errors import RecordingError
-from needle_identification.recording import Recording
+from needle_identification.storage import (
+    Batch,
+    BLOCK,
+    BROKEN,
+    decompressed,
+    LARGEST,
+    LATEST,
+    MOST,
+    opened,
+    skip,
+    taken,
+    Tally,
+    Topic,
+    topic_of,
+    uncompressed,
+)
 import numpy as np
 from numpy.typing import NDArray
-from rosbags.interfaces import MessageDefinitionFormat
-from rosbags.rosbag2 import Reader, ReaderError
 from rosbags.serde import SerdeError
 from rosbags.typesys import (
     get_types_from_idl,
@@ -39,7 +57,6 @@ from rosbags.typesys import (
 )
 from rosbags.typesys.store import Typestore
 import yaml
-from zstandard import ZstdError
 
 #: Compression of the chunks in a bag.
 COMPRESSIONS: Final = {
@@ -48,31 +65,18 @@ COMPRESSIONS: Final = {
     'none': CompressionType.NONE,
 }
 
-_WRENCH: Final = 'geometry_msgs/msg/WrenchStamped'
-_MOTION: Final = 'sensor_msgs/msg/JointState'
-_TEXT: Final = 'std_msgs/msg/String'
 _MAGIC: Final = b'\x89MCAP0\r\n'
 _METADATA: Final = 'metadata.yaml'
 _FORMS: Final = 'valid: a rosbag2 folder, an .mcap or a .db3 file'
 
-#: Motion is not interpolated over a longer step between samples [sample periods].
-_GAP: Final = 10.0
+#: Kind and length of a record; start, end, size, checksum and the length of a name of a chunk;
+#: the end of a file: a footer record and the magic bytes.
+_HEAD: Final = struct.Struct('<BQ')
+_CHUNK: Final = struct.Struct('<QQQII')
+_TAIL: Final = struct.Struct('<BQQQI8s')
 
-#: What the readers of the storage formats raise at bytes that make no sense.
-_BROKEN: Final = (
-    McapError,
-    ReaderError,
-    ZstdError,
-    apsw.Error,
-    struct.error,
-    AssertionError,
-    KeyError,
-    MemoryError,
-    OverflowError,
-    RuntimeError,
-    TypeError,
-    ValueError,
-)
+#: What readers of the storage formats raise at bytes that make no sense.
+_BROKEN: Final = (*BROKEN, McapError, SerdeError, sqlite3.Error)
 
 
 class OfferedQos(NamedTuple):
@@ -311,41 +315,315 @@ class BagWriter:
         }
 
 
-@dataclass(slots=True)
-class _Topic:
-    """What a bag holds of one topic; ``messages`` are receive times [ns] and bytes."""
+class Bag:
+    """
+    A recording on disk, of any origin and in any state.
 
-    type_name: str
-    encoding: str
-    definition: str
-    count: int = 0
-    messages: list[tuple[int, bytes]] = field(default_factory=list)
+    Parameters
+    ----------
+    path : Path
+        A rosbag2 folder, an ``.mcap`` or a ``.db3`` file, compressed or not.
 
+    Attributes
+    ----------
+    counts : dict
+        Messages by topic that `batches` has come across; those of an unknown channel are not.
+    losses : list of str
+        What is missing or broken, as far as `batches` has come.
 
-@dataclass(slots=True)
-class _Contents:
-    """What a bag holds; messages only of the topics that were wanted."""
+    Raises
+    ------
+    RecordingError
+        If there is no such recording.
 
-    path: Path
-    topics: dict[str, _Topic] = field(default_factory=dict)
-    losses: list[str] = field(default_factory=list)
+    """
 
-    def listing(self) -> str:
-        return ', '.join(f'{name} ({t.type_name})' for name, t in sorted(self.topics.items()))
-
-    def decoded(self, name: str) -> Iterator[tuple[int, Any]]:
-        """Yield receive time [ns] and message of a topic that was wanted."""
-        topic = self.topics[name]
-        store = _typestore(topic.type_name, topic.encoding, topic.definition)
-        number = 0
+    def __init__(self, path: Path) -> None:
+        self.path = path
         try:
-            for stamp, data in topic.messages:
-                yield stamp, store.deserialize_cdr(data, topic.type_name)
-                number += 1
-        except (SerdeError, *_BROKEN) as error:
+            self._files, self._missing = _files(path)
+        except OSError as error:
+            raise RecordingError(f'cannot read {path}: {error.strerror or error}') from error
+        self.counts: dict[Topic, int] = {}
+        self.losses = list(self._missing)
+
+    def topics(self) -> tuple[Topic, ...]:
+        """
+        List the topics that have messages, in order of name.
+
+        Raises
+        ------
+        RecordingError
+            If there is none.
+
+        """
+        found: set[Topic] = set()
+        for file in self._files:
+            listed = _listed(file)
+            if listed is None:
+                for _ in self.batches(lambda _topic: False):
+                    pass
+                found.update(self.counts)
+                break
+            found.update(listed)
+        if not found:
+            raise RecordingError('; '.join([f'{self.path} holds no messages', *self.losses]))
+        return tuple(sorted(found, key=lambda topic: (topic.name, topic.type_name)))
+
+    def batches(self, wanted: Callable[[Topic], bool]) -> Iterator[Batch]:
+        """Go through the bag from its start, yielding the messages of the topics wanted."""
+        self.counts.clear()
+        self.losses[:] = self._missing
+        for file in self._files:
+            faults: list[str] = []
+            tally = Tally(self.counts, wanted, faults)
+            try:
+                yield from _BATCHES[_form(file)](file, tally)
+            except RecordingError as error:
+                self.losses.append(str(error))
+                continue
+            except OSError as error:
+                faults.append(f'cannot be read: {error.strerror or error}')
+            except _BROKEN as error:
+                faults.append(f'is broken: {error}')
+            if faults:
+                self.losses.append(f'{file.name} {faults[0]}; {tally} read'.replace('\n', ' '))
+
+
+def _form(file: Path) -> str:
+    """Return ``.mcap`` or ``.db3``, '' for what is neither."""
+    name = uncompressed(file)
+    return name.suffix if name.suffix in _BATCHES else ''
+
+
+def _files(path: Path) -> tuple[list[Path], list[str]]:
+    """List the files of a bag in the order of recording, and what is amiss."""
+    if not path.exists():
+        raise RecordingError(f'{path} does not exist; {_FORMS}')
+    if path.is_file():
+        if path.suffix == '.bag':
             raise RecordingError(
-                f'{self.path}: message {number} of {name} is not a {topic.type_name}: {error}'
-            ) from error
+                f'{path} is a recording of ROS 1; convert it first: '
+                f'rosbags-convert --src {path} --dst {path.with_suffix("")}'
+            )
+        if not _form(path):
+            raise RecordingError(f'{path} is not a recording; {_FORMS}')
+        return [path], []
+    # part_10 comes after part_9.
+    found = sorted(
+        (file for file in (path.iterdir() if path.is_dir() else ()) if file.is_file()),
+        key=lambda file: [len(file.name), file.name],
+    )
+    files = {form: [file for file in found if _form(file) == form] for form in _BATCHES}
+    chosen = files['.mcap'] or files['.db3']
+    if not chosen:
+        inside = min(path.glob(f'*/{_METADATA}'), default=None)
+        hint = _FORMS if inside is None else f'name those inside, such as {inside.parent}'
+        raise RecordingError(f'{path} holds no recording; {hint}')
+    names = _names_in_metadata(path)
+    if names is None:
+        # Parts of one recording differ in a number at the end.
+        if len({re.sub(r'_\d+$', '', uncompressed(file).stem) for file in chosen}) > 1:
+            raise RecordingError(
+                f'{path} holds several recordings; name them, such as {chosen[0]}'
+            )
+        return chosen, [f'no readable {_METADATA}: the recording was not closed']
+    there = {file.name for file in chosen}
+    losses = [f'{name} is missing' for name in names if name not in there]
+    if there.isdisjoint(names):
+        return chosen, losses
+    losses += [
+        f'{file.name} is not part of the recording by {_METADATA}, left out'
+        for file in chosen
+        if file.name not in names
+    ]
+    return [path / name for name in names if name in there], losses
+
+
+def _names_in_metadata(folder: Path) -> list[str] | None:
+    """Return the files of a bag by its metadata, None if that cannot be read."""
+    try:
+        document = yaml.safe_load((folder / _METADATA).read_text(encoding='utf-8'))
+        paths = document['rosbag2_bagfile_information']['relative_file_paths']
+        if not isinstance(paths, list):
+            return None
+        return list(dict.fromkeys(Path(str(name)).name for name in paths))
+    except (OSError, yaml.YAMLError, KeyError, TypeError, ValueError, RecursionError):
+        return None
+
+
+def _listed(file: Path) -> set[Topic] | None:
+    """List the topics of a file that have messages by its own index, None if it has none."""
+    if file.suffix != '.mcap':
+        return None
+    channels = _Channels()
+    try:
+        with file.open('rb') as stream:
+            stream.seek(-_TAIL.size, 2)
+            footer, _, start, _, checksum, magic = _TAIL.unpack(stream.read())
+            if (footer, magic) != (Opcode.FOOTER, _MAGIC) or not start or not checksum:
+                return None
+            stream.seek(start)
+            # The checksum covers all up to itself.
+            summary = stream.read()[: -4 - len(_MAGIC)]
+        if zlib.crc32(summary) != checksum:
+            return None
+        for table in _tables(np.frombuffer(summary, dtype=np.uint8)):
+            for kind, _, _, begin, end in table.T.tolist():
+                channels.define(kind, summary[begin:end])
+        return {channels.topics[id_] for id_, number in channels.counts.items() if number} or None
+    except (OSError, *_BROKEN):
+        return None
+
+
+class _Channels:
+    """Topics of an MCAP file by channel, and what its statistics say of them."""
+
+    def __init__(self) -> None:
+        self.topics: dict[int, Topic] = {}
+        self.counts: dict[int, int] = {}
+        self._schemas = {0: Schema(id=0, data=b'', encoding='', name='no type')}
+
+    def define(self, kind: int, record: bytes) -> None:
+        """Take in a record if it is a schema, a channel or the statistics."""
+        stream = ReadDataStream(BytesIO(record))
+        if kind == Opcode.SCHEMA:
+            schema = Schema.read(stream)
+            self._schemas[schema.id] = schema
+        elif kind == Opcode.CHANNEL:
+            channel = Channel.read(stream)
+            schema = self._schemas[channel.schema_id]
+            self.topics[channel.id] = topic_of(
+                channel.topic,
+                schema.name,
+                channel.message_encoding,
+                schema.encoding,
+                schema.data.decode(errors='replace'),
+            )
+        elif kind == Opcode.STATISTICS:
+            self.counts = Statistics.read(stream).channel_message_counts
+
+
+@compiled
+def _walk(data: NDArray[np.uint8], position: int, table: NDArray[np.int64]) -> tuple[int, int]:
+    """
+    Enter the whole records from a position on, as far as the table reaches.
+
+    Rows: kind, channel, receive time [ns], begin and end of what the record holds; of a message,
+    begin and end of its data. Returns the number of records and where the next one begins.
+    """
+    number, start = 0, np.int64(position)
+    while number < table.shape[1] and len(data) - start >= 9:
+        length = np.int64(0)
+        for k in range(8):
+            length |= np.int64(data[start + 1 + k]) << (8 * k)
+        begin = start + 9
+        if length < 0 or length > len(data) - begin:
+            break
+        kind = data[start]
+        start = begin + length
+        table[0, number] = kind
+        table[3, number] = begin
+        table[4, number] = start
+        if kind == 5 and length < 22:
+            table[0, number] = 0
+        elif kind == 5:
+            received = np.int64(0)
+            for k in range(8):
+                received |= np.int64(data[begin + 6 + k]) << (8 * k)
+            table[1, number] = np.int64(data[begin]) | np.int64(data[begin + 1]) << 8
+            table[2, number] = received if 0 <= received < LATEST else LATEST
+            table[3, number] = begin + 22
+        number += 1
+    return number, int(start)
+
+
+def _tables(data: NDArray[np.uint8]) -> Iterator[NDArray[np.int64]]:
+    """Yield tables of the records in a piece of an MCAP file, as `_walk` makes them."""
+    table = np.empty((5, MOST), dtype=np.int64)
+    number, position = MOST, 0
+    while number == MOST:
+        number, position = _walk(data, position, table)
+        yield table[:, :number]
+
+
+def _mcap_batches(file: Path, tally: Tally) -> Iterator[Batch]:
+    channels = _Channels()
+    loose = bytearray()
+    complete = False
+    with opened(file) as stream:
+        magic = taken(stream, len(_MAGIC))
+        if magic != _MAGIC:
+            begin = repr(magic) if magic else 'nothing'
+            raise RecordingError(f'{file.name} is not an MCAP file: begins with {begin}')
+        while len(head := taken(stream, _HEAD.size)) == _HEAD.size:
+            kind, length = _HEAD.unpack(head)
+            if kind in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE, Opcode.CHUNK):
+                if length > LARGEST:
+                    tally.faults.append(f'is broken: a record of {length} bytes')
+                    break
+                body = taken(stream, length)
+                if kind != Opcode.CHUNK:
+                    loose += head + body
+                if kind == Opcode.CHUNK or len(loose) > BLOCK:
+                    yield from _records(bytes(loose), channels, tally)
+                    loose.clear()
+                if kind == Opcode.CHUNK:
+                    yield from _records(_content(body, length, tally), channels, tally)
+            elif kind == Opcode.STATISTICS:
+                tally.written = int.from_bytes(taken(stream, length)[:8], 'little')
+            else:
+                skip(stream, length)
+                complete |= kind == Opcode.DATA_END
+            if kind == Opcode.FOOTER:
+                break
+    yield from _records(bytes(loose), channels, tally)
+    if not complete:
+        tally.faults.insert(0, 'is cut off')
+    if tally.written not in (None, tally.count):
+        tally.faults.append('has lost messages')
+
+
+def _content(chunk: bytes, length: int, tally: Tally) -> bytes:
+    """Return what is in a chunk; of one that is cut off, what there is; none if it is broken."""
+    try:
+        _, _, size, checksum, name_length = _CHUNK.unpack_from(chunk)
+        begin = _CHUNK.size + name_length + 8
+        if size > LARGEST:
+            raise ValueError(f'a chunk of {size} bytes')
+        data = decompressed(chunk[_CHUNK.size : begin - 8].decode(), chunk[begin:], size)
+        if len(chunk) == length:
+            if len(data) != size:
+                raise ValueError(f'a chunk of {len(data)} instead of {size} bytes')
+            if checksum not in (0, zlib.crc32(data)):
+                raise ValueError('the checksum of a chunk is wrong')
+    except _BROKEN as error:
+        tally.faults.append(f'is broken: {error}')
+        return b''
+    return data
+
+
+def _records(content: bytes, channels: _Channels, tally: Tally) -> Iterator[Batch]:
+    """Yield the messages among the records of a chunk."""
+    data = np.frombuffer(content, dtype=np.uint8)
+    for table in _tables(data):
+        kinds, ids, received, begin, end = table
+        for k in np.flatnonzero((kinds == Opcode.SCHEMA) | (kinds == Opcode.CHANNEL)):
+            # What cannot be read leaves messages of an unknown topic.
+            with suppress(*_BROKEN):
+                channels.define(kinds[k], content[begin[k] : end[k]])
+        messages = kinds == Opcode.MESSAGE
+        for id_ in np.flatnonzero(np.bincount(ids[messages])):
+            rows = np.flatnonzero(messages & (ids == id_))
+            topic = channels.topics.get(int(id_))
+            if topic is None:
+                tally.faults.append(f'is broken: {len(rows)} messages of an unknown topic')
+            elif tally.enter(topic, len(rows)):
+                yield Batch(topic, received[rows], data, begin[rows], end[rows]).plain()
+
+
+#: Readers of the forms of storage.
+_BATCHES: Final = {'.mcap': _mcap_batches, '.db3': sqlite_batches}
 
 
 @lru_cache(maxsize=64)
@@ -370,121 +648,6 @@ def _typestore(type_name: str, encoding: str, definition: str) -> Typestore:
     return store
 
 
-def _scan(path: Path, wanted: Callable[[str, str], bool]) -> _Contents:
-    """Read a bag once, keeping the messages of those topics (name, type) that are wanted."""
-    contents = _Contents(path)
-    try:
-        for file in _files(contents):
-            _scan_file(file, contents, wanted)
-    except OSError as error:
-        raise RecordingError(f'cannot read {path}: {error.strerror or error}') from error
-    if not contents.topics:
-        raise RecordingError('; '.join([f'{path} holds no messages', *contents.losses]))
-    return contents
-
-
-def _scan_file(file: Path, contents: _Contents, wanted: Callable[[str, str], bool]) -> None:
-    records = _mcap_records(file) if file.suffix == '.mcap' else _other_records(file)
-    count = 0
-    try:
-        for name, channel, stamp, data in records:
-            topic = contents.topics.setdefault(name, channel)
-            topic.count += 1
-            if wanted(name, topic.type_name):
-                topic.messages.append((stamp, data))
-            count += 1
-    except (EndOfFile, struct.error):
-        contents.losses.append(f'{file.name} is cut off after {count} messages')
-    except _BROKEN as error:
-        contents.losses.append(f'{file.name} is broken after {count} messages: {error}')
-
-
-def _files(contents: _Contents) -> list[Path]:
-    """List the files of a bag in the order of recording, noting what is amiss."""
-    path = contents.path
-    if not path.exists():
-        raise RecordingError(f'{path} does not exist; {_FORMS}')
-    if path.is_file():
-        if path.suffix not in ('.mcap', '.db3'):
-            raise RecordingError(f'{path} is not a recording; {_FORMS}')
-        return [path]
-    found = [*path.glob('*.mcap')] or [*path.glob('*.db3')]
-    metadata = _metadata(path)
-    if metadata is None:
-        contents.losses.append(f'no readable {_METADATA}: the recording was not closed')
-    elif metadata.get('compression_mode') in ('FILE', 'MESSAGE', 'file', 'message'):
-        return [path]
-    else:
-        paths = metadata.get('relative_file_paths')
-        listed = {Path(str(name)).name for name in paths} if isinstance(paths, list) else set()
-        for name in sorted(listed - {file.name for file in found}):
-            contents.losses.append(f'{name} is missing')
-    if not found:
-        raise RecordingError(f'{path} holds no recording; {_FORMS}')
-    # part_10 comes after part_9.
-    return sorted(found, key=lambda file: [len(file.name), file.name])
-
-
-def _metadata(folder: Path) -> dict[str, Any] | None:
-    try:
-        document = yaml.safe_load((folder / _METADATA).read_text(encoding='utf-8'))
-        return dict(document['rosbag2_bagfile_information'])
-    except (FileNotFoundError, yaml.YAMLError, KeyError, TypeError, ValueError):
-        return None
-
-
-def _mcap_records(file: Path) -> Iterator[tuple[str, _Topic, int, bytes]]:
-    """Yield topic, channel, receive time [ns] and bytes of the messages of an MCAP file."""
-    schemas: dict[int, Schema] = {}
-    channels: dict[int, tuple[str, _Topic]] = {}
-    with file.open('rb') as stream:
-        begin = stream.read(len(_MAGIC))
-        if begin != _MAGIC:
-            raise RecordingError(f'{file} is not an MCAP file: begins with {begin!r}')
-        reader = StreamReader(
-            stream, skip_magic=True, validate_crcs=True, record_size_limit=file.stat().st_size
-        )
-        count, complete = 0, False
-        try:
-            for record in reader.records:
-                if isinstance(record, Message):
-                    yield *channels[record.channel_id], record.log_time, record.data
-                    count += 1
-                elif isinstance(record, Channel):
-                    schema = schemas[record.schema_id]
-                    definition = schema.data.decode(errors='replace')
-                    channels[record.id] = (
-                        record.topic,
-                        _Topic(schema.name, schema.encoding, definition),
-                    )
-                elif isinstance(record, Schema):
-                    schemas[record.id] = record
-                elif isinstance(record, DataEnd):
-                    complete = True
-                elif isinstance(record, Statistics) and record.message_count != count:
-                    raise McapError(f'{record.message_count} were written')
-        except EndOfFile:
-            # What follows the data only repeats it.
-            if not complete:
-                raise
-
-
-def _other_records(path: Path) -> Iterator[tuple[str, _Topic, int, bytes]]:
-    """Yield the same of an sqlite3 file, or of a folder with compressed files or messages."""
-    encodings = {MessageDefinitionFormat.MSG: 'ros2msg', MessageDefinitionFormat.IDL: 'ros2idl'}
-    with Reader(path) as reader:
-        channels = {
-            connection.id: _Topic(
-                connection.msgtype,
-                encodings.get(connection.msgdef.format, ''),
-                connection.msgdef.data,
-            )
-            for connection in reader.connections
-        }
-        for connection, stamp, data in reader.messages():
-            yield connection.topic, channels[connection.id], stamp, data
-
-
 def message_counts(path: Path) -> dict[str, int]:
     """
     Count the messages of a bag by topic.
@@ -495,8 +658,15 @@ def message_counts(path: Path) -> dict[str, int]:
         If it is not readable or empty.
 
     """
-    contents = _scan(path, lambda _name, _kind: False)
-    return {name: topic.count for name, topic in sorted(contents.topics.items())}
+    bag = Bag(path)
+    for _ in bag.batches(lambda _topic: False):
+        pass
+    if not bag.counts:
+        raise RecordingError('; '.join([f'{path} holds no messages', *bag.losses]))
+    counts: dict[str, int] = {}
+    for topic, count in sorted(bag.counts.items(), key=lambda item: item[0].name):
+        counts[topic.name] = counts.get(topic.name, 0) + count
+    return counts
 
 
 def check_distinct(paths: Sequence[Path]) -> None:
@@ -538,195 +708,33 @@ def read_topic(path: Path, topic: str) -> list[tuple[int, Any]]:
         If the bag is not readable or has no such topic.
 
     """
-    contents = _scan(path, lambda name, _kind: name == topic)
-    if topic not in contents.topics:
-        raise RecordingError(f'{path} has no topic {topic}; it has {contents.listing()}')
-    return list(contents.decoded(topic))
+    bag = Bag(path)
+    topics = bag.topics()
+    if topic not in (known.name for known in topics):
+        listing = ', '.join(map(str, topics))
+        raise RecordingError(f'{path} has no topic {topic}; it has {listing}')
+    messages: list[tuple[int, Any]] = []
+    try:
+        for batch in bag.batches(lambda known: known.name == topic):
+            for received, data in batch.messages():
+                messages.append((received, deserialize(batch.topic, data)))
+    except RecordingError as error:
+        raise RecordingError(f'{path}: message {len(messages)} of {topic} {error}') from error
+    return messages
 
 
-def read_friction_recording(
-    path: Path,
-    *,
-    wrench_topic: str | None = None,
-    motion_topic: str | None = None,
-    force_axis: str = 'y',
-    joint: str = 'insertion',
-) -> Recording:
+def deserialize(topic: Topic, data: bytes) -> Any:
     """
-    Read force and motion of the needle base from a bag, on the time base of the force.
-
-    Parameters
-    ----------
-    path : Path
-        A rosbag2 folder, an ``.mcap`` or a ``.db3`` file; the end may be missing.
-    wrench_topic, motion_topic : str, optional
-        Topics of type WrenchStamped and JointState; if not given, the only one of its type, or
-        else the one whose last name is base_wrench or joint_states.
-    force_axis : str
-        Component of the force that points into the tissue: x, y, z, or one of them after ``-``.
-    joint : str
-        Joint whose position is the inserted length [m].
-
-    Returns
-    -------
-    Recording
-        By header stamps; `Recording.losses` says what was left out or repaired.
+    Decode one message of a topic.
 
     Raises
     ------
     RecordingError
-        If the bag is not readable or lacks what is needed.
+        If it is not of its type, or if that is not known.
 
     """
-    sign, axis = (-1.0, force_axis[1:]) if force_axis.startswith('-') else (1.0, force_axis)
-    if axis not in ('x', 'y', 'z'):
-        raise RecordingError(f'force axis must be x, y, z, -x, -y or -z, got {force_axis!r}')
-    contents = _scan(
-        path,
-        lambda name, kind: kind in (_WRENCH, _MOTION) or _is_configuration(name, kind),
-    )
-    wrench_topic = _chosen(contents, _WRENCH, wrench_topic, 'base_wrench')
-    motion_topic = _chosen(contents, _MOTION, motion_topic, 'joint_states')
-    wrenches = contents.decoded(wrench_topic)
-    stamps, force = _samples(
-        contents, wrench_topic, wrenches, lambda m: [getattr(m.wrench.force, axis)]
-    )
-    motion_stamps, motion = _motion(contents, motion_topic, joint)
-    covered = _covered(stamps, motion_stamps)
-    if not covered.any():
-        raise RecordingError(
-            f'{path}: {wrench_topic} and {motion_topic} do not overlap in time; they last from '
-            f'{stamps[0]} to {stamps[-1]} ns and from {motion_stamps[0]} to {motion_stamps[-1]} ns'
-        )
-    if not covered.all():
-        contents.losses.append(
-            f'{np.count_nonzero(~covered)} of {wrench_topic} not covered by {motion_topic}'
-        )
-    start = stamps[covered][0]
-    time = (stamps[covered] - start) * 1e-9
-    motion_time = (motion_stamps - start) * 1e-9
-    return Recording(
-        name=str(path),
-        time=time,
-        depth=np.interp(time, motion_time, motion[:, 0]),
-        speed=np.interp(time, motion_time, motion[:, 1]),
-        force=sign * force[covered, 0],
-        losses=tuple(contents.losses),
-        configuration=_configuration(contents),
-    )
-
-
-def _is_configuration(name: str, type_name: str) -> bool:
-    return type_name == _TEXT and name.endswith('plant/configuration')
-
-
-def _configuration(contents: _Contents) -> str:
-    texts = [
-        message.data
-        for name, topic in contents.topics.items()
-        if _is_configuration(name, topic.type_name)
-        for _, message in contents.decoded(name)
-    ]
-    return str(texts[-1]) if texts else ''
-
-
-def _chosen(contents: _Contents, type_name: str, topic: str | None, usual: str) -> str:
-    """Return the topic asked for, or the one that must be meant."""
-    names = sorted(name for name, t in contents.topics.items() if t.type_name == type_name)
-    if topic is not None:
-        if topic not in names:
-            raise RecordingError(
-                f'{contents.path} has no topic {topic} of type {type_name}; it has '
-                f'{contents.listing()}'
-            )
-        return topic
-    if not names:
-        raise RecordingError(
-            f'{contents.path} has no topic of type {type_name}; it has {contents.listing()}'
-        )
-    meant = names if len(names) == 1 else [n for n in names if n.rsplit('/', 1)[-1] == usual]
-    if len(meant) != 1:
-        raise RecordingError(
-            f'{contents.path} has several topics of type {type_name}; name one of '
-            f'{", ".join(meant or names)}'
-        )
-    return meant[0]
-
-
-def _samples(
-    contents: _Contents,
-    topic: str,
-    messages: Iterable[tuple[int, Any]],
-    read: Callable[[Any], list[float]],
-) -> tuple[NDArray[np.int64], FloatArray]:
-    """
-    Return stamps [ns], strictly increasing, and finite values of a topic.
-
-    ``read`` takes the values from a message, none at all if it is of no interest. A message
-    without a header stamp counts at the time it was received.
-    """
-    stamps: list[int] = []
-    rows: list[list[float]] = []
-    for received, message in messages:
-        row = read(message)
-        if row:
-            stamp = message.header.stamp
-            stamps.append(int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec) or received)
-            rows.append(row)
-    time, values = np.array(stamps, dtype=np.int64), np.array(rows, dtype=np.float64)
-    if len(time) == 0:
-        return time, values
-    order = np.argsort(time, kind='stable')
-    late = np.count_nonzero(time < np.maximum.accumulate(time))
-    time, values = time[order], values[order]
-    finite = np.isfinite(values).all(axis=1)
-    repeated = np.zeros(len(time), dtype=np.bool_)
-    repeated[1:] = time[1:] == time[:-1]
-    for count, what in (
-        (late, 'out of order, sorted by stamp'),
-        (np.count_nonzero(~finite), 'not finite, left out'),
-        (np.count_nonzero(repeated), 'with the stamp of another, left out'),
-    ):
-        if count:
-            contents.losses.append(f'{count} of {topic} {what}')
-    kept = finite & ~repeated
-    if np.count_nonzero(kept) < 2:
-        raise RecordingError(
-            f'{contents.path}: {topic} must have >= 2 samples at different times, has '
-            f'{np.count_nonzero(kept)}'
-        )
-    return time[kept], values[kept]
-
-
-def _motion(contents: _Contents, topic: str, joint: str) -> tuple[NDArray[np.int64], FloatArray]:
-    """Return stamps [ns], shape (n,), with depth [m] and speed [m/s], shape (n, 2)."""
-    messages = list(contents.decoded(topic))
-    with_speed = any(len(message.velocity) for _, message in messages)
-
-    def read(message: Any) -> list[float]:
-        if joint not in message.name:
-            return []
-        i = message.name.index(joint)
-        columns = (message.position, message.velocity) if with_speed else (message.position,)
-        return [column[i] if i < len(column) else np.nan for column in columns]
-
-    stamps, motion = _samples(contents, topic, messages, read)
-    if len(stamps) == 0:
-        names = {name for _, message in messages for name in message.name}
-        raise RecordingError(
-            f'{contents.path}: {topic} has no joint {joint!r}; it has '
-            f'{", ".join(sorted(names)) or "none"}'
-        )
-    if not with_speed:
-        contents.losses.append(f'{topic} has no velocity: position differentiated')
-        speed = np.gradient(motion[:, 0], (stamps - stamps[0]) * 1e-9)
-        motion = np.column_stack([motion, speed])
-    return stamps, motion
-
-
-def _covered(stamps: NDArray[np.int64], motion: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Mark the stamps at which motion can be interpolated."""
-    steps = np.diff(motion)
-    after = np.clip(np.searchsorted(motion, stamps), 1, len(steps))
-    inside = (motion[0] <= stamps) & (stamps <= motion[-1])
-    return np.asarray(inside & (steps[after - 1] <= _GAP * np.median(steps)))
+    store = _typestore(topic.type_name, topic.encoding, topic.definition)
+    try:
+        return store.deserialize_cdr(data, topic.type_name)
+    except _BROKEN as error:
+        raise RecordingError(f'is not a {topic.type_name}: {error}') from error

@@ -6,23 +6,37 @@ from collections.abc import Callable
 import sys
 import time
 
-from needle_insertion import bench_batches, bench_rods, bench_solvers, bench_step
+from needle_insertion import (
+    bench_batches,
+    bench_identification,
+    bench_rods,
+    bench_solvers,
+    bench_step,
+)
 from needle_insertion.bench_measure import Bar, environment
 from needle_insertion.report import table
 from tqdm import tqdm
 
-#: Questions, in order: each returns its text and what it says of the bars.
-QUESTIONS: tuple[Callable[[Callable[[str], None]], tuple[str, list[Bar]]], ...] = (
-    bench_step.compare,
-    bench_solvers.compare,
-    bench_rods.compare,
-    bench_batches.compare,
-)
+#: Questions by subject: each returns its text and what it says of the bars.
+QUESTIONS: dict[str, tuple[Callable[[Callable[[str], None]], tuple[str, list[Bar]]], ...]] = {
+    'dynamics': (
+        bench_step.compare,
+        bench_solvers.compare,
+        bench_rods.compare,
+        bench_batches.compare,
+    ),
+    'identification': (bench_identification.compare,),
+}
 
 
-def dynamics() -> int:
+def run(subject: str) -> int:
     """
-    Measure the integrator beside what else could be used, and print one table per question.
+    Measure what is ours beside what else could be used, and print one table per question.
+
+    Parameters
+    ----------
+    subject : str
+        One of `QUESTIONS`.
 
     Returns
     -------
@@ -39,7 +53,7 @@ def dynamics() -> int:
             progress.set_description(what, refresh=False)
             progress.update()
 
-        for question in QUESTIONS:
+        for question in QUESTIONS[subject]:
             text, found = question(tick)
             bars += found
             progress.clear()

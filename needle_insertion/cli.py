@@ -4,33 +4,13 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from dataclasses import fields
-import json
 from pathlib import Path
 import signal
 import sys
-import tempfile
 from types import FrameType
-from typing import Any, NoReturn
-
-from needle_dynamics import JobError, NeedleError, ParameterError
-from needle_identification import (
-    check_distinct,
-    FrictionSettings,
-    FrictionSummary,
-    identify_friction,
-    read_friction_recording,
-    summarize,
-    write_result,
-)
-from needle_insertion import analyze, simulate
-from needle_insertion.report import table
-from tqdm import tqdm
+from typing import NoReturn
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-
-#: Recordings shipped with the source tree.
-SHIPPED_BAGS = Path(__file__).parent.parent / 'bags'
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -49,10 +29,23 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
-    options = _parser().parse_args(_joined(words))
-    # What was started is ended on the way out, whatever ends the command.
-    previous = {name: signal.signal(name, _interrupt) for name in _SIGNALS}
+    # Loading takes a second, and leaves nothing to tidy up: a signal just ends it.
+    previous = {name: signal.signal(name, signal.SIG_DFL) for name in _SIGNALS}
     try:
+        return _run(words)
+    finally:
+        for name, handler in previous.items():
+            signal.signal(name, handler)
+
+
+def _run(words: list[str]) -> int:
+    from needle_dynamics import JobError, NeedleError
+
+    options = _parser().parse_args(_joined(words))
+    try:
+        # What was started is ended on the way out, whatever ends the command.
+        for name in _SIGNALS:
+            signal.signal(name, _interrupt)
         status: int = options.command(options)
     except JobError as error:
         sys.stderr.write(f'error: {error}\n')
@@ -63,9 +56,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         sys.stderr.write('interrupted\n')
         return 130
-    finally:
-        for name, handler in previous.items():
-            signal.signal(name, handler)
     return status
 
 
@@ -78,9 +68,12 @@ def _interrupt(_signal: int, _frame: FrameType | None) -> NoReturn:
 
 def _joined(words: list[str]) -> list[str]:
     """Join ``--force-axis -y``, which argparse would take for two options."""
+    from needle_insertion.identify import SIGNED
+
     joined: list[str] = []
     for word in words:
-        if joined and joined[-1] == '--force-axis' and word in ('-x', '-y', '-z'):
+        signed = word.startswith('-') and not word.startswith('--')
+        if joined and joined[-1] in SIGNED and signed:
             joined[-1] += f'={word}'
         else:
             joined.append(word)
@@ -88,43 +81,27 @@ def _joined(words: list[str]) -> list[str]:
 
 
 def _parser() -> argparse.ArgumentParser:
+    from needle_insertion import analyze, identify, protocol, reproduce, simulate
+
     parser = argparse.ArgumentParser(prog='needle', description='Robot-assisted needle insertion.')
     commands = parser.add_subparsers(required=True, metavar='COMMAND')
 
     demo = commands.add_parser('demo', help='insertion, recording, identification, one report')
     demo.add_argument('-o', '--output', type=Path, default=Path('demo_output'), help='folder')
-    demo.add_argument('--bags', type=Path, default=SHIPPED_BAGS, help='shipped recordings')
+    demo.add_argument(
+        '--bags', type=Path, default=protocol.SHIPPED_BAGS, help='shipped recordings'
+    )
     demo.set_defaults(command=_demo)
 
-    identify = commands.add_parser('identify', help='fit parameters to recordings')
-    what = identify.add_subparsers(required=True, metavar='WHAT')
-    friction = what.add_parser('friction', help='Coulomb and viscous friction, equation (15)')
-    friction.add_argument('bags', type=Path, nargs='+', metavar='BAG')
-    friction.add_argument('-o', '--output', type=Path, help='ROS parameter file to write')
-    friction.add_argument('--json', action='store_true', help='print JSON instead of a table')
-    friction.add_argument('--wrench-topic', help='WrenchStamped topic')
-    friction.add_argument('--motion-topic', help='JointState topic')
-    friction.add_argument('--force-axis', default='y', help='x, y, z or signed: -x')
-    for item in fields(FrictionSettings):
-        friction.add_argument(
-            f'--{item.name.replace("_", "-")}',
-            type=float,
-            default=item.default,
-            metavar=item.metadata['unit'],
-            help=f'{item.metadata["description"]} (default {item.default:g})',
-        )
-    friction.set_defaults(command=_identify_friction)
+    identify.add_arguments(commands.add_parser('identify', help='fit parameters to recordings'))
 
     experiment = commands.add_parser('experiment', help='record an experiment on the stand-in')
-    which = experiment.add_subparsers(required=True, metavar='WHICH')
-    runs = which.add_parser('friction', help='strokes at several speeds, section 3.2.2.2')
-    runs.add_argument('output', type=Path, help='folder for the bags friction_1, friction_2, ...')
-    runs.add_argument('--repeats', type=int, default=1, metavar='N')
-    runs.add_argument('--seed', type=int, default=1, help='the k-th run has seed + k')
-    runs.add_argument(
-        '--rate', type=float, default=1000.0, metavar='Hz', help='samples per second'
-    )
-    runs.set_defaults(command=_experiment_friction)
+    protocol.add_arguments(experiment)
+    experiment.set_defaults(command=_experiment)
+
+    paper = commands.add_parser('reproduce', help="the paper's results anew, beside the paper's")
+    reproduce.add_arguments(paper)
+    paper.set_defaults(command=_reproduce)
 
     open_loop = commands.add_parser('simulate', help='the open-loop needle, without ROS')
     simulate.add_arguments(open_loop)
@@ -132,16 +109,30 @@ def _parser() -> argparse.ArgumentParser:
 
     analyze.add_arguments(commands.add_parser('analyze', help='controllability and observability'))
 
-    bench = commands.add_parser('bench', help='measure speed as ratios, side by side')
-    bench.add_argument('what', choices=('dynamics',))
-    bench.set_defaults(command=_bench)
+    bench = commands.add_parser('bench', help='measure speed as ratios, and errors')
+    subjects = bench.add_subparsers(required=True, dest='subject', metavar='SUBJECT')
+    for subject, asked in (('dynamics', 'the integrator'), ('identification', 'bag to result')):
+        subjects.add_parser(subject, help=f'speed: {asked}').set_defaults(command=_bench)
+    intervals = subjects.add_parser('calibration', help='do the intervals hold the truth?')
+    intervals.add_argument(
+        '--recordings', type=int, default=1000, metavar='N', help='simulated ones of each kind'
+    )
+    intervals.add_argument('--seed', type=int, default=2014, help='of the truth and of the noise')
+    intervals.add_argument('--json', action='store_true', help='print JSON instead')
+    intervals.set_defaults(command=_calibration)
     return parser
 
 
-def _bench(_options: argparse.Namespace) -> int:
+def _bench(options: argparse.Namespace) -> int:
     from needle_insertion import bench
 
-    return bench.dynamics()
+    return bench.run(options.subject)
+
+
+def _calibration(options: argparse.Namespace) -> int:
+    from needle_insertion import bench_calibration
+
+    return bench_calibration.run(options)
 
 
 def _demo(options: argparse.Namespace) -> int:
@@ -150,83 +141,21 @@ def _demo(options: argparse.Namespace) -> int:
     return demo.run(options.output, options.bags)
 
 
-def _experiment_friction(options: argparse.Namespace) -> int:
-    from needle_insertion.experiment import RATES, record_friction_run
+def _experiment(options: argparse.Namespace) -> int:
+    from needle_insertion import experiment
 
-    runs = range(options.repeats)
-    if options.repeats < 1:
-        raise ParameterError(f'--repeats must be >= 1, got {options.repeats}')
-    if options.seed < 0:
-        raise ParameterError(f'--seed must be >= 0, got {options.seed}')
-    if not RATES[0] <= options.rate <= RATES[1]:
-        raise ParameterError(
-            f'--rate must be in [{RATES[0]:g}, {RATES[1]:g}] Hz, got {options.rate}'
-        )
-    for k in runs:
-        bag = options.output / f'friction_{k + 1}'
-        if bag.exists():
-            raise ParameterError(f'{bag} exists; name another folder')
-    with tempfile.TemporaryDirectory() as logs:
-        for k in tqdm(runs, desc='friction runs', disable=None):
-            bag = options.output / f'friction_{k + 1}'
-            record_friction_run(bag, Path(logs), seed=options.seed + k, rate=options.rate)
-    return 0
+    return experiment.run(options)
 
 
-def _identify_friction(options: argparse.Namespace) -> int:
-    settings = FrictionSettings(
-        **{item.name: getattr(options, item.name) for item in fields(FrictionSettings)}
-    )
-    check_distinct(options.bags)
-    estimates = []
-    for bag in tqdm(options.bags, desc='bags', disable=None, leave=False):
-        recording = read_friction_recording(
-            bag,
-            wrench_topic=options.wrench_topic,
-            motion_topic=options.motion_topic,
-            force_axis=options.force_axis,
-        )
-        for loss in recording.losses:
-            sys.stderr.write(f'warning: {recording.name}: {loss}\n')
-        estimates.append(identify_friction(recording, settings))
-    summary = summarize(estimates)
-    if options.output is not None:
-        write_result(options.output, summary)
-    text = json.dumps(_as_json(summary), indent=2) if options.json else _as_table(summary)
-    sys.stdout.write(f'{text}\n')
-    return 0
+def _reproduce(options: argparse.Namespace) -> int:
+    from needle_insertion import reproduce
 
+    bags = None
+    if options.record is not None:
+        from needle_insertion import experiment
 
-def _as_table(summary: FrictionSummary) -> str:
-    rows = [
-        (
-            estimate.name,
-            f'{estimate.coulomb_friction:.4f} ± {estimate.coulomb_error:.4f}',
-            f'{estimate.viscous_friction:.3f} ± {estimate.viscous_error:.3f}',
-            f'{estimate.samples}',
-            f'{estimate.residual:.4f}',
-        )
-        for estimate in summary.estimates
-    ]
-    c, v = summary.coulomb, summary.viscous
-    if c.deviation is not None and v.deviation is not None:
-        rows.append(('STD over bags', f'{c.deviation:.4f}', f'{v.deviation:.3f}', '', ''))
-    rows.append(
-        ('mean ± its SE', f'{c.mean:.4f} ± {c.error:.4f}', f'{v.mean:.3f} ± {v.error:.3f}', '', '')
-    )
-    heads = ('bag', 'mu_s [N] ± SE', 'mu_v [N s/m] ± SE', 'samples', 'residual [N]')
-    return table(rows, heads)
-
-
-def _as_json(summary: FrictionSummary) -> dict[str, Any]:
-    def values(record: Any) -> dict[str, Any]:
-        return {item.name: getattr(record, item.name) for item in fields(record)}
-
-    return {
-        'coulomb_friction': {**values(summary.coulomb), 'unit': 'N'},
-        'viscous_friction': {**values(summary.viscous), 'unit': 'N s/m'},
-        'bags': [values(estimate) for estimate in summary.estimates],
-    }
+        bags = experiment.record(reproduce.campaign(options.what), options.record)
+    return reproduce.run(options, bags)
 
 
 if __name__ == '__main__':

@@ -14,14 +14,16 @@ from typing import Any, IO
 
 from domain_coordinator import domain_id
 from lifecycle_msgs.msg import Transition
-from lifecycle_msgs.srv import ChangeState
+from lifecycle_msgs.srv import ChangeState, GetState
 from needle_dynamics import JobError
 from needle_dynamics.base_node import END_WITH_PARENT
+from rclpy.client import Client
 from rclpy.context import Context
 from rclpy.executors import Executor
 from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
+from rclpy.task import Future
 import yaml
 
 #: Modules of the nodes by name.
@@ -31,6 +33,11 @@ MODULES: Mapping[str, str] = {
     'identification': 'needle_identification.identification_node',
     'recorder': 'needle_identification.recorder_node',
 }
+
+CONFIGURE = Transition.TRANSITION_CONFIGURE
+ACTIVATE = Transition.TRANSITION_ACTIVATE
+DEACTIVATE = Transition.TRANSITION_DEACTIVATE
+CLEANUP = Transition.TRANSITION_CLEANUP
 
 
 class GraphError(JobError):
@@ -131,6 +138,7 @@ class Graph:
         self._processes: list[NodeProcess] = []
         self._files: list[IO[str]] = []
         self._nodes: list[Node] = []
+        self._life_cycles: dict[str, Client] = {}
 
     def __enter__(self) -> Graph:
         self._domain = domain_id()
@@ -197,9 +205,46 @@ class Graph:
         self._processes.append(process)
         return process
 
-    def activate(self, node: Node, name: str) -> None:
+    def wait_for(self, node: Node, name: str) -> None:
         """
-        Configure and activate a node that was started with ``autostart`` off.
+        Wait until a node of the suite answers a node of this process, with all its clients.
+
+        Raises
+        ------
+        GraphError
+            If it does not.
+
+        """
+        if name in self._life_cycles:
+            return
+        self._life_cycles[name] = node.create_client(ChangeState, f'{name}/change_state')
+        probe = node.create_client(GetState, f'{name}/get_state')
+        self.spin_until(probe.service_is_ready, f'the node {name}')
+        # An answer to a client that the other side does not know yet is lost. Clients become
+        # known in the order they were made: once the last has its answer, all will.
+        answers: list[Future] = []
+        start = time.monotonic()
+
+        def answered() -> bool:
+            if time.monotonic() - start >= len(answers):
+                answers.append(probe.call_async(GetState.Request()))
+            return any(answer.done() for answer in answers)
+
+        self.spin_until(answered, f'the answer of {name}')
+        node.destroy_client(probe)
+
+    def change(self, node: Node, name: str, *transitions: int) -> None:
+        """
+        Take a node, started with ``autostart`` off, through transitions of its life cycle.
+
+        Parameters
+        ----------
+        node : Node
+            Node in this process that asks for it.
+        name : str
+            Name of the other node.
+        *transitions : int
+            `CONFIGURE`, `ACTIVATE`, `DEACTIVATE` or `CLEANUP`, in order.
 
         Raises
         ------
@@ -207,11 +252,10 @@ class Graph:
             If it refuses.
 
         """
-        client = node.create_client(ChangeState, f'{name}/change_state')
-        self.spin_until(client.service_is_ready, f'the node {name}')
-        for transition in (Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_ACTIVATE):
-            request = ChangeState.Request(transition=Transition(id=transition))
-            answer = client.call_async(request)
+        self.wait_for(node, name)
+        client = self._life_cycles[name]
+        for transition in transitions:
+            answer = client.call_async(ChangeState.Request(transition=Transition(id=transition)))
             self.spin_until(answer.done, f'the answer of {name}')
             if not answer.result().success:
                 said = [p.last_words() for p in self._processes if p.name == name]

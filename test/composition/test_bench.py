@@ -15,6 +15,7 @@ from needle_insertion import (
     bench_step,
 )
 from needle_insertion.bench_measure import Bar
+from needle_insertion.cli import main
 import numba
 import numpy as np
 from numpy.testing import assert_allclose
@@ -230,8 +231,9 @@ def test_jobs_take_turns():
 
 def test_the_whole_is_one_table_per_question_and_one_of_bars(monkeypatch, capsys):
     bars = [Bar('a', '>= 1', 2.0, 1.0), Bar('b', '>= 1', None, 1.0)]
-    monkeypatch.setattr(bench, 'QUESTIONS', (lambda tick: (tick('x') or 'a table', bars),))
-    assert bench.dynamics() == 0
+    questions = {'dynamics': (lambda tick: (tick('x') or 'a table', bars),)}
+    monkeypatch.setattr(bench, 'QUESTIONS', questions)
+    assert main(['bench', 'dynamics']) == 0
     printed = capsys.readouterr()
     assert 'date: ' in printed.out
     assert 'machine: ' in printed.out

@@ -1,15 +1,31 @@
 """The demo's verdicts: each can fail."""
 
-from needle_identification import FrictionSummary, Recording, Statistic
+from dataclasses import replace
+from math import inf, nan
+
+from needle_identification import (
+    identify_friction,
+    identify_stiffness,
+    ParameterEstimate,
+    read_friction_recording,
+    read_indentation_recording,
+)
 from needle_insertion.demo import (
+    Comparison,
     COUNTED,
     DemoError,
-    friction_checks,
+    fresh_checks,
+    friction_comparisons,
+    friction_figure,
     Insertion,
     insertion_checks,
     run,
+    shipped_checks,
+    stiffness_comparisons,
+    stiffness_figure,
     TARGET_DEPTH,
 )
+from needle_insertion.protocol import SHIPPED_BAGS
 import numpy as np
 import pytest
 
@@ -46,53 +62,71 @@ def test_an_insertion_is_judged_by_end_overshoot_tracking_and_messages(changes, 
     assert [check.passed for check in insertion_checks(insertion(**changes))] == verdicts
 
 
-def statistic(mean: float, error: float) -> Statistic:
-    """Return a made-up result."""
-    interval = mean - 2.0 * error, mean + 2.0 * error
-    return Statistic(mean=mean, deviation=None, error=error, interval=interval)
+def comparison(value: float, symbol: str = 'k_zz', **changes: object) -> Comparison:
+    """Return a made-up estimate: the truth is 100, the interval reaches 10 to both sides."""
+    estimate = {
+        'name': symbol, 'symbol': symbol, 'unit': 'N/m', 'value': value, 'error': 4.0,
+        'interval': (value - 10.0, value + 10.0), 'determined': True,
+    }  # fmt: skip
+    return Comparison(estimate=ParameterEstimate(**{**estimate, **changes}), truth=100.0)
 
 
-def recording(configuration: str) -> Recording:
-    """Return a made-up recording."""
-    values = np.zeros(2)
-    return Recording(
-        name='bag',
-        time=np.array([0.0, 1.0]),
-        depth=values,
-        speed=values,
-        force=values,
-        configuration=configuration,
-    )
+@pytest.mark.parametrize(('missed', 'passed'), [(0, True), (4, True), (5, False), (20, False)])
+def test_shipped_bags_are_judged_by_how_many_intervals_hold_their_truth(missed, passed):
+    """Of 20 at least 16 must, for each parameter on its own."""
+    bags = [
+        [comparison(111.0 if k < missed else 109.0), comparison(100.0, symbol='k_xx')]
+        for k in range(20)
+    ]
+    stiff, other = shipped_checks('bags', bags)
+    assert stiff.passed == passed
+    assert stiff.found == f'in {20 - missed} of 20'
+    assert other.passed
 
 
-@pytest.mark.parametrize('found', [0.5599, 0.5571])
-def test_friction_is_judged_by_its_standard_errors(found):
-    """Two standard errors from the truth of the recorded plant decide."""
-    truth = (
-        '/plant: {ros__parameters: {model.coulomb_friction: 0.56, model.viscous_friction: 300.0}}'
-    )
-    summary = FrictionSummary(
-        coulomb=statistic(found, 0.001),
-        viscous=statistic(300.1, 0.1),
-        estimates=(),
-    )
-    coulomb, viscous = friction_checks('one bag', recording(truth), summary, 2.0)
-    assert coulomb.passed == (found == 0.5599)
-    assert viscous.passed
+@pytest.mark.parametrize(('value', 'passed'), [(119.0, True), (81.0, True), (121.0, False)])
+def test_a_fresh_recording_is_judged_at_its_worst_force(value, passed):
+    """Twice the interval decides; what is not determined fails."""
+    (check,) = fresh_checks([comparison(100.0), comparison(value), comparison(101.0)])
+    assert check.passed == passed
+    assert check.found.startswith(f'{value:.5g} ')
+    (check,) = fresh_checks([comparison(nan, interval=(-inf, inf), determined=False)])
+    assert not check.passed
+
+
+def test_estimates_are_compared_with_the_stand_in_of_their_own_bag():
+    """Of the first shipped bags every parameter, at every level, is within a few intervals."""
+    friction = read_friction_recording(SHIPPED_BAGS / 'friction_01')
+    found = friction_comparisons(friction, identify_friction(friction))
+    assert [one.truth for one in found] == [
+        friction.truth['model.coulomb_friction'],
+        friction.truth['model.viscous_friction'],
+    ]
+    press = read_indentation_recording(SHIPPED_BAGS / 'stiffness_01')
+    estimate = identify_stiffness(press)
+    found += stiffness_comparisons(press, estimate)
+    assert len(found) == 2 + 4 * 5
+    for one in found:
+        low, high = one.estimate.interval
+        assert abs(one.estimate.value - one.truth) < 2.0 * (high - low)
+    # What is drawn of them is in the pictures of the page.
+    assert len(friction_figure(identify_friction(friction)).axes) == 2
+    assert len(stiffness_figure(press, estimate).axes) == 2
 
 
 def test_a_recording_without_truth_cannot_be_judged():
     """A bag that does not say what its plant was is no base for a verdict."""
-    one = statistic(1.0, 0.1)
-    summary = FrictionSummary(coulomb=one, viscous=one, estimates=())
-    with pytest.raises(DemoError, match='bag does not hold the configuration'):
-        friction_checks('one bag', recording(''), summary, 2.0)
+    recording = read_friction_recording(SHIPPED_BAGS / 'friction_01')
+    estimate = identify_friction(recording)
+    with pytest.raises(DemoError, match='friction_01 does not hold the configuration'):
+        friction_comparisons(replace(recording, configuration=''), estimate)
 
 
 def test_the_demo_removes_nothing_that_is_not_its_own(tmp_path):
     """A folder that no demo made is left alone."""
     bags, output = tmp_path / 'bags', tmp_path / 'thesis'
     (bags / 'friction_1').mkdir(parents=True)
+    (bags / 'stiffness_1').mkdir()
     output.mkdir()
     (output / 'chapter').touch()
     with pytest.raises(DemoError, match='is not from a demo'):
@@ -100,3 +134,7 @@ def test_the_demo_removes_nothing_that_is_not_its_own(tmp_path):
     assert (output / 'chapter').exists()
     with pytest.raises(DemoError, match='holds no friction recordings'):
         run(output, output)
+    (bags / 'stiffness_1').rmdir()
+    with pytest.raises(DemoError, match='holds no stiffness recordings'):
+        run(tmp_path / 'new', bags)
+    assert not (tmp_path / 'new').exists()

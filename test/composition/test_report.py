@@ -2,12 +2,31 @@
 
 from html.parser import HTMLParser
 
+from composition.pages import look_at
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from matplotlib.figure import Figure
-from needle_insertion.report import Check, check_table, Picture, table, write_page
+from needle_dynamics import ParameterError
+from needle_insertion.report import (
+    bullets,
+    Check,
+    check_table,
+    code,
+    grid,
+    heading,
+    headline,
+    notice,
+    paragraph,
+    Picture,
+    table,
+    write_document,
+    write_page,
+)
+import pytest
 
 cells = st.text(st.characters(categories=('L', 'N', 'P', 'S')), min_size=1, max_size=12)
+#: Whatever text there is, but for carriage returns, which HTML does not keep.
+texts = st.text(st.characters(exclude_categories=('Cs', 'Cc')), max_size=30)
 
 
 @settings(deadline=None)
@@ -31,23 +50,149 @@ def test_a_failure_is_told_in_capitals():
     assert text.splitlines()[3].endswith('pass')
 
 
+class Reader(HTMLParser):
+    """Reads a piece of HTML: its texts, and its tags, which must be closed in order."""
+
+    def __init__(self, piece: str) -> None:
+        super().__init__()
+        self.texts: list[str] = []
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.open: list[str] = []
+        self.feed(piece)
+        self.close()
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append((tag, dict(attrs)))
+        if tag not in ('meta', 'img'):
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        self.texts.append(data)
+
+
+@settings(deadline=None)
+@given(texts)
+def test_no_text_can_be_taken_for_a_tag(text):
+    """Each block holds what it was given, letter by letter, and only tags of its own."""
+    for block in (
+        heading(text),
+        paragraph(text),
+        bullets([text]),
+        notice(text, [text], [text, text]),
+        code(text),
+        headline([(text, text, text)]),
+        grid([(text, text)], (text, text), text),
+    ):
+        reader = Reader(block)
+        assert not reader.open
+        assert {tag for tag, _ in reader.tags} <= {
+            *('h2', 'p', 'ul', 'li', 'aside', 'pre', 'code', 'dl', 'div', 'dt', 'dd', 'strong'),
+            *(
+                'details',
+                'summary',
+                'span',
+                'table',
+                'caption',
+                'thead',
+                'tbody',
+                'tr',
+                'th',
+                'td',
+                'i',
+                'sub',
+            ),
+        }
+        # Symbols are set in Greek; all else is as it was given.
+        if '_' not in text:
+            assert text in ''.join(reader.texts)
+
+
+def test_symbols_are_written_as_in_print():
+    """The name of a coefficient becomes a letter with a subscript, within words too."""
+    assert '<i>μ</i><sub>s</sub> = 1' in paragraph('mu_s = 1')
+    assert '<i>k</i><sub>zz</sub>' in paragraph('k_zz')
+    assert 'k_coulomb' in paragraph('k_coulomb')
+
+
+def test_a_notice_of_nothing_is_nothing():
+    """No empty frame is drawn."""
+    assert notice('Warnings', []) == ''
+
+
+def test_a_table_says_what_its_cells_are():
+    """Heads of columns and of rows are marked as such, and the table has a caption."""
+    reader = Reader(grid([('mu_s', '0.56')], ('parameter', 'value'), 'Friction'))
+    scopes = [given['scope'] for tag, given in reader.tags if tag == 'th']
+    assert scopes == ['col', 'col', 'row']
+    assert 'caption' in dict(reader.tags)
+
+
+def picture() -> Picture:
+    """Return a picture with something on it."""
+    figure = Figure()
+    figure.subplots().plot([1.0, 2.0])
+    return Picture('plot', 'caption "x"', figure, 'a line that "rises"')
+
+
 def test_the_page_needs_nothing_beside_it(tmp_path):
     """Pictures are inside, texts are escaped, and no draft is left."""
     path = tmp_path / 'report.html'
     checks = [Check('a < b', '<script>', '1 & 2', passed=True)]
-    write_page(path, 'title', 'text', checks, [Picture('plot', 'caption "x"', Figure())])
-    sources, rows = [], []
-
-    class Reader(HTMLParser):
-        def handle_starttag(self, tag, attrs):
-            assert tag != 'script'
-            sources.extend(value for name, value in attrs if name in ('src', 'href'))
-
-        def handle_data(self, data):
-            rows.append(data)
-
-    Reader().feed(path.read_text())
+    write_page(path, 'title', 'text', checks, [picture()])
+    reader = Reader(path.read_text())
+    assert not reader.open
+    assert not {'script', 'link', 'iframe'} & {tag for tag, _ in reader.tags}
+    sources = [given[key] for _, given in reader.tags for key in ('src', 'href') if key in given]
     assert all(source.startswith('data:image/png;base64,') for source in sources)
     assert len(sources) == 1
-    assert {'a < b', '<script>', '1 & 2'} <= set(rows)
+    assert {'a < b', '<script>', '1 & 2'} <= set(reader.texts)
     assert {item.name for item in tmp_path.iterdir()} == {'report.html', 'plot.png'}
+
+
+def test_the_same_content_gives_the_same_bytes(tmp_path):
+    """No date and no name of the folder gets into the page or its pictures."""
+    pages = []
+    for name in ('one', 'two'):
+        folder = tmp_path / name
+        folder.mkdir()
+        write_document(folder / 'page.html', 'title', 'text', [picture()])
+        pages.append([(folder / file).read_bytes() for file in ('page.html', 'plot.png')])
+    assert pages[0] == pages[1]
+
+
+def test_a_page_is_shown_whole_even_on_a_telephone(tmp_path):
+    """Pictures have loaded with their texts, nothing outside is asked for, nothing sticks out."""
+    path = tmp_path / 'page.html'
+    blocks = [
+        headline([('Friction mu_s', '0.5604 N', '95 % interval 0.5594 to 0.5614')]),
+        grid([['one', *['1234567890'] * 12]], ['x'] * 13, 'a wide table'),
+        code('ros2 run ' + 'word ' * 60),
+        paragraph('/a/path/that/is/long' * 10),
+        picture(),
+    ]
+    write_document(path, 'A page', 'of many blocks', blocks)
+    seen = look_at(path)
+    assert 'μs' in seen.text
+    assert '0.5604 N' in seen.text
+    assert [alt for alt, width in seen.images if width > 0] == ['a line that "rises"']
+    assert seen.requests == []
+    assert seen.overflow == 0
+
+
+def test_what_a_page_would_load_from_outside_is_noticed(tmp_path):
+    """The look at a page can fail: an image from elsewhere is seen as missing and as asked for."""
+    path = tmp_path / 'page.html'
+    write_document(path, 'A page', '', ['<img src="http://127.0.0.1:9/outside.png">'])
+    seen = look_at(path)
+    assert all(width == 0 for _, width in seen.images)
+    assert seen.requests == ['http://127.0.0.1:9/outside.png']
+
+
+def test_names_the_page_that_cannot_be_written(tmp_path):
+    """A folder that is not there ends in one line, and nothing is left."""
+    with pytest.raises(ParameterError, match=r'no/page.html cannot be written: No such file'):
+        write_document(tmp_path / 'no' / 'page.html', 'title', '', [])
+    assert not list(tmp_path.iterdir())

@@ -111,6 +111,39 @@ def test_a_new_target_in_motion_does_not_make_the_reference_jump():
     assert speeds.min() < -0.009
 
 
+def test_it_goes_on_with_other_constants():
+    """Told the right friction in mid-motion, it keeps its target and reference and arrives."""
+    truth = NeedleParameters.preset('phantom', coulomb_friction=1.0, viscous_friction=500.0)
+    steering, told = controller(), controller()
+    told.change(truth)
+    for each in (steering, told):
+        each.set_target(0.05)
+    believed, _ = insert(steering, truth, 2.0)
+    steering.change(truth)
+    assert steering.target == 0.05
+    where = Measurement(time=2.0, depth=believed[-1], speed=0.0)
+    before = steering.command(Measurement(time=1.999, depth=believed[-1], speed=0.0)).setpoint
+    # One period at 0.01 m/s.
+    assert steering.command(where).setpoint.position == pytest.approx(before.position, abs=1.1e-5)
+    depths, aims = insert(told, truth, 3.5)
+    # As with the right model from the start.
+    assert np.abs(depths - aims).max() < 5e-5
+    assert np.abs(believed - aims[:2000]).max() > 5e-4
+
+
+def test_constants_that_its_gains_cannot_bear_are_refused():
+    """Less friction than the gains need is refused with what would do; the law stays."""
+    steering, other = controller('pid'), controller('pid')
+    thin = NeedleParameters.preset('phantom', viscous_friction=0.3)
+    with pytest.raises(ParameterError, match=r'pid.insertion gains cannot be stable at 1000 Hz'):
+        steering.change(thin)
+    measured = Measurement(time=0.5, depth=0.021, speed=1e-3)
+    for each in (steering, other):
+        each.set_target(0.05)
+        each.command(Measurement(time=0.0, depth=0.02, speed=0.0))
+    assert steering.command(measured) == other.command(measured)
+
+
 def test_forces_stay_within_their_limit():
     """No command exceeds the force limit, whatever the error."""
     steering = controller(force_limit=2.0)

@@ -102,7 +102,8 @@ def test_number_out_of_range_is_refused_with_name_value_and_range(name: str, val
         value = 1.5 * meta['low']
     with pytest.raises(ParameterError) as caught:
         NeedleParameters(**{name: value})
-    message = f'{name} must be finite, {bound} {meta["low"]:g} {meta["unit"]}, got {value!r}'
+    unit = '' if meta['unit'] == '1' else f' {meta["unit"]}'
+    message = f'{name} must be finite, {bound} {meta["low"]:g}{unit}, got {value!r}'
     assert str(caught.value) == message
     with pytest.raises(ParameterError):
         NeedleParameters.preset('phantom', **{name: value})

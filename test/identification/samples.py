@@ -20,9 +20,9 @@ EPOCH = 1_700_000_000_123_456_789
 STORE = get_typestore(Stores.ROS2_JAZZY)
 TRUTH = NeedleParameters.preset('paper_mm')
 IDEAL = ForceSensorParameters(
-    force_noise=0.0, torque_noise=0.0, force_resolution=0.0, torque_resolution=0.0, cutoff=0.0
+    force_noise=0.0, torque_noise=0.0, force_resolution=0.0, torque_resolution=0.0, filter=0
 )
-NOISY = ForceSensorParameters(cutoff=30.0)
+NOISY = ForceSensorParameters(filter=3)
 #: Speeds [m/s] there and back, each held for the time [s] that follows it.
 THERE_AND_BACK = tuple(
     leg

@@ -1,7 +1,7 @@
 """The value that identification works on is what it claims to be."""
 
 from needle_dynamics import ShapeError
-from needle_identification import Recording
+from needle_identification import IndentationRecording, Recording
 import numpy as np
 import pytest
 
@@ -14,7 +14,7 @@ def recording(**changes):
 @pytest.mark.parametrize(
     ('changes', 'complaint'),
     [
-        ({'force': np.zeros(2)}, r'force must have the shape \(n,\) of time, got \(2,\)'),
+        ({'force': np.zeros(2)}, r'force must have the shape \(n,\) .*, got \(2,\) and \(3,\)'),
         ({'depth': np.zeros((3, 1))}, r'depth must have the shape'),
         ({'speed': np.array([0.0, np.nan, 0.0])}, 'speed must be finite'),
         ({'time': np.array([0.0, 1.0, 1.0])}, 'time must increase strictly'),
@@ -42,3 +42,25 @@ def test_knows_no_truth_without_a_parameter_file(text):
 def test_reads_the_truth_from_the_configuration_of_the_plant():
     text = '/lab/plant:\n  ros__parameters:\n    model.coulomb_friction: 0.56\n'
     assert recording(configuration=text).truth == {'model.coulomb_friction': 0.56}
+
+
+def test_only_speed_may_be_missing():
+    assert recording(speed=None).speed is None
+    with pytest.raises(ShapeError, match='force must have the shape'):
+        recording(force=None)
+
+
+def test_an_indentation_has_two_components_and_one_across():
+    fields = {
+        'time': np.arange(3.0),
+        'position': np.zeros((3, 2)),
+        'off_plane': np.zeros(3),
+        'force': np.zeros((3, 2)),
+        'configuration': '/plant:\n  ros__parameters:\n    mode: indenter\n',
+    }
+    made = IndentationRecording(name='it', **fields)
+    assert made.truth == {'mode': 'indenter'}
+    assert not made.force.flags.writeable
+    for name, wrong in (('force', np.zeros(3)), ('off_plane', np.zeros((3, 1)))):
+        with pytest.raises(ShapeError, match=f'{name} must have the shape'):
+            IndentationRecording(name='it', **{**fields, name: wrong})

@@ -1,53 +1,161 @@
-"""The result is a parameter file, whole or not there."""
+"""The result is a parameter file, whole or not there, and numbers are told to their errors."""
 
-from identification.samples import simulated
+from math import inf, nan
+
+from hypothesis import given
+from hypothesis import strategies as st
+from needle_dynamics import NeedleParameters, ParameterError
 from needle_identification import (
+    FrictionSummary,
     IdentificationError,
-    identify_friction,
     result_yaml,
     Statistic,
-    summarize,
     write_result,
 )
-from needle_identification.friction import FrictionSummary
+from needle_identification.result import between, measured, model_parameters, rounded, UNKNOWN
+from needle_identification.stiffness import StiffnessSummary
 import pytest
 import yaml
 
 
-@pytest.fixture(scope='module')
-def summary():
-    return summarize([identify_friction(simulated())])
+def found(name: str, mean: float, error: float = 0.01, unit: str = 'N') -> Statistic:
+    """Return a made-up result."""
+    if mean != mean:
+        return Statistic(name=name, symbol=name, unit=unit)
+    interval = (mean - 2.0 * error, mean + 2.0 * error)
+    return Statistic(
+        name=name, symbol=name, unit=unit, mean=mean, deviation=None, error=error,
+        interval=interval, count=1,
+    )  # fmt: skip
 
 
-def test_holds_the_friction_for_plant_and_controller(summary):
-    document = yaml.safe_load(result_yaml(summary))
-    assert sorted(document) == ['/**/controller', '/**/plant']
-    for section in document.values():
-        assert section == {
-            'ros__parameters': {
-                'model.coulomb_friction': round(summary.coulomb.mean, 6),
-                'model.viscous_friction': round(summary.viscous.mean, 6),
-            }
-        }
-    assert '# from simulated 0' in result_yaml(summary)
+def friction(*statistics: Statistic) -> FrictionSummary:
+    """Return a made-up result over no recordings."""
+    return FrictionSummary(statistics=statistics, estimates=())
 
 
-def test_a_mean_below_zero_is_zero_within_its_error():
-    zero = Statistic(mean=-0.001, deviation=0.002, error=0.001, interval=(-0.003, 0.001))
-    document = yaml.safe_load(
-        result_yaml(FrictionSummary(coulomb=zero, viscous=zero, estimates=()))
+STIFFNESS = StiffnessSummary(
+    levels=(), tissue_stiffness=found('tissue_stiffness', 520.25, 3.0, 'N/m^2'), estimates=()
+)
+FRICTION = friction(found('coulomb_friction', 0.5604), found('viscous_friction', 300.014, 0.04))
+
+
+def test_holds_what_was_identified_for_plant_and_controller():
+    """Both sections hold the means under the names of the nodes' parameters."""
+    document = yaml.safe_load(result_yaml(FRICTION, STIFFNESS))
+    expected = {
+        'model.coulomb_friction': 0.5604,
+        'model.viscous_friction': 300.014,
+        'model.tissue_stiffness': 520.25,
+    }
+    assert document == {
+        f'/**/{node}': {'ros__parameters': expected} for node in ('plant', 'controller')
+    }
+
+
+@pytest.mark.parametrize(
+    ('given_', 'names'),
+    [
+        ((FRICTION, None), {'model.coulomb_friction', 'model.viscous_friction'}),
+        ((None, STIFFNESS), {'model.tissue_stiffness'}),
+    ],
+)
+def test_holds_only_what_was_looked_for(given_, names):
+    """Friction alone leaves the stiffness as it is, and the other way around."""
+    assert set(yaml.safe_load(result_yaml(*given_))['/**/plant']['ros__parameters']) == names
+
+
+def test_what_the_data_do_not_determine_is_not_set():
+    """It is said in a comment, and the node keeps its value."""
+    text = result_yaml(friction(found('coulomb_friction', 0.5), found('viscous_friction', nan)))
+    assert list(yaml.safe_load(text)['/**/plant']['ros__parameters']) == ['model.coulomb_friction']
+    assert f'# viscous_friction (viscous_friction) is {UNKNOWN}\n' in text
+    with pytest.raises(IdentificationError, match='determine no parameter'):
+        result_yaml(friction(found('viscous_friction', nan)))
+
+
+def test_a_mean_outside_the_range_is_moved_to_its_end():
+    """Negative friction, and a break-away below Coulomb friction, are refused by the model."""
+    values = model_parameters(
+        [
+            found('coulomb_friction', -0.001),
+            found('breakaway_friction', 0.99, unit='1'),
+            found('offset', 0.1),
+        ]
     )
-    assert document['/**/plant']['ros__parameters']['model.viscous_friction'] == 0.0
+    assert values == {
+        'model.coulomb_friction': 0.0,
+        'model.breakaway_friction': 1.0,
+        # Break-away has a meaning in this law only.
+        'model.friction_law': 'stribeck',
+    }
+    constants = {name.removeprefix('model.'): value for name, value in values.items()}
+    assert NeedleParameters.from_mapping(constants).friction_law == 'stribeck'
 
 
-def test_replaces_the_file_at_once(tmp_path, summary):
+@given(st.floats(1e-12, 1e12))
+def test_a_value_survives_the_file(value):
+    """To seven digits, and as a number: YAML reads 5e-05 as a text."""
+    text = result_yaml(friction(found('viscous_friction', value)))
+    read = yaml.safe_load(text)['/**/plant']['ros__parameters']['model.viscous_friction']
+    assert isinstance(read, float)
+    # Half a unit of the seventh digit.
+    assert abs(read - value) <= 5e-7 * value
+
+
+def test_replaces_the_file_at_once(tmp_path):
+    """The new text is there whole, and no draft is left."""
     path = tmp_path / 'result.yaml'
     path.write_text('old')
-    write_result(path, summary)
-    assert path.read_text() == result_yaml(summary)
+    write_result(path, FRICTION)
+    assert path.read_text() == result_yaml(FRICTION)
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_names_the_file_that_cannot_be_written(tmp_path, summary):
-    with pytest.raises(IdentificationError, match=r'cannot write .*/no/result.yaml: No such file'):
-        write_result(tmp_path / 'no' / 'result.yaml', summary)
+@pytest.mark.parametrize(
+    ('name', 'complaint'),
+    [
+        ('no/result.yaml', r'no/result.yaml cannot be written: No such file'),
+        ('.', 'it is not the name of a file'),
+        ('', 'it is not the name of a file'),
+    ],
+)
+def test_names_the_file_that_cannot_be_written(tmp_path, name, complaint):
+    """One line that names it; nothing is left behind."""
+    with pytest.raises(ParameterError, match=complaint):
+        write_result(tmp_path / name, FRICTION)
+    assert not list(tmp_path.iterdir())
+
+
+@given(st.floats(-1e6, 1e6), st.floats(1e-6, 1e6))
+def test_a_number_is_told_to_two_digits_of_its_error(value, error):
+    """What is not told of the value is within a twentieth of its error."""
+    told, reach = measured(value, error).split(' ± ')
+    # Half of the second digit of the error, which is 1.0 at least, and rounding of the sum.
+    assert abs(float(told) - value) <= max(0.0501 * error, 0.501 if error >= 10.0 else 0.0)
+    assert abs(float(reach) - error) <= max(0.0501 * error, 0.501 if error >= 10.0 else 0.0)
+    assert rounded(value, error) == told
+    low, high = map(float, between((value - error, value + error)).split(' to '))
+    assert low <= value + 0.03 * error + 0.501 * (error >= 10.0)
+    assert high >= value - 0.03 * error - 0.501 * (error >= 10.0)
+
+
+@pytest.mark.parametrize(
+    ('value', 'error', 'text'),
+    [
+        (0.56043, 0.00051, '0.56043 ± 0.00051 N'),
+        (300.014, 12.6, '300 ± 13 N'),
+        (0.25, 0.0, '0.25 ± 0 N'),
+        (0.25, inf, '0.25 N'),
+        (nan, inf, UNKNOWN),
+    ],
+)
+def test_a_number_is_told_with_its_unit(value, error, text):
+    """An error of zero is said, one that is not known is not, and a nan is told in words."""
+    assert measured(value, error, 'N') == text
+
+
+def test_a_pure_number_has_no_unit():
+    """The unit 1 is not written."""
+    assert measured(0.1, 0.01, '1') == '0.100 ± 0.010'
+    assert between((-inf, inf)) == UNKNOWN

@@ -66,7 +66,7 @@ def test_reaches_the_target(ros_graph, law, reference):
     errors = ros_graph.listen(probe, JointState, 'tracking_error', SENSOR)
     aims = ros_graph.listen(probe, JointState, 'reference', SENSOR)
     targets = probe.create_publisher(PointStamped, 'target', COMMAND)
-    ros_graph.add(PlantNode, parameters={**SLOW, 'sensor.cutoff': 50.0})
+    ros_graph.add(PlantNode, parameters=SLOW)
     ros_graph.add(ControllerNode, parameters={**SLOW, 'law': law, 'reference.kind': reference})
     ros_graph.spin_until(lambda: states and targets.get_subscription_count(), 'discovery')
     message = PointStamped()

@@ -1,12 +1,23 @@
-"""From bags to a latched result and a parameter file that other nodes take."""
+"""From bags and from running topics to results, parameter files and running nodes."""
 
-from diagnostic_msgs.msg import DiagnosticArray
+import math
+
+from composition.presses import write_presses
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from geometry_msgs.msg import WrenchStamped
 from identification.samples import NOISY, simulated, TRUTH, write_bag
-from needle_dynamics.base_node import LATCHED
+from needle_dynamics.base_node import COMMAND, LATCHED, SENSOR
+from needle_dynamics.plant_node import PlantNode
 from needle_identification.identification_node import IdentificationNode
 import pytest
+from rcl_interfaces.srv import GetParameters
 from rclpy.node import Node
+from rclpy.parameter import Parameter
+from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+
+COEFFICIENTS = (('coulomb_friction', 'N'), ('viscous_friction', 'N s/m'))
 
 
 @pytest.fixture(scope='module')
@@ -19,12 +30,40 @@ def bags(tmp_path_factory):
     return [str(path) for path in paths]
 
 
-def identify(ros_graph):
-    client = ros_graph.node('caller').create_client(Trigger, 'identification/identify')
+@pytest.fixture(scope='module')
+def place(tmp_path_factory):
+    """Return a recording of presses."""
+    path = tmp_path_factory.mktemp('places') / 'place'
+    write_presses(path)
+    return str(path)
+
+
+def call(ros_graph, service):
+    """Call a service of the node; return success and message."""
+    client = ros_graph.node('caller').create_client(Trigger, f'identification/{service}')
     ros_graph.spin_until(client.service_is_ready, 'the service')
     answer = client.call_async(Trigger.Request())
     ros_graph.spin_until(answer.done, 'the answer')
     return answer.result().success, answer.result().message
+
+
+def apply(ros_graph, target):
+    """Call ``~/apply`` until the node has found the other node."""
+    answers = [(False, f'{target}: no such node')]
+
+    def answered():
+        if f'{target}: no such node' in answers[-1][1]:
+            answers.append(call(ros_graph, 'apply'))
+            return False
+        return True
+
+    ros_graph.spin_until(answered, f'the node {target}')
+    return answers[-1]
+
+
+def statuses(message):
+    """Return the values of each status by name."""
+    return {s.name: {v.key: v.value for v in s.values} for s in message.status}
 
 
 def test_identifies_when_activated_and_tells_who_comes_late(ros_graph, bags):
@@ -32,9 +71,10 @@ def test_identifies_when_activated_and_tells_who_comes_late(ros_graph, bags):
     ros_graph.add(IdentificationNode, parameters={'bags': bags})
     late = ros_graph.listen(ros_graph.node('late'), DiagnosticArray, 'friction', LATCHED)
     ros_graph.spin_until(lambda: late, 'the result')
-    status = {s.name: {v.key: v.value for v in s.values} for s in late[0].status}
-    assert list(status) == ['coulomb_friction', 'viscous_friction', *bags]
-    for name, unit in (('coulomb_friction', 'N'), ('viscous_friction', 'N s/m')):
+    status = statuses(late[0])
+    assert list(status)[:2] == ['coulomb_friction', 'viscous_friction']
+    assert list(status)[-3:] == bags
+    for name, unit in COEFFICIENTS:
         values = status[name]
         low, high = float(values['interval_low']), float(values['interval_high'])
         assert low < getattr(TRUTH, name) < high
@@ -42,6 +82,18 @@ def test_identifies_when_activated_and_tells_who_comes_late(ros_graph, bags):
         assert (values['unit'], values['recordings']) == (unit, '3')
         assert int(values['samples']) > 1000
     assert float(status[bags[0]]['determination']) > 0.99
+
+
+def test_publishes_stiffness_by_force(ros_graph, place):
+    """The result at the force asked for, and each entry of the matrix at each, latched."""
+    parameters = {'bags': [place], 'what': 'stiffness', 'level': 1.5}
+    ros_graph.add(IdentificationNode, parameters=parameters)
+    late = ros_graph.listen(ros_graph.node('late'), DiagnosticArray, 'stiffness', LATCHED)
+    ros_graph.spin_until(lambda: late, 'the result')
+    status = statuses(late[0])
+    assert float(status['tissue_stiffness']['estimate']) == pytest.approx(520.0, abs=5.0)
+    assert float(status['k_xx at 1.10 N']['estimate']) == pytest.approx(1260.0, abs=5.0)
+    assert status[place]['presses'] == '16'
 
 
 def test_its_result_is_a_parameter_file_for_nodes_in_any_namespace(ros_graph, bags, tmp_path):
@@ -67,20 +119,22 @@ def test_its_result_is_a_parameter_file_for_nodes_in_any_namespace(ros_graph, ba
             assert value == pytest.approx(TRUTH.viscous_friction, rel=0.01)
 
 
-def test_the_service_identifies_and_gives_the_reason_when_it_cannot(ros_graph, bags, tmp_path):
+def test_the_service_identifies_and_gives_the_reason_when_it_cannot(ros_graph):
     """Failure is an answer of one line, and the node lives on."""
     node = ros_graph.add(IdentificationNode)
-    assert identify(ros_graph) == (False, 'no recordings to identify from')
+    assert call(ros_graph, 'identify') == (False, 'no recordings to identify from')
     assert node.is_active
 
 
-def test_the_service_says_what_it_found(ros_graph, bags):
-    """Success is an answer with both coefficients."""
-    ros_graph.add(IdentificationNode, parameters={'bags': bags})
-    success, message = identify(ros_graph)
+def test_the_service_takes_the_bags_that_are_named_now(ros_graph, bags):
+    """A node that runs identifies from other recordings without a new start."""
+    node = ros_graph.add(IdentificationNode, parameters={'bags': bags[:1]})
+    assert node.set_parameters([Parameter('bags', value=bags)])[0].successful
+    success, message = call(ros_graph, 'identify')
     assert success
     assert message.startswith('mu_s = 0.5')
-    assert message.endswith('N s/m from 3 recordings')
+    assert message.endswith('from 3 recordings')
+    assert not node.set_parameters([Parameter('what', value='stiffness')])[0].successful
 
 
 @pytest.mark.parametrize(
@@ -88,7 +142,14 @@ def test_the_service_says_what_it_found(ros_graph, bags):
     [
         ({'bags': ['/no/such/bag']}, '/no/such/bag does not exist'),
         ({'friction.cutoff': 0.0}, 'friction.cutoff must be finite, > 0'),
+        ({'friction.terms': ['drag']}, 'friction.terms must be of coulomb'),
         ({'friction.cutof': 5.0}, "unknown parameter 'friction.cutof'; did you mean 'friction."),
+        ({'stiffness.estimator': 'luck'}, 'stiffness.estimator must be one of'),
+        ({'what': 'mass'}, "what must be one of friction, stiffness, got 'mass'"),
+        ({'time': 'now'}, "time must be one of header, receive, got 'now'"),
+        ({'force_axis': '-w'}, "force_axis must be x, y or z, or signed: -x, got '-w'"),
+        ({'axes': ['x']}, "axes must be two, got ['x']"),
+        ({'forgetting': 0.0}, 'forgetting must be finite, > 0'),
     ],
 )
 def test_refuses_to_start_and_says_why(ros_graph, parameters, complaint):
@@ -96,3 +157,142 @@ def test_refuses_to_start_and_says_why(ros_graph, parameters, complaint):
     node = ros_graph.add(IdentificationNode, start=False, parameters=parameters)
     assert not node.start()
     assert complaint in node.failure
+
+
+# Running topics.
+
+
+def test_finds_the_friction_of_a_plant_that_runs(ros_graph):
+    """Against a stand-in that moves, the intervals close around its friction."""
+    truth = {'coulomb_friction': 0.8, 'viscous_friction': 200.0}
+    parameters = {f'model.{name}': value for name, value in truth.items()}
+    plant = {'mode': 'robot', 'depth': 0.1, 'rate': 250.0, 'real_time_factor': 4.0}
+    ros_graph.start('plant', {**plant, **parameters})
+    node = ros_graph.add(IdentificationNode, parameters={'live': True})
+    probe = ros_graph.node('probe')
+    found = ros_graph.listen(probe, DiagnosticArray, 'friction', LATCHED)
+    reports = ros_graph.listen(probe, DiagnosticArray, '/diagnostics', 10)
+    trajectory = probe.create_publisher(JointTrajectory, 'joint_trajectory', COMMAND)
+    ros_graph.spin_until(trajectory.get_subscription_count, 'the plant')
+    message = JointTrajectory(joint_names=['insertion'])
+    for second, depth in enumerate([0.1, 0.105, 0.1, 0.11, 0.1, 0.115] * 5, 1):
+        point = JointTrajectoryPoint(positions=[depth])
+        point.time_from_start.sec = second
+        message.points.append(point)
+    trajectory.publish(message)
+
+    def told():
+        if not found:
+            return False
+        status = statuses(found[-1])
+        intervals = [
+            (float(status[name]['interval_low']), float(status[name]['interval_high']))
+            for name, _ in COEFFICIENTS
+        ]
+        # Two percent of the truth.
+        return all(
+            high - low < 0.04 * truth[name]
+            for (name, _), (low, high) in zip(COEFFICIENTS, intervals, strict=True)
+        )
+
+    ros_graph.spin_until(told, 'the friction')
+    assert {status.hardware_id for status in found[-1].status} == {'live'}
+    status = statuses(found[-1])
+    for name, _ in COEFFICIENTS:
+        # The sensor noise is seeded, what is received is not: the interval, twice as wide.
+        low, high = (float(status[name][f'interval_{end}']) for end in ('low', 'high'))
+        assert abs(truth[name] - (low + high) / 2.0) < high - low
+    assert int(status['coulomb_friction']['samples']) > 100
+    node.publish_diagnostics()
+    ros_graph.spin_until(
+        lambda: any('mu_s = 0.' in s.message for r in reports for s in r.status), 'diagnostics'
+    )
+
+
+def test_lives_on_with_messages_that_make_no_sense(ros_graph):
+    """NaN, stamps that go back, joints that are missing: counted, and the node is active."""
+    node = ros_graph.add(IdentificationNode, parameters={'live': True})
+    probe = ros_graph.node('probe')
+    joints = probe.create_publisher(JointState, 'joint_states', SENSOR)
+    wrenches = probe.create_publisher(WrenchStamped, 'base_wrench', SENSOR)
+    ros_graph.spin_until(
+        lambda: joints.get_subscription_count() and wrenches.get_subscription_count(), 'discovery'
+    )
+    level, message, _ = node.diagnose()
+    assert level == DiagnosticStatus.WARN
+    assert 'insertion' in message
+    for names, position in ((['other'], [0.1]), (['insertion'], []), ([], [])):
+        joints.publish(JointState(name=names, position=position))
+    for seconds, force in ((5, 1.0), (4, 1.0), (6, math.nan), (1, 1.0)):
+        wrench = WrenchStamped()
+        wrench.header.stamp.sec, wrench.wrench.force.y = seconds, force
+        wrenches.publish(wrench)
+    ros_graph.spin_until(lambda: sum(node.diagnose()[2].values()) >= 3, 'the counts')
+    assert node.diagnose()[2] == {
+        'samples': 0, 'out of order': 1, 'not finite': 1, 'clock set back': 1,
+    }  # fmt: skip
+    assert node.is_active
+
+
+# Into running nodes.
+
+
+def test_applies_what_it_found_to_a_plant_that_runs(ros_graph, bags):
+    """The plant goes on with the identified friction, and the answer names it."""
+    plant = ros_graph.add(
+        PlantNode, parameters={'rate': 200.0, 'model.coulomb_friction': 2.0, 'mode': 'robot'}
+    )
+    ros_graph.add(IdentificationNode, parameters={'bags': bags})
+    success, message = apply(ros_graph, 'plant')
+    assert success, message
+    assert 'plant: model.coulomb_friction = 0.5' in message
+    assert 'controller: no such node' in message
+    for name, _ in COEFFICIENTS:
+        value = plant.get_parameter(f'model.{name}').value
+        assert value == pytest.approx(getattr(TRUTH, name), rel=0.01)
+
+
+def test_applies_it_from_process_to_process(ros_graph, bags):
+    """A call that fails, then one that succeeds, with the executor that the nodes have."""
+    ros_graph.start('identification', {'bags': bags, 'apply_to': ['plant']})
+    assert call(ros_graph, 'apply') == (False, 'plant: no such node')
+    ros_graph.start('plant', {'model.coulomb_friction': 2.0})
+    asker = ros_graph.node('asker')
+    parameters = asker.create_client(GetParameters, 'plant/get_parameters')
+    ros_graph.wait_for(asker, 'plant')
+    # Not at once: the nodes may have yet to find each other.
+    ros_graph.spin_until(lambda: call(ros_graph, 'apply')[0], 'that the plant takes it')
+    answer = parameters.call_async(GetParameters.Request(names=['model.coulomb_friction']))
+    ros_graph.spin_until(answer.done, 'the parameter')
+    value = answer.result().values[0].double_value
+    assert value == pytest.approx(TRUTH.coulomb_friction, rel=0.01)
+
+
+def test_says_what_a_node_does_not_take(ros_graph, place):
+    """A plant that runs keeps its tissue: the answer gives the reason."""
+    ros_graph.add(PlantNode, parameters={'rate': 200.0})
+    ros_graph.add(IdentificationNode, parameters={'bags': [place], 'what': 'stiffness'})
+    success, message = apply(ros_graph, 'plant')
+    assert not success
+    assert 'not model.tissue_stiffness' in message
+    assert 'cannot change while configured' in message
+
+
+def test_has_nothing_to_apply_before_it_found_something(ros_graph):
+    """The answer says so."""
+    ros_graph.add(IdentificationNode)
+    success, message = call(ros_graph, 'apply')
+    assert not success
+    assert message.startswith('nothing identified yet')
+
+
+def test_a_node_that_does_not_answer_does_not_keep_it_waiting(ros_graph, bags, monkeypatch):
+    """The call ends with the reason, and meanwhile the node is at work."""
+    monkeypatch.setattr('needle_identification.identification_node._ANSWER_TIME', 0.3)
+    ros_graph.add(IdentificationNode, parameters={'bags': bags, 'apply_to': ['deaf']})
+    # A node whose executor does not spin has the service, but answers nothing.
+    deaf = Node('deaf', context=ros_graph.context)
+    try:
+        assert apply(ros_graph, 'deaf') == (False, 'deaf: no answer within 0.3 s')
+    finally:
+        deaf.destroy_node()

@@ -4,25 +4,31 @@ from pathlib import Path
 import signal
 import subprocess
 import sys
+import time
 
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import PointStamped, WrenchStamped
+from geometry_msgs.msg import PointStamped, PoseStamped, WrenchStamped
 from needle_controller.controller_node import ControllerNode
-from needle_dynamics import ForceSensorParameters
+from needle_dynamics import ForceSensorParameters, IndenterParameters
 from needle_dynamics.base_node import COMMAND, LATCHED, SENSOR
 from needle_dynamics.plant_node import PlantNode
 from needle_insertion.graph import GraphError
 import numpy as np
 import pytest
+from rclpy.duration import Duration
 from rclpy.lifecycle import TransitionCallbackReturn
+from rclpy.node import Node
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
+from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 import yaml
 
 #: Slow enough for a thread that also runs the test.
-RATE = {'rate': 200.0, 'sensor.cutoff': 50.0}
+RATE = {'rate': 200.0}
+
+NOISE = ForceSensorParameters().force_noise
 
 
 def stamp_ns(message) -> int:
@@ -35,6 +41,62 @@ def wrench(force: float) -> WrenchStamped:
     message = WrenchStamped()
     message.wrench.force.y = force
     return message
+
+
+def trajectory(
+    joints: list[str], *points: tuple[float, list[float], list[float]]
+) -> JointTrajectory:
+    """Return a trajectory of points: time from start, positions, efforts."""
+    message = JointTrajectory(joint_names=joints)
+    for at, positions, effort in points:
+        point = JointTrajectoryPoint(positions=positions, effort=effort)
+        point.time_from_start.sec, rest = divmod(round(at * 1e9), 10**9)
+        point.time_from_start.nanosec = rest
+        message.points.append(point)
+    return message
+
+
+class Bench:
+    """A plant in this process with a probe that listens to it and commands it."""
+
+    def __init__(self, ros_graph, **parameters):
+        self.graph = ros_graph
+        self.probe = ros_graph.node('probe')
+        self.states = ros_graph.listen(self.probe, JointState, 'joint_states', SENSOR)
+        self.wrenches = ros_graph.listen(self.probe, WrenchStamped, 'base_wrench', SENSOR)
+        self.poses = ros_graph.listen(self.probe, PoseStamped, 'end_effector_pose', SENSOR)
+        self.commands = self.probe.create_publisher(WrenchStamped, 'wrench_command', COMMAND)
+        self.course = self.probe.create_publisher(JointTrajectory, 'joint_trajectory', COMMAND)
+        self.tare = self.probe.create_client(Trigger, 'plant/tare')
+        self.plant = ros_graph.add(PlantNode, parameters={**RATE, **parameters})
+        self.until(
+            lambda: (
+                self.wrenches
+                and self.commands.get_subscription_count()
+                and self.course.get_subscription_count()
+                and self.tare.service_is_ready()
+            ),
+            'discovery',
+        )
+
+    def until(self, condition, what):
+        self.graph.spin_until(condition, what)
+
+    def further(self, count):
+        """Spin until there are so many more readings of the force; return them."""
+        seen = len(self.wrenches)
+        self.until(lambda: len(self.wrenches) >= seen + count, 'readings')
+        return self.wrenches[seen:]
+
+    def zero(self):
+        """Ask for the tare; return the answer."""
+        answer = self.tare.call_async(Trigger.Request())
+        self.until(answer.done, 'the answer')
+        return answer.result()
+
+    def refused(self, count):
+        """Spin until so many commands have been refused."""
+        self.until(lambda: self.plant.diagnose()[2]['commands refused'] == count, 'the refusal')
 
 
 def test_publishes_its_four_topics_in_step(ros_graph):
@@ -115,10 +177,9 @@ def test_the_base_follows_a_trajectory_and_feels_friction(ros_graph):
     assert states[-1].position[0] == pytest.approx(0.11, abs=1e-6)
     speed = {stamp_ns(m): m.velocity[0] for m in states}
     steady = [m.wrench.force.y for m in wrenches if abs(speed.get(stamp_ns(m), 0.0) - 0.01) < 1e-6]
-    noise = ForceSensorParameters().force_noise
-    # Mean of at least 50 samples of which the filter leaves 70 % of the noise; five sigma.
+    # Mean of at least 50 readings; the filter leaves a fifth of the noise; five sigma.
     assert len(steady) > 50
-    assert np.mean(steady) == pytest.approx(3.56, abs=5 * noise / np.sqrt(50))
+    assert np.mean(steady) == pytest.approx(3.56, abs=5 * 0.2 * max(NOISE) / np.sqrt(50))
 
 
 def test_a_needle_pulled_out_stands_still_and_is_reported(ros_graph):
@@ -174,8 +235,7 @@ def test_the_shipped_parameter_file_is_accepted(ros_graph, kind):
     [
         ({'model.lenght': 0.3}, "unknown parameter 'model.lenght'; did you mean 'model.length'"),
         ({'model.preset': 'steel'}, 'model.preset must be one of paper_si, paper_mm, phantom'),
-        ({'mode': 'dream'}, 'mode must be one of simulation, robot'),
-        ({'sensor.cutoff': 600.0}, 'cutoff must be < half the sample rate = 500 Hz'),
+        ({'mode': 'dream'}, "mode must be one of simulation, robot, indenter, got 'dream'"),
         ({'model.length': 'long'}, "model.length must be a number, got 'long'"),
         ({'model.density': -1.0}, 'model.density'),
         ({'step': float('nan')}, 'step'),
@@ -191,6 +251,45 @@ def test_bad_parameters_end_the_process_with_one_line(ros_graph, parameters, com
     assert complaint in plant.last_words()
     with pytest.raises(GraphError, match='ended early with status 2'):
         plant.check()
+
+
+@pytest.mark.parametrize(
+    ('parameters', 'complaint'),
+    [
+        ({'sensor.filter': 7}, 'sensor.filter must be an integer from 0 (none) to 6, got 7'),
+        (
+            {'sensor.rate': 1500.0},
+            'must be a whole multiple of 1000 Hz, got 1500 Hz; 8000 Hz would do',
+        ),
+        (
+            {'sensor.force_noise': [0.1, 0.2]},
+            'sensor.force_noise must be one number or three, x y z, got [0.1, 0.2]',
+        ),
+        (
+            {'sensor.force_drift': [0.1, -0.1, 0.1]},
+            'sensor.force_drift must be finite, >= 0 N/s^0.5',
+        ),
+        (
+            {'base.encoder_resolution': -1},
+            'base.encoder_resolution must be finite, >= 0 m, got -1.0',
+        ),
+        ({'real_time_factor': 0}, 'real_time_factor must be finite, > 0 and <= 100, got 0.0'),
+        (
+            {'mode': 'indenter', 'indenter.stiffness_xx': [1000.0]},
+            'indenter.stiffness_xx must be a list with one value for each of the force_levels',
+        ),
+        (
+            {'publish_clock': True, 'use_sim_time': True},
+            'publish_clock and use_sim_time cannot both be true: the plant would follow its own',
+        ),
+    ],
+)
+def test_it_refuses_to_be_configured_and_says_why(ros_graph, parameters, complaint):
+    """The reason is one line that names the parameter; nothing is left half made."""
+    node = ros_graph.add(PlantNode, parameters=parameters, start=False)
+    assert not node.start()
+    assert complaint in node.failure
+    assert node.diagnose()[2] == {}
 
 
 @pytest.mark.parametrize('name', [signal.SIGINT, signal.SIGTERM])
@@ -271,3 +370,344 @@ def test_a_trajectory_out_of_reach_is_refused(ros_graph):
     seen = len(states)
     ros_graph.spin_until(lambda: len(states) > seen + 50, 'further samples')
     assert {message.position[0] for message in states[seen:]} == {0.1}
+
+
+def test_a_push_breaks_the_needle_away_and_a_motion_follows(ros_graph):
+    """An effort ramp moves the base from mu_s on; then positions count from where it is."""
+    quiet = {'sensor.force_noise': 0.0, 'sensor.force_resolution': 0.0, 'sensor.filter': 0}
+    bench = Bench(ros_graph, mode='robot', depth=0.1, **quiet)
+    bench.course.publish(
+        trajectory(['insertion'], (1.0, [], [2.0]), (1.4, [0.1], []), (2.0, [0.1], []))
+    )
+    states = bench.states
+    bench.until(lambda: states[-1].velocity[0] < 0.0, 'the way back')
+    bench.until(lambda: states[-1].velocity[0] == 0.0, 'rest')
+    force = {stamp_ns(m): m.wrench.force.y for m in bench.wrenches}
+    pushed = states[: next(i for i, m in enumerate(states) if m.velocity[0] < 0.0)]
+    at = [(force[stamp_ns(m)], m.velocity[0]) for m in pushed if stamp_ns(m) in force]
+    moving = [f for f, speed in at if speed > 0.0]
+    resting = [f for f, speed in at[: len(at) - len(moving)]]
+    # The force of a sample is the mean of its interval: 2 N/s over 5 ms between samples; the
+    # ramp itself is rounded.
+    assert max(resting) <= 0.56 + 1e-12
+    assert 0.56 - 1e-12 < min(moving) < 0.56 + 0.011
+    # mu_v = 300 N s/m; the speed is that of the last quarter of 5 ms, in which the force rises by
+    # 2.5 mN, the reading that at its end. After the largest force it brakes for the way back.
+    last = max(range(len(at)), key=lambda i: at[i][0])
+    steady = [(f - 0.56) / 300.0 - speed for f, speed in at[:last] if f > 0.56]
+    assert len(steady) > 100
+    assert np.abs(steady).max() < 0.0013 / 300.0
+    assert states[-1].position[0] == pytest.approx(0.1, abs=1.5e-6)
+
+
+def test_a_trajectory_sent_before_the_activation_begins_with_it(ros_graph):
+    """With the same seed two runs are then the same, sample by sample."""
+    runs = []
+    for name in ('one', 'two'):
+        probe = ros_graph.node(name)
+        wrenches = ros_graph.listen(probe, WrenchStamped, f'{name}/base_wrench', SENSOR)
+        course = probe.create_publisher(JointTrajectory, f'{name}/joint_trajectory', COMMAND)
+        plant = ros_graph.add(
+            PlantNode,
+            parameters={**RATE, 'mode': 'robot', 'depth': 0.1},
+            namespace=name,
+            start=False,
+        )
+        plant.trigger_configure()
+        ros_graph.spin_until(
+            lambda course=course: course.get_subscription_count(), 'the subscription'
+        )
+        course.publish(trajectory(['insertion'], (0.3, [], [2.0]), (0.6, [0.1], [])))
+        assert course.wait_for_all_acked(Duration(seconds=10))
+        for _ in range(10):
+            ros_graph.executor.spin_once(timeout_sec=0.02)
+        # Only the newest command counts: this one, refused, tells that the first was taken.
+        course.publish(trajectory(['insertion']))
+        ros_graph.spin_until(
+            lambda plant=plant: plant.diagnose()[2]['commands refused'] == 1, 'the refusal'
+        )
+        plant.trigger_activate()
+        ros_graph.spin_until(lambda wrenches=wrenches: len(wrenches) >= 150, 'readings')
+        runs.append([message.wrench.force.y for message in wrenches[:150]])
+    assert max(runs[0]) > 1.0
+    assert runs[0] == runs[1]
+
+
+def test_the_encoder_counts_whole_micrometers(ros_graph):
+    """In mode robot the joint position is rounded to the encoder's resolution."""
+    bench = Bench(ros_graph, mode='robot', depth=0.1, **{'base.encoder_resolution': 1e-4})
+    bench.course.publish(trajectory(['insertion'], (0.5, [0.102], [])))
+    bench.until(lambda: bench.states[-1].position[0] >= 0.102, 'the end')
+    counts = np.array([m.position[0] for m in bench.states]) / 1e-4
+    # Rounding of a quotient of the size of 1000.
+    assert np.abs(counts - np.round(counts)).max() < 1e-9
+    assert len(set(np.round(counts))) == 21
+
+
+def test_the_end_effector_presses_the_tissue(ros_graph):
+    """In mode indenter the pose is where K(|F|) d = F, and the wrench is F; nothing else comes."""
+    bench = Bench(ros_graph, mode='indenter')
+    force = np.array([0.6, -1.2])
+    bench.course.publish(trajectory(['z', 'x'], (0.5, [], [-1.2, 0.6]), (9.0, [], [-1.2, 0.6])))
+    bench.until(lambda: bench.poses and bench.poses[-1].pose.position.z < -9e-4, 'the press')
+    bench.until(lambda: bench.wrenches[-1].wrench.force.z < -1.1, 'the press')
+    seen = len(bench.poses)
+    # The last of the ramp takes 0.1 s, 20 samples.
+    readings = np.array([[m.wrench.force.x, m.wrench.force.z] for m in bench.further(150)[50:]])
+    poses = [message.pose.position for message in bench.poses[seen + 50 :]]
+    place = np.array([[p.x, p.z] for p in poses])
+    p = IndenterParameters()
+    stiffness = [
+        np.interp(np.hypot(*force), p.force_levels, m) for m in p.matrices.reshape(-1, 4).T
+    ]
+    # Five sigma of 100 readings.
+    assert np.abs(readings.mean(axis=0) - force).max() < 5 * 0.2 * max(NOISE) / 10.0
+    pressed = np.linalg.solve(np.reshape(stiffness, (2, 2)), force)
+    assert np.abs(place.mean(axis=0) - pressed).max() < 5 * p.position_noise / np.sqrt(len(place))
+    assert np.mean([p.y for p in poses]) == pytest.approx(1e-4 * np.hypot(*force), abs=1e-5)
+    assert bench.poses[-1].header.frame_id == 'needle_entry'
+    assert not bench.states
+    assert {stamp_ns(m) for m in bench.poses} & {stamp_ns(m) for m in bench.wrenches}
+
+
+@pytest.mark.parametrize(
+    ('mode', 'message', 'reason'),
+    [
+        (
+            'simulation',
+            trajectory(['insertion'], (1.0, [0.1], [])),
+            'is followed in the modes robot and indenter only',
+        ),
+        ('robot', trajectory(['x'], (1.0, [0.1], [])), "needs the joint 'insertion', got ['x']"),
+        ('robot', trajectory(['insertion']), 'trajectory has no points'),
+        (
+            'robot',
+            trajectory(['insertion'], (1.0, [], [])),
+            'each point needs a position or an effort',
+        ),
+        (
+            'robot',
+            trajectory(['insertion'], (1.0, [], [5e3])),
+            'a push must be within 1000 N, got [5000.0] N',
+        ),
+        (
+            'robot',
+            trajectory(['insertion'], (1.0, [0.1], []), (1.0, [0.1], [])),
+            'trajectory times must be >= 0 and increasing, got [1.0, 1.0] s',
+        ),
+        (
+            'indenter',
+            trajectory(['x', 'z'], (1.0, [0.0, 0.0], [])),
+            'the indenter takes efforts, not positions',
+        ),
+        ('indenter', trajectory(['x'], (1.0, [], [1.0])), "needs the joint 'z', got ['x']"),
+        (
+            'indenter',
+            trajectory(['x', 'z'], (1.0, [], [1.0])),
+            'each point needs efforts of x and z within 1000 N, got [[1.0]]',
+        ),
+    ],
+)
+def test_trajectories_are_refused_with_their_reason(ros_graph, capfd, mode, message, reason):
+    """What a mode cannot follow is refused in one line, counted, and changes nothing."""
+    bench = Bench(ros_graph, mode=mode, depth=0.1)
+    bench.course.publish(message)
+    bench.refused(1)
+    assert f'joint_trajectory: {reason}\n' in capfd.readouterr().err
+    if bench.states:
+        assert bench.states[-1].position[0] == 0.1
+
+
+def test_tare_zeroes_the_readings_at_rest(ros_graph):
+    """After the tare the readings are about zero, and stay so after a deactivation."""
+    biased = {'sensor.force_bias': [1.0, -2.0, 3.0], 'sensor.torque_bias': 0.1}
+    bench = Bench(ros_graph, **biased)
+
+    def mean(messages):
+        parts = [(m.wrench.force, m.wrench.torque) for m in messages]
+        return np.mean([[f.x, f.y, f.z, t.x, t.y, t.z] for f, t in parts], axis=0)
+
+    offset = np.array([1.0, -2.0, 3.0, 0.1, 0.1, 0.1])
+    # Five sigma of the 20 readings of a tenth of a second and of 100 more.
+    noise = np.repeat([0.2 * max(NOISE), 0.2 * 1.5e-3], 3)
+    bound = 5 * noise * np.sqrt(1 / 20 + 1 / 100)
+    assert np.all(np.abs(mean(bench.further(100)) - offset) < bound)
+    answer = bench.zero()
+    assert (answer.success, answer.message) == (True, 'the force sensor is zeroed')
+    # The readings on their way when the tare came are not zeroed.
+    assert np.all(np.abs(mean(bench.further(110)[10:])) < bound)
+    bench.plant.trigger_deactivate()
+    refused = bench.zero()
+    assert (refused.success, refused.message) == (False, 'tare refused: the plant is not active')
+    bench.plant.trigger_activate()
+    assert np.all(np.abs(mean(bench.further(110)[10:])) < bound)
+    bench.plant.trigger_deactivate()
+    bench.plant.trigger_cleanup()
+    assert bench.plant.start()
+    assert np.all(np.abs(mean(bench.further(110)[10:]) - offset) < bound)
+
+
+def test_tare_is_refused_while_the_needle_moves(ros_graph):
+    """A moving needle cannot be zeroed, nor one that has just come to rest."""
+    bench = Bench(ros_graph)
+
+    def pushed() -> bool:
+        bench.commands.publish(wrench(3.56))
+        return bench.states[-1].velocity[0] > 0.0
+
+    bench.until(pushed, 'motion')
+    answer = bench.tare.call_async(Trigger.Request())
+    bench.until(lambda: pushed() and answer.done(), 'the answer')
+    assert not answer.result().success
+    # (3.56 - 0.56) N / 300 N s/m.
+    assert answer.result().message == 'tare refused: the needle moves at 10 mm/s; it must rest'
+    bench.until(lambda: bench.states[-1].velocity[0] == 0.0, 'rest')
+    soon = bench.zero()
+    assert not soon.success
+    assert 'of 20 readings at rest so far' in soon.message
+    bench.further(20)
+    assert bench.zero().success
+
+
+def test_simulated_time_runs_faster(ros_graph):
+    """At ten times the pace 10 s of stamps pass in about 1 s; not one sample is missing."""
+    bench = Bench(ros_graph, rate=100.0, real_time_factor=10.0)
+    begin, first = time.monotonic(), len(bench.states)
+    bench.until(lambda: len(bench.states) >= first + 1000, 'ten seconds')
+    passed = time.monotonic() - begin
+    # Not faster, but for what a stall of the backlog of 0.5 s has left to make up; slower
+    # only as far as this machine is busy.
+    assert 0.5 < passed < 5.0
+    stamps = np.diff([stamp_ns(message) for message in bench.states])
+    assert set(stamps) <= {9_999_999, 10_000_000, 10_000_001}
+
+
+@pytest.mark.parametrize('factor', [1.0, 2.0])
+def test_after_a_stall_samples_are_given_up_or_simulated_time_waits(ros_graph, factor):
+    """Stamps that are the node's clock skip what is beyond the backlog; others never skip."""
+    bench = Bench(ros_graph, rate=100.0, real_time_factor=factor, backlog=0.05)
+    bench.further(20)
+    # The stall: nobody spins the plant.
+    time.sleep(0.5)
+    bench.further(50)
+    stamps = np.diff([stamp_ns(message) for message in bench.states])
+    given_up = bench.plant.diagnose()[2]['samples given up']
+    if factor == 1.0:
+        # 0.5 s, less the backlog.
+        assert given_up >= 44
+        assert stamps.max() >= 0.44e9
+    else:
+        assert given_up == 0
+        assert float(bench.plant.diagnose()[2]['waited for the machine [s]']) >= 0.44
+        assert set(stamps) <= {9_999_999, 10_000_000, 10_000_001}
+
+
+def test_its_clock_drives_a_node_with_simulated_time(ros_graph):
+    """A node with use_sim_time is never ahead of the newest sample, and goes with it."""
+    follower = ros_graph.add(Node, 'follower', parameters={'use_sim_time': True})
+    bench = Bench(ros_graph, rate=100.0, real_time_factor=10.0, publish_clock=True)
+    bench.until(lambda: follower.get_clock().now().nanoseconds > 0, '/clock')
+    before = follower.get_clock().now().nanoseconds
+    begin = time.monotonic()
+    bench.until(
+        lambda: follower.get_clock().now().nanoseconds > before + 5 * 10**9, 'five seconds'
+    )
+    assert time.monotonic() - begin < 2.5
+    now = follower.get_clock().now().nanoseconds
+    bench.further(50)
+    assert now in {stamp_ns(message) for message in bench.states}
+
+
+def test_a_command_ages_in_simulated_time(ros_graph):
+    """At ten times the pace a command of 0.1 s counts for 0.01 s of the node's clock."""
+    bench = Bench(ros_graph, rate=1000.0, real_time_factor=5.0)
+    bench.commands.publish(wrench(3.56))
+    bench.until(lambda: any(m.velocity[0] > 0.0 for m in bench.states), 'motion')
+    bench.until(lambda: bench.states[-1].velocity[0] == 0.0, 'rest')
+    moving = [stamp_ns(m) for m in bench.states if m.velocity[0] > 0.0]
+    # Command and sample are at most a burst apart, twice the pace of a tick of 1 ms.
+    assert 0.08e9 < moving[-1] - moving[0] < 0.12e9
+
+
+def test_friction_may_change_while_it_moves(ros_graph):
+    """A live change of friction alters the speed at once, and not the depth."""
+    bench = Bench(ros_graph)
+    configurations = bench.graph.listen(bench.probe, String, 'plant/configuration', LATCHED)
+
+    def pushed() -> bool:
+        bench.commands.publish(wrench(3.56))
+        return bench.states[-1].velocity[0] > 0.0
+
+    bench.until(lambda: pushed() and bench.states[-1].position[0] > 0.021, 'motion')
+    depth = bench.plant.diagnose()[2]['inserted length [m]']
+    changed = bench.plant.set_parameters_atomically(
+        [
+            Parameter('model.coulomb_friction', value=2.06),
+            Parameter('model.viscous_friction', value=150.0),
+        ]
+    )
+    assert changed.successful
+    assert bench.plant.diagnose()[2]['inserted length [m]'] == depth
+    slow = len(bench.states)
+    bench.until(lambda: pushed() and len(bench.states) > slow + 40, 'further samples')
+    speed = np.array([message.velocity[0] for message in bench.states])
+    position = np.array([message.position[0] for message in bench.states])
+    # (3.56 - 2.06) N / 150 N s/m, friction being settled within 0.1 ms.
+    assert set(np.round(speed[speed > 0.0], 9)) == {0.01}
+    assert np.diff(position).max() <= 0.01 / 200.0 * (1.0 + 1e-9)
+    bench.until(lambda: 'model.coulomb_friction: 2.06' in configurations[-1].data, 'configuration')
+
+
+def test_the_controller_takes_friction_live_if_its_gains_can_bear_it(ros_graph):
+    """Friction is checked as at the start; what is refused leaves the value, and says why."""
+    node = ros_graph.add(ControllerNode, parameters={**RATE, 'law': 'pid'})
+    friction = [Parameter('model.viscous_friction', value=value) for value in (200.0, 0.3)]
+    assert node.set_parameters(friction[:1])[0].successful
+    refused = node.set_parameters(friction[1:])[0]
+    assert not refused.successful
+    assert refused.reason.startswith('pid.insertion gains cannot be stable at 200 Hz')
+    assert node.get_parameter('model.viscous_friction').value == 200.0
+
+
+@pytest.mark.parametrize(
+    ('kind', 'name', 'value', 'reason'),
+    [
+        (
+            PlantNode,
+            'model.tissue_stiffness',
+            600.0,
+            'model.tissue_stiffness: cannot change while configured; clean up the node first',
+        ),
+        (
+            PlantNode,
+            'model.coulomb_friction',
+            'much',
+            "model.coulomb_friction must be a number, got 'much'",
+        ),
+        (
+            PlantNode,
+            'model.viscous_friction',
+            -1,
+            'model.viscous_friction must be finite, >= 0 N s/m, got -1.0',
+        ),
+        (
+            ControllerNode,
+            'law',
+            'pid',
+            'law: cannot change while configured; clean up the node first',
+        ),
+        (
+            ControllerNode,
+            'model.coulomb_friction',
+            True,
+            'model.coulomb_friction must be a number, got True',
+        ),
+    ],
+)
+def test_what_cannot_change_live_is_refused(ros_graph, kind, name, value, reason):
+    """A refused change says why and leaves the value."""
+    node = ros_graph.add(kind, parameters=RATE)
+    before = node.get_parameter(name).value
+    answer = node.set_parameters([Parameter(name, value=value)])[0]
+    assert (answer.successful, answer.reason) == (False, reason)
+    assert node.get_parameter(name).value == before

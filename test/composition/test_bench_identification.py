@@ -1,0 +1,269 @@
+"""What the benchmarks of identification measure is what they say; never their times."""
+
+from __future__ import annotations
+
+import json
+from math import nan, pi
+
+from needle_dynamics import ForceSensorParameters, IndenterParameters, NeedleParameters
+from needle_identification import FrictionSettings, message_counts, read_friction_recording
+from needle_insertion import bench_calibration, bench_identification, bench_measure
+from needle_insertion.bench_calibration import Found
+from needle_insertion.cli import main
+import numpy as np
+from numpy.testing import assert_allclose
+import pytest
+from scipy.linalg import toeplitz
+
+
+@pytest.fixture(scope='module')
+def friction():
+    return [bench_calibration.friction(1, number) for number in range(2)]
+
+
+@pytest.fixture(scope='module')
+def stiffness():
+    return bench_calibration.stiffness(1, 0)
+
+
+@pytest.fixture(scope='module')
+def bag(tmp_path_factory):
+    path = tmp_path_factory.mktemp('bag') / 'strokes'
+    bench_identification.write_bag(path, 5000)
+    return path
+
+
+def found(value, low, high, *, truth=1.0, bound=1.0, unit='N', case='a'):
+    return Found(case, 'x', unit, truth, bound, value, 0.5, low, high)
+
+
+# The bag and its readers.
+
+
+def test_the_bag_holds_the_friction_it_was_made_with(bag):
+    recording = read_friction_recording(bag)
+    assert recording.losses == ()
+    assert_allclose(np.diff(recording.time), 1.0 / 250.0, rtol=1e-6)
+    # The speed is the derivative of the inserted length, to the second order of the step.
+    slope = np.gradient(recording.depth, recording.time)[1:-1]
+    assert_allclose(slope, recording.speed[1:-1], atol=2e-5)
+    estimate = bench_identification.ours(bag)
+    for name, true in (('coulomb_friction', 0.56), ('viscous_friction', 300.0)):
+        # Five standard errors.
+        assert abs(estimate[name].value - true) < 5.0 * estimate[name].error
+
+
+def test_bags_of_any_length_have_as_many_messages_as_asked_for(tmp_path):
+    # More than one block of messages is made of.
+    bench_identification.write_bag(tmp_path / 'bag', 2**16 + 3)
+    assert set(message_counts(tmp_path / 'bag').values()) == {2**16 + 3}
+
+
+def test_rosbags_takes_the_numbers_that_we_do(bag, monkeypatch):
+    taken = {}
+    monkeypatch.setattr(bench_identification, '_arrays', taken.update)
+    bench_identification.any_reader(bag)
+    recording = read_friction_recording(bag)
+    force = np.array(taken['/base_wrench'])
+    motion = np.array(taken['/joint_states'])
+    assert_allclose(force[:, 1], recording.force, rtol=0.0, atol=0.0)
+    assert_allclose(motion[:, 1:].T, [recording.depth, recording.speed], rtol=1e-12)
+
+
+def test_mcap_ros2_support_takes_the_numbers_that_we_do(bag, monkeypatch):
+    pytest.importorskip('mcap_ros2.reader')
+    taken = {}
+    monkeypatch.setattr(bench_identification, '_arrays', taken.update)
+    bench_identification.mcap_ros2(bag)
+    assert_allclose(np.array(taken['/base_wrench'])[:, 1], read_friction_recording(bag).force)
+
+
+def test_a_process_of_its_own_tells_its_time_and_memory(bag):
+    figures = bench_identification.measured('needle_identification', bag, bag, 1)
+    assert 0.0 < figures['seconds'] < 60.0
+    # NumPy alone takes 10 MB.
+    assert 1e7 < figures['before'] <= figures['memory'] < 1e10
+
+
+def test_what_is_not_installed_is_said_and_the_rest_is_compared(monkeypatch):
+    monkeypatch.setattr(bench_identification, 'optional', lambda _name: None)
+    monkeypatch.setattr(bench_identification, 'LONGER', (1, 2))
+    asked = []
+
+    def measured(reader, warm, path, repeats):
+        asked.append((reader, path.name))
+        speed = 1.0 if reader == 'needle_identification' else 4.0
+        return {'seconds': speed, 'memory': 2e8, 'before': 1e8}
+
+    monkeypatch.setattr(bench_identification, 'measured', measured)
+    text, bars = bench_identification.compare(lambda _what: None, 3000)
+    assert bench_measure.NOT_INSTALLED in text
+    assert asked == [
+        ('needle_identification', 'times_1'),
+        ('rosbags AnyReader', 'times_1'),
+        ('needle_identification', 'times_1'),
+        ('needle_identification', 'times_2'),
+    ]
+    assert [bar.found for bar in bars] == [4.0, 1.0]
+    assert [bar.verdict for bar in bars] == ['met', 'met']
+
+
+# Coverage and bounds.
+
+
+def test_the_noise_of_readings_is_that_of_the_sensor():
+    parameters = ForceSensorParameters(force_noise=(0.01, 0.05, 0.02))
+    wrenches = np.zeros((20_000, 6))
+    sensor = bench_calibration.ForceSensor(parameters, bench_calibration.RATE, 3)
+    noise = np.array([sensor.measure(wrench)[1] for wrench in wrenches])
+    expected = bench_calibration.reading_noise(parameters, 1)
+    measured = [noise[: len(noise) - k] @ noise[k:] / (len(noise) - k) for k in range(5)]
+    # Each is a mean of 20,000 products: four standard errors of 1/sqrt(20,000).
+    assert_allclose(measured, expected[:5], atol=4.0 / np.sqrt(20_000) * expected[0])
+
+
+def test_information_is_that_of_the_samples_that_are_used():
+    rng = np.random.default_rng(2)
+    x, noise = rng.standard_normal((40, 2)), np.array([2.0, 0.7, 0.2])
+    used = rng.random(40) < 0.7
+    covariance = toeplitz(np.append(noise, np.zeros(37)))[np.ix_(used, used)]
+    expected = x[used].T @ np.linalg.solve(covariance, x[used])
+    assert_allclose(bench_calibration.information(x, noise, used), expected, rtol=1e-12)
+
+
+def test_no_filter_delays_nothing_and_two_delay_by_their_cutoffs():
+    assert bench_calibration.sensor_lag(ForceSensorParameters(filter=0)) == 0.0
+    # A Butterworth filter of second order delays by sqrt(2) / (2 pi f).
+    expected = np.sqrt(2.0) / (2.0 * pi) * (1.0 / 500.0 + 1.0 / 125.0)
+    # Discrete filters differ by the square of cutoff over rate.
+    assert bench_calibration.sensor_lag(ForceSensorParameters()) == pytest.approx(expected, 0.02)
+
+
+def test_the_bound_of_friction_is_the_textbook_one_for_white_noise():
+    needle = NeedleParameters.preset('phantom')
+    sensor = ForceSensorParameters(filter=0, force_resolution=0.0)
+    motion = bench_calibration.insertion(needle)
+    settings = FrictionSettings()
+    truth = bench_calibration.friction_truth(needle, sensor, motion, settings)
+    moving = motion.speed[np.abs(motion.speed) > settings.moving_speed]
+    x = np.column_stack([np.sign(moving), moving])
+    expected = 0.05**2 * np.diag(np.linalg.inv(x.T @ x))
+    names = 'coulomb_friction', 'viscous_friction'
+    assert_allclose([truth[name][1] for name in names], expected, rtol=1e-9)
+
+
+def test_the_bound_of_a_matrix_turns_with_it():
+    tissue, sensor = IndenterParameters(), ForceSensorParameters()
+    one = bench_calibration.stiffness_truth(
+        np.array([[900.0, 20.0], [-40.0, 600.0]]), 1.3, sensor, tissue
+    )
+    other = bench_calibration.stiffness_truth(
+        np.array([[600.0, 40.0], [-20.0, 900.0]]), 1.3, sensor, tissue
+    )
+    # Turned by a quarter, x is what z was; the forces are the same set.
+    for name, turned in (('k_xx', 'k_zz'), ('k_xz', 'k_zx')):
+        assert one[name][1] == pytest.approx(other[turned][1], rel=1e-9)
+    for name in ('curl', 'spring', 'principal_stiffness_1', 'principal_angle'):
+        # Differences of 1e-3 in 1e3 give gradients to 1e-9 or so.
+        assert one[name][1] == pytest.approx(other[name][1], rel=1e-5)
+
+
+def test_the_same_seed_gives_the_same_study(friction):
+    again = np.array([one[3:] for one in bench_calibration.friction(1, 0)])
+    assert np.array_equal(again, np.array([one[3:] for one in friction[0]]), equal_nan=True)
+    assert friction[0][0].truth != friction[1][0].truth
+
+
+def test_every_case_reports_what_it_is_about(friction):
+    by_case = {}
+    for one in friction[0]:
+        by_case.setdefault(one.case, set()).add(one.name)
+    assert list(by_case) == list(bench_calibration.FRICTION_CASES)
+    assert by_case['(15)'] == {
+        'coulomb_friction',
+        'viscous_friction',
+        'breakaway_force',
+        'lag',
+    }
+    assert 'offset' in by_case['+ offset']
+    assert 'withdrawal_friction' in by_case['+ direction']
+    assert {'breakaway_friction', 'stribeck_friction'} <= by_case['+ break-away']
+    assert 'moving_mass' in by_case['+ inertia, stamps off']
+    # A lag is not told from positions, nor beside a mass.
+    assert all(
+        ('lag' in names) == ('positions' not in case and 'inertia' not in case)
+        for case, names in by_case.items()
+    )
+    # Cases beside the default one are in every second recording.
+    assert {one.case for one in friction[1]} == {'(15)'}
+
+
+def test_estimates_are_near_the_truth(friction, stiffness):
+    for one in (*friction[0], *friction[1], *stiffness):
+        # Of a few hundred none is off by four times what 95 % of them are.
+        if one.name != 'principal_angle' and np.isfinite(one.value):
+            assert abs(one.value - one.truth) < 2.0 * (one.high - one.low), one
+
+
+def test_stiffness_is_reported_by_estimator_and_level(stiffness):
+    cases = {one.case for one in stiffness}
+    assert cases == {'K, ordinary', 'K, weighted', 'K, huber', 'K, total'}
+    assert sum(one.name == 'k_zz' for one in stiffness) == 4 * 5
+
+
+def test_a_row_counts_what_holds_the_truth_and_what_was_not_determined():
+    [row] = bench_calibration.summarized(
+        [
+            found(1.5, 0.5, 2.5),
+            found(2.5, 1.5, 3.5),
+            found(0.5, 0.0, 1.0),
+            found(nan, -np.inf, np.inf),
+        ]
+    )
+    assert (row.count, row.undetermined) == (4, 1)
+    assert row.coverage == pytest.approx(2.0 / 3.0)
+    assert row.bias == pytest.approx(0.5)
+    assert row.efficiency == pytest.approx((0.25 + 2.25 + 0.25) / 3.0)
+    assert not row.holds
+    [row] = bench_calibration.summarized([found(1.0, 0.0, 2.0, bound=nan)])
+    assert row.efficiency is None
+    # Nothing misses the truth: intervals are too wide.
+    assert not row.holds
+
+
+def test_directions_half_a_turn_apart_are_the_same():
+    [row] = bench_calibration.summarized(
+        [found(-1.5, -1.6, -1.4, truth=1.6, bound=0.01, unit='rad')]
+    )
+    # -1.5 + pi = 1.64.
+    assert row.coverage == 1.0
+    assert row.bias == pytest.approx(pi - 3.1)
+
+
+def test_processes_give_what_one_gives(friction):
+    pairs = list(bench_calibration.studied(bench_calibration.friction, 2, 1, 1))
+    assert pairs[1][0] == friction[1][0]
+    # Any function of seed and number will do, if other processes can import it.
+    assert list(bench_calibration.studied(max, 8, 5, 2)) == [5, 5, 5, 5, 5, 5, 6, 7]
+
+
+def test_the_command_prints_a_table_or_json(monkeypatch, capsys):
+    monkeypatch.setattr(bench_calibration.os, 'cpu_count', lambda: 1)
+    studies = {'friction': lambda seed, number: [found(1.5, 0.5, 2.5 + seed + number)]}
+    monkeypatch.setattr(bench_calibration, '_STUDIES', studies)
+    assert main(['bench', 'calibration', '--recordings', '3']) == 0
+    printed = capsys.readouterr().out
+    assert '100.0%' in printed
+    assert '3 recordings of each kind' in printed
+    assert main(['bench', 'calibration', '--recordings', '3', '--json']) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document['recordings'] == 3
+    [row] = document['rows']
+    assert row['coverage'] == 1.0
+    assert row['holds'] is False
+
+
+@pytest.mark.parametrize('words', [['--recordings', '1'], ['--seed', '-1']])
+def test_numbers_out_of_range_end_with_2(words, capsys):
+    assert main(['bench', 'calibration', *words]) == 2
+    assert 'must be' in capsys.readouterr().err

@@ -1,0 +1,73 @@
+"""Draws represent the tables they are drawn from."""
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from needle_insertion.draw import (
+    draw_friction,
+    draw_stiffness,
+    FORCE_LEVELS,
+    TABLE_1,
+    TABLE_2,
+)
+import numpy as np
+import pytest
+
+SEEDS = st.integers(0, 2**32)
+
+
+@pytest.mark.parametrize('seed', [0, 1, 2014])
+def test_twenty_draws_have_the_mean_and_std_of_the_tables(seed):
+    """
+    The midpoints of 20 strata stand for the whole distribution.
+
+    They leave out the outer half of the outermost strata: of a normal distribution that is
+    0.6 % of the STD, of the most skewed entry (k_xx at 1.2 N, an STD of two thirds of its mean)
+    2.7 %, and 1.3 % of an STD from the mean, whatever the seed. 3 % and 1.5 % bound them.
+    """
+    friction, stiffness = draw_friction(20, seed), draw_stiffness(20, seed)
+    drawn = {name: np.array([d[name] for d in friction])[:, None] for name in TABLE_1}
+    drawn |= {entry: np.array([d[entry] for d in stiffness]) for entry in TABLE_2}
+    for name, (means, deviations) in (TABLE_1 | TABLE_2).items():
+        found = drawn[name]
+        assert np.all(abs(found.mean(0) - means) <= 0.015 * np.array(deviations))
+        assert np.all(abs(found.std(0, ddof=1) / deviations - 1.0) <= 0.03)
+
+
+@settings(max_examples=30, deadline=None)
+@given(repeats=st.integers(1, 60), seed=SEEDS)
+def test_every_draw_is_a_tissue_that_can_be(repeats, seed):
+    """Friction is positive, and pressing the tissue costs energy at every level, anywhere."""
+    assert all(value > 0.0 for drawn in draw_friction(repeats, seed) for value in drawn.values())
+    places = draw_stiffness(repeats, seed)
+    assert len(places) == repeats
+    for place in places:
+        for k_xx, k_xz, k_zx, k_zz in zip(*place.values(), strict=True):
+            matrix = np.array([[k_xx, k_xz], [k_zx, k_zz]])
+            assert np.linalg.eigvalsh((matrix + matrix.T) / 2.0).min() > 0.0
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=SEEDS)
+def test_a_place_has_one_quantile_per_entry(seed):
+    """The order of the places by an entry is the same at every force level."""
+    places = draw_stiffness(20, seed)
+    for entry in TABLE_2:
+        values = np.array([place[entry] for place in places])
+        assert values.shape == (20, len(FORCE_LEVELS))
+        orders = np.argsort(values, axis=0)
+        assert (orders == orders[:, :1]).all()
+
+
+def test_a_seed_gives_one_draw():
+    """The same seed gives the same draw, another seed another."""
+    for draw in (draw_friction, draw_stiffness):
+        assert draw(20, 7) == draw(20, 7)
+        assert draw(20, 7) != draw(20, 8)
+
+
+def test_a_single_repeat_is_typical():
+    """One repeat takes the medians, which the tables' means are close to."""
+    (friction,) = draw_friction(1, 3)
+    # A gamma distribution's median is below its mean by a third of variance over mean.
+    for name, (mean, deviation) in TABLE_1.items():
+        assert abs(friction[name] - mean) < 0.4 * deviation**2 / mean

@@ -1,0 +1,327 @@
+"""The experiments: what they command, what they record, and how they go on after a break."""
+
+from contextlib import suppress
+from hashlib import sha256
+from pathlib import Path
+import signal
+import subprocess
+import sys
+import time
+
+from needle_dynamics import ParameterError
+from needle_dynamics.indenter import IndenterParameters
+from needle_dynamics.plant import BaseParameters
+from needle_identification import (
+    BagWriter,
+    encode,
+    identify_friction,
+    identify_stiffness,
+    message_type,
+    read_friction_recording,
+    read_indentation_recording,
+    read_topic,
+)
+from needle_insertion import experiment
+from needle_insertion.cli import main
+from needle_insertion.draw import draw_friction, draw_stiffness, FORCE_LEVELS, TABLE_1, TABLE_2
+from needle_insertion.experiment import ExperimentError, record, rig
+from needle_insertion.protocol import (
+    Campaign,
+    DIRECTIONS,
+    PROTOCOLS,
+    PUSH,
+    SHIPPED_BAGS,
+    SPEEDS,
+    START_DEPTH,
+)
+import numpy as np
+import pytest
+
+FRICTION, STIFFNESS = PROTOCOLS['friction'], PROTOCOLS['stiffness']
+
+#: As the shipped bags are recorded: enough to identify from, quickly.
+RATE, SPEED = 100.0, 20.0
+
+
+# What is commanded.
+
+
+@pytest.mark.parametrize('protocol', PROTOCOLS.values(), ids=PROTOCOLS)
+def test_times_increase(protocol):
+    """No point is before or at the one before it."""
+    assert (np.diff([0.0, *(point.time for point in protocol.points)]) > 0.0).all()
+
+
+def test_strokes_go_both_ways_at_each_speed_and_the_base_can_follow():
+    """The speed of each stroke is held for most of its time, in and out, and ends at the start."""
+    moved = [point for point in FRICTION.points if point.positions]
+    times = np.array([point.time for point in moved])
+    depths = np.array([point.positions[0] for point in moved])
+    speeds, spans = np.diff(depths) / np.diff(times), np.diff(times)
+    for speed in SPEEDS:
+        for direction in (1.0, -1.0):
+            # 1e-9: rounding of metres over hundredths of seconds.
+            held = spans[np.isclose(speeds, direction * speed, rtol=0.0, atol=1e-9)]
+            assert held.sum() > 0.5
+    assert depths[-1] == pytest.approx(START_DEPTH, abs=1e-12)
+    # Between the middles of two lines the speed changes by their difference.
+    accelerations = np.diff(speeds) / ((spans[1:] + spans[:-1]) / 2.0)
+    base = BaseParameters()
+    assert np.abs(accelerations).max() < base.acceleration_limit
+    assert np.abs(speeds).max() < base.speed_limit
+
+
+def test_the_push_moves_any_needle_that_is_drawn():
+    """Its force rises from zero to a third more than the largest mu_s of a thousand draws."""
+    first, last = (point.effort for point in FRICTION.points if point.effort)
+    assert first == (0.0,)
+    assert last == (PUSH,)
+    assert max(drawn['coulomb_friction'] for drawn in draw_friction(1000, 1)) < 0.75 * PUSH
+
+
+def test_each_level_is_pressed_in_eight_directions_from_rest():
+    """Forces held have the five magnitudes, evenly around; before and after is no force."""
+    forces = np.array([point.effort for point in STIFFNESS.points])
+    held = np.flatnonzero((forces[1:] == forces[:-1]).all(axis=1) & forces[1:].any(axis=1))
+    assert len(held) == DIRECTIONS * len(FORCE_LEVELS)
+    assert not forces[held - 1].any()
+    assert not forces[held + 2].any()
+    # 1e-12: rounding of cos and sin.
+    sizes = np.linalg.norm(forces[held], axis=1)
+    assert sizes == pytest.approx(np.repeat(FORCE_LEVELS, DIRECTIONS), abs=1e-12)
+    angles = np.arctan2(*forces[held].T[::-1]).reshape(-1, DIRECTIONS)
+    assert np.diff(np.unwrap(angles)) == pytest.approx(2.0 * np.pi / DIRECTIONS, abs=1e-12)
+
+
+def test_a_campaign_draws_around_the_tables_or_takes_their_means():
+    """Runs have the drawn values and a seed each; ``fixed`` gives every run the means."""
+    runs = Campaign(protocol=FRICTION, repeats=3, seed=5).runs()
+    assert list(runs) == ['friction_01', 'friction_02', 'friction_03']
+    assert [run['seed'] for run in runs.values()] == [5, 6, 7]
+    assert [run['model.coulomb_friction'] for run in runs.values()] == [
+        drawn['coulomb_friction'] for drawn in draw_friction(3, 5)
+    ]
+    runs = Campaign(protocol=STIFFNESS, repeats=2, seed=5).runs()
+    assert [run['indenter.stiffness_zz'] for run in runs.values()] == [
+        list(drawn['k_zz']) for drawn in draw_stiffness(2, 5)
+    ]
+    (fixed,) = Campaign(protocol=FRICTION, repeats=1, fixed=True).runs().values()
+    assert fixed['model.viscous_friction'] == TABLE_1['viscous_friction'][0]
+    (fixed,) = Campaign(protocol=STIFFNESS, repeats=1, fixed=True).runs().values()
+    assert fixed['indenter.stiffness_xz'] == list(TABLE_2['k_xz'][0])
+
+
+@pytest.mark.parametrize('seed', [0, 2014])
+def test_the_indenter_takes_every_place_that_is_drawn(seed):
+    """No draw is refused by the stand-in."""
+    for run in Campaign(protocol=STIFFNESS, repeats=40, seed=seed).runs().values():
+        IndenterParameters(
+            **{
+                name.removeprefix('indenter.'): tuple(value)
+                for name, value in run.items()
+                if isinstance(value, list)
+            }
+        )
+
+
+@pytest.mark.parametrize('rate', [40.0, 100.0, 333.0, 5000.0])
+def test_the_sensor_suits_any_rate(rate):
+    """The sensor's own rate is a whole multiple of that of the samples."""
+    (run,) = Campaign(protocol=FRICTION, repeats=1, rate=rate).runs().values()
+    assert run['sensor.rate'] % rate == 0.0
+    assert rate <= run['sensor.rate'] <= 8000.0
+
+
+# What is refused.
+
+
+@pytest.mark.parametrize(
+    ('words', 'complaint'),
+    [
+        (['--repeats', '0'], '--repeats must be in [1, 1000], got 0'),
+        (['--seed', '-3'], '--seed must be >= 0'),
+        (['--rate', 'nan'], '--rate must be in'),
+        (['--rate', '-5'], '--rate must be in'),
+        (['--speed', '0'], '--speed must be in'),
+        (['--speed', 'nan'], '--speed must be in'),
+    ],
+)
+def test_bad_numbers_are_refused_before_anything_is_written(tmp_path, capsys, words, complaint):
+    """They are named, with exit status 2, and leave no folder behind."""
+    assert main(['experiment', 'friction', str(tmp_path / 'out'), *words]) == 2
+    assert complaint in capsys.readouterr().err
+    assert not (tmp_path / 'out').exists()
+
+
+def pretended(folder: Path, configuration: str = '', **changes: object) -> None:
+    """Write a bag that says it is the only run of the friction experiment, but for changes."""
+    (parameters,) = Campaign(protocol=FRICTION, repeats=1).runs().values()
+    text = message_type('std_msgs/msg/String')
+    kinds = {
+        '/plant/configuration': 'std_msgs/msg/String',
+        '/joint_trajectory': 'trajectory_msgs/msg/JointTrajectory',
+    }
+    trajectory = message_type(kinds['/joint_trajectory'])
+    header, stamp = (
+        message_type('std_msgs/msg/Header'),
+        message_type('builtin_interfaces/msg/Time'),
+    )
+    values = {**parameters, **changes}
+    empty = trajectory(
+        header=header(stamp=stamp(sec=0, nanosec=0), frame_id=''), joint_names=[], points=[]
+    )
+    with BagWriter(folder) as bag:
+        for topic, kind in kinds.items():
+            bag.add_topic(topic, kind)
+        said = configuration or str({'/plant': {'ros__parameters': values}})
+        bag.write('/plant/configuration', encode(text(data=said)), 1)
+        bag.write('/joint_trajectory', encode(empty), 2)
+
+
+def test_what_is_no_run_of_this_experiment_is_left_alone(tmp_path):
+    """A file, a folder, other parameters, another trajectory: named, and nothing is recorded."""
+    campaign = Campaign(protocol=FRICTION, repeats=1)
+    place = tmp_path / 'friction_01'
+    place.write_text('notes')
+    with pytest.raises(ParameterError, match='exists and is no run of this experiment'):
+        record(campaign, tmp_path)
+    place.unlink()
+    place.mkdir()
+    with pytest.raises(ParameterError, match='exists and is no run of this experiment'):
+        record(campaign, tmp_path)
+    place.rmdir()
+    pretended(place, seed=7)
+    with pytest.raises(ParameterError, match='recorded with seed = 7, asked for is 2014'):
+        record(campaign, tmp_path)
+    pretended(tmp_path / 'none' / 'friction_01', configuration='none')
+    with pytest.raises(ParameterError, match='exists and is no run of this experiment'):
+        record(campaign, tmp_path / 'none')
+    pretended(tmp_path / 'other' / 'friction_01')
+    with pytest.raises(ParameterError, match='recorded with another trajectory'):
+        record(campaign, tmp_path / 'other')
+    assert sorted(path.name for path in tmp_path.iterdir()) == ['friction_01', 'none', 'other']
+
+
+# What is recorded.
+
+
+@pytest.mark.parametrize(('protocol', 'rate'), [(FRICTION, 100.0), (STIFFNESS, 40.0)])
+def test_the_shipped_bags_are_those_of_the_command_that_makes_them(protocol, rate, monkeypatch):
+    """Parameters and trajectory are as today: the command would record nothing."""
+    monkeypatch.delattr(experiment, 'rig')
+    bags = record(Campaign(protocol=protocol, rate=rate), SHIPPED_BAGS)
+    assert bags == sorted(SHIPPED_BAGS.glob(f'{protocol.name}_*'))
+
+
+def digests(folder: Path) -> dict[str, str]:
+    """Return the checksums of the files of a folder."""
+    return {path.name: sha256(path.read_bytes()).hexdigest() for path in folder.iterdir()}
+
+
+def test_an_interrupted_experiment_goes_on_where_it_was(tmp_path):
+    """Ctrl-C leaves whole bags only; the same call keeps them and records the others."""
+    words = ['experiment', 'friction', str(tmp_path), '--repeats', '3']
+    words += ['--rate', f'{RATE:g}', '--speed', f'{SPEED:g}']
+    foreign = tmp_path / 'notes.txt'
+    foreign.write_text('keep me')
+    # What a call that was killed leaves.
+    (tmp_path / '.friction.unfinished' / 'run').mkdir(parents=True)
+    first, last = tmp_path / 'friction_01', tmp_path / 'friction_03'
+    command = [sys.executable, '-m', 'needle_insertion.cli', *words]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+        deadline = time.monotonic() + 60.0
+        while not first.exists():
+            with suppress(subprocess.TimeoutExpired):
+                pytest.fail(f'ended early with status {process.wait(0.02)}')
+            assert time.monotonic() < deadline
+        process.send_signal(signal.SIGINT)
+        _, said = process.communicate(timeout=30.0)
+    assert process.returncode == 130
+    assert said.splitlines()[-1] == 'interrupted'
+    assert not last.exists()
+    assert not list(tmp_path.glob('.*'))
+    kept = digests(first)
+
+    assert main(words) == 0
+    assert digests(first) == kept
+    assert foreign.read_text() == 'keep me'
+    names = [f'friction_0{k}' for k in (1, 2, 3)]
+    assert sorted(path.name for path in tmp_path.iterdir()) == [*names, 'notes.txt']
+    assert set(digests(last)) == {'friction_03_0.mcap', 'metadata.yaml'}
+    for name, drawn in zip(names, draw_friction(3, 2014), strict=True):
+        recording = read_friction_recording(tmp_path / name)
+        assert recording.losses == ()
+        assert recording.truth['model.coulomb_friction'] == drawn['coulomb_friction']
+        estimate = identify_friction(recording)
+        # 1 %: some ten standard errors; what matters here is that each has its own friction.
+        for coefficient, value in drawn.items():
+            assert estimate[coefficient].value == pytest.approx(value, rel=0.01)
+
+    # All is there: nothing is started.
+    assert main(words) == 0
+
+
+def test_stiffness_is_recorded_press_by_press(tmp_path):
+    """The bag of a place gives the matrix that was drawn, at each level."""
+    campaign = Campaign(protocol=STIFFNESS, repeats=1, rate=RATE)
+    (bag,) = record(campaign, tmp_path, 2.0 * SPEED)
+    (drawn,) = draw_stiffness(1, campaign.seed)
+    estimate = identify_stiffness(read_indentation_recording(bag))
+    assert [level.force for level in estimate.levels] == pytest.approx(FORCE_LEVELS, abs=0.01)
+    for k, level in enumerate(estimate.levels):
+        for entry, values in drawn.items():
+            # 15 N/m: some ten standard errors.
+            assert level[entry].value == pytest.approx(values[k], abs=15.0)
+
+
+def test_a_run_with_losses_is_done_again_at_half_the_speed_and_then_given_up(
+    tmp_path, monkeypatch, capfd
+):
+    """What lacks samples never becomes a bag; the second attempt may."""
+    (parameters,) = Campaign(protocol=FRICTION, repeats=1, rate=RATE).runs().values()
+    judged, answers = [], iter(['few messages', 'fewer', 'few messages', None])
+    whole = experiment._lost
+
+    def lossy(bag: Path, *rest: object) -> str:
+        judged.append(bag)
+        return next(answers) or whole(bag, *rest)
+
+    monkeypatch.setattr(experiment, '_lost', lossy)
+    with rig(tmp_path, FRICTION) as stand:
+        with pytest.raises(ExperimentError, match='fewer at 25 times real time; ask for a lower'):
+            stand.record(tmp_path / 'a', parameters, 50.0)
+        assert not (tmp_path / 'a').exists()
+        stand.record(tmp_path / 'b', parameters, 50.0)
+    assert len(set(judged)) == 4
+    ((_, configuration),) = read_topic(tmp_path / 'b', '/plant/configuration')
+    assert 'real_time_factor: 25.0' in configuration.data
+    assert capfd.readouterr().err.count('few messages at 50 times real time') == 2
+
+
+@pytest.mark.parametrize(
+    ('kept', 'complaint'),
+    [
+        (lambda k: k >= 0, ''),
+        (lambda k: k % 100 != 50, 'has 1095 messages of 1106'),
+        (lambda k: k < 900, 'lasts 8.99 s of 11.05 s'),
+        (lambda k: k < 0, '/base_wrench has no messages'),
+    ],
+    ids=['whole', 'gaps', 'cut', 'none'],
+)
+def test_losses_are_seen(tmp_path, kept, complaint):
+    """A bag is whole if the stamps of the sampled topics leave no gaps and reach to the end."""
+    header, stamp = (
+        message_type('std_msgs/msg/Header'),
+        message_type('builtin_interfaces/msg/Time'),
+    )
+    kind = 'geometry_msgs/msg/PointStamped'
+    pointed, point = message_type(kind), message_type('geometry_msgs/msg/Point')
+    with BagWriter(tmp_path / 'bag') as bag:
+        for topic in FRICTION.topics:
+            bag.add_topic(topic, kind)
+            for k in filter(kept, range(1106)) if topic == '/base_wrench' else range(1106):
+                at = header(stamp=stamp(sec=k // 100, nanosec=k % 100 * 10**7), frame_id='')
+                message = pointed(header=at, point=point(x=0.0, y=0.0, z=0.0))
+                bag.write(topic, encode(message), k)
+    assert complaint in experiment._lost(tmp_path / 'bag', FRICTION, 100.0)
+    assert bool(complaint) == bool(experiment._lost(tmp_path / 'bag', FRICTION, 100.0))

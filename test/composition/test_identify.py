@@ -1,0 +1,265 @@
+"""`needle identify`: what it prints, warns of, writes, and how it ends."""
+
+import json
+from pathlib import Path
+import re
+import shutil
+
+from composition.pages import look_at
+from composition.presses import STIFFNESS, write_presses
+from needle_identification import TERMS
+from needle_insertion.cli import main
+from needle_insertion.protocol import SHIPPED_BAGS
+import pytest
+import yaml
+
+BAGS = [str(path) for path in sorted(SHIPPED_BAGS.glob('friction_*'))][:4]
+
+
+@pytest.fixture(scope='module')
+def places(tmp_path_factory):
+    """Return recordings of presses at two places."""
+    folder = tmp_path_factory.mktemp('places')
+    for seed in (1, 2):
+        write_presses(folder / f'place_{seed}', seed)
+    return [str(folder / f'place_{seed}') for seed in (1, 2)]
+
+
+def identify(capsys, *words, status=0):
+    """Run the command; return what it printed and what it warned of."""
+    assert main(['identify', *words]) == status
+    said = capsys.readouterr()
+    return said.out, said.err
+
+
+def as_json(capsys, *words, status=0):
+    """Run the command for machines; nothing in its answer is other than standard JSON."""
+
+    def refuse(word):
+        raise AssertionError(f'{word} is no JSON')
+
+    out, _ = identify(capsys, *words, '--json', status=status)
+    return json.loads(out, parse_constant=refuse)
+
+
+# Friction.
+
+
+def test_the_tables_hold_every_parameter_with_error_and_interval(capsys):
+    """Over the bags with 95 % interval and STD, and bag by bag; break-away stands beside mu_s."""
+    out, _ = identify(capsys, 'friction', *BAGS)
+    whole, each = out.split('\n\n')
+    heads = whole.splitlines()[0]
+    assert re.split(r' {2,}', heads) == [
+        'parameter', 'mean ± SE', '95 % interval', 'STD over bags', 'bags',
+    ]  # fmt: skip
+    for symbol in ('mu_s', 'mu_v'):
+        (line,) = [line for line in whole.splitlines() if f' {symbol} [' in line]
+        cells = re.split(r' {2,}', line)
+        mean, error = map(float, cells[1].split(' ± '))
+        low, high = map(float, cells[2].split(' to '))
+        assert low < mean < high
+        assert 0.0 < error < high - low
+        assert cells[4] == str(len(BAGS))
+    assert all(bag in each for bag in BAGS)
+
+
+def test_json_names_everything_and_has_no_nan(capsys):
+    """Statistics and parameters by name, with settings, files and checksums."""
+    found = as_json(capsys, 'friction', *BAGS, '--terms', 'coulomb,viscous,offset')
+    assert {'coulomb_friction', 'viscous_friction', 'offset'} <= set(found['statistics'])
+    assert set(found['statistics']['coulomb_friction']) == {
+        'name', 'symbol', 'unit', 'mean', 'deviation', 'error', 'interval', 'count',
+    }  # fmt: skip
+    assert [one['name'] for one in found['estimates']] == BAGS
+    assert found['estimates'][0]['parameters']['offset']['unit'] == 'N'
+    assert 'fit' not in found['estimates'][0]
+    assert found['settings']['terms'] == ['coulomb', 'viscous', 'offset']
+    assert found['reading']['force_axis'] == 'y'
+    (path, digest), *_ = found['recordings'][0]['files']
+    assert path.startswith(BAGS[0])
+    assert re.fullmatch('[0-9a-f]{64}', digest)
+    assert found['failures'] == []
+
+
+def test_terms_are_a_list_or_repeated(capsys):
+    """Both ways of writing them mean the same."""
+    one = as_json(capsys, 'friction', BAGS[0], '--terms', 'coulomb,viscous,offset')
+    two = as_json(capsys, 'friction', BAGS[0], '--terms', 'coulomb', '--terms', 'viscous, offset')
+    assert one == two
+
+
+@pytest.mark.parametrize(
+    ('words', 'complaint'),
+    [
+        (['--terms', 'coulomb,drag'], f'terms must be of {", ".join(TERMS)}'),
+        (['--cutoff', '-1'], 'cutoff must be'),
+        (['--force-axis', 'w'], "'w'"),
+        (['--wrench-topic', '/force'], '/base_wrench'),
+        (['--motion-axis', '-slide'], 'slide'),
+    ],
+)
+def test_what_is_not_valid_is_named_in_one_line(capsys, words, complaint):
+    """Exit status 2; the line says what was found and what would be valid."""
+    out, err = identify(capsys, 'friction', BAGS[0], *words, status=2)
+    assert out == ''
+    assert err.count('\n') == 1
+    assert complaint in err
+
+
+@pytest.mark.parametrize(
+    'words',
+    [
+        ['--force-axis', '-y', '--motion-axis', '-insertion'],
+        ['--force-axis=-y', '--motion-axis=-insertion'],
+    ],
+)
+def test_signed_axes_are_taken_as_they_are_written(capsys, words):
+    """Force and motion both turned around leave friction what it is."""
+    turned = as_json(capsys, 'friction', BAGS[0], *words)['statistics']
+    straight = as_json(capsys, 'friction', BAGS[0])['statistics']
+    for name in ('coulomb_friction', 'viscous_friction'):
+        # The search for the lag stops at 1 % of its error, on one side of it or the other.
+        tolerance = 0.1 * straight[name]['error']
+        assert turned[name]['mean'] == pytest.approx(straight[name]['mean'], abs=tolerance)
+
+
+def test_a_force_turned_around_is_refused(capsys):
+    """Friction that drives is none."""
+    _, err = identify(capsys, 'friction', BAGS[0], '--force-axis', '-y', status=2)
+    assert 'must not be negative' in err
+
+
+def test_a_bad_bag_among_good_ones_is_named_and_the_others_go_on(capsys, tmp_path):
+    """The result is that of the others; exit status 2 tells a script that it is not of all."""
+    bad, file = str(tmp_path / 'bad.mcap'), tmp_path / 'result.yaml'
+    Path(bad).write_bytes(b'not a bag')
+    found = as_json(capsys, 'friction', BAGS[0], bad, BAGS[1], '-o', str(file), status=2)
+    assert [one['name'] for one in found['estimates']] == BAGS[:2]
+    assert [one['name'] for one in found['failures']] == [bad]
+    assert f'# from {BAGS[1]}' in file.read_text()
+    assert bad not in file.read_text()
+    out, err = identify(capsys, 'friction', BAGS[0], bad, status=2)
+    assert BAGS[0] in out
+    assert [bad in line for line in err.splitlines() if line.startswith('error: ')] == [True]
+
+
+def test_nothing_is_written_if_no_bag_can_be_used(capsys, tmp_path):
+    """Neither file nor folder, and nothing is printed but the reasons."""
+    bad = [str(tmp_path / name) for name in ('one', 'two')]
+    file, page = tmp_path / 'result.yaml', tmp_path / 'report'
+    out, err = identify(capsys, 'friction', *bad, '-o', str(file), '--report', str(page), status=2)
+    assert out == ''
+    assert err.count('does not exist') == 2
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_the_data_do_not_determine_is_said(capsys, tmp_path):
+    """A single term too many for one speed is no tight number, and not in the file."""
+    file = tmp_path / 'result.yaml'
+    words = ('friction', BAGS[0], '-o', str(file), '--terms', 'coulomb,viscous,stribeck')
+    out, _ = identify(capsys, *words, '--stribeck-speed', '10')
+    assert 'not determined by the data' in out
+    found = as_json(capsys, *words, '--stribeck-speed', '10')
+    unknown = [one for one in found['statistics'].values() if one['mean'] is None]
+    assert unknown
+    assert all(one['interval'] == [None, None] and one['error'] is None for one in unknown)
+
+
+def test_the_friction_page_shows_what_was_found(capsys, tmp_path):
+    """A person sees figures, pictures and what was read; the page loads nothing from outside."""
+    file, folder = tmp_path / 'result.yaml', tmp_path / 'new' / 'report'
+    bags = [*BAGS, str(tmp_path / 'missing')]
+    out, _ = identify(
+        capsys, 'friction', *bags, '-o', str(file), '--report', str(folder), status=2
+    )
+    assert out.endswith(f'wrote {file}\nwrote {folder / "friction.html"}\n')
+    seen = look_at(folder / 'friction.html')
+    found = as_json(capsys, 'friction', *BAGS)
+    for name in ('coulomb_friction', 'viscous_friction'):
+        one = found['statistics'][name]
+        assert re.search(rf'\b{one["mean"]:.3f}'[:-1], seen.text)
+    for words in (
+        'Coulomb friction', 'Table 1', '0.56 ± 0.0374', 'could not be used', 'missing', 'lost',
+        'SHA-256', found['recordings'][0]['files'][0][1], str(file), 'ros2 param set', *BAGS,
+    ):  # fmt: skip
+        assert words in seen.text
+    assert len(seen.images) == 3
+    assert all(alt and width > 500 for alt, width in seen.images)
+    assert seen.requests == []
+    assert seen.overflow == 0
+    pictures = {path.stem for path in folder.glob('*.png')}
+    assert pictures == {'friction_data', 'friction_residuals', 'friction_spread'}
+
+
+def test_the_same_recordings_give_the_same_page(capsys, tmp_path):
+    """Byte by byte: pages can be compared, and kept under version control."""
+    pages = []
+    for _ in range(2):
+        identify(capsys, 'friction', BAGS[0], '--report', str(tmp_path / 'report'))
+        pages.append((tmp_path / 'report' / 'friction.html').read_bytes())
+        shutil.rmtree(tmp_path / 'report')
+    assert pages[0] == pages[1]
+
+
+def test_a_folder_that_cannot_be_made_ends_in_one_line(capsys):
+    """The reason of the operating system, exit status 2."""
+    _, err = identify(capsys, 'friction', BAGS[0], '--report', '/dev/null/report', status=2)
+    assert '/dev/null/report cannot be written' in err.splitlines()[-1]
+
+
+# Stiffness.
+
+
+def test_stiffness_is_told_by_force_as_table_2(capsys, places):
+    """Each entry of the matrix at each force, and k_a at the largest."""
+    out, _ = identify(capsys, 'stiffness', *places)
+    matrices, intervals, result = out.strip().split('\n\n')
+    assert re.split(r' {2,}', matrices.splitlines()[0])[1:] == ['1.10 N', '1.50 N']
+    assert len(intervals.splitlines()) == 4
+    for i, entry in enumerate(('k_xx', 'k_xz', 'k_zx', 'k_zz')):
+        (line,) = [line for line in matrices.splitlines() if line.startswith(f'{entry} ')]
+        told = [float(cell.split(' ±')[0]) for cell in re.split(r' {2,}', line)[1:]]
+        truth = [stiffness.flat[i] for stiffness in STIFFNESS.values()]
+        # Noise of 1 um and 2 mN over 30 samples and 8 presses: some N/m at most.
+        assert told == pytest.approx(truth, abs=5.0)
+    assert result.startswith('k_a = 5')
+
+
+def test_the_level_of_the_result_can_be_chosen(capsys, places, tmp_path):
+    """The parameter file holds k_a at that force, over the contact length."""
+    file = tmp_path / 'result.yaml'
+    words = ('--level', '1.1', '--contact-length', '2', '-o', str(file))
+    found = as_json(capsys, 'stiffness', *places, *words)
+    values = yaml.safe_load(file.read_text())['/**/plant']['ros__parameters']
+    assert values['model.tissue_stiffness'] == pytest.approx(505.0, abs=5.0)
+    assert found['tissue_stiffness']['mean'] == pytest.approx(505.0, abs=5.0)
+    assert [level['force'] for level in found['levels']] == pytest.approx([1.1, 1.5], abs=0.01)
+    spring = found['estimates'][0]['levels'][0]['spring']
+    assert found['estimates'][0]['levels'][0]['presses'] == 8
+    assert spring['value'] == pytest.approx(20.0 / 1625.0, abs=5e-3)
+    _, err = identify(capsys, 'stiffness', *places, '--level', '3', status=2)
+    assert 'no level at 3 N' in err
+
+
+def test_the_plane_of_the_presses_can_be_named(capsys, places):
+    """Axes in the other order and with a sign turn the matrix accordingly."""
+    found = as_json(capsys, 'stiffness', *places, '--axes', '-z,x')['levels'][0]['statistics']
+    k = STIFFNESS[1.1]
+    assert found['k_xx']['mean'] == pytest.approx(k[1, 1], abs=5.0)
+    assert found['k_xz']['mean'] == pytest.approx(-k[1, 0], abs=5.0)
+    _, err = identify(capsys, 'stiffness', *places, '--axes', 'x', status=2)
+    assert '--axes must name two axes' in err
+
+
+def test_the_stiffness_page_shows_what_was_found(capsys, places, tmp_path):
+    """A person sees the matrices beside Table 2, whether it is a spring, and the pictures."""
+    folder = tmp_path / 'report'
+    identify(capsys, 'stiffness', *places, '--report', str(folder))
+    seen = look_at(folder / 'stiffness.html')
+    for words in ('ka', 'Table 2', '1260 (80)', 'Is it a spring?', 'principal', *places):
+        assert words in seen.text
+    assert len(seen.images) == 3
+    assert all(alt and width > 500 for alt, width in seen.images)
+    assert seen.requests == []
+    assert seen.overflow == 0

@@ -1,0 +1,131 @@
+"""The tables anew from the shipped recordings, and verdicts that can fail."""
+
+import json
+
+from needle_identification import ParameterEstimate, Statistic
+from needle_insertion import reproduce
+from needle_insertion.cli import main
+from needle_insertion.draw import FORCE_LEVELS, TABLE_1, TABLE_2
+from needle_insertion.protocol import SHIPPED_BAGS
+from needle_insertion.reproduce import (
+    as_table,
+    count_held,
+    deviation_interval,
+    fewest,
+    Line,
+    stiffness_truth,
+)
+import numpy as np
+import pytest
+
+
+def test_table_1_comes_out_of_the_shipped_bags(capsys):
+    """Both means and both STDs of the paper are in their intervals, from 20 recordings."""
+    assert main(['reproduce', 'table-1', '--json']) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert len(found['bags']) == 20
+    assert [
+        (line['paper']['mean'], line['paper']['deviation']) for line in found['lines']
+    ] == list(TABLE_1.values())
+    assert found['holds']
+    assert all(line['holds'] for line in found['lines'])
+    assert found['truth']['of'] == 40
+
+
+def test_table_2_comes_out_of_the_shipped_bags(capsys):
+    """Every entry at every level is in its intervals, and k_a, from 20 places."""
+    assert main(['reproduce', 'table-2']) == 0
+    text = capsys.readouterr().out
+    assert 'DOES NOT HOLD' not in text
+    lines = text.splitlines()
+    for entry in TABLE_2:
+        for force in FORCE_LEVELS:
+            assert sum(line.startswith(f'{entry} at {force:g} N') for line in lines) == 1
+    assert any(line.startswith('k_a at 1.5 N [N/m^2]') and '520' in line for line in lines)
+    assert 'of 400' in lines[-1]
+
+
+def line(mean: float, deviation: float | None, count: int = 20) -> Line:
+    """Return a made-up line: published are 10 ± 1."""
+    reach = 2.1 * (deviation or 1.0) / np.sqrt(count)
+    found = Statistic(
+        name='a', symbol='a', unit='N', mean=mean, deviation=deviation, error=0.2,
+        interval=(mean - reach, mean + reach), count=count,
+    )  # fmt: skip
+    return Line(quantity='a [N]', paper=(10.0, 1.0), found=found, held=19, known=20)
+
+
+@pytest.mark.parametrize(
+    ('mean', 'deviation', 'holds'),
+    [
+        (10.1, 1.0, True),
+        (11.0, 1.0, False),
+        (9.0, 1.0, False),
+        # Half and twice the STD are out of what chi-squared allows 20 to scatter.
+        (10.0, 0.5, False),
+        (10.0, 2.0, False),
+        (10.0, None, True),
+    ],
+)
+def test_a_line_holds_if_mean_and_std_are_in_their_intervals(mean, deviation, holds):
+    """Each of the two can break it; of a single recording the STD is not known."""
+    judged = line(mean, deviation)
+    assert judged.holds == holds
+    assert ('DOES NOT HOLD' in as_table([judged])) == (not holds)
+
+
+def test_the_interval_of_the_std_is_that_of_chi_squared():
+    """It holds the STD of the population in 95 of 100 samples of it."""
+    rng = np.random.default_rng(0)
+    samples = rng.normal(size=(4000, 20)).std(axis=1, ddof=1)
+    bounds = np.array([deviation_interval(float(s), 20) for s in samples])
+    held = np.mean((bounds[:, 0] <= 1.0) & (bounds[:, 1] >= 1.0))
+    # Four standard errors of a share of 0.95 in 4000.
+    assert held == pytest.approx(0.95, abs=4.0 * np.sqrt(0.95 * 0.05 / 4000))
+    # Published factors for 20: the square roots of 19/32.852 and of 19/8.907.
+    assert deviation_interval(1.0, 20) == pytest.approx((0.76049, 1.46057), abs=1e-4)
+    assert deviation_interval(None, 1) == (0.0, np.inf)
+
+
+@pytest.mark.parametrize('trials', [1, 20, 40, 400])
+def test_fewer_intervals_than_the_least_are_improbable(trials):
+    """If each holds its truth in 95 %, fewer than `fewest` do so once in a hundred at most."""
+    held = np.random.default_rng(trials).binomial(trials, 0.95, size=20000)
+    # Three standard errors of a share of 0.01 in 20000.
+    assert np.mean(held < fewest(trials)) <= 0.01 + 3.0 * np.sqrt(0.01 / 20000)
+    assert np.mean(held <= fewest(trials)) >= 0.01 - 3.0 * np.sqrt(0.01 / 20000)
+
+
+def test_an_interval_counts_where_the_truth_is_known():
+    """Held, missed, not determined, not known."""
+    sure = {'name': 'a', 'symbol': 'a', 'unit': 'N', 'value': 1.0, 'error': 0.5}
+    held = ParameterEstimate(**sure, interval=(0.0, 2.0), determined=True)
+    unknown = ParameterEstimate(name='a', symbol='a', unit='N')
+    assert count_held([held, held, unknown, held], [1.5, 2.5, 1.0, None]) == (1, 3)
+
+
+def test_the_truth_of_a_place_is_that_of_the_level():
+    """The nearest level counts, not what lies between; without a configuration it is unknown."""
+    truth = {'indenter.force_levels': [1.1, 1.2], 'indenter.stiffness_zz': [900.0, 700.0]}
+    assert stiffness_truth(truth, 'k_zz', 1.198) == 700.0
+    assert stiffness_truth(truth, 'k_xx', 1.1) is None
+    assert stiffness_truth(None, 'k_zz', 1.1) is None
+
+
+def test_without_recordings_there_is_one_line(tmp_path, monkeypatch, capsys):
+    """What is missing, and where to get it, with exit status 2."""
+    monkeypatch.setattr(reproduce, 'SHIPPED_BAGS', tmp_path)
+    assert main(['reproduce', 'table-2']) == 2
+    said = capsys.readouterr().err
+    assert said.count('\n') == 1
+    assert 'holds no stiffness_*' in said
+
+
+def test_a_table_that_does_not_hold_ends_in_status_1(tmp_path, monkeypatch, capsys):
+    """Three recordings of one kind are not the population of the paper."""
+    for k, bag in enumerate(sorted(SHIPPED_BAGS.glob('friction_*'))[:2]):
+        (tmp_path / f'friction_{k}').symlink_to(bag)
+    monkeypatch.setitem(reproduce.TABLE_1, 'coulomb_friction', (5.6, 0.0374))
+    monkeypatch.setattr(reproduce, 'SHIPPED_BAGS', tmp_path)
+    assert main(['reproduce', 'table-1', '--json']) == 1
+    assert not json.loads(capsys.readouterr().out)['holds']

@@ -1,0 +1,294 @@
+"""The plant as an object: a base that follows and pushes, constants that change, the zero."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from math import inf, nan
+from typing import Any
+
+from needle_dynamics import (
+    FloatArray,
+    ForceSensor,
+    ForceSensorParameters,
+    InsertedLengthError,
+    Integrator,
+    NeedleModel,
+    NeedleParameters,
+    ParameterError,
+    PRESETS,
+    ShapeError,
+)
+from needle_dynamics.errors import JobError
+from needle_dynamics.plant import BaseMotion, BaseParameters, Plant, Sample
+import numpy as np
+from numpy.testing import assert_allclose
+import pytest
+
+RATE = 500.0
+DEPTH = 0.1
+PERFECT = ForceSensorParameters(
+    force_noise=0.0, torque_noise=0.0, force_resolution=0.0, torque_resolution=0.0, filter=0
+)
+
+
+def robot(
+    parameters: NeedleParameters = PRESETS['phantom'], depth: float = DEPTH, **limits: Any
+) -> Plant:
+    """Make a plant in mode robot with a perfect sensor."""
+    state = NeedleModel(parameters).state_at(depth, 0.0)
+    base = BaseMotion(
+        BaseParameters(**limits), depth, (parameters.minimum_depth, parameters.length), 1e3
+    )
+    return Plant(Integrator(parameters, state, 2e-5), ForceSensor(PERFECT, RATE, 0), RATE, base)
+
+
+def follow(plant: Plant, *points: tuple[float, float | None, float | None]) -> None:
+    """Send a trajectory of points: time, inserted length or None, force or None."""
+    times, depths, forces = zip(*points, strict=True)
+
+    def row(value: float | None) -> list[float]:
+        return [] if value is None else [value]
+
+    plant.follow(['insertion'], times, [row(d) for d in depths], [row(f) for f in forces])
+
+
+def run(plant: Plant, duration: float) -> list[Sample]:
+    return [plant.advance() for _ in range(round(duration * RATE))]
+
+
+def column(samples: list[Sample], name: str) -> FloatArray:
+    return np.array([getattr(sample, name) for sample in samples])
+
+
+@pytest.mark.parametrize('way', [1.0, -1.0])
+@pytest.mark.parametrize('changes', [{}, {'coulomb_friction': 0.31}, {'carriage_mass': 0.5}])
+def test_a_ramp_moves_the_needle_exactly_when_it_exceeds_friction(
+    way: float, changes: dict[str, float]
+) -> None:
+    """Up to mu_s nothing moves, bit for bit; beyond, the steady speed is (f - mu_s) / mu_v."""
+    parameters = NeedleParameters.preset('phantom', **changes)
+    mu_s = parameters.coulomb_friction
+    plant = robot(parameters)
+    follow(plant, (1.0, None, 2.0 * way))
+    samples = run(plant, 1.0)
+    # The needle moves under the mean force of each quarter of an interval.
+    ends = np.arange(1, len(samples) + 1)
+    felt, force = 2.0 * way * ends / RATE, 2.0 * way * (ends - 0.125) / RATE
+    speed, depth = column(samples, 'speed'), column(samples, 'depth')
+    at_rest = np.abs(force) <= mu_s
+    assert at_rest.sum() == np.floor(mu_s / 2.0 * RATE + 0.125)
+    assert np.all(speed[at_rest] == 0.0)
+    assert np.all(depth[at_rest] == DEPTH)
+    assert np.all(speed[~at_rest] * way > 0.0)
+    wrench = column(samples, 'wrench')[:, 1]
+    assert_allclose(wrench[at_rest], felt[at_rest], rtol=1e-12)
+    if not parameters.carriage_mass:
+        # M / mu_v = 7 us: settled to e^-70 within a quarter of an interval of 2 ms.
+        assert_allclose(speed[~at_rest], (force[~at_rest] - way * mu_s) / 300.0, rtol=1e-9)
+        assert_allclose(wrench[~at_rest], felt[~at_rest], rtol=1e-12)
+
+
+@pytest.mark.parametrize('preset', ['phantom', 'paper_si'])
+@pytest.mark.parametrize('force', [100.0, -100.0])
+def test_a_push_keeps_within_the_speed_limit(preset: str, force: float) -> None:
+    """However strong, a push does not exceed the limit, and the sensor feels what that took."""
+    parameters = PRESETS[preset]
+    plant = robot(parameters, speed_limit=0.03)
+    follow(plant, (0.5, None, force))
+    samples = run(plant, 1.0)
+    speed = column(samples, 'speed')
+    # The speed is set, not approached: rounding only.
+    assert np.abs(speed).max() <= 0.03 * (1.0 + 1e-12)
+    assert_allclose(speed[-250:], np.copysign(0.03, force), rtol=1e-12)
+    felt = np.copysign(parameters.coulomb_friction + 0.03 * parameters.viscous_friction, force)
+    # The bent needle's share is nil: it was straight.
+    assert_allclose(column(samples, 'wrench')[-200:, 1], felt, rtol=1e-9)
+
+
+def test_a_push_that_leaves_the_tissue_only_without_its_limit_stays_in() -> None:
+    """A force that would throw the needle out within an interval is limited before."""
+    plant = robot(PRESETS['paper_si'], depth=0.003, speed_limit=0.001)
+    follow(plant, (0.0, None, -1000.0))
+    # The speed is reached evenly in the first quarter of the interval.
+    assert plant.advance().depth == pytest.approx(0.003 - 0.875 * 0.001 / RATE, rel=1e-9)
+    with pytest.raises(InsertedLengthError, match='minimum_depth'):
+        run(plant, 3.0)
+
+
+def test_a_motion_begins_where_the_push_has_left_the_base() -> None:
+    """After a push the line of inserted lengths starts there; it ends where it shall."""
+    plant = robot()
+    follow(plant, (0.5, None, 2.0), (1.5, 0.11, None), (2.0, 0.11, None))
+    pushed = run(plant, 0.5)[-1].depth
+    assert pushed > DEPTH + 1e-4
+    back = run(plant, 1.0)
+    slope = (0.11 - pushed) / 1.0
+    line = pushed + slope * np.arange(1, len(back) + 1) / RATE
+    # The speed at the end of the push, (2 - 0.56) / 300 m/s, is braked at 0.5 m/s^2.
+    lead = (1.44 / 300.0) ** 2
+    assert np.abs(column(back, 'depth') - line).max() < lead
+    assert np.abs(np.diff(column(back, 'speed'))).max() <= 0.5 / RATE * (1.0 + 1e-12)
+    assert run(plant, 0.5)[-1].depth == pytest.approx(0.11, abs=1e-7)
+
+
+def test_the_force_of_a_push_is_straight_between_points_and_held_after_the_last() -> None:
+    """Points of effort are joined by lines; the first starts at zero, the last goes on."""
+    plant = robot()
+    follow(plant, (0.2, None, 0.4), (0.4, None, -0.2))
+    ends = np.arange(1, 301) / RATE
+    expected = np.interp(ends, [0.0, 0.2, 0.4], [0.0, 0.4, -0.2])
+    assert_allclose(column(run(plant, 0.6), 'force'), expected, atol=1e-12)
+    # A new one begins with the force under way.
+    follow(plant, (0.1, None, 0.3))
+    ramp = np.interp(ends[:50], [0.0, 0.1], [-0.2, 0.3])
+    assert_allclose(column(run(plant, 0.1), 'force'), ramp, atol=1e-12)
+    # After a motion a push begins at zero.
+    follow(plant, (0.1, DEPTH, None), (0.2, None, 0.5))
+    run(plant, 0.1)
+    assert_allclose(column(run(plant, 0.1), 'force'), 5.0 * ends[:50], atol=1e-12)
+
+
+def test_a_point_with_both_is_a_position() -> None:
+    """An effort beside a position does not count."""
+    one, other = robot(), robot()
+    follow(one, (0.5, 0.102, None), (0.7, 0.102, None))
+    follow(other, (0.5, 0.102, 50.0), (0.7, 0.102, nan))
+    assert np.array_equal(column(run(one, 0.7), 'depth'), column(run(other, 0.7), 'depth'))
+
+
+@pytest.mark.parametrize('resolution', [0.0, 1e-6, 2.5e-5])
+def test_the_encoder_shows_the_nearest_count(resolution: float) -> None:
+    """The joint position is a whole number of counts, half a count off at most; zero is off."""
+    plant = robot(encoder_resolution=resolution)
+    follow(plant, (1.0, 0.103, None))
+    samples = run(plant, 1.2)
+    depth, shown = column(samples, 'depth'), column(samples, 'joint_position')
+    if resolution == 0.0:
+        assert np.array_equal(depth, shown)
+    else:
+        # Rounding of the quotient of up to 1e5 counts.
+        assert np.abs(shown / resolution - np.round(shown / resolution)).max() < 1e-9
+        assert np.abs(depth - shown).max() <= 0.5 * resolution * (1.0 + 1e-9)
+
+
+@pytest.mark.parametrize(
+    ('points', 'complaint'),
+    [
+        ([(1.0, 0.3, None)], r'trajectory must stay in \[0.001, 0.2\] m, got \[0.3\] m'),
+        ([(1.0, nan, None)], 'trajectory must stay in'),
+        ([(1.0, None, inf)], r'a push must be within 1000 N, got \[inf\] N'),
+        ([(1.0, None, nan)], 'a push must be within 1000 N'),
+        ([(1.0, None, 1.0), (2.0, None, None)], 'each point needs a position or an effort'),
+        ([(-1.0, 0.1, None)], r'trajectory times must be >= 0 and increasing, got \[-1.0\] s'),
+        ([(1.0, 0.1, None), (1.0, 0.1, None)], 'trajectory times must be >= 0 and increasing'),
+    ],
+)
+def test_a_trajectory_that_cannot_be_followed_changes_nothing(
+    points: list[Any], complaint: str
+) -> None:
+    """It is refused with its reason, and the one before goes on."""
+    plant = robot()
+    follow(plant, (0.0, 0.101, None))
+    with pytest.raises(ParameterError, match=complaint):
+        follow(plant, *points)
+    assert run(plant, 1.0)[-1].depth == pytest.approx(0.101, abs=1e-7)
+
+
+def test_a_needle_without_a_robot_follows_no_trajectory() -> None:
+    """In mode simulation there is nothing to follow it."""
+    parameters = PRESETS['phantom']
+    needle = Integrator(parameters, NeedleModel(parameters).state_at(DEPTH, 0.0))
+    plant = Plant(needle, ForceSensor(PERFECT, RATE, 0), RATE)
+    with pytest.raises(ParameterError, match='in the modes robot and indenter only'):
+        follow(plant, (1.0, 0.1, None))
+
+
+def test_the_sensor_is_zeroed_at_rest_only() -> None:
+    """A moving needle is refused by its speed, one at rest after a tenth of a second not."""
+    plant = robot()
+    follow(plant, (0.2, None, 0.5), (1.2, 0.11, None))
+    run(plant, 0.7)
+    with pytest.raises(JobError, match=r'^the needle moves at 10 mm/s; it must rest$'):
+        plant.tare()
+    samples = run(plant, 1.5)
+    assert samples[-1].speed == 0.0
+    rested = sum(1 for sample in samples if abs(sample.speed) <= 1e-6)
+    assert rested >= 50
+    plant.tare()
+    # At rest with the least force: nothing but the zero is left.
+    assert abs(plant.advance().wrench[1]) < 1e-9
+    with pytest.raises(JobError, match='1 of 50 readings at rest so far'):
+        plant.tare()
+
+
+def test_a_push_below_the_limit_is_an_advance() -> None:
+    """Within the limit the result is that of the free needle under the force, bit for bit."""
+    parameters = PRESETS['phantom']
+    state = NeedleModel(parameters).state_at(0.05, 1e-3)
+    one, other = Integrator(parameters, state), Integrator(parameters, state)
+    for force in (0.2, 1.5, 3.0):
+        assert one.advance_pushed(0.01, force, 0.05) == other.advance(0.01, force)
+        assert np.array_equal(one.state, other.state)
+        assert one.time == other.time
+
+
+@pytest.mark.parametrize('law', ['coulomb', 'stribeck', 'tanh'])
+def test_constants_change_without_a_jump(law: str) -> None:
+    """The state stays bit for bit; from there the motion is that under the new constants."""
+    parameters = NeedleParameters.preset('phantom', friction_law=law)
+    changed = replace(parameters, coulomb_friction=0.8, viscous_friction=200.0)
+    one = Integrator(parameters, NeedleModel(parameters).state_at(0.05, 1e-3))
+    one.advance(0.05, 3.0)
+    before = one.state
+    one.change(changed)
+    assert np.array_equal(one.state, before)
+    other = Integrator(changed, before)
+    assert one.advance(0.05, 3.0) == other.advance(0.05, 3.0)
+    assert np.array_equal(one.state, other.state)
+    if law != 'tanh':
+        assert one.speed == pytest.approx((3.0 - 0.8) / 200.0, rel=1e-3)
+
+
+def test_constants_that_do_not_suit_the_state_are_refused() -> None:
+    """Another number of modes or a shorter needle: an error, and the old constants stay."""
+    parameters = PRESETS['phantom']
+    state = NeedleModel(parameters).state_at(0.05, 1e-3)
+    one, other = Integrator(parameters, state), Integrator(parameters, state)
+    with pytest.raises(ShapeError):
+        one.change(replace(parameters, modes=1))
+    with pytest.raises(InsertedLengthError):
+        one.change(replace(parameters, length=0.1))
+    assert one.model.parameters == parameters
+    assert one.advance(0.05, 3.0) == other.advance(0.05, 3.0)
+
+
+def test_same_seed_same_samples() -> None:
+    """The whole plant is a function of its seed and of what it is told."""
+
+    def seen(seed: int) -> FloatArray:
+        parameters = PRESETS['phantom']
+        needle = Integrator(parameters, NeedleModel(parameters).state_at(DEPTH, 1e-4))
+        base = BaseMotion(BaseParameters(), DEPTH, (0.001, 0.2))
+        plant = Plant(needle, ForceSensor(ForceSensorParameters(), RATE, seed), RATE, base)
+        follow(plant, (0.2, None, 1.0), (0.4, 0.1, None))
+        return column(run(plant, 0.5), 'wrench')
+
+    assert np.array_equal(seen(1), seen(1))
+    assert not np.array_equal(seen(1), seen(2))
+
+
+def test_force_and_speed_of_a_carried_base_are_of_one_instant() -> None:
+    """(15) holds sample by sample while the base speeds up and slows down."""
+    plant = robot(acceleration_limit=0.1)
+    parameters = plant.integrator.model.parameters
+    follow(plant, (0.1, 0.1, None), (0.5, 0.112, None), (0.9, 0.1, None))
+    samples = run(plant, 1.0)
+    speed = column(samples, 'speed')
+    moving = np.flatnonzero(speed[1:] * speed[:-1] > 0.0) + 1
+    inertia = parameters.moving_mass * np.diff(speed, prepend=0.0) * RATE
+    friction = np.array([parameters.friction.force(v, 0.0) for v in speed])
+    assert len(moving) > 300
+    # The needle is straight: rounding of forces of 10 N.
+    assert_allclose(
+        column(samples, 'force')[moving], (friction + inertia)[moving], rtol=0.0, atol=1e-11
+    )

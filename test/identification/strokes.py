@@ -1,0 +1,72 @@
+"""Recordings of strokes by the equations alone: friction, a base with limits, a sensor."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any
+
+from needle_identification import Recording
+import numpy as np
+from scipy.signal import butter, lfilter
+
+#: Step of the equations [s], and samples of it in one of the recording (250 Hz).
+STEP, EVERY = 1e-3, 4
+#: mu_s [N] and mu_v [N s/m].
+COULOMB, VISCOUS = 0.56, 300.0
+SPEEDS = (2e-3, 5e-3, 10e-3, 15e-3, 20e-3)
+ACCELERATION = 0.5
+NOISE = 0.02
+
+
+@lru_cache(maxsize=16)
+def motion(speeds: tuple[float, ...] = SPEEDS, push: float = 1.0) -> Any:
+    """Speed [m/s] and force of a push [N]: it rises to its end in 1.5 s, then strokes come."""
+    rise = np.maximum(np.arange(1, 1701) * STEP - 0.2, 0.0) / 1.5 * push
+    rise = rise if push else rise[:0]
+    pushed = np.maximum(rise - COULOMB, 0.0) / VISCOUS
+    rows = []
+    speed = pushed[-1] if len(pushed) else 0.0
+    for target, duration in [(0.0, 0.3)] + [
+        leg for v in speeds for leg in ((v, 1.0), (0.0, 0.2), (-v, 1.0), (0.0, 0.2))
+    ]:
+        for _ in range(round(duration / STEP)):
+            change = np.clip(target - speed, -ACCELERATION * STEP, ACCELERATION * STEP)
+            speed = speed + change
+            # Speeds come to rest, not to rounding errors.
+            speed = 0.0 if abs(speed) < 1e-12 else speed
+            rows.append(speed)
+    return np.concatenate([pushed, rows]), rise
+
+
+def strokes(
+    *,
+    seed: int | None = None,
+    speeds: tuple[float, ...] = SPEEDS,
+    push: float = 1.0,
+    offset: float = 0.0,
+    withdrawal: float = 1.0,
+    breakaway: float = 1.0,
+    mass: float = 0.0,
+    lag: float = 0.0,
+    noise: float = NOISE,
+    cutoff: float = 125.0,
+) -> Recording:
+    """Record strokes; with a seed through a noisy sensor of second order, else as they are."""
+    speed, rise = motion(speeds, push)
+    time = STEP * np.arange(1, len(speed) + 1)
+    more = 1.0 + (breakaway - 1.0) * np.exp(-((speed / 1e-3) ** 2))
+    force = COULOMB * more * np.sign(speed) + VISCOUS * speed
+    force = np.where(speed < 0.0, withdrawal, 1.0) * force + mass * np.gradient(speed, STEP)
+    # Until it moves, the push is what the sensor feels.
+    force[: len(rise)] = np.where(speed[: len(rise)] > 0.0, force[: len(rise)], rise)
+    force = np.interp(time - lag, time, force) + offset
+    if seed is not None:
+        force = force + np.random.default_rng(seed).normal(scale=noise, size=len(force))
+        b, a = butter(2, cutoff, fs=1.0 / STEP)
+        force = np.round(lfilter(b, a, force) / 0.0025) * 0.0025
+    # The inserted length at the samples whose mean speed lies around them.
+    depth = 0.1 + STEP * (np.cumsum(speed) - 0.5 * speed)
+    kept = slice(EVERY - 1, None, EVERY)
+    return Recording(
+        name='strokes', time=time[kept], depth=depth[kept], speed=speed[kept], force=force[kept]
+    )

@@ -1,0 +1,539 @@
+"""Recordings of any lab give force and motion as they were, or one line that says why not."""
+
+from contextlib import suppress
+import struct
+
+from hypothesis import given, settings, strategies
+from identification.samples import (
+    EPOCH,
+    header,
+    joint_states,
+    MOTION,
+    STORE,
+    TEXT,
+    text,
+    WRENCH,
+    wrench,
+)
+from mcap.reader import make_reader
+from mcap.writer import Writer as McapWriter
+from needle_identification import (
+    BagWriter,
+    message_type,
+    read_friction_recording,
+    read_indentation_recording,
+    RecordingError,
+)
+import numpy as np
+from numpy.testing import assert_allclose, assert_array_equal
+import pytest
+
+MILLISECOND = 1_000_000
+POSE = 'geometry_msgs/msg/PoseStamped'
+POINT = 'geometry_msgs/msg/PointStamped'
+TWIST = 'geometry_msgs/msg/TwistStamped'
+ODOMETRY = 'nav_msgs/msg/Odometry'
+
+
+def pose(position, turn=0.0):
+    """Return a pose turned about z [rad]."""
+    orientation = (0.0, 0.0, np.sin(turn / 2.0), np.cos(turn / 2.0))
+    return message_type('geometry_msgs/msg/Pose')(
+        message_type('geometry_msgs/msg/Point')(*position),
+        message_type('geometry_msgs/msg/Quaternion')(*orientation),
+    )
+
+
+def twist(velocity):
+    vector = message_type('geometry_msgs/msg/Vector3')
+    return message_type('geometry_msgs/msg/Twist')(vector(*velocity), vector(0.0, 0.0, 0.0))
+
+
+def odometry(stamp, position, velocity, turn=0.0):
+    """Serialize an Odometry whose body is turned about z; the velocity is in the body."""
+    zero = np.zeros(36)
+    return serialized(
+        ODOMETRY,
+        stamp,
+        'needle_base',
+        message_type('geometry_msgs/msg/PoseWithCovariance')(pose(position, turn), zero),
+        message_type('geometry_msgs/msg/TwistWithCovariance')(twist(velocity), zero),
+    )
+
+
+def serialized(type_name, stamp, *parts):
+    return bytes(STORE.serialize_cdr(message_type(type_name)(header(stamp), *parts), type_name))
+
+
+def moving(type_name, stamp, depth, speed):
+    """Serialize what a motion along y is in each type of message."""
+    if type_name == MOTION:
+        return joint_states(stamp, depth, speed)
+    if type_name == ODOMETRY:
+        return odometry(stamp, (0.0, depth, 0.0), (0.0, speed, 0.0))
+    if type_name == TWIST:
+        return serialized(TWIST, stamp, twist((0.0, speed, 0.0)))
+    if type_name == POSE:
+        return serialized(POSE, stamp, pose((0.0, depth, 0.0)))
+    return serialized(POINT, stamp, message_type('geometry_msgs/msg/Point')(0.0, depth, 0.0))
+
+
+def write(path, topics):
+    """Write topics, each a type and (stamp [ms after the epoch], bytes)."""
+    with BagWriter(path) as writer:
+        for topic, (type_name, messages) in topics.items():
+            writer.add_topic(topic, type_name)
+            for stamp, data in messages:
+                writer.write(topic, data, EPOCH + stamp * MILLISECOND)
+    return path
+
+
+def at(stamp):
+    return EPOCH + stamp * MILLISECOND
+
+
+def small_bag(path, wrenches=(), motions=(), joint_names=('insertion',)):
+    """Write (stamp, value) wrenches and (stamp, depth, speed) motions, in ms after the epoch."""
+    return write(
+        path,
+        {
+            '/ft': (WRENCH, [(t, wrench(at(t), force)) for t, force in wrenches]),
+            '/joints': (
+                MOTION,
+                [(t, joint_states(at(t), d, v, joint_names)) for t, d, v in motions],
+            ),
+        },
+    )
+
+
+def forces(count=11, step=10):
+    return WRENCH, [(i * step, wrench(at(i * step), float(i))) for i in range(count)]
+
+
+def grid(count=11, step=10):
+    return [(i * step, float(i)) for i in range(count)], [
+        (i * step, 0.1 + 0.001 * i, 0.1) for i in range(count)
+    ]
+
+
+# Finding force and motion.
+
+
+@pytest.mark.parametrize(('axis', 'sign'), [('y', 1.0), ('-y', -1.0), ('x', 0.0)])
+def test_takes_the_axis_asked_for(tmp_path, axis, sign):
+    path = small_bag(tmp_path / 'bag', *grid())
+    assert_array_equal(
+        read_friction_recording(path, force_axis=axis).force, sign * np.arange(11.0)
+    )
+
+
+@pytest.mark.parametrize('axis', ['', '-', 'w', '--x', 'xy'])
+def test_refuses_an_axis_that_is_none(tmp_path, axis):
+    with pytest.raises(RecordingError, match='force axis must be'):
+        read_friction_recording(tmp_path, force_axis=axis)
+
+
+def test_takes_the_joint_asked_for_and_lists_what_there_is(tmp_path):
+    path = small_bag(tmp_path / 'bag', *grid(), joint_names=('slide', 'roll'))
+    with pytest.raises(RecordingError, match=r"no joint 'insertion'; .* one of roll, slide"):
+        read_friction_recording(path)
+    one, other = (read_friction_recording(path, motion_axis=axis) for axis in ('slide', '-slide'))
+    assert_array_equal(one.depth, -other.depth)
+    assert_array_equal(one.speed, -other.speed)
+    alone = small_bag(tmp_path / 'alone', *grid(), joint_names=('slide',))
+    assert_array_equal(read_friction_recording(alone).depth, one.depth)
+
+
+def test_motion_is_interpolated_to_the_stamps_of_the_force(tmp_path):
+    wrenches = [(i * 10 + 5, float(i)) for i in range(10)]
+    path = small_bag(tmp_path / 'bag', wrenches, grid()[1])
+    read = read_friction_recording(path)
+    assert_allclose(read.depth, 0.1005 + 0.001 * np.arange(10), rtol=1e-12)
+
+
+def test_speed_that_is_not_there_is_none_and_said(tmp_path):
+    wrenches, motions = grid()
+    for name, value in (('empty', None), ('nan', float('nan'))):
+        path = small_bag(tmp_path / name, wrenches, [(t, d, value) for t, d, _ in motions])
+        read = read_friction_recording(path)
+        assert read.speed is None
+        assert read.losses == ('/joints has no velocity',)
+    path = small_bag(tmp_path / 'zero', wrenches, [(t, d, 0.0) for t, d, _ in motions])
+    read = read_friction_recording(path)
+    assert read.speed is None
+    assert read.losses == ('/joints moves at the velocity 0, which is left out',)
+
+
+def test_a_speed_that_is_there_mostly_is_taken_where_it_is(tmp_path):
+    wrenches, motions = grid()
+    motions[4] = (40, 0.104, None)
+    read = read_friction_recording(small_bag(tmp_path / 'bag', wrenches, motions))
+    assert_array_equal(read.speed, 0.1)
+    assert read.losses == ('1 of /joints without velocity, left out',)
+
+
+def test_samples_that_say_nothing_are_left_out_and_counted(tmp_path):
+    wrenches, motions = grid()
+    wrenches[3] = (30, float('nan'))
+    wrenches[5], wrenches[6] = wrenches[6], wrenches[5]
+    wrenches.append(wrenches[-1])
+    motions[8] = (80, float('inf'), 0.1)
+    read = read_friction_recording(small_bag(tmp_path / 'bag', wrenches, motions))
+    assert_allclose(read.time, [t / 100.0 for t in range(11) if t != 3], atol=1e-12)
+    assert read.losses == (
+        '1 of /ft out of order, sorted by stamp',
+        '1 of /ft not finite, left out',
+        '1 of /ft with the stamp of another, left out',
+        '1 of /joints not finite, left out',
+    )
+
+
+def test_force_without_motion_is_left_out_and_counted(tmp_path):
+    wrenches, motions = grid(count=101)
+    path = small_bag(tmp_path / 'bag', wrenches, motions[10:40] + motions[70:])
+    read = read_friction_recording(path)
+    # Ten before the motion; thirty in the gap, and the one at its end.
+    assert read.losses == (
+        '/joints pauses in 1 place, 0.31 s in all',
+        '41 of /ft not covered by /joints',
+    )
+    later = small_bag(tmp_path / 'later', wrenches, [(t + 5000, d, v) for t, d, v in motions])
+    with pytest.raises(RecordingError, match='/ft and /joints do not overlap in time'):
+        read_friction_recording(later)
+
+
+def test_without_header_stamps_the_time_of_reception_counts(tmp_path):
+    with BagWriter(tmp_path / 'bag') as writer:
+        writer.add_topic('/ft', WRENCH)
+        writer.add_topic('/joints', MOTION)
+        for i in range(5):
+            writer.write('/ft', wrench(0, float(i)), at(10 * i))
+            writer.write('/joints', joint_states(0, 0.1, 0.0), at(10 * i))
+    read = read_friction_recording(tmp_path / 'bag')
+    assert_allclose(read.time, np.arange(5) * 1e-2)
+    assert read.losses == (
+        '5 of /ft without a stamp, taken at the time of reception',
+        '5 of /joints without a stamp, taken at the time of reception',
+    )
+
+
+def test_one_sample_is_not_a_recording(tmp_path):
+    path = small_bag(tmp_path / 'bag', [(0, 1.0)], grid()[1])
+    with pytest.raises(
+        RecordingError, match='/ft must have >= 2 samples at different times, has 1'
+    ):
+        read_friction_recording(path)
+
+
+# Other types and labs.
+
+
+@pytest.mark.parametrize('type_name', [MOTION, POSE, POINT, TWIST, ODOMETRY])
+def test_motion_is_the_same_in_every_type_of_message(tmp_path, type_name):
+    motions = [(t, moving(type_name, at(t), d, v)) for t, d, v in grid()[1]]
+    path = write(tmp_path / 'bag', {'/ft': forces(), '/robot': (type_name, motions)})
+    axis = '-insertion' if type_name == MOTION else '-y'
+    for sign, chosen in ((1.0, None), (-1.0, axis)):
+        read = read_friction_recording(path, motion_axis=chosen)
+        begin = 0.0 if type_name == TWIST else 0.1
+        # 1e-12: rounding of sums and differences near 0.1.
+        assert_allclose(read.depth, sign * (begin + 0.001 * np.arange(11)), atol=1e-12)
+        if type_name in (POSE, POINT):
+            assert read.speed is None
+        else:
+            assert_allclose(read.speed, sign * 0.1, rtol=1e-12)
+    said = {
+        POSE: ('/robot has no velocity',),
+        POINT: ('/robot has no velocity',),
+        TWIST: ('/robot has no position: depth is the integral of speed from 0',),
+    }
+    assert read.losses == said.get(type_name, ())
+
+
+def test_the_velocity_of_an_odometry_is_turned_from_the_body(tmp_path):
+    # Turned by 90 degrees about z, the body moves along its x where the frame has y.
+    motions = [
+        (t, odometry(at(t), (0.0, d, 0.0), (v, 0.0, 0.0), np.pi / 2.0)) for t, d, v in grid()[1]
+    ]
+    path = write(tmp_path / 'bag', {'/ft': forces(), '/odom': (ODOMETRY, motions)})
+    # 1e-12: rounding of the quaternion.
+    assert_allclose(read_friction_recording(path).speed, 0.1, rtol=1e-12)
+
+
+def test_joints_may_change_places_and_come_from_several_publishers(tmp_path):
+    messages = []
+    for i in range(11):
+        names = ('insertion', 'rotation') if i % 2 else ('rotation', 'insertion')
+        values = (0.1 + 0.001 * i, -5.0) if i % 2 else (-5.0, 0.1 + 0.001 * i)
+        messages.append((10 * i, joints(at(10 * i), names, values, values)))
+        messages.append((10 * i + 5, joints(at(10 * i + 5), ('grip',), (9.0,), ())))
+    path = write(tmp_path / 'bag', {'/ft': forces(), '/joints': (MOTION, messages)})
+    read = read_friction_recording(path, motion_axis='insertion')
+    assert_array_equal(read.depth, 0.1 + 0.001 * np.arange(11))
+    assert read.losses == ()
+    with pytest.raises(RecordingError, match=r'several joints; .* one of grip, insertion, rot'):
+        read_friction_recording(path)
+
+
+def joints(stamp, names, position, velocity):
+    return serialized(
+        MOTION,
+        stamp,
+        list(names),
+        np.array(position, dtype=float),
+        np.array(velocity, dtype=float),
+        np.array([]),
+    )
+
+
+def test_arrays_shorter_than_the_names_are_samples_that_are_missing(tmp_path):
+    messages = [
+        (10 * i, joints(at(10 * i), ('a', 'insertion'), (0.0, 0.1)[: 1 + (i != 4)], (0.0, 0.1)))
+        for i in range(11)
+    ]
+    path = write(tmp_path / 'bag', {'/ft': forces(), '/joints': (MOTION, messages)})
+    assert read_friction_recording(path).losses == ('1 of /joints not finite, left out',)
+
+
+def test_messages_that_are_none_are_left_out_and_counted(tmp_path):
+    kind, wrenches = forces()
+    wrenches[3] = (30, wrenches[3][1][:-5])
+    wrenches[5] = (50, b'')
+    wrenches[6] = (60, b'\x00\x03' + wrenches[6][1][2:])
+    path = write(
+        tmp_path / 'bag',
+        {'/ft': (kind, wrenches), '/joints': (MOTION, [
+            (t, joint_states(at(t), d, v)) for t, d, v in grid()[1]
+        ])},
+    )  # fmt: skip
+    read = read_friction_recording(path)
+    assert_array_equal(read.force, [0, 1, 2, 4, 7, 8, 9, 10])
+    assert read.losses == ('3 of /ft not readable, left out: the first one ends after 71 bytes',)
+
+
+def test_what_lies_beside_the_topics_does_no_harm(tmp_path):
+    path = small_bag(tmp_path / 'bag', *grid())
+    file = path / 'bag_0.mcap'
+    with file.open('rb') as stream:
+        known = [*make_reader(stream).iter_messages()]
+    with (tmp_path / 'more.mcap').open('wb') as stream:
+        writer = McapWriter(stream)
+        writer.start('ros2')
+        event = writer.register_schema('lab_srvs/srv/Tare_Event', 'ros2idl', b'what is this?')
+        strange = writer.register_channel('/tare/_service_event', 'cdr', event)
+        bare = writer.register_channel('/bare', 'json', 0)
+        ids = {}
+        for schema, channel, message in known:
+            if channel.topic not in ids:
+                kind = writer.register_schema(schema.name, 'ros2msg', schema.data)
+                ids[channel.topic] = writer.register_channel(channel.topic, 'cdr', kind)
+            writer.add_message(strange, message.log_time, b'\x00\x01\xff', message.log_time)
+            writer.add_message(bare, message.log_time, b'{}', message.log_time)
+            writer.add_message(
+                ids[channel.topic], message.log_time, message.data, message.log_time
+            )
+        writer.finish()
+    read = read_friction_recording(tmp_path / 'more.mcap')
+    assert_array_equal(read.force, np.arange(11.0))
+    assert read.losses == ()
+
+
+def test_prefers_the_usual_names_and_lists_candidates_otherwise(tmp_path):
+    motions = (MOTION, [(t, joint_states(at(t), d, v)) for t, d, v in grid()[1]])
+    usual = write(
+        tmp_path / 'usual',
+        {
+            '/lab/base_wrench': forces(),
+            '/command': forces(count=5),
+            '/lab/joint_states': motions,
+            '/reference': motions,
+        },
+    )
+    assert len(read_friction_recording(usual).time) == 11
+    assert len(read_friction_recording(usual, wrench_topic='/command').time) == 5
+    with pytest.raises(RecordingError, match=r'no topic /nope of type WrenchStamped; it has /com'):
+        read_friction_recording(usual, wrench_topic='/nope')
+    two = write(tmp_path / 'two', {'/left/ft': forces(), '/right/ft': forces()})
+    with pytest.raises(RecordingError, match=r'several topics.*name one of /left/ft, /right/ft'):
+        read_friction_recording(two)
+    with pytest.raises(RecordingError, match=r'no topic of type JointState, .*; it has /l'):
+        read_friction_recording(two, wrench_topic='/left/ft')
+
+
+def test_the_last_configuration_of_the_plant_comes_along(tmp_path):
+    wrenches, motions = grid()
+    with BagWriter(tmp_path / 'bag') as writer:
+        for topic, kind in (('/ft', WRENCH), ('/joints', MOTION), ('/plant/configuration', TEXT)):
+            writer.add_topic(topic, kind)
+        for data in (text('old'), text('new')):
+            writer.write('/plant/configuration', data, EPOCH)
+        for (t, force), (_, depth, speed) in zip(wrenches, motions, strict=True):
+            writer.write('/ft', wrench(at(t), force), at(t))
+            writer.write('/joints', joint_states(at(t), depth, speed), at(t))
+    assert read_friction_recording(tmp_path / 'bag').configuration == 'new'
+
+
+# Clocks.
+
+
+def two_clocks(path, ahead, latency=(0.002, 0.002), count=500):
+    """Write force and motion 4 ms apart, the force stamped by a clock that is ahead [s]."""
+    rng = np.random.default_rng(0)
+    with BagWriter(path) as writer:
+        writer.add_topic('/ft', WRENCH)
+        writer.add_topic('/joints', MOTION)
+        for i in range(count):
+            true = at(4 * i)
+            late = [round(1e9 * (least + rng.exponential(0.005))) for least in latency]
+            stamp = true + round(1e9 * ahead)
+            writer.write('/ft', wrench(stamp, float(i)), true + late[0])
+            writer.write('/joints', joint_states(true, 1e-3 * i, 0.25), true + late[1])
+    return path
+
+
+@pytest.mark.parametrize('ahead', [-3600.0, 0.5, 1e6])
+def test_clocks_that_differ_are_set_to_each_other(tmp_path, ahead):
+    read = read_friction_recording(two_clocks(tmp_path / 'bag', ahead))
+    # 2e-3: the 5 % quantiles of 500 latencies scatter by 5e-5 s, and the clock of 1e6 s is told
+    # to the nanosecond; this leaves room for what other generators draw.
+    assert_allclose(read.clock_offset, ahead, rtol=0.0, atol=2e-3)
+    assert_allclose(read.depth, 1e-3 * read.force, atol=2e-3 * 0.25)
+    assert f'/ft is stamped {read.clock_offset:.3f} s after /joints: clocks' in read.losses[0]
+    by_reception = read_friction_recording(tmp_path / 'bag', time='receive')
+    assert by_reception.clock_offset == 0.0
+    assert not any('clocks' in loss for loss in by_reception.losses)
+
+
+@pytest.mark.parametrize(('latency', 'said'), [((0.002, 0.002), 0), ((0.002, 0.2), 1)])
+def test_latency_is_not_taken_for_a_clock(tmp_path, latency, said):
+    read = read_friction_recording(two_clocks(tmp_path / 'bag', 0.0, latency))
+    assert read.clock_offset == 0.0
+    assert_array_equal(read.depth, 1e-3 * read.force)
+    assert len([loss for loss in read.losses if 'may be latency' in loss]) == said
+
+
+def test_receive_times_that_mean_nothing_move_no_stamps(tmp_path):
+    wrenches, motions = grid()
+    with BagWriter(tmp_path / 'bag') as writer:
+        writer.add_topic('/ft', WRENCH)
+        writer.add_topic('/joints', MOTION)
+        for (t, force), (_, depth, speed) in zip(wrenches[5:], motions[:-1], strict=False):
+            writer.write('/ft', wrench(at(100 * t), force), 0)
+            writer.write('/joints', joint_states(at(100 * t - 3000), depth, speed), 0)
+    assert read_friction_recording(tmp_path / 'bag').clock_offset == 0.0
+
+
+def test_refuses_a_time_that_is_none(tmp_path):
+    path = small_bag(tmp_path / 'bag', *grid())
+    with pytest.raises(RecordingError, match="time must be one of header, receive, got 'now'"):
+        read_friction_recording(path, time='now')
+
+
+SECONDS = strategies.integers(-(2**31), 2**31 - 1)
+
+
+@settings(max_examples=100, deadline=None)
+@given(
+    stamps=strategies.lists(
+        strategies.tuples(SECONDS, strategies.integers(0, 2**32 - 1)), min_size=3, max_size=8
+    ),
+    received=strategies.lists(strategies.integers(0, 2**64 - 1), min_size=8, max_size=8),
+    value=strategies.floats(),
+)
+def test_any_stamps_and_values_are_read_or_refused(tmp_path_factory, stamps, received, value):
+    path = tmp_path_factory.mktemp('stamps') / 'bag'
+    with BagWriter(path) as writer:
+        writer.add_topic('/ft', WRENCH)
+        writer.add_topic('/joints', MOTION)
+        for (seconds, rest), now in zip(stamps, received, strict=False):
+            stamp = struct.pack('<iI', seconds, rest)
+            data = wrench(0, value)
+            writer.write('/ft', data[:4] + stamp + data[12:], now)
+            data = joint_states(0, value, value)
+            writer.write('/joints', data[:4] + stamp + data[12:], now)
+    for time in ('header', 'receive'):
+        with suppress(RecordingError):
+            assert len(read_friction_recording(path, time=time).time) <= len(stamps)
+
+
+# Dense recordings.
+
+
+def test_dense_samples_are_averaged_without_delay(tmp_path):
+    rate, frequency = 4000, 5.0
+    with BagWriter(tmp_path / 'bag') as writer:
+        writer.add_topic('/ft', WRENCH)
+        writer.add_topic('/joints', MOTION)
+        for i in range(2 * rate):
+            stamp = EPOCH + i * 10**9 // rate
+            wave = np.sin(2.0 * np.pi * frequency * i / rate)
+            writer.write('/ft', wrench(stamp, wave), stamp)
+            if i % 16 == 0:
+                writer.write('/joints', joint_states(stamp, wave, 1.0), stamp)
+    read = read_friction_recording(tmp_path / 'bag')
+    assert abs(len(read.time) - 800) <= 2
+    begin = read.force[0] / (2.0 * np.pi * frequency)
+    # A mean over a bin of width h is off by (2 pi f h)^2 / 24 = 3e-4, and nothing else.
+    wave = np.sin(2.0 * np.pi * frequency * (read.time + begin))
+    assert_allclose(read.force, wave, rtol=0.0, atol=4e-4)
+
+
+# Indentation.
+
+
+def pressed(path, type_name):
+    """Write an indentation along x, z and a little y; force 100 and 200 N/m."""
+    messages = []
+    for i in range(11):
+        place = (1e-3 * i, 1e-5 * i, 2e-3 * i)
+        if type_name == MOTION:
+            data = joints(at(10 * i), ('x', 'y', 'z'), place, ())
+        elif type_name == ODOMETRY:
+            data = odometry(at(10 * i), place, (0.0, 0.0, 0.0))
+        elif type_name == POSE:
+            data = serialized(POSE, at(10 * i), pose(place))
+        else:
+            data = serialized(POINT, at(10 * i), message_type('geometry_msgs/msg/Point')(*place))
+        messages.append((10 * i, data))
+    vector = message_type('geometry_msgs/msg/Vector3')
+    zero = vector(0.0, 0.0, 0.0)
+    wrenches = [
+        (10 * i, serialized(WRENCH, at(10 * i), message_type('geometry_msgs/msg/Wrench')(
+            vector(0.1 * i, 0.0, 0.4 * i), zero
+        )))
+        for i in range(11)
+    ]  # fmt: skip
+    return write(path, {'/base_wrench': (WRENCH, wrenches), '/robot': (type_name, messages)})
+
+
+@pytest.mark.parametrize('type_name', [POSE, POINT, ODOMETRY, MOTION])
+def test_reads_an_indentation_from_every_type_of_message(tmp_path, type_name):
+    path = pressed(tmp_path / 'bag', type_name)
+    read = read_indentation_recording(path)
+    i = np.arange(11)
+    assert_allclose(read.position, np.column_stack([1e-3 * i, 2e-3 * i]), rtol=1e-12)
+    assert_allclose(read.off_plane, 1e-5 * i, rtol=1e-12)
+    assert_allclose(read.force, np.column_stack([0.1 * i, 0.4 * i]), rtol=1e-12)
+    assert read.losses == ()
+    turned = read_indentation_recording(path, axes=('-z', 'x'))
+    assert_array_equal(turned.position, read.position[:, ::-1] * [-1.0, 1.0])
+    assert_array_equal(turned.force, read.force[:, ::-1] * [-1.0, 1.0])
+
+
+def test_joints_of_an_indentation_may_lack_the_one_across(tmp_path):
+    messages = [(10 * i, joints(at(10 * i), ('z', 'x'), (i, -i), ())) for i in range(11)]
+    path = write(tmp_path / 'bag', {'/ft': forces(), '/joint_states': (MOTION, messages)})
+    read = read_indentation_recording(path)
+    assert_array_equal(read.off_plane, 0.0)
+    assert_array_equal(read.position[:, 1], np.arange(11))
+    assert read.losses == (
+        '/joint_states has no joint across the plane: off-plane motion unknown',
+    )
+    with pytest.raises(RecordingError, match='must have the joints y and z, has x, z'):
+        read_indentation_recording(path, axes=('y', 'z'))
+
+
+@pytest.mark.parametrize('axes', [('x', 'x'), ('x', '-x'), ('x', 'w')])
+def test_refuses_a_plane_that_is_none(tmp_path, axes):
+    with pytest.raises(RecordingError, match=r'axes must be two different|axis of the plane must'):
+        read_indentation_recording(tmp_path, axes=axes)

@@ -1,0 +1,72 @@
+"""Samples keep their values and their means, in bounded memory."""
+
+from hypothesis import given, settings, strategies
+from needle_identification import series
+from needle_identification.series import FINEST, Series
+import numpy as np
+from numpy.testing import assert_allclose, assert_array_equal
+import pytest
+
+
+def gathered(stamps, values, batch=7):
+    made = Series(values.shape[1])
+    for k in range(0, len(stamps), batch):
+        made.add(stamps[k : k + batch], values[k : k + batch])
+    made.compact()
+    return made
+
+
+@settings(max_examples=100, deadline=None)
+@given(strategies.lists(strategies.integers(-(10**9), 10**9), min_size=1, max_size=50))
+def test_sparse_samples_are_kept_bit_for_bit_in_order_of_time(numbers):
+    stamps = np.array(numbers) * FINEST
+    values = np.random.default_rng(0).normal(size=(len(stamps), 2))
+    made = gathered(stamps, values)
+    unique, first = np.unique(stamps, return_index=True)
+    assert made.width == 0
+    assert_array_equal(made.stamps, unique)
+    assert_array_equal(made.values, values[first])
+    assert made.repeated == len(stamps) - len(unique)
+    assert made.late == np.count_nonzero(np.diff(stamps) < 0)
+
+
+def test_dense_samples_become_means_of_stamps_and_of_values():
+    step = 125_000
+    stamps = np.arange(100_000) * step
+    made = gathered(stamps, stamps[:, None] * 1e-9, batch=1000)
+    assert made.width == FINEST
+    assert len(made.stamps) == 100_000 * step // FINEST
+    # The mean of a line lies on it, but for the rounding of a stamp to 1 ns.
+    assert_allclose(made.values[:, 0], made.stamps * 1e-9, rtol=0.0, atol=1e-9)
+
+
+@pytest.fixture
+def small(monkeypatch):
+    monkeypatch.setattr(series, 'LARGEST', 64)
+    monkeypatch.setattr(series, '_GATHERED', 100)
+
+
+def test_a_long_series_trades_resolution_for_length_and_keeps_the_mean(small):
+    rng = np.random.default_rng(0)
+    stamps = np.arange(5000) * 4_000_000
+    values = rng.normal(size=(5000, 1))
+    made = Series(1)
+    for k in range(0, 5000, 50):
+        made.add(stamps[k : k + 50], values[k : k + 50])
+        assert len(made.stamps) <= 64
+    made.compact()
+    assert 20.0 / 64 < made.width * 1e-9 < 2.1 * 20.0 / 64
+    # A bin begins where a multiple of its width does, so that only the ends are not full.
+    full = made.values[1:-1, 0]
+    assert abs(full.mean() - values.mean()) < 0.02
+
+
+def test_stamps_from_anywhere_take_no_more_memory(small):
+    rng = np.random.default_rng(0)
+    made = Series(1)
+    for _ in range(50):
+        stamps = rng.integers(-(2**61), 2**61, size=100)
+        made.add(stamps, rng.normal(size=(100, 1)))
+        assert len(made.stamps) <= 64
+    made.compact()
+    assert (np.diff(made.stamps) > 0).all()

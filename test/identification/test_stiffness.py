@@ -1,0 +1,564 @@
+"""The stiffness matrix comes out as it went in, and its errors mean what they say."""
+
+from dataclasses import replace
+
+from hypothesis import given
+from hypothesis import settings as hypothesis_settings
+from hypothesis import strategies as st
+from needle_dynamics import ParameterError
+from needle_identification import IdentificationError
+from needle_identification.recording import IndentationRecording
+from needle_identification.stiffness import (
+    identify_stiffness,
+    StiffnessSettings,
+    summarize_stiffness,
+)
+import numpy as np
+from numpy.testing import assert_allclose, assert_array_equal
+import pytest
+from scipy.signal import butter, lfilter, sosfilt
+from scipy.stats import binom
+
+EIGHT = np.arange(8) * np.pi / 4.0
+#: Table 2 at 1.1, 1.3 and 1.5 N [N/m].
+TABLE = {
+    1.1: np.array([[1260.0, 40.0], [-100.0, 1010.0]]),
+    1.3: np.array([[1100.0, 10.0], [-110.0, 690.0]]),
+    1.5: np.array([[960.0, -5.0], [-110.0, 520.0]]),
+}
+FORCE_NOISE, POSITION_NOISE = 0.01, 5e-6
+COUNT, RESOLUTION = 2.5e-3, 1e-6
+HOLD, RATE = 0.3, 250.0
+
+
+def grid(forces=(1.1, 1.3, 1.5), angles=EIGHT):
+    """Return force vectors, level by level, shape (m, 2)."""
+    return np.array([[f * np.cos(a), f * np.sin(a)] for f in forces for a in angles])
+
+
+def ofs(table):
+    """Return the stiffness at a force as that of the nearest level."""
+    return lambda force: table[min(table, key=lambda level: abs(level - force))]
+
+
+def pressed(
+    stiffness,
+    forces,
+    *,
+    hold=HOLD,
+    rest=0.3,
+    ramp=0.2,
+    rate=RATE,
+    noise=0.0,
+    seed=0,
+    bias=(0.3, -0.2),
+    drift=(0.0, 0.0),
+    creep=(0.0, 0.0),
+    off_plane=0.0,
+    rests=True,
+):
+    """Press with force vectors in turn; stiffness is a matrix or gives one for a force."""
+    matrix = stiffness if callable(stiffness) else lambda _force: stiffness
+    legs = [(rest, (0.0, 0.0), 1.0)]
+    for force in forces:
+        size = np.hypot(*force)
+        legs += [(ramp, force, size), (hold, force, size)]
+        legs += [(ramp, (0.0, 0.0), size), (rest, (0.0, 0.0), size)] if rests else []
+    knots = np.cumsum([0.0] + [leg[0] for leg in legs])
+    corners = np.array([(0.0, 0.0)] + [leg[1] for leg in legs])
+    time = np.arange(round(knots[-1] * rate)) / rate
+    force = np.column_stack([np.interp(time, knots, corner) for corner in corners.T])
+    place = np.clip(np.searchsorted(knots, time, side='right') - 1, 0, len(legs) - 1)
+    sizes = np.array([leg[2] for leg in legs])[place]
+    position = np.empty_like(force)
+    for size in np.unique(sizes):
+        position[sizes == size] = np.linalg.solve(matrix(size), force[sizes == size].T).T
+    off = off_plane * np.hypot(*position.T)
+    force = force + np.array(bias) + np.outer(time, drift)
+    position = position + np.array([0.1, 0.05]) + np.outer(time, creep)
+    if noise:
+        rng = np.random.default_rng(seed)
+        force = force + noise * FORCE_NOISE * limited(rng, len(time), rate)
+        position = position + noise * POSITION_NOISE * rng.normal(size=position.shape)
+        force = np.round(force / COUNT) * COUNT
+        position = np.round(position / RESOLUTION) * RESOLUTION
+    return IndentationRecording(
+        name='place', time=time, position=position, off_plane=off, force=force
+    )
+
+
+def limited(rng, count, rate):
+    """Noise of unit power below 125 Hz, as the sensor's second filter leaves it."""
+    every = round(2000.0 / rate)
+    white = rng.normal(size=((count + 10) * every, 2))
+    noise = sosfilt(butter(2, 125.0, fs=2000.0, output='sos'), white, axis=0)
+    # A second-order Butterworth passes 1.11 times the noise of an ideal filter.
+    return noise[10 * every :: every] / np.sqrt(1.11 * 125.0 / 1000.0)
+
+
+def expected(matrix):
+    """Return every parameter of a matrix, by name."""
+    stiffness, directions = np.linalg.eigh((matrix + matrix.T) / 2.0)
+    angle = np.arctan2(*directions[::-1, 1])
+    return {
+        **dict(zip(('k_xx', 'k_xz', 'k_zx', 'k_zz'), matrix.ravel(), strict=True)),
+        'curl': matrix[1, 0] - matrix[0, 1],
+        'spring': np.linalg.norm(matrix - matrix.T) / np.linalg.norm(matrix + matrix.T),
+        'principal_stiffness_1': stiffness[1],
+        'principal_stiffness_2': stiffness[0],
+        'principal_angle': (angle + np.pi / 2.0) % np.pi - np.pi / 2.0,
+        'tissue_stiffness': matrix[1, 1],
+    }
+
+
+def turned(recording, angle):
+    """Return the same presses seen from axes turned by an angle, and the turn."""
+    c, s = np.cos(angle), np.sin(angle)
+    turn = np.array([[c, -s], [s, c]])
+    return (
+        replace(recording, force=recording.force @ turn.T, position=recording.position @ turn.T),
+        turn,
+    )
+
+
+@st.composite
+def matrices(draw):
+    """Return tissues: principal stiffnesses 300 to 3000 N/m, in any direction, with a curl."""
+    first, second = (draw(st.floats(300.0, 3000.0)) for _ in range(2))
+    angle, curl = draw(st.floats(0.0, np.pi)), draw(st.floats(-200.0, 200.0))
+    c, s = np.cos(angle), np.sin(angle)
+    turn = np.array([[c, -s], [s, c]])
+    return turn @ np.diag([first, second]) @ turn.T + curl / 2.0 * np.array([[0, -1], [1, 0]])
+
+
+@given(matrices())
+@hypothesis_settings(max_examples=20, deadline=None)
+def test_recovers_any_matrix_from_exact_presses(matrix):
+    (level,) = identify_stiffness(pressed(matrix, grid((1.2,)))).levels
+    # 1e-8: noise below this part of a reading is taken as rounding.
+    assert_allclose(level.matrix, matrix, atol=1e-8 * np.linalg.norm(matrix))
+    assert_allclose(level.symmetric + level.antisymmetric, matrix, atol=1e-5)
+    truth = expected(matrix)
+    for name in ('curl', 'spring', 'principal_stiffness_1', 'tissue_stiffness'):
+        assert_allclose(level[name].value, truth[name], rtol=1e-6, atol=1e-5)
+    assert (level.presses, level.directions) == (8, 8)
+
+
+@given(matrices(), st.floats(0.0, 2.0 * np.pi))
+@hypothesis_settings(max_examples=10, deadline=None)
+def test_turning_the_axes_turns_the_matrix(matrix, angle):
+    recording = pressed(matrix, grid((1.2,)))
+    (level,) = identify_stiffness(recording).levels
+    other, turn = turned(recording, angle)
+    (seen,) = identify_stiffness(other).levels
+    # 1e-7: ten times the rounding of a reading, since some matrices amplify it.
+    size = np.linalg.norm(matrix)
+    assert_allclose(seen.matrix, turn @ level.matrix @ turn.T, atol=1e-7 * size)
+    assert_allclose(seen.curl.value, level.curl.value, atol=1e-7 * size)
+    assert_allclose(seen.spring.value, level.spring.value, atol=1e-7)
+
+
+def test_a_quarter_turn_changes_no_error():
+    recording = pressed(TABLE[1.3], grid((1.3,)), noise=1.0)
+    (level,) = identify_stiffness(recording).levels
+    (seen,) = identify_stiffness(turned(recording, np.pi / 2.0)[0]).levels
+    for name, other in (
+        ('k_xx', 'k_zz'),
+        ('k_zz', 'k_xx'),
+        ('curl', 'curl'),
+        ('spring', 'spring'),
+        ('principal_stiffness_1', 'principal_stiffness_1'),
+    ):
+        # 1e-6: a quarter turn exchanges the axes but for rounding.
+        assert_allclose(seen[name].value, level[other].value, rtol=1e-6)
+        assert_allclose(seen[name].interval, level[other].interval, rtol=1e-6)
+
+
+def test_force_over_length_scales_the_matrix_and_its_errors():
+    recording = pressed(TABLE[1.3], grid((1.3,)), noise=1.0)
+    (level,) = identify_stiffness(recording).levels
+    larger = replace(recording, force=4.0 * recording.force, position=recording.position / 2.0)
+    wide = StiffnessSettings(level_tolerance=0.2, rest_force=0.4)
+    (other,) = identify_stiffness(larger, wide).levels
+    # 1e-9: scales by powers of two change no digit but those of rounding floors.
+    assert_allclose(other.matrix, 8.0 * level.matrix, rtol=1e-9)
+    assert_allclose(other.curl.interval, 8.0 * np.array(level.curl.interval), rtol=1e-9)
+    assert_allclose(other.spring.interval, level.spring.interval, rtol=1e-9)
+    assert_allclose(other.angle.interval, level.angle.interval, rtol=1e-9)
+
+
+def test_tissue_stiffness_is_per_length_of_contact():
+    recording = pressed(TABLE[1.5], grid((1.5,)), noise=1.0)
+    (level,) = identify_stiffness(recording, StiffnessSettings(contact_length=0.02)).levels
+    assert_allclose(level.tissue_stiffness.value, level['k_zz'].value / 0.02)
+    assert_allclose(level.tissue_stiffness.error, level['k_zz'].error / 0.02)
+    assert level.tissue_stiffness.unit == 'N/m^2'
+
+
+NEARLY = {force: np.array([[800.6, 0.2], [-0.2, 800.0]]) for force in (1.1, 1.3, 1.5)}
+ROUND = {force: 800.0 * np.eye(2) for force in (1.1, 1.3, 1.5)}
+
+
+@pytest.fixture(
+    scope='module',
+    params=[(TABLE, 60), (NEARLY, 30), (ROUND, 30)],
+    ids=['table 2', 'nearly round', 'round'],
+)
+def repeats(request):
+    """Identify the same place many times."""
+    table, count = request.param
+    return table, [
+        identify_stiffness(pressed(ofs(table), grid(), noise=1.0, seed=seed))
+        for seed in range(count)
+    ]
+
+
+def test_intervals_hold_the_truth_as_often_as_they_say(repeats):
+    table, estimates = repeats
+    for name in expected(TABLE[1.1]):
+        inside = [
+            low <= expected(matrix)[name] <= high
+            for estimate in estimates
+            for level, matrix in zip(estimate.levels, table.values(), strict=True)
+            for low, high in (level[name].interval,)
+        ]
+        # One in 5,000 that 95 % intervals do worse by chance.
+        assert sum(inside) >= binom.ppf(2e-4, len(inside), 0.95), name
+        if table is TABLE:
+            assert sum(inside) <= binom.ppf(1.0 - 2e-4, len(inside), 0.95), name
+
+
+def test_variance_is_near_the_least_possible(repeats):
+    """The Cramer-Rao bound of whole holds whose zero is known, without drift."""
+    table, estimates = repeats
+    samples = HOLD * RATE
+    rng = np.random.default_rng(1)
+    holds = FORCE_NOISE * limited(rng, round(2000 * samples), RATE).reshape(2000, -1, 2)
+    force_variance = holds.mean(axis=1).var()
+    ratios = []
+    for index, (force, matrix) in enumerate(table.items()):
+        displacement = np.linalg.solve(matrix, grid((force,)).T)
+        among_rows = force_variance * np.eye(2)
+        among_rows += POSITION_NOISE**2 / samples * matrix @ matrix.T
+        bound = np.diag(np.kron(among_rows, np.linalg.inv(displacement @ displacement.T)))
+        found = np.var([e.levels[index].matrix.ravel() for e in estimates], axis=0)
+        ratios.append(found / bound)
+    # The mean over levels and entries scatters by 6 % over 60 repeats, by 8 % over 30.
+    assert np.mean(ratios) < 1.3
+
+
+def test_zero_is_in_the_interval_of_the_figure_where_it_is_in_that_of_the_curl(repeats):
+    for estimate in repeats[1]:
+        for level in estimate.levels:
+            low, high = level.curl.interval
+            assert (level.spring.interval[0] == 0.0) == (low <= 0.0 <= high)
+            assert level.spring.interval[0] <= level.spring.value <= level.spring.interval[1]
+
+
+def test_a_round_tissue_has_no_principal_direction(repeats):
+    table, estimates = repeats
+    determined = sum(level.angle.determined for e in estimates for level in e.levels)
+    if table is TABLE:
+        assert determined == len(estimates) * len(TABLE)
+    elif table is ROUND:
+        # One in a hundred by chance; one in 10,000 that there are more than this.
+        assert determined <= binom.ppf(1.0 - 1e-4, len(estimates) * len(TABLE), 0.01)
+
+
+def test_errors_of_presses_are_those_of_their_scatter():
+    """Also where a slow sensor leaves few independent samples in a hold."""
+    forces = grid((1.3,))
+    off, error = [], []
+    exact = pressed(TABLE[1.3], forces, hold=1.0, rest=1.0)
+    for seed in range(30):
+        rng = np.random.default_rng(seed)
+        noise = lfilter([0.05], [1.0, -0.95], rng.normal(size=exact.force.shape), axis=0)
+        presses = identify_stiffness(replace(exact, force=exact.force + 0.02 * noise)).presses
+        off.append(presses.force - forces)
+        error.append(presses.force_error)
+    # 15 %: 480 values scatter by 3 %, and 40 correlated samples tell their noise to 10 %.
+    assert_allclose(np.sqrt(np.mean(np.square(error))), np.std(off), rtol=0.15)
+
+
+def test_linear_drift_leaves_no_trace():
+    forces = grid()
+    still = identify_stiffness(pressed(ofs(TABLE), forces))
+    moving = identify_stiffness(
+        pressed(ofs(TABLE), forces, drift=(8e-3, -5e-3), creep=(2e-5, 1e-5))
+    )
+    for a, b in zip(still.levels, moving.levels, strict=True):
+        # 1e-7: ten times the rounding of a reading.
+        assert_allclose(b.matrix, a.matrix, atol=1e-7 * np.linalg.norm(a.matrix))
+    text = ' '.join(moving.warnings)
+    assert 'force at rest drifted' in text
+    assert 'position at rest drifted' in text
+    assert 'drift' not in ' '.join(still.warnings)
+
+
+def test_the_order_of_presses_does_not_matter():
+    forces = grid()
+    order = np.random.default_rng(3).permutation(len(forces))
+    straight = identify_stiffness(pressed(ofs(TABLE), forces))
+    mixed = identify_stiffness(pressed(ofs(TABLE), forces[order]))
+    assert_array_equal(mixed.presses.level, straight.presses.level[order])
+    for a, b in zip(straight.levels, mixed.levels, strict=True):
+        # 1e-7: ten times the rounding of a reading.
+        assert_allclose(b.matrix, a.matrix, atol=1e-7 * np.linalg.norm(a.matrix))
+
+
+FEW_ANGLES = np.array([0.0, 2.0, 4.0])
+STAIRS = np.array([[f * np.cos(a), f * np.sin(a)] for a in EIGHT for f in (0.5, 1.0, 1.5, 0.0)])
+
+
+@pytest.mark.parametrize(
+    ('forces', 'options', 'levels'),
+    [
+        (grid((0.6, 2.0), FEW_ANGLES), {'rate': 100.0, 'hold': 2.0, 'ramp': 4.0}, 2),
+        (grid((3.0, 5.0)), {'rate': 1000.0, 'hold': 0.15, 'ramp': 0.05}, 2),
+        (grid((1.1, 1.3)) * np.linspace(0.99, 1.01, 16)[:, np.newaxis], {'rest': 1.0}, 2),
+        (grid((1.0,)), {'bias': (7.0, 3.0), 'rest': 0.15, 'hold': 3.0}, 1),
+        (STAIRS, {'rests': False}, 3),
+    ],
+    ids=['slow', 'fast', 'scattered', 'short rests and bias', 'stairs'],
+)
+def test_finds_the_presses_of_other_protocols(forces, options, levels):
+    matrix = TABLE[1.3]
+    estimate = identify_stiffness(pressed(matrix, forces, noise=1.0, **options))
+    assert len(estimate.levels) == levels
+    pressed_forces = forces[np.hypot(*forces.T) > 0.1]
+    # 5 mN: four times the noise of the mean of a hold.
+    assert_allclose(estimate.presses.force, pressed_forces, atol=5e-3)
+    for level in estimate.levels:
+        assert_allclose(level.matrix, matrix, atol=10.0)
+        assert level.determination > 0.999
+
+
+def test_uneven_stamps_and_gaps_do_no_harm():
+    recording = pressed(TABLE[1.3], grid((1.3,)), noise=1.0)
+    rng = np.random.default_rng(5)
+    kept = (rng.random(len(recording.time)) < 0.8) & (np.abs(recording.time - 3.35) > 0.2)
+    lossy = IndentationRecording(
+        name='lossy',
+        time=recording.time[kept],
+        position=recording.position[kept],
+        off_plane=recording.off_plane[kept],
+        force=recording.force[kept],
+    )
+    (level,) = identify_stiffness(lossy).levels
+    assert level.presses >= 7
+    # 5 N/m: ten standard errors.
+    assert_allclose(level.matrix, TABLE[1.3], atol=5.0)
+
+
+def test_begins_and_ends_anywhere():
+    recording = pressed(TABLE[1.3], grid((1.3,)), noise=1.0)
+    kept = (recording.time > 0.6) & (recording.time < 7.9)
+    cut = IndentationRecording(
+        name='cut',
+        time=recording.time[kept],
+        position=recording.position[kept],
+        off_plane=recording.off_plane[kept],
+        force=recording.force[kept],
+    )
+    (level,) = identify_stiffness(cut).levels
+    assert level.presses == 8
+    assert_allclose(level.matrix, TABLE[1.3], atol=5.0)
+
+
+def test_a_press_without_a_hold_is_left_out_and_said():
+    forces = grid((1.3,))
+    exact = pressed(TABLE[1.3], forces)
+    force, position = exact.force.copy(), exact.position.copy()
+    held = np.abs(exact.time - 1.65) < 0.15
+    shake = 1.0 + 0.3 * np.sin(2.0 * np.pi * 8.0 * exact.time[held, np.newaxis])
+    force[held] = (force[held] - (0.3, -0.2)) * shake + (0.3, -0.2)
+    position[held] = (position[held] - (0.1, 0.05)) * shake + (0.1, 0.05)
+    estimate = identify_stiffness(replace(exact, force=force, position=position))
+    assert estimate.levels[0].presses == 7
+    assert any('presses left out: 1' in warning for warning in estimate.warnings)
+    assert_allclose(estimate.levels[0].matrix, TABLE[1.3], rtol=1e-6)
+
+
+UNKNOWN_FROM_X = (
+    'k_xz',
+    'k_zz',
+    'curl',
+    'spring',
+    'principal_stiffness_1',
+    'principal_stiffness_2',
+    'principal_angle',
+    'tissue_stiffness',
+)
+
+
+@pytest.mark.parametrize('noise', [0.0, 1.0])
+def test_motion_along_x_tells_only_what_it_can(noise):
+    along = TABLE[1.3] @ (1e-3, 0.0)
+    estimate = identify_stiffness(pressed(TABLE[1.3], [along, -along] * 4, noise=noise))
+    (level,) = estimate.levels
+    # 5 N/m: five standard errors.
+    assert_allclose([level['k_xx'].value, level['k_zx'].value], TABLE[1.3][:, 0], atol=5.0)
+    for name in UNKNOWN_FROM_X:
+        assert not level[name].determined
+        assert level[name].interval == (-np.inf, np.inf)
+    assert not level.is_spring
+    assert 'undetermined' in level.words
+    assert any('k_xz, k_zz undetermined' in warning for warning in estimate.warnings)
+
+
+@pytest.mark.parametrize(
+    'forces',
+    [
+        [(0.9, 0.6), (-0.9, -0.6)] * 4,
+        grid((1.2,), np.array([0.3, 0.32, 0.34, 0.36])),
+        [(1.1, 0.0), (0.0, 1.1)],
+    ],
+    ids=['one oblique direction', 'a narrow fan', 'two presses'],
+)
+@pytest.mark.parametrize('noise', [0.0, 1.0])
+def test_too_few_directions_tell_nothing(forces, noise):
+    (level,) = identify_stiffness(pressed(TABLE[1.3], forces, noise=noise)).levels
+    for parameter in level.parameters:
+        assert not parameter.determined
+        assert np.isnan(parameter.value)
+        assert parameter.error == np.inf
+
+
+@pytest.mark.parametrize('estimator', ['ordinary', 'weighted', 'huber', 'total'])
+def test_every_estimator_finds_the_matrix(estimator):
+    recording = pressed(ofs(TABLE), grid(), noise=1.0)
+    settings = StiffnessSettings(estimator=estimator)
+    for level, matrix in zip(
+        identify_stiffness(recording, settings).levels, TABLE.values(), strict=True
+    ):
+        errors = np.array([p.error for p in level.parameters]).reshape(2, 2)
+        # Five standard errors, themselves known to about a third.
+        assert (np.abs(level.matrix - matrix) < 5.0 * errors).all()
+        assert errors.max() < 2.0
+
+
+def test_huber_is_not_led_astray_by_one_press():
+    exact = pressed(TABLE[1.3], grid((1.3,)), noise=1.0)
+    position = exact.position.copy()
+    position[np.abs(exact.time - 1.65) < 0.24] += (1e-4, 1e-4)
+    slipped = replace(exact, position=position)
+    off = {
+        estimator: np.abs(
+            identify_stiffness(slipped, StiffnessSettings(estimator=estimator)).levels[0].matrix
+            - TABLE[1.3]
+        ).max()
+        for estimator in ('ordinary', 'huber')
+    }
+    assert off['huber'] < off['ordinary'] / 2.0
+
+
+def test_weighted_looks_less_at_noisy_presses():
+    forces = grid((1.3,), np.tile(EIGHT, 2))
+    off = {'ordinary': [], 'weighted': []}
+    for seed in range(12):
+        exact = pressed(TABLE[1.3], forces)
+        rng = np.random.default_rng(seed)
+        noise = 2e-3 * rng.normal(size=exact.force.shape)
+        noise[exact.time > exact.time[-1] / 2.0] *= 10.0
+        for estimator, found in off.items():
+            (level,) = identify_stiffness(
+                replace(exact, force=exact.force + noise), StiffnessSettings(estimator=estimator)
+            ).levels
+            found.append(level.matrix - TABLE[1.3])
+    # Half the presses have a hundred times the variance: weights leave a fiftieth of it at best.
+    assert np.var(off['weighted']) < np.var(off['ordinary']) / 5.0
+
+
+def test_a_spring_is_told_from_what_is_none():
+    skewed = TABLE[1.5] + np.array([[0.0, -150.0], [150.0, 0.0]])
+    spring, other = (
+        identify_stiffness(pressed(matrix, grid((1.5,)), noise=1.0)).levels[0]
+        for matrix in (TABLE[1.5], skewed)
+    )
+    assert spring.is_spring
+    assert spring.words.startswith('a spring')
+    assert not other.is_spring
+    assert other.words.startswith('not a spring')
+    loud = identify_stiffness(
+        pressed(TABLE[1.1], grid((1.1,)), noise=1.0), StiffnessSettings(largest_asymmetry=0.0614)
+    ).levels[0]
+    assert not loud.is_spring
+    assert loud.words.startswith('cannot be told')
+
+
+def test_warns_of_what_makes_the_numbers_doubtful():
+    falling = {1.1: 500.0 * np.eye(2), 1.3: 900.0 * np.eye(2)}
+    recording = pressed(ofs(falling), grid((1.1, 1.3), np.arange(3) * 2.0), off_plane=0.3)
+    text = '\n'.join(identify_stiffness(recording).warnings)
+    assert 'out of the plane by up to 30%' in text
+    assert 'in 3 of 3 directions the displacement falls' in text
+    assert 'few directions' in text
+    assert 'k_xx differs' not in text
+    assert 'k_xx differs' in '\n'.join(
+        identify_stiffness(pressed(TABLE[1.5], grid((1.5,)))).warnings
+    )
+    assert identify_stiffness(pressed(ROUND[1.1], grid((1.1,)), noise=1.0)).warnings == ()
+
+
+def test_says_where_presses_do_not_follow_one_matrix():
+    forces = grid((1.1,))
+    stiffer = {1.08: 900.0 * np.eye(2), 1.12: 800.0 * np.eye(2)}
+    forces[:4] *= 1.08 / 1.1
+    forces[4:] *= 1.12 / 1.1
+    text = '\n'.join(identify_stiffness(pressed(ofs(stiffer), forces, noise=1.0)).warnings)
+    assert 'scatter more than their noise' in text
+
+
+def test_tells_what_is_missing():
+    flat = pressed(TABLE[1.1], [(0.05, 0.0)])
+    with pytest.raises(IdentificationError, match=r'place: no hold: .* the largest is 0\.05 N'):
+        identify_stiffness(flat)
+    waving = replace(flat, force=np.column_stack([np.sin(20.0 * flat.time)] * 2))
+    with pytest.raises(IdentificationError, match=r'no force is steady within 0\.05 N for 0\.1 s'):
+        identify_stiffness(waving)
+    short = IndentationRecording(
+        name='short',
+        time=flat.time[:2],
+        position=flat.position[:2],
+        off_plane=flat.off_plane[:2],
+        force=flat.force[:2],
+    )
+    with pytest.raises(IdentificationError, match='too short: 2 samples'):
+        identify_stiffness(short)
+    with pytest.raises(ParameterError, match=r"one of ordinary, .* got 'best'"):
+        StiffnessSettings(estimator='best')
+
+
+def test_summary_is_a_column_of_table_2_per_level():
+    rng = np.random.default_rng(8)
+    places = [
+        {force: matrix + 50.0 * rng.normal(size=(2, 2)) for force, matrix in TABLE.items()}
+        for _ in range(4)
+    ]
+    estimates = [identify_stiffness(pressed(ofs(place), grid())) for place in places]
+    # A place where the robot pressed by a little less, and one level only.
+    estimates.append(identify_stiffness(pressed(places[0][1.3], grid((1.29,)))))
+    summary = summarize_stiffness(estimates)
+    assert_allclose([level.force for level in summary.levels], [1.1, 1.298, 1.5], rtol=1e-6)
+    matrices_at_largest = np.array([place[1.5] for place in places]).reshape(4, 4)
+    for column, name in enumerate(('k_xx', 'k_xz', 'k_zx', 'k_zz')):
+        found = summary.levels[2][name]
+        assert found.count == 4
+        assert_allclose(found.mean, matrices_at_largest[:, column].mean(), rtol=1e-5)
+        assert_allclose(found.deviation, matrices_at_largest[:, column].std(ddof=1), rtol=1e-5)
+    assert summary.levels[1]['curl'].count == 5
+    assert summary.tissue_stiffness is summary.levels[2]['tissue_stiffness']
+    asked = summarize_stiffness(estimates, force=1.1)
+    assert asked.tissue_stiffness is asked.levels[0]['tissue_stiffness']
+    with pytest.raises(IdentificationError, match=r'no level at 2 N; there are 1\.1, 1\.3, 1\.5'):
+        summarize_stiffness(estimates, force=2.0)
+    with pytest.raises(IdentificationError, match='no recordings'):
+        summarize_stiffness([])
+
+
+def test_what_was_found_is_read_by_name():
+    (level,) = identify_stiffness(pressed(TABLE[1.1], grid((1.1,)))).levels
+    assert level['principal_angle'] is level.angle
+    assert level['curl'] is level.curl
+    with pytest.raises(KeyError, match='valid: k_xx'):
+        level['k_yy']
