@@ -698,12 +698,12 @@ def _check(
         raise IdentificationError(
             f'steady motion above {settings.moving_speed:g} m/s must last '
             f'{_FEWEST_WINDOWS * span * signals.period:.3g} s in all, lasts '
-            f'{samples * signals.period:.3g} s: longer strokes, or another axis or topic of motion'
+            f'{samples * signals.period:.3g} s: move longer, or choose another axis or topic'
         )
     force = signals.force[design.used]
     if np.ptp(force) == 0.0:
         raise IdentificationError(
-            f'the force must vary, got {force[0]:g} N throughout: another axis or topic of force'
+            f'the force must vary, got {force[0]:g} N throughout: choose another axis or topic'
         )
 
 
@@ -721,7 +721,7 @@ def _check_size(parameters: Sequence[ParameterEstimate]) -> None:
     if friction and all(p.determined and abs(p.value) < 2.0 * p.error for p in friction):
         sizes = ', '.join(f'{p.symbol} = {p.value:.2g} ± {p.error:.2g} {p.unit}' for p in friction)
         raise IdentificationError(
-            f'no friction: {sizes}; force and motion do not belong together, or other axes do'
+            f'no friction: {sizes}; force and motion do not belong together, or the axes are wrong'
         )
 
 
@@ -915,7 +915,7 @@ def _breakaway(
 ) -> ParameterEstimate | None:
     """Return the mean force at which the needle left a rest in which the force rose."""
     # Shorter than `WINDOW`: the rise of the force is short too.
-    window = signals.spanning(0.5 * WINDOW / settings.cutoff)
+    window = signals.spanning(0.4 * WINDOW / settings.cutoff)
     starts = np.flatnonzero((design.regime[1:] != 0.0) & (design.regime[:-1] == 0.0)) + 1
     changes = np.flatnonzero(np.diff(design.stroke)) + 1
     found, signs = [], []

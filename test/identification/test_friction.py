@@ -425,13 +425,13 @@ def jump(recording):
 @pytest.mark.parametrize(
     ('recording', 'complaint'),
     [
-        (law(np.zeros_like), r'must last .* s in all, lasts 0 s: .* axis or topic of motion'),
+        (law(np.zeros_like), r'must last .* s in all, lasts 0 s: .* choose another axis or topic'),
         (law(varied, duration=0.5), 'steady motion above 1e-05 m/s must last'),
         (law(varied, duration=0.04), 'must last > 0.048 s for a filter of 30 Hz'),
         (law(varied, duration=0.004), 'too short: 1 samples'),
         (
             replace(law(varied), force=np.zeros(2000)),
-            'force must vary, got 0 N throughout: another axis or topic',
+            'force must vary, got 0 N throughout: choose another axis or topic',
         ),
         (
             replace(law(varied), force=np.random.default_rng(0).normal(scale=0.01, size=2000)),
