@@ -1,6 +1,14 @@
 """Control laws of the source in sampled form, references, and the controller node."""
 
-from needle_controller.axis import Axis, SampledLoop, Setpoint
+from needle_controller.axis import Axis, Law, no_memory, Response, SampledLoop, Setpoint
+from needle_controller.continuous import (
+    ACTUATIONS,
+    closed_loop,
+    closed_loop_matrix,
+    ContinuousInverseDynamics,
+    ContinuousLaw,
+    ContinuousPid,
+)
 from needle_controller.controller import (
     Command,
     Controller,
@@ -9,28 +17,59 @@ from needle_controller.controller import (
     Measurement,
 )
 from needle_controller.inverse_dynamics import InverseDynamics, InverseDynamicsGains
-from needle_controller.pid import Pid, PidGains
+from needle_controller.modal import DeflectionLaw, DeflectionLoop, ModalLoop, NormalModes
+from needle_controller.observer import Consistency, Observer, ObserverSettings
+from needle_controller.pid import ANTI_WINDUP, Pid, PidGains
 from needle_controller.reference import MinimumJerk, ReferenceLimits, REFERENCES, Trapezoid
-from needle_controller.stability import check_stability, spectral_radius, transition_matrix
+from needle_controller.stability import (
+    check_stability,
+    deflection_matrix,
+    Limit,
+    MARGIN,
+    spectral_radius,
+    stability_limit,
+    transition_matrix,
+)
 
 __all__ = [
+    'ACTUATIONS',
+    'ANTI_WINDUP',
     'LAWS',
+    'MARGIN',
     'REFERENCES',
     'Axis',
     'Command',
+    'Consistency',
+    'ContinuousInverseDynamics',
+    'ContinuousLaw',
+    'ContinuousPid',
     'Controller',
     'ControllerSettings',
+    'DeflectionLaw',
+    'DeflectionLoop',
     'InverseDynamics',
     'InverseDynamicsGains',
+    'Law',
+    'Limit',
     'Measurement',
     'MinimumJerk',
+    'ModalLoop',
+    'NormalModes',
+    'Observer',
+    'ObserverSettings',
     'Pid',
     'PidGains',
     'ReferenceLimits',
+    'Response',
     'SampledLoop',
     'Setpoint',
     'Trapezoid',
     'check_stability',
+    'closed_loop',
+    'closed_loop_matrix',
+    'deflection_matrix',
+    'no_memory',
     'spectral_radius',
+    'stability_limit',
     'transition_matrix',
 ]

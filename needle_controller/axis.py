@@ -1,30 +1,75 @@
-"""One actuated axis as a sampled law sees it: a mass under viscous and Coulomb friction."""
+"""One axis as a sampled law sees it: a mass or oscillator, and the loop around a law on it."""
 
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass, replace
-from typing import Protocol
+from dataclasses import dataclass, field, replace
+from math import exp, isfinite
+from typing import Final, NamedTuple
 
-from needle_dynamics import NeedleParameters
+from needle_controller import kernels
+from needle_controller.kernels import law_force, law_match, law_remember, law_step, oscillation
+from needle_dynamics import FloatArray, NeedleParameters, ParameterError
 from needle_dynamics.kernels import decay_means, slide
+import numpy as np
+
+#: Coulomb friction is compensated in the direction of the speed that is wanted this much later
+#: [s], or at the end of the period if that is longer: so a law breaks away at any rate.
+BREAKAWAY_TIME: Final = 1e-3
+
+#: Time constant with which a force taken over at a switch of laws fades [s].
+HANDOVER_TIME: Final = 0.1
+
+
+class Response(NamedTuple):
+    """
+    Linear response of an axis over a time, under a constant force.
+
+    ``end position = pp position + pv speed + pf force`` and likewise for the end speed.
+    """
+
+    pp: float
+    pv: float
+    vp: float
+    vv: float
+    pf: float
+    vf: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Axis:
     """
-    Insertion (SI: kg, N, N s/m) or rotation (kg m^2, N m, N m s) with its friction.
+    Insertion (SI: kg, N, N s/m), rotation (kg m^2, N m, N m s), or one mode of deflection.
 
     Attributes
     ----------
-    inertia, coulomb, viscous : float
-        Inertia, Coulomb friction mu_s and viscous friction mu_v.
+    inertia, coulomb, viscous, stiffness : float
+        Inertia, Coulomb friction mu_s, viscous friction mu_v and stiffness. An axis with
+        stiffness has no Coulomb friction.
+
+    Raises
+    ------
+    ParameterError
+        If a value is not finite or negative, the inertia is zero, or both stiffness and Coulomb
+        friction are given.
 
     """
 
     inertia: float
     coulomb: float = 0.0
     viscous: float = 0.0
+    stiffness: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ('inertia', 'coulomb', 'viscous', 'stiffness'):
+            value = getattr(self, name)
+            if not (isfinite(value) and value >= 0.0) or (name == 'inertia' and value == 0.0):
+                sign = '>' if name == 'inertia' else '>='
+                raise ParameterError(f'{name} must be finite and {sign} 0, got {value!r}')
+        if self.stiffness > 0.0 and self.coulomb > 0.0:
+            raise ParameterError(
+                f'an axis with stiffness must have coulomb = 0, got {self.coulomb!r}'
+            )
 
     @classmethod
     def insertion(cls, parameters: NeedleParameters) -> Axis:
@@ -48,24 +93,26 @@ class Axis:
         self, position: float, speed: float, force: float, t: float
     ) -> tuple[float, float]:
         """Return position and speed after a constant force for a time t [s], exactly."""
+        if self.stiffness > 0.0:
+            r = self.response(t)
+            return (
+                r.pp * position + r.pv * speed + r.pf * force,
+                r.vp * position + r.vv * speed + r.vf * force,
+            )
         end, moved = slide(speed, force, self.inertia, self.coulomb, self.viscous, t)
         return position + moved, end
 
-    def response(self, t: float) -> tuple[float, float, float, float]:
-        """
-        Return the linear response over a time t [s] under a constant force.
-
-        Returns
-        -------
-        tuple of float
-            ``(decay, speed, drift, shift)`` with ``end = decay u + speed f`` for the speed and
-            ``moved = drift u + shift f`` for the displacement.
-
-        """
+    def response(self, t: float) -> Response:
+        """Return the linear response over a time t [s] under a constant force, exactly."""
+        if self.stiffness > 0.0:
+            pp, pv, vp, vv, pf, vf = oscillation(
+                self.viscous / self.inertia, self.stiffness / self.inertia, t
+            )
+            return Response(pp, pv, vp, vv, pf / self.inertia, vf / self.inertia)
         x = self.viscous * t / self.inertia
         mean, ramp = decay_means(x)
         push = t / self.inertia
-        return 1.0 - x * mean, mean * push, mean * t, ramp * t * push
+        return Response(1.0, mean * t, 0.0, 1.0 - x * mean, ramp * t * push, mean * push)
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,30 +124,123 @@ class Setpoint:
     acceleration: float = 0.0
 
 
-class Law(Protocol):
-    """A sampled control law on one axis; what it remembers is passed in and out."""
+def no_memory(count: int | None = None) -> FloatArray:
+    """Return what a law remembers at the beginning: of one axis, or of ``count`` deflections."""
+    return np.zeros(kernels.MEMORY if count is None else (kernels.MEMORY, count))
 
-    @property
-    def axis(self) -> Axis:
-        """The axis as the law believes it to be."""
 
-    @property
-    def period(self) -> float:
-        """Sample period [s]."""
+def law_constants(period: float, breakaway_speed: float, **slots: float) -> FloatArray:
+    """Return the constants that the compiled laws take, by the names of their slots."""
+    c = np.zeros(kernels.CONSTANTS)
+    c[kernels.PERIOD] = period
+    c[kernels.BREAKAWAY] = breakaway_speed
+    c[kernels.AHEAD] = max(period, BREAKAWAY_TIME)
+    c[kernels.FADE] = exp(-period / HANDOVER_TIME)
+    for name, value in slots.items():
+        c[getattr(kernels, name)] = value
+    return c
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Law:
+    """
+    A sampled control law on one axis; what it remembers is kept by its loop.
+
+    Attributes
+    ----------
+    axis : Axis
+        Axis as the law believes it to be.
+    period : float
+        Sample period h [s].
+    constants : ndarray, shape (CONSTANTS,)
+        The law as the functions of `needle_controller.kernels` take it.
+
+    Notes
+    -----
+    ``memory`` is an array of shape (MEMORY,), see `no_memory`, that is written in place.
+
+    """
+
+    axis: Axis
+    period: float
+    constants: FloatArray = field(init=False, repr=False, compare=False)
+
+    def _set_constants(self, breakaway_speed: float, **slots: float) -> None:
+        response = self.axis.response(self.period)
+        constants = law_constants(
+            self.period,
+            breakaway_speed,
+            COULOMB=self.axis.coulomb,
+            **{name.upper(): value for name, value in response._asdict().items()},
+            **slots,
+        )
+        object.__setattr__(self, 'constants', constants)
 
     def force(
-        self, position: float, speed: float, setpoint: Setpoint, memory: float, load: float
+        self,
+        position: float,
+        speed: float,
+        setpoint: Setpoint,
+        memory: FloatArray,
+        load: float = 0.0,
     ) -> float:
-        """Return the force for the next period, before any limit."""
+        """Return the force for the next period, before any limit; ``load`` is against it."""
+        at = setpoint
+        return law_force(
+            self.constants, memory, position, speed, at.position, at.speed, at.acceleration, load
+        )
 
-    def remember(self, memory: float, position: float, setpoint: Setpoint, excess: float) -> float:
-        """Return the new memory; ``excess`` is the force that a limit took away."""
+    def remember(
+        self,
+        position: float,
+        speed: float,
+        setpoint: Setpoint,
+        memory: FloatArray,
+        wanted: float,
+        force: float,
+    ) -> None:
+        """Update the memory for a force that was wanted and the one that limits left."""
+        law_remember(
+            self.constants,
+            memory,
+            position,
+            speed,
+            setpoint.position,
+            setpoint.speed,
+            setpoint.acceleration,
+            wanted,
+            force,
+        )
+
+    def match(
+        self,
+        position: float,
+        speed: float,
+        setpoint: Setpoint,
+        memory: FloatArray,
+        load: float,
+        force: float,
+    ) -> None:
+        """Set the memory so that the next force is the given one: a switch without a bump."""
+        law_match(
+            self.constants,
+            memory,
+            position,
+            speed,
+            setpoint.position,
+            setpoint.speed,
+            setpoint.acceleration,
+            load,
+            force,
+        )
 
     def linear(self) -> Law:
         """Return the same law without Coulomb friction, for its poles."""
+        return replace(self, axis=self.axis.without_coulomb())
 
     def scaled(self, factor: float) -> Law:
         """Return the same law with all gains times a factor."""
+        raise NotImplementedError
 
 
 class SampledLoop:
@@ -125,13 +265,30 @@ class SampledLoop:
         self.law = law
         self.limit = limit
         self.on_the_way: deque[float] = deque([0.0] * delay, maxlen=delay)
-        self.memory = 0.0
+        self.memory = no_memory()
+        self.last = 0.0
+        self._take_over = False
+
+    def stop(self) -> None:
+        """Nothing is on the way any more; what the law remembers stays as it is."""
+        for i in range(len(self.on_the_way)):
+            self.on_the_way[i] = 0.0
+        self.last = 0.0
+        self._take_over = False
 
     def reset(self) -> None:
         """Forget the past: nothing on the way, nothing remembered."""
-        for i in range(len(self.on_the_way)):
-            self.on_the_way[i] = 0.0
-        self.memory = 0.0
+        self.stop()
+        self.memory[:] = 0.0
+
+    def switch(self, law: Law) -> None:
+        """Go on with another law, or other gains: its first force is the last one again."""
+        if law.period != self.law.period:
+            raise ParameterError(
+                f'the period must stay {self.law.period:g} s, got {law.period!r} s'
+            )
+        self.law = law
+        self._take_over = True
 
     def command(
         self, position: float, speed: float, setpoint: Setpoint, load: float = 0.0
@@ -157,8 +314,25 @@ class SampledLoop:
         law = self.law
         for force in self.on_the_way:
             position, speed = law.axis.propagate(position, speed, force - load, law.period)
-        wanted = law.force(position, speed, setpoint, self.memory, load)
-        force = min(max(wanted, -self.limit), self.limit)
-        self.memory = law.remember(self.memory, position, setpoint, wanted - force)
+        return self.answer(position, speed, setpoint, load)
+
+    def answer(
+        self, position: float, speed: float, setpoint: Setpoint, load: float = 0.0
+    ) -> float:
+        """Do what `command` does, from the state when the command takes effect."""
+        if self._take_over:
+            self._take_over = False
+            self.law.match(position, speed, setpoint, self.memory, load, self.last)
+        self.last = force = law_step(
+            self.law.constants,
+            self.memory,
+            position,
+            speed,
+            setpoint.position,
+            setpoint.speed,
+            setpoint.acceleration,
+            load,
+            self.limit,
+        )
         self.on_the_way.append(force)
         return force

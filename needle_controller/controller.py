@@ -2,19 +2,32 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from math import isfinite
+from math import isfinite, sqrt
+from typing import Final, TypeAlias
 
 from needle_controller.axis import Axis, Law, SampledLoop, Setpoint
+from needle_controller.continuous import ACTUATIONS
 from needle_controller.inverse_dynamics import InverseDynamics, InverseDynamicsGains
+from needle_controller.modal import DeflectionLaw, ModalLoop
 from needle_controller.pid import Pid, PidGains
-from needle_controller.reference import Reference, ReferenceLimits, REFERENCES
-from needle_controller.stability import check_stability
-from needle_dynamics import NeedleParameters, ParameterError
+from needle_controller.reference import Guide, Quintic, ReferenceLimits
+from needle_controller.stability import check_stability, Limit, MARGIN
+from needle_dynamics import FloatArray, NeedleModel, NeedleParameters, ParameterError
 from needle_dynamics.parameters import check_constants, constant
+import numpy as np
 
 #: Control laws by name.
-LAWS = ('inverse_dynamics', 'pid')
+LAWS: Final = ('inverse_dynamics', 'pid')
+
+#: What is driven: the base; with `modal` actuation the deflections too.
+AXES: Final = ('insertion', 'rotation', 'deflection')
+
+Gains: TypeAlias = InverseDynamicsGains | PidGains
+
+#: Largest tip deflection that can be asked for [m].
+_MOST_DEFLECTION: Final = 0.1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -29,13 +42,43 @@ class ControllerSettings:
         0.1, 's', 'age at which a measurement no longer counts', open_low=True
     )
     jump: float = constant(
-        2e-3, 'm', 'move during a fault after which the target no longer counts', open_low=True
+        2e-3, 'm', 'move that the speed does not explain, which is a fault; after a move of that '
+        'size during a fault the target no longer counts', open_low=True,
+    )  # fmt: skip
+    stability_margin: float = constant(
+        MARGIN, '1', 'part by which every error has to shrink in a period', high=0.5
+    )
+    lowest_depth: float = constant(
+        0.0, 'm', 'least inserted length to control; no less than minimum_depth'
+    )
+    highest_depth: float = constant(
+        10.0, 'm', 'largest inserted length to control; no more than the needle', open_low=True
     )
 
     def __post_init__(self) -> None:
         check_constants(self)
         if self.delay != int(self.delay):
             raise ParameterError(f'delay must be a whole number of periods, got {self.delay!r}')
+
+    def depths(self, parameters: NeedleParameters) -> tuple[float, float]:
+        """
+        Return the range of inserted lengths to control a needle in [m].
+
+        Raises
+        ------
+        ParameterError
+            If nothing is left of it.
+
+        """
+        low = max(self.lowest_depth, parameters.minimum_depth)
+        high = min(self.highest_depth, parameters.length)
+        if not low < high:
+            raise ParameterError(
+                f'lowest_depth and highest_depth must leave some of '
+                f'[{parameters.minimum_depth:g}, {parameters.length:g}] m, got '
+                f'{self.lowest_depth:g} and {self.highest_depth:g} m'
+            )
+        return low, high
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -76,17 +119,29 @@ class Command:
         f_y [N], positive into the tissue, and tau [N m].
     setpoint : Setpoint
         Reference of the inserted length at the time of the measurement.
+    modal : ndarray, shape (n,), or None
+        Generalized forces on q1..qn [N m^-1/2]; None with `physical` actuation.
+    fault : str or None
+        Why no force is commanded.
+    notice : str or None
+        What people should know.
 
     """
 
     force: float
     torque: float
     setpoint: Setpoint
+    modal: FloatArray | None = None
+    fault: str | None = None
+    notice: str | None = None
 
 
 class Controller:
     """
-    Drives the needle to a target depth with the two forces a robot has (`physical` actuation).
+    Drives the needle to a target depth or along a path.
+
+    With `physical` actuation it commands the two forces that a robot has; with `modal` actuation
+    a generalized force on every coordinate, and the deflections have targets too.
 
     Parameters
     ----------
@@ -97,11 +152,22 @@ class Controller:
     settings : ControllerSettings
         Rate, delay and limits.
     inverse_dynamics, pid : tuple of gains
-        Gains of insertion and of rotation for each law.
+        Gains of insertion and rotation for each law, and with `modal` actuation of deflection.
     reference : str
         Name of the reference, a key of `REFERENCES`.
     limits : ReferenceLimits
-        Limits of the reference.
+        Limits of the reference; with `modal` actuation those of the tip deflection too.
+    actuation : str
+        One of `ACTUATIONS`.
+
+    Attributes
+    ----------
+    law : str
+        Name of the law.
+    guide : Guide
+        What it aims at: paths, pauses.
+    limits : dict of str to Limit
+        What limits the stability of each axis.
 
     Raises
     ------
@@ -116,50 +182,109 @@ class Controller:
         parameters: NeedleParameters,
         settings: ControllerSettings,
         *,
-        inverse_dynamics: tuple[InverseDynamicsGains, InverseDynamicsGains],
-        pid: tuple[PidGains, PidGains],
+        inverse_dynamics: tuple[InverseDynamicsGains, ...],
+        pid: tuple[PidGains, ...],
         reference: str,
         limits: ReferenceLimits,
+        actuation: str = 'physical',
     ) -> None:
-        for name, valid in ((law, LAWS), (reference, tuple(REFERENCES))):
-            if name not in valid:
-                raise ParameterError(f'unknown {name!r}; valid: {", ".join(valid)}')
-        self._name = law
-        self._gains = pid if law == 'pid' else inverse_dynamics
-        self._limits = limits
-        self._reference_kind = REFERENCES[reference]
+        if actuation not in ACTUATIONS:
+            raise ParameterError(f'unknown {actuation!r}; valid: {", ".join(ACTUATIONS)}')
+        self._axes = AXES if actuation == 'modal' else AXES[:2]
+        self._settings = settings
         self._period = 1.0 / settings.rate
         self._delay = int(settings.delay)
-        insertion, rotation = self._laws(parameters)
+        self._depths = settings.depths(parameters)
+        self.guide = Guide(reference, limits, self._depths)
+        self.law = ''
+        self.limits: dict[str, Limit] = {}
+        self._gains: dict[str, tuple[Gains, ...]] = {}
         self._parameters = parameters
-        self._insertion = SampledLoop(insertion, self._delay, settings.force_limit)
-        self._rotation = SampledLoop(rotation, self._delay, settings.torque_limit)
-        self._target: float | None = None
-        self._reference: Reference | None = None
-        self._reference_start = 0.0
-        self._planned = False
+        self._laws: list[Law | DeflectionLaw] = []
+        gains: dict[str, tuple[Gains, ...]] = {'inverse_dynamics': inverse_dynamics, 'pid': pid}
+        self._laws, self.limits = self._checked(law, parameters, gains)
+        self.law, self._gains = law, gains
+        insertion, rotation, deflection = self._split()
+        forces = {'force_limit': settings.force_limit, 'torque_limit': settings.torque_limit}
+        self._modal: ModalLoop | None = None
+        if deflection is not None:
+            self._modal = ModalLoop(insertion, rotation, deflection, self._delay, **forces)
+            self._insertion, self._rotation = self._modal.insertion, self._modal.rotation
+        else:
+            self._insertion = SampledLoop(insertion, self._delay, settings.force_limit)
+            self._rotation = SampledLoop(rotation, self._delay, settings.torque_limit)
+        self._deflection = 0.0
+        self.forget()
 
-    def _laws(self, parameters: NeedleParameters) -> tuple[Law, Law]:
-        """Return the laws of insertion and rotation, or refuse gains that cannot be stable."""
-        laws: list[Law] = []
-        axes = Axis.insertion(parameters), Axis.rotation(parameters)
-        for i, name in enumerate(('insertion', 'rotation')):
-            axis, gains = axes[i], self._gains[i]
-            if isinstance(gains, PidGains):
-                laws.append(Pid(axis=axis, gains=gains, period=self._period))
-            else:
-                laws.append(InverseDynamics(axis=axis, gains=gains, period=self._period))
-            check_stability(laws[-1], self._delay, f'{self._name}.{name} gains')
-        return laws[0], laws[1]
+    def _split(self) -> tuple[Law, Law, DeflectionLaw | None]:
+        """Return the laws by their kind."""
+        insertion, rotation, *others = self._laws
+        if isinstance(insertion, DeflectionLaw) or isinstance(rotation, DeflectionLaw):
+            raise TypeError(self._laws)
+        deflection = others[0] if others else None
+        return insertion, rotation, deflection if isinstance(deflection, DeflectionLaw) else None
 
-    def change(self, parameters: NeedleParameters) -> None:
+    def _checked(
+        self, name: str, parameters: NeedleParameters, gains: Mapping[str, tuple[Gains, ...]]
+    ) -> tuple[list[Law | DeflectionLaw], dict[str, Limit]]:
+        """Return the laws and what limits them, or refuse gains that cannot be stable."""
+        if name not in LAWS:
+            raise ParameterError(f'unknown {name!r}; valid: {", ".join(LAWS)}')
+        if len(gains[name]) < len(self._axes):
+            raise ParameterError(
+                f'{name} needs gains of {", ".join(self._axes)}, got {len(gains[name])}'
+            )
+        laws: list[Law | DeflectionLaw] = []
+        limits: dict[str, Limit] = {}
+        for i, axis in enumerate(self._axes):
+            chosen = gains[name][i]
+            if self._laws and (name, parameters, chosen) == (
+                self.law, self._parameters, self._gains[name][i]
+            ):  # fmt: skip
+                # The search for what limits the deflections takes a while.
+                laws.append(self._laws[i])
+                limits[axis] = self.limits[axis]
+                continue
+            law = self._make(axis, parameters, chosen)
+            limits[axis] = check_stability(
+                law,
+                self._delay,
+                f'{name}.{axis} gains',
+                margin=self._settings.stability_margin,
+                depths=self._depths if isinstance(law, DeflectionLaw) else None,
+            )
+            laws.append(law)
+        return laws, limits
+
+    def _make(self, name: str, parameters: NeedleParameters, gains: Gains) -> Law | DeflectionLaw:
+        if name == 'deflection':
+            return DeflectionLaw(model=NeedleModel(parameters), gains=gains, period=self._period)
+        axis = getattr(Axis, name)(parameters)
+        if isinstance(gains, PidGains):
+            return Pid(axis=axis, gains=gains, period=self._period)
+        return InverseDynamics(axis=axis, gains=gains, period=self._period)
+
+    def change(
+        self,
+        parameters: NeedleParameters | None = None,
+        *,
+        law: str | None = None,
+        inverse_dynamics: tuple[InverseDynamicsGains, ...] | None = None,
+        pid: tuple[PidGains, ...] | None = None,
+    ) -> None:
         """
-        Believe other constants from now on; target, reference and memory stay.
+        Go on with other constants, gains or another law; target, reference and memory stay.
+
+        With other gains or another law the first forces in a motion are the last ones again.
 
         Parameters
         ----------
-        parameters : NeedleParameters
+        parameters : NeedleParameters, optional
             Needle and tissue.
+        law : str, optional
+            Name of the law.
+        inverse_dynamics, pid : tuple of gains, optional
+            Gains.
 
         Raises
         ------
@@ -167,15 +292,33 @@ class Controller:
             If the gains cannot be stable with them; the old ones then stay.
 
         """
-        self._insertion.law, self._rotation.law = self._laws(parameters)
-        self._parameters = parameters
+        parameters = parameters or self._parameters
+        name = law or self.law
+        gains: dict[str, tuple[Gains, ...]] = {
+            'inverse_dynamics': inverse_dynamics or self._gains['inverse_dynamics'],
+            'pid': pid or self._gains['pid'],
+        }
+        laws, limits = self._checked(name, parameters, gains)
+        steady = (name, gains[name]) == (self.law, self._gains[self.law])
+        self._laws, self.limits = laws, limits
+        self._parameters, self.law, self._gains = parameters, name, gains
+        insertion, rotation, deflection = self._split()
+        if steady or not self.guide.moves:
+            self._insertion.law, self._rotation.law = insertion, rotation
+            if self._modal is not None and deflection is not None:
+                self._modal.deflection.law = deflection
+        elif self._modal is not None and deflection is not None:
+            self._modal.switch(insertion, rotation, deflection)
+        else:
+            self._insertion.switch(insertion)
+            self._rotation.switch(rotation)
 
     @property
     def target(self) -> float | None:
         """Inserted length to reach [m], None before the first target."""
-        return self._target
+        return self.guide.target
 
-    def set_target(self, depth: float) -> None:
+    def set_target(self, depth: float, deflection: float = 0.0) -> None:
         """
         Aim at an inserted length, from wherever the reference is now.
 
@@ -183,6 +326,8 @@ class Controller:
         ----------
         depth : float
             Inserted length [m].
+        deflection : float
+            Deflection of the tip there [m]; counts with `modal` actuation only.
 
         Raises
         ------
@@ -190,27 +335,90 @@ class Controller:
             If it is not finite or the needle cannot be there.
 
         """
-        p = self._parameters
-        if not p.minimum_depth <= depth <= p.length:
+        # Written so that NaN is refused too.
+        if not abs(deflection) <= _MOST_DEFLECTION:
             raise ParameterError(
-                f'target depth must be in [{p.minimum_depth:g}, {p.length:g}] m, got {depth!r}'
+                f'target deflection must be within {_MOST_DEFLECTION:g} m, got {deflection!r}'
             )
-        self._target = depth
-        self._planned = False
+        self.guide.aim(depth)
+        self._deflection = deflection
+        self._bending_due = True
+
+    def follow(
+        self,
+        times: Sequence[float],
+        positions: Sequence[float],
+        speeds: Sequence[float] | None = None,
+    ) -> None:
+        """
+        Follow a path of inserted lengths from now on; see `Path` and `Joined`.
+
+        Parameters
+        ----------
+        times, positions, speeds : sequence of float
+            Times from now [s], inserted lengths [m] and insertion speeds [m/s].
+
+        Raises
+        ------
+        ParameterError
+            If it is not a valid path.
+
+        """
+        self.guide.follow(times, positions, speeds)
 
     def forget(self) -> None:
-        """Let go and forget the target too."""
-        self.release()
-        self._target = None
+        """Let go and forget the target too, and all that is remembered."""
+        self.guide.forget()
+        for loop in (self._insertion, self._rotation, self._modal):
+            if loop is not None:
+                loop.reset()
+        self._seen: Measurement | None = None
+        self._last_depth: float | None = None
+        self._stopped = False
+        self._bending: list[Quintic] | None = None
+        self._bending_start, self._bending_due = 0.0, True
 
     def release(self) -> None:
-        """Let go: forget the motion; the next measurement starts anew from where the needle is."""
-        self._reference = None
-        self._planned = False
-        self._insertion.reset()
-        self._rotation.reset()
+        """
+        Let go: forget the motion; the next measurement starts anew from where the needle is.
 
-    def command(self, measured: Measurement, load: float = 0.0) -> Command:
+        Integrals stay as they are while nothing is commanded.
+        """
+        self.guide.release()
+        for loop in (self._insertion, self._rotation, self._modal):
+            if loop is not None:
+                loop.stop()
+        self._stopped = True
+        self._bending, self._bending_due = None, True
+
+    def _fault(self, measured: Measurement) -> str | None:
+        """Return why a measurement cannot be answered."""
+        if not measured.is_finite():
+            return f'joint_states must be finite, got {measured}'
+        before, self._seen = self._seen, measured
+        if before is not None:
+            elapsed = measured.time - before.time
+            moved = measured.depth - before.depth
+            explained = 0.5 * (before.speed + measured.speed) * elapsed
+            if not abs(moved - explained) <= self._settings.jump:
+                return (
+                    f'insertion moved by {moved:.6g} m in {elapsed:.6g} s at speeds of '
+                    f'{before.speed:.6g} and {measured.speed:.6g} m/s'
+                )
+        low, high = self._depths
+        if self._modal is not None and not low <= measured.depth <= high:
+            return (
+                f'inserted length {measured.depth:.6g} m is outside [{low:g}, {high:g}] m, where '
+                'the deflections are controlled'
+            )
+        return None
+
+    def command(
+        self,
+        measured: Measurement,
+        load: float = 0.0,
+        bend: tuple[FloatArray, FloatArray] | None = None,
+    ) -> Command:
         """
         Return the command that answers a measurement.
 
@@ -219,30 +427,90 @@ class Controller:
         measured : Measurement
             Encoders.
         load : float
-            Force of the bent needle against insertion [N], if it is known.
+            Force of the bent needle against insertion [N], if it is known; with `modal`
+            actuation it comes from the deflections.
+        bend : tuple of ndarray, shape (n,) each, optional
+            Deflections q1..qn and their rates; needed with `modal` actuation.
 
         Returns
         -------
         Command
-            Zero force while there is no target or the measurement is not finite.
+            Zero force while there is no target, or with the fault that a measurement has: it is
+            not finite, has moved by more than its speed explains, or is out of range.
 
         """
-        if not measured.is_finite():
+        at_rest = np.zeros(len(bend[0])) if self._modal is not None and bend else None
+        fault = self._fault(measured)
+        if fault is None and self._modal is not None and bend is None:
+            fault = 'deflections are not known'
+        notice = None
+        if fault is not None:
             self.release()
-        if self._target is None or not measured.is_finite():
-            return Command(force=0.0, torque=0.0, setpoint=Setpoint(measured.depth))
-        reference = self._reference
-        if reference is None or not self._planned:
-            start = Setpoint(measured.depth)
-            if reference is not None:
-                start = reference.at(measured.time - self._reference_start)
-            reference = self._reference_kind(start, self._target, self._limits)
-            self._reference, self._reference_start = reference, measured.time
-            self._planned = True
-        elapsed = measured.time - self._reference_start
-        ahead = reference.at(elapsed + self._delay * self._period)
+        else:
+            last, self._last_depth = self._last_depth, measured.depth
+            moved = abs(measured.depth - last) if last is not None else 0.0
+            if self._stopped and moved > self._settings.jump and self.guide.aims:
+                seen = self._seen
+                self.forget()
+                self._seen, self._last_depth = seen, measured.depth
+                notice = (
+                    f'the needle is {moved:.6f} m from where it was before the fault; the target '
+                    'is forgotten'
+                )
+            self._stopped = False
+        if fault is not None or not self.guide.aims:
+            here = Setpoint(measured.depth)
+            return Command(
+                force=0.0, torque=0.0, setpoint=here, modal=at_rest, fault=fault, notice=notice
+            )
+        now = self.guide.at(measured.time, measured.depth)
+        later = measured.time + self._delay * self._period
+        ahead = self.guide.ahead(later)
+        if self._modal is not None and bend is not None:
+            wanted = self._wanted(measured.time, later, bend[0])
+            p = self._parameters
+            state = np.concatenate(
+                [
+                    [p.length - measured.depth, measured.angle],
+                    bend[0],
+                    [-measured.speed, measured.angular_speed],
+                    bend[1],
+                ]
+            )
+            forces = self._modal.command(state, ahead, Setpoint(0.0), wanted)
+            return Command(
+                force=float(forces[0]), torque=float(forces[1]), setpoint=now, modal=forces[2:]
+            )
         return Command(
             force=self._insertion.command(measured.depth, measured.speed, ahead, load),
             torque=self._rotation.command(measured.angle, measured.angular_speed, Setpoint(0.0)),
-            setpoint=reference.at(elapsed),
+            setpoint=now,
         )
+
+    def _wanted(self, time: float, later: float, now: FloatArray) -> FloatArray:
+        """Return the deflections to have, with rates and accelerations, shape (3, n)."""
+        if self._bending_due and self.guide.target is not None:
+            self._bending_due = False
+            model, limits = NeedleModel(self._parameters), self.guide.limits
+            m, target = model.coordinates, self.guide.target
+            goal = model.state_at(target, self._deflection)[2:m]
+            starts = [Setpoint(float(q)) for q in now]
+            if self._bending is not None:
+                starts = [motion.at(time - self._bending_start) for motion in self._bending]
+            straight = model.state_at(target)
+            straight[2:m] = [start.position for start in starts]
+            change = abs(self._deflection - model.tip_deflection(straight))
+            # Rest to rest within the limits, and no earlier than the insertion.
+            duration = max(
+                self.guide.left(time),
+                1.875 * change / limits.speed,
+                sqrt(10.0 / sqrt(3.0) * change / limits.acceleration),
+                100.0 * self._period,
+            )
+            self._bending_start = time
+            self._bending = [
+                Quintic(start, Setpoint(float(end)), duration)
+                for start, end in zip(starts, goal, strict=True)
+            ]
+        points = [motion.at(later - self._bending_start) for motion in self._bending or ()]
+        return np.array([[p.position, p.speed, p.acceleration] for p in points]).T.copy()

@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from typing import Final
 
-from needle_controller.axis import Axis, Setpoint
+from needle_controller import kernels
+from needle_controller.axis import Law
+from needle_dynamics import ParameterError
 from needle_dynamics.parameters import check_constants, constant
+
+#: Ways to keep the integral from winding up in a limit, by name.
+ANTI_WINDUP: Final = ('conditional', 'back_calculation')
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PidGains:
-    """Gains of f = kp e + ki int e dt + kd e_dot, per axis."""
+    """Gains of f = kp e + ki int e dt + kd e_dot, per axis, and what goes with them."""
 
     kp: float = constant(6000.0, 'N/m or N m/rad', 'proportional gain')
     ki: float = constant(30000.0, 'N/(m s) or N m/(rad s)', 'integral gain')
@@ -18,56 +24,80 @@ class PidGains:
     tolerance: float = constant(
         2e-5, 'm or rad', 'error at rest below which the integral is frozen (no hunting)'
     )
+    filter_time: float = constant(
+        0.0, 's', 'time constant of the low-pass on the rate of the error; 0 for none'
+    )
+    anti_windup: str = field(
+        default='conditional', metadata={'description': f'one of {", ".join(ANTI_WINDUP)}'}
+    )
+    tracking_time: float = constant(
+        0.2, 's', 'time constant in which back_calculation unwinds the integral', open_low=True
+    )
+    feed_forward: bool = field(
+        default=False,
+        metadata={'description': 'add the force that the reference takes on the modeled axis'},
+    )
+    breakaway_speed: float = constant(
+        1e-4, '(m or rad)/s', 'speed of the reference at which feed_forward has all of Coulomb '
+        'friction', open_low=True,
+    )  # fmt: skip
 
     def __post_init__(self) -> None:
         check_constants(self)
+        if self.anti_windup not in ANTI_WINDUP:
+            raise ParameterError(
+                f'anti_windup must be one of {", ".join(ANTI_WINDUP)}, got {self.anti_windup!r}'
+            )
+        if not isinstance(self.feed_forward, bool):
+            raise ParameterError(f'feed_forward must be true or false, got {self.feed_forward!r}')
+
+    def slots(self, period: float) -> dict[str, float]:
+        """Return the gains by the names of their slots in `needle_controller.kernels`."""
+        tracks = self.anti_windup == 'back_calculation'
+        return {
+            'LAW': kernels.PID,
+            'KP': self.kp,
+            'KI': self.ki,
+            'KD': self.kd,
+            'TOLERANCE': self.tolerance,
+            'FILTER_TIME': self.filter_time,
+            # Implicit: no tracking time is too short.
+            'TRACKING': period / (self.tracking_time + period) if tracks else 0.0,
+            'FEED_FORWARD': float(self.feed_forward),
+        }
+
+    def scaled(self, factor: float) -> PidGains:
+        """Return all gains times a factor."""
+        return replace(self, kp=factor * self.kp, ki=factor * self.ki, kd=factor * self.kd)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Pid:
+class Pid(Law):
     """
     PID evaluated at the end of the period that its own force brings about.
 
     The textbook sampled form takes the error at the start of the period and is unstable as soon
     as kd exceeds about mass / period + friction. Here error and rate are those predicted for
     the end of the period with the force itself in the prediction (a linear equation for it):
-    high gains then tend to reaching the reference in one period instead of to overshoot.
+    high gains then tend to reaching the reference in one period instead of to overshoot. The
+    filter of the rate is implicit, too.
+
+    Back-calculation takes the force that a limit took away out of the integral, as
+    ki int e dt -> ... - excess / tracking_time; `conditional` stops it while it would drive
+    further into the limit. The axis' Coulomb friction is left to the integral, or to the
+    feed-forward: the force that gives the modeled axis the motion of the reference exactly.
 
     Attributes
     ----------
-    axis : Axis
-        Axis as the law believes it to be; its Coulomb friction is left to the integral.
     gains : PidGains
         Gains.
-    period : float
-        Sample period h [s].
 
     """
 
-    axis: Axis
     gains: PidGains
-    period: float
 
-    def force(
-        self, position: float, speed: float, setpoint: Setpoint, memory: float, load: float
-    ) -> float:
-        """Return the force for the next period, before any limit; ``memory`` is int e dt."""
-        del load
-        gains, h = self.gains, self.period
-        decay, gain, drift, shift = self.axis.response(h)
-        error = setpoint.position + h * setpoint.speed - position - drift * speed
-        error_rate = setpoint.speed + h * setpoint.acceleration - decay * speed
-        stiffness = gains.kp + h * gains.ki
-        push = stiffness * error + gains.kd * error_rate + gains.ki * memory
-        return push / (1.0 + stiffness * shift + gains.kd * gain)
-
-    def remember(self, memory: float, position: float, setpoint: Setpoint, excess: float) -> float:
-        """Integrate the error, but not further into a limit nor within the tolerance at rest."""
-        error = setpoint.position - position
-        at_rest = setpoint.speed == 0.0 and setpoint.acceleration == 0.0
-        if excess * error > 0.0 or (at_rest and abs(error) < self.gains.tolerance):
-            return memory
-        return memory + self.period * error
+    def __post_init__(self) -> None:
+        self._set_constants(self.gains.breakaway_speed, **self.gains.slots(self.period))
 
     def linear(self) -> Pid:
         """Return the same law without Coulomb friction and tolerance."""
@@ -77,6 +107,4 @@ class Pid:
 
     def scaled(self, factor: float) -> Pid:
         """Return the same law with all gains times a factor."""
-        gains = self.gains
-        kp, ki, kd = factor * gains.kp, factor * gains.ki, factor * gains.kd
-        return replace(self, gains=replace(gains, kp=kp, ki=ki, kd=kd))
+        return replace(self, gains=self.gains.scaled(factor))

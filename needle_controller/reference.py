@@ -2,14 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from math import copysign, sqrt
-from typing import Protocol
+from itertools import pairwise
+from math import copysign, isfinite, sqrt
+from typing import Final, Protocol
 
 from needle_controller.axis import Setpoint
+from needle_dynamics import FloatArray, ParameterError
 from needle_dynamics.parameters import check_constants, constant
 import numpy as np
-from numpy.polynomial import Polynomial
+
+#: Rounding that a limit may be exceeded by.
+_ROUNDING: Final = 1e-9
+
+#: Factor by which a motion is made longer until it is within its limits.
+_LONGER: Final = 1.1
+
+#: Shortest time in which a motion is changed [s].
+_SHORTEST: Final = 1e-3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -34,6 +45,33 @@ class Reference(Protocol):
 
     def at(self, time: float) -> Setpoint:
         """Return where the reference is; before the start and after the end it rests."""
+
+
+class Step:
+    """
+    The target at once: what the source regulates to.
+
+    Parameters
+    ----------
+    start : Setpoint
+        Not used.
+    target : float
+        Where it is [m].
+    limits : ReferenceLimits
+        Not used.
+
+    """
+
+    duration: Final = 0.0
+
+    def __init__(self, start: Setpoint, target: float, limits: ReferenceLimits) -> None:
+        del start, limits
+        self._target = target
+
+    def at(self, time: float) -> Setpoint:
+        """Return where the reference is."""
+        del time
+        return Setpoint(self._target)
 
 
 class Trapezoid:
@@ -96,6 +134,76 @@ class Trapezoid:
         return Setpoint(position, speed, acceleration)
 
 
+class Quintic:
+    """
+    The motion of least integrated squared jerk from one setpoint to another in a given time.
+
+    Parameters
+    ----------
+    start, end : Setpoint
+        Ends, with their speeds and accelerations.
+    duration : float
+        Time between them [s].
+
+    """
+
+    def __init__(self, start: Setpoint, end: Setpoint, duration: float) -> None:
+        t = duration
+        self.duration = t
+        self.start, self.end = start, end
+        v0, a0 = start.speed * t, start.acceleration * t * t
+        v1, a1 = end.speed * t, end.acceleration * t * t
+        d = end.position - start.position
+        # Powers of time over duration.
+        c3 = 10.0 * d - 6.0 * v0 - 4.0 * v1 - 1.5 * a0 + 0.5 * a1
+        c4 = -15.0 * d + 8.0 * v0 + 7.0 * v1 + 1.5 * a0 - a1
+        c5 = 6.0 * d - 3.0 * (v0 + v1) - 0.5 * (a0 - a1)
+        self._c = start.position, v0, 0.5 * a0, c3, c4, c5
+
+    def at(self, time: float) -> Setpoint:
+        """Return where the motion is; it is held at the ends."""
+        if time >= self.duration:
+            return self.end
+        if time <= 0.0:
+            return self.start
+        t = self.duration
+        x = time / t
+        p, v, a, c3, c4, c5 = self._c
+        return Setpoint(
+            p + x * (v + x * (a + x * (c3 + x * (c4 + x * c5)))),
+            (v + x * (2.0 * a + x * (3.0 * c3 + x * (4.0 * c4 + x * 5.0 * c5)))) / t,
+            (2.0 * a + x * (6.0 * c3 + x * (12.0 * c4 + x * 20.0 * c5))) / (t * t),
+        )
+
+    def within(self, limits: ReferenceLimits) -> bool:
+        """Return whether it keeps the limits; what an end exceeds is not held against it."""
+        ends = self.start, self.end
+        top = max(limits.speed, *(abs(end.speed) for end in ends)) * (1.0 + _ROUNDING)
+        ramp = max(limits.acceleration, *(abs(end.acceleration) for end in ends))
+        ramp *= 1.0 + _ROUNDING
+        t = self.duration
+        acceleration, _ = self.changes
+        _, v, a, c3, c4, c5 = self._c
+        speed = np.array([5.0 * c5, 4.0 * c4, 3.0 * c3, 2.0 * a, v]) / t
+        return _peak(*self.changes) <= ramp and _peak(speed, acceleration) <= top
+
+    @property
+    def changes(self) -> tuple[FloatArray, FloatArray]:
+        """Acceleration and jerk as polynomials of time over duration, highest powers first."""
+        t = self.duration
+        _, _, a, c3, c4, c5 = self._c
+        acceleration = np.array([20.0 * c5, 12.0 * c4, 6.0 * c3, 2.0 * a]) / (t * t)
+        return acceleration, np.asarray(np.polyder(acceleration), dtype=float)
+
+
+def _peak(curve: FloatArray, slope: FloatArray) -> float:
+    """Return the largest modulus of a polynomial on [0, 1]; highest powers first."""
+    turns = np.roots(slope)
+    # A double root may come out with a small imaginary part: an extra point does no harm.
+    inside = turns.real[(turns.real > 0.0) & (turns.real < 1.0)]
+    return float(np.abs(np.polyval(curve, np.concatenate([[0.0, 1.0], inside]))).max())
+
+
 class MinimumJerk:
     """
     The quintic of least integrated squared jerk, as short as the limits allow.
@@ -112,69 +220,484 @@ class MinimumJerk:
     """
 
     def __init__(self, start: Setpoint, target: float, limits: ReferenceLimits) -> None:
-        self._start = start
-        self._target = target
         distance = abs(target - start.position)
         # Rest to rest: the peaks of the quintic are 15/8 D/T and 10/sqrt(3) D/T^2.
         shortest = max(
             1.875 * distance / limits.speed,
             sqrt(10.0 / sqrt(3.0) * distance / limits.acceleration),
             2.0 * abs(start.speed) / limits.acceleration,
+            _SHORTEST,
         )
-        self._fit(max(shortest, 1e-3))
+        end = Setpoint(target)
+        motion = Quintic(start, end, shortest)
         at_rest = start.speed == 0.0 and start.acceleration == 0.0
-        top = max(limits.speed, abs(start.speed)) * (1.0 + 1e-9)
-        ramp = max(limits.acceleration, abs(start.acceleration)) * (1.0 + 1e-9)
-        while not at_rest and not self._within(top, ramp) and self.duration < 100.0 * shortest:
-            self._fit(1.1 * self.duration)
+        while not (at_rest or motion.within(limits)) and motion.duration < 100.0 * shortest:
+            motion = Quintic(start, end, _LONGER * motion.duration)
+        self._halt: Quintic | None = None
+        self._motion = motion
+        if not (at_rest or motion.within(limits)):
+            # No quintic does it: to rest first.
+            self._halt = halt(start, limits)
+            distance = abs(target - self._halt.end.position)
+            least = max(
+                1.875 * distance / limits.speed,
+                sqrt(10.0 / sqrt(3.0) * distance / limits.acceleration),
+                _SHORTEST,
+            )
+            self._motion = Quintic(self._halt.end, end, least)
+        self.duration = self._motion.duration + (self._halt.duration if self._halt else 0.0)
 
-    def _fit(self, duration: float) -> None:
-        """Take the quintic of this duration; its variable is time over duration."""
-        t = duration
-        p0, v0, a0 = self._start.position, self._start.speed * t, self._start.acceleration * t * t
-        d = self._target - p0
-        self.duration = t
-        self._position = Polynomial(
-            [
-                p0,
-                v0,
-                0.5 * a0,
-                10.0 * d - 6.0 * v0 - 1.5 * a0,
-                -15.0 * d + 8.0 * v0 + 1.5 * a0,
-                6.0 * d - 3.0 * v0 - 0.5 * a0,
-            ]
+    def at(self, time: float) -> Setpoint:
+        """Return where the reference is."""
+        if self._halt is not None:
+            if time < self._halt.duration:
+                return self._halt.at(time)
+            time -= self._halt.duration
+        return self._motion.at(time)
+
+
+def halt(start: Setpoint, limits: ReferenceLimits) -> Quintic:
+    """
+    Return the motion to rest that does not turn, within the limit of acceleration.
+
+    Parameters
+    ----------
+    start : Setpoint
+        Where it begins. An acceleration goes on for a while: by 4/27 of it times the duration
+        the speed may go up at first.
+    limits : ReferenceLimits
+        Limits.
+
+    Returns
+    -------
+    Quintic
+        Motion.
+
+    """
+    v, a = start.speed, start.acceleration
+    time = max(1.5 * abs(v) / limits.acceleration, _SHORTEST)
+
+    def motion() -> Quintic:
+        end = Setpoint(start.position + time * (0.5 * v + time * a / 12.0))
+        return Quintic(start, end, time)
+
+    # Its speed is a cubic: with more time its acceleration goes to that of the start.
+    for _ in range(40):
+        if _peak(*motion().changes) <= max(limits.acceleration, abs(a)) * (1.0 + _ROUNDING):
+            break
+        time *= _LONGER
+    return motion()
+
+
+#: References to a target by name.
+REFERENCES: dict[str, type[Trapezoid] | type[MinimumJerk] | type[Step]] = {
+    'trapezoid': Trapezoid,
+    'minimum_jerk': MinimumJerk,
+    'step': Step,
+}
+
+
+class Path:
+    """
+    A motion given by points: straight lines between positions, cubics where speeds are given.
+
+    Corners between lines are rounded by parabolas with the acceleration limit. The time of a
+    path is that of its points; it ends at rest.
+
+    Parameters
+    ----------
+    times : sequence of float
+        Times of the points [s], increasing from zero or later.
+    positions : sequence of float
+        Inserted lengths [m].
+    speeds : sequence of float, optional
+        Insertion speeds [m/s], zero at the end.
+    limits : ReferenceLimits
+        Limits.
+    reach : tuple of float
+        Least and largest inserted length [m].
+
+    Raises
+    ------
+    ParameterError
+        If numbers are missing, not finite or beyond a limit, or times do not increase.
+
+    """
+
+    def __init__(
+        self,
+        times: Sequence[float],
+        positions: Sequence[float],
+        speeds: Sequence[float] | None,
+        limits: ReferenceLimits,
+        reach: tuple[float, float],
+    ) -> None:
+        if not times or len(times) != len(positions):
+            raise ParameterError(
+                f'needs one position for each of at least one time, got {len(positions)} for '
+                f'{len(times)}'
+            )
+        if speeds is not None and len(speeds) != len(times):
+            raise ParameterError(
+                f'needs a speed for each of its {len(times)} points or none, got {len(speeds)}'
+            )
+        if not all(map(isfinite, (*times, *positions, *(speeds or ())))):
+            raise ParameterError('times, positions and speeds must be finite')
+        if times[0] < 0.0 or any(late <= early for early, late in pairwise(times)):
+            raise ParameterError(f'times must be >= 0 and increasing, got {list(times)} s')
+        low, high = reach
+        if not all(low <= at <= high for at in positions):
+            raise ParameterError(
+                f'positions must be in [{low:g}, {high:g}] m, got {list(positions)} m'
+            )
+        #: Start time, position, speed, acceleration and jerk of each piece.
+        self._pieces: list[tuple[float, float, float, float, float]] = []
+        if speeds is None:
+            self._join_lines(times, positions, limits)
+        else:
+            self._join_cubics(times, positions, speeds, limits)
+            self._check_reach(low, high)
+        self._starts = np.array([piece[0] for piece in self._pieces])
+        self.begin, self.last = float(times[0]), float(positions[-1])
+
+    def _join_lines(
+        self, times: Sequence[float], positions: Sequence[float], limits: ReferenceLimits
+    ) -> None:
+        """Join lines by parabolas."""
+        ramp = limits.acceleration
+        speed, free = 0.0, times[0]
+        # At the first point it has the speed of the first line already.
+        if len(times) > 1:
+            speed = (positions[1] - positions[0]) / (times[1] - times[0])
+            self._pieces.append((times[0], positions[0], speed, 0.0, 0.0))
+        for k in range(len(times)):
+            following = 0.0
+            if k + 1 < len(times):
+                following = (positions[k + 1] - positions[k]) / (times[k + 1] - times[k])
+            if abs(following) > limits.speed * (1.0 + _ROUNDING):
+                raise ParameterError(
+                    f'speed after {times[k]:g} s must be within {limits.speed:g} m/s, got '
+                    f'{following:g} m/s'
+                )
+            if k > 0:
+                half = 0.5 * abs(following - speed) / ramp
+                start = times[k] - half
+                if start < free - _ROUNDING:
+                    raise ParameterError(
+                        f'speed changes from {speed:g} to {following:g} m/s at {times[k]:g} s '
+                        f'within less time than the acceleration limit {ramp:g} m/s^2 takes'
+                    )
+                turn = copysign(ramp, following - speed)
+                self._pieces.append((start, positions[k] - half * speed, speed, turn, 0.0))
+                free = times[k] + half
+                at = positions[k] + half * following
+                self._pieces.append((free, at, following, 0.0, 0.0))
+            speed = following
+        self.end = free
+        # To the bit, and at rest.
+        self._pieces[len(self._pieces) - 1 :] = [(free, positions[-1], 0.0, 0.0, 0.0)]
+
+    def _join_cubics(
+        self,
+        times: Sequence[float],
+        positions: Sequence[float],
+        speeds: Sequence[float],
+        limits: ReferenceLimits,
+    ) -> None:
+        """Join cubics."""
+        if speeds[-1] != 0.0:
+            raise ParameterError(f'speed at the end must be 0, got {speeds[-1]:g} m/s')
+        for k in range(len(times) - 1):
+            t = times[k + 1] - times[k]
+            d, v0, v1 = positions[k + 1] - positions[k], speeds[k], speeds[k + 1]
+            a = (6.0 * d / t - 4.0 * v0 - 2.0 * v1) / t
+            jerk = (6.0 * (v0 + v1) - 12.0 * d / t) / (t * t)
+            inside = -a / jerk if jerk else -1.0
+            peaks = [abs(v0), abs(v1)]
+            if 0.0 < inside < t:
+                peaks.append(abs(v0 + 0.5 * a * inside))
+            for name, unit, found, bound in (
+                ('speed', 'm/s', max(peaks), limits.speed),
+                ('acceleration', 'm/s^2', max(abs(a), abs(a + jerk * t)), limits.acceleration),
+            ):
+                if found > bound * (1.0 + _ROUNDING):
+                    raise ParameterError(
+                        f'{name} after {times[k]:g} s must be within {bound:g} {unit}, got '
+                        f'{found:g} {unit}'
+                    )
+            self._pieces.append((times[k], positions[k], v0, a, jerk))
+        self._pieces.append((times[-1], positions[-1], 0.0, 0.0, 0.0))
+        self.end = float(times[-1])
+
+    def _check_reach(self, low: float, high: float) -> None:
+        """Refuse cubics that leave the reach between their points."""
+        for (start, p, v, a, jerk), after in pairwise(self._pieces):
+            span = after[0] - start
+            for turn in np.roots([0.5 * jerk, a, v]):
+                t = float(turn.real)
+                at = p + t * (v + t * (0.5 * a + t * jerk / 6.0))
+                if turn.imag == 0.0 and 0.0 < t < span and not low <= at <= high:
+                    raise ParameterError(
+                        f'path must stay in [{low:g}, {high:g}] m, got {at:g} m between its points'
+                    )
+
+    def at(self, time: float) -> Setpoint:
+        """Return where the path is; before its first point it is there."""
+        k = max(int(np.searchsorted(self._starts, time, side='right')) - 1, 0)
+        start, p, v, a, jerk = self._pieces[k]
+        t = max(time - start, 0.0)
+        return Setpoint(
+            p + t * (v + t * (0.5 * a + t * jerk / 6.0)),
+            v + t * (a + 0.5 * t * jerk),
+            a + t * jerk,
         )
-        self._speed = self._position.deriv()
-        self._acceleration = self._speed.deriv()
 
-    def _within(self, top: float, ramp: float) -> bool:
-        t = self.duration
-        return bool(_peak(self._speed) <= top * t and _peak(self._acceleration) <= ramp * t * t)
+
+class Joined:
+    """
+    A path joined from elsewhere without a jump in position, speed or acceleration.
+
+    The path is reached at its first point in time if the limits allow that, else later, and is
+    then late by half of what the joining took longer.
+
+    Parameters
+    ----------
+    start : Setpoint
+        Where it begins.
+    path : Path
+        Path to join.
+    since : float
+        Time of the path that is now [s].
+    limits : ReferenceLimits
+        Limits of the motion that joins it.
+
+    """
+
+    def __init__(self, start: Setpoint, path: Path, since: float, limits: ReferenceLimits) -> None:
+        self._path = path
+        first = max(since, path.begin)
+        least = first - since
+        self._halt: Quintic | None = None
+        if start.acceleration:
+            # No quintic goes far with an acceleration at its start: to rest first.
+            self._halt = halt(start, limits)
+            start = self._halt.end
+        # A needle on the path goes on at once.
+        there = path.at(first)
+        joining: Quintic | None = None
+        entry = first
+        if least > 0.0 or start != there:
+            joining = Quintic(start, there, max(least, _SHORTEST))
+            longest = max(least, path.end - since) + _enough(start, path, limits)
+            while not joining.within(limits) and joining.duration < longest:
+                duration = _LONGER * joining.duration
+                entry = first + 0.5 * (duration - least)
+                joining = Quintic(start, path.at(entry), duration)
+        self._joining = joining
+        self._halting = self._halt.duration if self._halt else 0.0
+        self._joined = self._halting + (joining.duration if joining else 0.0)
+        #: Time of this motion that belongs to the time zero of the path.
+        self.offset = self._joined - entry
+        self.duration = max(path.end + self.offset, self._joined)
 
     def at(self, time: float) -> Setpoint:
         """Return where the reference is."""
         if time >= self.duration:
-            return Setpoint(self._target)
-        if time <= 0.0:
-            return self._start
-        t = self.duration
-        x = time / t
-        return Setpoint(
-            float(self._position(x)),
-            float(self._speed(x)) / t,
-            float(self._acceleration(x)) / (t * t),
-        )
+            return Setpoint(self._path.last)
+        if self._halt is not None and time < self._halting:
+            return self._halt.at(time)
+        if self._joining is not None and time < self._joined:
+            return self._joining.at(time - self._halting)
+        return self._path.at(time - self.offset)
 
 
-def _peak(curve: Polynomial) -> float:
-    """Return the largest modulus of a polynomial on [0, 1]."""
-    turns = curve.deriv().roots()
-    inside = turns.real[(abs(turns.imag) < 1e-9) & (turns.real > 0.0) & (turns.real < 1.0)]
-    return float(abs(curve(np.concatenate([[0.0, 1.0], inside]))).max())
+def _enough(start: Setpoint, path: Path, limits: ReferenceLimits) -> float:
+    """Return a time in which the end of a path is reached from anywhere within the limits."""
+    distance = abs(path.last - start.position)
+    pace = abs(start.speed) / limits.acceleration
+    return 100.0 * (distance / limits.speed + pace + sqrt(distance / limits.acceleration))
 
 
-#: References by name.
-REFERENCES: dict[str, type[Trapezoid] | type[MinimumJerk]] = {
-    'trapezoid': Trapezoid,
-    'minimum_jerk': MinimumJerk,
-}
+class Guide:
+    """
+    What a controller aims at over time: a target or a path, with pauses, without a jump.
+
+    Every change is planned from where the reference then is, with the next call of `at`.
+
+    Parameters
+    ----------
+    kind : str
+        Motion to a target, a key of `REFERENCES`.
+    limits : ReferenceLimits
+        Limits.
+    reach : tuple of float
+        Least and largest inserted length [m].
+
+    Raises
+    ------
+    ParameterError
+        If the kind is unknown.
+
+    """
+
+    def __init__(self, kind: str, limits: ReferenceLimits, reach: tuple[float, float]) -> None:
+        if kind not in REFERENCES:
+            raise ParameterError(f'unknown {kind!r}; valid: {", ".join(REFERENCES)}')
+        self._kind = REFERENCES[kind]
+        self.limits = limits
+        self.reach = reach
+        self.paused = False
+        self._target: float | None = None
+        self._path: Path | None = None
+        #: Time of the path that has passed at the last change [s].
+        self._passed = 0.0
+        self._motion: Reference | None = None
+        self._motion_path: Path | None = None
+        self._start = self._now = 0.0
+        self.forget()
+
+    def forget(self) -> None:
+        """Aim at nothing."""
+        self._target, self._path, self.paused = None, None, False
+        self.release()
+
+    def release(self) -> None:
+        """Start anew from wherever the needle is, towards the same aim."""
+        self._mark()
+        self._motion = self._motion_path = None
+        self._change: Callable[[Setpoint], Reference] | None = self._plan
+
+    def _mark(self) -> None:
+        """Keep how far the path has come."""
+        if isinstance(self._motion, Joined) and self._motion_path is self._path:
+            self._passed = max(self._now - self._start - self._motion.offset, self._passed)
+
+    @property
+    def aims(self) -> bool:
+        """Whether there is something to aim at."""
+        return self._target is not None
+
+    @property
+    def moves(self) -> bool:
+        """Whether a motion has been planned."""
+        return self._motion is not None
+
+    @property
+    def target(self) -> float | None:
+        """Inserted length where it ends [m], None without an aim."""
+        return self._target
+
+    def aim(self, depth: float) -> None:
+        """
+        Aim at an inserted length, from wherever the reference is now.
+
+        Parameters
+        ----------
+        depth : float
+            Inserted length [m].
+
+        Raises
+        ------
+        ParameterError
+            If it is not finite or out of reach.
+
+        """
+        low, high = self.reach
+        if not low <= depth <= high:
+            raise ParameterError(f'target depth must be in [{low:g}, {high:g}] m, got {depth!r}')
+        self._target, self._path = depth, None
+        self._replan()
+
+    def follow(
+        self,
+        times: Sequence[float],
+        positions: Sequence[float],
+        speeds: Sequence[float] | None = None,
+    ) -> None:
+        """
+        Follow a path from now on; see `Path` and `Joined`.
+
+        Raises
+        ------
+        ParameterError
+            If it is not a valid path.
+
+        """
+        path = Path(times, positions, speeds, self.limits, self.reach)
+        self._target, self._path, self._passed = path.last, path, 0.0
+        self._replan()
+
+    def pause(self) -> None:
+        """Brake to rest within the limits and stay there."""
+        if not self.paused:
+            self.paused = True
+            self._change = self._brake
+
+    def resume(self) -> None:
+        """Go on to the target, or along the path from where it was left."""
+        if self.paused:
+            self.paused = False
+            self._change = self._plan
+
+    def _replan(self) -> None:
+        # A pause outlasts a new aim.
+        if not self.paused:
+            self._change = self._plan
+
+    def at(self, time: float, depth: float) -> Setpoint:
+        """
+        Return where the reference is, planning a change that is due.
+
+        Parameters
+        ----------
+        time : float
+            Time now [s].
+        depth : float
+            Where the needle is [m], for a motion that starts anew.
+
+        Returns
+        -------
+        Setpoint
+            Reference now.
+
+        """
+        self._now = time
+        if self._change is not None:
+            # A step is nowhere on its way.
+            anew = self._motion is None or isinstance(self._motion, Step)
+            now = Setpoint(depth) if anew else self.ahead(time)
+            self._mark()
+            change, self._change = self._change, None
+            self._motion, self._motion_path, self._start = change(now), self._path, time
+        return self.ahead(time)
+
+    def ahead(self, time: float) -> Setpoint:
+        """Return where the reference will be if nothing changes."""
+        return self._motion.at(time - self._start) if self._motion else Setpoint(0.0)
+
+    def left(self, time: float) -> float:
+        """Return how long the motion still takes [s]."""
+        return max(self._start + self._motion.duration - time, 0.0) if self._motion else 0.0
+
+    def _plan(self, now: Setpoint) -> Reference:
+        if self.paused:
+            return self._brake(now)
+        if self._path is not None:
+            if self._kind is not MinimumJerk:
+                now = Setpoint(now.position, now.speed)
+            return Joined(now, self._path, self._passed, self.limits)
+        target = now.position if self._target is None else self._target
+        return self._kind(now, target, self.limits)
+
+    def _brake(self, now: Setpoint) -> Reference:
+        """Stop within the acceleration limit, without passing the end of the motion."""
+        motion: Reference
+        if self._kind is MinimumJerk:
+            motion = halt(now, self.limits)
+        else:
+            pace = now.speed / self.limits.acceleration
+            motion = Trapezoid(now, now.position + 0.5 * abs(pace) * now.speed, self.limits)
+        if self._path is not None:
+            # Half of the braking counts: so long the path takes to where the needle stops.
+            self._passed += 0.5 * motion.duration
+        return motion

@@ -198,9 +198,14 @@ class NeedleNode(LifecycleNode):
         except ParameterError as error:
             raise ParameterError(f'{prefix}{error}') from error
 
-    def text(self, name: str, valid: tuple[str, ...] = ()) -> str:
+    def text(
+        self,
+        name: str,
+        valid: tuple[str, ...] = (),
+        changes: Mapping[str, Any] | None = None,
+    ) -> str:
         """
-        Read a text parameter, one of ``valid`` if that is given.
+        Read a text parameter, one of ``valid`` if that is given; ``changes`` as in `settings`.
 
         Raises
         ------
@@ -208,7 +213,7 @@ class NeedleNode(LifecycleNode):
             Naming the parameter, what was found and what would be valid.
 
         """
-        value = self.get_parameter(name).value
+        value = (changes or {}).get(name, self.get_parameter(name).value)
         if not isinstance(value, str) or (valid and value not in valid):
             raise ParameterError(f'{name} must be one of {", ".join(valid)}, got {value!r}')
         return value

@@ -9,6 +9,7 @@ splitting of the Hamiltonian system:
    eigenbasis of (E I_y H + k_a G, rho A G) are exact, whatever their frequency. With the
    momenta as variables dG/dt needs no term. The impulse -dH/ds that the modes exert on the
    insertion axis along that rotation is an exact integral too;
+   Constant generalized forces on q1..qn shift the deflections about which the modes rotate;
 3. insertion force and mean modal force being constant over the step, the insertion axis under
    viscous and set-valued Coulomb friction has an exact flow, including stops and sticking.
 
@@ -71,7 +72,8 @@ _SHORTEST_STEP: Final = 1e-9
 _MOST_INTERVALS: Final = 100_000_000
 
 
-def _constants(model: NeedleModel) -> Constants:
+def kernel_constants(model: NeedleModel) -> Constants:
+    """Return the numbers that the kernels take."""
     p, tissue, friction = model.parameters, model.tissue, model.friction
     return Constants(
         length=p.length,
@@ -96,7 +98,8 @@ def _constants(model: NeedleModel) -> Constants:
     )
 
 
-def _tables(model: NeedleModel) -> Tables:
+def kernel_tables(model: NeedleModel) -> Tables:
+    """Return the arrays that the kernels take."""
     return Tables(
         series=model.modes.series,
         terms=model.modes.terms,
@@ -125,7 +128,7 @@ class Interval:
     friction_work, damping_work : float
         Energy lost to friction and to tissue damping [J].
     input_work : float
-        Work done by force and torque [J].
+        Work done by force, torque and generalized forces [J].
     impact_loss : float
         Energy lost on the hub [J].
     contact_time : float or None
@@ -197,8 +200,8 @@ class Integrator:
         model = NeedleModel(parameters)
         self._state = model.checked_state(state)
         self.model = model
-        self._constants = _constants(model)
-        self._tables = _tables(model)
+        self._constants = kernel_constants(model)
+        self._tables = kernel_tables(model)
 
     def change(self, parameters: NeedleParameters) -> None:
         """
@@ -232,7 +235,13 @@ class Integrator:
         """Insertion speed s_dot [m/s]."""
         return float(-self._state[self.model.coordinates])
 
-    def advance(self, duration: float, force: float = 0.0, torque: float = 0.0) -> Interval:
+    def advance(
+        self,
+        duration: float,
+        force: float = 0.0,
+        torque: float = 0.0,
+        modal: FloatArray | None = None,
+    ) -> Interval:
         """
         Advance under a constant force and torque at the base.
 
@@ -244,6 +253,9 @@ class Integrator:
             Insertion force f_y [N], positive into the tissue.
         torque : float
             Torque tau about x [N m].
+        modal : ndarray, shape (n,), optional
+            Constant generalized forces on q1..qn [N m^-1/2], what the source's modal inputs are.
+            No force at the base belongs to them: the base does not feel them.
 
         Returns
         -------
@@ -252,11 +264,18 @@ class Integrator:
 
         Raises
         ------
+        ShapeError
+            If ``modal`` does not have one finite number for each mode.
         InsertedLengthError
             If the inserted length fell below its minimum; the state is the last valid one.
 
         """
-        return self._run(duration, force, torque, 0.0, moved=False)
+        if modal is not None:
+            n = self.model.modes.count
+            modal = _floats('modal', modal)
+            if modal.shape != (n,) or not np.isfinite(modal).all():
+                raise ShapeError(f'modal must be finite with shape ({n},), got {modal.tolist()}')
+        return self._run(duration, force, torque, 0.0, modal, moved=False)
 
     def advance_moved(self, duration: float, speed: float) -> Interval:
         """
@@ -281,7 +300,7 @@ class Integrator:
             If the inserted length fell below its minimum; the state is the last valid one.
 
         """
-        return self._run(duration, 0.0, 0.0, speed, moved=True)
+        return self._run(duration, 0.0, 0.0, speed, None, moved=True)
 
     def advance_pushed(self, duration: float, force: float, speed_limit: float) -> Interval:
         """
@@ -325,7 +344,14 @@ class Integrator:
         return seen
 
     def _run(
-        self, duration: float, force: float, torque: float, speed: float, *, moved: bool
+        self,
+        duration: float,
+        force: float,
+        torque: float,
+        speed: float,
+        modal: FloatArray | None,
+        *,
+        moved: bool,
     ) -> Interval:
         if not 0.0 < duration < inf:
             raise ParameterError(f'duration must be positive and finite, got {duration!r} s')
@@ -337,7 +363,7 @@ class Integrator:
         before = self._state.copy()
 
         def take(longest: float) -> None:
-            self._take(duration, (force, torque, speed), longest, moved=moved)
+            self._take(duration, (force, torque, speed), modal, longest, moved=moved)
 
         if self.tolerance is None:
             take(self.step)
@@ -347,14 +373,21 @@ class Integrator:
         return self._interval(before, duration, force, torque, moved=moved)
 
     def _take(
-        self, duration: float, inputs: tuple[float, float, float], longest: float, *, moved: bool
+        self,
+        duration: float,
+        inputs: tuple[float, float, float],
+        modal: FloatArray | None,
+        longest: float,
+        *,
+        moved: bool,
     ) -> None:
         """Take steps under constant inputs: force, torque, and speed of a moved base."""
         self._sums[:] = 0.0
-        left = advance(
+        known = (
             self._constants, self._tables, self._state, self.time,
             *inputs, moved, longest, self.graded, duration, self._sums,
         )  # fmt: skip
+        left = advance(*known) if modal is None else advance(*known, modal)
         if isnan(left):
             raise NeedleError(
                 'the motion is not finite: constants, state or inputs are out of proportion'
@@ -678,7 +711,7 @@ def simulate_batch(
         raise ParameterError(f'workers must be an integer >= 1, got {workers!r}')
     runs = sizes.pop() if sizes else 1
     models = [NeedleModel(p) for p in each]
-    tables = [(_constants(model), _tables(model)) for model in models]
+    tables = [(kernel_constants(model), kernel_tables(model)) for model in models]
     starts = np.array(
         [models[i % len(models)].checked_state(starts[i % len(starts)]) for i in range(runs)]
     )

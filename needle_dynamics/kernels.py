@@ -44,7 +44,9 @@ SUM_RESISTANCE: Final = 6
 #: Energy lost on the hub, and time of the last contact from the start [s] (-1 for none).
 SUM_IMPACT: Final = 7
 SUM_CONTACT: Final = 8
-SUMS: Final = 9
+#: Integral of the curvature at the tip.
+SUM_BEND: Final = 9
+SUMS: Final = 10
 
 _Function = TypeVar('_Function', bound=Callable[..., object])
 
@@ -555,6 +557,7 @@ def _rotate_two(
     s1 = (b1 - f1) / square1
     s2 = (b2 - f2) / square2
     sums[SUM_TIP] += n1 * s1 + n2 * s2
+    sums[SUM_BEND] += m1 * s1 + m2 * s2
     y1 = cj * s1 + sj * s2
     y2 = cj * s2 - sj * s1
     mean2 = y2 * i22
@@ -720,6 +723,7 @@ def _rotate_many(  # noqa: C901
         lost += f[j] * f[j]
         mean[j] = (b[j] - f[j]) / stiff[j, j]
         sums[SUM_TIP] += value[j] * mean[j]
+        sums[SUM_BEND] += curvature[j] * mean[j]
     sums[SUM_DAMPING_WORK] += 0.5 * lost * (1.0 - decay * decay)
     impulse = 0.0
     for i in range(n):
@@ -766,6 +770,73 @@ def _rotate_many(  # noqa: C901
 
 
 @compiled
+def _balance(
+    c: Constants,
+    at: FloatArray,
+    offset: FloatArray,
+    layer: int,
+    ka: float,
+    growth: float,
+    modal: FloatArray,
+) -> FloatArray:
+    """Return the deflections q that hold generalized forces on them at rest, K q = Q."""
+    n = modal.shape[0]
+    pairs = n * (n + 1) // 2
+    factor = np.zeros((n, n))
+    for j in range(n):
+        for i in range(j, n):
+            pair = j * n - j * (j - 1) // 2 + i - j
+            tissue = ka * at[pair] + growth * offset[layer, pair]
+            value = c.bending_stiffness * at[pairs + pair] + tissue
+            for k in range(j):
+                value -= factor[i, k] * factor[j, k]
+            factor[i, j] = sqrt(value) if i == j else value / factor[j, j]
+    held = modal.copy()
+    _forward(factor, held)
+    _backward(factor, held)
+    return held
+
+
+@compiled
+def _shift(
+    c: Constants,
+    at: FloatArray,
+    offset: FloatArray,
+    layer: int,
+    ka: float,
+    growth: float,
+    held: FloatArray,
+    h: float,
+    before: tuple[float, float],
+    sums: FloatArray,
+) -> float:
+    """
+    Add to the sums of a rotation what it misses of one about the deflections ``held``.
+
+    ``before`` are the sums of tip and curvature before it. Returns what the impulse on the
+    insertion axis misses, which is quadratic in the deflections (none as printed).
+    """
+    n = held.shape[0]
+    pairs = n * (n + 1) // 2
+    tip, bend, force, torque = 0.0, 0.0, 0.0, 0.0
+    for i in range(n):
+        j = 2 * pairs + i
+        tip += at[j] * held[i]
+        bend += at[j + n] * held[i]
+        force += (ka * at[j + 2 * n] + growth * offset[layer, pairs + i]) * held[i]
+        torque += (ka * at[j + 3 * n] + growth * offset[layer, pairs + n + i]) * held[i]
+    crossed = sums[SUM_TIP] - before[0], sums[SUM_BEND] - before[1]
+    sums[SUM_TIP] += h * tip
+    sums[SUM_BEND] += h * bend
+    sums[SUM_REACTION] += h * force
+    sums[SUM_REACTION_MOMENT] += h * torque
+    if c.as_printed:
+        return 0.0
+    elastic: float = c.bending_stiffness * bend * (crossed[1] + 0.5 * h * bend)
+    return float(elastic + ka * tip * (crossed[0] + 0.5 * h * tip))
+
+
+@compiled
 def advance(  # noqa: C901
     c: Constants,
     tables: Tables,
@@ -779,9 +850,13 @@ def advance(  # noqa: C901
     graded: bool,
     duration: float,
     sums: FloatArray,
+    modal: FloatArray | None = None,
 ) -> float:
     """
     Advance ``state`` in place under constant inputs; return the time that was left undone.
+
+    ``modal`` are generalized forces on q1..qn; without them the machine code knows nothing of
+    such forces. At frozen depth they shift the deflections about which the modes rotate.
 
     Steps are no longer than ``longest`` [s]; with ``graded`` they grow with the inserted length
     once it exceeds a tenth of the needle's, since the modes slow down. With ``moved`` the speed
@@ -813,6 +888,9 @@ def advance(  # noqa: C901
     growth, decay, layer = 1.0, 1.0, 0
     pull = 0.0
     sums[SUM_CONTACT] = -1.0
+    if modal is not None:
+        for i in range(n):
+            sums[SUM_INPUT_WORK] -= modal[i] * q[i]
     count, whole, renew = 0, longest, True
     left = duration
     while left > 0.0:
@@ -851,14 +929,25 @@ def advance(  # noqa: C901
         if c.tissue_damping != 0.0:
             decay = exp(-0.5 * h * c.tissue_damping / c.linear_density)
         ka = growth * layer_stiffness[layer]
+        if n != 2:
+            q_before[:], z_before[:] = q, z
+        x1, x2 = q1, q2
+        if modal is not None:
+            held = _balance(c, at, layer_offset, layer, ka, growth, modal)
+            before = sums[SUM_TIP], sums[SUM_BEND]
+            x1, x2 = q1 - held[0], q2 - held[-1]
+            q -= held
         if n == 2:
             r1, r2, y1, y2, impulse = _rotate_two(
                 rho, ei, damping, printed,
-                at, layer_offset, layer, ka, growth, q1, q2, z1, z2, h, decay, sums,
+                at, layer_offset, layer, ka, growth, x1, x2, z1, z2, h, decay, sums,
             )  # fmt: skip
         else:
-            q_before[:], z_before[:] = q, z
             impulse = _rotate_many(c, at, layer_offset, layer, ka, growth, q, z, h, decay, sums)
+        if modal is not None:
+            impulse += _shift(c, at, layer_offset, layer, ka, growth, held, h, before, sums)
+            r1, r2 = r1 + held[0], r2 + held[-1]
+            q += held
         drive = force - impulse / h
         if moved:
             # Counted from the end, so that a base that shall rest does so exactly.
@@ -933,6 +1022,9 @@ def advance(  # noqa: C901
         left = rest
     if n == 2:
         q[0], q[1], z[0], z[1] = q1, q2, z1, z2
+    if modal is not None:
+        for i in range(n):
+            sums[SUM_INPUT_WORK] += modal[i] * q[i]
     if not c.as_printed:
         _integrals(c.length, s, series, terms, modes, work, at)
         factor = np.zeros((n, n))

@@ -11,7 +11,7 @@ small enough at any s: one Horner pass gives all of them.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cache, cached_property, lru_cache
 from math import cos, cosh, factorial, pi
 from typing import Final
 
@@ -24,7 +24,7 @@ from needle_dynamics.kernels import (
     TERMS_PER_LENGTH,
 )
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import brentq
 
 #: The first term that a series leaves out is below this part of the sum.
@@ -303,13 +303,18 @@ class ModeShapes:
         """
         packed, n = self.packed(depth), self.count
         pairs = n * (n + 1) // 2
-        upper = np.triu_indices(n)
+        upper = _upper(n)
         gram, curvature_gram = np.empty((n, n)), np.empty((n, n))
         for matrix, start in ((gram, 0), (curvature_gram, pairs)):
             matrix[upper] = packed[start : start + pairs]
             matrix.T[upper] = matrix[upper]
         value, curvature, area, moment = packed[2 * pairs :].reshape(4, n)
         return ModeIntegrals(gram, curvature_gram, value, curvature, area, moment)
+
+
+@cache
+def _upper(n: int) -> tuple[NDArray[np.intp], ...]:
+    return np.triu_indices(n)
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise, zip_longest
-from math import copysign, inf, sqrt
+from math import ceil, copysign, inf, sqrt
 from statistics import fmean
 from typing import Final
 
@@ -261,6 +262,105 @@ class BaseMotion:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class TipParameters:
+    """What sees the tip: a tracker or imager, exposed all the time from one sample to the next."""
+
+    rate: float = constant(0.0, 'Hz', 'samples per second; 0: one with every sample of the plant')
+    noise: float = constant(0.0, 'm', 'standard deviation of a sample')
+    delay: float = constant(0.0, 's', 'time from a sample to its message', high=1.0)
+
+    def __post_init__(self) -> None:
+        check_constants(self)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TipReading:
+    """
+    A sample of the tip as it leaves its sensor.
+
+    Attributes
+    ----------
+    age : int
+        Samples of the plant since the end of its exposure.
+    depth : float
+        Inserted length then [m].
+    deflection : float
+        Mean deflection of the tip over the exposure, with noise [m].
+
+    """
+
+    age: int
+    depth: float
+    deflection: float
+
+
+class TipSensor:
+    """
+    Turns mean deflections of the tip into what its sensor reports, and when.
+
+    Parameters
+    ----------
+    parameters : TipParameters
+        Constants.
+    rate : float
+        Samples per second of the plant [Hz].
+    seed : int
+        Seed of the noise.
+
+    Raises
+    ------
+    ParameterError
+        If the plant's rate is not a whole multiple of the sensor's.
+
+    """
+
+    def __init__(self, parameters: TipParameters, rate: float, seed: int) -> None:
+        self._noise = parameters.noise
+        self._every = round(rate / parameters.rate) if parameters.rate else 1
+        if parameters.rate and abs(self._every * parameters.rate - rate) > 1e-6 * rate:
+            raise ParameterError(
+                f'tip.rate must divide the rate of the plant {rate:g} Hz, got '
+                f'{parameters.rate:g} Hz'
+            )
+        # A message leaves with the first sample of the plant that is late enough.
+        self._late = ceil(parameters.delay * rate * (1.0 - 1e-9))
+        self._random = np.random.default_rng([seed, 1])
+        self._sum = 0.0
+        self._count = 0
+        self._waiting: deque[tuple[int, float, float]] = deque()
+
+    def measure(self, depth: float, deflection: float) -> TipReading | None:
+        """
+        Take in a sample of the plant.
+
+        Parameters
+        ----------
+        depth : float
+            Inserted length now [m].
+        deflection : float
+            Mean deflection of the tip since the sample before [m].
+
+        Returns
+        -------
+        TipReading or None
+            What leaves the sensor now.
+
+        """
+        self._count += 1
+        self._sum += deflection
+        if self._count % self._every == 0:
+            value = self._sum / self._every
+            if self._noise:
+                value += self._noise * float(self._random.standard_normal())
+            self._waiting.append((self._count, depth, value))
+            self._sum = 0.0
+        if not self._waiting or self._count - self._waiting[0][0] < self._late:
+            return None
+        taken, at, value = self._waiting.popleft()
+        return TipReading(age=self._count - taken, depth=at, deflection=value)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Sample:
     """
     What the plant shows at the end of one sample interval.
@@ -279,6 +379,8 @@ class Sample:
         Reading of the base sensor: force x y z [N], torque x y z [N m].
     tip_deflection : float
         Mean deflection of the tip over the interval [m].
+    tip : TipReading or None
+        What the sensor of the tip reports now.
 
     """
 
@@ -289,6 +391,7 @@ class Sample:
     force: float
     wrench: FloatArray
     tip_deflection: float
+    tip: TipReading | None
 
 
 class Plant:
@@ -305,6 +408,8 @@ class Plant:
         Samples per second [Hz].
     base : BaseMotion, optional
         The robot that moves the base; without it the commanded wrench does.
+    tip : TipSensor, optional
+        Sensor of the tip; without it one that is perfect.
 
     """
 
@@ -314,12 +419,14 @@ class Plant:
         sensor: ForceSensor,
         rate: float,
         base: BaseMotion | None = None,
+        tip: TipSensor | None = None,
     ) -> None:
         self.integrator = integrator
         self.base = base
         self.interval = 1.0 / rate
         self.time = 0.0
         self._sensor = sensor
+        self._tip = tip or TipSensor(TipParameters(), rate, 0)
         self._count = 0
 
     @property
@@ -377,7 +484,9 @@ class Plant:
             raise JobError(f'the needle moves at {1e3 * speed:.3g} mm/s; it must rest')
         self._sensor.tare()
 
-    def advance(self, force: float = 0.0, torque: float = 0.0) -> Sample:
+    def advance(
+        self, force: float = 0.0, torque: float = 0.0, modal: FloatArray | None = None
+    ) -> Sample:
         """
         Advance by one sample interval.
 
@@ -387,6 +496,8 @@ class Plant:
             Commanded insertion force [N]; not used when a base moves the needle.
         torque : float
             Commanded torque about x [N m]; likewise.
+        modal : ndarray, shape (n,), optional
+            Commanded generalized forces on q1..qn [N m^-1/2]; likewise.
 
         Returns
         -------
@@ -402,7 +513,7 @@ class Plant:
         needle, base, interval = self.integrator, self.base, self.interval
         resolution = late = 0.0
         if base is None:
-            seen = needle.advance(interval, force, torque)
+            seen = needle.advance(interval, force, torque, modal)
         else:
             resolution = base.limits.encoder_resolution
             push = base.push(self.time, needle.depth, interval / _PUSHES)
@@ -428,6 +539,7 @@ class Plant:
             force=axial,
             wrench=self._sensor.measure(wrench, start=start, moving=abs(speed) > AT_REST),
             tip_deflection=seen.tip_deflection,
+            tip=self._tip.measure(depth, seen.tip_deflection),
         )
 
     def _pushed(self, base: BaseMotion, force: float) -> tuple[Interval, float]:

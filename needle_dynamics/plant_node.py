@@ -16,9 +16,18 @@ from needle_dynamics.errors import JobError, NeedleError, ParameterError
 from needle_dynamics.force_sensor import ForceSensor, ForceSensorParameters, HIGHEST_RATE
 from needle_dynamics.indenter import Indenter, IndenterParameters, Press
 from needle_dynamics.integrators import Integrator
+from needle_dynamics.kernels import FloatArray
 from needle_dynamics.model import NeedleModel
 from needle_dynamics.parameters import check_constants, constant
-from needle_dynamics.plant import BaseMotion, BaseParameters, Plant, Sample
+from needle_dynamics.plant import (
+    BaseMotion,
+    BaseParameters,
+    Plant,
+    Sample,
+    TipParameters,
+    TipSensor,
+)
+import numpy as np
 from rcl_interfaces.msg import IntegerRange, ParameterDescriptor
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile, ReliabilityPolicy
@@ -63,6 +72,9 @@ class PlantSettings:
     )
     force_limit: float = constant(1e3, 'N', 'largest force that a command may ask for')
     torque_limit: float = constant(1.0, 'N m', 'largest torque that a command may ask for')
+    modal_limit: float = constant(
+        1e4, 'N m^-1/2', 'largest generalized force on q1..qn that a command may ask for'
+    )
     backlog: float = constant(0.5, 's', 'delay that is made up after a stall', open_low=True)
 
     def __post_init__(self) -> None:
@@ -74,7 +86,8 @@ class PlantNode(NeedleNode):
     The needle, or the end-effector, with its sensors.
 
     Lengths in m, forces in N, torques in N m, positive into the tissue. In mode `simulation`
-    the needle moves under ``wrench_command`` (force.y, torque.x); in mode `robot` the base
+    the needle moves under ``wrench_command`` (force.y, torque.x) or ``generalized_command``
+    (efforts of d, theta and q1..qn), whichever came last; in mode `robot` the base
     follows ``joint_trajectory`` (joint `insertion`: positions, or efforts for a push). Both
     publish ``joint_states``, ``base_wrench``, ``tip_deflection`` and ``ground_truth``. In mode
     `indenter` the end-effector presses the tissue by ``joint_trajectory`` (efforts of the joints
@@ -104,6 +117,7 @@ class PlantNode(NeedleNode):
         self.declare_settings('', PlantSettings())
         self.declare_model()
         self.declare_settings('sensor.', ForceSensorParameters())
+        self.declare_settings('tip.', TipParameters())
         self.declare_settings('base.', BaseParameters())
         self.declare_settings('indenter.', IndenterParameters())
 
@@ -113,6 +127,7 @@ class PlantNode(NeedleNode):
         #: Samples given up, and time that simulated time waited [ns].
         self._lost = self._waited = 0
         self._force = self._torque = 0.0
+        self._modal: FloatArray | None = None
         self._command_time: int | None = None
         self._bad_commands = 0
 
@@ -124,6 +139,7 @@ class PlantNode(NeedleNode):
         self._end_effector_pose = publisher(PoseStamped, 'end_effector_pose', SENSOR)
         self._clock_topic: Publisher | None = None
         self.create_subscription(WrenchStamped, 'wrench_command', self._on_command, COMMAND)
+        self.create_subscription(JointState, 'generalized_command', self._on_generalized, COMMAND)
         self.create_subscription(JointTrajectory, 'joint_trajectory', self._on_trajectory, COMMAND)
         self.create_service(Trigger, '~/tare', self._on_tare)
 
@@ -159,6 +175,7 @@ class PlantNode(NeedleNode):
         mode = self.text('mode', MODES)
         sensor = ForceSensor(self.settings('sensor.', ForceSensorParameters), settings.rate, seed)
         base = self.settings('base.', BaseParameters)
+        tip = TipSensor(self.settings('tip.', TipParameters), settings.rate, seed)
         tissue = self.settings('indenter.', IndenterParameters)
         parameters = self.model_parameters()
         if mode == 'indenter':
@@ -174,6 +191,7 @@ class PlantNode(NeedleNode):
             BaseMotion(base, settings.depth, reach, settings.force_limit)
             if mode == 'robot'
             else None,
+            tip,
         )
 
     def cleanup(self) -> None:
@@ -223,20 +241,57 @@ class PlantNode(NeedleNode):
         force, torque = message.wrench.force.y, message.wrench.torque.x
         limits = self._settings.force_limit, self._settings.torque_limit
         # Written so that NaN is refused too.
-        if not (abs(force) <= limits[0] and abs(torque) <= limits[1]):
-            self._bad_commands += 1
-            self.get_logger().error(
+        if abs(force) <= limits[0] and abs(torque) <= limits[1]:
+            self._take(force, torque, None)
+        else:
+            self._refuse(
                 f'wrench_command must be within {limits[0]:g} N and {limits[1]:g} N m, got '
-                f'force.y = {force}, torque.x = {torque}; no force is applied',
-                throttle_duration_sec=1.0,
+                f'force.y = {force}, torque.x = {torque}'
             )
-            force = torque = 0.0
-        self._force, self._torque = force, torque
+
+    def _on_generalized(self, message: JointState) -> None:
+        settings, names = self._settings, self._truth.name
+        if not isinstance(self._plant, Plant):
+            return
+        efforts = dict(zip(message.name, message.effort, strict=False))
+        if sorted(message.name) != sorted(names) or len(message.effort) != len(names):
+            self._refuse(
+                f'generalized_command needs an effort for each of {", ".join(names)}, got '
+                f'{list(message.effort)} for {", ".join(message.name) or "none"}'
+            )
+            return
+        forces = [efforts[name] for name in names]
+        limits = settings.force_limit, settings.torque_limit, settings.modal_limit
+        bounds = [*limits[:2], *limits[2:] * (len(names) - 2)]
+        if all(abs(force) <= bound for force, bound in zip(forces, bounds, strict=True)):
+            # Insertion makes d smaller.
+            self._take(-forces[0], forces[1], np.array(forces[2:]))
+        else:
+            self._refuse(
+                f'generalized_command must be within {limits[0]:g} N, {limits[1]:g} N m and '
+                f'{limits[2]:g} N m^-1/2, got {forces}'
+            )
+
+    def _take(self, force: float, torque: float, modal: FloatArray | None) -> None:
+        """Apply a command from now on."""
+        self._force, self._torque, self._modal = force, torque, modal
         if self.is_active:
             self._command_time = self._simulated()
 
+    def _refuse(self, complaint: str) -> None:
+        """Apply no force instead of a command."""
+        self._bad_commands += 1
+        self.get_logger().error(f'{complaint}; no force is applied', throttle_duration_sec=1.0)
+        self._take(0.0, 0.0, None)
+
     def _on_trajectory(self, message: JointTrajectory) -> None:
         points = message.points
+        if (
+            self.get_parameter('mode').value == 'simulation'
+            and self.count_subscribers('joint_trajectory') > 1
+        ):
+            # It is the reference of a controller.
+            return
         try:
             if self._plant is None:
                 raise ParameterError('the plant is not configured')
@@ -303,9 +358,13 @@ class PlantNode(NeedleNode):
         if self._command_time is not None:
             age = (stamp - self._command_time) / _NANOSECONDS
         if age > self._settings.command_timeout:
-            self._force = self._torque = 0.0
+            self._force, self._torque, self._modal = 0.0, 0.0, None
         try:
-            sample = plant.advance(self._force, self._torque)
+            sample = (
+                plant.advance(self._force, self._torque, self._modal)
+                if isinstance(plant, Plant)
+                else plant.advance(self._force, self._torque)
+            )
         except NeedleError as error:
             self._halted = str(error)
             self.get_logger().error(f'{error}; the plant stands still')
@@ -319,24 +378,28 @@ class PlantNode(NeedleNode):
         if isinstance(sample, Press):
             self._show_press(sample, time)
         else:
-            self._show_needle(sample, time)
+            self._show_needle(sample, stamp, time)
 
-    def _show_needle(self, sample: Sample, time: TimeMessage) -> None:
+    def _show_needle(self, sample: Sample, stamp: int, time: TimeMessage) -> None:
         state = sample.state
         middle = len(state) // 2
         joints, truth, tip = self._joints, self._truth, self._tip
-        for message in (joints, tip, truth):
+        for message in (joints, truth):
             message.header.stamp = time
         joints.position = [sample.joint_position, state[1]]
         joints.velocity = [sample.speed, state[middle + 1]]
         joints.effort = [sample.force, self._torque]
         truth.position = state[:middle].tolist()
         truth.velocity = state[middle:].tolist()
-        tip.point.y = sample.depth
-        tip.point.z = sample.tip_deflection
-        self._joint_states.publish(joints)
-        self._tip_deflection.publish(tip)
+        seen = sample.tip
+        if seen is not None:
+            late = round(seen.age / self._settings.rate * _NANOSECONDS)
+            tip.header.stamp = _message(stamp - late) if late else time
+            tip.point.y, tip.point.z = seen.depth, seen.deflection
+            self._tip_deflection.publish(tip)
         self._ground_truth.publish(truth)
+        # Last: who answers it has the rest of the sample.
+        self._joint_states.publish(joints)
 
     def _show_press(self, sample: Press, time: TimeMessage) -> None:
         position = self._pose.pose.position

@@ -31,7 +31,8 @@ from needle_dynamics.analysis import (
     Structure,
 )
 from needle_insertion.options import constants
-from needle_insertion.report import png, table, write_whole
+from needle_insertion.report import Picture, png, table, write_whole
+from needle_insertion.section import Grid, Section
 import numpy as np
 from tqdm import tqdm
 
@@ -40,6 +41,11 @@ SHALLOWEST, DEPTHS, DEFLECTIONS = 0.05, 41, 31
 
 #: Largest tip deflection of the map if none is given [m].
 LARGEST_DEFLECTION = 2e-3
+
+_MAPPED = ('rank', 'distance', 'observed_rank', 'observed_margin', 'output_gain')
+
+#: Operating points of `section`: depths [m], tip deflections [m], speed [m/s].
+_POINTS = (0.02, 0.1, 0.2), (0.0, 5e-4), 5e-3
 
 _PANELS = (
     ('distance', 'distance from losing state controllability'),
@@ -162,8 +168,69 @@ def run(options: argparse.Namespace) -> int:
     return 0
 
 
+def section() -> Section:
+    """
+    Return controllability and observability of the paper's needle for the page of results.
+
+    Returns
+    -------
+    Section
+        Plain data.
+
+    """
+    parameters = NeedleParameters.preset('paper_si')
+    model = NeedleModel(parameters)
+    depths, deflections, speed = _POINTS
+    points: list[tuple[float, ...]] = [(s, w, speed) for w in deflections for s in depths]
+    results = [analyze(linearize(model, operating_point(model, *point))) for point in points]
+    straight, bent = results[: len(depths)], results[len(depths) :]
+    figure = _figure(parameters, _map(parameters, LARGEST_DEFLECTION, speed), speed)
+    return Section(
+        title='Controllability and observability',
+        paragraphs=(
+            (
+                'Linearized about a straight needle, f_y and tau steer '
+                f'{straight[0].state.rank} of {straight[0].state.order} states and the tip shows '
+                f'{straight[0].observed.rank}; with a deflection of {1e3 * deflections[-1]:g} mm '
+                f'they steer {bent[0].state.rank} and it shows {bent[0].observed.rank}. Ranks are '
+                'taken in natural units: in SI units the columns of [B, AB, ...] span more '
+                'decades than doubles have digits. The margin is the change of the pair that '
+                'takes away a rank.'
+            ),
+        ),
+        tables=(
+            Grid(
+                caption='States steered by f_y and tau, and seen in the tip deflection '
+                '(0.3 N s/m, complete equations)',
+                heads=_HEADS,
+                rows=tuple(_rows(points, results)),
+            ),
+        ),
+        pictures=(
+            Picture(
+                'controllability',
+                'How far the linearized needle is from losing controllability and observability, '
+                'and how far the base moves the tip, by inserted length and deflection.',
+                figure,
+            ),
+        ),
+    )
+
+
+_HEADS = (
+    'depth, tip, speed',
+    *('steered', 'not steered', 'margin', 'next to lose'),
+    *('seen', 'not seen', 'margin', 'next to lose'),
+    'tip / base travel',
+)
+
+
 def _as_table(points: list[tuple[float, ...]], results: list[Analysis]) -> str:
-    rows = [
+    return table(_rows(points, results), _HEADS)
+
+
+def _rows(points: list[tuple[float, ...]], results: list[Analysis]) -> list[tuple[str, ...]]:
+    return [
         (
             f'{1e2 * depth:g} cm, {1e3 * deflection:g} mm, {1e3 * speed:g} mm/s',
             *_cells(result.state),
@@ -172,13 +239,6 @@ def _as_table(points: list[tuple[float, ...]], results: list[Analysis]) -> str:
         )
         for (depth, deflection, speed), result in zip(points, results, strict=True)
     ]
-    heads = (
-        'depth, tip, speed',
-        *('steered', 'not steered', 'margin', 'next to lose'),
-        *('seen', 'not seen', 'margin', 'next to lose'),
-        'tip / base travel',
-    )
-    return table(rows, heads)
 
 
 def _cells(found: Structure) -> tuple[str, ...]:
@@ -226,32 +286,16 @@ def _write_map(parameters: NeedleParameters, options: argparse.Namespace) -> lis
         options.output.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ParameterError(f'{options.output} cannot be written: {error.strerror}') from error
-    length, largest = parameters.length, max(abs(value) for value in options.tip_deflection)
-    rows = [
-        controllability_map(
-            parameters,
-            [depth],
-            np.linspace(0.0, largest or LARGEST_DEFLECTION, DEFLECTIONS),
-            options.speed[0],
-            options.sliding,
-            options.force,
-        )
-        for depth in tqdm(
-            np.linspace(max(SHALLOWEST * length, parameters.minimum_depth), length, DEPTHS),
-            desc='depths',
-            disable=None,
-            leave=False,
-        )
-    ]
-    names = ('rank', 'distance', 'observed_rank', 'observed_margin', 'output_gain')
-    whole = ControllabilityMap(
-        depths=np.concatenate([row.depths for row in rows]),
-        deflections=rows[0].deflections,
-        **{name: np.concatenate([getattr(row, name) for row in rows]) for name in names},
+    whole = _map(
+        parameters,
+        max(abs(value) for value in options.tip_deflection),
+        options.speed[0],
+        options.sliding,
+        options.force,
     )
     depths, deflections = np.meshgrid(whole.depths, whole.deflections, indexing='ij')
-    columns = (depths, deflections, *(getattr(whole, name) for name in names))
-    lines = [','.join(('depth_m', 'tip_deflection_m', *names))]
+    columns = (depths, deflections, *(getattr(whole, name) for name in _MAPPED))
+    lines = [','.join(('depth_m', 'tip_deflection_m', *_MAPPED))]
     lines += [
         ','.join(f'{value:.6g}' for value in line)
         for line in zip(*(column.flat for column in columns), strict=True)
@@ -263,6 +307,38 @@ def _write_map(parameters: NeedleParameters, options: argparse.Namespace) -> lis
     for name, content in contents.items():
         write_whole(options.output / name, content)
     return [options.output / name for name in contents]
+
+
+def _map(
+    parameters: NeedleParameters,
+    largest: float,
+    speed: float,
+    sliding: str | None = None,
+    force: float = 0.0,
+) -> ControllabilityMap:
+    """Map inserted lengths and deflections up to the largest [m]."""
+    length = parameters.length
+    rows = [
+        controllability_map(
+            parameters,
+            [depth],
+            np.linspace(0.0, largest or LARGEST_DEFLECTION, DEFLECTIONS),
+            speed,
+            sliding,
+            force,
+        )
+        for depth in tqdm(
+            np.linspace(max(SHALLOWEST * length, parameters.minimum_depth), length, DEPTHS),
+            desc='depths',
+            disable=None,
+            leave=False,
+        )
+    ]
+    return ControllabilityMap(
+        depths=np.concatenate([row.depths for row in rows]),
+        deflections=rows[0].deflections,
+        **{name: np.concatenate([getattr(row, name) for row in rows]) for name in _MAPPED},
+    )
 
 
 def _figure(parameters: NeedleParameters, found: ControllabilityMap, speed: float) -> Figure:

@@ -8,6 +8,7 @@ import time
 
 from needle_insertion import (
     bench_batches,
+    bench_control,
     bench_identification,
     bench_rods,
     bench_solvers,
@@ -26,6 +27,7 @@ QUESTIONS: dict[str, tuple[Callable[[Callable[[str], None]], tuple[str, list[Bar
         bench_batches.compare,
     ),
     'identification': (bench_identification.compare,),
+    'control': (bench_control.compare,),
 }
 
 

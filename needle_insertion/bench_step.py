@@ -166,7 +166,8 @@ def count_operations(function: Callable[..., object], arguments: tuple[Any, ...]
             return value._make(items) if hasattr(value, '_make') else tuple(items)
         return number(value) if isinstance(value, float) else value
 
-    FunctionType(source.__code__, names)(*[counted(value) for value in arguments])
+    run = FunctionType(source.__code__, names, None, source.__defaults__)
+    run(*[counted(value) for value in arguments])
     return tally.counts
 
 

@@ -111,7 +111,11 @@ def _parser() -> argparse.ArgumentParser:
 
     bench = commands.add_parser('bench', help='measure speed as ratios, and errors')
     subjects = bench.add_subparsers(required=True, dest='subject', metavar='SUBJECT')
-    for subject, asked in (('dynamics', 'the integrator'), ('identification', 'bag to result')):
+    for subject, asked in (
+        ('dynamics', 'the integrator'),
+        ('identification', 'bag to result'),
+        ('control', 'a control step'),
+    ):
         subjects.add_parser(subject, help=f'speed: {asked}').set_defaults(command=_bench)
     intervals = subjects.add_parser('calibration', help='do the intervals hold the truth?')
     intervals.add_argument(
@@ -150,12 +154,15 @@ def _experiment(options: argparse.Namespace) -> int:
 def _reproduce(options: argparse.Namespace) -> int:
     from needle_insertion import reproduce
 
-    bags = None
+    recorded = None
     if options.record is not None:
         from needle_insertion import experiment
 
-        bags = experiment.record(reproduce.campaign(options.what), options.record)
-    return reproduce.run(options, bags)
+        recorded = {
+            name: experiment.record(campaign, options.record)
+            for name, campaign in reproduce.campaigns(options.what).items()
+        }
+    return reproduce.run(options, recorded)
 
 
 if __name__ == '__main__':

@@ -30,7 +30,7 @@ def convergence_figure() -> Figure:
     figure = Figure(figsize=(10.0, 4.2), layout='constrained')
     left, right = figure.subplots(1, 2, sharex=True)
     depth = 0.75 * length
-    exact = _exact_frequencies(depth)
+    exact = exact_frequencies(depth)
     models = _models(depth)
     found = np.full((len(models), 3), np.nan)
     for row, model in zip(found, models, strict=True):
@@ -51,7 +51,7 @@ def convergence_figure() -> Figure:
         for model in models:
             value = model.modes.integrals(depth).value
             deflection = value @ np.linalg.solve(model.stiffness_matrix(depth), value)
-            errors.append(1.0 - deflection / _exact_compliance(depth))
+            errors.append(1.0 - deflection / exact_compliance(depth))
         right.semilogy(_counts(models), errors, f'{mark}-', label=f's = {depth * 100:g} cm')
     right.set(
         title='tip deflection under a force at the tip',
@@ -79,14 +79,14 @@ def _counts(models: list[NeedleModel]) -> list[int]:
     return [model.modes.count for model in models]
 
 
-def _exact_frequencies(depth: float) -> FloatArray:
+def exact_frequencies(depth: float) -> FloatArray:
     """Return the first three angular frequencies of the clamped-free beam of this length."""
     p = NeedleParameters()
     bending = p.bending_stiffness * (mode_shapes(p.length, 3).arguments / depth) ** 4
     return np.asarray(np.sqrt((bending + p.tissue_stiffness) / p.linear_density))
 
 
-def _exact_compliance(depth: float) -> float:
+def exact_compliance(depth: float) -> float:
     """Return the tip deflection of E I w'''' + k w = 0 under a force of 1 N at the tip."""
     p = NeedleParameters()
     decay = (p.tissue_stiffness / (4.0 * p.bending_stiffness)) ** 0.25

@@ -38,9 +38,18 @@ __all__ = [
 ]
 
 _SYMBOL = re.compile(r'\b(?:(mu|k|f)_(\w{1,3})|tau)\b')
+_POWER = re.compile(r'\^([2-4])(?!\d)')
 _ROW_HEAD = 'th scope="row"'
 #: What begins as a number and is longer is a text, such as a checksum.
 _LONGEST_NUMBER = 40
+#: Cells that are a verdict, and how they look.
+_VERDICTS = {
+    'pass': 'pass',
+    'holds': 'pass',
+    'FAIL': 'FAIL',
+    'does not hold': 'FAIL',
+    'DOES NOT HOLD': 'FAIL',
+}
 _NUMBER = re.compile(r'[-+]?\d')
 
 
@@ -144,13 +153,13 @@ def _check_rows(checks: Sequence[Check]) -> list[tuple[str, str, str, str]]:
 
 
 def _text(words: str) -> str:
-    """Escape, and write mu_s and its like, and squares, as in print."""
+    """Escape, and write mu_s and its like, and powers, as in print."""
 
     def symbol(found: re.Match[str]) -> str:
         letter = {'mu': 'μ', None: 'τ'}.get(found[1], found[1])
         return f'<i>{letter}</i>' + (f'<sub>{found[2]}</sub>' if found[2] else '')
 
-    return _SYMBOL.sub(symbol, escape(words).replace('^2', '²'))
+    return _POWER.sub(lambda found: '⁰¹²³⁴'[int(found[1])], _SYMBOL.sub(symbol, escape(words)))
 
 
 def heading(words: str) -> str:
@@ -257,7 +266,7 @@ def grid(rows: Sequence[Sequence[str]], heads: Sequence[str], caption: str) -> s
 
 def _cell(words: str, tag: str = 'td') -> str:
     is_number = _NUMBER.match(words) and len(words) < _LONGEST_NUMBER
-    kind = words if words in ('pass', 'FAIL') else 'number' if is_number else ''
+    kind = _VERDICTS.get(words, 'number' if is_number else '')
     mark = f' class="{kind}"' if kind else ''
     return f'<{tag}{mark}>{_text(words)}</{tag.partition(" ")[0]}>'
 

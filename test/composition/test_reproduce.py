@@ -1,9 +1,12 @@
 """The tables anew from the shipped recordings, and verdicts that can fail."""
 
+from argparse import ArgumentParser
+from functools import cache
 import json
 
+from composition.pages import look_at
 from needle_identification import ParameterEstimate, Statistic
-from needle_insertion import reproduce
+from needle_insertion import claims, mismatch, paper_figures, reproduce
 from needle_insertion.cli import main
 from needle_insertion.draw import FORCE_LEVELS, TABLE_1, TABLE_2
 from needle_insertion.protocol import SHIPPED_BAGS
@@ -129,3 +132,107 @@ def test_a_table_that_does_not_hold_ends_in_status_1(tmp_path, monkeypatch, caps
     monkeypatch.setattr(reproduce, 'SHIPPED_BAGS', tmp_path)
     assert main(['reproduce', 'table-1', '--json']) == 1
     assert not json.loads(capsys.readouterr().out)['holds']
+
+
+@pytest.mark.parametrize(
+    'what',
+    [
+        *(f'figure-{number}' for number in range(4, 9)),
+        *(f'table-{number}' for number in range(1, 4)),
+        *('controllability', 'claims', 'mismatch', 'all'),
+    ],
+)
+def test_every_result_can_be_asked_for(what):
+    """Figures, tables, analysis, claims, mismatch, or all of them."""
+    parser = ArgumentParser()
+    reproduce.add_arguments(parser)
+    assert parser.parse_args([what]).what == what
+
+
+@pytest.mark.parametrize(
+    ('what', 'pictures', 'words'),
+    [
+        ('table-1', 0, ['Table 1', 'holds', '2 quantities', '299.9 ± 44.4']),
+        ('table-3', 0, ['Table 3', 'kg/m³', 'round wire of 1.27 mm']),
+        ('figure-4', 1, ['Figure 4', 'what came out of each run', 'paper_mm, as_printed']),
+        ('controllability', 1, ['steer 4 of 8 states', 'q1, q2, q1_dot, q2_dot']),
+    ],
+)
+def test_a_result_is_a_page_that_a_browser_shows(tmp_path, capsys, what, pictures, words):
+    """It is whole, fits a telephone, asks for nothing outside, and says what the terminal says."""
+    assert main(['reproduce', what, '-o', str(tmp_path)]) == 0
+    assert f'wrote {tmp_path}/reproduce.html' in capsys.readouterr().out
+    seen = look_at(tmp_path / 'reproduce.html')
+    for word in words:
+        assert word in seen.text
+    assert [width > 0 for _, width in seen.images] == [True] * pictures
+    assert seen.requests == []
+    assert seen.overflow == 0
+
+
+@pytest.fixture
+def cheap(monkeypatch):
+    """Have all results, but few runs behind them."""
+    figure = paper_figures.FIGURES['figure-5']
+    study = cache(lambda: mismatch.study(8))
+    monkeypatch.setattr(reproduce, '_study', study)
+    monkeypatch.setattr(
+        claims, 'claims',
+        lambda tables, found, _progress: [
+            claims.table_3(), claims.linear(tables), claims.reading_of_table_1(tables),
+            claims.not_zero(found),
+        ],
+    )  # fmt: skip
+    monkeypatch.setattr(
+        paper_figures, 'section',
+        lambda: reproduce.Section(
+            title='Figures 4 to 8', paragraphs=(), pictures=(figure().picture,)
+        ),
+    )  # fmt: skip
+
+
+@pytest.mark.usefixtures('cheap')
+def test_all_is_one_page_with_every_part(tmp_path, capsys):
+    """Parts in order, claims judged by what the bags gave, and the same bytes each time."""
+    first, second = tmp_path / 'first', tmp_path / 'second'
+    assert main(['reproduce', 'all', '-o', str(first)]) == 0
+    said = capsys.readouterr().out
+    assert said.count('holds only if') == 2
+    assert said.count('does not hold') == 1
+    seen = look_at(first / 'reproduce.html')
+    titles = [
+        *('What the paper claims', 'Table 1', 'Table 2', 'Table 3', 'Figures 4 to 8'),
+        *('Controllability and observability', 'Needles that the controller does not know'),
+    ]
+    places = [seen.text.index(f'\n{title}\n') for title in titles[1:]]
+    assert places == sorted(places)
+    assert titles[0] in seen.text
+    assert '1 of 4 hold' in seen.text
+    # Means of the shipped bags in the units of the paper, not of ours.
+    assert 'From the shipped recordings: 0.3 with an STD of 0.044 N s/mm' in seen.text
+    assert 'From the shipped recordings: k_zz falls by' in seen.text.replace('kzz', 'k_zz')
+    assert [width > 0 for _, width in seen.images] == [True] * 3
+    assert (seen.requests, seen.overflow) == ([], 0)
+    assert main(['reproduce', 'all', '--json', '-o', str(second)]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found['holds']
+    assert len(found['results']['claims']['claims']) == 4
+    assert found['results']['table-1']['lines'][0]['holds']
+    assert {path.name: path.read_bytes() for path in first.iterdir()} == {
+        path.name: path.read_bytes() for path in second.iterdir()
+    }
+
+
+@pytest.mark.usefixtures('cheap')
+def test_a_claim_that_does_not_hold_is_a_finding(tmp_path, capsys):
+    """Only a table that does not come out is a failure."""
+    assert main(['reproduce', 'claims', '-o', str(tmp_path)]) == 0
+    assert 'does not hold' in capsys.readouterr().out
+
+
+def test_what_is_computed_is_not_recorded(tmp_path, capsys):
+    """A recording for a figure is refused in one line."""
+    assert main(['reproduce', 'figure-6', '--record', str(tmp_path / 'bags')]) == 2
+    assert 'nothing to --record' in capsys.readouterr().err
+    assert not (tmp_path / 'bags').exists()
+    assert {*reproduce.campaigns('all')} == {'friction', 'stiffness'}

@@ -10,6 +10,7 @@ from needle_controller import (
     PidGains,
     ReferenceLimits,
 )
+from needle_controller.kernels import INTEGRAL
 from needle_dynamics import Integrator, NeedleModel, NeedleParameters, ParameterError
 import numpy as np
 import pytest
@@ -171,3 +172,171 @@ def test_fractional_delay_is_refused():
     """A delay is a whole number of periods."""
     with pytest.raises(ParameterError, match='whole number'):
         ControllerSettings(delay=1.5)
+
+
+@pytest.mark.parametrize('switch', ['law', 'gains'])
+def test_a_switch_in_motion_goes_on_with_the_last_force(switch):
+    """Another law, or other gains, begin with the force before; then it does not jump either."""
+    truth = NeedleParameters.preset('phantom')
+    steering = controller()
+    steering.set_target(0.1)
+    insert(steering, truth, 1.0)
+    # What the last command was, from where it then was.
+    needle = Integrator(truth, NeedleModel(truth).state_at(0.02, 5e-4), 2e-5)
+    steering = controller()
+    steering.set_target(0.1)
+    forces, waiting = [], [0.0]
+    for i in range(3000):
+        if i == 2000 and switch == 'law':
+            steering.change(law='pid')
+        elif i == 2000:
+            stiff = InverseDynamicsGains(kp=2500.0, kv=100.0)
+            steering.change(inverse_dynamics=(stiff, InverseDynamicsGains()))
+        measured = Measurement(time=i * PERIOD, depth=needle.depth, speed=needle.speed)
+        forces.append(steering.command(measured).force)
+        waiting.append(forces[-1])
+        needle.advance(PERIOD, waiting.pop(0))
+    steps = np.abs(np.diff(forces))
+    # The first force is the last one to rounding; from then on it changes as the laws have it:
+    # what is left of the offset fades by 1 % a period.
+    assert steps[1999] < 1e-9
+    assert steps[1999:].max() < 0.02 * abs(forces[1999])
+    assert steering.law == ('pid' if switch == 'law' else 'inverse_dynamics')
+
+
+def test_a_switch_to_gains_that_cannot_be_stable_is_refused():
+    """The reason names them, and the old law goes on."""
+    steering = controller()
+    with pytest.raises(ParameterError, match=r'inverse_dynamics.insertion gains cannot be stable'):
+        steering.change(inverse_dynamics=(InverseDynamicsGains(kv=3000.0), InverseDynamicsGains()))
+    with pytest.raises(ParameterError, match='valid: inverse_dynamics, pid'):
+        steering.change(law='bang_bang')
+    assert steering.law == 'inverse_dynamics'
+
+
+def test_what_limits_the_stability_is_told():
+    """A radius for each axis; a margin that the gains do not have is refused."""
+    steering = controller()
+    assert set(steering.limits) == {'insertion', 'rotation'}
+    assert all(limit.stable for limit in steering.limits.values())
+    with pytest.raises(ParameterError, match=r'must be <= 1 - 0.1'):
+        controller(stability_margin=0.1)
+
+
+@pytest.mark.parametrize(
+    ('depth', 'speed', 'fault'),
+    [(0.025, 0.0, 'moved by 0.005 m'), (0.02, 9e3, 'moved by 0 m'), (nan, 0.0, 'must be finite')],
+)
+def test_a_measurement_that_jumps_is_not_answered(depth, speed, fault):
+    """More than its speed explains, or a speed that the depth denies: no force, and why."""
+    steering = controller()
+    steering.set_target(0.05)
+    for i in range(100):
+        command = steering.command(Measurement(time=i * PERIOD, depth=0.02, speed=0.0))
+    assert command.force > 0.0
+    wrong = steering.command(Measurement(time=0.1, depth=depth, speed=speed))
+    assert (wrong.force, wrong.torque) == (0.0, 0.0)
+    assert fault in wrong.fault
+    # Back where it was, and told so once more, it goes on to its target.
+    for i in range(101, 200):
+        command = steering.command(Measurement(time=i * PERIOD, depth=0.02, speed=0.0))
+    assert command.fault is None
+    assert command.force > 0.0
+    assert steering.target == 0.05
+
+
+def test_a_needle_that_is_elsewhere_for_good_is_not_driven_to_the_old_target():
+    """It says so once, and waits for a target."""
+    steering = controller()
+    steering.set_target(0.05)
+    commands = [
+        steering.command(Measurement(time=i * PERIOD, depth=0.02 + 0.01 * (i > 50), speed=0.0))
+        for i in range(100)
+    ]
+    assert [c.notice for c in commands if c.notice] == [
+        'the needle is 0.010000 m from where it was before the fault; the target is forgotten'
+    ]
+    assert steering.target is None
+    assert not any(c.force for c in commands[51:])
+
+
+def test_the_integral_is_frozen_while_nothing_is_commanded():
+    """After a fault PID goes on with the friction that it had learned."""
+    truth = NeedleParameters.preset('phantom')
+    steering = controller('pid')
+    steering.set_target(0.05)
+    insert(steering, truth, 1.0)
+    # Measured as `insert` left it, at rest: only the integral acts then.
+    loop = steering._insertion
+    learned = float(loop.memory[INTEGRAL])
+    assert learned != 0.0
+    steering.release()
+    for i in range(500):
+        steering.command(Measurement(time=2.0 + i * PERIOD, depth=nan, speed=0.0))
+    assert loop.memory[INTEGRAL] == learned
+    steering.forget()
+    assert loop.memory[INTEGRAL] == 0.0
+
+
+def test_a_range_of_depths_bounds_the_targets():
+    """Targets outside it are refused, and one that leaves nothing of the needle too."""
+    steering = controller(lowest_depth=0.02, highest_depth=0.1)
+    for depth in (0.01, 0.11):
+        with pytest.raises(ParameterError, match=r'must be in \[0.02, 0.1\] m'):
+            steering.set_target(depth)
+    with pytest.raises(ParameterError, match='lowest_depth and highest_depth must leave some'):
+        controller(lowest_depth=0.3)
+
+
+def modal(law: str = 'inverse_dynamics', low: float = 0.184, **changes) -> Controller:
+    """Return a controller with a force on every coordinate."""
+    return Controller(
+        law,
+        NeedleParameters.preset('phantom'),
+        ControllerSettings(lowest_depth=low, **changes),
+        inverse_dynamics=(InverseDynamicsGains(),) * 3,
+        pid=(
+            PidGains(),
+            PidGains(kp=2.1e-7, ki=0.0, kd=2.1e-8),
+            PidGains(kp=5.0, ki=20.0, kd=0.02, feed_forward=True),
+        ),
+        reference='minimum_jerk',
+        limits=ReferenceLimits(),
+        actuation='modal',
+    )
+
+
+def test_modes_that_are_too_fast_for_the_rate_are_refused_by_name():
+    """At 1 kHz and 2 cm the second mode has 22 kHz: samples do not tell it."""
+    with pytest.raises(ParameterError, match=r'deflection mode 2 at 2 cm: 22 kHz') as refusal:
+        modal(low=0.02)
+    assert 'rate of' in str(refusal.value)
+    assert 'inserted lengths from' in str(refusal.value)
+
+
+@pytest.mark.parametrize(('law', 'left'), [('inverse_dynamics', 0.02), ('pid', 0.02)])
+def test_modal_actuation_brings_depth_and_deflection_to_their_targets(law, left):
+    """From a bent needle both laws arrive, PID with its feed-forward: its gains are soft."""
+    truth = NeedleParameters.preset('phantom')
+    steering = modal(law)
+    model = NeedleModel(truth)
+    needle = Integrator(truth, model.state_at(0.185, 1e-3), 2e-5)
+    steering.set_target(0.195, -2e-3)
+    waiting = [np.zeros(4)]
+    for i in range(3000):
+        x = needle.state
+        measured = Measurement(
+            time=i * PERIOD, depth=needle.depth, speed=needle.speed, angle=x[1], angular_speed=x[5]
+        )
+        command = steering.command(measured, bend=(x[2:4], x[6:8]))
+        assert command.fault is None
+        waiting.append(np.array([command.force, command.torque, *command.modal]))
+        force = waiting.pop(0)
+        needle.advance(PERIOD, force[0], force[1], force[2:])
+    assert needle.depth == pytest.approx(0.195, abs=1e-4)
+    assert model.tip_deflection(needle.state) == pytest.approx(-2e-3, abs=left * 3e-3)
+    outside = steering.command(
+        Measurement(time=3.001, depth=0.18299, speed=-12.0), bend=(x[2:4], x[6:8])
+    )
+    assert 'outside' in (outside.fault or '')
+    assert not outside.modal.any()

@@ -3,6 +3,8 @@
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from needle_controller import MinimumJerk, ReferenceLimits, Setpoint, Trapezoid
+from needle_controller.reference import Guide, Joined, Path
+from needle_dynamics import ParameterError
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest
@@ -66,3 +68,178 @@ def test_minimum_jerk_meets_its_limit():
     # Peak of the quintic at half time: 15/8 of the mean speed.
     assert motion.at(0.5 * motion.duration).speed == pytest.approx(LIMITS.speed, rel=1e-12)
     assert motion.duration == pytest.approx(18.75, rel=1e-12)
+
+
+def samples(motion, end: float, count: int = 4001):
+    """Return times, positions, speeds and accelerations of a motion."""
+    times = np.linspace(0.0, end, count)
+    points = [motion(t) for t in times]
+    return times, *np.array([(p.position, p.speed, p.acceleration) for p in points]).T
+
+
+def check_smooth(motion, end: float, extra_speed: float = 0.0, extra_ramp: float = 0.0):
+    """Check that position and speed do not jump and keep the limits, and what a start exceeds."""
+    times, position, speed, _ = samples(motion, end)
+    step = times[1]
+    top = max(LIMITS.speed, abs(extra_speed))
+    ramp = max(LIMITS.acceleration, abs(extra_ramp))
+    # A mean over a step does not exceed the largest value within it.
+    assert np.abs(np.diff(position)).max() <= top * step * (1.0 + 1e-6) + 1e-12
+    assert np.abs(np.diff(speed)).max() <= ramp * step * (1.0 + 1e-6) + 1e-12
+    assert np.abs(speed).max() <= top * (1.0 + 1e-6)
+
+
+REACH = (0.001, 0.2)
+
+#: Points of a path: time to the next one, and part of the highest speed on the way there.
+legs = st.lists(st.tuples(st.floats(0.3, 3.0), st.floats(-1.0, 1.0)), min_size=1, max_size=6)
+
+
+def lines(legs, start: float = 0.1):
+    """Return times and positions of lines within limits and reach."""
+    times, positions = [0.0], [start]
+    for time, part in legs:
+        times.append(times[-1] + time)
+        at = positions[-1] + part * LIMITS.speed * time
+        positions.append(min(max(at, 0.01), 0.19))
+    return times, positions
+
+
+@settings(deadline=None, max_examples=60)
+@given(legs, st.floats(0.05, 0.15), speeds, st.booleans())
+def test_a_path_is_joined_from_anywhere_without_a_jump_and_followed_to_its_end(
+    legs, start, speed, cubic
+):
+    """Lines, or cubics at rest in their points: joined within the limits, ended exactly."""
+    times, positions = lines(legs)
+    if cubic:
+        # Rest to rest a cubic has 3/2 of the mean speed and 6 D / T^2.
+        positions = [0.1 + 0.05 * (at - 0.1) for at in positions]
+    path = Path(times, positions, [0.0] * len(times) if cubic else None, LIMITS, REACH)
+    motion = Joined(Setpoint(start, speed), path, 0.0, LIMITS)
+    first = motion.at(0.0)
+    assert_allclose((first.position, first.speed), (start, speed), rtol=1e-12)
+    check_smooth(motion.at, motion.duration + 0.1, speed)
+    assert motion.at(motion.duration) == Setpoint(positions[-1])
+
+
+def test_lines_are_followed_to_the_bit_between_their_corners():
+    """In the middle of each line the path is the line; a corner is cut by dv^2 / 8a at most."""
+    times, positions = [0.0, 2.0, 4.0], [0.1, 0.118, 0.11]
+    path = Path(times, positions, None, LIMITS, REACH)
+    for t in (1.0, 3.0):
+        assert path.at(t).position == pytest.approx(np.interp(t, times, positions), rel=1e-12)
+    off = max(abs(path.at(t).position - np.interp(t, times, positions))
+              for t in np.linspace(0.0, 4.2, 2001))  # fmt: skip
+    assert off <= 0.013**2 / (8.0 * LIMITS.acceleration) * (1.0 + 1e-9)
+
+
+@pytest.mark.parametrize(
+    ('times', 'positions', 'rates', 'reason'),
+    [
+        ([], [], None, 'at least one time'),
+        ([1.0], [0.1, 0.2], None, 'one position for each'),
+        ([1.0, 2.0], [0.1, 0.1], [0.0], 'a speed for each of its 2 points or none'),
+        ([1.0, 1.0], [0.1, 0.1], None, 'times must be >= 0 and increasing'),
+        ([-1.0], [0.1], None, 'times must be >= 0 and increasing'),
+        ([1.0, np.nan], [0.1, 0.1], None, 'must be finite'),
+        ([1.0], [np.inf], None, 'must be finite'),
+        ([1.0], [0.3], None, r'positions must be in \[0.001, 0.2\] m'),
+        ([0.0, 1.0], [0.1, 0.12], None, 'speed after 0 s must be within 0.01 m/s, got 0.02 m/s'),
+        ([0.0, 1.0], [0.1, 0.101], [0.0, 0.01], 'speed at the end must be 0'),
+        ([0.0, 0.1], [0.1, 0.1004], [0.0, 0.0], 'acceleration after 0 s must be within 0.1'),
+        ([0.0, 0.01, 1.0], [0.1, 0.1001, 0.1], None, 'speed changes from 0.01 to'),
+        ([0.0, 4.0], [0.1995, 0.1995], [0.009, 0.0], r'must stay in \[0.001, 0.2\] m'),
+    ],
+)
+def test_a_path_that_cannot_be_followed_is_refused(times, positions, rates, reason):
+    """In one line, with what was found and what would be valid."""
+    with pytest.raises(ParameterError, match=reason):
+        Path(times, positions, rates, LIMITS, REACH)
+
+
+class Walk:
+    """A guide sampled at 1 kHz around changes."""
+
+    def __init__(self, kind: str) -> None:
+        self.guide = Guide(kind, LIMITS, REACH)
+        self.time = 0.0
+        self.points: list[Setpoint] = []
+
+    def on(self, duration: float) -> Setpoint:
+        for _ in range(round(duration * 1000.0)):
+            self.points.append(self.guide.at(self.time, 0.05))
+            self.time += 1e-3
+        return self.points[-1]
+
+
+KINDS = pytest.mark.parametrize('kind', ['trapezoid', 'minimum_jerk'])
+events = st.lists(
+    st.tuples(st.sampled_from(['target', 'path', 'pause', 'resume']), st.floats(0.01, 1.5)),
+    min_size=1,
+    max_size=6,
+)
+
+
+@KINDS
+@settings(deadline=None, max_examples=25)
+@given(st.data(), events)
+def test_no_change_makes_the_reference_jump(kind, data, events):
+    """Targets, paths, pauses and resumptions in any order: position and speed are continuous."""
+    walk = Walk(kind)
+    walk.guide.aim(0.12)
+    for event, wait in events:
+        walk.on(wait)
+        if event == 'target':
+            walk.guide.aim(data.draw(depths.filter(lambda at: at > 0.001)))
+        elif event == 'path':
+            walk.guide.follow(*lines([(1.0, 0.9), (0.7, -0.4)], 0.06))
+        else:
+            getattr(walk.guide, event)()
+        before, after = walk.guide.ahead(walk.time), walk.guide.at(walk.time, 0.05)
+        assert_allclose(after.position, before.position, rtol=1e-12)
+        assert_allclose(after.speed, before.speed, rtol=1e-9, atol=1e-12)
+        if kind == 'minimum_jerk':
+            assert_allclose(after.acceleration, before.acceleration, rtol=1e-9, atol=1e-9)
+    walk.on(0.5)
+    position, speed = np.array([(p.position, p.speed) for p in walk.points]).T
+    assert np.abs(np.diff(position)).max() <= 1e-3 * LIMITS.speed * (1.0 + 1e-6)
+    assert np.abs(np.diff(speed)).max() <= 1e-3 * LIMITS.acceleration * (1.0 + 1e-6)
+
+
+@KINDS
+def test_a_pause_brakes_to_rest_holds_and_is_resumed(kind):
+    """In motion it stops within v^2 / 2a (2.9 times as far with little jerk), then goes on."""
+    walk = Walk(kind)
+    walk.guide.aim(0.1)
+    before = walk.on(2.0)
+    walk.guide.pause()
+    held = walk.on(1.0)
+    assert held.speed == held.acceleration == 0.0
+    assert 0.0 < held.position - before.position <= 2.9 * 0.01**2 / (2.0 * 0.1) + 1e-5
+    assert walk.on(1.0) == held
+    # A target while paused waits.
+    walk.guide.aim(0.06)
+    assert walk.on(0.5) == held
+    walk.guide.resume()
+    assert walk.on(10.0) == Setpoint(0.06)
+
+
+@KINDS
+def test_a_paused_path_is_resumed_where_it_was_left(kind):
+    """It goes on behind where it stopped, to the end of the path, as late as the pause took."""
+    times, positions = [0.0, 4.0, 8.0], [0.05, 0.08, 0.06]
+    walk = Walk(kind)
+    walk.guide.follow(times, positions)
+    walk.on(2.0)
+    walk.guide.pause()
+    held = walk.on(3.0)
+    walk.guide.resume()
+    start = len(walk.points)
+    walk.on(10.0)
+    after = np.array([p.position for p in walk.points[start:]])
+    assert after.min() == pytest.approx(0.06, abs=1e-9)
+    # It still goes to the farthest point, less what its corner is cut.
+    assert after.max() == pytest.approx(0.08, abs=0.0125**2 / 0.8 + 1e-9)
+    assert after[0] == held.position
+    assert walk.points[-1] == Setpoint(0.06)

@@ -948,3 +948,94 @@ def test_speed_that_is_not_finite_is_refused_and_leaves_the_state(speed: float) 
     with pytest.raises(ParameterError):
         it.advance_moved(1e-3, speed)
     assert np.array_equal(it.state, before)
+
+
+def driven(model: NeedleModel, forces: FloatArray, push: float) -> Callable[..., FloatArray]:
+    """Return the right-hand side of the motion under generalized forces and a push."""
+    m = model.coordinates
+
+    def derivative(time: float, x: FloatArray) -> FloatArray:
+        result = model.acceleration(x, push, 0.0, time)
+        result[2:] += np.linalg.solve(model.mass_matrix(x)[2:, 2:], forces)
+        return np.concatenate([x[m:], result])
+
+    return derivative
+
+
+@pytest.mark.parametrize('modes', [1, 2, 3])
+@pytest.mark.parametrize('formulation', ['complete', 'as_printed'])
+def test_generalized_forces_act_as_in_the_equations_of_motion(
+    formulation: str, modes: int
+) -> None:
+    """With them a sliding needle goes as an ODE solver has it, and converges with order two."""
+    it = needle('paper_si', 0.1, 5e-4, formulation=formulation, modes=modes, minimum_depth=0.05,
+                tissue_damping=1.6, coulomb_friction=0.0)  # fmt: skip
+    forces, state = np.array([0.2, -0.3, 0.2])[:modes], it.state
+    state[2 + modes] = -0.05
+    exact = solve_ivp(
+        driven(it.model, forces, 0.1), (0.0, 4e-3), state, rtol=1e-11, atol=1e-15, method='DOP853'
+    ).y[:, -1]
+    free = solve_ivp(
+        driven(it.model, 0.0 * forces, 0.1), (0.0, 4e-3), state, rtol=1e-9, atol=1e-15
+    ).y[:, -1]
+    scale = np.abs(exact - free)[2 : 2 + modes].max()
+    steps, errors = 2e-5 / 2.0 ** np.arange(4), []
+    for step in steps:
+        it = Integrator(it.model.parameters, state, float(step))
+        it.advance(4e-3, 0.1, 0.0, forces)
+        errors.append(np.abs(it.state - exact)[2 : 2 + modes].max())
+    # Modes up to 1.8 kHz (three of them): (omega h)^2 / 12 = 4e-3 at the longest step.
+    assert errors[0] < 4e-3 * scale
+    assert_allclose(order(steps, np.array(errors)), 2.0, atol=0.15)
+
+
+@given(
+    st.floats(0.02, 0.2),
+    st.lists(st.floats(-5.0, 5.0), min_size=2, max_size=2),
+    st.floats(1e-6, 1e-3),
+)
+@settings(deadline=None, max_examples=25)
+def test_generalized_forces_hold_the_deflections_of_their_statics(
+    depth: float, forces: list[float], step: float
+) -> None:
+    """At K q = Q a needle that sticks rests, at any depth and step; its tip mean tells that."""
+    it = needle('phantom', depth, coulomb_friction=1e6, step=step)
+    state = it.state
+    state[2:4] = np.linalg.solve(it.model.stiffness_matrix(depth), forces)
+    it = Integrator(it.model.parameters, state, step)
+    seen = it.advance(5e-3, 0.0, 0.0, np.array(forces))
+    # Rounding, larger by the condition of K: 1e5 at 2 cm.
+    scale = np.abs(state[2:4]).max() + 1e-300
+    assert_allclose(it.state[2:4], state[2:4], rtol=1e-9, atol=1e-9 * scale)
+    tip = it.model.tip_deflection(state)
+    assert seen.tip_deflection == pytest.approx(tip, rel=1e-8, abs=1e-9 * scale)
+    assert seen.input_work == pytest.approx(0.0, abs=1e-8 * abs(np.dot(forces, state[2:4])))
+
+
+def test_work_of_generalized_forces_belongs_to_the_balance_of_energy() -> None:
+    """E_end - E_start = input - friction - damping work, at the order of the integrator."""
+    steps, forces = 2.5e-6 / 2.0 ** np.arange(4), np.array([0.5, -0.5])
+    gaps, total = [], Interval
+    for step in steps:
+        it = needle('paper_mm', **SECTION_328, step=step, tissue_damping=1.6)
+        before = energy(it)
+        total = it.advance(0.02, PUSH, 1e-9, forces)
+        spent = total.friction_work + total.damping_work
+        gaps.append(abs(energy(it) - before + spent - total.input_work))
+    pushed = needle('paper_mm', **SECTION_328, step=1e-6, tissue_damping=1.6)
+    without = pushed.advance(0.02, PUSH, 1e-9)
+    # What the generalized forces do is not a small part of it.
+    assert abs(total.input_work - without.input_work) > 0.01 * without.input_work
+    # They shake the 22 kHz mode, which these steps resolve: (omega h)^2 / 12 is 0.01.
+    assert gaps[0] < 0.01 * total.damping_work
+    assert_allclose(order(steps, np.array(gaps)), 2.0, atol=0.1)
+
+
+@pytest.mark.parametrize('forces', [[1.0], [1.0, 2.0, 3.0], [1.0, np.nan], ['a', 'b']])
+def test_generalized_forces_that_do_not_fit_are_refused(forces: list[Any]) -> None:
+    """One finite number for each mode, else an error, and the state stays."""
+    it = needle()
+    before = it.state
+    with pytest.raises(ShapeError, match='modal must be'):
+        it.advance(1e-3, 0.0, 0.0, forces)  # type: ignore[arg-type]
+    assert_allclose(it.state, before, rtol=0.0)

@@ -16,7 +16,7 @@ from needle_dynamics import (
     ParameterError,
     ShapeError,
 )
-from needle_dynamics.integrators import _constants
+from needle_dynamics.integrators import kernel_constants
 from needle_dynamics.kernels import _rotate_many, _rotate_two, evaluate_many, SUMS
 from needle_dynamics.parameters import LARGEST_CONDITION, MOST_MODES
 import numpy as np
@@ -179,7 +179,7 @@ def test_two_modes_rotate_the_same_by_the_general_path(depth: float, formulation
     p, printed = parameters, formulation == 'as_printed'
     constants = (p.linear_density, p.bending_stiffness, p.tissue_damping, printed)
     special = _rotate_two(*constants, *where, *q, *z, 1e-5, 0.99, seen)
-    impulse = _rotate_many(_constants(model), *where, q, z, 1e-5, 0.99, others)
+    impulse = _rotate_many(kernel_constants(model), *where, q, z, 1e-5, 0.99, others)
     # Rounding times sqrt(cond G) = 3e3 at 2 mm, for each of a dozen sums: 1e-10.
     for one, other in (
         (special[:2], q),

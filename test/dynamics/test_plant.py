@@ -19,7 +19,15 @@ from needle_dynamics import (
     ShapeError,
 )
 from needle_dynamics.errors import JobError
-from needle_dynamics.plant import BaseMotion, BaseParameters, Plant, Sample
+from needle_dynamics.plant import (
+    BaseMotion,
+    BaseParameters,
+    Plant,
+    Sample,
+    TipParameters,
+    TipReading,
+    TipSensor,
+)
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest
@@ -292,3 +300,37 @@ def test_force_and_speed_of_a_carried_base_are_of_one_instant() -> None:
     assert_allclose(
         column(samples, 'force')[moving], (friction + inertia)[moving], rtol=0.0, atol=1e-11
     )
+
+
+def watched(rate: float = 0.0, noise: float = 0.0, delay: float = 0.0) -> list[TipReading | None]:
+    """Return what a sensor of the tip says of 40 samples at 100 Hz that count up from 1."""
+    sensor = TipSensor(TipParameters(rate=rate, noise=noise, delay=delay), 100.0, 1)
+    return [sensor.measure(0.1 * k, float(k)) for k in range(1, 41)]
+
+
+def test_the_tip_is_seen_at_the_rate_and_delay_of_its_sensor() -> None:
+    """Each sample is the mean over its exposure and leaves when it is late enough."""
+    assert [r.deflection for r in watched() if r] == list(range(1, 41))
+    readings = watched(rate=10.0, delay=0.03)
+    assert [k for k, r in enumerate(readings, 1) if r] == [13, 23, 33]
+    seen = [r for r in readings if r]
+    assert [r.deflection for r in seen] == [5.5, 15.5, 25.5]
+    assert [r.age for r in seen] == [3, 3, 3]
+    assert_allclose([r.depth for r in seen], [1.0, 2.0, 3.0], rtol=1e-12)
+
+
+def test_noise_of_the_tip_is_of_the_size_asked_for_and_seeded() -> None:
+    """The same seed gives the same noise."""
+    noisy, again = watched(noise=0.5), watched(noise=0.5)
+    assert noisy == again
+    errors = [r.deflection - k for k, r in enumerate(noisy, 1) if r]
+    # 40 samples: the standard deviation is known to 11 %, taken three times.
+    assert 0.33 < np.std(errors) < 0.67
+
+
+def test_a_rate_of_the_tip_that_does_not_divide_the_plants_is_refused() -> None:
+    """Its exposures would not end with samples of the plant."""
+    with pytest.raises(
+        ParameterError, match=r'tip\.rate must divide the rate of the plant 100 Hz'
+    ):
+        watched(rate=30.0)

@@ -18,7 +18,7 @@ from needle_dynamics import (
     ParameterError,
     Tissue,
 )
-from needle_dynamics.integrators import _constants
+from needle_dynamics.integrators import kernel_constants
 from needle_dynamics.kernels import _flow
 import numpy as np
 from numpy.polynomial.legendre import leggauss
@@ -322,7 +322,7 @@ def test_stribeck_without_break_away_is_coulomb(name: str) -> None:
 def test_equal_friction_both_ways_is_symmetric(law: str) -> None:
     """With withdrawal = 1 a straight needle moves out as it moves in, bit for bit."""
     p = preset('paper_mm', friction_law=law, breakaway_friction=1.5)
-    c, ends = _constants(NeedleModel(p)), []
+    c, ends = kernel_constants(NeedleModel(p)), []
     for sign in (-1.0, 1.0):
         u = gone = 0.0
         for push in PUSHES:
@@ -515,7 +515,7 @@ def test_a_step_never_takes_energy_out_of_friction(
 ) -> None:
     """Whatever the step, drive times travel exceeds the kinetic energy gained."""
     p = axis(law, coulomb, viscous, withdrawal, breakaway, turn)
-    new, gone = _flow(_constants(NeedleModel(p)), u, drive, 10.0**exponent)
+    new, gone = _flow(kernel_constants(NeedleModel(p)), u, drive, 10.0**exponent)
     kinetic = 0.5 * p.moving_mass * np.array([u * u, new * new])
     lost = drive * gone - (kinetic[1] - kinetic[0])
     # Rounding of what is subtracted.
@@ -536,7 +536,7 @@ def test_smooth_friction_ends_between_its_start_and_its_steady_speed(
 ) -> None:
     """Under the smooth law the speed goes monotonically to where friction balances the drive."""
     p = axis('tanh', coulomb, viscous, withdrawal, 1.0, 1e-4)
-    new, gone = _flow(_constants(NeedleModel(p)), u, drive, 10.0**exponent)
+    new, gone = _flow(kernel_constants(NeedleModel(p)), u, drive, 10.0**exponent)
     factor = 1.0 if drive > 0.0 else withdrawal
     low, high = 0.0, abs(drive) / (factor * viscous)
     for _ in range(200):

@@ -1,5 +1,6 @@
 """The controller as the graph sees it, alone and around the plant."""
 
+from itertools import pairwise
 from math import nan
 
 from geometry_msgs.msg import PointStamped, WrenchStamped
@@ -9,8 +10,10 @@ from needle_dynamics.plant_node import PlantNode
 import pytest
 from rclpy.duration import Duration
 from rclpy.lifecycle import TransitionCallbackReturn
+from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
-from std_srvs.srv import Trigger
+from std_srvs.srv import SetBool, Trigger
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 #: Both nodes in the test's own thread.
 SLOW = {'rate': 200.0}
@@ -163,7 +166,7 @@ def test_unstable_gains_end_the_process(ros_graph):
 def test_parameters_cannot_change_while_configured(ros_graph):
     """A change that would not take effect is refused, with the way to make it."""
     controller = ros_graph.add(ControllerNode, parameters=SLOW)
-    parameter = controller.get_parameter('law')
+    parameter = controller.get_parameter('reference.kind')
     result = controller.set_parameters([parameter])[0]
     assert not result.successful
     assert 'clean up the node first' in result.reason
@@ -208,3 +211,224 @@ def test_configuring_again_doubles_nothing(ros_graph):
     topics = [subscription.topic_name for subscription in controller.subscriptions]
     assert topics.count('/ground_truth') == 1
     assert topics.count('/joint_states') == 1
+
+
+class Loop:
+    """Controller and simulated plant in one thread, with a probe."""
+
+    def __init__(self, graph, *, rate=200.0, depth=0.02, **parameters):
+        self.graph = graph
+        self.probe = graph.node('probe')
+        self.states = graph.listen(self.probe, JointState, 'joint_states', SENSOR)
+        self.aims = graph.listen(self.probe, JointState, 'reference', SENSOR)
+        self.forces = graph.listen(self.probe, WrenchStamped, 'wrench_command', COMMAND)
+        self.targets = self.probe.create_publisher(PointStamped, 'target', COMMAND)
+        self.paths = self.probe.create_publisher(JointTrajectory, 'joint_trajectory', COMMAND)
+        # All in one thread, which may be held up.
+        self.plant = graph.add(
+            PlantNode, parameters={'rate': rate, 'depth': depth, 'command_timeout': 1.0}
+        )
+        self.node = graph.add(
+            ControllerNode, parameters={'rate': rate, 'measurement_timeout': 1.0, **parameters}
+        )
+        self.until(lambda: self.aims and self.targets.get_subscription_count(), 'discovery')
+        self.until(lambda: self.paths.get_subscription_count() == 2, 'discovery')
+
+    def until(self, condition, what):
+        self.graph.spin_until(condition, what)
+
+    def aim(self, depth):
+        message = PointStamped()
+        message.point.y = depth
+        self.targets.publish(message)
+        self.until(lambda: self.said('target [m]') == depth, 'the target')
+
+    def call(self, kind, name, request):
+        client = self.probe.create_client(kind, f'controller/{name}')
+        self.until(client.service_is_ready, name)
+        answer = client.call_async(request)
+        self.until(answer.done, name)
+        return answer.result()
+
+    def said(self, key):
+        return self.node.diagnose()[2][key]
+
+    def speed(self):
+        return self.aims[-1].velocity[0]
+
+
+def path(*points, joint='insertion'):
+    """Return a trajectory of points: time, position, speed or None."""
+    message = JointTrajectory(joint_names=[joint])
+    for time, position, speed in points:
+        point = JointTrajectoryPoint(positions=[position])
+        if speed is not None:
+            point.velocities = [speed]
+        point.time_from_start = Duration(seconds=time).to_msg()
+        message.points.append(point)
+    return message
+
+
+def test_pauses_goes_on_and_retracts(ros_graph):
+    """The reference brakes, holds, goes on to its target, and back out again."""
+    loop = Loop(ros_graph, retract_depth=0.019)
+    loop.aim(0.1)
+    loop.until(lambda: loop.speed() == 0.01, 'the highest speed')
+    assert loop.call(SetBool, 'pause', SetBool.Request(data=True)).success
+    loop.until(lambda: loop.speed() == 0.0, 'rest')
+    held = loop.aims[-1].position[0]
+    count = len(loop.aims)
+    loop.until(lambda: len(loop.aims) > count + 40, 'a while')
+    assert {m.position[0] for m in loop.aims[count:]} == {held}
+    assert loop.said('paused') is True
+    assert loop.call(SetBool, 'pause', SetBool.Request(data=False)).success
+    loop.until(lambda: loop.speed() > 0.0, 'motion')
+    assert loop.call(Trigger, 'retract', Trigger.Request()).message == 'goes to 0.019 m'
+    loop.until(lambda: loop.aims[-1].position[0] == 0.019, 'the way back')
+    loop.until(lambda: abs(loop.states[-1].position[0] - 0.019) < 1e-4, 'the needle')
+    # No jump in all of it: one period at the limits, and rounding.
+    aims = [(m.position[0], m.velocity[0]) for m in loop.aims]
+    assert max(abs(b[0] - a[0]) for a, b in pairwise(aims)) < 0.01 * 0.2
+    assert loop.call(Trigger, 'emergency_stop', Trigger.Request()).success
+    refused = loop.call(Trigger, 'retract', Trigger.Request())
+    assert 'stopped' in refused.message
+    assert not refused.success
+
+
+def test_follows_a_trajectory(ros_graph):
+    """Lines by positions alone are followed to their end; the plant leaves them to it."""
+    loop = Loop(ros_graph)
+    loop.paths.publish(path((0.5, 0.024, None), (1.0, 0.022, None)))
+    loop.until(lambda: loop.aims[-1].position[0] == 0.022, 'the end')
+    assert max(m.position[0] for m in loop.aims) > 0.0235
+    loop.until(lambda: abs(loop.states[-1].position[0] - 0.022) < 1e-4, 'the needle')
+    assert loop.said('inputs refused') == 0
+    assert loop.plant.diagnose()[2]['commands refused'] == 0
+
+
+@pytest.mark.parametrize(
+    ('message', 'reason'),
+    [
+        (path((1.0, 0.3, None)), 'positions must be in [0.001, 0.2] m'),
+        (path((1.0, nan, None)), 'must be finite'),
+        (path((1.0, 0.05, None), (1.0, 0.06, None)), 'increasing'),
+        (path((1.0, 0.05, None), joint='elbow'), "needs the joint 'insertion'"),
+        (path((0.0, 0.05, None), (1.0, 0.1, None)), 'must be within 0.01 m/s'),
+    ],
+    ids=['reach', 'finite', 'times', 'joint', 'speed'],
+)
+def test_a_trajectory_that_it_cannot_follow_is_refused(ros_graph, message, reason):
+    """In one line, which diagnostics have too; nothing moves."""
+    bench = Bench(ros_graph)
+    paths = bench.node.create_publisher(JointTrajectory, 'joint_trajectory', COMMAND)
+    ros_graph.spin_until(paths.get_subscription_count, 'discovery')
+    paths.publish(message)
+    said = bench.controller.diagnose
+    ros_graph.spin_until(lambda: said()[2]['inputs refused'] == 1, 'the refusal')
+    assert reason in said()[2]['last complaint']
+    assert bench.measure(0.02) == 0.0
+
+
+def test_switches_law_and_gains_in_motion_without_a_bump(ros_graph):
+    """By parameter, over DDS: the commanded force goes on where it was."""
+    loop = Loop(ros_graph)
+    loop.aim(0.1)
+    loop.until(lambda: loop.states[-1].position[0] > 0.022, 'steady motion')
+    for name, value in (('law', 'pid'), ('pid.insertion.kp', 4000.0), ('law', 'inverse_dynamics')):
+        # One that is there belongs to the time before.
+        count = len(loop.forces)
+        assert loop.node.set_parameters([Parameter(name, value=value)])[0].successful
+        loop.until(lambda count=count: len(loop.forces) > count + 20, 'commands')
+        forces = [m.wrench.force.y for m in loop.forces[count - 1 :]]
+        # 3.6 N; the handover fades by 5 % of its part in a period of 5 ms.
+        assert max(abs(b - a) for a, b in pairwise(forces)) < 0.05 * forces[0]
+    assert loop.said('law') == 'inverse_dynamics'
+
+
+@pytest.mark.parametrize(
+    ('name', 'value', 'reason'),
+    [
+        ('inverse_dynamics.insertion.kv', 3000.0, 'cannot be stable'),
+        ('pid.insertion.kp', [1.0, 2.0], 'must be a number'),
+        ('law', 'bang_bang', 'law must be one of inverse_dynamics, pid'),
+        ('retract_depth', 0.5, 'retract_depth must be in [0.001, 0.2] m'),
+    ],
+)
+def test_gains_that_will_not_do_are_refused_while_running(ros_graph, name, value, reason):
+    """The reason is the answer and on /diagnostics; the old value stays."""
+    node = ros_graph.add(ControllerNode, parameters=SLOW)
+    before = node.get_parameter(name).value
+    answer = node.set_parameters([Parameter(name, value=value)])[0]
+    assert not answer.successful
+    assert reason in answer.reason
+    assert node.get_parameter(name).value == before
+    assert reason in node.diagnose()[2]['last complaint']
+
+
+def test_a_measurement_that_jumps_is_answered_with_no_force(ros_graph):
+    """A needle that is 5 mm on within a period is no needle."""
+    bench = Bench(ros_graph)
+    bench.aim(0.1)
+    assert bench.push() > 0.5
+    assert bench.measure(0.025) == 0.0
+    assert 'insertion moved by' in bench.controller.diagnose()[1]
+    assert bench.controller.get_parameter('jump').value < 5e-3
+
+
+def test_the_observer_tells_what_it_sees(ros_graph):
+    """By default it follows the tip of a bent needle from the plant's sensors."""
+    probe = ros_graph.node('probe')
+    tips = ros_graph.listen(probe, PointStamped, 'tip_deflection', SENSOR)
+    ros_graph.add(
+        PlantNode,
+        parameters={**SLOW, 'depth': 0.15, 'tip_deflection': 3e-3, 'model.tissue_damping': 1.6,
+                    'tip.rate': 50.0, 'tip.noise': 1e-4, 'tip.delay': 0.02},
+    )  # fmt: skip
+    node = ros_graph.add(ControllerNode, parameters={**SLOW, 'observer.tip_exposure': 0.02})
+    ros_graph.spin_until(lambda: len(tips) > 25, 'tips')
+    said = node.diagnose()[2]
+    estimate, _, spread = str(said['tip deflection [m]']).split()
+    # The needle swings to rest; three standard deviations and those of the last tip seen.
+    assert abs(float(estimate) - tips[-1].point.z) < 3.0 * (float(spread) + 1e-4) + 5e-4
+    assert 'in [' in said['observer consistency (NIS)']
+    assert said['observer restarts'] == 0
+    stamps = [m.header.stamp.sec + 1e-9 * m.header.stamp.nanosec for m in tips]
+    assert min(b - a for a, b in pairwise(stamps)) == pytest.approx(0.02, abs=1e-6)
+
+
+def test_modal_actuation_drives_the_deflection_where_it_is_stable(ros_graph):
+    """With a force on every coordinate the plant's tip goes where it shall, at 500 Hz."""
+    rate = {'rate': 1000.0}
+    probe = ros_graph.node('probe')
+    tips = ros_graph.listen(probe, PointStamped, 'tip_deflection', SENSOR)
+    forces = ros_graph.listen(probe, JointState, 'generalized_command', COMMAND)
+    targets = probe.create_publisher(PointStamped, 'target', COMMAND)
+    modal = {
+        **rate, 'actuation': 'modal', 'deflection_feedback': 'ground_truth', 'lowest_depth': 0.184,
+        'measurement_timeout': 1.0,
+    }  # fmt: skip
+    ros_graph.start('plant', {**rate, 'depth': 0.19, 'command_timeout': 1.0})
+    ros_graph.start('controller', modal)
+    ros_graph.spin_until(lambda: forces and targets.get_subscription_count(), 'the loop', 60.0)
+    assert forces[-1].name == ['d', 'theta', 'q1', 'q2']
+    message = PointStamped()
+    message.point.y, message.point.z = 0.19, 1e-3
+    targets.publish(message)
+    ros_graph.spin_until(lambda: tips and abs(tips[-1].point.z - 1e-3) < 1e-4, 'the deflection')
+
+
+@pytest.mark.parametrize(
+    ('parameters', 'reason'),
+    [
+        ({'deflection_feedback': 'ground_truth'}, 'deflection mode 2 at 0.1 cm'),
+        ({'deflection_feedback': 'ground_truth', 'lowest_depth': 0.02}, 'mode 2 at 2 cm: 22 kHz'),
+        ({}, 'deflection_feedback must be ground_truth'),
+    ],
+)
+def test_modal_actuation_is_refused_where_it_cannot_work(ros_graph, parameters, reason):
+    """Modes that the rate cannot tell, or deflections that nothing tells."""
+    node = ros_graph.add(
+        ControllerNode, start=False, parameters={'actuation': 'modal', **parameters}
+    )
+    assert not node.start()
+    assert reason in node.failure

@@ -1,0 +1,57 @@
+"""What the benchmark of the control step compares is the same law; never its times."""
+
+from itertools import pairwise
+
+from needle_controller import (
+    DeflectionLaw,
+    DeflectionLoop,
+    InverseDynamicsGains,
+    SampledLoop,
+    Setpoint,
+)
+from needle_dynamics import NeedleModel, NeedleParameters
+from needle_insertion import bench_control
+from needle_insertion.bench_control import NumpyInverseDynamics, PERIOD
+from needle_insertion.cli import main
+from needle_insertion.mismatch import sampled_laws
+import numpy as np
+from numpy.testing import assert_allclose
+
+PHANTOM = NeedleParameters.preset('phantom')
+
+
+def test_the_plain_law_is_ours():
+    plain = NumpyInverseDynamics(PHANTOM, InverseDynamicsGains())
+    law = sampled_laws(PHANTOM, PERIOD)['inverse_dynamics']
+    ours = SampledLoop(law, bench_control.DELAY, 15.0)
+    for k, (before, depth) in enumerate(pairwise(np.linspace(0.1, 0.101, 101))):
+        speed, target = (depth - before) / PERIOD, depth + 1e-5
+        expected = ours.command(depth, speed, Setpoint(target, 0.01))
+        found = plain.command(depth, speed, np.array([target, 0.01, 0.0]))
+        if k == 0:
+            # The plain one does not know that nothing was on its way: friction stops no needle.
+            plain.last = expected
+            continue
+        assert_allclose(found, expected, rtol=1e-9)
+
+
+def test_the_plain_deflection_law_is_ours():
+    model, gains = NeedleModel(PHANTOM), InverseDynamicsGains()
+    state = model.state_at(0.1, 5e-4)
+    x = np.array([state[2:4], [1e-3, -2e-3]])
+    law = DeflectionLaw(model=model, gains=gains, period=PERIOD)
+    modes = law.at(0.1 + 0.5 * PERIOD * 0.01)
+    expected = DeflectionLoop(law, 0).answer(modes, x, np.zeros((3, 2)), 0.01)[0]
+    found = bench_control.numpy_deflection(model, gains, x, 0.01)
+    # 1e-8: eigenvectors of matrices with condition 1e3, and a matrix exponential.
+    assert_allclose(found, expected, rtol=1e-8)
+
+
+def test_every_job_runs_and_has_a_verdict(capsys, monkeypatch):
+    monkeypatch.setattr(bench_control, '_CALLS', 1)
+    monkeypatch.setattr(bench_control, '_ROUNDS', 1)
+    assert main(['bench', 'control']) == 0
+    text = capsys.readouterr().out
+    for name in bench_control.jobs():
+        assert name in text
+    assert text.count('<= 20') == 4

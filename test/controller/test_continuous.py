@@ -1,0 +1,352 @@
+"""The laws of the source in continuous time, and how the sampled ones tend to them."""
+
+from dataclasses import replace
+
+from needle_controller import (
+    Axis,
+    closed_loop,
+    closed_loop_matrix,
+    ContinuousInverseDynamics,
+    ContinuousPid,
+    DeflectionLaw,
+    InverseDynamics,
+    InverseDynamicsGains,
+    ModalLoop,
+    Pid,
+    PidGains,
+    SampledLoop,
+    Setpoint,
+)
+from needle_controller.continuous import acceleration
+from needle_dynamics import Integrator, NeedleModel, NeedleParameters, ParameterError, ShapeError
+import numpy as np
+from numpy.testing import assert_allclose
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.linalg import expm
+
+#: Friction slow enough for explicit solvers, and so weak that PID does not get stuck in it.
+MODEL = NeedleModel(
+    NeedleParameters.preset('phantom', viscous_friction=0.5, coulomb_friction=0.01)
+)
+DEPTH, SPEED = 0.15, 0.02
+
+
+def matrix(diagonal: list[float], skew: float = 0.0) -> np.ndarray:
+    """Return a positive definite matrix: one that is not symmetric if ``skew`` is not zero."""
+    gains = np.diag(diagonal)
+    gains[0, -1], gains[-1, 0] = skew, -skew
+    return gains
+
+
+def moving(depth: float = DEPTH, deflection: float = 5e-4) -> np.ndarray:
+    """Return the state of a bent needle in motion."""
+    state = MODEL.state_at(depth, deflection)
+    state[4:] = [-SPEED, 0.4, 1e-3, -5e-4]
+    return state
+
+
+def goal(time: float) -> np.ndarray:
+    """Return a steady insertion, 1 mm ahead of where the needle starts, to no deflection."""
+    wanted = np.zeros((3, 4))
+    wanted[0, 0] = MODEL.parameters.length - (DEPTH + 1e-3 + SPEED * time)
+    wanted[1, 0] = -SPEED
+    return wanted
+
+
+@pytest.mark.parametrize('skew', [0.0, 20.0])
+def test_inverse_dynamics_makes_the_error_linear(skew):
+    """With its own model as the plant, e_ddot + k_v e_dot + k_p e = 0 on all coordinates."""
+    kp, kv = matrix([900.0, 400.0, 1600.0, 2500.0], skew), matrix([60.0, 40.0, 30.0, 20.0], skew)
+    law = ContinuousInverseDynamics(model=MODEL, actuation='modal', kp=kp, kv=kv)
+    start = moving()
+    run = solve_ivp(
+        closed_loop(law, MODEL, goal), (0.0, 0.1), start, method='DOP853', rtol=1e-10, atol=1e-14
+    )
+    errors = (start.reshape(2, 4) - goal(0.0)[:2]).ravel()
+    linear = expm(0.1 * np.block([[np.zeros((4, 4)), np.eye(4)], [-kp, -kv]])) @ errors
+    end = (run.y[:, -1].reshape(2, 4) - goal(0.1)[:2]).ravel()
+    # 1e-7: a thousand times the solver's own rtol, over the size of each error.
+    assert_allclose(end, linear, rtol=1e-7, atol=1e-7 * np.abs(linear).max())
+
+
+def test_physical_actuation_forces_the_base_alone():
+    """Both laws leave q1..qn alone; the base follows the error equation of its own gains."""
+    law = ContinuousInverseDynamics(model=MODEL, kp=[900.0, 100.0], kv=[60.0, 20.0])
+    forces = law.forces(moving(), goal(0.0))
+    assert_allclose(forces[2:], 0.0, atol=0.0)
+    result = acceleration(MODEL, moving(), forces)
+    expected = 900.0 * (goal(0.0)[0, 0] - moving()[0])
+    # Friction and bias are compensated to rounding, of 1 N on 2 g.
+    assert_allclose(result[:2], [expected, -20.0 * 0.4], rtol=1e-10)
+    pid = ContinuousPid(model=MODEL, kp=[50.0, 1.0], kd=[3.0, 2.0], ki=[7.0, 0.0])
+    error = goal(0.0)[0, 0] - moving()[0]
+    found = pid.forces(moving(), goal(0.0), [0.1, 0.2])
+    # f_y pushes into the tissue, and d grows the other way.
+    assert_allclose(found, [-(50.0 * error + 0.7), -2.0 * 0.4, 0.0, 0.0], rtol=1e-12)
+
+
+def test_inverse_dynamics_breaks_away():
+    """At rest friction counts in the direction of the wanted acceleration."""
+    rest = MODEL.state_at(DEPTH)
+    kp, kv = [900.0, 100.0], [60.0, 20.0]
+    for breakaway_speed in (0.0, 1e-6):
+        law = ContinuousInverseDynamics(model=MODEL, kp=kp, kv=kv, breakaway_speed=breakaway_speed)
+        for sign in (-1.0, 1.0):
+            aim = np.zeros((3, 4))
+            aim[0, 0] = rest[0] - sign * 1e-3
+            found = acceleration(MODEL, rest, law.forces(rest, aim))
+            assert_allclose(found[0], -sign * 0.9, rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    'friction', ['coulomb', 'stribeck', 'tanh'], ids=['coulomb', 'stribeck', 'tanh']
+)
+@pytest.mark.parametrize('speed', [-0.02, 0.02])
+def test_full_compensation_is_the_friction_of_the_model(friction, speed):
+    """Beyond the breakaway speed the smooth compensation is friction itself, in either way."""
+    model = NeedleModel(replace(MODEL.parameters, friction_law=friction, withdrawal_friction=1.5))
+    state = moving()
+    state[4] = -speed
+    laws = [
+        ContinuousInverseDynamics(
+            model=model, kp=[9.0, 1.0], kv=[6.0, 2.0], breakaway_speed=breakaway_speed
+        )
+        for breakaway_speed in (0.0, 1e-3)
+    ]
+    exact, smooth = (law.forces(state, goal(0.0)) for law in laws)
+    assert_allclose(smooth, exact, rtol=1e-12)
+
+
+def test_the_law_may_believe_in_another_needle():
+    """The forces are those of the law's own model, whatever the plant is."""
+    other = NeedleModel(
+        replace(MODEL.parameters, viscous_friction=0.7, tissue_stiffness=700.0, area=1e-6)
+    )
+    law = ContinuousInverseDynamics(
+        model=other, actuation='modal', kp=np.full(4, 100.0), kv=np.full(4, 20.0)
+    )
+    state = moving()
+    wanted = 100.0 * (goal(0.0)[0] - state[:4]) + 20.0 * (goal(0.0)[1] - state[4:])
+    assert_allclose(law.forces(state, goal(0.0)), other.inverse_dynamics(state, wanted))
+    rate = closed_loop(law, MODEL, goal)(0.0, state)
+    assert_allclose(
+        MODEL.inverse_dynamics(state, rate[4:]), law.forces(state, goal(0.0)), rtol=1e-9
+    )
+
+
+LAWS = {
+    'inverse_dynamics': lambda model, size, actuation: ContinuousInverseDynamics(
+        model=model,
+        actuation=actuation,
+        kp=matrix([900.0, 400.0, 1600.0, 2500.0][:size], 20.0),
+        kv=matrix([60.0, 40.0, 30.0, 20.0][:size], 5.0),
+    ),
+    'pid': lambda model, size, actuation: ContinuousPid(
+        model=model,
+        actuation=actuation,
+        kp=matrix([50.0, 1e-6, 20.0, 30.0][:size], 1e-7),
+        kd=matrix([3.0, 1e-8, 0.1, 0.2][:size]),
+        ki=matrix([40.0, 1e-6, 9.0, 0.0][:size]),
+    ),
+}
+
+
+@pytest.mark.parametrize('kind', LAWS)
+@pytest.mark.parametrize(('actuation', 'size'), [('physical', 2), ('modal', 4)])
+@pytest.mark.parametrize('speed', [0.0, 0.01])
+def test_the_closed_loop_matrix_is_the_derivative(kind, actuation, size, speed):
+    """Differences of the closed loop around a straight needle, the law believing in another."""
+    other = NeedleModel(replace(MODEL.parameters, viscous_friction=0.3, tissue_stiffness=400.0))
+    plant = NeedleModel(replace(MODEL.parameters, coulomb_friction=0.0))
+    law = LAWS[kind](NeedleModel(replace(other.parameters, coulomb_friction=0.0)), size, actuation)
+    found = closed_loop_matrix(law, plant, 0.1, speed)
+    point = np.zeros(8 + law.integrals)
+    point[0], point[4] = 0.1, -speed
+    aim = np.zeros((3, 4))
+    aim[0, 0], aim[1, 0] = 0.1, -speed
+    field = closed_loop(law, plant, aim)
+    # A step for each coordinate: lengths, angles, and modal coordinates of 1e-6.
+    steps = np.full(len(point), 1e-6)
+    columns = [
+        (field(0.0, point + step * unit) - field(0.0, point - step * unit)) / (2.0 * step)
+        for step, unit in zip(steps, np.eye(len(point)), strict=True)
+    ]
+    # Rounding of q_ddot over the step, and its second derivative by the depth.
+    scale = np.abs(found).max(axis=1, keepdims=True) + 1.0
+    assert_allclose(np.transpose(columns) / scale, found / scale, rtol=0.0, atol=1e-5)
+
+
+@pytest.mark.parametrize('actuation', ['physical', 'modal'])
+def test_inverse_dynamics_puts_the_poles_where_its_gains_say(actuation):
+    """Poles of s^2 + k_v s + k_p for each driven coordinate, with the law's own model."""
+    size = 2 if actuation == 'physical' else 4
+    law = ContinuousInverseDynamics(
+        model=MODEL, actuation=actuation, kp=np.full(size, 500.0), kv=np.full(size, 60.0)
+    )
+    poles = np.linalg.eigvals(closed_loop_matrix(law, MODEL, 0.1))
+    near = np.abs(poles[:, np.newaxis] - np.roots([1.0, 60.0, 500.0])).min(axis=0)
+    # Rounding of forces against a stiffness of 1e7.
+    assert near.max() < 1e-4
+    assert np.sum(np.abs(poles) < 100.0) == 2 * size
+
+
+# Convergence.
+
+
+def sampled_end(kind: str, actuation: str, gains, period: float, duration: float) -> np.ndarray:
+    """Run the sampled loop around the true needle; return its state at the end."""
+    p = MODEL.parameters
+    law = InverseDynamics if kind == 'inverse_dynamics' else Pid
+    insertion = law(axis=Axis.insertion(p), gains=gains[0], period=period)
+    rotation = law(axis=Axis.rotation(p), gains=gains[1], period=period)
+    state, count = moving(), round(duration / period)
+
+    def aim(time: float) -> Setpoint:
+        return Setpoint(DEPTH + 1e-3 + SPEED * time, SPEED)
+
+    if actuation == 'physical':
+        needle = Integrator(p, state, 2e-5)
+        loops = SampledLoop(insertion, 0, np.inf), SampledLoop(rotation, 0, np.inf)
+        for i in range(count):
+            x = needle.state
+            load = -float(MODEL.bias_forces(x)[0])
+            force = loops[0].command(needle.depth, needle.speed, aim(i * period), load)
+            torque = loops[1].command(float(x[1]), float(x[5]), Setpoint(0.0))
+            needle.advance(period, force, torque)
+        return needle.state
+    deflection = DeflectionLaw(model=MODEL, gains=gains[2], period=period)
+    loop = ModalLoop(insertion, rotation, deflection, 0, force_limit=np.inf, torque_limit=np.inf)
+    # Runge-Kutta of fourth order with steps of 0.1 rad of the fastest mode.
+    steps = max(1, round(period / 5e-5))
+    h = period / steps
+    for i in range(count):
+        forces = loop.command(state, aim(i * period), Setpoint(0.0), np.zeros((3, 2)))
+
+        def field(x: np.ndarray, forces: np.ndarray = forces) -> np.ndarray:
+            return np.concatenate([x[4:], acceleration(MODEL, x, forces)])
+
+        for _ in range(steps):
+            k1 = field(state)
+            k2 = field(state + 0.5 * h * k1)
+            k3 = field(state + 0.5 * h * k2)
+            k4 = field(state + h * k3)
+            state = state + h / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
+    return state
+
+
+ID_GAINS = (InverseDynamicsGains(kp=900.0, kv=60.0),) * 3
+PID_GAINS = (
+    PidGains(kp=50.0, ki=40.0, kd=1.0),
+    # 20 rad/s on 5e-10 kg m^2.
+    PidGains(kp=2e-7, ki=1e-6, kd=2e-8),
+    PidGains(kp=2.0, ki=9.0, kd=5e-3),
+)
+
+
+@pytest.mark.parametrize('actuation', ['physical', 'modal'])
+@pytest.mark.parametrize('kind', ['inverse_dynamics', 'pid'])
+def test_the_sampled_law_tends_to_the_continuous_one(kind, actuation):
+    """Half the period, half the difference of the closed loops, in every coordinate together."""
+    size, gains = (2 if actuation == 'physical' else 4), ID_GAINS
+    if kind == 'inverse_dynamics':
+        law = ContinuousInverseDynamics(
+            model=MODEL,
+            actuation=actuation,
+            kp=np.full(size, 900.0),
+            kv=np.full(size, 60.0),
+            breakaway_speed=1e-4,
+        )
+    else:
+        gains = PID_GAINS
+        columns = [(g.kp, g.kd, g.ki) for g in (*gains, gains[2])[:size]]
+        kp, kd, ki = np.transpose(columns)
+        law = ContinuousPid(model=MODEL, actuation=actuation, kp=kp, kd=kd, ki=ki)
+    duration = 0.016
+    start = np.concatenate([moving(), np.zeros(law.integrals)])
+    exact = solve_ivp(
+        closed_loop(law, MODEL, goal), (0.0, duration), start,
+        method='DOP853', rtol=1e-9, atol=1e-14,
+    ).y[:8, -1]  # fmt: skip
+    # Each coordinate and rate in the size of its motion.
+    scales = np.abs(moving()) + np.abs(exact) + 1e-4
+    scales[0] = 1e-3
+    periods = np.array([2e-4, 1e-4, 5e-5])
+    errors = [
+        np.linalg.norm((sampled_end(kind, actuation, gains, h, duration) - exact) / scales)
+        for h in periods
+    ]
+    orders = np.log2(np.array(errors[:-1]) / errors[1:])
+    # First order; the second-order part is h omega_2 = 0.35 at the longest period.
+    assert_allclose(orders, 1.0, atol=0.2)
+    assert errors[-1] < 0.05
+
+
+def test_the_modal_loop_predicts_its_delay():
+    """With a force on its way it commands what it would without delay a period later."""
+    p, now = MODEL.parameters, moving()
+    aim = Setpoint(DEPTH + 1e-3, SPEED), Setpoint(0.0), np.zeros((3, 2))
+    waiting, differences = [0.2, 1e-7, 0.05, -0.02], []
+    for period in (2e-4, 1e-4, 5e-5):
+        loops = [
+            ModalLoop(
+                InverseDynamics(axis=Axis.insertion(p), gains=ID_GAINS[0], period=period),
+                InverseDynamics(axis=Axis.rotation(p), gains=ID_GAINS[1], period=period),
+                DeflectionLaw(model=MODEL, gains=ID_GAINS[2], period=period),
+                delay,
+                force_limit=np.inf,
+                torque_limit=np.inf,
+            )
+            for delay in (0, 1)
+        ]
+        loops[1].insertion.on_the_way[0], loops[1].rotation.on_the_way[0] = waiting[:2]
+        loops[1].deflection.on_the_way[0] = np.array(waiting[2:])
+        later = solve_ivp(
+            lambda _, x: np.concatenate([x[4:], acceleration(MODEL, x, waiting)]),
+            (0.0, period), now, method='DOP853', rtol=1e-12, atol=1e-16,
+        ).y[:, -1]  # fmt: skip
+        known, predicted = loops[0].command(later, *aim), loops[1].command(now, *aim)
+        differences.append(np.abs(predicted - known) / np.abs(known))
+    # Depth and loads are held over a period: small, and of first order at least.
+    assert np.max(differences[-1]) < 1e-4
+    assert np.all(differences[2] < differences[0] / 4.0 + 1e-12)
+
+
+# Bad input.
+
+
+@pytest.mark.parametrize(
+    ('changes', 'error', 'words'),
+    [
+        ({'kp': [1.0, 2.0, 3.0]}, ShapeError, r'kp must be finite with shape \(2,\) or \(2, 2\)'),
+        ({'kp': np.eye(4)}, ShapeError, 'got shape'),
+        ({'kv': [1.0, np.nan]}, ShapeError, 'kv must be finite'),
+        ({'kv': 'stiff'}, ShapeError, 'kv must be numbers'),
+        ({'kp': [1.0, -2.0]}, ParameterError, 'kp must be positive definite, .* eigenvalue -2'),
+        ({'kv': [1.0, 0.0]}, ParameterError, 'kv must be positive definite'),
+        ({'kp': [[1.0, 5.0], [5.0, 1.0]]}, ParameterError, 'kp must be positive definite'),
+        ({'actuation': 'magnetic'}, ParameterError, 'one of physical, modal'),
+        ({'breakaway_speed': -1.0}, ParameterError, 'breakaway_speed must be finite and >= 0'),
+    ],
+)
+def test_bad_gains_are_named(changes, error, words):
+    """Sizes, numbers, definiteness and names, each in one line."""
+    valid = {'kp': [900.0, 100.0], 'kv': [60.0, 20.0]}
+    with pytest.raises(error, match=words):
+        ContinuousInverseDynamics(model=MODEL, **{**valid, **changes})
+
+
+def test_bad_arguments_are_named():
+    """An integral gain may vanish but not be negative; goals and integrals have their sizes."""
+    with pytest.raises(ParameterError, match='ki must be positive semidefinite'):
+        ContinuousPid(model=MODEL, kp=[1.0, 1.0], kd=[1.0, 1.0], ki=[1.0, -1.0])
+    pid = ContinuousPid(model=MODEL, kp=[1.0, 1.0], kd=[1.0, 1.0], ki=[1.0, 0.0])
+    with pytest.raises(ShapeError, match=r'integral must be finite with shape \(2,\)'):
+        pid.forces(moving(), goal(0.0))
+    with pytest.raises(ShapeError, match=r'goal must be finite with shape \(3, 4\)'):
+        pid.forces(moving(), np.zeros(4), [0.0, 0.0])
+    with pytest.raises(ShapeError, match=r'forces must be finite with shape \(4,\)'):
+        acceleration(MODEL, moving(), [1.0, 2.0])
+    plant = NeedleModel(NeedleParameters.preset('phantom', modes=1))
+    with pytest.raises(ParameterError, match='must have the 1 modes of the plant, got 2'):
+        closed_loop(pid, plant, goal)

@@ -1,0 +1,289 @@
+"""The laws inside the simulation: friction as a set, sampled loops, and batches of them."""
+
+from dataclasses import replace
+
+from needle_controller import (
+    ContinuousInverseDynamics,
+    ContinuousPid,
+    Controller,
+    ControllerSettings,
+    InverseDynamics,
+    InverseDynamicsGains,
+    MinimumJerk,
+    Pid,
+    PidGains,
+    ReferenceLimits,
+    SampledLoop,
+    Setpoint,
+)
+from needle_controller.axis import Axis
+from needle_controller.in_loop import run_batch, run_continuous, run_controller, tip_deflections
+from needle_dynamics import (
+    InsertedLengthError,
+    Integrator,
+    NeedleError,
+    NeedleModel,
+    NeedleParameters,
+    ParameterError,
+    ShapeError,
+)
+import numpy as np
+from numpy.testing import assert_allclose
+import pytest
+from scipy.linalg import expm
+
+#: Friction slow enough to be looked at, deflection damped.
+MODEL = NeedleModel(
+    NeedleParameters.preset('phantom', viscous_friction=0.5, coulomb_friction=0.02)
+)
+STRAIGHT = MODEL.state_at(0.15)
+PERIOD = 1e-3
+
+
+def goal(depth: float) -> np.ndarray:
+    """Return the goal of a straight needle at rest at a depth."""
+    wanted = np.zeros((3, 4))
+    wanted[0, 0] = MODEL.parameters.length - depth
+    return wanted
+
+
+def pid(kp: float, kd: float) -> ContinuousPid:
+    """Return a continuous PID of the base."""
+    return ContinuousPid(model=MODEL, kp=[kp, 1e-6], kd=[kd, 1e-8])
+
+
+def test_a_piece_of_sliding_is_the_linear_flow_with_constant_dry_friction():
+    """Until it first comes to rest: M x_ddot = - kp x - (kd + mu_v) x_dot - mu_s, for x = e."""
+    law, p = pid(2.0, 0.01), MODEL.parameters
+    run = run_continuous(law, MODEL, STRAIGHT, goal(0.19), np.linspace(0.0, 0.4, 81))
+    # The goal shifted by mu_s / kp, as friction acts against the motion inward.
+    center = 0.19 - p.coulomb_friction / 2.0
+    m = p.moving_mass
+    flow = np.array([[0.0, 1.0], [-2.0 / m, -(0.01 + p.viscous_friction) / m]])
+    for t, depth in zip(run.time[::20], run.depth[::20], strict=True):
+        expected = center + (expm(t * flow) @ [0.15 - center, 0.0])[0]
+        # 1e-6: ten times the solver's tolerance, over the way of 4 cm.
+        assert_allclose(depth, expected, atol=4e-8 * 10.0)
+
+
+def test_it_sticks_inside_the_bound_and_says_when():
+    """An underdamped PID swings, comes to rest, and stays where |kp e| <= mu_s, exactly."""
+    model = NeedleModel(replace(MODEL.parameters, viscous_friction=0.01))
+    law = ContinuousPid(model=model, kp=[5.0, 1e-6], kd=[0.005, 1e-8])
+    run = run_continuous(law, model, STRAIGHT, goal(0.17), np.linspace(0.0, 1.0, 201))
+    names = [name for _, name in run.events]
+    assert names[-1] == 'comes to rest'
+    assert names.count('comes to rest') >= 2
+    late = run.time > run.events[-1][0]
+    assert late.sum() > 100
+    assert np.ptp(run.depth[late]) == 0.0
+    assert 5.0 * abs(0.17 - run.depth[-1]) <= model.parameters.coulomb_friction
+
+
+def test_a_growing_push_breaks_away_when_it_reaches_the_bound():
+    """A PID with its goal moving off at 1 cm/s reaches mu_s = kp v t, and slides from then on."""
+
+    def moving(time: float) -> np.ndarray:
+        wanted = goal(0.15 + 0.01 * time)
+        wanted[1, 0] = 0.0
+        return wanted
+
+    law = pid(10.0, 0.1)
+    run = run_continuous(law, MODEL, STRAIGHT, moving, np.linspace(0.0, 0.4, 41))
+    time, what = run.events[0]
+    assert what == 'breaks away inward'
+    # 1e-6 s: the solver finds the root to its own tolerance.
+    assert_allclose(time, MODEL.parameters.coulomb_friction / (10.0 * 0.01), atol=1e-6)
+    assert_allclose(run.depth[run.time < time], 0.15, rtol=1e-15)
+    assert run.depth[-1] > 0.15 + 1e-4
+
+
+def test_inverse_dynamics_goes_through_reversals_as_if_there_were_no_friction():
+    """With its own model as the plant d obeys its error equation, at rest for an instant only."""
+    kp, kv = [400.0, 100.0], [4.0, 20.0]
+    law = ContinuousInverseDynamics(model=MODEL, kp=kp, kv=kv)
+    run = run_continuous(
+        law, MODEL, STRAIGHT, goal(0.17), np.linspace(0.0, 0.6, 61), method='DOP853'
+    )
+    assert len(run.events) >= 3
+    flow = np.array([[0.0, 1.0], [-400.0, -4.0]])
+    expected = [0.17 + (expm(t * flow) @ [-0.02, 0.0])[0] for t in run.time]
+    # 2e-7: ten times the tolerance of the solver over the 2 cm.
+    assert_allclose(run.depth, expected, atol=2e-7)
+
+
+def test_the_hub_stops_the_needle_and_lets_it_go_again():
+    """On the hub d = 0 and d_dot = 0; a goal that comes out again takes the needle along."""
+
+    def swinging(time: float) -> np.ndarray:
+        return goal(0.25 - 0.15 * time)
+
+    law = pid(20.0, 0.5)
+    run = run_continuous(law, MODEL, STRAIGHT, swinging, np.linspace(0.0, 1.0, 201))
+    names = [name for _, name in run.events]
+    assert 'touches the hub' in names
+    assert names.index('breaks away outward') > names.index('touches the hub')
+    assert run.states[:, 0].min() == 0.0
+    held = run.states[:, 0] == 0.0
+    # But for the sample where it leaves.
+    assert np.count_nonzero(run.states[held, 4]) <= 1
+    assert held.sum() > 50
+    assert run.depth[-1] < 0.15
+
+
+def test_agrees_with_the_sampled_law_inside_the_integrator():
+    """The implicit PID at a short period, without delay, tends to the continuous one."""
+    law, p = pid(5.0, 0.2), MODEL.parameters
+    state = MODEL.state_at(0.15, 5e-4)
+    run = run_continuous(law, MODEL, state, goal(0.19), [0.0, 0.1])
+    errors = []
+    for period in (4e-5, 2e-5, 1e-5):
+        sampled = Pid(
+            axis=Axis.insertion(p),
+            gains=PidGains(kp=5.0, ki=0.0, kd=0.2, tolerance=0.0),
+            period=period,
+        )
+        loop, integrator = SampledLoop(sampled, 0, 100.0), Integrator(p, state, period)
+        for _ in range(round(0.1 / period)):
+            integrator.advance(
+                period, loop.command(integrator.depth, integrator.speed, Setpoint(0.19))
+            )
+        errors.append(abs(integrator.depth - run.depth[-1]))
+    orders = np.log2(np.array(errors[:-1]) / errors[1:])
+    # First order: a force is held over a period.
+    assert_allclose(orders, 1.0, atol=0.15)
+    assert errors[-1] < 1e-5
+
+
+def test_refuses_what_it_cannot_run():
+    law = pid(2.0, 0.01)
+    with pytest.raises(ShapeError, match='times must be at least two that ascend'):
+        run_continuous(law, MODEL, STRAIGHT, goal(0.16), [0.0])
+    other = NeedleModel(NeedleParameters(modes=1))
+    with pytest.raises(ParameterError, match='1 modes of the plant'):
+        run_continuous(law, other, other.state_at(0.1), goal(0.1), [0.0, 1.0])
+    with pytest.raises(InsertedLengthError, match='left its range'):
+        run_continuous(law, MODEL, STRAIGHT, goal(-0.5), np.linspace(0.0, 20.0, 3))
+    assert issubclass(InsertedLengthError, NeedleError)
+
+
+def test_tips_of_many_states_are_those_of_each():
+    states = np.array([MODEL.state_at(depth, 1e-3 * depth) for depth in (0.02, 0.1, 0.2)])
+    found = [MODEL.tip_deflection(x) for x in states]
+    # Closed form here, series there: rounding of cosh and sinh at small depth.
+    assert_allclose(tip_deflections(MODEL, states), found, rtol=1e-9)
+
+
+# Sampled loops.
+
+BELIEVED = NeedleParameters.preset('phantom')
+START = NeedleModel(BELIEVED).state_at(0.02, 5e-4)
+REFERENCE = MinimumJerk(Setpoint(0.02), 0.024, ReferenceLimits())
+DURATION = 1.5
+
+
+def plants(count: int) -> list[NeedleParameters]:
+    random = np.random.default_rng(5)
+    return [
+        replace(
+            BELIEVED,
+            coulomb_friction=0.56 * float(random.uniform(0.7, 1.3)),
+            viscous_friction=300.0 * float(random.uniform(0.7, 1.3)),
+            tissue_stiffness=520.0 * float(random.uniform(0.7, 1.3)),
+        )
+        for _ in range(count)
+    ]
+
+
+@pytest.mark.parametrize('name', ['inverse_dynamics', 'pid'])
+@pytest.mark.parametrize('delay', [0, 1, 3])
+def test_a_batch_is_the_controller_of_the_node(name, delay):
+    """Every run of a batch is, to the bit, that of the controller object."""
+    axis = Axis.insertion(BELIEVED)
+    inverse, gains = InverseDynamicsGains(kp=400.0, kv=40.0), PidGains(kp=1000.0, ki=3000.0)
+    law = (
+        Pid(axis=axis, gains=gains, period=PERIOD)
+        if name == 'pid'
+        else InverseDynamics(axis=axis, gains=inverse, period=PERIOD)
+    )
+    needles = plants(3)
+    batch = run_batch(
+        law, needles, START, REFERENCE, delay=delay, limit=2.0, duration=DURATION, step=1e-4,
+        keep=True,
+    )  # fmt: skip
+    for i, plant in enumerate(needles):
+        controller = Controller(
+            name,
+            BELIEVED,
+            ControllerSettings(delay=float(delay), force_limit=2.0),
+            inverse_dynamics=(inverse, InverseDynamicsGains()),
+            pid=(gains, PidGains(kp=1e-6, ki=1e-6, kd=1e-8)),
+            reference='minimum_jerk',
+            limits=ReferenceLimits(),
+        )
+        controller.set_target(0.024)
+        run = run_controller(
+            controller, plant, START, period=PERIOD, delay=delay, duration=DURATION, step=1e-4
+        )
+        # 1e-9: the same arithmetic, but for what the compiler may join.
+        assert_allclose(batch.depths[i], run.depth, rtol=1e-9)
+        assert_allclose(batch.states[i], run.states[-1], rtol=1e-9, atol=1e-12)
+        wanted = np.array([REFERENCE.at(t).position for t in run.time])
+        error = wanted - run.depth
+        assert_allclose(batch.final[i], error[-1], atol=1e-12)
+        assert_allclose(batch.largest[i], np.abs(error).max(), rtol=1e-6)
+        assert_allclose(batch.rms[i], np.sqrt((error**2).mean()), rtol=1e-6)
+        assert batch.completed[i] == len(run.time) - 1
+
+
+def test_the_controller_drives_the_deflections_too():
+    """`modal`, from 18.5 cm on at 1 kHz: with the ground truth the tip comes to zero."""
+    inverse, gains = InverseDynamicsGains(), PidGains()
+    settings = ControllerSettings(lowest_depth=0.185)
+    controller = Controller(
+        'inverse_dynamics', BELIEVED, settings, inverse_dynamics=(inverse,) * 3,
+        pid=(gains,) * 3, reference='minimum_jerk', limits=ReferenceLimits(), actuation='modal',
+    )  # fmt: skip
+    controller.set_target(0.195)
+    start = NeedleModel(BELIEVED).state_at(0.19, 5e-4)
+    run = run_controller(
+        controller, BELIEVED, start, period=PERIOD, delay=1, duration=1.2, ground_truth=True
+    )
+    assert np.abs(run.forces[:, 2:]).max() > 1e-3
+    # Micrometers: what friction holds of the base, and exp(-20 t) of the deflection.
+    assert abs(run.depth[-1] - 0.195) < 5e-5
+    assert abs(run.tip_deflection[-1]) < 1e-6
+
+
+def test_a_batch_does_not_depend_on_threads_nor_on_its_step():
+    law = Pid(axis=Axis.insertion(BELIEVED), gains=PidGains(), period=PERIOD)
+    needles = plants(5)
+
+    def run(**how):
+        return run_batch(law, needles, START, REFERENCE, delay=1, limit=15.0, duration=0.8, **how)
+
+    one, two, fine = run(workers=1, step=PERIOD), run(workers=2, step=PERIOD), run(step=1e-5)
+    assert (one.states == two.states).all()
+    assert (one.final == two.final).all()
+    # Nanometers: the modal flow is exact at any step, and the needle is slow.
+    assert_allclose(one.largest, fine.largest, atol=1e-9)
+
+
+def test_a_needle_that_leaves_its_range_is_told_apart():
+    shallow = NeedleModel(BELIEVED).state_at(0.0012)
+    out = MinimumJerk(Setpoint(0.0012), 0.0, ReferenceLimits())
+    law = Pid(axis=Axis.insertion(BELIEVED), gains=PidGains(), period=PERIOD)
+    batch = run_batch(law, BELIEVED, shallow, out, delay=1, limit=15.0, duration=1.0)
+    assert 0 < batch.completed[0] < 1000
+
+
+def test_a_batch_refuses_what_does_not_agree():
+    law = Pid(axis=Axis.insertion(BELIEVED), gains=PidGains(), period=PERIOD)
+    options = {'delay': 1, 'limit': 15.0, 'duration': 0.1}
+    with pytest.raises(ShapeError, match='one number of runs'):
+        run_batch([law, law], plants(3), START, REFERENCE, **options)
+    other = Pid(axis=law.axis, gains=PidGains(), period=2e-3)
+    with pytest.raises(ParameterError, match='one period'):
+        run_batch([law, other], BELIEVED, START, REFERENCE, **options)
+    with pytest.raises(ParameterError, match='duration must be'):
+        run_batch(law, BELIEVED, START, REFERENCE, delay=1, limit=15.0, duration=0.0)

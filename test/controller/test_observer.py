@@ -1,0 +1,850 @@
+"""The observer against exact conditional means, its own statistics, and the simulated needle."""
+
+from __future__ import annotations
+
+from functools import cache
+from itertools import pairwise
+from math import nan
+from typing import Any
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from needle_controller import Consistency, Observer, ObserverSettings
+from needle_dynamics import (
+    FloatArray,
+    ForceSensor,
+    ForceSensorParameters,
+    InsertedLengthError,
+    Integrator,
+    NeedleError,
+    NeedleModel,
+    NeedleParameters,
+    ParameterError,
+    ShapeError,
+)
+from needle_dynamics.analysis import linearize, observability, operating_point
+import numpy as np
+from numpy.testing import assert_allclose
+import pytest
+from scipy.linalg import cholesky, eigh, expm, solve_discrete_lyapunov
+from scipy.signal import butter, lfilter
+
+preset = NeedleParameters.preset
+
+PERIOD = 1e-3
+
+#: Least depth at which n modes are told apart.
+LEAST_DEPTH = {1: 0.001, 2: 0.001, 3: 0.03}
+
+
+def phantom(modes: int = 2, **changes: Any) -> NeedleParameters:
+    return preset('phantom', modes=modes, minimum_depth=LEAST_DEPTH[modes], **changes)
+
+
+class Reference:
+    """
+    The linear model that the observer stands on, written densely with matrix exponentials.
+
+    The state is q, p = rho A G q_dot (q_dot as printed), the impulses of lateral force and moment
+    and the integral of the tip deflection; depth is frozen at its mean over a sample.
+    """
+
+    def __init__(self, parameters: NeedleParameters, options: ObserverSettings) -> None:
+        self.model, self.options = NeedleModel(parameters), options
+        self.n = parameters.modes
+        self.sections = [butter(2, cut, fs=options.filter_rate) for cut in options.cutoffs]
+        self.ticks = round(options.filter_rate * PERIOD)
+        # Standard deviation of the noise before the low-pass, from its impulse response.
+        impulse = np.zeros(20_000)
+        impulse[0] = 1.0
+        for b, a in self.sections:
+            impulse = lfilter(b, a, impulse)
+        gain = np.sqrt((impulse**2).sum())
+        self.noise = np.array([options.force_noise, options.torque_noise]) / gain
+
+    def low_pass(self, values: FloatArray, memory: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Filter values over the first axis, section by section, sample by sample."""
+        memory, result = memory.copy(), []
+        for value in values:
+            for (b, a), own in zip(self.sections, memory, strict=True):
+                read = b[0] * value + own[0]
+                own[:] = b[1] * value - a[1] * read + own[1], b[2] * value - a[2] * read
+                value = read  # noqa: PLW2901
+            result.append(value)
+        return np.array(result), memory
+
+    def rates(self, depth: float, speed: float, time: float) -> FloatArray:
+        """Matrix of the differential equation at a frozen depth."""
+        model, n, p = self.model, self.n, self.model.parameters
+        at, rho = model.modes.integrals(depth), p.linear_density
+        mass, stiff = rho * at.gram, model.stiffness_matrix(depth, time)
+        printed = p.formulation == 'as_printed'
+        growth = model.tissue.growth(time)
+        to_rate = np.eye(n) if printed else np.linalg.inv(mass)
+        force_q, force_p = -stiff, -p.tissue_damping * at.gram @ to_rate
+        # Acceleration of the moving needle, with the momentum that dG/dt takes.
+        convected = 0.0 if printed else rho * speed * np.outer(at.value, at.value)
+        accel_q = np.linalg.solve(mass, force_q)
+        accel_p = np.linalg.solve(mass, force_p - convected @ to_rate if not printed else force_p)
+        layer = int(np.searchsorted(model.tissue.starts, depth, side='right')) - 1
+        above = model.tissue.offsets(model.modes)[layer, -2 * n :].reshape(2, n)
+        a = np.zeros((2 * n + 3, 2 * n + 3))
+        a[:n, n : 2 * n] = to_rate
+        a[n : 2 * n, :n] = accel_q if printed else force_q
+        a[n : 2 * n, n : 2 * n] = accel_p if printed else force_p
+        for row, shape, lever in ((0, at.area, 1.0), (1, at.moment, depth)):
+            held = growth * (model.tissue.stiffnesses[layer] * shape + above[row])
+            a[2 * n + row, :n] = rho * shape @ accel_q + held
+            a[2 * n + row, n : 2 * n] = rho * shape @ accel_p
+            a[2 * n + row, n : 2 * n] += (
+                p.tissue_damping * shape + rho * speed * lever * at.value
+            ) @ to_rate
+        a[2 * n + 1] += (p.length - depth) * a[2 * n]
+        a[2 * n + 2, :n] = at.value
+        return a
+
+    def noise_root(self, depth: float) -> FloatArray:
+        """Root of the density of the noise on p."""
+        gram = self.model.modes.integrals(depth).gram
+        root = self.options.irregularity * np.asarray(cholesky(gram, lower=True))
+        if self.model.parameters.formulation == 'as_printed':
+            root = np.linalg.solve(self.model.parameters.linear_density * gram, root)
+        return root
+
+    def prior(self, depth: float) -> tuple[FloatArray, FloatArray]:
+        """Root of the covariance of (q, p), and of the memories of the low-pass, at the start."""
+        p, n = self.model.parameters, self.n
+        at = self.model.modes.integrals(depth)
+        squares, normal = eigh(self.model.stiffness_matrix(depth), p.linear_density * at.gram)
+        tip = at.value @ normal / np.sqrt(squares)
+        size = self.options.initial_deflection / np.sqrt(tip @ tip)
+        rates = normal if p.formulation == 'as_printed' else np.linalg.inv(normal).T
+        root = np.zeros((2 * n, 2 * n))
+        root[:n, :n], root[n:, n:] = size * normal / np.sqrt(squares), size * rates
+        order = 2 * len(self.sections)
+        memory = np.zeros((2 * order, 2 * (order + 1)))
+        if order:
+            # The low-pass as matrices, by what it does to units.
+            a, b = np.empty((order, order)), np.empty(order)
+            for k in range(order):
+                unit = np.eye(order)[k].reshape(-1, 2)
+                a[:, k] = self.low_pass(np.zeros(1), unit)[1].ravel()
+            b[:] = self.low_pass(np.ones(1), np.zeros((order // 2, 2)))[1].ravel()
+            white = np.linalg.cholesky(solve_discrete_lyapunov(a, np.outer(b, b)))
+            steady = np.linalg.solve(np.eye(order) - a, b)
+            impulse = expm(PERIOD * self.rates(depth, 0.0, 0.0))[2 * n : 2 * n + 2, : 2 * n] @ root
+            reaction = (impulse**2).sum(axis=1) / PERIOD**2
+            for c in range(2):
+                rows, first = slice(c * order, (c + 1) * order), c * (order + 1)
+                memory[rows, first] = np.sqrt(reaction[c]) * steady
+                spread = np.sqrt(self.noise[c] ** 2 + reaction[c])
+                memory[rows, first + 1 : first + 1 + order] = spread * white
+        return root, memory
+
+    def run(
+        self,
+        start: FloatArray,
+        memory: FloatArray,
+        kicks: FloatArray,
+        noise: FloatArray,
+        depths: FloatArray,
+        speeds: FloatArray,
+        windows: list[tuple[float, float]],
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """
+        Return states (q, p) on the grid, readings of the wrench, and means over windows.
+
+        The last axis of all inputs and results numbers cases, which are run side by side.
+        ``kicks`` has shape (samples, 2, n, cases): the noise at both ends of each sample.
+        """
+        n, count, cases = self.n, len(depths) - 1, start.shape[-1]
+        x = start.copy()
+        states, readings = [x], []
+        means = np.zeros((len(windows), cases))
+        memories = [memory[c * len(memory) // 2 :][: len(memory) // 2] for c in range(2)]
+        sections = len(self.sections)
+        root = self.noise_root(depths[0])
+        frozen = (depths[0], 0.0)
+        tick = PERIOD / self.ticks
+        for k in range(count):
+            # Mean of the cubic through depths and speeds at both ends.
+            middle = 0.5 * (depths[k] + depths[k + 1])
+            middle += PERIOD * (speeds[k] - speeds[k + 1]) / 12.0
+            speed, time = 0.5 * (speeds[k] + speeds[k + 1]), (k + 1) * PERIOD
+            rates = self.rates(middle, speed, time)
+            scale = np.sqrt(0.5 * PERIOD)
+            x = x.copy()
+            x[n:] += scale * root @ kicks[k, 0]
+            x = self.carry(frozen, (middle, time), -0.5 * PERIOD, 0.5 * PERIOD) @ x
+            frozen = (middle, time)
+            for w, (begin, end) in enumerate(windows):
+                low = min(max(begin - k * PERIOD, 0.0), PERIOD)
+                high = min(max(end - k * PERIOD, 0.0), PERIOD)
+                if high > low:
+                    part = expm(high * rates)[-1, : 2 * n] - expm(low * rates)[-1, : 2 * n]
+                    means[w] += part @ x / (end - begin)
+            step = expm(tick * rates)
+            for i in range(self.ticks):
+                inputs = step[2 * n : 2 * n + 2, : 2 * n] @ x / tick
+                x = step[: 2 * n, : 2 * n] @ x
+                read = []
+                for c in range(2):
+                    value = inputs[c] + self.noise[c] * noise[k, i, c]
+                    own = memories[c].reshape(sections, 2, cases)
+                    out, after = self.low_pass(value[np.newaxis], own)
+                    memories[c] = after.reshape(-1, cases)
+                    read.append(out[0])
+            readings.append(read)
+            root = self.noise_root(middle)
+            x[n:] += scale * root @ kicks[k, 1]
+            states.append(x)
+        return np.array(states), np.array(readings), means
+
+    def modes(self, depth: float, time: float) -> tuple[FloatArray, FloatArray]:
+        """Frequencies, and the matrix from c = omega a and b of the normal modes to (q, p)."""
+        p, n = self.model.parameters, self.n
+        mass = p.linear_density * self.model.modes.integrals(depth).gram
+        squares, normal = eigh(self.model.stiffness_matrix(depth, time), mass)
+        matrix = np.zeros((2 * n, 2 * n))
+        matrix[:n, :n] = normal / np.sqrt(squares)
+        matrix[n:, n:] = normal if p.formulation == 'as_printed' else mass @ normal
+        return np.sqrt(squares), matrix
+
+    def carry(
+        self, old: tuple[float, float], new: tuple[float, float], since: float, until: float
+    ) -> FloatArray:
+        """Change of (q, p) from one depth and time to others, spread over a time."""
+        n = self.n
+        _, before = self.modes(*old)
+        omega, after = self.modes(*new)
+        change = np.linalg.solve(after, before)
+        # The modes are those of either sign.
+        signs = np.tile(np.sign(np.diag(change)[:n]), 2)
+        after *= signs
+        change = signs[:, np.newaxis] * change - np.eye(2 * n)
+        times = np.linspace(since, until, 4001)
+        turns = np.zeros((len(times), 2 * n, 2 * n))
+        for i in range(n):
+            angle = omega[i] * times
+            turns[:, i, i] = turns[:, n + i, n + i] = np.cos(angle)
+            turns[:, i, n + i], turns[:, n + i, i] = np.sin(angle), -np.sin(angle)
+        turned = turns.transpose(0, 2, 1) @ change @ turns
+        weights = np.full(len(times), 2.0)
+        weights[1::2], weights[0], weights[-1] = 4.0, 1.0, 1.0
+        mean = np.tensordot(weights / weights.sum(), turned, 1)
+        return np.asarray(after @ (np.eye(2 * n) + mean) @ np.linalg.inv(before))
+
+    def present(self, x: FloatArray, depths: FloatArray, speeds: FloatArray) -> FloatArray:
+        """Return (q, q_dot) at the last depth, from (q, p) at the mean one of the last sample."""
+        end, time = depths[-1], PERIOD * (len(depths) - 1)
+        middle = 0.5 * (depths[-2] + end) + PERIOD * (speeds[-2] - speeds[-1]) / 12.0
+        x = self.carry((middle, time), (end, time), -0.5 * PERIOD, 0.0) @ x
+        if self.model.parameters.formulation != 'as_printed':
+            gram = self.model.modes.integrals(end).gram
+            x[self.n :] = np.linalg.solve(self.model.parameters.linear_density * gram, x[self.n :])
+        return x
+
+
+def draw(reference: Reference, depth: float, count: int, cases: int, rng: Any) -> list[FloatArray]:
+    """Draw starts, memories, kicks and noise as the observer believes them to be."""
+    root, memory = reference.prior(depth)
+    return [
+        root @ rng.normal(size=(len(root), cases)),
+        memory @ rng.normal(size=(memory.shape[1], cases)),
+        rng.normal(size=(count, 2, reference.n, cases)),
+        rng.normal(size=(count, reference.ticks, 2, cases)),
+    ]
+
+
+BATCH_CASES: dict[str, tuple[int, dict[str, Any], dict[str, Any]]] = {
+    'one mode': (1, {}, {}),
+    'two modes': (2, {}, {}),
+    'three modes': (3, {}, {}),
+    'undamped': (2, {'tissue_damping': 0.0}, {'irregularity': 0.0}),
+    'beyond critical damping': (2, {'tissue_damping': 60.0}, {}),
+    'as printed': (2, {'formulation': 'as_printed'}, {}),
+    'layers that swell': (
+        2,
+        {
+            'layer_depths': (0.05, 0.0601),
+            'layer_stiffnesses': (4000.0, 90.0),
+            'swelling': 0.5,
+            'swelling_time': 0.02,
+        },
+        {},
+    ),
+    'long exposure': (2, {}, {'tip_exposure': 4.7e-3}),
+    'short exposure': (2, {}, {'tip_exposure': 1e-4}),
+    'no low-pass': (2, {}, {'cutoffs': ()}),
+    'fast sensor': (2, {}, {'cutoffs': (500.0, 125.0), 'filter_rate': 8000.0}),
+}
+
+
+@pytest.mark.parametrize('case', BATCH_CASES)
+def test_is_the_conditional_mean_of_all_that_was_measured(case: str) -> None:
+    """With late, early, disordered and missing samples: a dense batch solution says the same."""
+    modes, changes, options = BATCH_CASES[case]
+    parameters = phantom(modes, **changes)
+    beliefs = ObserverSettings(
+        **{'irregularity': 3e-3, 'force_resolution': 0.02, 'torque_resolution': 2e-3, **options}
+    )
+    reference = Reference(parameters, beliefs)
+    count, n = 24, modes
+    time = PERIOD * np.arange(count + 1)
+    depths = 0.06 + 0.02 * time + 1e-4 * np.sin(300.0 * time)
+    speeds = 0.02 + 0.03 * np.cos(300.0 * time)
+    exposure = beliefs.tip_exposure
+    ends = np.array([0.3, 6.0, 11.25, 16.4, 17.0 + 1e3 * exposure, 23.0]) * 1e-3
+    ends = ends[ends - exposure >= 0.0]
+    windows = [(end - exposure, end) for end in ends]
+
+    root, memory = reference.prior(depths[0])
+    shapes = [
+        (root.shape[1],),
+        (memory.shape[1],),
+        (count, 2, n),
+        (count, reference.ticks, 2),
+    ]
+    sizes = [int(np.prod(shape)) for shape in shapes]
+    borders = np.cumsum([0, *sizes])
+    units = np.eye(borders[-1])
+
+    def simulated(unknowns: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        parts = [unknowns[low:high] for low, high in pairwise(borders)]
+        parts = [part.reshape(*shape, -1) for part, shape in zip(parts, shapes, strict=True)]
+        parts[0], parts[1] = root @ parts[0], memory @ parts[1]
+        return reference.run(*parts, depths, speeds, windows)
+
+    rng = np.random.default_rng(5)
+    states, wrenches, tips = simulated(units)
+    truth = rng.normal(size=len(units))
+    wrench_read = wrenches @ truth
+    tip_read = tips @ truth
+    counts = np.array([beliefs.force_resolution, beliefs.torque_resolution]) / np.sqrt(12.0)
+    wrench_read += counts * rng.normal(size=wrench_read.shape)
+    tip_read += beliefs.tip_noise * rng.normal(size=tip_read.shape)
+    wrench_read[rng.random(wrench_read.shape) < 0.2] = nan
+
+    observer = Observer(parameters, beliefs, PERIOD)
+    # Out of order, one before its sample, the first one last of all.
+    arrivals = {3: [1], 14: [3, 2], 20: [5, 4], count: [0]} if len(ends) == 6 else {9: [1, 0, 2]}
+    for k in range(count + 1):
+        wrench = None if k == 0 else (float(wrench_read[k - 1, 0]), float(wrench_read[k - 1, 1]))
+        observer.update(float(time[k]), float(depths[k]), float(speeds[k]), wrench)
+        for w in arrivals.get(k, []):
+            if w < len(ends):
+                observer.add_tip(float(ends[w]), float(tip_read[w]))
+    known = np.isfinite(wrench_read)
+    taken = sorted({w for late in arrivals.values() for w in late if w < len(ends)})
+    a = np.vstack([wrenches[known], tips[taken]])
+    y = np.concatenate([wrench_read[known], tip_read[taken]])
+    r = np.concatenate(
+        [np.broadcast_to(counts**2, known.shape)[known], np.full(len(taken), beliefs.tip_noise**2)]
+    )
+    innovation = a @ a.T + np.diag(r)
+    to_state = reference.present(states[-1], depths, speeds)
+    gain = np.linalg.solve(innovation, a @ to_state.T).T
+    expected = gain @ y
+    covariance = to_state @ to_state.T - gain @ a @ to_state.T
+
+    assert observer.refused == 0
+    assert observer.nis.degrees == len(y)
+    deviation = np.sqrt(np.diag(covariance))
+    # 1e-6 of a standard deviation: the batch solution inverts what spans many decades.
+    assert_allclose(
+        np.concatenate(observer.modal) / deviation, expected / deviation, rtol=0.0, atol=1e-6
+    )
+    assert_allclose(
+        observer.covariance / np.outer(deviation, deviation),
+        covariance / np.outer(deviation, deviation),
+        rtol=0.0,
+        atol=1e-6,
+    )
+    # The innovations are white: their squares are the likelihood's exponent.
+    assert_allclose(
+        observer.nis.ratio * observer.nis.degrees, y @ np.linalg.solve(innovation, y), rtol=1e-6
+    )
+
+
+def test_errors_are_as_large_as_said_over_200_runs() -> None:
+    """NEES and NIS within their bands of 95 % where the truth is the model with its noise."""
+    parameters, beliefs = phantom(), ObserverSettings(tip_exposure=5e-3)
+    reference = Reference(parameters, beliefs)
+    cases, count = 200, 100
+    rng = np.random.default_rng(2)
+    time = PERIOD * np.arange(count + 1)
+    speeds = np.full(count + 1, 0.05)
+    depths = 0.1 + speeds * time
+    ends = np.arange(10, count + 1, 20) * PERIOD
+    windows = [(end - beliefs.tip_exposure, end) for end in ends]
+    drawn = draw(reference, depths[0], count, cases, rng)
+    states, wrench, tips = reference.run(*drawn, depths, speeds, windows)
+    counts = np.array([beliefs.force_resolution, beliefs.torque_resolution]) / np.sqrt(12.0)
+    wrench += counts[:, np.newaxis] * rng.normal(size=wrench.shape)
+    tips += beliefs.tip_noise * rng.normal(size=tips.shape)
+    looks = {20, 60, count}
+    nees = dict.fromkeys(looks, 0.0)
+    squares, degrees = 0.0, 0
+    truth = {k: reference.present(states[k], depths[: k + 1], speeds[: k + 1]) for k in looks}
+    for case in range(cases):
+        observer = Observer(parameters, beliefs, PERIOD)
+        observer.update(0.0, depths[0], speeds[0])
+        for k in range(1, count + 1):
+            lateral, moment = wrench[k - 1, :, case].tolist()
+            observer.update(float(time[k]), float(depths[k]), 0.05, (lateral, moment))
+            if k % 20 == 10 and k > 10:
+                observer.add_tip(float(ends[k // 20 - 1]), float(tips[k // 20 - 1, case]))
+            if k in looks:
+                nees[k] += observer.nees(truth[k][:2, case], truth[k][2:, case])
+        seen = observer.nis
+        squares, degrees = squares + seen.ratio * seen.degrees, degrees + seen.degrees
+    for total in nees.values():
+        assert Consistency.of(total, 4 * cases).holds
+    assert degrees == cases * (2 * count + 4)
+    assert Consistency.of(squares, degrees).holds
+
+
+@cache
+def prior(parameters: NeedleParameters, beliefs: ObserverSettings, depth: float) -> FloatArray:
+    """Root of the covariance of (q, p) at the start."""
+    return Reference(parameters, beliefs).prior(depth)[0]
+
+
+def simulate(
+    seed: int,
+    parameters: NeedleParameters,
+    depth: float,
+    count: int,
+    *,
+    speed: float = 0.008,
+    believed: NeedleParameters | None = None,
+    **options: Any,
+) -> tuple[Observer, FloatArray]:
+    """
+    Watch the simulated needle through the simulated sensors: tip at 50 Hz, 20 ms late.
+
+    Returns the observer, and for every sample NEES, true tip deflection, its estimate, the
+    standard deviation of that, and the last tip sample that has come.
+    """
+    # Read as often as it samples: its filter then runs on means over the samples.
+    sensing = ForceSensorParameters(rate=1.0 / PERIOD, filter=1)
+    filters: dict[str, Any] = {'cutoffs': sensing.cutoffs, 'filter_rate': sensing.rate}
+    gain = ObserverSettings(**filters).noise_gain
+    noise = sensing.per_axis('noise')[2:4] * gain
+    beliefs = ObserverSettings(
+        **{**filters, 'force_noise': noise[0], 'torque_noise': noise[1], **options}
+    )
+    rng = np.random.default_rng(seed)
+    root, model, n = prior(parameters, beliefs, depth), NeedleModel(parameters), parameters.modes
+    start = root @ rng.normal(size=2 * n)
+    gram = parameters.linear_density * model.modes.integrals(depth).gram
+    state = model.state_at(depth)
+    state[2 : 2 + n], state[2 + n] = start[:n], -speed
+    state[4 + n :] = np.linalg.solve(gram, start[n:])
+    needle = Integrator(parameters, state, 2e-5)
+    sensor = ForceSensor(sensing, 1.0 / PERIOD, seed)
+    observer = Observer(believed or parameters, beliefs, PERIOD)
+    observer.update(0.0, depth, speed)
+    late: list[tuple[int, float]] = []
+    rows, raw = [], 0.0
+    for k in range(1, count + 1):
+        seen = needle.advance_moved(PERIOD, speed)
+        read = sensor.measure(np.array([0.0, 0.0, seen.lateral_force, seen.moment, 0.0, 0.0]))
+        observer.update(k * PERIOD, needle.depth, needle.speed, (float(read[2]), float(read[3])))
+        if k % 20 == 0:
+            late.append((k, seen.tip_deflection + beliefs.tip_noise * rng.normal()))
+        if late and late[0][0] == k - 20:
+            taken, raw = late.pop(0)
+            observer.add_tip(taken * PERIOD, raw)
+        now = needle.state
+        rows.append(
+            [
+                observer.nees(now[2 : 2 + n], now[4 + n :]),
+                model.tip_deflection(now),
+                *observer.tip_deflection,
+                raw,
+            ]
+        )
+    return observer, np.array(rows)
+
+
+def test_errors_on_the_simulated_needle_are_as_large_as_said_over_200_runs() -> None:
+    """
+    The true flow while the depth changes, through the true force sensor with its counts.
+
+    It has no irregularity: with none believed the filter is consistent, with that of the default
+    it is on the safe side.
+    """
+    parameters = preset('paper_mm')
+    for options, runs, least in (({'irregularity': 0.0}, 200, None), ({}, 50, 0.0)):
+        nees, squares, degrees = np.zeros(50), 0.0, 0
+        for seed in range(runs):
+            observer, rows = simulate(seed, parameters, 0.1, 50, **options)
+            nees += rows[:, 0]
+            seen = observer.nis
+            squares, degrees = squares + seen.ratio * seen.degrees, degrees + seen.degrees
+        for k in (9, 29, 49):
+            found = Consistency.of(nees[k], 4 * runs)
+            assert (found.low if least is None else least) < found.ratio < found.high
+        assert squares / degrees < Consistency.of(squares, degrees).high
+
+
+def test_low_pass_belongs_to_the_state() -> None:
+    """Taken for white noise, what the sensor's filter leaves is neither white nor in time."""
+    parameters = preset('paper_mm')
+    for options, consistent in (({}, True), ({'cutoffs': ()}, False)):
+        observer, rows = simulate(1, parameters, 0.1, 80, irregularity=0.0, **options)
+        error = abs(rows[40:, 2] - rows[40:, 1]).max()
+        assert (observer.nis.ratio < 1.5) == consistent
+        assert (error < 5.0 * rows[40:, 3].max()) == consistent
+
+
+def test_fast_modes_keep_their_action_while_the_depth_changes() -> None:
+    """
+    At 2 cm, where a sample is 2 and 22 turns of the modes, without any noise believed.
+
+    A change of basis all at once, in whatever phase the modes are, is wrong by a thousandth each
+    time: after 150 samples errors would be ten times as large as said.
+    """
+    nees = np.zeros(150)
+    for seed in range(10):
+        _, rows = simulate(seed, preset('paper_mm'), 0.02, 150, irregularity=0.0)
+        nees += rows[:, 0] / 40.0
+    # Band of 95 % up to 1.48, and what a depth frozen over each sample leaves.
+    assert nees[[50, 100, 149]].max() < 3.0
+
+
+@pytest.mark.parametrize(
+    ('name', 'depth'), [('paper_mm', 0.02), ('paper_mm', 0.18), ('phantom', 0.1)]
+)
+@pytest.mark.parametrize('modes', [1, 2])
+def test_tip_estimate_is_better_than_the_tip_sensor(name: str, depth: float, modes: int) -> None:
+    parameters = preset(name, modes=modes)
+    _, rows = simulate(3, parameters, depth, 240)
+    _, truth, estimate, spread, raw = rows[60:].T
+    noise = ObserverSettings().tip_noise
+    error = np.sqrt(np.mean((estimate - truth) ** 2))
+    # The needle turns over several times before a late sample comes.
+    # Deep in, the wrench says little of it: a sample of the force has 0.05 N of noise.
+    assert error < 0.95 * noise
+    assert error < 0.95 * np.sqrt(np.mean((raw - truth) ** 2))
+    assert error < 1.5 * np.sqrt(np.mean(spread**2))
+
+
+@pytest.mark.parametrize('depth', [0.03, 0.06, 0.1])
+@pytest.mark.parametrize('factor', [0.7, 1.3])
+def test_default_irregularity_covers_a_tissue_that_is_not_as_believed(
+    depth: float, factor: float
+) -> None:
+    """Stiffness 30 % off on the needle that rings for ever: errors are about as large as said."""
+    believed = preset('paper_mm')
+    parameters = preset('paper_mm', tissue_stiffness=factor * believed.tissue_stiffness)
+    observer, rows = simulate(4, parameters, depth, 300, believed=believed)
+    _, truth, estimate, spread, _ = rows[60:].T
+    assert np.sqrt(np.mean((estimate - truth) ** 2)) < 2.0 * np.sqrt(np.mean(spread**2))
+    assert observer.nis.ratio < 1.5
+    # With none believed it cannot be right, and says so.
+    observer, _ = simulate(4, parameters, depth, 300, believed=believed, irregularity=0.0)
+    assert observer.nis.ratio > 2.0 * observer.nis.high
+
+
+@pytest.mark.parametrize('modes', [1, 2, 3])
+@pytest.mark.parametrize('depth', [0.03, 0.08, 0.2])
+@pytest.mark.parametrize('name', ['paper_mm', 'phantom'])
+def test_deflection_is_observable(name: str, depth: float, modes: int) -> None:
+    """Modal coordinates and rates are seen by the tip alone, and better with the wrench."""
+    parameters = preset(name, modes=modes, minimum_depth=LEAST_DEPTH[modes])
+    model = NeedleModel(parameters)
+    system = linearize(model, operating_point(model, depth, 0.0, 0.01))
+    a, _, c = system.scaled()
+    keep = [k for k, label in enumerate(system.scaled_names) if label.startswith('bending')]
+    names = tuple(system.scaled_names[k] for k in keep)
+    a, c = a[np.ix_(keep, keep)], c[:, keep]
+    tip = observability(a, c, names)
+    assert tip.rank == 2 * modes
+    assert tip.lost == ()
+
+    rates = Reference(parameters, ObserverSettings()).rates(depth, 0.0, 0.0)
+    gram = parameters.linear_density * model.modes.integrals(depth).gram
+    to_state = np.kron(np.eye(2), np.eye(modes))
+    to_state[modes:, modes:] = gram
+    middle = model.coordinates
+    rows = [*range(2, middle), *range(middle + 2, 2 * middle)]
+    transform = system.transform[np.ix_(rows, keep)]
+    wrench = rates[2 * modes : 2 * modes + 2, : 2 * modes] @ to_state @ transform
+    wrench /= np.abs(wrench).max(axis=1, keepdims=True)
+    both = observability(a, np.vstack([c, wrench]), names)
+    assert both.rank == 2 * modes
+    assert both.margin >= tip.margin * (1.0 - 1e-9)
+
+
+def exact(depth: float, modes: int, **changes: Any) -> tuple[Observer, Integrator]:
+    """Watch the simulated needle with sensors that hardly err."""
+    parameters = phantom(modes, **changes)
+    needle = Integrator(parameters, NeedleModel(parameters).state_at(depth, 1e-3), 2e-6)
+    beliefs = ObserverSettings(
+        irregularity=0.0, tip_noise=1e-9, force_noise=1e-6, torque_noise=1e-8,
+        force_resolution=0.0, torque_resolution=0.0, cutoffs=(),
+    )  # fmt: skip
+    observer = Observer(parameters, beliefs, PERIOD)
+    observer.update(0.0, depth, 0.0)
+    for k in range(1, 31):
+        seen = needle.advance_moved(PERIOD, 0.0)
+        observer.update(k * PERIOD, depth, 0.0, (seen.lateral_force, seen.moment))
+        observer.add_tip(k * PERIOD, seen.tip_deflection)
+    return observer, needle
+
+
+@pytest.mark.parametrize('modes', [1, 2, 3])
+@pytest.mark.parametrize('depth', [0.03, 0.1])
+@pytest.mark.parametrize('formulation', ['complete', 'as_printed'])
+def test_agrees_with_the_simulated_needle(depth: float, modes: int, formulation: str) -> None:
+    """What modal state, tip deflection and load mean is what the model means by them."""
+    observer, needle = exact(depth, modes, formulation=formulation, tissue_damping=0.0)
+    model, state = needle.model, needle.state
+    modal, rates = observer.modal
+    # 1e-4 of the largest: with a minute noise of 1e-6 and thirty samples.
+    assert_allclose(modal, state[2 : 2 + modes], rtol=0, atol=1e-4 * abs(modal).max())
+    assert_allclose(rates, state[4 + modes :], rtol=0, atol=1e-4 * abs(rates).max())
+    value, spread = observer.tip_deflection
+    assert_allclose(value, model.tip_deflection(state), rtol=0, atol=1e-7)
+    assert 0.0 < spread < 1e-7
+    # The load is that of the modes below half the rate alone.
+    mass, stiffness = model.mass_matrix(state)[2:, 2:], model.stiffness_matrix(depth)
+    squares, shapes = eigh(stiffness, mass)
+    kept = shapes[:, np.sqrt(squares) * PERIOD < np.pi]
+    slow = state.copy()
+    for part in (slice(2, 2 + modes), slice(4 + modes, None)):
+        slow[part] = kept @ (kept.T @ mass @ state[part])
+    bias = model.bias_forces(slow)[0]
+    assert_allclose(observer.load, -bias, rtol=0, atol=1e-3 * abs(bias) + 1e-12)
+    tip = np.concatenate([model.modes.integrals(depth).value, np.zeros(modes)])
+    assert_allclose(np.sqrt(tip @ observer.covariance @ tip), spread, rtol=1e-6)
+
+
+@settings(deadline=None, max_examples=15)
+@given(st.permutations(range(1, 21)), st.integers(1, 20))
+def test_a_wrench_may_come_apart_from_its_encoder_sample(order: list[int], shown: int) -> None:
+    """Late, early, in whatever order: it counts where its stamp says."""
+    together, apart = (Observer(phantom(), ObserverSettings(), PERIOD) for _ in range(2))
+    clock = 1.7e9
+
+    def wrench(k: int) -> tuple[float, float]:
+        return 0.1 * float(np.sin(k)), nan if k == 7 else 0.01 * float(np.cos(k))
+
+    for k in range(21):
+        together.update(clock + k * PERIOD, 0.1, 0.0, wrench(k))
+        apart.update(clock + k * PERIOD, 0.1, 0.0)
+        if k == shown:
+            # At most sixteen wait.
+            late = [j for j in order if j <= k] + [j for j in order if j > k][:16]
+            for j in late:
+                apart.add_wrench(clock + j * PERIOD, *wrench(j))
+    for j in set(order) - set(late):
+        apart.add_wrench(clock + j * PERIOD, *wrench(j))
+    assert apart.refused == 0
+    assert apart.nis.degrees == together.nis.degrees == 39
+    for one, other in zip(together.modal, apart.modal, strict=True):
+        # 1e-4: the clock's resolution there, 2e-7 s, in the fraction of a sample.
+        assert_allclose(one, other, rtol=0, atol=1e-4 * abs(one).max())
+    for bad in ((0.5, 0.0), (5.0, 0.0), (3.0, nan), (-2.0, 0.0), (nan, 0.0)):
+        apart.add_wrench(clock + bad[0] * PERIOD, bad[1], bad[1])
+    assert apart.refused == 5
+
+
+ticks = st.integers(1, 40)
+readings = st.floats(-1e-3, 1e-3)
+
+
+def watch(
+    tips: list[tuple[float, float]],
+    sign: float = 1.0,
+    origin: float = 0.0,
+    at_once: bool = True,
+) -> Observer:
+    """Forty samples with a made-up wrench; tips when their time has come, or at the end."""
+    observer = Observer(phantom(), ObserverSettings(), PERIOD)
+    waiting = list(tips)
+    for k in range(41):
+        lateral, moment = 0.1 * np.sin(0.4 * k), 0.01 * np.cos(0.3 * k)
+        time = origin + k * PERIOD
+        wrench = (sign * float(lateral), sign * float(moment))
+        observer.update(time, 0.1 + 1e-5 * k, 0.01, wrench)
+        for tip in [tip for tip in waiting if at_once and tip[0] <= k * PERIOD]:
+            observer.add_tip(origin + tip[0], sign * tip[1])
+            waiting.remove(tip)
+    for stamp, value in waiting:
+        observer.add_tip(origin + stamp, sign * value)
+    return observer
+
+
+@settings(deadline=None, max_examples=25)
+@given(st.dictionaries(ticks, readings, max_size=8), st.randoms(use_true_random=False))
+def test_order_of_arrival_does_not_matter(samples: dict[int, float], random: Any) -> None:
+    """Whatever the order in which tip samples come, the estimate is the same."""
+    tips = [(k * PERIOD, value) for k, value in samples.items()]
+    inorder = watch(sorted(tips))
+    random.shuffle(tips)
+    shuffled = watch(tips, at_once=False)
+    for one, other in zip(inorder.modal, shuffled.modal, strict=True):
+        # 1e-9: exposures that meet are cut where the earlier one ends, up to rounding.
+        assert_allclose(one, other, rtol=0, atol=1e-9 * abs(one).max())
+    spread = np.sqrt(np.diag(inorder.covariance))
+    change = (inorder.covariance - shuffled.covariance) / np.outer(spread, spread)
+    assert_allclose(change, 0.0, rtol=0, atol=1e-9)
+    assert inorder.nis.degrees == shuffled.nis.degrees == 80 + len(samples)
+
+
+@settings(deadline=None, max_examples=25)
+@given(st.dictionaries(ticks, readings, max_size=8), st.floats(-1e9, 1e9))
+def test_mirror_and_clock_do_not_matter(samples: dict[int, float], origin: float) -> None:
+    """A mirrored needle is estimated mirrored, on a clock that starts anywhere."""
+    tips = sorted((k * PERIOD, value) for k, value in samples.items())
+    plain, mirrored, moved = watch(tips), watch(tips, sign=-1.0), watch(tips, origin=origin)
+    for one, other, later in zip(plain.modal, mirrored.modal, moved.modal, strict=True):
+        assert_allclose(one, -other, rtol=0, atol=0)
+        # The clock's own resolution at 1e9 s is 1e-7 s, a hundredth of a percent of an exposure.
+        assert_allclose(one, later, rtol=0, atol=1e-3 * abs(one).max())
+    assert plain.load == mirrored.load
+
+
+def test_repeated_and_unusable_samples_are_refused() -> None:
+    clean, tips = watch([(0.02, 1e-4)]), [(0.02, 1e-4)]
+    observer = watch(tips)
+    before = observer.modal
+    bad = [(0.02, 5e-4), (0.0203, 5e-4), (nan, 0.0), (0.03, nan), (-1.0, 0.0), (9.0, 0.0)]
+    for stamp, value in bad:
+        observer.add_tip(stamp, value)
+    observer.update(0.04, 0.2, 0.0)
+    observer.update(0.03, 0.2, 0.0)
+    assert observer.refused == len(bad) + 2
+    assert observer.warning is None
+    assert_allclose(np.array(observer.modal), np.array(before), rtol=0, atol=0)
+    assert_allclose(np.array(observer.modal), np.array(clean.modal), rtol=0, atol=0)
+
+
+@pytest.mark.parametrize('missing', [(nan, nan), (nan, 0.01), (0.1, nan), (float('inf'), 0.01)])
+def test_each_channel_may_be_missing(missing: tuple[float, float]) -> None:
+    observer = Observer(phantom(), ObserverSettings(), PERIOD)
+    for k in range(10):
+        observer.update(k * PERIOD, 0.1, 0.0, missing)
+    given = sum(np.isfinite(value) for value in missing)
+    assert observer.nis.degrees == 9 * given
+    assert np.isfinite(observer.covariance).all()
+    without = Observer(phantom(), ObserverSettings(), PERIOD)
+    for k in range(10):
+        without.update(k * PERIOD, 0.1, 0.0)
+    informed, ignorant = (np.diag(o.covariance) for o in (observer, without))
+    assert (informed <= ignorant * (1.0 + 1e-9)).all()
+    assert (informed.sum() < ignorant.sum()) == bool(given)
+
+
+def test_bad_encoder_samples_leave_the_estimate_as_it_is() -> None:
+    observer = watch([(0.02, 1e-4)])
+    before = observer.modal
+    for bad in ((nan, 0.1, 0.0), (0.05, nan, 0.0), (0.05, 0.1, float('inf'))):
+        with pytest.raises(ParameterError, match='must be finite'):
+            observer.update(*bad)
+    for depth in (0.0005, 0.21, -1.0):
+        with pytest.raises(InsertedLengthError, match='the estimate is held'):
+            observer.update(0.05, depth, 0.0)
+    assert_allclose(np.array(observer.modal), np.array(before), rtol=0, atol=0)
+    observer.update(0.045, 0.1004, 0.0)
+    assert observer.warning is None
+
+
+@pytest.mark.parametrize(
+    ('sample', 'reason'),
+    [
+        ((0.041, 0.11, 0.0), 'depth jumped from 0.1004 to 0.11 m'),
+        ((0.5, 0.1, 0.0), 'encoders went from 0.04 to 0.5 s'),
+        ((-5.0, 0.1, 0.0), 'encoders went from 0.04 to -5 s'),
+    ],
+)
+def test_starts_anew_where_it_lost_track(sample: tuple[float, float, float], reason: str) -> None:
+    observer = watch([(0.02, 1e-4)])
+    observer.update(*sample)
+    assert observer.warning is not None
+    assert reason in observer.warning
+    assert observer.restarts == 1
+    assert observer.nis.degrees == 0
+    value, spread = observer.tip_deflection
+    assert value == 0.0
+    assert_allclose(spread, ObserverSettings().initial_deflection, rtol=1e-9)
+    observer.reset()
+    assert not observer.ready
+    assert observer.warning is None
+    with pytest.raises(NeedleError, match='before the first encoder sample'):
+        observer.modal  # noqa: B018
+
+
+def test_a_gap_is_bridged() -> None:
+    """Missing encoder samples cost nothing where the depth went evenly in between."""
+    whole, gap = (Observer(phantom(), ObserverSettings(), PERIOD) for _ in range(2))
+    for k in range(31):
+        wrench = (0.1, 0.01) if k < 10 or k == 30 else None
+        whole.update(k * PERIOD, 0.1 + 1e-5 * k, 0.01, wrench)
+        if k < 10 or k == 30:
+            gap.update(k * PERIOD, 0.1 + 1e-5 * k, 0.01, wrench)
+    # 1e-9: depths in between differ by rounding only.
+    for one, other in zip(whole.modal, gap.modal, strict=True):
+        assert_allclose(one, other, rtol=1e-9, atol=0)
+    assert_allclose(whole.covariance, gap.covariance, rtol=1e-9, atol=0)
+
+
+@pytest.mark.parametrize('name', ['paper_mm', 'phantom'])
+def test_covariance_stays_finite_without_measurements(name: str) -> None:
+    """Ten minutes of encoders alone: uncertainty grows as noise does, symmetric and positive."""
+    parameters = preset(name)
+    observer = Observer(parameters, ObserverSettings(history=0.06), PERIOD)
+    observer.update(0.0, 0.05, 0.0)
+    for k in range(1, 12_001):
+        # A gap is 50 samples.
+        observer.update(k * 0.05, 0.05 + 2e-4 * (k % 2), 0.0)
+    assert observer.restarts == 0
+    covariance = observer.covariance
+    assert np.isfinite(covariance).all()
+    assert (covariance == covariance.T).all()
+    scale = np.sqrt(np.diag(covariance))
+    assert np.linalg.eigvalsh(covariance / np.outer(scale, scale))[0] > 0.0
+    # Undamped, the noise of ten minutes adds up: S t / (2 rho omega^2) a mode; damped it does not.
+    assert observer.tip_deflection[1] < (1e-2 if name == 'paper_mm' else 1e-3)
+
+
+def test_covariance_stays_positive_with_measurements_that_hardly_err() -> None:
+    observer, _ = exact(0.05, 2)
+    covariance = observer.covariance
+    scale = np.sqrt(np.diag(covariance))
+    assert np.linalg.eigvalsh(covariance / np.outer(scale, scale))[0] > 0.0
+
+
+def test_consistency_bands_are_those_of_chi_squared() -> None:
+    rng = np.random.default_rng(7)
+    sums = (rng.normal(size=(4000, 30)) ** 2).sum(axis=1)
+    inside = sum(Consistency.of(total, 30).holds for total in sums)
+    # 95 % within four standard deviations of the count.
+    assert abs(inside / 4000 - 0.95) < 4.0 * np.sqrt(0.05 * 0.95 / 4000)
+    assert Consistency.of(0.0, 0).holds
+
+
+@pytest.mark.parametrize(
+    ('options', 'period', 'match'),
+    [
+        ({'irregularity': -1.0}, PERIOD, 'irregularity must be'),
+        ({'tip_noise': 0.0}, PERIOD, 'tip_noise must be'),
+        ({'cutoffs': (600.0,)}, PERIOD, 'below half the filter_rate = 500 Hz'),
+        ({'cutoffs': 'no'}, PERIOD, 'cutoffs must be'),
+        ({}, 0.0, 'period must be > 0'),
+        ({}, 1.5e-3, 'whole multiple of the sample rate'),
+        ({}, 1e-4, 'whole multiple of the sample rate'),
+    ],
+)
+def test_bad_settings_are_named(options: dict[str, Any], period: float, match: str) -> None:
+    with pytest.raises(ParameterError, match=match):
+        Observer(phantom(), ObserverSettings(**options), period)
+
+
+def test_nees_wants_the_right_shape() -> None:
+    observer = watch([])
+    with pytest.raises(ShapeError, match=r'must have shape \(2,\) each'):
+        observer.nees([0.0], [0.0])

@@ -1,0 +1,373 @@
+"""What is accepted is stable, and what is refused is not."""
+
+from contextlib import nullcontext
+from dataclasses import replace
+from math import log
+import re
+
+from hypothesis import assume, given, HealthCheck, settings
+from hypothesis import strategies as st
+from needle_controller import (
+    Axis,
+    check_stability,
+    deflection_matrix,
+    DeflectionLaw,
+    DeflectionLoop,
+    InverseDynamics,
+    InverseDynamicsGains,
+    MARGIN,
+    Pid,
+    PidGains,
+    SampledLoop,
+    Setpoint,
+    spectral_radius,
+    stability_limit,
+    transition_matrix,
+)
+from needle_dynamics import Integrator, NeedleModel, NeedleParameters, ParameterError
+import numpy as np
+from numpy.testing import assert_allclose
+import pytest
+
+MODEL = NeedleModel(NeedleParameters.preset('phantom'))
+PHANTOM = Axis.insertion(MODEL.parameters)
+PAPER_SI = Axis.insertion(NeedleParameters.preset('paper_si'))
+PERIOD = 1e-3
+
+PROPERTY = settings(
+    deadline=None, derandomize=True, suppress_health_check=[HealthCheck.filter_too_much]
+)
+
+
+@pytest.mark.parametrize('delay', [0, 1, 3])
+@pytest.mark.parametrize('unmodeled', [0, 1, 2])
+@pytest.mark.parametrize('filter_time', [0.0, 5e-3])
+def test_transition_matrix_is_the_loop(delay, unmodeled, filter_time):
+    """Powers of the matrix are what the running loop does to an initial error."""
+    axis = PHANTOM.without_coulomb()
+    gains = PidGains(tolerance=0.0, filter_time=filter_time)
+    law = Pid(axis=axis, gains=gains, period=PERIOD)
+    matrix = transition_matrix(law, delay, unmodeled)
+    state = np.zeros(len(matrix))
+    state[0] = 1e-3
+    loop = SampledLoop(law, delay, np.inf)
+    position, speed = 1e-3, 0.0
+    waiting = [0.0] * (delay + unmodeled)
+    for _ in range(50):
+        state = matrix @ state
+        waiting.append(loop.command(position, speed, Setpoint(0.0)))
+        position, speed = axis.propagate(position, speed, waiting.pop(0), PERIOD)
+    # Rounding over fifty steps.
+    assert_allclose([position, speed], state[:2], rtol=1e-9, atol=1e-15)
+
+
+DEFLECTION_GAINS = {
+    'inverse_dynamics': InverseDynamicsGains(),
+    'pid': PidGains(kp=5.0, ki=20.0, kd=0.02, filter_time=2e-3),
+}
+
+
+def deflection_law(kind: str, period: float = PERIOD, factor: float = 1.0) -> DeflectionLaw:
+    """Return a law on the deflections of the phantom."""
+    gains = DEFLECTION_GAINS[kind].scaled(factor)
+    return DeflectionLaw(model=MODEL, gains=gains, period=period)
+
+
+def deflect(law: DeflectionLaw, depth: float, late: int, periods: int, delay: int = 1):
+    """Run the loop on the deflections of the true needle at rest; return their norms."""
+    modes, loop = law.at(depth), DeflectionLoop(law, delay)
+    x = np.stack([modes.from_normal([1.0, 1.0]), np.zeros(2)])
+    waiting = [np.zeros(2)] * (delay + late)
+    sizes, ends = [], []
+    for _ in range(periods):
+        waiting.append(loop.command(modes, x, np.zeros((3, 2))))
+        x, _ = loop.predict(modes, x, 0.0, waiting.pop(0))
+        eta, rate = modes.to_normal(x[0]), modes.to_normal(x[1])
+        sizes.append(float(np.sqrt(eta @ eta + (rate / np.sqrt(modes.squares)) @ rate)))
+        ends.append(np.concatenate([eta, rate]))
+        if not sizes[-1] < 1e9:
+            break
+    return np.array(sizes), np.array(ends)
+
+
+@pytest.mark.parametrize('kind', DEFLECTION_GAINS)
+@pytest.mark.parametrize('unmodeled', [0, 1])
+def test_deflection_matrix_is_the_loop(kind, unmodeled):
+    """Powers of the matrix are what the running loop does to deflections."""
+    law = deflection_law(kind)
+    matrix = deflection_matrix(law, law.at(0.195), 1, unmodeled)
+    state = np.zeros(len(matrix))
+    state[:2] = 1.0
+    _, ends = deflect(law, 0.195, unmodeled, 30)
+    for end in ends:
+        state = matrix @ state
+        # Rounding over the steps, of rates of 1e3.
+        assert_allclose(state[:4], end, rtol=1e-8, atol=1e-8)
+
+
+def decays(law, unmodeled: int) -> bool:
+    """Return whether an error of the loop without Coulomb friction is smaller at the end."""
+    loop = SampledLoop(law.linear(), 1, np.inf)
+    axis = law.axis.without_coulomb()
+    position, speed = 1.0, 0.0
+    waiting = [0.0] * (1 + unmodeled)
+    sizes = []
+    for _ in range(4000):
+        waiting.append(loop.command(position, speed, Setpoint(0.0)))
+        position, speed = axis.propagate(position, speed, waiting.pop(0), PERIOD)
+        sizes.append(abs(position))
+        if sizes[-1] > 1e6:
+            return False
+    return max(sizes[-500:]) < max(sizes[:500])
+
+
+@pytest.mark.parametrize('axis', [PHANTOM, PAPER_SI], ids=['phantom', 'paper_si'])
+@pytest.mark.parametrize('scale', [0.1, 1.0, 10.0, 100.0, 1000.0])
+@pytest.mark.parametrize('law', [InverseDynamics, Pid])
+def test_what_is_accepted_is_stable_and_what_is_refused_is_not(axis, law, scale):
+    """Acceptance and the growth of the error in the running loop agree."""
+    if law is Pid:
+        gains = PidGains(kp=20.0 * scale, ki=0.0, kd=1.0 * scale, tolerance=0.0)
+    else:
+        gains = InverseDynamicsGains(kp=900.0 * scale, kv=60.0 * scale)
+    chosen = law(axis=axis, gains=gains, period=PERIOD)
+    stable = all(decays(chosen, unmodeled) for unmodeled in (0, 1))
+    with nullcontext() if stable else pytest.raises(ParameterError, match='spectral radius'):
+        check_stability(chosen, 1, 'gains')
+
+
+def power_of_ten(low: float, high: float) -> st.SearchStrategy[float]:
+    """Return numbers spread evenly over decades."""
+    return st.floats(low, high).map(lambda exponent: 10.0**exponent)
+
+
+gains_of_a_law = st.one_of(
+    st.builds(InverseDynamicsGains, kp=power_of_ten(1.5, 6.0), kv=power_of_ten(0.5, 3.3)),
+    st.builds(
+        PidGains,
+        kp=power_of_ten(1.0, 5.0),
+        ki=st.one_of(st.just(0.0), power_of_ten(0.0, 6.0)),
+        kd=power_of_ten(-2.0, 4.0),
+        filter_time=st.sampled_from([0.0, 2e-3]),
+        tolerance=st.just(0.0),
+    ),
+)
+
+
+def law_of(gains: InverseDynamicsGains | PidGains, axis: Axis) -> InverseDynamics | Pid:
+    """Return the law that the gains are for."""
+    kind = InverseDynamics if isinstance(gains, InverseDynamicsGains) else Pid
+    return kind(axis=axis, gains=gains, period=PERIOD)
+
+
+@settings(PROPERTY, max_examples=60)
+@given(
+    gains_of_a_law,
+    st.sampled_from(['phantom', 'paper_si', 'paper_mm']),
+    st.sampled_from([0.0, 0.1, 0.56]),
+    st.floats(0.003, 0.198),
+    st.integers(0, 2),
+    st.integers(0, 1),
+)
+def test_whatever_is_accepted_is_stable_at_every_depth(
+    gains, preset, coulomb, depth, delay, unmodeled
+):
+    """Around the true, bent needle the error stays bounded and ends within what friction holds."""
+    truth = NeedleParameters.preset(preset, coulomb_friction=coulomb)
+    law = law_of(gains, Axis.insertion(truth))
+    assume(stability_limit(law, delay).stable)
+    radius = spectral_radius(law, delay, unmodeled)
+    # Four decades of the slowest pole, not longer than three seconds.
+    periods = 50 + round(log(1e-4) / log(radius))
+    assume(periods <= 3000)
+    model = NeedleModel(truth)
+    state = model.state_at(depth, 2e-4 * depth)
+    # The bent needle pulls by the change of its energy, that of a beam goes as s^-3.
+    pull = 5.0 * model.energy(state) / depth
+    needle = Integrator(truth, state, 1e-4)
+    error = 1e-4 if depth < 0.1 else -1e-4
+    loop, waiting = SampledLoop(law, delay, np.inf), [0.0] * (delay + unmodeled)
+    errors = []
+    for _ in range(periods):
+        measured = needle.depth, needle.speed
+        errors.append(depth + error - measured[0])
+        waiting.append(loop.command(*measured, Setpoint(depth + error)))
+        needle.advance(PERIOD, waiting.pop(0))
+    # Friction holds the needle where the law asks for less than it: at rest, the compensation
+    # of inverse dynamics leans by kp e 1 ms / breakaway_speed. An undamped needle keeps pulling.
+    if isinstance(gains, InverseDynamicsGains):
+        band = (1e-4 / (1e-3 * gains.kp) if coulomb else 0.0) + pull / (PHANTOM.inertia * gains.kp)
+    else:
+        # The law counts on a motion that friction does not allow, and divides its push by what
+        # that would take off. What sticks and slips under the integral goes as far beyond.
+        r, h = law.axis.response(PERIOD), PERIOD
+        share = h / (h + gains.filter_time)
+        divisor = 1.0 + (gains.kp + h * gains.ki) * r.pf + gains.kd * share * r.vf
+        band = divisor * (2.0 * coulomb + pull) / gains.kp
+    # A fast loop with a period of delay that it does not know of swings before it settles.
+    assert max(map(abs, errors)) < 20.0 * (abs(error) + band)
+    assert max(map(abs, errors[-20:])) < 0.02 * abs(error) + band
+
+
+@settings(PROPERTY, max_examples=60)
+@given(gains_of_a_law, st.sampled_from([PHANTOM, PAPER_SI]), st.integers(0, 3), st.integers(0, 1))
+def test_what_has_a_pole_outside_diverges(gains, axis, delay, unmodeled):
+    """In the running loop without friction an error grows as the spectral radius says."""
+    law = law_of(gains, axis)
+    radius = spectral_radius(law, delay, unmodeled)
+    assume(radius > 1.0 + 1e-3)
+    assert not stability_limit(law, delay).stable
+    loop, linear = SampledLoop(law.linear(), delay, np.inf), axis.without_coulomb()
+    waiting, (position, speed) = [0.0] * (delay + unmodeled), (1e-6, 0.0)
+    for _ in range(100_000):
+        waiting.append(loop.command(position, speed, Setpoint(0.0)))
+        position, speed = linear.propagate(position, speed, waiting.pop(0), PERIOD)
+        if abs(position) > 1.0:
+            break
+    assert abs(position) > 1.0
+
+
+def test_the_gains_of_the_source_hold_in_the_implicit_form():
+    """On 2 g at 1 kHz kp = 1e3, kv = 1e4 are stable here; the textbook form explodes."""
+    law = Pid(axis=PAPER_SI, gains=PidGains(kp=1e3, ki=0.0, kd=1e4), period=PERIOD)
+    assert spectral_radius(law, 0) < 1.0
+    r = PAPER_SI.response(PERIOD)
+    textbook = np.array([[1.0 - 1e3 * r.pf, r.pv - 1e4 * r.pf], [-1e3 * r.vf, r.vv - 1e4 * r.vf]])
+    assert np.abs(np.linalg.eigvals(textbook)).max() > 1000.0
+
+
+@pytest.mark.parametrize('rate', [100.0, 1e3, 1e4])
+def test_the_slow_gains_of_the_source_are_within_the_margin(rate):
+    """k_p = 1, k_v = 0.1 take a minute to settle; the default margin does not forbid that."""
+    law = InverseDynamics(
+        axis=PAPER_SI, gains=InverseDynamicsGains(kp=1.0, kv=0.1), period=1.0 / rate
+    )
+    check_stability(law, 1, 'gains')
+    # The pole is at -0.05 1/s; the period adds h k_p / (2 k_v) to that.
+    assert_allclose(1.0 - spectral_radius(law, 1), 0.05 / rate, rtol=0.05)
+
+
+def test_the_margin_is_kept():
+    """A margin beyond what the loop has is refused, and named; less is accepted."""
+    law = Pid(axis=PHANTOM, gains=PidGains(ki=0.0), period=PERIOD)
+    # The slow pole is at -kp / (mu_v + kd) = -15 1/s.
+    assert_allclose(spectral_radius(law, 1), 1.0 - 0.015, atol=5e-4)
+    check_stability(law, 1, 'gains', margin=0.014)
+    with pytest.raises(ParameterError, match=r'radius 0\.98.* must be <= 1 - 0\.02') as refusal:
+        check_stability(law, 1, 'gains', margin=0.02)
+    factor = float(re.search(r'times ([\d.]+) would', str(refusal.value))[1])
+    assert factor > 1.0
+    check_stability(law.scaled(factor), 1, 'gains', margin=0.02)
+    with pytest.raises(ParameterError, match=r'margin must be in \[0, 1\)'):
+        check_stability(law, 1, 'gains', margin=1.0)
+
+
+def test_gains_that_cannot_be_stable_are_named():
+    """The refusal names the gains, the rate, what was found and what would do."""
+    law = InverseDynamics(axis=PHANTOM, gains=InverseDynamicsGains(kv=3000.0), period=PERIOD)
+    words = (
+        r'my gains cannot be stable at 1000 Hz with a delay of 2 periods: spectral radius .* '
+        r'must be < 1; all of them times ([\d.]+) would be'
+    )
+    with pytest.raises(ParameterError, match=words) as refusal:
+        check_stability(law, 1, 'my gains')
+    factor = float(re.search(words, str(refusal.value))[1])
+    check_stability(law.scaled(factor), 1, 'my gains')
+    # A tenth more would not do.
+    assert not stability_limit(law.scaled(1.15 * factor), 1).stable
+
+
+@pytest.mark.parametrize(
+    ('gains', 'missing'),
+    [(InverseDynamicsGains(kp=0.0), 'kp'), (PidGains(kp=0.0, ki=0.0, kd=0.0), 'kp and kd')],
+)
+def test_missing_gains_are_named(gains, missing):
+    """No factor makes up for a gain of zero."""
+    with pytest.raises(ParameterError, match=f'{missing} must not be zero'):
+        check_stability(law_of(gains, PAPER_SI), 1, 'gains')
+
+
+# The deflection.
+
+
+def test_modal_control_at_2_cm_is_refused_at_1_khz():
+    """The refusal names the 22 kHz mode, and the rate and depth it names are accepted."""
+    law = deflection_law('inverse_dynamics')
+    with pytest.raises(ParameterError) as refusal:
+        check_stability(law, 1, 'deflection gains', depths=(0.02, 0.2))
+    text = str(refusal.value)
+    words = (
+        r'deflection gains cannot be stable at 1000 Hz with a delay of 2 periods: deflection '
+        r'mode 2 at 2 cm: 22 kHz, not below half the rate, spectral radius .* a rate of (\d+) Hz '
+        r'or inserted lengths from ([\d.]+) cm on would do'
+    )
+    rate, centimeters = (float(found) for found in re.fullmatch(words, text).groups())
+    fast, deep = replace(law, period=1.0 / rate), 1e-2 * centimeters
+    check_stability(fast, 1, 'gains', depths=(0.02, 0.2))
+    check_stability(law, 1, 'gains', depths=(deep, 0.2))
+    # Not for little: six times the frequency, and nearly the whole needle.
+    assert 100e3 < rate < 150e3
+    assert 0.17 < deep < 0.19
+    # Nearest: a step of the search less would not do.
+    assert not stability_limit(replace(law, period=1.2 / rate), 1, (0.02, 0.2)).stable
+    assert not stability_limit(law, 1, (deep - 1e-3, 0.2)).stable
+
+
+def test_gains_on_deflections_are_cut_to_what_would_do():
+    """Where the rate is fit for the modes, a factor on the gains is named, and accepted."""
+    law = deflection_law('pid', factor=1e4)
+    words = r'deflection mode \d at .* cm: [\d.]+ Hz, spectral .* times ([\d.e-]+) would be'
+    with pytest.raises(ParameterError, match=words) as refusal:
+        check_stability(law, 1, 'gains', depths=(0.19, 0.2))
+    factor = float(re.search(words, str(refusal.value))[1])
+    assert check_stability(law.scaled(factor), 1, 'gains', depths=(0.19, 0.2)).stable
+
+
+def test_gains_that_no_rate_saves_are_named():
+    """The source's gains of PID on the deflections are refused with their delay at any rate."""
+    gains = PidGains(kp=1e3, ki=0.0, kd=1e4)
+    law = DeflectionLaw(model=MODEL, gains=gains, period=PERIOD)
+    with pytest.raises(ParameterError, match=r'22 kHz.* no rate up to 1000000 Hz would do'):
+        check_stability(law, 1, 'gains', depths=(0.02, 0.2))
+
+
+@settings(PROPERTY, max_examples=25)
+@given(
+    st.sampled_from(list(DEFLECTION_GAINS)),
+    power_of_ten(-1.0, 1.5),
+    st.floats(0.12, 0.2),
+    power_of_ten(-3.7, -3.0),
+    st.integers(0, 1),
+)
+def test_deflections_obey_the_verdict_at_every_depth(kind, factor, depth, period, unmodeled):
+    """Accepted over a range, they settle at each of its depths; outside the circle they grow."""
+    law = deflection_law(kind, period, factor)
+    accepted = stability_limit(law, 1, (0.12, 0.2)).stable
+    matrix = deflection_matrix(law, law.at(depth), 1, unmodeled)
+    radius = float(np.abs(np.linalg.eigvals(matrix)).max())
+    if accepted:
+        assert radius < 1.0
+    assume(abs(log(radius)) > 3e-3)
+    # Six time constants beyond a thousand for what the other poles hide.
+    sizes, _ = deflect(law, depth, unmodeled, round(13.0 / abs(log(radius))))
+    if radius < 1.0:
+        assert sizes[-1] < 0.1 * sizes.max()
+    else:
+        assert sizes[-1] > 10.0
+
+
+def test_depths_out_of_range_are_refused():
+    """A range must increase and lie on the needle."""
+    law = deflection_law('inverse_dynamics')
+    for depths in ((0.1, 0.05), (0.0, 0.1), (0.1, 0.3)):
+        with pytest.raises(ParameterError, match=r'depths must be increasing in \(0, 0\.2\] m'):
+            stability_limit(law, 1, depths)
+
+
+def test_an_axis_too_fast_for_the_rate_is_refused():
+    """A spring beyond half the rate is refused even where its aliased poles are inside."""
+    axis = Axis(inertia=1.0, viscous=100.0, stiffness=(7.0 / PERIOD) ** 2)
+    law = InverseDynamics(axis=axis, gains=InverseDynamicsGains(), period=PERIOD)
+    assert spectral_radius(law, 0) < 1.0 - MARGIN
+    with pytest.raises(ParameterError, match='not below half the rate'):
+        check_stability(law, 0, 'gains')
