@@ -25,6 +25,8 @@ from needle_dynamics.errors import NeedleError, ParameterError
 from needle_dynamics.parameters import as_number, NeedleParameters, PRESETS, unknown_name
 from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor, SetParametersResult
 import rclpy
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
 from rclpy.exceptions import ParameterException
 from rclpy.executors import Executor
 from rclpy.experimental.events_executor import EventsExecutor
@@ -56,6 +58,28 @@ _Settings = TypeVar('_Settings')
 _SUCCESS = TransitionCallbackReturn.SUCCESS
 
 
+class Meter:
+    """How often something happens: events per second, over the last second or more."""
+
+    def __init__(self) -> None:
+        self._since = time.monotonic()
+        self._events = 0
+        self._rate = 0.0
+
+    def count(self) -> None:
+        """Take note of an event."""
+        self._events += 1
+
+    @property
+    def rate(self) -> float:
+        """Events per second [Hz]."""
+        elapsed = time.monotonic() - self._since
+        if elapsed >= 1.0:
+            self._rate = self._events / elapsed
+            self._since, self._events = time.monotonic(), 0
+        return self._rate
+
+
 class NeedleNode(LifecycleNode):
     """
     A lifecycle node that reads its parameters into dataclasses and says how it is.
@@ -78,7 +102,9 @@ class NeedleNode(LifecycleNode):
         self._configuration = self.create_publisher(String, '~/configuration', LATCHED)
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
         self._last_level = DiagnosticStatus.OK
-        self._health_timer = self.create_timer(1.0, self.publish_diagnostics)
+        # Not the node's clock: a simulation that stands still must be told of too.
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._health_timer = self.create_timer(1.0, self.publish_diagnostics, clock=steady)
         self.add_on_set_parameters_callback(self._check_change)
         self.add_post_set_parameters_callback(self._after_change)
 

@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
-from math import ceil
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields
+from math import cos, sin
 import sys
 from typing import Any
 
 from builtin_interfaces.msg import Time as TimeMessage
 from diagnostic_msgs.msg import DiagnosticStatus
-from geometry_msgs.msg import PointStamped, PoseStamped, WrenchStamped
-from needle_dynamics.base_node import COMMAND, NeedleNode, run, SENSOR
+from geometry_msgs.msg import Point, PointStamped, Pose, PoseArray, PoseStamped, WrenchStamped
+from needle_dynamics.base_node import COMMAND, Meter, NeedleNode, run, SENSOR
 from needle_dynamics.errors import JobError, NeedleError, ParameterError
+from needle_dynamics.faults import Fault, FaultParameters, FAULTS
 from needle_dynamics.force_sensor import ForceSensor, ForceSensorParameters, HIGHEST_RATE
 from needle_dynamics.indenter import Indenter, IndenterParameters, Press
 from needle_dynamics.integrators import Integrator
 from needle_dynamics.kernels import FloatArray
 from needle_dynamics.model import NeedleModel
+from needle_dynamics.pace import NANOSECONDS, Pace
 from needle_dynamics.parameters import check_constants, constant
 from needle_dynamics.plant import (
     BaseMotion,
@@ -29,12 +31,16 @@ from needle_dynamics.plant import (
 )
 import numpy as np
 from rcl_interfaces.msg import IntegerRange, ParameterDescriptor
+from rclpy.clock import Clock as NodeClock
+from rclpy.clock_type import ClockType
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
-from std_srvs.srv import Trigger
+from std_msgs.msg import Header
+from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import JointTrajectory
+from visualization_msgs.msg import Marker
 
 #: What the node stands in for.
 MODES = ('simulation', 'robot', 'indenter')
@@ -42,14 +48,38 @@ MODES = ('simulation', 'robot', 'indenter')
 #: As rclpy listens to it.
 CLOCK = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 
-_NANOSECONDS = 1_000_000_000
+#: Streams that a fault can hit, and how many of their values a bias changes.
+_FAULTY = {'joint_states': 1, 'base_wrench': 6, 'tip_deflection': 1}
 
-#: Time between ticks that is short enough for whoever listens [s].
-_TICK = 1e-3
+#: Time between looks at the graph [s]; looks after which an unanswered sample is repeated.
+_WATCH = 0.1
+_REPEAT = 5
+
+#: More commands per sample than this are worth a word.
+_TOO_MANY = 3.0
+
+_NO_FAULT = 'none'
+
+#: For people: pictures of the needle per second, and points of each.
+_PICTURES = 30.0
+_POINTS = 21
+
+#: How thick the needle is drawn [m].
+_THICKNESS = 1e-3
 
 
 def _message(stamp: int) -> TimeMessage:
-    return TimeMessage(sec=stamp // _NANOSECONDS, nanosec=stamp % _NANOSECONDS)
+    return TimeMessage(sec=stamp // NANOSECONDS, nanosec=stamp % NANOSECONDS)
+
+
+@dataclass(frozen=True, slots=True)
+class _Command:
+    """Forces on the needle, and the time from which they count [ns]."""
+
+    stamp: int
+    force: float = 0.0
+    torque: float = 0.0
+    modal: FloatArray | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -60,8 +90,9 @@ class PlantSettings:
         1000.0, 'Hz', 'samples per second of simulated time', low=1.0, high=HIGHEST_RATE
     )
     real_time_factor: float = constant(
-        1.0, '1', "pace of simulated time over that of the node's clock", high=100.0, open_low=True
-    )
+        1.0, '1', "pace of simulated time over that of the node's clock; 0: as fast as possible",
+        high=100.0,
+    )  # fmt: skip
     depth: float = constant(0.02, 'm', 'inserted length at the start', open_low=True)
     tip_deflection: float = constant(
         0.0, 'm', 'deflection of the tip at the start', low=-0.1, high=0.1
@@ -89,23 +120,37 @@ class PlantNode(NeedleNode):
     the needle moves under ``wrench_command`` (force.y, torque.x) or ``generalized_command``
     (efforts of d, theta and q1..qn), whichever came last; in mode `robot` the base
     follows ``joint_trajectory`` (joint `insertion`: positions, or efforts for a push). Both
-    publish ``joint_states``, ``base_wrench``, ``tip_deflection`` and ``ground_truth``. In mode
-    `indenter` the end-effector presses the tissue by ``joint_trajectory`` (efforts of the joints
-    `x` and `z`) and shows ``base_wrench`` and ``end_effector_pose``. A trajectory begins when it
-    comes, or with the activation if it came before.
+    publish ``joint_states``, ``base_wrench``, ``tip_deflection`` and ``ground_truth``, and for
+    people ``needle_shape`` and ``needle_poses``. In mode `indenter` the end-effector presses the
+    tissue by ``joint_trajectory`` (efforts of the joints `x` and `z`) and shows ``base_wrench``
+    and ``end_effector_pose``. A trajectory begins when it comes, or with the activation if it
+    came before.
 
-    Samples are taken at exact multiples of the period of simulated time, which starts at the
-    node's now and runs ``real_time_factor`` times as fast; with ``publish_clock`` it is /clock.
-    After a stall the missing samples are made up. What is beyond the backlog is given up at a
-    factor of one, where the stamps are the node's clock; else simulated time waits.
+    Samples are taken at exact multiples of the period of simulated time, see `Pace`; with
+    ``publish_clock`` or ``lockstep`` it is /clock. The command that is newest when a sample is
+    taken acts until the next one. A command carries the stamp of the sample that it answers;
+    with ``lockstep`` the next sample waits for it. ``~/pause`` stops time, ``~/step`` takes one
+    sample, ``~/reset`` puts the needle and its noise back to their start while time goes on.
     """
 
-    LIVE = frozenset({'model.coulomb_friction', 'model.viscous_friction'})
+    LIVE = frozenset(
+        {
+            'model.coulomb_friction',
+            'model.viscous_friction',
+            'fault.kind',
+            'fault.topic',
+            *(f'fault.{item.name}' for item in fields(FaultParameters)),
+        }
+    )
 
     def __init__(self, **node_options: Any) -> None:
         super().__init__('plant', **node_options)
         self.declare_text('mode', MODES[0], f'one of {", ".join(MODES)}')
         self.declare_text('publish_clock', False, 'publish the simulated time on /clock')
+        self.declare_text(
+            'lockstep', False, 'each sample waits for the command that answers the one before it'
+        )
+        self.declare_text('paused', False, 'begin with time standing still')
         self.declare_parameter(
             'seed',
             1,
@@ -120,16 +165,25 @@ class PlantNode(NeedleNode):
         self.declare_settings('tip.', TipParameters())
         self.declare_settings('base.', BaseParameters())
         self.declare_settings('indenter.', IndenterParameters())
+        self.declare_text('fault.kind', _NO_FAULT, f'{_NO_FAULT}, or one of {", ".join(FAULTS)}')
+        self.declare_text('fault.topic', 'joint_states', f'one of {", ".join(_FAULTY)}')
+        self.declare_settings('fault.', FaultParameters())
 
         self._settings = PlantSettings()
         self._plant: Plant | Indenter | None = None
         self._halted: str | None = None
-        #: Samples given up, and time that simulated time waited [ns].
-        self._lost = self._waited = 0
-        self._force = self._torque = 0.0
-        self._modal: FloatArray | None = None
-        self._command_time: int | None = None
-        self._bad_commands = 0
+        #: The command that acts, and the newest.
+        self._held = self._newest = _Command(0)
+        self._fault: Fault | None = None
+        self._faulty = ''
+        #: Others that command, beyond the one that may.
+        self._rivals = 0
+        self._looks = 0
+        self._sampled = self._made_up = 0
+        self._saturated = 0
+        self._commands, self._samples = Meter(), Meter()
+        #: Commands not taken: not valid, of too long ago, older than one that came before.
+        self._refused = self._stale = self._overtaken = 0
 
         publisher = self.create_lifecycle_publisher
         self._joint_states = publisher(JointState, 'joint_states', SENSOR)
@@ -137,11 +191,16 @@ class PlantNode(NeedleNode):
         self._tip_deflection = publisher(PointStamped, 'tip_deflection', SENSOR)
         self._ground_truth = publisher(JointState, 'ground_truth', SENSOR)
         self._end_effector_pose = publisher(PoseStamped, 'end_effector_pose', SENSOR)
+        self._needle_shape = publisher(Marker, 'needle_shape', SENSOR)
+        self._needle_poses = publisher(PoseArray, 'needle_poses', SENSOR)
         self._clock_topic: Publisher | None = None
         self.create_subscription(WrenchStamped, 'wrench_command', self._on_command, COMMAND)
         self.create_subscription(JointState, 'generalized_command', self._on_generalized, COMMAND)
         self.create_subscription(JointTrajectory, 'joint_trajectory', self._on_trajectory, COMMAND)
         self.create_service(Trigger, '~/tare', self._on_tare)
+        self.create_service(SetBool, '~/pause', self._on_pause)
+        self.create_service(Trigger, '~/step', self._on_step)
+        self.create_service(Trigger, '~/reset', self._on_reset)
 
         self._joints = JointState(name=['insertion', 'rotation'])
         self._truth = JointState()
@@ -152,18 +211,46 @@ class PlantNode(NeedleNode):
         self._pose = PoseStamped()
         self._pose.header.frame_id = 'needle_entry'
         self._pose.pose.orientation.w = 1.0
+        self._shape = Marker(ns='needle', type=Marker.LINE_STRIP)
+        self._shape.header.frame_id = 'needle_entry'
+        self._shape.pose.orientation.w = 1.0
+        self._shape.scale.x = _THICKNESS
+        self._shape.color.r = self._shape.color.g = self._shape.color.b = 0.8
+        self._shape.color.a = 1.0
+        self._poses = PoseArray()
+        self._poses.header.frame_id = 'needle_entry'
 
     # Transitions.
 
     def configure(self) -> None:
         """Make the plant from the parameters."""
         self._settings = self.settings('', PlantSettings)
-        publishes = self.get_parameter('publish_clock').value
+        lockstep = bool(self.get_parameter('lockstep').value)
+        publishes = lockstep or bool(self.get_parameter('publish_clock').value)
         if publishes and self.get_parameter('use_sim_time').value:
             raise ParameterError(
-                'publish_clock and use_sim_time cannot both be true: the plant would follow its '
-                'own /clock'
+                f'{"lockstep" if lockstep else "publish_clock"} and use_sim_time cannot both be '
+                'true: the plant would follow its own /clock'
             )
+        mode = self.text('mode', MODES)
+        if lockstep and mode != 'simulation':
+            raise ParameterError(
+                'lockstep must be false but in mode simulation, where commands answer samples, '
+                f'got mode {mode!r}'
+            )
+        self._pace = Pace(
+            self._settings.rate,
+            self._settings.real_time_factor,
+            self._settings.backlog,
+            own=publishes,
+            lockstep=lockstep,
+        )
+        if mode == 'simulation' and self._settings.command_timeout < 1.0 / self._settings.rate:
+            raise ParameterError(
+                f'command_timeout must be at least a period, {1.0 / self._settings.rate:g} s, got '
+                f'{self._settings.command_timeout:g} s'
+            )
+        self._set_fault({})
         # Compile, or load what was compiled, before time counts.
         self._make_plant().advance()
         self._plant = self._make_plant()
@@ -173,7 +260,11 @@ class PlantNode(NeedleNode):
     def _make_plant(self) -> Plant | Indenter:
         settings, seed = self._settings, self.get_parameter('seed').value
         mode = self.text('mode', MODES)
-        sensor = ForceSensor(self.settings('sensor.', ForceSensorParameters), settings.rate, seed)
+        sensed = self.settings('sensor.', ForceSensorParameters)
+        sensor = ForceSensor(sensed, settings.rate, seed)
+        limits = sensed.per_axis('range').tolist()
+        # Rounding to counts may leave a saturated reading just below.
+        self._full_scale = [limit * (1.0 - 1e-9) for limit in limits]
         base = self.settings('base.', BaseParameters)
         tip = TipSensor(self.settings('tip.', TipParameters), settings.rate, seed)
         tissue = self.settings('indenter.', IndenterParameters)
@@ -202,62 +293,104 @@ class PlantNode(NeedleNode):
             self._clock_topic = None
 
     def change(self, changes: Mapping[str, Any]) -> None:
-        """Go on with other friction; the state stays."""
-        parameters = self.model_parameters(changes)
-        if isinstance(self._plant, Plant):
-            self._plant.integrator.change(parameters)
+        """Go on with other friction, or another fault; the state stays."""
+        if any(name.startswith('model.') for name in changes):
+            parameters = self.model_parameters(changes)
+            if isinstance(self._plant, Plant):
+                self._plant.integrator.change(parameters)
+        if any(name.startswith('fault.') for name in changes):
+            self._set_fault(changes)
+
+    def _set_fault(self, changes: Mapping[str, Any]) -> None:
+        """Let measurements suffer from what the parameters say."""
+        kind = self.text('fault.kind', (_NO_FAULT, *FAULTS), changes)
+        topic = self.text('fault.topic', tuple(_FAULTY), changes)
+        parameters = self.settings('fault.', FaultParameters, changes)
+        self._fault, self._faulty = None, topic
+        if kind != _NO_FAULT:
+            rate, seed = self._settings.rate, self.get_parameter('seed').value
+            self._fault = Fault(kind, parameters, rate, seed)
 
     def activate(self) -> None:
         """Begin to sample now."""
         self._halted = None
-        self._lost = self._waited = 0
-        rate, factor = self._settings.rate, self._settings.real_time_factor
-        # Several samples at a tick are well: no more ticks than in real time are needed.
-        tick = max(1.0 / (rate * factor), min(1.0 / rate, _TICK))
-        #: Most samples at one tick when simulated time may wait: a burst would overrun readers.
-        self._burst = ceil(2.0 * rate * factor * tick)
-        self._begin(self.get_clock().now().nanoseconds)
-        self._timer = self.create_timer(tick, self._on_timer)
-
-    def _begin(self, now: int) -> None:
-        """Let simulated time start at the node's now."""
-        #: Node's clock and simulated time that belong together [ns].
-        self._wall = self._start = now
-        self._sampled = 0
-        self._command_time = None
-
-    def _simulated(self) -> int:
-        """Return the simulated time now [ns]."""
-        elapsed = self.get_clock().now().nanoseconds - self._wall
-        return self._start + round(elapsed * self._settings.real_time_factor)
+        self._sampled = self._made_up = self._saturated = 0
+        self._rivals = 0
+        self._held = self._newest = _Command(0)
+        pictured = self._settings.rate * max(1.0, self._settings.real_time_factor)
+        #: Samples from one picture to the next.
+        self._picture = max(1, round(pictured / _PICTURES))
+        self._pace.begin(self._now())
+        if self.get_parameter('paused').value:
+            self._pace.pause()
+        self._timer = self.create_timer(self._pace.tick, self._on_timer)
+        steady = NodeClock(clock_type=ClockType.STEADY_TIME)
+        self._watch = self.create_timer(_WATCH, self._on_watch, clock=steady)
 
     def deactivate(self) -> None:
         """Stop sampling."""
         self.destroy_timer(self._timer)
+        self.destroy_timer(self._watch)
+
+    def _now(self) -> int:
+        return int(self.get_clock().now().nanoseconds)
 
     # Commands.
 
+    def _counts_from(self, header: Header) -> int | None:
+        """Return the time from which a command counts [ns]; None if it is not taken."""
+        if not self.is_active:
+            return None
+        self._commands.count()
+        now = self._pace.simulated(self._now())
+        stamp = int(header.stamp.sec) * NANOSECONDS + int(header.stamp.nanosec)
+        # Who has no clock leaves the stamp empty: it counts from now.
+        stamp = stamp or now
+        timeout = self._settings.command_timeout
+        age = (now - stamp) / NANOSECONDS
+        if abs(age) > timeout:
+            self._stale += 1
+            self.get_logger().error(
+                f'a command of {age:.3f} s ago is not taken: command_timeout is {timeout:g} s',
+                throttle_duration_sec=1.0,
+            )
+            return None
+        # A newer one from the future is one of before the clock was set back.
+        if stamp < self._newest.stamp <= now + timeout * NANOSECONDS:
+            self._overtaken += 1
+            return None
+        return stamp
+
     def _on_command(self, message: WrenchStamped) -> None:
+        stamp = self._counts_from(message.header)
+        if stamp is None:
+            return
         force, torque = message.wrench.force.y, message.wrench.torque.x
         limits = self._settings.force_limit, self._settings.torque_limit
+        frame = message.header.frame_id
+        if frame not in ('', 'needle_base'):
+            self._refuse(f'wrench_command must be in needle_base, got {frame!r}', stamp)
         # Written so that NaN is refused too.
-        if abs(force) <= limits[0] and abs(torque) <= limits[1]:
-            self._take(force, torque, None)
+        elif abs(force) <= limits[0] and abs(torque) <= limits[1]:
+            self._take(_Command(stamp, force, torque))
         else:
             self._refuse(
                 f'wrench_command must be within {limits[0]:g} N and {limits[1]:g} N m, got '
-                f'force.y = {force}, torque.x = {torque}'
+                f'force.y = {force}, torque.x = {torque}',
+                stamp,
             )
 
     def _on_generalized(self, message: JointState) -> None:
         settings, names = self._settings, self._truth.name
-        if not isinstance(self._plant, Plant):
+        stamp = self._counts_from(message.header)
+        if stamp is None or not isinstance(self._plant, Plant):
             return
         efforts = dict(zip(message.name, message.effort, strict=False))
         if sorted(message.name) != sorted(names) or len(message.effort) != len(names):
             self._refuse(
                 f'generalized_command needs an effort for each of {", ".join(names)}, got '
-                f'{list(message.effort)} for {", ".join(message.name) or "none"}'
+                f'{list(message.effort)} for {", ".join(message.name) or "none"}',
+                stamp,
             )
             return
         forces = [efforts[name] for name in names]
@@ -265,24 +398,28 @@ class PlantNode(NeedleNode):
         bounds = [*limits[:2], *limits[2:] * (len(names) - 2)]
         if all(abs(force) <= bound for force, bound in zip(forces, bounds, strict=True)):
             # Insertion makes d smaller.
-            self._take(-forces[0], forces[1], np.array(forces[2:]))
+            self._take(_Command(stamp, -forces[0], forces[1], np.array(forces[2:])))
         else:
             self._refuse(
                 f'generalized_command must be within {limits[0]:g} N, {limits[1]:g} N m and '
-                f'{limits[2]:g} N m^-1/2, got {forces}'
+                f'{limits[2]:g} N m^-1/2, got {forces}',
+                stamp,
             )
 
-    def _take(self, force: float, torque: float, modal: FloatArray | None) -> None:
-        """Apply a command from now on."""
-        self._force, self._torque, self._modal = force, torque, modal
-        if self.is_active:
-            self._command_time = self._simulated()
+    def _take(self, command: _Command) -> None:
+        """Let a command act from the next sample on."""
+        if self._rivals:
+            command = _Command(command.stamp)
+        self._newest = command
+        if self._pace.awaited is not None:
+            self._pace.answered(command.stamp)
+            self._on_timer()
 
-    def _refuse(self, complaint: str) -> None:
+    def _refuse(self, complaint: str, stamp: int) -> None:
         """Apply no force instead of a command."""
-        self._bad_commands += 1
+        self._refused += 1
         self.get_logger().error(f'{complaint}; no force is applied', throttle_duration_sec=1.0)
-        self._take(0.0, 0.0, None)
+        self._take(_Command(stamp))
 
     def _on_trajectory(self, message: JointTrajectory) -> None:
         points = message.points
@@ -298,131 +435,245 @@ class PlantNode(NeedleNode):
             self._plant.follow(
                 message.joint_names,
                 [
-                    point.time_from_start.sec + point.time_from_start.nanosec / _NANOSECONDS
+                    point.time_from_start.sec + point.time_from_start.nanosec / NANOSECONDS
                     for point in points
                 ],
                 [point.positions for point in points],
                 [point.effort for point in points],
             )
         except ParameterError as error:
-            self._bad_commands += 1
+            self._refused += 1
             self.get_logger().error(f'joint_trajectory: {error}')
 
-    def _on_tare(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    # Services.
+
+    def _answer(self, response: Any, what: str, act: Callable[[], str]) -> Any:
+        """Do what a service asks for, or say why not."""
         try:
             if self._plant is None or not self.is_active:
                 raise JobError('the plant is not active')
-            self._plant.tare()
-        except JobError as error:
-            response.message = f'tare refused: {error}'
-        else:
-            response.success, response.message = True, 'the force sensor is zeroed'
+            response.message = act()
+            response.success = True
+        except (JobError, ParameterError) as error:
+            response.message = f'{what} refused: {error}'
+        self.publish_diagnostics()
         return response
+
+    def _on_tare(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        def tare() -> str:
+            if self._plant is not None:
+                self._plant.tare()
+            return 'the force sensor is zeroed'
+
+        return self._answer(response, 'tare', tare)
+
+    def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+        def pause() -> str:
+            if request.data:
+                self._pace.pause()
+                return f'paused at {self._pace.stamp / NANOSECONDS:.6f} s'
+            self._pace.resume(self._now())
+            return 'time goes on'
+
+        return self._answer(response, 'pause', pause)
+
+    def _on_step(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        def step() -> str:
+            self._sample(self._pace.step(self._now()))
+            return f'stepped to {self._pace.stamp / NANOSECONDS:.6f} s'
+
+        return self._answer(response, 'step', step)
+
+    def _on_reset(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        def reset() -> str:
+            self._plant = self._make_plant()
+            self._held = self._newest = _Command(self._newest.stamp)
+            self._halted = None
+            self._set_fault({})
+            return 'needle and noise are at their start; time goes on'
+
+        return self._answer(response, 'reset', reset)
 
     # Samples.
 
     def _on_timer(self) -> None:
         """Take every sample that is due, each stamped with its own time."""
-        settings = self._settings
-        rate, factor = settings.rate, settings.real_time_factor
-        due = int((self._simulated() - self._start) * rate / _NANOSECONDS) - self._sampled
-        if self._start == 0 or due < 0:
-            # The first /clock has come, or the clock was set back: sample on from here.
-            self._begin(self.get_clock().now().nanoseconds)
-            return
-        beyond = due - max(1, int(settings.backlog * rate * factor))
-        if beyond > 0:
-            late = round(beyond / (rate * factor) * _NANOSECONDS)
-            self._wall += late
-            due -= beyond
-            if factor == 1.0:
-                # Time that was given up is skipped, and said on /diagnostics.
-                self._lost += beyond
-                self._start += late
-            else:
-                self._waited += late
-        if factor != 1.0:
-            due = min(due, self._burst)
+        due = self._pace.due(self._now())
+        self._made_up += max(0, due - 1)
         for _ in range(due):
-            self._sampled += 1
-            self._sample(self._start + round(self._sampled / rate * _NANOSECONDS))
-        if self._clock_topic is not None:
-            newest = self._start + round(self._sampled / rate * _NANOSECONDS)
-            self._clock_topic.publish(Clock(clock=_message(newest)))
+            self._sample(self._pace.take())
+
+    def _on_watch(self) -> None:
+        """Look who commands, and ask again for an answer that does not come."""
+        commanders = max(map(self.count_publishers, ('wrench_command', 'generalized_command')))
+        rivals = max(0, commanders - 1)
+        if rivals != self._rivals:
+            self._rivals = rivals
+            self._newest = _Command(self._newest.stamp)
+            if rivals:
+                self.get_logger().error(f'{commanders} nodes command; no force is applied')
+        self._looks = self._looks + 1 if self._pace.awaited is not None else 0
+        if self._looks and self._looks % _REPEAT == 0 and not self._pace.paused:
+            self._publish_joints(*self._last_joints)
+        self.report_change()
 
     def _sample(self, stamp: int) -> None:
-        plant = self._plant
+        plant, held = self._plant, self._held
+        if self._clock_topic is not None:
+            # Before the sample, so that who answers it has its time.
+            self._clock_topic.publish(Clock(clock=_message(stamp)))
         if plant is None or self._halted is not None:
             return
-        age = float('inf')
-        if self._command_time is not None:
-            age = (stamp - self._command_time) / _NANOSECONDS
-        if age > self._settings.command_timeout:
-            self._force, self._torque, self._modal = 0.0, 0.0, None
         try:
             sample = (
-                plant.advance(self._force, self._torque, self._modal)
+                plant.advance(held.force, held.torque, held.modal)
                 if isinstance(plant, Plant)
-                else plant.advance(self._force, self._torque)
+                else plant.advance(held.force, held.torque)
             )
         except NeedleError as error:
             self._halted = str(error)
             self.get_logger().error(f'{error}; the plant stands still')
             self.report_change()
             return
-        time = _message(stamp)
-        self._wrench.header.stamp = time
-        force, torque = self._wrench.wrench.force, self._wrench.wrench.torque
-        force.x, force.y, force.z, torque.x, torque.y, torque.z = sample.wrench.tolist()
-        self._base_wrench.publish(self._wrench)
+        self._sampled += 1
+        self._samples.count()
+        reading = sample.wrench.tolist()
+        for value, limit in zip(reading, self._full_scale, strict=True):
+            if abs(value) >= limit:
+                self._saturated += 1
+        self._pass('base_wrench', stamp, reading, self._publish_wrench)
         if isinstance(sample, Press):
-            self._show_press(sample, time)
+            self._show_press(sample, stamp)
         else:
-            self._show_needle(sample, stamp, time)
+            self._show_needle(sample, stamp)
+        # What is newest now acts until the next sample.
+        fresh = stamp - self._newest.stamp <= self._settings.command_timeout * NANOSECONDS
+        self._held = self._newest if fresh else _Command(self._newest.stamp)
 
-    def _show_needle(self, sample: Sample, stamp: int, time: TimeMessage) -> None:
-        state = sample.state
-        middle = len(state) // 2
-        joints, truth, tip = self._joints, self._truth, self._tip
-        for message in (joints, truth):
-            message.header.stamp = time
-        joints.position = [sample.joint_position, state[1]]
-        joints.velocity = [sample.speed, state[middle + 1]]
-        joints.effort = [sample.force, self._torque]
-        truth.position = state[:middle].tolist()
-        truth.velocity = state[middle:].tolist()
-        seen = sample.tip
-        if seen is not None:
-            late = round(seen.age / self._settings.rate * _NANOSECONDS)
-            tip.header.stamp = _message(stamp - late) if late else time
-            tip.point.y, tip.point.z = seen.depth, seen.deflection
-            self._tip_deflection.publish(tip)
-        self._ground_truth.publish(truth)
-        # Last: who answers it has the rest of the sample.
+    def _pass(
+        self,
+        topic: str,
+        stamp: int,
+        values: list[float],
+        publish: Callable[[int, list[float]], None],
+    ) -> None:
+        """Publish a measurement, or what a fault makes of it."""
+        if self._fault is None or topic != self._faulty:
+            publish(stamp, values)
+            return
+        for at, left in self._fault.leaves(stamp, values, _FAULTY[topic]):
+            publish(at, left)
+
+    def _publish_wrench(self, stamp: int, values: list[float]) -> None:
+        self._wrench.header.stamp = _message(stamp)
+        force, torque = self._wrench.wrench.force, self._wrench.wrench.torque
+        force.x, force.y, force.z, torque.x, torque.y, torque.z = values
+        self._base_wrench.publish(self._wrench)
+
+    def _publish_joints(self, stamp: int, values: list[float]) -> None:
+        joints = self._joints
+        joints.header.stamp = _message(stamp)
+        depth, speed, angle, angular_speed, force, torque = values
+        joints.position = [depth, angle]
+        joints.velocity = [speed, angular_speed]
+        joints.effort = [force, torque]
         self._joint_states.publish(joints)
 
-    def _show_press(self, sample: Press, time: TimeMessage) -> None:
+    def _publish_tip(self, stamp: int, values: list[float]) -> None:
+        self._tip.header.stamp = _message(stamp)
+        self._tip.point.z, self._tip.point.y = values
+        self._tip_deflection.publish(self._tip)
+
+    def _show_needle(self, sample: Sample, stamp: int) -> None:
+        state = sample.state.tolist()
+        middle = len(state) // 2
+        truth, seen = self._truth, sample.tip
+        if seen is not None:
+            late = round(seen.age / self._settings.rate * NANOSECONDS)
+            self._pass(
+                'tip_deflection', stamp - late, [seen.deflection, seen.depth], self._publish_tip
+            )
+        truth.header.stamp = _message(stamp)
+        truth.position = state[:middle]
+        truth.velocity = state[middle:]
+        self._ground_truth.publish(truth)
+        if self._sampled % self._picture == 0:
+            self._draw(sample, truth.header.stamp)
+        values = [
+            sample.joint_position, sample.speed, state[1], state[middle + 1],
+            sample.force, self._held.torque,
+        ]  # fmt: skip
+        self._last_joints = stamp, values
+        # Last: who answers it has the rest of the sample.
+        self._pass('joint_states', stamp, values, self._publish_joints)
+
+    def _draw(self, sample: Sample, time: TimeMessage) -> None:
+        """Show the shape of the needle, from its base through the entry point to its tip."""
+        if not isinstance(self._plant, Plant):
+            return
+        seen = self._needle_shape.get_subscription_count()
+        if not (seen or self._needle_poses.get_subscription_count()):
+            return
+        model = self._plant.integrator.model
+        points = model.shape(sample.state, _POINTS)
+        slopes = np.gradient(points[:, 1], points[:, 0])
+        outside = model.parameters.length - sample.depth
+        shape, poses = self._shape, self._poses
+        shape.header.stamp = poses.header.stamp = time
+        shape.points = [Point(y=-outside), *(Point(y=y, z=z) for y, z in points.tolist())]
+        self._needle_shape.publish(shape)
+        poses.poses = []
+        for (y, z), slope in zip(points.tolist(), np.arctan(slopes).tolist(), strict=True):
+            pose = Pose(position=Point(y=y, z=z))
+            # Along the needle is y of the pose.
+            pose.orientation.x, pose.orientation.w = sin(0.5 * slope), cos(0.5 * slope)
+            poses.poses.append(pose)
+        self._needle_poses.publish(poses)
+
+    def _show_press(self, sample: Press, stamp: int) -> None:
         position = self._pose.pose.position
-        self._pose.header.stamp = time
+        self._pose.header.stamp = _message(stamp)
         position.x, position.y, position.z = sample.position.tolist()
         self._end_effector_pose.publish(self._pose)
 
     def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
-        """Say where the needle is and what went wrong."""
+        """Say where the needle is, how time goes, and what went wrong."""
         if self._plant is None:
             return super().diagnose()
+        pace, rate = self._pace, self._settings.rate
+        samples, commands = self._samples.rate, self._commands.rate
         values: dict[str, object] = {
             **self._plant.report,
-            'samples given up': self._lost,
-            'waited for the machine [s]': f'{self._waited / _NANOSECONDS:.3f}',
-            'commands refused': self._bad_commands,
+            'real-time factor': f'{samples / rate:.3f}',
+            'commands per second [Hz]': f'{commands:.1f}',
+            'samples made up after stalls': self._made_up,
+            'samples given up': pace.lost,
+            'waited for the machine [s]': f'{pace.waited / NANOSECONDS:.3f}',
+            'commands refused': self._refused,
+            'commands too old': self._stale,
+            'commands overtaken': self._overtaken,
+            'saturated readings': self._saturated,
         }
+        if not self.is_active:
+            return *super().diagnose()[:2], values
         if self._halted:
             return DiagnosticStatus.ERROR, self._halted, values
-        if self._lost:
-            return DiagnosticStatus.WARN, f'{self._lost} samples given up after stalls', values
-        level, message, _ = super().diagnose()
-        return level, message, values
+        if self._rivals:
+            return DiagnosticStatus.ERROR, f'{self._rivals + 1} nodes command', values
+        warnings = []
+        if pace.paused:
+            warnings.append(f'paused at {pace.stamp / NANOSECONDS:.6f} s')
+        if self._looks >= _REPEAT:
+            warnings.append(f'no command answers the sample of {pace.stamp / NANOSECONDS:.6f} s')
+        if pace.lost:
+            warnings.append(f'{pace.lost} samples given up after stalls')
+        if commands > _TOO_MANY * max(samples, rate):
+            warnings.append(f'{commands:.0f} commands come per second for {samples:.0f} samples')
+        if self._fault is not None:
+            warnings.append(f'{self._faulty} has the fault {self.text("fault.kind")}')
+        if warnings:
+            return DiagnosticStatus.WARN, '; '.join(warnings), values
+        return *super().diagnose()[:2], values
 
 
 def main() -> int:

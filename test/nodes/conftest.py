@@ -41,5 +41,5 @@ class RosGraph(Graph):
 @pytest.fixture
 def ros_graph(tmp_path: Path) -> Iterator[RosGraph]:
     """Return a graph for one test."""
-    with RosGraph(tmp_path / 'logs', SingleThreadedExecutor) as graph:
+    with RosGraph(tmp_path / 'logs') as graph:
         yield graph

@@ -72,6 +72,7 @@ class Bench:
         self.until(
             lambda: (
                 self.wrenches
+                and (self.states or self.poses)
                 and self.commands.get_subscription_count()
                 and self.course.get_subscription_count()
                 and self.tare.service_is_ready()
@@ -273,7 +274,21 @@ def test_bad_parameters_end_the_process_with_one_line(ros_graph, parameters, com
             {'base.encoder_resolution': -1},
             'base.encoder_resolution must be finite, >= 0 m, got -1.0',
         ),
-        ({'real_time_factor': 0}, 'real_time_factor must be finite, > 0 and <= 100, got 0.0'),
+        ({'real_time_factor': -1}, 'real_time_factor must be finite, >= 0 and <= 100, got -1.0'),
+        (
+            {'lockstep': True, 'use_sim_time': True},
+            'lockstep and use_sim_time cannot both be true: the plant would follow its own',
+        ),
+        (
+            {'lockstep': True, 'mode': 'robot'},
+            'lockstep must be false but in mode simulation, where commands answer samples, got',
+        ),
+        (
+            {'rate': 5.0},
+            'command_timeout must be at least a period, 0.2 s, got 0.1 s',
+        ),
+        ({'fault.kind': 'bad luck'}, 'fault.kind must be one of none, drop, delay, duplicate'),
+        ({'fault.topic': 'clock'}, 'fault.topic must be one of joint_states, base_wrench'),
         (
             {'mode': 'indenter', 'indenter.stiffness_xx': [1000.0]},
             'indenter.stiffness_xx must be a list with one value for each of the force_levels',

@@ -1,0 +1,308 @@
+"""Manners of the simulated plant: pause, step, reset, lock-step, stamps of commands, faults."""
+
+from geometry_msgs.msg import PointStamped, PoseArray, WrenchStamped
+from needle_dynamics import NeedleModel, NeedleParameters
+from needle_dynamics.base_node import COMMAND, SENSOR
+from needle_dynamics.plant_node import PlantNode
+import numpy as np
+import pytest
+from rclpy.parameter import Parameter
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import JointState
+from std_srvs.srv import SetBool, Trigger
+from visualization_msgs.msg import Marker
+
+RATE = {'rate': 200.0}
+PERIOD = 5_000_000
+
+
+def stamp_ns(message):
+    """Return the stamp of a message in nanoseconds."""
+    return message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec
+
+
+class Bench:
+    """A plant in this process, with a probe that listens, commands and calls its services."""
+
+    def __init__(self, ros_graph, **parameters):
+        self.graph = ros_graph
+        self.probe = ros_graph.node('probe')
+        #: Force with which each sample is answered; None: not at all.
+        self.force = None
+        self.states = []
+        self.probe.create_subscription(JointState, 'joint_states', self.on_state, SENSOR)
+        self.wrenches = ros_graph.listen(self.probe, WrenchStamped, 'base_wrench', SENSOR)
+        self.tips = ros_graph.listen(self.probe, PointStamped, 'tip_deflection', SENSOR)
+        self.commands = self.probe.create_publisher(WrenchStamped, 'wrench_command', COMMAND)
+        self.services = {
+            name: self.probe.create_client(kind, f'plant/{name}')
+            for name, kind in (('pause', SetBool), ('step', Trigger), ('reset', Trigger))
+        }
+        self.plant = ros_graph.add(PlantNode, parameters={**RATE, **parameters})
+        self.until(
+            lambda: (
+                self.commands.get_subscription_count()
+                and all(client.service_is_ready() for client in self.services.values())
+            ),
+            'discovery',
+        )
+
+    def on_state(self, message):
+        """Keep a sample, and answer it."""
+        self.states.append(message)
+        if self.force is not None:
+            self.command(self.force, stamp=message.header.stamp)
+
+    def command(self, force, stamp=None, frame=''):
+        """Publish a command."""
+        message = WrenchStamped()
+        message.header.frame_id = frame
+        if stamp is not None:
+            message.header.stamp = stamp
+        message.wrench.force.y = force
+        self.commands.publish(message)
+
+    def until(self, condition, what):
+        """Spin until a condition holds."""
+        self.graph.spin_until(condition, what)
+
+    def further(self, count):
+        """Spin until there are so many more samples; return them."""
+        seen = len(self.states)
+        self.until(lambda: len(self.states) >= seen + count, 'samples')
+        return self.states[seen:]
+
+    def call(self, name, data=None):
+        """Call a service; return whether it was granted and what it said."""
+        request = Trigger.Request() if data is None else SetBool.Request(data=data)
+        answer = self.services[name].call_async(request)
+        self.until(answer.done, 'the answer')
+        return answer.result().success, answer.result().message
+
+    def set(self, **values):
+        """Change parameters."""
+        parameters = [
+            Parameter(name.replace('__', '.'), value=value) for name, value in values.items()
+        ]
+        changed = self.plant.set_parameters_atomically(parameters)
+        assert changed.successful, changed.reason
+
+    def counts(self, name):
+        """Return a figure of the diagnostics."""
+        return self.plant.diagnose()[2][name]
+
+    def quiet(self):
+        """Spin until nothing has come for ten periods."""
+        for _ in range(100):
+            seen = len(self.states)
+            for _ in range(10):
+                self.graph.executor.spin_once(timeout_sec=PERIOD * 1e-9)
+            if len(self.states) == seen:
+                return
+        pytest.fail('samples come all the time')
+
+
+def test_a_command_acts_from_the_sample_after_it(ros_graph):
+    """The answer to sample k moves the needle from k + 1 to k + 2: one period of delay."""
+    bench = Bench(ros_graph, lockstep=True, **{'model.preset': 'paper_mm'})
+    forces = {}
+
+    def answer(message):
+        # Friction is settled within microseconds: the speed tells the force.
+        k = round(stamp_ns(message) / PERIOD)
+        forces[k] = 0.56 + 3.0 * (1 + k % 5)
+        bench.command(forces[k], stamp=message.header.stamp)
+
+    bench.on_state = answer
+    bench.probe.create_subscription(JointState, 'joint_states', answer, SENSOR)
+    bench.until(lambda: len(bench.states) >= 50, 'samples')
+    for message in bench.states[5:]:
+        k = round(stamp_ns(message) / PERIOD)
+        assert message.velocity[0] == pytest.approx((forces[k - 2] - 0.56) / 300.0, rel=1e-9)
+
+
+def test_in_a_pause_time_stands_and_steps_are_single_samples(ros_graph):
+    """Nothing comes in a pause but what is asked for; time goes on where it stood."""
+    bench = Bench(ros_graph, publish_clock=True)
+    clocks = ros_graph.listen(bench.probe, Clock, '/clock', SENSOR)
+    bench.further(20)
+    assert bench.call('step') == (False, 'step refused: time goes on; pause first')
+    granted, said = bench.call('pause', data=True)
+    assert granted
+    assert said.startswith('paused at ')
+    bench.quiet()
+    assert 'paused at' in bench.plant.diagnose()[1]
+    before = stamp_ns(bench.states[-1])
+    for k in (1, 2, 3):
+        seen = len(bench.states)
+        assert bench.call('step')[0]
+        bench.until(lambda seen=seen: len(bench.states) > seen, 'the sample')
+        assert stamp_ns(bench.states[-1]) == before + k * PERIOD
+        assert len(bench.states) == seen + 1
+    assert bench.call('pause', data=False) == (True, 'time goes on')
+    first = bench.further(20)[0]
+    assert stamp_ns(first) == before + 4 * PERIOD
+    last = bench.states[-1].header.stamp
+    bench.until(lambda: any(message.clock == last for message in clocks), 'its time')
+
+
+def test_it_may_begin_paused(ros_graph):
+    """With `paused` nothing comes before time is let go on."""
+    bench = Bench(ros_graph, paused=True)
+    bench.quiet()
+    assert not bench.states
+    bench.call('pause', data=False)
+    bench.further(10)
+
+
+def test_reset_puts_the_needle_back_while_time_goes_on(ros_graph):
+    """Depth, speed and noise are those of the start, stamps never go back, and it is not held."""
+    bench = Bench(ros_graph, lockstep=True, paused=True, tip_deflection=5e-4)
+    bench.force = 3.56
+    bench.call('pause', data=False)
+    bench.until(lambda: bench.states and bench.states[-1].position[0] > 0.0225, 'motion')
+    bench.call('pause', data=True)
+    bench.quiet()
+    assert bench.call('reset')[0]
+    moved, before = len(bench.states), bench.states[-1]
+    begun = len(bench.wrenches)
+    bench.call('pause', data=False)
+    bench.until(lambda: len(bench.wrenches) >= begun + 40, 'samples')
+    assert stamp_ns(bench.states[moved]) == stamp_ns(before) + PERIOD
+    assert bench.states[moved].position[0] == bench.states[0].position[0]
+    again = [(m.wrench.force.y, m.wrench.force.z) for m in bench.wrenches[begun : begun + 40]]
+    first = [(m.wrench.force.y, m.wrench.force.z) for m in bench.wrenches[:40]]
+    assert again == first
+
+
+def test_reset_revives_a_plant_that_stands_still(ros_graph):
+    """A needle that left the tissue is back in it."""
+    bench = Bench(ros_graph, depth=0.002)
+    bench.force = -3.0
+    bench.until(lambda: 'minimum_depth' in bench.plant.diagnose()[1], 'the end')
+    bench.force = 0.0
+    bench.quiet()
+    assert bench.call('reset')[0]
+    # As the state has it: 0.2 m less 0.198 m.
+    assert bench.further(5)[-1].position[0] == pytest.approx(0.002, abs=1e-15)
+
+
+def test_services_of_a_plant_that_is_not_active_are_refused(ros_graph):
+    """Each says why."""
+    bench = Bench(ros_graph)
+    bench.plant.trigger_deactivate()
+    for name, data in (('pause', True), ('step', None), ('reset', None)):
+        assert bench.call(name, data) == (False, f'{name} refused: the plant is not active')
+
+
+def test_in_lockstep_the_plant_waits_and_says_for_what(ros_graph):
+    """Without an answer time stands, the sample is repeated, and the diagnostics tell."""
+    bench = Bench(ros_graph, lockstep=True)
+    bench.until(lambda: len(bench.states) >= 2, 'the repeated sample')
+    assert {stamp_ns(message) for message in bench.states} == {PERIOD}
+    bench.until(
+        lambda: 'no command answers the sample of 0.005000 s' in bench.plant.diagnose()[1],
+        'the warning',
+    )
+    bench.force = 0.0
+    bench.further(20)
+    assert stamp_ns(bench.states[-1]) > 15 * PERIOD
+
+
+def test_as_fast_as_possible_is_faster_than_real_time(ros_graph):
+    """With a factor of 0 thirty seconds pass in fewer, by the plant's own account."""
+    probe = ros_graph.node('probe')
+    clock = ros_graph.latest(probe, Clock, '/clock', SENSOR)
+    ros_graph.start('plant', {'rate': 100.0, 'real_time_factor': 0.0, 'publish_clock': True})
+    ros_graph.spin_until(lambda: clock.message, '/clock', timeout=60.0)
+    begin, first = probe.get_clock().now(), clock.message.clock.sec
+    ros_graph.spin_until(lambda: clock.message.clock.sec > first + 30, '30 s')
+    assert (probe.get_clock().now() - begin).nanoseconds < 15e9
+
+
+def test_a_command_that_was_overtaken_is_not_taken(ros_graph):
+    """What is older than a newer command came too late."""
+    bench = Bench(ros_graph, command_timeout=60.0)
+    *_, earlier, newest = bench.further(10)
+    bench.command(0.0, stamp=newest.header.stamp)
+    # Only the newest message waits for the plant.
+    bench.further(20)
+    bench.command(3.56, stamp=earlier.header.stamp)
+    bench.until(lambda: bench.counts('commands overtaken') == 1, 'the refusal')
+    assert not any(message.velocity[0] for message in bench.further(20))
+
+
+def test_stale_and_foreign_commands_do_not_move_it(ros_graph):
+    """What is older than the timeout or in another frame is no force."""
+    bench = Bench(ros_graph)
+    bench.further(5)
+    old = bench.states[-1].header.stamp
+    bench.further(40)
+    # 40 samples are 0.2 s; command_timeout is 0.1 s.
+    bench.command(3.56, stamp=old)
+    bench.until(lambda: bench.counts('commands too old') == 1, 'the refusal')
+    bench.command(3.56, frame='needle_tip')
+    bench.until(lambda: bench.counts('commands refused') == 1, 'the refusal')
+    assert not any(message.velocity[0] for message in [*bench.states, *bench.further(20)])
+    bench.force = 3.56
+    bench.until(lambda: bench.states[-1].position[0] > 0.0201, 'motion')
+
+
+def test_two_commanders_are_none(ros_graph):
+    """While another node commands too no force is applied, and the diagnostics say so."""
+    bench = Bench(ros_graph)
+    bench.force = 3.56
+    bench.until(lambda: bench.states and bench.states[-1].velocity[0] > 0.0, 'motion')
+    other = bench.probe.create_publisher(WrenchStamped, 'wrench_command', COMMAND)
+    bench.until(lambda: bench.plant.diagnose()[1] == '2 nodes command', 'the error')
+    bench.until(lambda: bench.states[-1].velocity[0] == 0.0, 'rest')
+    assert not any(message.velocity[0] for message in bench.further(20))
+    bench.probe.destroy_publisher(other)
+    bench.until(lambda: bench.states[-1].velocity[0] > 0.0, 'motion')
+
+
+def test_its_shape_is_that_of_the_model(ros_graph):
+    """The line runs from the base through the entry point to the tip; the poses lie along it."""
+    bench = Bench(ros_graph, depth=0.1, tip_deflection=0.005, **{'model.tissue_damping': 0.0})
+    shapes = ros_graph.listen(bench.probe, Marker, 'needle_shape', SENSOR)
+    poses = ros_graph.listen(bench.probe, PoseArray, 'needle_poses', SENSOR)
+    truth = ros_graph.listen(bench.probe, JointState, 'ground_truth', SENSOR)
+    bench.until(lambda: len(shapes) >= 3 and len(poses) >= 3, 'shapes')
+    states = {stamp_ns(m): [*m.position, *m.velocity] for m in truth}
+    shape, line = next(
+        (m, p) for m in shapes for p in poses if stamp_ns(m) == stamp_ns(p) in states
+    )
+    model = NeedleModel(NeedleParameters.preset('phantom'))
+    state = states[stamp_ns(shape)]
+    points = np.array([[p.y, p.z] for p in shape.points])
+    assert points[0] == pytest.approx([-0.1, 0.0])
+    assert points[1:] == pytest.approx(model.shape(state, len(points) - 1), abs=1e-15)
+    assert points[-1] == pytest.approx([0.1, model.tip_deflection(state)])
+    assert [(p.position.y, p.position.z) for p in line.poses] == [tuple(p) for p in points[1:]]
+    # The pose's y is along the needle, to the second order of the distance of 5 mm.
+    tip, before = line.poses[-1], line.poses[-2]
+    turn = 2.0 * np.arctan2(tip.orientation.x, tip.orientation.w)
+    rise = (tip.position.z - before.position.z) / (tip.position.y - before.position.y)
+    assert np.tan(turn) == pytest.approx(rise, rel=1e-6)
+    assert (shape.header.frame_id, line.header.frame_id) == ('needle_entry', 'needle_entry')
+
+
+def test_faults_may_come_and_go_while_it_runs(ros_graph):
+    """A fault hits its stream alone, is told, and ends when it is taken back."""
+    bench = Bench(ros_graph)
+    bench.further(5)
+    bench.set(fault__kind='bias', fault__topic='base_wrench', fault__size=20.0)
+    bench.until(lambda: bench.wrenches[-1].wrench.force.x > 15.0, 'the bias')
+    assert 'base_wrench has the fault bias' in bench.plant.diagnose()[1]
+    bench.set(fault__kind='nan', fault__topic='joint_states')
+    bench.until(lambda: np.isnan(bench.states[-1].position[0]), 'the fault')
+    bench.until(lambda: abs(bench.wrenches[-1].wrench.force.x) < 1.0, 'the end of the bias')
+    bench.set(fault__kind='drop', fault__topic='tip_deflection')
+    # What was on its way.
+    bench.further(20)
+    dropped = len(bench.tips)
+    bench.further(20)
+    assert len(bench.tips) == dropped
+    bench.set(fault__kind='none')
+    bench.until(lambda: len(bench.tips) > dropped + 10, 'the tip')
+    assert bench.plant.diagnose()[1] == 'active'
