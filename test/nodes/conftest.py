@@ -9,7 +9,6 @@ from typing import Any
 from needle_dynamics.base_node import NeedleNode
 from needle_insertion.graph import Graph
 import pytest
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
