@@ -21,6 +21,7 @@ from needle_controller.modal import DeflectionLaw, DeflectionLoop, ModalLoop, No
 from needle_controller.observer import Consistency, Observer, ObserverSettings
 from needle_controller.pid import ANTI_WINDUP, Pid, PidGains
 from needle_controller.reference import MinimumJerk, ReferenceLimits, REFERENCES, Trapezoid
+from needle_controller.safety import Guard, Refusal, Safety, SafetyLimits, Stream
 from needle_controller.stability import (
     check_stability,
     deflection_matrix,
@@ -47,6 +48,7 @@ __all__ = [
     'ControllerSettings',
     'DeflectionLaw',
     'DeflectionLoop',
+    'Guard',
     'InverseDynamics',
     'InverseDynamicsGains',
     'Law',
@@ -60,9 +62,13 @@ __all__ = [
     'Pid',
     'PidGains',
     'ReferenceLimits',
+    'Refusal',
     'Response',
+    'Safety',
+    'SafetyLimits',
     'SampledLoop',
     'Setpoint',
+    'Stream',
     'Trapezoid',
     'check_stability',
     'closed_loop',

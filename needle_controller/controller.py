@@ -391,12 +391,18 @@ class Controller:
         self._stopped = True
         self._bending, self._bending_due = None, True
 
+    def _gap(self, before: Measurement | None, measured: Measurement) -> float:
+        """Return the time between measurements [s] if it is too long, or negative; else zero."""
+        elapsed = measured.time - before.time if before is not None else 0.0
+        most = self._settings.measurement_timeout + self._period
+        return 0.0 if 0.0 <= elapsed <= most else elapsed
+
     def _fault(self, measured: Measurement) -> str | None:
         """Return why a measurement cannot be answered."""
         if not measured.is_finite():
             return f'joint_states must be finite, got {measured}'
         before, self._seen = self._seen, measured
-        if before is not None:
+        if before is not None and not self._gap(before, measured):
             elapsed = measured.time - before.time
             moved = measured.depth - before.depth
             explained = 0.5 * (before.speed + measured.speed) * elapsed
@@ -436,14 +442,20 @@ class Controller:
         -------
         Command
             Zero force while there is no target, or with the fault that a measurement has: it is
-            not finite, has moved by more than its speed explains, or is out of range.
+            not finite, has moved by more than its speed explains, or is out of range. After a
+            gap, or a step back in time, the motion starts anew from where the needle is.
 
         """
         at_rest = np.zeros(len(bend[0])) if self._modal is not None and bend else None
+        gap = self._gap(self._seen, measured)
+        notice = None
+        if gap:
+            if self.guide.moves:
+                notice = f'measurements went on after {gap:.3f} s; the motion starts anew'
+            self.release()
         fault = self._fault(measured)
         if fault is None and self._modal is not None and bend is None:
             fault = 'deflections are not known'
-        notice = None
         if fault is not None:
             self.release()
         else:
@@ -479,12 +491,17 @@ class Controller:
             )
             forces = self._modal.command(state, ahead, Setpoint(0.0), wanted)
             return Command(
-                force=float(forces[0]), torque=float(forces[1]), setpoint=now, modal=forces[2:]
+                force=float(forces[0]),
+                torque=float(forces[1]),
+                setpoint=now,
+                modal=forces[2:],
+                notice=notice,
             )
         return Command(
             force=self._insertion.command(measured.depth, measured.speed, ahead, load),
             torque=self._rotation.command(measured.angle, measured.angular_speed, Setpoint(0.0)),
             setpoint=now,
+            notice=notice,
         )
 
     def _wanted(self, time: float, later: float, now: FloatArray) -> FloatArray:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 import sys
+from time import monotonic
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -23,6 +24,16 @@ from needle_controller.inverse_dynamics import InverseDynamicsGains
 from needle_controller.observer import Observer, ObserverSettings
 from needle_controller.pid import PidGains
 from needle_controller.reference import ReferenceLimits, REFERENCES
+from needle_controller.safety import (
+    BY_HAND,
+    DROPPED,
+    NANOSECONDS,
+    read_encoders,
+    REPEATED,
+    Safety,
+    SafetyLimits,
+    SENSORS,
+)
 from needle_dynamics import (
     FloatArray,
     ForceSensorParameters,
@@ -35,13 +46,14 @@ from needle_dynamics.base_node import COMMAND, NeedleNode, run, SENSOR
 from needle_dynamics.plant import joint_values
 import numpy as np
 from rcl_interfaces.msg import ParameterDescriptor
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
 from rclpy.subscription import Subscription
+from rclpy.time import Time
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
 from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import JointTrajectory
-
-_NANOSECONDS = 1_000_000_000
 
 _WAITING = 'no joint_states yet'
 
@@ -76,7 +88,7 @@ def _observer_defaults() -> ObserverSettings:
 
 
 def _stamp(header: Header) -> int:
-    return int(header.stamp.sec) * _NANOSECONDS + int(header.stamp.nanosec)
+    return int(header.stamp.sec) * NANOSECONDS + int(header.stamp.nanosec)
 
 
 class ControllerNode(NeedleNode):
@@ -88,12 +100,15 @@ class ControllerNode(NeedleNode):
 
     ``target`` (point.y [m]) is the inserted length to reach, ``joint_trajectory`` (joint
     `insertion`: positions, and speeds or none) a path to follow. Before the first of them, while
-    measurements are stale, jump or are not finite, and after ``~/emergency_stop`` the command is
-    zero. ``~/pause`` brakes the reference and holds it, ``~/retract`` goes to ``retract_depth``.
+    measurements are stale, jump or are not finite, while another node commands too, and after
+    ``~/emergency_stop`` or beyond a limit, until ``~/clear_stop``, the command is zero. It carries
+    the stamp of the measurement that it answers; one that answers none is of now.
+    ``~/pause`` brakes the reference and holds it, ``~/retract`` goes to ``retract_depth``.
     ``reference`` and ``tracking_error`` show what it aims at and how far off it is.
 
     What the bending adds to the insertion force comes from an observer that takes in
-    ``tip_deflection`` and ``base_wrench``, as far as these come.
+    ``tip_deflection`` and ``base_wrench``, as far as these come. Both are held against the limits
+    in any case.
     """
 
     LIVE = frozenset(
@@ -134,6 +149,7 @@ class ControllerNode(NeedleNode):
         )
         self.declare_settings('', ControllerSettings())
         self.declare_settings('reference.', ReferenceLimits())
+        self.declare_settings('safety.', SafetyLimits())
         self.declare_settings('observer.', _observer_defaults())
         for law, axes in _GAINS.items():
             for axis, gains in axes.items():
@@ -143,18 +159,18 @@ class ControllerNode(NeedleNode):
         self._controller: Controller | None = None
         self._observer: Observer | None = None
         self._settings = ControllerSettings()
+        self._safety = Safety(SafetyLimits(), self._settings, NeedleParameters())
         self._load = 0.0
         #: Deflections and rates that the ground truth last had, and its stamp.
         self._truth: tuple[int, tuple[FloatArray, FloatArray]] | None = None
-        #: Measurement that waits for the ground truth of its time.
+        self._truths: Subscription | None = None
+        #: Measurement that waits for the ground truth of its time, and looks that found one.
         self._pending: tuple[int, Measurement, JointState] | None = None
+        self._waits = 0
         #: Stamp, lateral force and moment of the last wrench that no measurement has taken.
         self._wrench_now: tuple[int, float, float] | None = None
         self._is_modal = False
         self._fault: str | None = None
-        self._stopped = False
-        self._last_stamp = 0
-        self._arrived = 0
         #: Measurements answered, those too late for the delay, and the age of the oldest [s].
         self._answered = self._late = 0
         self._oldest = 0.0
@@ -169,12 +185,15 @@ class ControllerNode(NeedleNode):
         self.create_subscription(JointState, 'joint_states', self._on_joint_states, SENSOR)
         self.create_subscription(PointStamped, 'target', self._on_target, COMMAND)
         self.create_subscription(JointTrajectory, 'joint_trajectory', self._on_trajectory, COMMAND)
+        self.create_subscription(WrenchStamped, 'base_wrench', self._on_wrench, SENSOR)
+        self.create_subscription(PointStamped, 'tip_deflection', self._on_tip, SENSOR)
         self.create_service(Trigger, '~/emergency_stop', self._on_emergency_stop)
         self.create_service(Trigger, '~/clear_stop', self._on_clear_stop)
         self.create_service(SetBool, '~/pause', self._on_pause)
         self.create_service(Trigger, '~/retract', self._on_retract)
-        #: Subscriptions to what the bending is known from.
-        self._senses: list[Subscription] = []
+        self._commands = (self._wrench_command, self._generalized_command)
+        #: One that stands still or jumps does not take the watchdog along.
+        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
 
         self._wrench = WrenchStamped()
         self._wrench.header.frame_id = 'needle_base'
@@ -208,20 +227,28 @@ class ControllerNode(NeedleNode):
         self._is_modal = actuation == 'modal'
         self._retract_depth({})
         self._take_model(parameters)
-        senses: list[tuple[type, str, Any]] = []
+        noise: dict[str, tuple[float, ...]] = {}
         if feedback == 'ground_truth':
-            senses = [(JointState, 'ground_truth', self._on_ground_truth)]
+            self._truths = self.create_subscription(
+                JointState, 'ground_truth', self._on_ground_truth, SENSOR
+            )
         elif feedback == 'observer':
             observed = self.settings('observer.', ObserverSettings)
             try:
                 self._observer = Observer(parameters, observed, 1.0 / self._settings.rate)
             except ParameterError as error:
                 raise ParameterError(f'observer.{error}') from error
-            senses = [
-                (PointStamped, 'tip_deflection', self._on_tip),
-                (WrenchStamped, 'base_wrench', self._on_wrench),
-            ]
-        self._senses = [self.create_subscription(*sense, SENSOR) for sense in senses]
+            noise['base_wrench'] = observed.force_noise, observed.torque_noise
+            noise['tip_deflection'] = (observed.tip_noise,)
+        stop = self._safety.stop
+        self._safety = Safety(
+            self.settings('safety.', SafetyLimits),
+            self._settings,
+            parameters,
+            expected=SENSORS if feedback == 'observer' else (),
+            noise=noise,
+        )
+        self._safety.stop = stop
 
     def _gains(
         self, law: str, kind: type[Any], changes: Mapping[str, Any] | None = None
@@ -261,24 +288,42 @@ class ControllerNode(NeedleNode):
         self._take_model(parameters)
 
     def cleanup(self) -> None:
-        """Forget the bending and who tells of it."""
-        self._load, self._truth, self._observer = 0.0, None, None
-        for sense in self._senses:
-            self.destroy_subscription(sense)
-        self._senses = []
+        """Forget the controller, the bending and who tells of it."""
+        self._controller = self._observer = self._truth = None
+        self._load = 0.0
+        if self._truths is not None:
+            self.destroy_subscription(self._truths)
+            self._truths = None
 
     def activate(self) -> None:
         """Begin to answer measurements and to watch for their absence."""
         self._fault = _WAITING
-        self._arrived = self._last_stamp = 0
         self._answered = self._late = 0
         self._oldest = 0.0
+        self._begin()
+        self._count_commanders()
+        self._watchdog = self.create_timer(
+            min(0.1, 0.5 * self._settings.measurement_timeout),
+            self._on_watchdog,
+            clock=self._steady,
+        )
+
+    def _begin(self) -> None:
+        """Know nothing of what was measured."""
+        self._safety.begin(self.get_clock().now().nanoseconds)
+        self._load, self._truth = 0.0, None
         self._pending = self._wrench_now = None
         if self._observer is not None:
             self._observer.reset()
-        self._watchdog = self.create_timer(
-            0.5 * self._settings.measurement_timeout, self._on_watchdog
-        )
+
+    def _now(self) -> int:
+        """Return the time [ns]; let go and know nothing if it was set back."""
+        now = self.get_clock().now().nanoseconds
+        back = self._safety.clock_went_back(now)
+        if back:
+            self._begin()
+            self._let_go(f'clock went back by {back:.3f} s')
+        return now
 
     def deactivate(self) -> None:
         """Let go: zero force, and no memory of the motion nor of its target."""
@@ -296,8 +341,33 @@ class ControllerNode(NeedleNode):
         self.get_logger().error(complaint)
         self.publish_diagnostics()
 
+    def _takes(self, name: str, header: Header) -> bool:
+        """Return whether a wish of the user counts; say why if it does not."""
+        if self._controller is None or not self.is_active:
+            self._refuse(f'{name} refused: the controller is not active')
+            return False
+        refusal = self._safety.streams[name].check(_stamp(header), self._now(), header.frame_id)
+        if refusal is not None and refusal.kind not in (REPEATED, DROPPED):
+            self._refuse(f'{name} refused: {refusal.line}')
+        return refusal is None
+
+    def _counts(self, name: str, header: Header, values: Sequence[float]) -> bool:
+        """Return whether a reading of a sensor counts; say once a second why if it does not."""
+        refusal = self._safety.streams[name].check(
+            _stamp(header), self._now(), header.frame_id, values
+        )
+        if refusal is not None and refusal.kind not in (REPEATED, DROPPED):
+            self._warn(f'{name} {refusal.kind}', f'{refusal.line}; not taken in')
+        return refusal is None
+
+    def _warn(self, kind: str, line: str) -> None:
+        """Say something of a kind at most once a second."""
+        if self._safety.due(kind, monotonic()):
+            self.get_logger().warning(line)
+            self.publish_diagnostics()
+
     def _on_target(self, message: PointStamped) -> None:
-        if self._controller is None:
+        if self._controller is None or not self._takes('target', message.header):
             return
         try:
             self._controller.set_target(message.point.y, message.point.z)
@@ -312,11 +382,11 @@ class ControllerNode(NeedleNode):
             )
 
     def _on_trajectory(self, message: JointTrajectory) -> None:
-        if self._controller is None:
+        if self._controller is None or not self._takes('joint_trajectory', message.header):
             return
         points, names = message.points, message.joint_names
         times = [
-            point.time_from_start.sec + point.time_from_start.nanosec / _NANOSECONDS
+            point.time_from_start.sec + point.time_from_start.nanosec / NANOSECONDS
             for point in points
         ]
         try:
@@ -332,27 +402,40 @@ class ControllerNode(NeedleNode):
             self._refuse(f'joint_trajectory refused: {error}')
 
     def _on_tip(self, message: PointStamped) -> None:
-        if self._observer is not None and self.is_active:
-            self._observer.add_tip(_stamp(message.header) / _NANOSECONDS, message.point.z)
+        deflection = message.point.z
+        if not self.is_active or not self._counts('tip_deflection', message.header, [deflection]):
+            return
+        self._stop_for(self._safety.guard.tip(deflection))
+        if self._observer is not None:
+            self._observer.add_tip(_stamp(message.header) / NANOSECONDS, deflection)
 
     def _on_wrench(self, message: WrenchStamped) -> None:
-        if self._observer is None or not self.is_active:
+        force, moment = message.wrench.force, message.wrench.torque.x
+        if not self.is_active or not self._counts(
+            'base_wrench', message.header, [force.z, moment, force.y]
+        ):
             return
-        stamp, wrench = _stamp(message.header), message.wrench
+        self._stop_for(self._safety.guard.wrench(force.y, force.z, moment))
+        if self._observer is None:
+            return
+        stamp = _stamp(message.header)
         # The sensor also feels the torque that turns the base.
-        moment = wrench.torque.x - self._wrench.wrench.torque.x
-        if stamp > self._last_stamp:
-            self._wrench_now = stamp, wrench.force.z, moment
+        moment -= self._wrench.wrench.torque.x
+        if stamp > self._safety.streams['joint_states'].last:
+            self._wrench_now = stamp, force.z, moment
         else:
-            self._observer.add_wrench(stamp / _NANOSECONDS, wrench.force.z, moment)
+            self._observer.add_wrench(stamp / NANOSECONDS, force.z, moment)
 
     def _on_ground_truth(self, message: JointState) -> None:
         """Take the load of the bent needle, or all of its bending, from the simulation."""
+        state = [*message.position, *message.velocity]
+        if not self.is_active or not self._counts('ground_truth', message.header, state):
+            return
         try:
-            bias = self._model.bias_forces([*message.position, *message.velocity])
+            bias = self._model.bias_forces(state)
         except NeedleError as error:
             self._load, self._truth = 0.0, None
-            self.get_logger().warning(f'ground_truth: {error}', throttle_duration_sec=1.0)
+            self._warn('ground_truth', f'ground_truth: {error}; not taken in')
             return
         self._load = -float(bias[0])
         if not self._is_modal:
@@ -361,6 +444,7 @@ class ControllerNode(NeedleNode):
         bend = np.array(message.position[2:]), np.array(message.velocity[2:])
         self._truth = stamp, bend
         pending, self._pending = self._pending, None
+        self._waits = 0
         if pending is not None and pending[0] == stamp:
             self._answer(pending[1], pending[2], bend)
 
@@ -374,56 +458,52 @@ class ControllerNode(NeedleNode):
             self._wrench_now = None
         self._load = 0.0
         try:
-            observer.update(stamp / _NANOSECONDS, measured.depth, measured.speed, own)
+            observer.update(stamp / NANOSECONDS, measured.depth, measured.speed, own)
             self._load = observer.load
         except NeedleError as error:
-            self.get_logger().warning(f'observer: {error}', throttle_duration_sec=1.0)
+            self._warn('observer', f'observer: {error}')
 
     def _on_joint_states(self, message: JointState) -> None:
-        """Answer a measurement at once; older ones than the last are not answered."""
-        stamp = _stamp(message.header)
+        """Answer a measurement at once, a repeated one as before, one that is late not at all."""
         if not self.is_active or self._controller is None:
             return
-        age = (self.get_clock().now().nanoseconds - stamp) / _NANOSECONDS
-        if abs(age) > self._settings.measurement_timeout:
-            self._let_go(f'joint_states is stale: its stamp is {age:.3f} s old')
+        stamp, now = _stamp(message.header), self._now()
+        refusal = self._safety.streams['joint_states'].check(stamp, now)
+        if refusal is not None:
+            if refusal.kind == REPEATED:
+                self._repeat(stamp)
+            elif refusal.kind != DROPPED:
+                self._let_go(refusal.line)
             return
-        if stamp <= self._last_stamp:
-            return
-        self._last_stamp = stamp
+        age = (now - stamp) / NANOSECONDS
         self._answered += 1
         self._late += age > (self._settings.delay + 1.0) / self._settings.rate
         self._oldest = max(self._oldest, age)
-        self._arrived = self.get_clock().now().nanoseconds
         try:
-            i = message.name.index('insertion')
-            depth, speed = message.position[i], message.velocity[i]
-            angle = angular_speed = 0.0
-            if 'rotation' in message.name:
-                j = message.name.index('rotation')
-                angle, angular_speed = message.position[j], message.velocity[j]
-        except (ValueError, IndexError):
-            self._let_go(
-                "joint_states needs position and velocity of 'insertion', got names "
-                f'{list(message.name)}, {len(message.position)} positions, '
-                f'{len(message.velocity)} velocities'
+            measured = read_encoders(
+                stamp / NANOSECONDS, message.name, message.position, message.velocity
             )
+        except ParameterError as error:
+            self._let_go(str(error), stamp)
             return
-        measured = Measurement(
-            time=stamp / _NANOSECONDS,
-            depth=depth,
-            speed=speed,
-            angle=angle,
-            angular_speed=angular_speed,
-        )
         if measured.is_finite():
+            self._stop_for(self._safety.guard.encoders(measured.depth, measured.speed), stamp)
             self._observe(stamp, measured)
-        if self._stopped:
-            self._publish(0.0, 0.0)
-        elif self._is_modal and (self._truth is None or self._truth[0] != stamp):
+        waits = self._is_modal and self._safety.stop is None
+        if waits and (self._truth is None or self._truth[0] != stamp):
             self._pending = stamp, measured, message
         else:
             self._answer(measured, message, self._truth[1] if self._truth else None)
+
+    def _repeat(self, stamp: int) -> None:
+        """Command the same again, or nothing if that was not the last word."""
+        last = self._generalized if self._is_modal else self._wrench
+        if self._pending is not None and self._pending[0] == stamp:
+            return
+        if _stamp(last.header) == stamp:
+            self._commands[self._is_modal].publish(last)
+        else:
+            self._publish(0.0, 0.0, stamp=stamp)
 
     def _answer(
         self,
@@ -432,39 +512,97 @@ class ControllerNode(NeedleNode):
         bend: tuple[FloatArray, FloatArray] | None,
     ) -> None:
         """Command what the controller says."""
+        stamp, safety = _stamp(message.header), self._safety
         if self._controller is None:
+            return
+        if safety.stop is not None:
+            self._publish(0.0, 0.0, stamp=stamp)
+            return
+        if safety.rivals is not None:
+            self._let_go(safety.rivals, stamp)
             return
         command = self._controller.command(measured, self._load, bend)
         if command.fault is not None:
-            self._let_go(command.fault)
+            self._let_go(command.fault, stamp)
             return
         if command.notice is not None:
             self.get_logger().error(command.notice)
             self._refusal = command.notice
+        if self._stop_for(
+            safety.guard.tracking(command.setpoint.position - measured.depth), stamp
+        ):
+            return
         if self._fault is not None:
             self._fault = None
-            self.publish_diagnostics()
-        self._publish(command.force, command.torque, command.modal)
+            if safety.due('recovery', monotonic()):
+                self.publish_diagnostics()
+        limits = self._settings
+        safety.saturation.add(
+            stamp,
+            abs(command.force) >= limits.force_limit or abs(command.torque) >= limits.torque_limit,
+        )
+        self._publish(command.force, command.torque, command.modal, stamp)
         self._show(message, measured, command)
 
+    def _count_commanders(self) -> None:
+        """See who else commands; those that are not active count too."""
+        topics = [publisher.topic_name for publisher in self._commands]
+        self._safety.count_commanders({topic: self.count_publishers(topic) for topic in topics})
+
     def _on_watchdog(self) -> None:
-        age = (self.get_clock().now().nanoseconds - self._arrived) / _NANOSECONDS
-        if self._arrived and age > self._settings.measurement_timeout:
-            self._let_go(f'joint_states is stale: the last came {age:.3f} s ago')
+        """Look for what does not come, and for who should not be there."""
+        now, safety = self._now(), self._safety
+        self._count_commanders()
+        silence = safety.streams['joint_states'].silence(now)
+        if silence > self._settings.measurement_timeout:
+            self._let_go(f'joint_states is stale: the last came {silence:.3f} s ago')
+        elif safety.rivals is not None:
+            self._let_go(safety.rivals)
+        self._waits += self._pending is not None
+        if self._pending is not None and self._waits > 1:
+            # Not one that came a moment ago: two looks in a row found it.
+            self._let_go(
+                'ground_truth of the time of joint_states does not come', self._pending[0]
+            )
+            self._pending = None
+        if safety.streams['ground_truth'].silence(now) > self._settings.measurement_timeout:
+            self._load, self._truth = 0.0, None
+        for line in safety.news(now):
+            self._warn(line.partition(' ')[0], f'{line}; the observer goes on without it')
+        if safety.limits.sensors_required:
+            self._stop_for(safety.warning(now))
+
+    def _stop_for(self, reason: str | None, stamp: int | None = None) -> bool:
+        """Stop until it is cleared, if there is a reason; return whether nothing is commanded."""
+        if self._safety.latch(reason):
+            self._fault = reason
+            self._release(stamp)
+            self.get_logger().error(f'stopped: {reason}; no force until ~/clear_stop')
+            self.publish_diagnostics()
+        return reason is not None
 
     def _on_emergency_stop(
         self, _request: Trigger.Request, response: Trigger.Response
     ) -> Trigger.Response:
-        self._stopped = True
-        self._let_go('emergency stop')
+        self._stop_for(BY_HAND)
         response.success, response.message = True, 'stopped; ~/clear_stop releases'
         return response
 
     def _on_clear_stop(
         self, _request: Trigger.Request, response: Trigger.Response
     ) -> Trigger.Response:
-        self._stopped = False
+        if self._safety.stop is None:
+            response.success, response.message = True, 'there was no stop'
+            return response
+        reason = self._safety.clear(self._now())
+        if reason is not None:
+            response.message = f'clear_stop refused: {reason}'
+            self._refuse(response.message)
+            return response
+        self._fault = _WAITING
         response.success, response.message = True, 'cleared; the motion starts anew'
+        self.get_logger().info('the stop is cleared')
+        self.publish_diagnostics()
         return response
 
     def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
@@ -482,8 +620,8 @@ class ControllerNode(NeedleNode):
     def _on_retract(
         self, _request: Trigger.Request, response: Trigger.Response
     ) -> Trigger.Response:
-        if self._controller is None or not self.is_active or self._stopped:
-            why = 'stopped; ~/clear_stop releases' if self._stopped else 'not active'
+        if self._controller is None or not self.is_active or self._safety.stop:
+            why = 'stopped; ~/clear_stop releases' if self._safety.stop else 'not active'
             response.message = f'retract refused: the controller is {why}'
             return response
         depth = self._retract_depth({})
@@ -494,28 +632,41 @@ class ControllerNode(NeedleNode):
 
     # What goes out.
 
-    def _let_go(self, fault: str) -> None:
-        """Command zero force for a reason, said once when it begins."""
-        begins = self._fault in (None, _WAITING)
+    def _let_go(self, fault: str, stamp: int | None = None) -> None:
+        """Command zero force for a reason, said when it begins; ``stamp`` of what it answers."""
+        # Those of one kind begin alike, whatever their numbers.
+        kind = fault.partition(' ')[0]
+        begins = self._fault is None or not self._fault.startswith(kind)
         self._fault = fault
-        if self._controller is not None:
-            self._controller.release()
-        self._publish(0.0, 0.0)
-        if begins:
+        self._release(stamp)
+        if begins and self._safety.due(kind, monotonic()):
             self.get_logger().error(f'{fault}; no force is commanded')
             self.publish_diagnostics()
 
-    def _publish(self, force: float, torque: float, modal: FloatArray | None = None) -> None:
+    def _release(self, stamp: int | None = None) -> None:
+        if self._controller is not None:
+            self._controller.release()
+        self._publish(0.0, 0.0, stamp=stamp)
+
+    def _publish(
+        self,
+        force: float,
+        torque: float,
+        modal: FloatArray | None = None,
+        stamp: int | None = None,
+    ) -> None:
+        """Command forces with the stamp of the measurement that they answer, or of now."""
+        moment = Time(nanoseconds=stamp) if stamp is not None else self.get_clock().now()
         if self._is_modal:
             forces = self._generalized
-            forces.header.stamp = self.get_clock().now().to_msg()
+            forces.header.stamp = moment.to_msg()
             rest = [0.0] * (len(forces.name) - 2) if modal is None else modal.tolist()
             # Insertion makes d smaller.
             forces.effort = [-force, torque, *rest]
             self._generalized_command.publish(forces)
             return
         message = self._wrench
-        message.header.stamp = self.get_clock().now().to_msg()
+        message.header.stamp = moment.to_msg()
         message.wrench.force.y = force
         message.wrench.torque.x = torque
         self._wrench_command.publish(message)
@@ -559,10 +710,15 @@ class ControllerNode(NeedleNode):
         values['oldest measurement answered [s]'] = f'{self._oldest:.4f}'
         values['inputs refused'] = self._refused
         values['last complaint'] = self._refusal or ''
-        if self._stopped:
-            return DiagnosticStatus.ERROR, 'emergency stop; ~/clear_stop releases', values
+        now = self.get_clock().now().nanoseconds
+        values.update(self._safety.describe(now))
+        if self._safety.stop is not None:
+            return DiagnosticStatus.ERROR, f'{self._safety.stop}; ~/clear_stop releases', values
         if self.is_active and self._fault is not None:
             return DiagnosticStatus.WARN, self._fault, values
+        warning = self._safety.warning(now) if self.is_active else None
+        if warning is not None:
+            return DiagnosticStatus.WARN, warning, values
         level, text, _ = super().diagnose()
         return level, text, values
 

@@ -278,6 +278,32 @@ def test_the_integral_is_frozen_while_nothing_is_commanded():
     assert loop.memory[INTEGRAL] == 0.0
 
 
+@pytest.mark.parametrize('step', [7.0, -7.0], ids=['forward', 'back'])
+def test_a_gap_or_a_step_back_in_time_starts_the_motion_anew(step):
+    """No fault, no jump of the reference: on to the same target from where the needle is."""
+    steering = controller()
+    steering.set_target(0.05)
+    for i in range(500):
+        before = steering.command(
+            Measurement(time=10.0 + i * PERIOD, depth=0.02 + 1e-5 * i, speed=0.01)
+        )
+    assert before.setpoint.speed == pytest.approx(0.01, rel=1e-12)
+    where = 0.02 + 1e-5 * 500
+    for i in range(200):
+        after = steering.command(
+            Measurement(time=10.5 + step + i * PERIOD, depth=where, speed=0.0)
+        )
+        assert after.fault is None
+        if i == 0:
+            assert after.setpoint.position == where
+            assert after.setpoint.speed == 0.0
+            assert f'went on after {7.001 if step > 0 else -6.999:.3f} s' in after.notice
+        else:
+            assert after.notice is None
+    assert steering.target == 0.05
+    assert after.force > 0.0
+
+
 def test_a_range_of_depths_bounds_the_targets():
     """Targets outside it are refused, and one that leaves nothing of the needle too."""
     steering = controller(lowest_depth=0.02, highest_depth=0.1)

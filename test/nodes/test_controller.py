@@ -1,16 +1,21 @@
 """The controller as the graph sees it, alone and around the plant."""
 
 from itertools import pairwise
-from math import nan
+from math import inf, nan
+from time import monotonic
 
+from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PointStamped, WrenchStamped
 from needle_controller.controller_node import ControllerNode
+from needle_controller.kernels import INTEGRAL
 from needle_dynamics.base_node import COMMAND, SENSOR
 from needle_dynamics.plant_node import PlantNode
 import pytest
 from rclpy.duration import Duration
 from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.parameter import Parameter
+from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
@@ -22,30 +27,95 @@ SLOW = {'rate': 200.0}
 class Bench:
     """A controller with a probe that plays the plant."""
 
-    def __init__(self, graph, **parameters):
+    def __init__(self, graph, start=True, **parameters):
         self.graph = graph
         self.node = graph.node('probe')
         self.states = self.node.create_publisher(JointState, 'joint_states', SENSOR)
         self.target = self.node.create_publisher(PointStamped, 'target', COMMAND)
+        self.wrenches = self.node.create_publisher(WrenchStamped, 'base_wrench', SENSOR)
+        self.tips = self.node.create_publisher(PointStamped, 'tip_deflection', SENSOR)
         self.commands = graph.listen(self.node, WrenchStamped, 'wrench_command', COMMAND)
-        self.controller = graph.add(ControllerNode, parameters={**SLOW, **parameters})
+        self.controller = graph.add(ControllerNode, start=False, parameters={**SLOW, **parameters})
+        if start:
+            assert self.controller.start(), self.controller.failure
         graph.spin_until(
             lambda: (
                 self.states.get_subscription_count()
                 and self.target.get_subscription_count()
+                and self.wrenches.get_subscription_count()
+                and self.tips.get_subscription_count()
                 and self.node.count_publishers('wrench_command')
             ),
             'discovery',
         )
 
+    def now(self):
+        """Return the time to stamp with."""
+        return self.node.get_clock().now().to_msg()
+
     def measure(self, depth: float, speed: float = 0.0) -> float:
         """Publish a measurement and return the force that answers it."""
         message = JointState(name=['insertion'], position=[depth], velocity=[speed])
-        message.header.stamp = self.node.get_clock().now().to_msg()
-        count = len(self.commands)
-        self.states.publish(message)
-        self.graph.spin_until(lambda: len(self.commands) > count, 'an answer')
-        return self.commands[-1].wrench.force.y
+        return self.ask(message, fresh=True)
+
+    def ask(self, message, fresh=False) -> float:
+        """Publish a joint state and return the force that answers it."""
+        count, asked = len(self.commands), []
+
+        def answers():
+            # On a machine that is held up a measurement may be stale before it is read.
+            if not asked or (fresh and monotonic() - asked[-1][0] > 1.0):
+                if fresh:
+                    message.header.stamp = self.now()
+                asked.append((monotonic(), message.header.stamp))
+                self.states.publish(message)
+            stamps = [stamp for _, stamp in asked]
+            return [c for c in self.commands[count:] if c.header.stamp in stamps]
+
+        self.graph.spin_until(answers, 'an answer')
+        return answers()[-1].wrench.force.y
+
+    def call(self, name: str, kind=Trigger, **request):
+        """Return the answer of a service."""
+        client = self.node.create_client(kind, f'controller/{name}')
+        self.graph.spin_until(client.service_is_ready, name)
+        answers = []
+
+        def answered():
+            # One to a client that the node does not know yet is lost; none of them adds up.
+            if not answers or monotonic() - answers[-1][0] > 1.0:
+                answers.append((monotonic(), client.call_async(kind.Request(**request))))
+            return [answer for _, answer in answers if answer.done()]
+
+        self.graph.spin_until(answered, name)
+        return answered()[0].result()
+
+    def said(self) -> str:
+        """Return what its diagnostics say first."""
+        return self.controller.diagnose()[1]
+
+    def value(self, key: str) -> str:
+        """Return one value of its diagnostics."""
+        return str(self.controller.diagnose()[2].get(key, ''))
+
+    def wrench(self, axial=0.0, lateral=0.0, moment=0.0, frame='needle_base', stamp=True):
+        """Publish a reading of the force sensor."""
+        message = WrenchStamped()
+        message.header.frame_id = frame
+        if stamp:
+            message.header.stamp = self.now()
+        message.wrench.force.y, message.wrench.force.z = axial, lateral
+        message.wrench.torque.x = moment
+        self.wrenches.publish(message)
+
+    def tip(self, deflection, frame='needle_entry', stamp=True):
+        """Publish a sample of the tip."""
+        message = PointStamped()
+        message.header.frame_id = frame
+        if stamp:
+            message.header.stamp = self.now()
+        message.point.y, message.point.z = 0.02, deflection
+        self.tips.publish(message)
 
     def aim(self, depth: float, deflection: float = 0.0) -> None:
         """Publish a target and wait until the controller has it."""
@@ -118,17 +188,12 @@ def test_lets_go_of_a_measurement_it_cannot_use(ros_graph, message):
 def test_an_emergency_stop_latches(ros_graph):
     """After a stop every answer is zero until it is cleared; then the motion starts anew."""
     bench = Bench(ros_graph)
-    stop = bench.node.create_client(Trigger, 'controller/emergency_stop')
-    clear = bench.node.create_client(Trigger, 'controller/clear_stop')
-    ros_graph.spin_until(lambda: stop.service_is_ready() and clear.service_is_ready(), 'services')
     bench.aim(0.1)
     assert bench.push() > 0.5
-    stopped = stop.call_async(Trigger.Request())
-    ros_graph.spin_until(stopped.done, 'the stop')
-    assert stopped.result().success
+    assert bench.call('emergency_stop').success
     assert [bench.measure(0.02) for _ in range(3)] == [0.0, 0.0, 0.0]
-    cleared = clear.call_async(Trigger.Request())
-    ros_graph.spin_until(cleared.done, 'the release')
+    assert bench.said() == 'emergency stop; ~/clear_stop releases'
+    assert bench.call('clear_stop').success
     assert bench.push() > 0.5
 
 
@@ -432,3 +497,414 @@ def test_modal_actuation_is_refused_where_it_cannot_work(ros_graph, parameters, 
     )
     assert not node.start()
     assert reason in node.failure
+
+
+def test_the_integral_is_frozen_while_it_is_stopped(ros_graph):
+    """What PID has learned of the friction is there again after the stop."""
+    bench = Bench(ros_graph, law='pid')
+    bench.aim(0.1)
+    memory = bench.controller._controller._insertion.memory
+    bench.push()
+    ros_graph.spin_until(lambda: bench.measure(0.02) and memory[INTEGRAL], 'the integral')
+    assert bench.call('emergency_stop').success
+    learned = float(memory[INTEGRAL])
+    assert [bench.measure(0.02) for _ in range(50)] == [0.0] * 50
+    assert memory[INTEGRAL] == learned
+    assert bench.call('clear_stop').success
+    bench.measure(0.02)
+    assert memory[INTEGRAL] != 0.0
+
+
+#: Beyond each limit, and what is well within it.
+BEYOND = {
+    'speed': (lambda b: b.measure(0.02, 0.15), 'insertion speed 0.15 m/s is beyond'),
+    'depth': (lambda b: b.measure(0.204), 'inserted length 0.204 m is outside'),
+    'axial': (lambda b: b.wrench(axial=-40.0), 'axial force -40 N is beyond the limit of 30 N'),
+    'lateral': (lambda b: b.wrench(lateral=12.0), 'lateral force 12 N is beyond'),
+    'moment': (lambda b: b.wrench(moment=1.5), 'moment 1.5 N m is beyond'),
+    'tip': (lambda b: b.tip(0.07), 'tip deflection 0.07 m is beyond the limit of 0.05 m'),
+}
+
+
+@pytest.mark.parametrize('limit', BEYOND)
+def test_beyond_a_limit_it_stops_until_it_is_cleared(ros_graph, limit):
+    """Zero force, the reason on /diagnostics, and no way back while it is still beyond."""
+    exceed, reason = BEYOND[limit]
+    bench = Bench(ros_graph)
+    arrays = ros_graph.listen(bench.node, DiagnosticArray, '/diagnostics', 10)
+    bench.aim(0.1)
+    assert bench.push() > 0.5
+
+    def stopped():
+        exceed(bench)
+        return bench.value('stop')
+
+    ros_graph.spin_until(stopped, 'the stop')
+    assert reason in bench.value('stop')
+    ros_graph.spin_until(
+        lambda: [
+            status
+            for array in arrays
+            for status in array.status
+            if reason in status.message and status.level == DiagnosticStatus.ERROR
+        ],
+        'the reason on /diagnostics',
+    )
+    assert [bench.measure(0.02) for _ in range(3)] == [0.0] * 3
+    exceed(bench)
+    ros_graph.spin_until(lambda: bench.controller._safety.guard.violated, 'one more')
+    refused = bench.call('clear_stop')
+    assert not refused.success
+    assert reason in refused.message
+    # Well again, it starts anew; a step back is a jump at first.
+    for _ in range(3):
+        bench.wrench()
+        bench.tip(0.0)
+        bench.measure(0.02)
+    ros_graph.spin_until(lambda: not bench.controller._safety.guard.violated, 'what is well')
+    assert bench.call('clear_stop').success
+    assert bench.value('stops latched') == '1'
+    if limit == 'depth':
+        # It was elsewhere: the target is forgotten.
+        bench.measure(0.02)
+        bench.aim(0.1)
+    assert bench.push() > 0.5
+
+
+def test_a_needle_that_does_not_follow_is_not_pushed_for_ever(ros_graph):
+    """Encoders that stand still while the reference goes on are a fault, not a reason to push."""
+    bench = Bench(ros_graph)
+    bench.aim(0.1)
+    ros_graph.spin_until(lambda: bench.measure(0.02) == 0.0 and bench.value('stop'), 'the stop')
+    assert 'tracking error' in bench.value('stop')
+    assert bench.call('clear_stop').success
+    assert bench.push() > 0.5
+
+
+def test_one_reading_alone_stops_nothing(ros_graph):
+    """A spike is not taken in, and the needle is pushed on."""
+    bench = Bench(ros_graph)
+    bench.aim(0.1)
+    assert bench.push() > 0.5
+    for load in (0.0, 0.1, 60.0, 0.1, 0.0):
+        bench.wrench(lateral=load)
+    ros_graph.spin_until(lambda: '2 jump' in bench.value('input base_wrench'), 'the readings')
+    ros_graph.spin_until(lambda: '3 taken' in bench.value('input base_wrench'), 'the readings')
+    assert bench.push() > 0.5
+    assert bench.value('stops latched') == '0'
+
+
+@pytest.mark.parametrize(
+    ('send', 'topic', 'kind'),
+    [
+        (lambda b: b.wrench(stamp=False), 'base_wrench', 'not stamped'),
+        (lambda b: b.wrench(frame='needle_entry'), 'base_wrench', 'frame'),
+        (lambda b: b.wrench(lateral=nan), 'base_wrench', 'not finite'),
+        (lambda b: b.wrench(axial=inf), 'base_wrench', 'not finite'),
+        (lambda b: b.tip(0.0, stamp=False), 'tip_deflection', 'not stamped'),
+        (lambda b: b.tip(0.0, frame=''), 'tip_deflection', 'frame'),
+        (lambda b: b.tip(nan), 'tip_deflection', 'not finite'),
+    ],
+)
+def test_a_reading_that_does_not_count_is_not_taken_in(ros_graph, send, topic, kind):
+    """It is counted by its kind; the observer hears nothing of it and the motion goes on."""
+    bench = Bench(ros_graph)
+    bench.aim(0.1)
+    assert bench.push() > 0.5
+    send(bench)
+    ros_graph.spin_until(lambda: f'1 {kind}' in bench.value(f'input {topic}'), 'the refusal')
+    assert '0 taken' in bench.value(f'input {topic}')
+    assert bench.controller._observer.refused == 0
+    assert bench.push() > 0.5
+
+
+def test_it_goes_on_without_sensors_that_fall_silent(ros_graph):
+    """Diagnostics warn for as long as they are; the force stays."""
+    bench = Bench(ros_graph, **{'safety.sensor_timeout': 0.3, 'safety.tracking_error': 1.0})
+    bench.aim(0.1)
+    depth = 0.02
+
+    def stale():
+        bench.measure(depth)
+        return 'base_wrench is stale' in bench.said() and 'tip_deflection' in bench.said()
+
+    ros_graph.spin_until(stale, 'the warning')
+    assert bench.controller.diagnose()[0] == DiagnosticStatus.WARN
+    assert bench.measure(depth) > 0.5
+
+    def well():
+        bench.wrench()
+        bench.tip(0.0)
+        bench.measure(depth)
+        return bench.said() == 'active'
+
+    ros_graph.spin_until(well, 'the end of the warning')
+    assert bench.measure(depth) > 0.5
+
+
+def test_it_stops_for_want_of_sensors_if_they_are_required(ros_graph):
+    """A parameter makes of the warning a stop."""
+    bench = Bench(
+        ros_graph,
+        **{
+            'safety.sensor_timeout': 0.3,
+            'safety.sensors_required': True,
+            'safety.tracking_error': 1.0,
+        },
+    )
+    bench.aim(0.1)
+    assert bench.push() > 0.5
+    ros_graph.spin_until(lambda: bench.measure(0.02) == 0.0, 'the stop')
+    assert 'is stale' in bench.value('stop')
+    assert 'is stale' in bench.call('clear_stop').message
+
+
+def test_two_that_command_both_let_go(ros_graph):
+    """While another node publishes the same topic the answer is zero; alone again it goes on."""
+    bench = Bench(ros_graph, **{'safety.tracking_error': 1.0})
+    bench.aim(0.1)
+    assert bench.push() > 0.5
+    rival = bench.node.create_publisher(WrenchStamped, 'wrench_command', COMMAND)
+    ros_graph.spin_until(lambda: bench.measure(0.02) == 0.0, 'zero force')
+    assert bench.said() == '2 nodes publish /wrench_command'
+    assert bench.controller.diagnose()[0] == DiagnosticStatus.WARN
+    bench.node.destroy_publisher(rival)
+    assert bench.push() > 0.5
+
+
+def test_commands_carry_the_stamp_of_what_they_answer(ros_graph):
+    """A measurement that comes again is answered as before; what answers nothing is of now."""
+    bench = Bench(ros_graph, measurement_timeout=1.0)
+    bench.aim(0.1)
+    force, stamp = bench.push(), bench.commands[-1].header.stamp
+    again = JointState(name=['insertion'], position=[0.02], velocity=[0.0])
+    again.header.stamp = stamp
+    assert bench.ask(again) == force
+    assert '1 repeated' in bench.value('input joint_states')
+    # The watchdog answers nothing.
+    ros_graph.spin_until(lambda: bench.commands[-1].wrench.force.y == 0.0, 'zero force')
+    last = bench.commands[-1].header.stamp
+    assert (last.sec, last.nanosec) > (stamp.sec, stamp.nanosec)
+
+
+def test_a_measurement_that_comes_again_after_a_stop_is_answered_with_none(ros_graph):
+    """The stop was the last word, not the force before it."""
+    bench = Bench(ros_graph, measurement_timeout=5.0)
+    bench.aim(0.1)
+    assert bench.push() > 0.5
+    stamp = bench.commands[-1].header.stamp
+    assert bench.call('emergency_stop').success
+    again = JointState(name=['insertion'], position=[0.02], velocity=[0.0])
+    again.header.stamp = stamp
+    assert bench.ask(again) == 0.0
+
+
+class SimulatedTime(Bench):
+    """A bench whose clock is what the test makes it."""
+
+    def __init__(self, graph, **parameters):
+        super().__init__(graph, use_sim_time=True, **parameters)
+        self.clock = self.node.create_publisher(Clock, '/clock', 10)
+        graph.spin_until(self.clock.get_subscription_count, 'the clock')
+        self.set(0.0)
+
+    def set(self, seconds):
+        """Set the clock and wait until the controller has it."""
+        self.time = round(seconds * 1e9)
+        self.clock.publish(Clock(clock=self.now()))
+        clock = self.controller.get_clock()
+        self.graph.spin_until(lambda: clock.now().nanoseconds == self.time, 'the clock')
+
+    def now(self):
+        return Time(sec=self.time // 10**9, nanosec=self.time % 10**9)
+
+    def measure(self, depth, speed=0.0):
+        self.set((self.time + 5_000_000) / 1e9)
+        return super().measure(depth, speed)
+
+
+def test_a_simulation_that_starts_at_zero_is_answered(ros_graph):
+    """Its first sample has a stamp of zero, and is one."""
+    bench = SimulatedTime(ros_graph)
+    message = JointState(name=['insertion'], position=[0.02], velocity=[0.0])
+    assert bench.ask(message) == 0.0
+    assert bench.value('measurements answered') == '1'
+    bench.aim(0.1)
+    assert bench.push() > 0.5
+
+
+def test_a_clock_that_is_set_back_starts_the_motion_anew(ros_graph):
+    """It lets go, and the next sample is answered again, though older than those before."""
+    bench = SimulatedTime(ros_graph)
+    bench.set(100.0)
+    bench.aim(0.1)
+    assert bench.push() > 0.5
+    bench.set(50.0)
+    ros_graph.spin_until(lambda: bench.commands[-1].wrench.force.y == 0.0, 'zero force')
+    assert 'clock went back by' in bench.said()
+    assert bench.push() > 0.5
+    assert bench.said() != 'not active'
+    assert 'clock' not in bench.said()
+
+
+def test_a_clock_that_jumps_ahead_is_a_gap(ros_graph):
+    """The motion starts anew from where the needle is; nothing is faulty."""
+    bench = SimulatedTime(ros_graph)
+    bench.set(100.0)
+    bench.aim(0.1)
+    assert bench.push() > 0.5
+    aims = ros_graph.listen(bench.node, JointState, 'reference', SENSOR)
+    bench.set(200.0)
+
+    def aimed():
+        bench.measure(0.0201)
+        return aims
+
+    ros_graph.spin_until(aimed, 'the reference')
+    # Had it gone on, it would be at the target by now.
+    assert aims[0].position[0] < 0.021
+    assert 'went on after 1' in bench.value('last complaint')
+    assert bench.value('stops latched') == '0'
+    assert bench.value('target [m]') == '0.1'
+    assert bench.push() > 0.5
+
+
+def test_a_clock_that_stands_is_no_fault(ros_graph):
+    """Paused, nothing is stale; the same sample again is answered with the same force."""
+    bench = SimulatedTime(ros_graph)
+    bench.set(100.0)
+    bench.aim(0.1)
+    force = bench.push()
+    message = JointState(name=['insertion'], position=[0.02], velocity=[0.0])
+    message.header.stamp = bench.now()
+    start = monotonic()
+
+    def repeated():
+        forces.add(bench.ask(message))
+        # Three times the timeout, by the clock on the wall.
+        return monotonic() - start > 0.3
+
+    forces: set[float] = set()
+    ros_graph.spin_until(repeated, 'a while')
+    assert forces == {force}
+    assert bench.push() > 0.5
+
+
+@pytest.mark.parametrize(
+    ('frame', 'stamp', 'reason'),
+    [
+        ('needle_base', Time(), "must be in frame '' or 'needle_entry', got 'needle_base'"),
+        ('', Time(sec=5), 'target is stale: its stamp is'),
+    ],
+)
+def test_a_target_of_another_frame_or_time_is_refused(ros_graph, frame, stamp, reason):
+    """In one line; without frame and stamp it is meant as it is, and now."""
+    bench = Bench(ros_graph)
+    message = PointStamped()
+    message.header.frame_id, message.header.stamp = frame, stamp
+    message.point.y = 0.1
+    bench.target.publish(message)
+    ros_graph.spin_until(lambda: bench.value('inputs refused') == '1', 'the refusal')
+    assert reason in bench.value('last complaint')
+    assert bench.value('target [m]') == 'None'
+
+
+def test_before_it_is_active_it_answers_and_waits(ros_graph):
+    """Services say so, a target is refused, and a stop is kept for when it is active."""
+    bench = Bench(ros_graph, start=False)
+    assert bench.call('emergency_stop').success
+    assert bench.controller.start()
+    assert bench.controller.trigger_deactivate() == TransitionCallbackReturn.SUCCESS
+    assert 'not active' in bench.call('pause', SetBool, data=True).message
+    assert 'stopped' in bench.call('retract').message
+    bench.target.publish(PointStamped())
+    ros_graph.spin_until(
+        lambda: 'target refused: the controller is not active' in bench.value('last complaint'),
+        'the refusal',
+    )
+    assert bench.controller.trigger_activate() == TransitionCallbackReturn.SUCCESS
+    bench.aim(0.1)
+    assert [bench.measure(0.02) for _ in range(5)] == [0.0] * 5
+    assert bench.value('stop') == 'emergency stop'
+    assert bench.call('clear_stop').success
+    assert bench.call('clear_stop').message == 'there was no stop'
+    assert bench.push() > 0.5
+
+
+@pytest.mark.parametrize(
+    'message',
+    [
+        JointState(),
+        JointState(name=['insertion'] * 3),
+        JointState(name=['insertion', 'rotation'], position=[0.02], velocity=[0.0, 0.0]),
+        JointState(name=['insertion'], position=[0.02], velocity=[inf]),
+        JointState(name=['insertion'], position=[1e300], velocity=[1e300]),
+        JointState(name=['insertion', 'rotation'], position=[0.02, nan], velocity=[0.0, 0.0]),
+    ],
+)
+def test_no_joint_state_raises(ros_graph, message):
+    """Whatever its fields are: zero force with its stamp, and the next good one is answered."""
+    bench = Bench(ros_graph, measurement_timeout=5.0)
+    bench.aim(0.1)
+    assert bench.push() > 0.5
+    message.header.stamp = bench.now()
+    assert bench.ask(message) == 0.0
+    assert bench.value('stop') == ''
+    assert bench.push() > 0.5
+
+
+@pytest.mark.parametrize(
+    'message',
+    [
+        JointState(),
+        JointState(position=[0.0] * 4, velocity=[0.0] * 3),
+        JointState(position=[0.18, 0.0, nan, 0.0], velocity=[0.0] * 4),
+        JointState(position=[-5.0, 0.0, 0.0, 0.0], velocity=[0.0] * 4),
+    ],
+)
+def test_no_ground_truth_raises(ros_graph, message):
+    """A truth of a wrong length, not finite or of a needle that is none is not taken in."""
+    bench = Bench(ros_graph, deflection_feedback='ground_truth')
+    truths = bench.node.create_publisher(JointState, 'ground_truth', SENSOR)
+    ros_graph.spin_until(truths.get_subscription_count, 'discovery')
+    bench.aim(0.1)
+    message.header.stamp = bench.now()
+    truths.publish(message)
+    ros_graph.spin_until(lambda: bench.value('input ground_truth'), 'the truth')
+    assert bench.controller._load == 0.0
+    assert bench.push() > 0.5
+
+
+def test_a_truth_that_does_not_come_is_answered_with_no_force(ros_graph):
+    """With a force on every coordinate it waits for the bending, but not for ever."""
+    bench = Bench(
+        ros_graph, actuation='modal', deflection_feedback='ground_truth', lowest_depth=0.184,
+        rate=1000.0,
+    )  # fmt: skip
+    forces = ros_graph.listen(bench.node, JointState, 'generalized_command', COMMAND)
+    ros_graph.spin_until(lambda: bench.node.count_publishers('generalized_command'), 'discovery')
+    message = JointState(name=['insertion'], position=[0.19], velocity=[0.0])
+
+    def answered():
+        message.header.stamp = bench.now()
+        bench.states.publish(message)
+        return forces and 'ground_truth' in bench.said()
+
+    ros_graph.spin_until(answered, 'zero force')
+    assert not any(forces[-1].effort)
+
+
+def test_diagnostics_tell_rates_and_saturation(ros_graph):
+    """Of each input in the last second, and how long the force was all there is."""
+    bench = Bench(ros_graph, force_limit=0.7, **{'safety.tracking_error': 0.1})
+    bench.aim(0.1)
+
+    def saturated():
+        bench.measure(0.02)
+        return bench.value('share of commands at their limit') == '1.000'
+
+    ros_graph.spin_until(saturated, 'a second at the limit')
+    rate = float(bench.value('input joint_states').split()[0])
+    # All of them are answered; the two windows of a second begin at most a sample apart.
+    assert rate == pytest.approx(float(bench.value('commands per second')), rel=0.1)
+    assert rate > 10.0

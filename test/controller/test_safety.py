@@ -1,0 +1,324 @@
+"""What counts as a message, what violates a limit, and what latches."""
+
+from math import inf, nan
+
+from needle_controller import (
+    ControllerSettings,
+    Guard,
+    Measurement,
+    Safety,
+    SafetyLimits,
+    Stream,
+)
+from needle_controller.safety import read_encoders, Window
+from needle_dynamics import NeedleParameters, ParameterError
+import numpy as np
+import pytest
+
+SECOND = 1_000_000_000
+MILLISECOND = SECOND // 1000
+
+
+def stream(**options) -> Stream:
+    """Return the stream of a force sensor at 1 kHz."""
+    return Stream('base_wrench', 0.5, **options)
+
+
+def safety(expected=(), **limits) -> Safety:
+    """Return the safety of a needle of the phantom that has begun at 10 s."""
+    whole = Safety(
+        SafetyLimits(**limits), ControllerSettings(), NeedleParameters(), expected=expected
+    )
+    whole.begin(10 * SECOND)
+    return whole
+
+
+@pytest.mark.parametrize(
+    ('stamp', 'kind', 'words'),
+    [
+        (10 * SECOND, None, ''),
+        (int(9.6 * SECOND), None, ''),
+        (int(9.4 * SECOND), 'stale', 'base_wrench is stale: its stamp is 0.600 s old'),
+        (11 * SECOND, 'stale', 'its stamp is 1.000 s ahead'),
+        (0, 'not stamped', 'base_wrench is stale: it is not stamped'),
+    ],
+)
+def test_a_stamp_must_be_of_now(stamp, kind, words):
+    """Old, from the future or missing: refused, and each counted by its kind."""
+    wrench = stream()
+    refusal = wrench.check(stamp, 10 * SECOND)
+    assert (refusal.kind if refusal else None) == kind
+    assert words in (refusal.line if refusal else '')
+    assert wrench.counts[kind or 'taken'] == 1
+
+
+def test_a_time_that_starts_at_zero_has_stamps_of_zero():
+    """The first sample of a simulation is one, not a message without a stamp."""
+    wrench = stream()
+    assert wrench.check(0, 0) is None
+    assert wrench.check(0, 0).kind == 'repeated'
+    assert wrench.check(MILLISECOND, MILLISECOND) is None
+
+
+def test_a_wish_without_a_stamp_is_of_now():
+    """`ros2 topic pub` sends no stamp; a wish with one must be of now all the same."""
+    target = Stream('target', 1.0, frames=('', 'needle_entry'), stamped=False)
+    assert [target.check(0, 10 * SECOND, frame) for frame in ('', 'needle_entry', '')] == [
+        None
+    ] * 3
+    assert target.check(SECOND, 10 * SECOND).kind == 'stale'
+
+
+def test_order_is_kept():
+    """One that comes twice, or after a later one, does not count and is no fault."""
+    wrench = stream()
+    stamps = [1, 2, 2, 4, 3, 5]
+    kinds = [wrench.check(10 * SECOND + s, 10 * SECOND) for s in stamps]
+    assert [r.kind if r else '' for r in kinds] == ['', '', 'repeated', '', 'dropped', '']
+    # A clock that was set back begins anew.
+    wrench.forget()
+    assert wrench.check(5 * SECOND, 5 * SECOND) is None
+    assert '5 taken, 1 repeated, 1 dropped; refused: none' in wrench.describe(5 * SECOND)
+
+
+def test_frame_and_numbers_are_checked():
+    """Another frame and what is not finite are refused with what came."""
+    wrench = stream(frames=('needle_base',))
+    now = 10 * SECOND
+    refusal = wrench.check(now, now, 'world', [1.0])
+    assert refusal.line == "base_wrench must be in frame 'needle_base', got 'world'"
+    for i, value in enumerate((nan, inf, -inf)):
+        assert wrench.check(now + i + 1, now, 'needle_base', [0.0, value]).kind == 'not finite'
+    assert wrench.check(now + 9, now, 'needle_base', [0.0, 1.0]) is None
+    assert wrench.describe(now).endswith('refused: 1 frame, 3 not finite')
+
+
+def feed(watched: Stream, readings) -> list[str]:
+    """Return what becomes of readings at 1 kHz from 10 s on, '' for those that count."""
+    kinds = []
+    for i, value in enumerate(readings):
+        now = 10 * SECOND + i * MILLISECOND
+        refusal = watched.check(now, now, '', [value])
+        kinds.append(refusal.kind if refusal else '')
+    return kinds
+
+
+def test_a_jump_is_not_believed_at_once():
+    """A spike counts neither up nor down; a step counts from its second reading on."""
+    assert feed(stream(jumps=[1.0]), [0, 0, 9, 0, 0]) == ['', '', 'jump', 'jump', '']
+    assert feed(stream(jumps=[1.0]), [0, 9, 9, 9]) == ['', 'jump', '', '']
+    assert feed(stream(jumps=[1.0]), [0, 0.9, 1.8]) == [''] * 3
+
+
+def test_a_noisy_reading_that_stands_still_is_frozen():
+    """After the timeout of 0.5 s it does not count until it changes."""
+    rng = np.random.default_rng(1)
+    noisy = [*rng.normal(0.0, 0.01, 100)]
+    wrench = stream(noise=[0.01])
+    kinds = feed(wrench, [*noisy, *[noisy[-1]] * 700])
+    assert set(kinds[:600]) == {''}
+    assert set(kinds[600:]) == {'frozen'}
+    assert wrench.frozen
+    last = 10 * SECOND + SECOND
+    assert wrench.check(last, last, '', [0.02]) is None
+    assert not wrench.frozen
+
+
+@pytest.mark.parametrize(
+    'readings',
+    [[0.0] * 2000, [0.1 * 0.9**i if i < 300 else 0.0 for i in range(2000)]],
+    ids=['still from the start', 'comes to rest'],
+)
+def test_a_reading_without_noise_may_stand_still(readings):
+    """A perfect sensor at rest is not frozen."""
+    assert set(feed(stream(noise=[0.01]), readings)) == {''}
+
+
+def test_rates_and_shares_are_those_of_the_last_second():
+    """In any second that is full; of a time that went back nothing is left."""
+    window = Window()
+    for i in range(2001):
+        window.add(i * MILLISECOND, i % 4 == 0)
+    # 1000 in the second, and a quarter of them: whole numbers.
+    assert window.rate(2000 * MILLISECOND) == 1000.0
+    assert window.share(2000 * MILLISECOND) == 0.25
+    # Only the one of 2 s in the five seconds since.
+    assert window.rate(7 * SECOND) == pytest.approx(0.2, rel=1e-12)
+    window.add(SECOND)
+    assert window.rate(SECOND) == pytest.approx(0.2, rel=1e-12)
+    assert window.rate(2 * SECOND) == 1.0
+
+
+GUARD = [
+    ('encoders', (0.05, 0.11), 'insertion speed 0.11 m/s is beyond the limit of 0.1 m/s'),
+    ('encoders', (0.05, -0.11), 'insertion speed -0.11 m/s'),
+    ('encoders', (0.0025, nan), 'insertion speed nan m/s'),
+    ('encoders', (0.103, 0.0), 'inserted length 0.103 m is outside [-0.001, 0.102] m'),
+    ('encoders', (-0.002, 0.0), 'inserted length -0.002 m'),
+    ('tracking', (0.011,), 'tracking error 0.011 m is beyond the limit of 0.01 m'),
+    ('wrench', (-31.0, 0.0, 0.0), 'axial force -31 N is beyond the limit of 30 N'),
+    ('wrench', (0.0, 10.5, 0.0), 'lateral force 10.5 N'),
+    ('wrench', (0.0, 0.0, -1.1), 'moment -1.1 N m'),
+    ('tip', (-0.051,), 'tip deflection -0.051 m is beyond the limit of 0.05 m'),
+]
+
+
+@pytest.mark.parametrize(('name', 'values', 'words'), GUARD)
+def test_two_readings_beyond_a_limit_violate_it(name, values, words):
+    """Quantity, value, limit and unit in one line; one reading alone does not count."""
+    guard = Guard(SafetyLimits(), (0.001, 0.1))
+    good = {'encoders': (0.05, 0.0), 'wrench': (0.0, 0.0, 0.0)}.get(name, (0.0,))
+    hold = getattr(guard, name)
+    assert [hold(*v) for v in (good, values, good, values)] == [None] * 4
+    line = hold(*values)
+    assert words in line
+    assert '\n' not in line
+    assert guard.violated == line
+    assert hold(*good) is None
+    assert guard.violated is None
+
+
+def test_readings_at_a_limit_are_within_it():
+    """Limits are the largest values that may be."""
+    guard, limits = Guard(SafetyLimits(), (0.001, 0.1)), SafetyLimits()
+    for _ in range(3):
+        assert guard.encoders(0.1 + limits.depth_tolerance, limits.speed) is None
+        assert guard.wrench(-limits.axial_load, limits.lateral_load, limits.moment_load) is None
+        assert guard.tip(limits.tip_deflection) is None
+        assert guard.tracking(-limits.tracking_error) is None
+
+
+def test_a_stop_holds_until_it_may_be_cleared():
+    """The first reason stays; clearing is refused with what is still beyond its limit."""
+    whole = safety()
+    now = 10 * SECOND
+    for _ in range(2):
+        whole.streams['base_wrench'].check(now, now, 'needle_base', [0.0, 0.0])
+        began = whole.latch(whole.guard.wrench(40.0, 0.0, 0.0))
+    assert began
+    assert 'axial force 40 N' in whole.stop
+    assert not whole.latch('emergency stop')
+    assert 'axial force 40 N' in whole.clear(now)
+    assert whole.stop is not None
+    whole.guard.wrench(1.0, 0.0, 0.0)
+    assert whole.clear(now) is None
+    assert (whole.stop, whole.stops) == (None, 1)
+
+
+def test_a_sensor_that_fell_silent_does_not_keep_the_stop():
+    """What it said before says nothing of now."""
+    whole = safety()
+    now = 10 * SECOND
+    whole.streams['base_wrench'].check(now, now, 'needle_base', [0.0, 0.0])
+    whole.guard.wrench(40.0, 0.0, 0.0)
+    whole.latch('emergency stop')
+    assert whole.clear(now + SECOND // 2) is not None
+    assert whole.clear(now + 2 * SECOND) is None
+
+
+def test_the_error_of_a_reference_that_was_let_go_does_not_keep_the_stop():
+    """The motion starts anew from where the needle is."""
+    whole = safety()
+    whole.guard.tracking(0.02)
+    assert whole.latch(whole.guard.tracking(0.02))
+    assert whole.clear(10 * SECOND) is None
+
+
+def test_sensors_are_missed_while_the_encoders_speak():
+    """Said once when they stop, shown as long as they are silent, and not before a plant is up."""
+    whole = safety(expected=('base_wrench',), sensor_timeout=0.5)
+    joints, wrench = (whole.streams[name] for name in ('joint_states', 'base_wrench'))
+    now = 15 * SECOND
+    assert whole.news(now) == []
+    assert whole.warning(now) is None
+    said = []
+    for i in range(2000):
+        now += MILLISECOND
+        joints.check(now, now)
+        if i < 1000:
+            wrench.check(now, now, 'needle_base', [0.0, 0.0])
+        said += whole.news(now)
+    assert said == ['base_wrench is stale: none that counts for 0.5 s']
+    assert whole.warning(now) == 'base_wrench is stale: none that counts for 1.0 s'
+    now += MILLISECOND
+    wrench.check(now, now, 'needle_base', [0.0, 0.0])
+    assert whole.warning(now) is None
+    # No plant, no news.
+    assert whole.news(now + 9 * SECOND) == []
+
+
+def test_a_stop_for_want_of_sensors_is_kept_while_they_are_missing():
+    """With `sensors_required` clearing is refused until they are back."""
+    whole = safety(expected=('base_wrench',), sensor_timeout=0.5, sensors_required=True)
+    joints, wrench = (whole.streams[name] for name in ('joint_states', 'base_wrench'))
+    now = 11 * SECOND
+    joints.check(now, now)
+    wrench.check(now, now, 'needle_base', [0.0, 0.0])
+    later = now + SECOND
+    joints.check(later, later)
+    assert whole.latch(whole.warning(later))
+    assert 'base_wrench is stale' in whole.clear(later)
+    wrench.check(later, later, 'needle_base', [0.0, 0.0])
+    assert whole.clear(later) is None
+
+
+def test_a_clock_set_back_is_told_from_one_that_stands():
+    """By more than the timeout of 0.1 s; forward and still are no matter."""
+    whole = safety()
+    steps = [10.0, 10.0, 10.5, 99.0, 98.95, 50.0, 50.0]
+    assert [whole.clock_went_back(round(t * SECOND)) for t in steps] == [0, 0, 0, 0, 0, 48.95, 0]
+
+
+def test_who_else_commands_is_named():
+    """Each topic with more than one publisher, until it is alone again."""
+    whole = safety()
+    whole.count_commanders({'/wrench_command': 2, '/generalized_command': 1})
+    assert whole.rivals == '2 nodes publish /wrench_command'
+    whole.count_commanders({'/wrench_command': 1, '/generalized_command': 1})
+    assert whole.rivals is None
+
+
+def test_nothing_is_said_twice_in_a_second():
+    """Each kind of complaint has its own second."""
+    whole = safety()
+    times = [0.0, 0.5, 1.0, 1.9, 2.1]
+    assert [whole.due('stale', t) for t in times] == [True, False, True, False, True]
+    assert whole.due('jump', 2.1)
+
+
+@pytest.mark.parametrize(
+    ('change', 'reason'),
+    [
+        ({'speed': 0.0}, 'speed must be finite, > 0 m/s'),
+        ({'axial_load': inf}, 'axial_load must be finite, > 0 N'),
+        ({'tip_jump': nan}, 'tip_jump must be finite'),
+        ({'sensors_required': 1}, 'sensors_required must be true or false, got 1'),
+    ],
+)
+def test_limits_must_be_finite(change, reason):
+    """There is no way to switch a limit off."""
+    with pytest.raises(ParameterError, match=reason):
+        SafetyLimits(**change)
+
+
+def test_encoders_are_read_by_name():
+    """In any order, with or without the rotation."""
+    both = read_encoders(1.0, ['rotation', 'insertion'], [0.1, 0.02], [0.2, 0.01])
+    assert both == Measurement(time=1.0, depth=0.02, speed=0.01, angle=0.1, angular_speed=0.2)
+    assert read_encoders(1.0, ['insertion'], [0.02], [0.01]).angle == 0.0
+
+
+@pytest.mark.parametrize(
+    ('names', 'positions', 'speeds'),
+    [
+        ([], [], []),
+        (['insertion'], [], [0.0]),
+        (['insertion'], [0.02], []),
+        (['insertion', 'rotation'], [0.02, 0.0], [0.0]),
+        (['elbow'], [0.02], [0.0]),
+    ],
+)
+def test_encoders_that_are_not_complete_are_refused(names, positions, speeds):
+    """In one line that says what came."""
+    with pytest.raises(ParameterError, match=r"needs position and velocity of 'insertion', got"):
+        read_encoders(1.0, names, positions, speeds)
