@@ -69,6 +69,7 @@ class NodeProcess:
         log: IO[str],
     ) -> None:
         self.name = name
+        self.killed = False
         self._log = log
         settings = []
         for key, value in parameters.items():
@@ -95,6 +96,12 @@ class NodeProcess:
         self._log.flush()
         lines = Path(self._log.name).read_text(encoding='utf-8', errors='replace').splitlines()
         return lines[-1] if lines else ''
+
+    def kill(self) -> None:
+        """End the node at once, as a crash does, and wait."""
+        self.killed = True
+        self.process.kill()
+        self.process.wait()
 
     def interrupt(self, timeout: float = 15.0) -> None:
         """End the node as Ctrl-C does and wait; raise `GraphError` if it does not end well."""
@@ -275,7 +282,7 @@ class Graph:
         while not condition():
             for started in self._processes:
                 # One that was interrupted on purpose has ended well.
-                if started.process.poll() not in (None, 0):
+                if started.process.poll() not in (None, 0) and not started.killed:
                     started.check()
             if time.monotonic() > deadline:
                 raise GraphError(f'{what} did not come within {timeout:g} s')

@@ -1,0 +1,375 @@
+"""What goes wrong in a graph, and what must then happen: never silence, never force."""
+
+import resource
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from geometry_msgs.msg import PointStamped, WrenchStamped
+from needle_controller.controller_node import ControllerNode
+from needle_dynamics.base_node import COMMAND, SENSOR
+from needle_dynamics.plant_node import PlantNode
+from needle_identification.bag_io import Bag
+import numpy as np
+import pytest
+from rclpy.parameter import Parameter
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import JointState
+from std_srvs.srv import Trigger
+
+RATE, START, TARGET = 200.0, 0.02, 0.025
+
+#: Where dry friction may hold the needle that inverse dynamics has let go of [m].
+NEAR = 2e-4
+
+
+class Loop:
+    """
+    Plant and controller in this process, and a probe.
+
+    Time is the plant's: a machine that stalls makes it wait, and is no fault of its own.
+    """
+
+    def __init__(self, graph, plant=None, controller=None):
+        self.graph = graph
+        self.probe = graph.node('probe')
+        self.truth = graph.latest(self.probe, JointState, 'ground_truth', SENSOR)
+        self.command = graph.latest(self.probe, WrenchStamped, 'wrench_command', COMMAND)
+        self.targets = self.probe.create_publisher(PointStamped, 'target', COMMAND)
+        self.plant = graph.add(
+            PlantNode, parameters={'rate': RATE, 'publish_clock': True, **(plant or {})}
+        )
+        self.controller = graph.add(
+            ControllerNode, parameters={'rate': RATE, 'use_sim_time': True, **(controller or {})}
+        )
+        self.until(
+            lambda: self.said('measurements answered') > 5 and self.truth.message, 'discovery'
+        )
+
+    def until(self, condition, what):
+        """Spin until a condition holds."""
+        self.graph.spin_until(condition, what)
+
+    def said(self, key):
+        """Return a figure of the controller's diagnostics."""
+        return self.controller.diagnose()[2][key]
+
+    @property
+    def depth(self):
+        """True inserted length [m]."""
+        return 0.2 - self.truth.message.position[0]
+
+    @property
+    def speed(self):
+        """True insertion speed [m/s]."""
+        return -self.truth.message.velocity[0]
+
+    @property
+    def time(self):
+        """Time of the newest sample [s]."""
+        stamp = self.truth.message.header.stamp
+        return stamp.sec + 1e-9 * stamp.nanosec
+
+    def aim(self, depth=TARGET):
+        """Send a target until it is taken."""
+        message = PointStamped()
+        message.point.y = depth
+
+        def taken():
+            self.targets.publish(message)
+            return self.said('target [m]') == depth
+
+        self.until(taken, 'the target')
+
+    def break_down(self, kind, topic, **values):
+        """Let a stream of the plant suffer from a fault."""
+        parameters = {'fault.kind': kind, 'fault.topic': topic}
+        parameters |= {f'fault.{name}': value for name, value in values.items()}
+        changed = self.plant.set_parameters_atomically(
+            [Parameter(name, value=value) for name, value in parameters.items()]
+        )
+        assert changed.successful, changed.reason
+
+    def mend(self):
+        """End the fault."""
+        self.plant.set_parameters([Parameter('fault.kind', value='none')])
+
+    def passes(self, seconds):
+        """Spin for a time of the needle."""
+        end = self.time + seconds
+        self.until(lambda: self.time >= end, f'{seconds} s')
+
+    def moves(self):
+        """Spin until the needle is on its way."""
+        self.until(lambda: self.speed > 0.005, 'motion')
+
+    def arrives(self, depth=TARGET):
+        """Spin until the needle rests at its target."""
+        self.until(lambda: abs(self.depth - depth) < NEAR and self.speed == 0.0, 'the arrival')
+
+    def rests_without_force(self, why):
+        """The needle rests, nothing is commanded, and the diagnostics say why."""
+        self.until(lambda: why in self.controller.diagnose()[1], why)
+        self.until(lambda: self.speed == 0.0, 'rest')
+        depth = self.depth
+        self.passes(0.3)
+        assert self.depth == depth
+        assert self.controller.diagnose()[0] != DiagnosticStatus.OK
+        force = self.command.message.wrench.force.y
+        # Where no measurement comes the plant has let go by itself.
+        assert force == 0.0 or self.plant.diagnose()[2]['commands per second [Hz]'] == '0.0'
+
+    def clears(self):
+        """Release the latched stop."""
+        client = self.probe.create_client(Trigger, 'controller/clear_stop')
+        self.until(client.service_is_ready, 'the service')
+        answer = client.call_async(Trigger.Request())
+        self.until(answer.done, 'the answer')
+        return answer.result()
+
+
+@pytest.mark.parametrize(
+    ('kind', 'values'),
+    [
+        ('drop', {'probability': 0.3}),
+        ('delay', {'probability': 0.3, 'delay': 0.01}),
+        ('duplicate', {}),
+        ('reorder', {'probability': 0.3}),
+    ],
+)
+@pytest.mark.parametrize('topic', ['joint_states', 'base_wrench', 'tip_deflection'])
+def test_a_network_that_loses_or_muddles_measurements_is_borne(ros_graph, kind, values, topic):
+    """The needle gets where it shall, and no stop latches."""
+    loop = Loop(ros_graph)
+    loop.break_down(kind, topic, **values)
+    loop.aim()
+    loop.arrives()
+    assert 'clear_stop' not in loop.controller.diagnose()[1]
+
+
+@pytest.mark.parametrize('topic', ['base_wrench', 'tip_deflection'])
+@pytest.mark.parametrize(
+    ('kind', 'values'),
+    [('drop', {}), ('freeze', {}), ('nan', {}), ('delay', {'delay': 5.0})],
+)
+def test_without_its_sensors_of_bending_it_goes_on(ros_graph, kind, values, topic):
+    """The observer does without what does not come or is of no use; the diagnostics tell."""
+    loop = Loop(ros_graph, plant={'tip.noise': 1e-5})
+    loop.aim()
+    loop.moves()
+    loop.break_down(kind, topic, **values)
+    loop.until(lambda: topic in loop.controller.diagnose()[1], 'the warning')
+    assert loop.controller.diagnose()[0] == DiagnosticStatus.WARN
+    loop.arrives()
+
+
+@pytest.mark.parametrize(
+    ('kind', 'values'), [('drop', {}), ('nan', {}), ('delay', {'delay': 0.5})]
+)
+def test_without_encoders_it_lets_go_and_goes_on_when_they_are_back(ros_graph, kind, values):
+    """Zero force while they are gone; then to the target."""
+    loop = Loop(ros_graph)
+    loop.aim(0.04)
+    loop.moves()
+    loop.break_down(kind, 'joint_states', **values)
+    loop.rests_without_force('joint_states')
+    loop.mend()
+    loop.arrives(0.04)
+
+
+@pytest.mark.parametrize(
+    ('kind', 'values', 'why'),
+    [
+        ('freeze', {}, 'safety.tracking_error'),
+        ('saturate', {'size': 0.021}, 'insertion moved by'),
+        ('bias', {'size': 0.01}, 'insertion moved by'),
+    ],
+)
+def test_encoders_that_lie_end_the_motion(ros_graph, kind, values, why):
+    """What the encoders say does not fit the motion: no force, and the reason."""
+    loop = Loop(ros_graph, controller={'jump': 5e-4} if kind == 'saturate' else None)
+    loop.aim(0.1)
+    loop.moves()
+    loop.break_down(kind, 'joint_states', **values)
+    said = []
+
+    def tells():
+        said.append(str(loop.controller.diagnose()))
+        return why in said[-1]
+
+    loop.until(tells, why)
+    loop.until(lambda: loop.speed == 0.0, 'rest')
+
+
+@pytest.mark.parametrize(
+    ('topic', 'size', 'why'),
+    [('base_wrench', 50.0, 'load'), ('tip_deflection', 0.06, 'tip_deflection')],
+)
+def test_a_load_beyond_the_limits_latches_a_stop(ros_graph, topic, size, why):
+    """Until the reading is within them again and the stop is cleared."""
+    loop = Loop(ros_graph)
+    loop.aim(0.04)
+    loop.moves()
+    loop.break_down('bias', topic, size=size)
+    loop.rests_without_force('~/clear_stop releases')
+    assert why in loop.controller.diagnose()[1]
+    refused = loop.clears()
+    assert not refused.success
+    loop.mend()
+    loop.passes(0.1)
+    loop.rests_without_force('~/clear_stop releases')
+    assert loop.clears().success
+    loop.arrives(0.04)
+
+
+def test_a_killed_controller_leaves_the_needle_at_rest(ros_graph):
+    """The plant lets go after command_timeout; a new controller takes over."""
+    probe = ros_graph.node('probe')
+    truth = ros_graph.latest(probe, JointState, 'ground_truth', SENSOR)
+    targets = probe.create_publisher(PointStamped, 'target', COMMAND)
+    plant = ros_graph.add(PlantNode, parameters={'rate': RATE, 'command_timeout': 1.0})
+    parameters = {'rate': RATE, 'measurement_timeout': 1.0}
+    message = PointStamped()
+    message.point.y = 0.1
+
+    def moves():
+        targets.publish(message)
+        return truth.message is not None and truth.message.velocity[0] < 0.0
+
+    first = ros_graph.start('controller', parameters)
+    ros_graph.spin_until(moves, 'motion', timeout=60.0)
+    first.kill()
+    ros_graph.spin_until(lambda: truth.message.velocity[0] == 0.0, 'rest')
+    assert plant.diagnose()[2]['commands refused'] == 0
+    ros_graph.start('controller', parameters)
+    # The dead one commands, as far as others know, until its lease of 20 s has ended.
+    ros_graph.spin_until(moves, 'motion', timeout=90.0)
+
+
+def test_a_killed_plant_is_waited_for(ros_graph):
+    """The controller commands nothing, says why, and goes on with a plant that takes its place."""
+    probe = ros_graph.node('probe')
+    states = ros_graph.latest(probe, JointState, 'joint_states', SENSOR)
+    forces = ros_graph.latest(probe, WrenchStamped, 'wrench_command', COMMAND)
+    targets = probe.create_publisher(PointStamped, 'target', COMMAND)
+    controller = ros_graph.add(ControllerNode, parameters={'measurement_timeout': 1.0})
+    message = PointStamped()
+    message.point.y = 0.1
+
+    def moves():
+        targets.publish(message)
+        return states.message is not None and states.message.velocity[0] > 0.0
+
+    first = ros_graph.start('plant', {'command_timeout': 1.0})
+    ros_graph.spin_until(moves, 'motion', timeout=60.0)
+    first.kill()
+    ros_graph.spin_until(lambda: 'stale' in controller.diagnose()[1], 'the fault')
+    ros_graph.spin_until(lambda: forces.message.wrench.force.y == 0.0, 'no force')
+    ros_graph.start('plant', {'command_timeout': 1.0})
+    ros_graph.spin_until(moves, 'motion', timeout=60.0)
+
+
+def test_a_recorder_without_disk_says_so_and_keeps_what_it_has(ros_graph, tmp_path):
+    """When no more can be written the recording ends, the node does not, and the bag is read."""
+    loop = Loop(ros_graph)
+    bag = tmp_path / 'bag'
+    health = []
+    listen = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
+    loop.probe.create_subscription(
+        DiagnosticArray, '/diagnostics', lambda m: health.extend(m.status), listen
+    )
+    recorder = ros_graph.start('recorder', {'path': str(bag), 'compression': 'none'})
+    loop.until(lambda: list(bag.glob('*.mcap')) and loop.depth, 'the bag')
+    size = 200_000
+    resource.prlimit(recorder.process.pid, resource.RLIMIT_FSIZE, (size, size))
+    loop.until(
+        lambda: any(
+            status.name == '/recorder' and 'File too large' in status.message for status in health
+        ),
+        'the report',
+    )
+    recorder.check()
+    (file,) = bag.glob('*.mcap')
+    read = Bag(file)
+    count = sum(len(batch.received) for batch in read.batches(lambda _topic: True))
+    assert file.stat().st_size <= size
+    # More than half of the file are messages, of less than 200 bytes each.
+    assert count > size / 2 / 200
+
+
+def test_a_clock_that_jumps_moves_nothing(ros_graph):
+    """Under a foreign clock that jumps both ways the loop goes on, without a force in between."""
+    clocks = ros_graph.node('clock')
+    ticks = clocks.create_publisher(Clock, '/clock', SENSOR)
+    probe = ros_graph.node('probe')
+    truth = ros_graph.latest(probe, JointState, 'ground_truth', SENSOR)
+    targets = probe.create_publisher(PointStamped, 'target', COMMAND)
+    simulated = {'rate': RATE, 'use_sim_time': True}
+    ros_graph.add(PlantNode, parameters=simulated)
+    controller = ros_graph.add(ControllerNode, parameters=simulated)
+    now = [100_000_000_000]
+
+    def goes_on(step=5_000_000):
+        now[0] += step
+        message = Clock()
+        message.clock.sec, message.clock.nanosec = divmod(now[0], 10**9)
+        ticks.publish(message)
+        return truth.message is not None
+
+    def aimed(depth):
+        message = PointStamped()
+        message.point.y = depth
+
+        def taken():
+            goes_on()
+            targets.publish(message)
+            return controller.diagnose()[2]['target [m]'] == depth
+
+        ros_graph.spin_until(taken, 'the target')
+
+    def reached(depth):
+        goes_on()
+        return abs(0.2 - truth.message.position[0] - depth) < NEAR
+
+    ros_graph.spin_until(goes_on, 'the first sample')
+    aimed(0.022)
+    ros_graph.spin_until(lambda: reached(0.022), 'the target')
+    for jump in (3600 * 10**9, -7200 * 10**9):
+        before = truth.message.position[0]
+        goes_on(jump)
+        for _ in range(20):
+            ros_graph.executor.spin_once(timeout_sec=0.01)
+            goes_on()
+        assert abs(truth.message.position[0] - before) < NEAR
+    aimed(0.024)
+    ros_graph.spin_until(lambda: reached(0.024), 'the target')
+
+
+def test_a_flood_of_commands_does_not_stop_the_samples(ros_graph):
+    """Commands as fast as a process can publish them: the plant samples on and warns."""
+    probe = ros_graph.node('probe')
+    stamps = []
+    probe.create_subscription(
+        JointState,
+        'joint_states',
+        lambda m: stamps.append(m.header.stamp.sec * 10**9 + m.header.stamp.nanosec),
+        QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT),
+    )
+    commands = probe.create_publisher(WrenchStamped, 'wrench_command', COMMAND)
+    plant = ros_graph.add(PlantNode, parameters={'rate': 20.0, 'publish_clock': True})
+    ros_graph.spin_until(lambda: stamps and commands.get_subscription_count(), 'discovery')
+    message = WrenchStamped()
+    message.wrench.force.y = 0.3
+    sent = [0]
+
+    def flood():
+        for _ in range(20):
+            commands.publish(message)
+        sent[0] += 20
+        return 'commands come per second' in plant.diagnose()[1]
+
+    ros_graph.spin_until(flood, 'the warning')
+    first = len(stamps)
+    ros_graph.spin_until(lambda: flood() and len(stamps) > first + 40, 'two seconds of samples')
+    assert set(np.diff(stamps)) <= {49_999_999, 50_000_000, 50_000_001}
+    # Each was below mu_s; none has moved the needle.
+    assert plant.diagnose()[2]['inserted length [m]'] == '0.020000'
