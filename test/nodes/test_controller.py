@@ -880,6 +880,7 @@ def test_no_joint_state_raises(ros_graph, message):
         JointState(position=[0.0] * 4, velocity=[0.0] * 3),
         JointState(position=[0.18, 0.0, nan, 0.0], velocity=[0.0] * 4),
         JointState(position=[-5.0, 0.0, 0.0, 0.0], velocity=[0.0] * 4),
+        JointState(position=[0.18, 0.0, 1e308, 0.0], velocity=[0.0] * 4),
     ],
 )
 def test_no_ground_truth_raises(ros_graph, message):
