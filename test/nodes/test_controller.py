@@ -139,18 +139,8 @@ def test_reaches_the_target(ros_graph, law, reference):
     errors = ros_graph.listen(probe, JointState, 'tracking_error', SENSOR)
     aims = ros_graph.listen(probe, JointState, 'reference', SENSOR)
     targets = probe.create_publisher(PointStamped, 'target', COMMAND)
-    # All in one thread, which may be held up.
-    ros_graph.add(PlantNode, parameters={**SLOW, 'command_timeout': 1.0})
-    ros_graph.add(
-        ControllerNode,
-        parameters={
-            **SLOW,
-            'measurement_timeout': 1.0,
-            'safety.tracking_error': 0.1,
-            'law': law,
-            'reference.kind': reference,
-        },
-    )
+    ros_graph.add(PlantNode, parameters=SLOW)
+    ros_graph.add(ControllerNode, parameters={**SLOW, 'law': law, 'reference.kind': reference})
     ros_graph.spin_until(lambda: states and targets.get_subscription_count(), 'discovery')
     message = PointStamped()
     message.point.y = 0.025
