@@ -135,6 +135,11 @@ class Command:
     fault: str | None = None
     notice: str | None = None
 
+    def is_finite(self) -> bool:
+        """Return whether every force is finite."""
+        modal = self.modal is None or bool(np.isfinite(self.modal).all())
+        return modal and isfinite(self.force) and isfinite(self.torque)
+
 
 class Controller:
     """

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
+from math import isfinite
 import sys
 from time import monotonic
 from typing import Any
@@ -432,12 +433,16 @@ class ControllerNode(NeedleNode):
         if not self.is_active or not self._counts('ground_truth', message.header, state):
             return
         try:
-            bias = self._model.bias_forces(state)
+            # What is finite may be too large all the same.
+            with np.errstate(over='ignore', invalid='ignore'):
+                load = -float(self._model.bias_forces(state)[0])
+            if not isfinite(load):
+                raise ParameterError('the forces of such a needle are not finite')
         except NeedleError as error:
             self._load, self._truth = 0.0, None
             self._warn('ground_truth', f'ground_truth: {error}; not taken in')
             return
-        self._load = -float(bias[0])
+        self._load = load
         if not self._is_modal:
             return
         stamp = _stamp(message.header)
@@ -524,6 +529,11 @@ class ControllerNode(NeedleNode):
         command = self._controller.command(measured, self._load, bend)
         if command.fault is not None:
             self._let_go(command.fault, stamp)
+            return
+        if not command.is_finite():
+            # Whatever the laws remember, it is not good any more.
+            self._controller.forget()
+            self._stop_for('the command is not finite', stamp)
             return
         if command.notice is not None:
             self.get_logger().error(command.notice)

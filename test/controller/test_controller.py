@@ -1,14 +1,16 @@
 """The controller as an object, around the true needle."""
 
-from math import nan
+from math import inf, nan
 
 from needle_controller import (
+    Command,
     Controller,
     ControllerSettings,
     InverseDynamicsGains,
     Measurement,
     PidGains,
     ReferenceLimits,
+    Setpoint,
 )
 from needle_controller.kernels import INTEGRAL
 from needle_dynamics import Integrator, NeedleModel, NeedleParameters, ParameterError
@@ -302,6 +304,20 @@ def test_a_gap_or_a_step_back_in_time_starts_the_motion_anew(step):
             assert after.notice is None
     assert steering.target == 0.05
     assert after.force > 0.0
+
+
+@pytest.mark.parametrize('load', [nan, inf])
+def test_a_command_knows_whether_it_is_finite(load):
+    """A load that is none makes a command that must not go out."""
+    steering = controller()
+    steering.set_target(0.05)
+    measured = Measurement(time=0.0, depth=0.02, speed=0.0)
+    assert steering.command(measured).is_finite()
+    assert not steering.command(measured, nan).is_finite()
+    assert not Command(force=0.0, torque=load, setpoint=Setpoint(0.02)).is_finite()
+    assert not Command(
+        force=0.0, torque=0.0, setpoint=Setpoint(0.02), modal=np.array([0.0, load])
+    ).is_finite()
 
 
 def test_a_range_of_depths_bounds_the_targets():

@@ -294,7 +294,14 @@ class Loop:
             PlantNode, parameters={'rate': rate, 'depth': depth, 'command_timeout': 1.0}
         )
         self.node = graph.add(
-            ControllerNode, parameters={'rate': rate, 'measurement_timeout': 1.0, **parameters}
+            ControllerNode,
+            parameters={
+                'rate': rate,
+                'measurement_timeout': 1.0,
+                # A needle that is pushed on while all is held up is ahead of its reference.
+                'safety.tracking_error': 0.1,
+                **parameters,
+            },
         )
         self.until(lambda: self.aims and self.targets.get_subscription_count(), 'discovery')
         self.until(lambda: self.paths.get_subscription_count() == 2, 'discovery')
@@ -471,6 +478,9 @@ def test_modal_actuation_drives_the_deflection_where_it_is_stable(ros_graph):
     modal = {
         **rate, 'actuation': 'modal', 'deflection_feedback': 'ground_truth', 'lowest_depth': 0.184,
         'measurement_timeout': 1.0,
+        # On a machine that is held up the answers are late and the tip swings: not looked at here.
+        'safety.tip_deflection': 1.0, 'safety.lateral_load': 1e3, 'safety.moment_load': 1e2,
+        'safety.speed': 10.0, 'safety.tracking_error': 1.0,
     }  # fmt: skip
     ros_graph.start('plant', {**rate, 'depth': 0.19, 'command_timeout': 1.0})
     ros_graph.start('controller', modal)
@@ -860,6 +870,7 @@ def test_no_joint_state_raises(ros_graph, message):
         JointState(position=[0.0] * 4, velocity=[0.0] * 3),
         JointState(position=[0.18, 0.0, nan, 0.0], velocity=[0.0] * 4),
         JointState(position=[-5.0, 0.0, 0.0, 0.0], velocity=[0.0] * 4),
+        JointState(position=[0.18, 0.0, 1e308, 0.0], velocity=[0.0] * 4),
     ],
 )
 def test_no_ground_truth_raises(ros_graph, message):
@@ -896,15 +907,15 @@ def test_a_truth_that_does_not_come_is_answered_with_no_force(ros_graph):
 
 def test_diagnostics_tell_rates_and_saturation(ros_graph):
     """Of each input in the last second, and how long the force was all there is."""
-    bench = Bench(ros_graph, force_limit=0.7, **{'safety.tracking_error': 0.1})
+    bench = SimulatedTime(ros_graph, force_limit=0.7, **{'safety.tracking_error': 0.1})
     bench.aim(0.1)
 
     def saturated():
         bench.measure(0.02)
-        return bench.value('share of commands at their limit') == '1.000'
+        seen = float(bench.value('input joint_states').split()[0])
+        return seen and bench.value('share of commands at their limit') == '1.000'
 
     ros_graph.spin_until(saturated, 'a second at the limit')
-    rate = float(bench.value('input joint_states').split()[0])
-    # All of them are answered; the two windows of a second begin at most a sample apart.
-    assert rate == pytest.approx(float(bench.value('commands per second')), rel=0.1)
-    assert rate > 10.0
+    # One each 5 ms; one more where a measurement had to be said again.
+    assert float(bench.value('commands per second')) == pytest.approx(200.0, abs=1.0)
+    assert float(bench.value('input joint_states').split()[0]) == pytest.approx(200.0, abs=5.0)
