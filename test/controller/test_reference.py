@@ -243,3 +243,58 @@ def test_a_paused_path_is_resumed_where_it_was_left(kind):
     assert after.max() == pytest.approx(0.08, abs=0.0125**2 / 0.8 + 1e-9)
     assert after[0] == held.position
     assert walk.points[-1] == Setpoint(0.06)
+
+
+#: A reach of ten stopping distances at the highest speed.
+NARROW = (0.05, 0.055)
+inside = st.one_of(st.sampled_from(NARROW), st.floats(*NARROW))
+
+
+@st.composite
+def narrow_paths(draw):
+    """Return times and positions of lines from end to end of the narrow reach."""
+    times, positions = [draw(st.sampled_from([0.0, 0.05, 1.0]))], [draw(inside)]
+    for _ in range(draw(st.integers(0, 4))):
+        positions.append(draw(inside))
+        distance = abs(positions[-1] - positions[-2])
+        # Time for the way, and for the corners at both its ends.
+        pause = draw(st.floats(0.21, 1.0))
+        times.append(times[-1] + distance / LIMITS.speed + pause)
+    return times, positions
+
+
+narrow_events = st.lists(
+    st.tuples(
+        st.one_of(st.sampled_from(['pause', 'resume']), inside, narrow_paths()),
+        st.floats(0.0, 1.0),
+    ),
+    min_size=2,
+    max_size=6,
+)
+
+
+@KINDS
+@settings(deadline=None, max_examples=40)
+@given(start=inside, events=narrow_events)
+def test_the_reference_never_leaves_the_reach(kind, start, events):
+    """Targets, paths and pauses at its ends, at any speed: it turns before them, and no jump."""
+    guide, time, points = Guide(kind, LIMITS, NARROW), 0.0, []
+    guide.aim(NARROW[1])
+    for event, wait in [('resume', 0.3), *events, ('resume', 2.0)]:
+        if isinstance(event, float):
+            guide.aim(event)
+        elif isinstance(event, tuple):
+            guide.follow(*event)
+        else:
+            getattr(guide, event)()
+        for _ in range(round(wait * 500.0) + 1):
+            points.append(guide.at(time, start))
+            time += 2e-3
+    positions, rates = np.array([(point.position, point.speed) for point in points]).T
+    assert np.abs(np.diff(positions)).max() <= 2e-3 * LIMITS.speed * (1.0 + 1e-6)
+    if kind == 'trapezoid':
+        # What keeps the limits and the reach can always brake before its end.
+        assert np.abs(np.diff(rates)).max() <= 2e-3 * LIMITS.acceleration * (1.0 + 1e-6)
+    # Extremes of polynomials are found to 1e-9 of the reach.
+    assert positions.min() >= NARROW[0] - 1e-11
+    assert positions.max() <= NARROW[1] + 1e-11
