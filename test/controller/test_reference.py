@@ -38,7 +38,7 @@ def test_position_speed_and_acceleration_belong_together(kind, start, speed, tar
     """The speed is the derivative of the position and stays within what limits and start allow."""
     motion = kind(Setpoint(start, speed), target, LIMITS)
     assume(motion.duration > 1e-2)
-    times = np.linspace(0.0, motion.duration, 4001)
+    times = np.linspace(0.0, motion.duration, 801)
     points = [motion.at(t) for t in times]
     position = np.array([p.position for p in points])
     rate = np.array([p.speed for p in points])
@@ -70,7 +70,7 @@ def test_minimum_jerk_meets_its_limit():
     assert motion.duration == pytest.approx(18.75, rel=1e-12)
 
 
-def samples(motion, end: float, count: int = 4001):
+def samples(motion, end: float, count: int = 801):
     """Return times, positions, speeds and accelerations of a motion."""
     times = np.linspace(0.0, end, count)
     points = [motion(t) for t in times]
