@@ -577,3 +577,62 @@ def deflection_matrix(c: FloatArray, table: FloatArray, delay: int, unmodeled: i
                 part_of_end = _times(shapes.T, commands[k - first + 1])
             matrix[k * n : (k + 1) * n, column] = part_of_end
     return matrix
+
+
+@compiled
+def _horner(c: FloatArray, x: float) -> float:
+    """Return the value of a polynomial, the constant first."""
+    value = 0.0
+    for j in range(len(c) - 1, -1, -1):
+        value = value * x + c[j]
+    return value
+
+
+@compiled
+def quintic_extremes(c: FloatArray) -> FloatArray:
+    """
+    Return where a quintic and its first two derivatives are least and largest on [0, 1].
+
+    Parameters
+    ----------
+    c : ndarray, shape (6,)
+        Coefficients, the constant first.
+
+    Returns
+    -------
+    ndarray, shape (3, 2)
+        Least and largest value of each.
+
+    """
+    derivatives, extremes = np.zeros((6, 6)), np.empty((3, 2))
+    derivatives[0] = c
+    for k in range(1, 6):
+        for j in range(6 - k):
+            derivatives[k, j] = (j + 1) * derivatives[k - 1, j + 1]
+    # Between the turns of a curve it has one root at the most: those of each derivative, from the
+    # straight one on, are the turns of the one before.
+    turns, count = np.array([0.0, 1.0, 0.0, 0.0, 0.0, 0.0]), 2
+    found = turns.copy()
+    for k in range(4, -1, -1):
+        values = np.array([_horner(derivatives[k], turns[i]) for i in range(count)])
+        if k < 3:
+            extremes[k, 0], extremes[k, 1] = values.min(), values.max()
+        if k == 0:
+            break
+        number = 1
+        for i in range(count - 1):
+            if values[i] * values[i + 1] >= 0.0:
+                continue
+            low, high = turns[i], turns[i + 1]
+            for _ in range(53):
+                middle = 0.5 * (low + high)
+                if _horner(derivatives[k], middle) * values[i] > 0.0:
+                    low = middle
+                else:
+                    high = middle
+            found[number] = low
+            number += 1
+        found[number] = 1.0
+        count = number + 1
+        turns[:] = found
+    return extremes

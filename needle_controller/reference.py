@@ -9,6 +9,7 @@ from math import copysign, inf, isfinite, sqrt
 from typing import Final, Protocol
 
 from needle_controller.axis import Setpoint
+from needle_controller.kernels import quintic_extremes
 from needle_dynamics import FloatArray, ParameterError
 from needle_dynamics.parameters import check_constants, constant
 import numpy as np
@@ -181,40 +182,21 @@ class Quintic:
         top = max(limits.speed, *(abs(end.speed) for end in ends)) * (1.0 + _ROUNDING)
         ramp = max(limits.acceleration, *(abs(end.acceleration) for end in ends))
         ramp *= 1.0 + _ROUNDING
-        t = self.duration
-        acceleration, _ = self.changes
-        _, v, a, c3, c4, c5 = self._c
-        speed = np.array([5.0 * c5, 4.0 * c4, 3.0 * c3, 2.0 * a, v]) / t
-        return _peak(*self.changes) <= ramp and _peak(speed, acceleration) <= top
+        _, speed, acceleration = self.extremes
+        return bool(np.abs(acceleration).max() <= ramp and np.abs(speed).max() <= top)
 
     def stays(self, reach: tuple[float, float]) -> bool:
         """Return whether it stays in a range of positions [m], ends and rounding included."""
         low, high = reach
-        curve = np.array(self._c[::-1])
-        found = np.polyval(curve, _turns(np.asarray(np.polyder(curve), dtype=float)))
+        least, largest = self.extremes[0]
         slack = _ROUNDING * (high - low) if high - low < inf else 0.0
-        return bool(low - slack <= found.min() and found.max() <= high + slack)
+        return bool(low - slack <= least and largest <= high + slack)
 
     @property
-    def changes(self) -> tuple[FloatArray, FloatArray]:
-        """Acceleration and jerk as polynomials of time over duration, highest powers first."""
+    def extremes(self) -> FloatArray:
+        """Least and largest position, speed and acceleration, shape (3, 2)."""
         t = self.duration
-        _, _, a, c3, c4, c5 = self._c
-        acceleration = np.array([20.0 * c5, 12.0 * c4, 6.0 * c3, 2.0 * a]) / (t * t)
-        return acceleration, np.asarray(np.polyder(acceleration), dtype=float)
-
-
-def _peak(curve: FloatArray, slope: FloatArray) -> float:
-    """Return the largest modulus of a polynomial on [0, 1]; highest powers first."""
-    return float(np.abs(np.polyval(curve, _turns(slope))).max())
-
-
-def _turns(slope: FloatArray) -> FloatArray:
-    """Return 0, 1 and the roots of a polynomial between them; highest powers first."""
-    turns = np.roots(slope)
-    # A double root may come out with a small imaginary part: an extra point does no harm.
-    inside = turns.real[(turns.real > 0.0) & (turns.real < 1.0)]
-    return np.concatenate([[0.0, 1.0], inside])
+        return np.asarray(quintic_extremes(np.array(self._c)) / [[1.0], [t], [t * t]])
 
 
 def _around(reach: tuple[float, float], start: Setpoint) -> tuple[float, float]:
@@ -322,7 +304,8 @@ def halt(
 
     # Its speed is a cubic: with more time its acceleration goes to that of the start.
     for _ in range(40):
-        if _peak(*motion().changes) <= max(limits.acceleration, abs(a)) * (1.0 + _ROUNDING):
+        peak = np.abs(motion().extremes[2]).max()
+        if peak <= max(limits.acceleration, abs(a)) * (1.0 + _ROUNDING):
             break
         time *= _LONGER
     found = motion()

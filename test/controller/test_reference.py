@@ -3,7 +3,7 @@
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from needle_controller import MinimumJerk, ReferenceLimits, Setpoint, Trapezoid
-from needle_controller.reference import Guide, Joined, Path
+from needle_controller.reference import Guide, Joined, Path, Quintic
 from needle_dynamics import ParameterError
 import numpy as np
 from numpy.testing import assert_allclose
@@ -49,6 +49,30 @@ def test_position_speed_and_acceleration_belong_together(kind, start, speed, tar
     assert np.abs(rate).max() <= max(LIMITS.speed, abs(speed)) * (1.0 + 1e-9)
     if kind is Trapezoid or speed == 0.0:
         assert np.abs(ramp).max() <= LIMITS.acceleration * (1.0 + 1e-6)
+
+
+ends = st.builds(Setpoint, depths, speeds, st.one_of(st.just(0.0), st.floats(-0.2, 0.2)))
+
+
+@settings(deadline=None)
+@given(ends, ends, st.floats(-3.0, 2.0))
+def test_extremes_of_a_quintic_are_found(start, end, exponent):
+    """No sample of position, speed or acceleration is beyond them, and some are near them."""
+    motion = Quintic(start, end, 10.0**exponent)
+    points = [motion.at(x * motion.duration) for x in np.linspace(0.0, 1.0, 1001)]
+    found = np.array([(p.position, p.speed, p.acceleration) for p in points]).T
+    low, high = motion.extremes.T
+    # The size of the terms that rounding, and a thousandth of the duration, act on.
+    t = motion.duration
+    terms = sum(
+        abs(e.position) + t * abs(e.speed) + t * t * abs(e.acceleration) for e in (start, end)
+    )
+    size = 100.0 * terms / np.array([1.0, t, t * t]) + 1e-300
+    assert (low <= found.min(axis=1) + 1e-13 * size).all()
+    assert (high >= found.max(axis=1) - 1e-13 * size).all()
+    # Sampled at half a thousandth off an extreme: a second derivative of 60 terms.
+    assert (np.abs(low - found.min(axis=1)) <= 1e-4 * size).all()
+    assert (np.abs(high - found.max(axis=1)) <= 1e-4 * size).all()
 
 
 @settings(deadline=None)
