@@ -621,12 +621,13 @@ def quintic_extremes(c: FloatArray) -> FloatArray:
             break
         number = 1
         for i in range(count - 1):
-            if values[i] * values[i + 1] >= 0.0:
+            positive = values[i] > 0.0
+            if (values[i + 1] > 0.0) == positive:
                 continue
             low, high = turns[i], turns[i + 1]
             for _ in range(53):
                 middle = 0.5 * (low + high)
-                if _horner(derivatives[k], middle) * values[i] > 0.0:
+                if (_horner(derivatives[k], middle) > 0.0) == positive:
                     low = middle
                 else:
                     high = middle
