@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections import deque
 from dataclasses import dataclass, field, replace
 from math import exp, isfinite
@@ -124,6 +125,11 @@ class Setpoint:
     acceleration: float = 0.0
 
 
+def _instant(position: float, speed: float, aim: Setpoint) -> kernels.Instant:
+    """Return what a law answers to, as its compiled functions take it."""
+    return float(position), float(speed), aim.position, aim.speed, aim.acceleration
+
+
 def no_memory(count: int | None = None) -> FloatArray:
     """Return what a law remembers at the beginning: of one axis, or of ``count`` deflections."""
     return np.zeros(kernels.MEMORY if count is None else (kernels.MEMORY, count))
@@ -142,7 +148,7 @@ def law_constants(period: float, breakaway_speed: float, **slots: float) -> Floa
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Law:
+class Law(ABC):
     """
     A sampled control law on one axis; what it remembers is kept by its loop.
 
@@ -185,10 +191,7 @@ class Law:
         load: float = 0.0,
     ) -> float:
         """Return the force for the next period, before any limit; ``load`` is against it."""
-        at = setpoint
-        return law_force(
-            self.constants, memory, position, speed, at.position, at.speed, at.acceleration, load
-        )
+        return law_force(self.constants, memory, _instant(position, speed, setpoint), load)
 
     def remember(
         self,
@@ -200,17 +203,7 @@ class Law:
         force: float,
     ) -> None:
         """Update the memory for a force that was wanted and the one that limits left."""
-        law_remember(
-            self.constants,
-            memory,
-            position,
-            speed,
-            setpoint.position,
-            setpoint.speed,
-            setpoint.acceleration,
-            wanted,
-            force,
-        )
+        law_remember(self.constants, memory, _instant(position, speed, setpoint), wanted, force)
 
     def match(
         self,
@@ -222,25 +215,15 @@ class Law:
         force: float,
     ) -> None:
         """Set the memory so that the next force is the given one: a switch without a bump."""
-        law_match(
-            self.constants,
-            memory,
-            position,
-            speed,
-            setpoint.position,
-            setpoint.speed,
-            setpoint.acceleration,
-            load,
-            force,
-        )
+        law_match(self.constants, memory, _instant(position, speed, setpoint), load, force)
 
     def linear(self) -> Law:
         """Return the same law without Coulomb friction, for its poles."""
         return replace(self, axis=self.axis.without_coulomb())
 
+    @abstractmethod
     def scaled(self, factor: float) -> Law:
         """Return the same law with all gains times a factor."""
-        raise NotImplementedError
 
 
 class SampledLoop:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import isfinite, sqrt
 from typing import Final, TypeAlias
 
@@ -141,6 +141,13 @@ class Command:
         return modal and isfinite(self.force) and isfinite(self.torque)
 
 
+def _felt(axis: str, parameters: NeedleParameters) -> NeedleParameters:
+    """Return the constants without those that do not matter to the poles of an axis."""
+    if axis != 'deflection':
+        return parameters
+    return replace(parameters, carriage_mass=0.0, coulomb_friction=0.0, viscous_friction=0.0)
+
+
 class Controller:
     """
     Drives the needle to a target depth or along a path.
@@ -243,14 +250,14 @@ class Controller:
         limits: dict[str, Limit] = {}
         for i, axis in enumerate(self._axes):
             chosen = gains[name][i]
-            if self._laws and (name, parameters, chosen) == (
-                self.law, self._parameters, self._gains[name][i]
+            law = self._make(axis, parameters, chosen)
+            laws.append(law)
+            if self._laws and (name, chosen, _felt(axis, parameters)) == (
+                self.law, self._gains[name][i], _felt(axis, self._parameters)
             ):  # fmt: skip
                 # The search for what limits the deflections takes a while.
-                laws.append(self._laws[i])
                 limits[axis] = self.limits[axis]
                 continue
-            law = self._make(axis, parameters, chosen)
             limits[axis] = check_stability(
                 law,
                 self._delay,
@@ -258,7 +265,6 @@ class Controller:
                 margin=self._settings.stability_margin,
                 depths=self._depths if isinstance(law, DeflectionLaw) else None,
             )
-            laws.append(law)
         return laws, limits
 
     def _make(self, name: str, parameters: NeedleParameters, gains: Gains) -> Law | DeflectionLaw:

@@ -10,10 +10,14 @@ is solved for all deflections together.
 
 While the needle moves, dG/dt adds rho A d_dot g q_dot to the modal rows and the deflection pulls
 on the row of d. The laws take both from the predicted state as loads, held over a period.
+
+Tissue that swells is refused: a measurement does not say since when it has, and the check of
+stability would have to hold for every stiffness that it comes to.
 """
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections import deque
 from dataclasses import dataclass, field, replace
 from typing import Final
@@ -21,13 +25,10 @@ from typing import Final
 from needle_controller import kernels
 from needle_controller.axis import Axis, Law, law_constants, no_memory, SampledLoop, Setpoint
 from needle_controller.inverse_dynamics import InverseDynamicsGains
-from needle_controller.kernels import (
-    deflection_match,
-    deflection_predict,
-    deflection_step,
-)
+from needle_controller.kernels import deflection_predict, deflection_step, separate
 from needle_controller.pid import PidGains
 from needle_dynamics import FloatArray, NeedleModel, ParameterError, ShapeError
+from needle_dynamics.kernels import evaluate, evaluate_many
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -101,6 +102,33 @@ class NormalModes:
         return np.asarray(self.inverse.T @ np.asarray(forces, dtype=float))
 
 
+class _Tabulate:
+    """Evaluates `needle_controller.kernels.normal_modes` at any depth, without a new array."""
+
+    def __init__(self, model: NeedleModel, period: float) -> None:
+        p, modes, self._tissue = model.parameters, model.modes, model.tissue
+        n = modes.count
+        self._length, self._series, self._terms = p.length, modes.series, modes.terms
+        self._constants = modes.constants
+        self._offsets = np.ascontiguousarray(model.tissue.offsets(modes))
+        self._material = p.linear_density, p.bending_stiffness
+        self._rest = p.tissue_damping, period
+        self._at = np.empty(n * (n + 1) + 4 * n)
+        self._work = np.empty(self._series.shape[1] + 4 * n)
+
+    def __call__(self, depth: float, table: FloatArray) -> None:
+        xi, work, at, starts = depth / self._length, self._work, self._at, self._tissue.starts
+        if table.shape[1] == 2:
+            evaluate(xi, self._series, self._terms, work, at)
+        else:
+            evaluate_many(xi, self._length, self._constants, self._series, work, at)
+        layer = bisect_right(starts, depth) - 1
+        stiffness = self._tissue.stiffnesses[layer]
+        kernels.normal_modes(
+            at, self._offsets[layer], *self._material, stiffness, *self._rest, table
+        )
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DeflectionLaw:
     """
@@ -120,24 +148,33 @@ class DeflectionLaw:
     constants : ndarray, shape (CONSTANTS,)
         The law as the functions of `needle_controller.kernels` take it.
 
+    Raises
+    ------
+    ParameterError
+        If the tissue of the model swells.
+
     """
 
     model: NeedleModel
     gains: InverseDynamicsGains | PidGains
     period: float
     constants: FloatArray = field(init=False, repr=False, compare=False)
-    _offsets: FloatArray = field(init=False, repr=False, compare=False)
+    _tabulate: _Tabulate = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         gains = self.gains
+        if self.model.parameters.swelling != 0.0:
+            raise ParameterError(
+                'swelling must be 0 with modal actuation, whose gains are for tissue that stays '
+                f'as it is, got {self.model.parameters.swelling!r}'
+            )
         slots = gains.slots(self.period) if isinstance(gains, PidGains) else gains.slots()
         p = self.model.parameters
         if p.formulation == 'complete':
             slots |= {'DENSITY': p.linear_density, 'BENDING': p.bending_stiffness, 'COUPLED': 1.0}
         constants = law_constants(self.period, gains.breakaway_speed, **slots)
         object.__setattr__(self, 'constants', constants)
-        offsets = self.model.tissue.offsets(self.model.modes)
-        object.__setattr__(self, '_offsets', np.ascontiguousarray(offsets))
+        object.__setattr__(self, '_tabulate', _Tabulate(self.model, self.period))
 
     @property
     def count(self) -> int:
@@ -148,7 +185,7 @@ class DeflectionLaw:
         """Return the same law with all gains times a factor."""
         return replace(self, gains=self.gains.scaled(factor))
 
-    def at(self, depth: float, time: float = 0.0) -> NormalModes:
+    def at(self, depth: float) -> NormalModes:
         """
         Return the axes that the law acts on at an inserted length.
 
@@ -156,8 +193,6 @@ class DeflectionLaw:
         ----------
         depth : float
             Inserted length s [m].
-        time : float
-            Time [s], for tissue that swells.
 
         Returns
         -------
@@ -170,24 +205,18 @@ class DeflectionLaw:
             If ``depth`` is beyond the modes' reach or the needle is not inserted.
 
         """
-        p, tissue = self.model.parameters, self.model.tissue
-        if not depth > 0.0:
-            raise ParameterError(f'inserted length must be > 0 m, got {depth!r}')
-        packed = self.model.modes.packed(depth)
-        layer = 0
-        if len(tissue.starts) > 1:
-            layer = int(np.searchsorted(tissue.starts, depth, side='right')) - 1
-        table = kernels.normal_modes(
-            packed,
-            self._offsets[layer],
-            p.linear_density,
-            p.bending_stiffness,
-            tissue.stiffnesses[layer],
-            tissue.growth(time),
-            p.tissue_damping,
-            self.period,
-        )
+        p, modes = self.model.parameters, self.model.modes
+        if not 0.0 < depth <= modes.reach * p.length:
+            raise ParameterError(
+                f'inserted length must be > 0 m and <= {modes.reach * p.length:g} m, got {depth!r}'
+            )
+        table = np.empty((2 * self.count + kernels.TABLE, self.count))
+        self.tabulate(depth, table)
         return NormalModes(depth=depth, damping=p.tissue_damping / p.linear_density, table=table)
+
+    def tabulate(self, depth: float, table: FloatArray) -> None:
+        """Write the table of `at` for a valid inserted length [m] into an array."""
+        self._tabulate(depth, table)
 
 
 class DeflectionLoop:
@@ -264,7 +293,9 @@ class DeflectionLoop:
             at its beginning [N].
 
         """
-        return deflection_predict(self.law.constants, modes.table, x, speed, force)
+        end = x.copy()
+        against = deflection_predict(self.law.constants, modes.table, end, speed, force)
+        return end, against
 
     def answer(
         self, modes: NormalModes, x: FloatArray, target: FloatArray, speed: float
@@ -289,13 +320,19 @@ class DeflectionLoop:
             Generalized forces on q1..qn, and the force of the bent needle against insertion [N].
 
         """
-        known = self.law.constants, self.memory, modes.table, x, target, speed
-        if self._take_over:
-            self._take_over = False
-            deflection_match(*known, self.last)
-        self.last, against = deflection_step(*known)
-        self.on_the_way.append(self.last)
-        return self.last, against
+        return self.step(modes.table, x, target, speed)
+
+    def step(
+        self, table: FloatArray, x: FloatArray, target: FloatArray, speed: float
+    ) -> tuple[FloatArray, float]:
+        """Do what `answer` does, given the table of the modes."""
+        force = self.last.copy()
+        against = deflection_step(
+            self.law.constants, self.memory, table, x, target, speed, self._take_over, force
+        )
+        self._take_over, self.last = False, force
+        self.on_the_way.append(force)
+        return force, against
 
 
 class ModalLoop:
@@ -338,6 +375,10 @@ class ModalLoop:
         self.insertion = SampledLoop(insertion, delay, force_limit)
         self.rotation = SampledLoop(rotation, delay, torque_limit)
         self.deflection = DeflectionLoop(deflection, delay)
+        n, model = deflection.count, deflection.model
+        p = model.parameters
+        self._delay, self._depths = delay, (p.minimum_depth, model.modes.reach * p.length)
+        self._table, self._x = np.empty((2 * n + kernels.TABLE, n)), np.empty((2, n))
 
     def stop(self) -> None:
         """Nothing is on the way any more; what the laws remember stays as it is."""
@@ -361,7 +402,6 @@ class ModalLoop:
         insertion: Setpoint,
         rotation: Setpoint,
         deflection: ArrayLike,
-        time: float = 0.0,
     ) -> FloatArray:
         """
         Return the forces to apply.
@@ -374,8 +414,6 @@ class ModalLoop:
             References of inserted length and angle at the time the command takes effect.
         deflection : array_like, shape (3, n)
             Wanted q1..qn, rates and accelerations at that time.
-        time : float
-            Time [s], for tissue that swells.
 
         Returns
         -------
@@ -389,35 +427,40 @@ class ModalLoop:
             If the state is not valid.
 
         """
-        law, sliding = self.deflection.law, self.insertion.law.axis
-        model, h = law.model, law.period
-        m, now = model.coordinates, model.checked_state(state)
+        law, sliding, turning = (
+            self.deflection.law,
+            self.insertion.law.axis,
+            self.rotation.law.axis,
+        )
+        h, m = law.period, law.count + _BASE
+        table, x = self._table, self._x
+        now = np.ascontiguousarray(state, dtype=float)
         target = np.ascontiguousarray(deflection, dtype=float)
-        if target.shape != (3, law.count) or not np.isfinite(target).all():
+        if now.shape != (2 * m,) or target.shape != (3, law.count) or not separate(now, target, x):
+            law.model.checked_state(state)
             raise ShapeError(
                 f'deflection must be finite with shape (3, {law.count}), got {target.tolist()}'
             )
-        depth, speed = float(model.parameters.length - now[0]), float(-now[m])
-        angle, turn = float(now[1]), float(now[m + 1])
-        x = np.stack([now[_BASE:m], now[m + _BASE :]])
-        ahead = 0.5 * (len(self.deflection.on_the_way) + 1) * h * speed
-        p = model.parameters
-        middle = min(max(depth + ahead, p.minimum_depth), model.modes.reach * p.length)
-        modes = law.at(middle, time)
+        low, high = self._depths
+        depth, speed = law.model.parameters.length - now.item(0), -now.item(m)
+        angle, turn = now.item(1), now.item(m + 1)
+        if not low <= depth <= high:
+            # Unless it is rounding.
+            law.model.checked_state(state)
+        middle = depth + 0.5 * (self._delay + 1) * h * speed
+        law.tabulate(min(max(middle, low), high), table)
         for force, torque, forces in zip(
             self.insertion.on_the_way,
             self.rotation.on_the_way,
             self.deflection.on_the_way,
             strict=True,
         ):
-            x, against = self.deflection.predict(modes, x, speed, forces)
+            against = deflection_predict(law.constants, table, x, speed, forces)
             depth, speed = sliding.propagate(depth, speed, force - against, h)
-            angle, turn = self.rotation.law.axis.propagate(angle, turn, torque, h)
-        forces, against = self.deflection.answer(modes, x, target, speed)
-        return np.array(
-            [
-                self.insertion.answer(depth, speed, insertion, against),
-                self.rotation.answer(angle, turn, rotation),
-                *forces,
-            ]
-        )
+            angle, turn = turning.propagate(angle, turn, torque, h)
+        forces, against = self.deflection.step(table, x, target, speed)
+        answer = np.empty(m)
+        answer[0] = self.insertion.answer(depth, speed, insertion, against)
+        answer[1] = self.rotation.answer(angle, turn, rotation)
+        answer[_BASE:] = forces
+        return answer

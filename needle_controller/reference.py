@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from math import copysign, isfinite, sqrt
+from math import copysign, inf, isfinite, sqrt
 from typing import Final, Protocol
 
 from needle_controller.axis import Setpoint
+from needle_controller.kernels import quintic_extremes
 from needle_dynamics import FloatArray, ParameterError
 from needle_dynamics.parameters import check_constants, constant
 import numpy as np
@@ -181,27 +182,26 @@ class Quintic:
         top = max(limits.speed, *(abs(end.speed) for end in ends)) * (1.0 + _ROUNDING)
         ramp = max(limits.acceleration, *(abs(end.acceleration) for end in ends))
         ramp *= 1.0 + _ROUNDING
-        t = self.duration
-        acceleration, _ = self.changes
-        _, v, a, c3, c4, c5 = self._c
-        speed = np.array([5.0 * c5, 4.0 * c4, 3.0 * c3, 2.0 * a, v]) / t
-        return _peak(*self.changes) <= ramp and _peak(speed, acceleration) <= top
+        _, speed, acceleration = self.extremes
+        return bool(np.abs(acceleration).max() <= ramp and np.abs(speed).max() <= top)
+
+    def stays(self, reach: tuple[float, float]) -> bool:
+        """Return whether it stays in a range of positions [m], ends and rounding included."""
+        low, high = reach
+        least, largest = self.extremes[0]
+        slack = _ROUNDING * (high - low) if high - low < inf else 0.0
+        return bool(low - slack <= least and largest <= high + slack)
 
     @property
-    def changes(self) -> tuple[FloatArray, FloatArray]:
-        """Acceleration and jerk as polynomials of time over duration, highest powers first."""
+    def extremes(self) -> FloatArray:
+        """Least and largest position, speed and acceleration, shape (3, 2)."""
         t = self.duration
-        _, _, a, c3, c4, c5 = self._c
-        acceleration = np.array([20.0 * c5, 12.0 * c4, 6.0 * c3, 2.0 * a]) / (t * t)
-        return acceleration, np.asarray(np.polyder(acceleration), dtype=float)
+        return np.asarray(quintic_extremes(np.array(self._c)) / [[1.0], [t], [t * t]])
 
 
-def _peak(curve: FloatArray, slope: FloatArray) -> float:
-    """Return the largest modulus of a polynomial on [0, 1]; highest powers first."""
-    turns = np.roots(slope)
-    # A double root may come out with a small imaginary part: an extra point does no harm.
-    inside = turns.real[(turns.real > 0.0) & (turns.real < 1.0)]
-    return float(np.abs(np.polyval(curve, np.concatenate([[0.0, 1.0], inside]))).max())
+def _around(reach: tuple[float, float], start: Setpoint) -> tuple[float, float]:
+    """Return a range of positions [m] that has the start in it: one outside has to come back."""
+    return min(reach[0], start.position), max(reach[1], start.position)
 
 
 class MinimumJerk:
@@ -216,10 +216,19 @@ class MinimumJerk:
         Where it ends, at rest [m].
     limits : ReferenceLimits
         Limits; what the start already exceeds is not held against it.
+    reach : tuple of float
+        Least and largest position on the way [m]; a start outside counts as in it.
 
     """
 
-    def __init__(self, start: Setpoint, target: float, limits: ReferenceLimits) -> None:
+    def __init__(
+        self,
+        start: Setpoint,
+        target: float,
+        limits: ReferenceLimits,
+        reach: tuple[float, float] = (-inf, inf),
+    ) -> None:
+        reach = _around(reach, start)
         distance = abs(target - start.position)
         # Rest to rest: the peaks of the quintic are 15/8 D/T and 10/sqrt(3) D/T^2.
         shortest = max(
@@ -231,13 +240,17 @@ class MinimumJerk:
         end = Setpoint(target)
         motion = Quintic(start, end, shortest)
         at_rest = start.speed == 0.0 and start.acceleration == 0.0
-        while not (at_rest or motion.within(limits)) and motion.duration < 100.0 * shortest:
+
+        def fits() -> bool:
+            return at_rest or (motion.within(limits) and motion.stays(reach))
+
+        while not fits() and motion.duration < 100.0 * shortest:
             motion = Quintic(start, end, _LONGER * motion.duration)
         self._halt: Quintic | None = None
         self._motion = motion
-        if not (at_rest or motion.within(limits)):
+        if not fits():
             # No quintic does it: to rest first.
-            self._halt = halt(start, limits)
+            self._halt = halt(start, limits, reach)
             distance = abs(target - self._halt.end.position)
             least = max(
                 1.875 * distance / limits.speed,
@@ -256,9 +269,14 @@ class MinimumJerk:
         return self._motion.at(time)
 
 
-def halt(start: Setpoint, limits: ReferenceLimits) -> Quintic:
+def halt(
+    start: Setpoint, limits: ReferenceLimits, reach: tuple[float, float] = (-inf, inf)
+) -> Quintic:
     """
     Return the motion to rest that does not turn, within the limit of acceleration.
+
+    Where that would leave the reach it ends where the reach does, braked as much harder as that
+    takes.
 
     Parameters
     ----------
@@ -267,6 +285,8 @@ def halt(start: Setpoint, limits: ReferenceLimits) -> Quintic:
         the speed may go up at first.
     limits : ReferenceLimits
         Limits.
+    reach : tuple of float
+        Least and largest position on the way [m]; a start outside counts as in it.
 
     Returns
     -------
@@ -274,6 +294,7 @@ def halt(start: Setpoint, limits: ReferenceLimits) -> Quintic:
         Motion.
 
     """
+    reach = _around(reach, start)
     v, a = start.speed, start.acceleration
     time = max(1.5 * abs(v) / limits.acceleration, _SHORTEST)
 
@@ -283,10 +304,33 @@ def halt(start: Setpoint, limits: ReferenceLimits) -> Quintic:
 
     # Its speed is a cubic: with more time its acceleration goes to that of the start.
     for _ in range(40):
-        if _peak(*motion().changes) <= max(limits.acceleration, abs(a)) * (1.0 + _ROUNDING):
+        peak = np.abs(motion().extremes[2]).max()
+        if peak <= max(limits.acceleration, abs(a)) * (1.0 + _ROUNDING):
             break
         time *= _LONGER
-    return motion()
+    found = motion()
+    if found.stays(reach):
+        return found
+    end = Setpoint(reach[1] if v > 0.0 or (v == 0.0 and a > 0.0) else reach[0])
+    # The longest time in which it does not pass the end first.
+    short, long = 0.0, time
+    for _ in range(30):
+        middle = 0.5 * (short + long)
+        if Quintic(start, end, middle).stays(reach):
+            short = middle
+        else:
+            long = middle
+    return Quintic(start, end, short or long)
+
+
+def _brake(start: Setpoint, limits: ReferenceLimits, reach: tuple[float, float]) -> Reference:
+    """Return the shortest motion to rest, whose acceleration begins and ends at once."""
+    low, high = reach
+    stop = start.position + 0.5 * start.speed * abs(start.speed) / limits.acceleration
+    slack = _ROUNDING * (high - low)
+    if low - slack <= stop <= high + slack:
+        return Trapezoid(start, min(max(stop, low), high), limits)
+    return halt(start, limits, reach)
 
 
 #: References to a target by name.
@@ -357,7 +401,7 @@ class Path:
         else:
             self._join_cubics(times, positions, speeds, limits)
             self._check_reach(low, high)
-        self._starts = np.array([piece[0] for piece in self._pieces])
+        self._starts, self.reach = np.array([piece[0] for piece in self._pieces]), reach
         self.begin, self.last = float(times[0]), float(positions[-1])
 
     def _join_lines(
@@ -457,8 +501,8 @@ class Joined:
     """
     A path joined from elsewhere without a jump in position, speed or acceleration.
 
-    The path is reached at its first point in time if the limits allow that, else later, and is
-    then late by half of what the joining took longer.
+    The path is reached at its first point in time if the limits and the reach of the path allow
+    that, else later, and is then late by half of what the joining took longer.
 
     Parameters
     ----------
@@ -475,24 +519,19 @@ class Joined:
 
     def __init__(self, start: Setpoint, path: Path, since: float, limits: ReferenceLimits) -> None:
         self._path = path
-        first = max(since, path.begin)
-        least = first - since
-        self._halt: Quintic | None = None
+        self._halt: Reference | None = None
+        reach = _around(path.reach, start)
         if start.acceleration:
             # No quintic goes far with an acceleration at its start: to rest first.
-            self._halt = halt(start, limits)
-            start = self._halt.end
-        # A needle on the path goes on at once.
-        there = path.at(first)
-        joining: Quintic | None = None
-        entry = first
-        if least > 0.0 or start != there:
-            joining = Quintic(start, there, max(least, _SHORTEST))
-            longest = max(least, path.end - since) + _enough(start, path, limits)
-            while not joining.within(limits) and joining.duration < longest:
-                duration = _LONGER * joining.duration
-                entry = first + 0.5 * (duration - least)
-                joining = Quintic(start, path.at(entry), duration)
+            stopped = halt(start, limits, reach)
+            self._halt, start = stopped, stopped.end
+        found = _join(start, path, since, limits, reach)
+        if found is None and start.speed:
+            self._halt = _brake(start, limits, reach)
+            start = self._halt.at(self._halt.duration)
+            found = _join(start, path, since, limits, reach)
+        # What no quintic joins is met from rest to rest, where it ends.
+        joining, entry = found or (MinimumJerk(start, path.last, limits), path.end)
         self._joining = joining
         self._halting = self._halt.duration if self._halt else 0.0
         self._joined = self._halting + (joining.duration if joining else 0.0)
@@ -509,6 +548,29 @@ class Joined:
         if self._joining is not None and time < self._joined:
             return self._joining.at(time - self._halting)
         return self._path.at(time - self.offset)
+
+
+def _join(
+    start: Setpoint,
+    path: Path,
+    since: float,
+    limits: ReferenceLimits,
+    reach: tuple[float, float],
+) -> tuple[Reference | None, float] | None:
+    """Return the quintic to a path, none if it is there, with the time of the path it leads to."""
+    first = max(since, path.begin)
+    least, entry = first - since, first
+    if least == 0.0 and start == path.at(first):
+        return None, first
+    duration = max(least, _SHORTEST)
+    longest = max(least, path.end - since) + _enough(start, path, limits)
+    while duration < longest:
+        joining = Quintic(start, path.at(entry), duration)
+        if joining.within(limits) and joining.stays(reach):
+            return joining, entry
+        duration *= _LONGER
+        entry = first + 0.5 * (duration - least)
+    return None
 
 
 def _enough(start: Setpoint, path: Path, limits: ReferenceLimits) -> float:
@@ -687,16 +749,17 @@ class Guide:
                 now = Setpoint(now.position, now.speed)
             return Joined(now, self._path, self._passed, self.limits)
         target = now.position if self._target is None else self._target
+        if self._kind is MinimumJerk:
+            return MinimumJerk(now, target, self.limits, self.reach)
         return self._kind(now, target, self.limits)
 
     def _brake(self, now: Setpoint) -> Reference:
         """Stop within the acceleration limit, without passing the end of the motion."""
         motion: Reference
         if self._kind is MinimumJerk:
-            motion = halt(now, self.limits)
+            motion = halt(now, self.limits, self.reach)
         else:
-            pace = now.speed / self.limits.acceleration
-            motion = Trapezoid(now, now.position + 0.5 * abs(pace) * now.speed, self.limits)
+            motion = _brake(now, self.limits, self.reach)
         if self._path is not None:
             # Half of the braking counts: so long the path takes to where the needle stops.
             self._passed += 0.5 * motion.duration

@@ -10,14 +10,14 @@ so that its default is small, yet far above the rounding of an eigenvalue.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from math import ceil, inf, log10, pi
 from typing import Final
 
 from needle_controller import kernels
-from needle_controller.axis import Law, no_memory, SampledLoop, Setpoint
-from needle_controller.modal import DeflectionLaw, DeflectionLoop, NormalModes
+from needle_controller.axis import Law, SampledLoop, Setpoint
+from needle_controller.modal import DeflectionLaw, NormalModes
 from needle_dynamics import FloatArray, ParameterError
 import numpy as np
 
@@ -29,6 +29,7 @@ RESERVE: Final = 1
 
 #: Depths at which a range is looked at before the worst of them is refined.
 _DEPTHS: Final = 25
+_FINER: Final = 7
 
 #: Largest factors by which gains and rate are changed in search of what would do.
 _MOST_GAIN: Final = 1e6
@@ -93,23 +94,26 @@ def transition_matrix(law: Law, delay: int, unmodeled: int = 0) -> FloatArray:
         Transition matrix over one period.
 
     """
-    linear = law.linear()
-    loop = SampledLoop(linear, delay, inf)
-    rest = Setpoint(0.0)
+    linear, late = law.linear(), delay + unmodeled
+    loop, rest = SampledLoop(linear, delay, inf), Setpoint(0.0)
+    # A memory that no gain uses is not part of the loop, and the offset of a switch just fades.
+    c, used = law.constants, []
+    if c[kernels.KI] > 0.0:
+        used.append(kernels.INTEGRAL)
+    if c[kernels.FILTER_TIME] * c[kernels.KD] > 0.0:
+        used.append(kernels.RATE)
+    first = 2 + len(used)
 
-    def respond(x: FloatArray, memory: FloatArray, known: FloatArray) -> FloatArray:
-        loop.memory = memory[:, 0].copy()
-        for i in range(delay):
-            loop.on_the_way[i] = float(known[i, 0])
-        force = loop.command(float(x[0, 0]), float(x[1, 0]), rest)
-        memory[:, 0] = loop.memory
-        return np.array([force])
+    def period(state: FloatArray) -> list[float]:
+        position, speed = state[:2].tolist()
+        commands: list[float] = state[first:].tolist()
+        loop.memory[used] = state[2:first]
+        loop.on_the_way.extend(commands[unmodeled:])
+        commands.append(loop.command(position, speed, rest))
+        end = linear.axis.propagate(position, speed, commands[0], linear.period)
+        return [*end, *loop.memory[used].tolist(), *commands[1:]]
 
-    def move(x: FloatArray, force: FloatArray) -> FloatArray:
-        end = linear.axis.propagate(float(x[0, 0]), float(x[1, 0]), float(force[0]), linear.period)
-        return np.array(end).reshape(2, 1)
-
-    return _probe(respond, move, law.constants, np.eye(1), delay, unmodeled)
+    return np.array([period(unit) for unit in np.eye(first + late)]).T
 
 
 def deflection_matrix(
@@ -133,54 +137,7 @@ def deflection_matrix(
         Transition matrix over one period; each part of the state has n entries.
 
     """
-    loop = DeflectionLoop(law, delay)
-    rest = np.zeros((3, law.count))
-
-    def respond(x: FloatArray, memory: FloatArray, known: FloatArray) -> FloatArray:
-        loop.memory[:] = memory
-        for i in range(delay):
-            loop.on_the_way[i] = known[i].copy()
-        force = loop.command(modes, x, rest)
-        memory[:] = loop.memory
-        return force
-
-    def move(x: FloatArray, force: FloatArray) -> FloatArray:
-        return loop.predict(modes, x, 0.0, force)[0]
-
-    return _probe(respond, move, law.constants, modes.shapes, delay, unmodeled)
-
-
-def _probe(
-    respond: Callable[[FloatArray, FloatArray, FloatArray], FloatArray],
-    move: Callable[[FloatArray, FloatArray], FloatArray],
-    constants: FloatArray,
-    shapes: FloatArray,
-    delay: int,
-    unmodeled: int,
-) -> FloatArray:
-    """Put a loop through one period from each unit state; coordinates are shapes times those."""
-    n, late = len(shapes), delay + unmodeled
-    # A memory that no gain uses is not part of the loop, and the offset of a switch just fades.
-    used = []
-    if constants[kernels.KI] > 0.0:
-        used.append(kernels.INTEGRAL)
-    if constants[kernels.FILTER_TIME] * constants[kernels.KD] > 0.0:
-        used.append(kernels.RATE)
-    first = 2 + len(used)
-    back = np.linalg.inv(shapes)
-
-    def period(unit: FloatArray) -> FloatArray:
-        state = unit.reshape(first + late, n)
-        state[:first], state[first:] = state[:first] @ shapes.T, state[first:] @ back
-        memory = no_memory(n)
-        memory[used] = state[2:first]
-        force = respond(state[:2].copy(), memory, state[len(state) - delay :])
-        commands = np.vstack([state[first:], force])
-        end = move(state[:2].copy(), commands[0])
-        coordinates = np.vstack([end, memory[used]]) @ back.T
-        return np.vstack([coordinates, commands[1:] @ shapes]).ravel()
-
-    return np.array([period(unit) for unit in np.eye((first + late) * n)]).T
+    return kernels.deflection_matrix(law.constants, modes.table, delay, unmodeled)
 
 
 def spectral_radius(law: Law, delay: int, unmodeled: int = 0) -> float:
@@ -273,26 +230,33 @@ def _worst_depth(
     grid = np.geomspace(low, high, _DEPTHS) if high > low else np.array([low])
     # The ends as they were given.
     grid[0], grid[-1] = low, high
-    limits = [_at_depth(law, delay, float(depth), bounds) for depth in grid]
-    worst = _worst(limits)
-    if worst.aliased:
+    excesses, fastest = _excesses(law, delay, grid, bounds)
+    if fastest.max() >= (pi / law.period) ** 2:
         # The fastest mode of all; there is no more to find out.
-        return max(
-            (limit for limit in limits if limit.aliased),
-            key=lambda limit: law.at(limit.depth or low).squares[-1],
-        )
-    k = limits.index(worst)
-    left, right = float(grid[max(k - 1, 0)]), float(grid[min(k + 1, len(grid) - 1)])
+        return _at_depth(law, delay, float(grid[fastest.argmax()]), bounds)
+    k = int(excesses.argmax())
+    worst, depth = excesses[k], grid[k]
+    left, right = grid[max(k - 1, 0)], grid[min(k + 1, len(grid) - 1)]
     while right - left > 1e-2 * high / _DEPTHS:
-        one, two = (
-            _at_depth(law, delay, left + part * (right - left), bounds) for part in (0.38, 0.62)
-        )
-        worst = _worst([worst, one, two])
-        if _worst([one, two]) is one:
-            right = left + 0.62 * (right - left)
-        else:
-            left = left + 0.38 * (right - left)
-    return worst
+        finer = np.linspace(left, right, _FINER)
+        excesses, _ = _excesses(law, delay, finer[1:-1], bounds)
+        k = int(excesses.argmax()) + 1
+        if excesses[k - 1] > worst:
+            worst, depth = excesses[k - 1], finer[k]
+        left, right = finer[k - 1], finer[k + 1]
+    return _at_depth(law, delay, float(depth), bounds)
+
+
+def _excesses(
+    law: DeflectionLaw, delay: int, depths: FloatArray, bounds: dict[int, float]
+) -> tuple[FloatArray, FloatArray]:
+    """Return by how much the radius is beyond its bound, and the square of the fastest mode."""
+    at = [law.at(float(depth)) for depth in depths]
+    excesses = []
+    for unmodeled, bound in bounds.items():
+        matrices = np.array([deflection_matrix(law, modes, delay, unmodeled) for modes in at])
+        excesses.append(np.abs(np.linalg.eigvals(matrices)).max(axis=1) - bound)
+    return np.max(excesses, axis=0), np.array([modes.squares[-1] for modes in at])
 
 
 def _at_depth(law: DeflectionLaw, delay: int, depth: float, bounds: dict[int, float]) -> Limit:

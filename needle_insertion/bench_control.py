@@ -133,6 +133,7 @@ def jobs() -> dict[str, Callable[[], object]]:
     model = NeedleModel(parameters)
     state = model.state_at(_DEPTH, 5e-4)
     state[4] = -_SPEED
+    seen = state.copy()
     goal, still = Setpoint(_DEPTH + _SPEED * PERIOD, _SPEED), Setpoint(0.0)
     rest = np.zeros((3, parameters.modes))
     observer = Observer(parameters, ObserverSettings(), PERIOD)
@@ -167,10 +168,8 @@ def jobs() -> dict[str, Callable[[], object]]:
 
         def modal_observed(deflections: ModalLoop = deflections) -> FloatArray:
             observe()
-            q, rates = observer.modal
-            x = state.copy()
-            x[2:4], x[6:8] = q, rates
-            return deflections.command(x, goal, still, rest)
+            seen[2:4], seen[6:8] = observer.modal
+            return deflections.command(seen, goal, still, rest)
 
         found[f'{name}, modal'] = modal
         found[f'{name}, modal, with observer'] = modal_observed

@@ -382,3 +382,20 @@ def test_modal_actuation_brings_depth_and_deflection_to_their_targets(law, left)
     )
     assert 'outside' in (outside.fault or '')
     assert not outside.modal.any()
+
+
+@pytest.mark.parametrize('law', ['inverse_dynamics', 'pid'])
+def test_only_what_the_deflections_feel_has_their_poles_searched_anew(law):
+    """Friction and other gains leave their limit as it is; their gains and tissue do not."""
+    steering = modal(law)
+    before = steering.limits
+    steering.change(NeedleParameters.preset('phantom', coulomb_friction=0.4))
+    assert steering.limits['deflection'] is before['deflection']
+    steering.change(NeedleParameters.preset('phantom', tissue_damping=0.5))
+    damped = steering.limits['deflection']
+    assert damped.radius != before['deflection'].radius
+    soft = tuple(gains.scaled(0.9) for gains in steering._gains[law])
+    steering.change(**{law: (soft[0], *steering._gains[law][1:])})
+    assert steering.limits['deflection'] is damped
+    steering.change(**{law: soft})
+    assert steering.limits['deflection'].radius != damped.radius

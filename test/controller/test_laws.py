@@ -328,27 +328,35 @@ def test_gains_that_are_none_are_refused(changes, words):
 
 # The deflection.
 
-#: Swelling tissue in two layers: every term of the model.
+#: Tissue in two layers, and modes that the general evaluation is for.
 LAYERED = NeedleModel(
-    NeedleParameters.preset(
-        'phantom', layer_depths=[0.05], layer_stiffnesses=[2000.0], swelling=0.3
-    )
+    NeedleParameters.preset('phantom', layer_depths=[0.05], layer_stiffnesses=[2000.0])
 )
+FOUR = NeedleModel(NeedleParameters.preset('phantom', modes=4, minimum_depth=0.05))
 
 
-@pytest.mark.parametrize('model', [MODEL, LAYERED], ids=['phantom', 'layered'])
-@pytest.mark.parametrize('depth', [0.005, 0.02, 0.1, 0.2])
+@pytest.mark.parametrize(
+    ('model', 'depth'),
+    [
+        *((MODEL, depth) for depth in (0.005, 0.02, 0.1, 0.2)),
+        *((LAYERED, depth) for depth in (0.005, 0.05, 0.2)),
+        *((FOUR, depth) for depth in (0.08, 0.2)),
+    ],
+)
 def test_normal_modes_are_the_model(model, depth):
     """V^T M V = 1, V^T K V = omega^2, and forces turn as the power asks for."""
     law = DeflectionLaw(model=model, gains=InverseDynamicsGains(), period=PERIOD)
-    modes = law.at(depth, time=0.4)
+    modes = law.at(depth)
     mass = model.parameters.linear_density * model.modes.integrals(depth).gram
     v = modes.shapes
     # Rounding times cond(G), 1e5 at 2 cm, over the entries of V.
-    assert_allclose(v.T @ mass @ v, np.eye(2), atol=1e-9)
-    stiffness = v.T @ model.stiffness_matrix(depth, 0.4) @ v
+    assert_allclose(v.T @ mass @ v, np.eye(law.count), atol=1e-9)
+    stiffness = v.T @ model.stiffness_matrix(depth) @ v
     assert_allclose(stiffness, np.diag(modes.squares), atol=1e-9 * modes.squares[-1])
-    q, force = np.array([0.3, -0.2]), np.array([2.0, 5.0])
+    q, force = (
+        np.array([0.3, -0.2, 0.1, 0.4])[: law.count],
+        np.array([2.0, 5.0, 1.0, 3.0])[: law.count],
+    )
     assert_allclose(modes.from_normal(modes.to_normal(q)), q, rtol=1e-10)
     assert_allclose(modes.from_normal_force(modes.to_normal_force(force)), force, rtol=1e-10)
     power = modes.to_normal_force(force) @ modes.to_normal(q)
@@ -461,6 +469,90 @@ def modal_loop(gains, delay: int, model: NeedleModel = MODEL) -> ModalLoop:
     )
 
 
+class PlainModalLoop:
+    """What `ModalLoop` does, in q1..qn and by matrix exponentials, without normal modes."""
+
+    def __init__(self, like: ModalLoop, delay: int) -> None:
+        self.laws = like.insertion.law, like.rotation.law
+        self.gains = like.deflection.law.gains
+        self.delay, self.sent = delay, [np.zeros(4)] * delay
+        self.memories = no_memory(), no_memory()
+        self.integral, self.rate = np.zeros(2), np.zeros(2)
+
+    def command(self, state: np.ndarray, insertion: Setpoint, target: np.ndarray) -> np.ndarray:
+        p, g = MODEL.parameters, self.gains
+        depth, speed, angle, turn = p.length - state[0], -state[4], state[1], state[5]
+        at = depth + 0.5 * (self.delay + 1) * PERIOD * speed
+        integrals, stiffness = MODEL.modes.integrals(at), MODEL.stiffness_matrix(at)
+        inverse = np.linalg.inv(p.linear_density * integrals.gram)
+        drift = np.zeros((6, 6))
+        drift[:2, 2:4], drift[2:4, :2], drift[2:4, 4:] = np.eye(2), -inverse @ stiffness, inverse
+        drift[2:4, 2:4] = -np.eye(2) * p.tissue_damping / p.linear_density
+        flow = expm(PERIOD * drift)[:4]
+        x = np.concatenate([state[2:4], state[6:]])
+
+        def coupled() -> tuple[float, np.ndarray]:
+            tip, rate = integrals.value @ x[:2], integrals.value @ x[2:]
+            bend = integrals.curvature @ x[:2]
+            elastic = p.bending_stiffness * bend**2 + p.tissue_stiffness * tip**2
+            held = p.linear_density * speed * rate * integrals.value
+            return 0.5 * (elastic - p.linear_density * rate**2), held
+
+        for force in self.sent:
+            against, held = coupled()
+            x = flow @ np.concatenate([x, force[2:] - held])
+            depth, speed = self.laws[0].axis.propagate(depth, speed, force[0] - against, PERIOD)
+            angle, turn = self.laws[1].axis.propagate(angle, turn, force[1], PERIOD)
+        against, held = coupled()
+        free, push = flow[:, :4] @ x, flow[:, 4:]
+        if isinstance(g, InverseDynamicsGains):
+            wanted = target[2] + g.kv * (target[1] - x[2:]) + g.kp * (target[0] - x[:2])
+            forces = held + np.linalg.solve(push[2:], x[2:] + PERIOD * wanted - free[2:])
+        else:
+            share = PERIOD / (g.filter_time + PERIOD)
+            ahead = np.concatenate(
+                [target[0] + PERIOD * target[1], target[1] + PERIOD * target[2]]
+            )
+            # Forces = gains [e, e_dot] + rest, with [e, e_dot] = ahead - free - push forces.
+            gains = np.hstack([(g.kp + PERIOD * g.ki) * np.eye(2), g.kd * share * np.eye(2)])
+            rest = g.ki * self.integral + g.kd * (1.0 - share) * self.rate
+            if g.feed_forward:
+                along = np.concatenate([target[0], target[1]])
+                rest = rest + np.linalg.solve(push[2:], ahead[2:] - flow[2:, :4] @ along)
+            forces = np.linalg.solve(np.eye(2) + gains @ push, gains @ (ahead - free) + rest)
+            error_rate = (ahead - free - push @ forces)[2:]
+            self.rate = (1.0 - share) * self.rate + share * error_rate
+            self.integral = self.integral + PERIOD * (target[0] - x[:2])
+        base = []
+        for law, memory, at_now, load in (
+            (self.laws[0], self.memories[0], (depth, speed, insertion), against),
+            (self.laws[1], self.memories[1], (angle, turn, Setpoint(0.0)), 0.0),
+        ):
+            base.append(law.force(*at_now, memory, load))
+            law.remember(*at_now, memory, base[-1], base[-1])
+        self.sent = [*self.sent, np.array([*base, *forces])]
+        answer = self.sent[-1]
+        self.sent = self.sent[len(self.sent) - self.delay :]
+        return answer
+
+
+@pytest.mark.parametrize('delay', [0, 1, 3])
+@pytest.mark.parametrize('kind', GAINS)
+def test_the_modal_loop_is_the_law_written_plainly(kind, delay):
+    """Period by period all forces agree, for a needle that moves, bends and is late."""
+    loop = modal_loop(GAINS[kind], delay)
+    loop.insertion.limit = loop.rotation.limit = np.inf
+    plain, rng = PlainModalLoop(loop, delay), np.random.default_rng(8)
+    for _ in range(20):
+        state = MODEL.state_at(rng.uniform(0.17, 0.19), 1e-3 * rng.standard_normal())
+        state[4:] = rng.standard_normal(4) * (0.01, 0.1, 1e-3, 1e-3)
+        aim = Setpoint(*rng.standard_normal(3) * (0.01, 0.01, 0.1))
+        target = 1e-4 * rng.standard_normal((3, 2))
+        found = loop.command(state, aim, Setpoint(0.0), target)
+        # Rounding of the exponential and of two eigenproblems; forces cancel by a factor of ten.
+        assert_allclose(found, plain.command(state, aim, target), rtol=1e-12)
+
+
 @pytest.mark.parametrize('gains', [InverseDynamicsGains(), GAINS['pid']], ids=['id', 'pid'])
 def test_a_modal_switch_has_no_bump(gains):
     """All forces go on from where they were."""
@@ -492,3 +584,8 @@ def test_the_modal_loop_checks_what_it_gets():
         loop.deflection.switch(slow)
     with pytest.raises(ParameterError, match='inserted length must be > 0'):
         slow.at(0.0)
+    swelling = NeedleModel(NeedleParameters.preset('phantom', swelling=0.3))
+    with pytest.raises(
+        ParameterError, match=r'swelling must be 0 with modal actuation.* got 0\.3'
+    ):
+        DeflectionLaw(model=swelling, gains=InverseDynamicsGains(), period=PERIOD)

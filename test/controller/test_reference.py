@@ -3,7 +3,7 @@
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from needle_controller import MinimumJerk, ReferenceLimits, Setpoint, Trapezoid
-from needle_controller.reference import Guide, Joined, Path
+from needle_controller.reference import Guide, Joined, Path, Quintic
 from needle_dynamics import ParameterError
 import numpy as np
 from numpy.testing import assert_allclose
@@ -38,7 +38,7 @@ def test_position_speed_and_acceleration_belong_together(kind, start, speed, tar
     """The speed is the derivative of the position and stays within what limits and start allow."""
     motion = kind(Setpoint(start, speed), target, LIMITS)
     assume(motion.duration > 1e-2)
-    times = np.linspace(0.0, motion.duration, 4001)
+    times = np.linspace(0.0, motion.duration, 801)
     points = [motion.at(t) for t in times]
     position = np.array([p.position for p in points])
     rate = np.array([p.speed for p in points])
@@ -49,6 +49,30 @@ def test_position_speed_and_acceleration_belong_together(kind, start, speed, tar
     assert np.abs(rate).max() <= max(LIMITS.speed, abs(speed)) * (1.0 + 1e-9)
     if kind is Trapezoid or speed == 0.0:
         assert np.abs(ramp).max() <= LIMITS.acceleration * (1.0 + 1e-6)
+
+
+ends = st.builds(Setpoint, depths, speeds, st.one_of(st.just(0.0), st.floats(-0.2, 0.2)))
+
+
+@settings(deadline=None)
+@given(ends, ends, st.floats(-3.0, 2.0))
+def test_extremes_of_a_quintic_are_found(start, end, exponent):
+    """No sample of position, speed or acceleration is beyond them, and some are near them."""
+    motion = Quintic(start, end, 10.0**exponent)
+    points = [motion.at(x * motion.duration) for x in np.linspace(0.0, 1.0, 1001)]
+    found = np.array([(p.position, p.speed, p.acceleration) for p in points]).T
+    low, high = motion.extremes.T
+    # The size of the terms that rounding, and a thousandth of the duration, act on.
+    t = motion.duration
+    terms = sum(
+        abs(e.position) + t * abs(e.speed) + t * t * abs(e.acceleration) for e in (start, end)
+    )
+    size = 100.0 * terms / np.array([1.0, t, t * t]) + 1e-300
+    assert (low <= found.min(axis=1) + 1e-13 * size).all()
+    assert (high >= found.max(axis=1) - 1e-13 * size).all()
+    # Sampled at half a thousandth off an extreme: a second derivative of 60 terms.
+    assert (np.abs(low - found.min(axis=1)) <= 1e-4 * size).all()
+    assert (np.abs(high - found.max(axis=1)) <= 1e-4 * size).all()
 
 
 @settings(deadline=None)
@@ -70,7 +94,7 @@ def test_minimum_jerk_meets_its_limit():
     assert motion.duration == pytest.approx(18.75, rel=1e-12)
 
 
-def samples(motion, end: float, count: int = 4001):
+def samples(motion, end: float, count: int = 801):
     """Return times, positions, speeds and accelerations of a motion."""
     times = np.linspace(0.0, end, count)
     points = [motion(t) for t in times]
@@ -243,3 +267,58 @@ def test_a_paused_path_is_resumed_where_it_was_left(kind):
     assert after.max() == pytest.approx(0.08, abs=0.0125**2 / 0.8 + 1e-9)
     assert after[0] == held.position
     assert walk.points[-1] == Setpoint(0.06)
+
+
+#: A reach of ten stopping distances at the highest speed.
+NARROW = (0.05, 0.055)
+inside = st.one_of(st.sampled_from(NARROW), st.floats(*NARROW))
+
+
+@st.composite
+def narrow_paths(draw):
+    """Return times and positions of lines from end to end of the narrow reach."""
+    times, positions = [draw(st.sampled_from([0.0, 0.05, 1.0]))], [draw(inside)]
+    for _ in range(draw(st.integers(0, 4))):
+        positions.append(draw(inside))
+        distance = abs(positions[-1] - positions[-2])
+        # Time for the way, and for the corners at both its ends.
+        pause = draw(st.floats(0.21, 1.0))
+        times.append(times[-1] + distance / LIMITS.speed + pause)
+    return times, positions
+
+
+narrow_events = st.lists(
+    st.tuples(
+        st.one_of(st.sampled_from(['pause', 'resume']), inside, narrow_paths()),
+        st.floats(0.0, 1.0),
+    ),
+    min_size=2,
+    max_size=6,
+)
+
+
+@KINDS
+@settings(deadline=None, max_examples=40)
+@given(start=inside, events=narrow_events)
+def test_the_reference_never_leaves_the_reach(kind, start, events):
+    """Targets, paths and pauses at its ends, at any speed: it turns before them, and no jump."""
+    guide, time, points = Guide(kind, LIMITS, NARROW), 0.0, []
+    guide.aim(NARROW[1])
+    for event, wait in [('resume', 0.3), *events, ('resume', 2.0)]:
+        if isinstance(event, float):
+            guide.aim(event)
+        elif isinstance(event, tuple):
+            guide.follow(*event)
+        else:
+            getattr(guide, event)()
+        for _ in range(round(wait * 500.0) + 1):
+            points.append(guide.at(time, start))
+            time += 2e-3
+    positions, rates = np.array([(point.position, point.speed) for point in points]).T
+    assert np.abs(np.diff(positions)).max() <= 2e-3 * LIMITS.speed * (1.0 + 1e-6)
+    if kind == 'trapezoid':
+        # What keeps the limits and the reach can always brake before its end.
+        assert np.abs(np.diff(rates)).max() <= 2e-3 * LIMITS.acceleration * (1.0 + 1e-6)
+    # Extremes of polynomials are found to 1e-9 of the reach.
+    assert positions.min() >= NARROW[0] - 1e-11
+    assert positions.max() <= NARROW[1] + 1e-11

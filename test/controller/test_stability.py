@@ -78,16 +78,16 @@ def deflect(law: DeflectionLaw, depth: float, late: int, periods: int, delay: in
     modes, loop = law.at(depth), DeflectionLoop(law, delay)
     x = np.stack([modes.from_normal([1.0, 1.0]), np.zeros(2)])
     waiting = [np.zeros(2)] * (delay + late)
-    sizes, ends = [], []
+    rest, path = np.zeros((3, 2)), []
     for _ in range(periods):
-        waiting.append(loop.command(modes, x, np.zeros((3, 2))))
+        waiting.append(loop.command(modes, x, rest))
         x, _ = loop.predict(modes, x, 0.0, waiting.pop(0))
-        eta, rate = modes.to_normal(x[0]), modes.to_normal(x[1])
-        sizes.append(float(np.sqrt(eta @ eta + (rate / np.sqrt(modes.squares)) @ rate)))
-        ends.append(np.concatenate([eta, rate]))
-        if not sizes[-1] < 1e9:
+        path.append(x)
+        if not abs(x[1, 0]) < 1e12:
             break
-    return np.array(sizes), np.array(ends)
+    normal = np.array(path) @ modes.inverse.T
+    sizes = np.sqrt((normal[:, 0] ** 2 + normal[:, 1] ** 2 / modes.squares).sum(axis=1))
+    return sizes, normal.reshape(-1, 4)
 
 
 @pytest.mark.parametrize('kind', DEFLECTION_GAINS)
