@@ -39,8 +39,8 @@ import pytest
 
 FRICTION, STIFFNESS = PROTOCOLS['friction'], PROTOCOLS['stiffness']
 
-#: As the shipped bags are recorded: enough to identify from, quickly.
-RATE, SPEED = 100.0, 20.0
+#: Enough to identify from, as the shipped bags are recorded; slow enough for a busy machine.
+RATE, SPEED = 100.0, 10.0
 
 
 # What is commanded.
@@ -229,13 +229,14 @@ def test_an_interrupted_experiment_goes_on_where_it_was(tmp_path):
     first, last = tmp_path / 'friction_01', tmp_path / 'friction_03'
     command = [sys.executable, '-m', 'needle_insertion.cli', *words]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
-        deadline = time.monotonic() + 60.0
+        # Until then it hangs: the first start compiles for a minute.
+        deadline = time.monotonic() + 300.0
         while not first.exists():
             with suppress(subprocess.TimeoutExpired):
                 pytest.fail(f'ended early with status {process.wait(0.02)}')
             assert time.monotonic() < deadline
         process.send_signal(signal.SIGINT)
-        _, said = process.communicate(timeout=30.0)
+        _, said = process.communicate(timeout=120.0)
     assert process.returncode == 130
     assert said.splitlines()[-1] == 'interrupted'
     assert not last.exists()
@@ -279,12 +280,11 @@ def test_a_run_with_losses_is_done_again_at_half_the_speed_and_then_given_up(
 ):
     """What lacks samples never becomes a bag; the second attempt may."""
     (parameters,) = Campaign(protocol=FRICTION, repeats=1, rate=RATE).runs().values()
-    judged, answers = [], iter(['few messages', 'fewer', 'few messages', None])
-    whole = experiment._lost
+    judged, answers = [], iter(['few messages', 'fewer', 'few messages', ''])
 
-    def lossy(bag: Path, *rest: object) -> str:
+    def lossy(bag: Path, *_rest: object) -> str:
         judged.append(bag)
-        return next(answers) or whole(bag, *rest)
+        return next(answers)
 
     monkeypatch.setattr(experiment, '_lost', lossy)
     with rig(tmp_path, FRICTION) as stand:
