@@ -112,7 +112,10 @@ def _parts(used: BoolArray, length: int) -> tuple[IntArray, BoolArray]:
 #: What each test says against the model, and for it.
 _WORDS: Final = {
     'normality': (
-        'the residuals are not normal: outliers move the estimates; huber minds them less',
+        (
+            'the residuals are not normal: outliers move the estimates; the estimator huber '
+            'minds them less'
+        ),
         'the residuals are as good as normal',
     ),
     'trend': (

@@ -379,9 +379,9 @@ def equation_9() -> Claim:
     by_12 = model.potential_energy(state) - bent
     return Claim(
         section='3.2.1, (9)',
-        claim='The tissue stores (k_a / 2) int (int w dw) dy, (9).',
+        claim='The tissue stores (k_a / 2) ∫ (∫ w dw) dy, (9).',
         verdict=_verdict(always=abs(0.5 * by_7 - by_12) < 1e-9 * by_12),
-        evidence=f'int w dw is w^2 / 2, which makes (9) {0.5 * by_7 / by_12:.3f} of what (7) and '
+        evidence=f'∫ w dw is w^2 / 2, which makes (9) {0.5 * by_7 / by_12:.3f} of what (7) and '
         '(12) say.',
         numbers={'ratio': 0.5 * by_7 / by_12},
     )
