@@ -82,12 +82,16 @@ def residual_tests(
     with warnings.catch_warnings(), np.errstate(invalid='ignore', divide='ignore'):
         # Of residuals that are all alike a test says nothing: nan.
         warnings.simplefilter('ignore')
-        tests = [_normality(means), _trend(times, means)]
+        found = {
+            'normality': stats.normaltest(means) if len(means) >= 20 else stats.shapiro(means),
+            'trend': stats.spearmanr(times, means),
+        }
         if len(groups) > parameters:
-            tests.append(_structure(means, groups, parameters))
-            tests.append(_spread([means[group] for group in groups]))
+            found['speed'] = _lack_of_fit(means, groups, parameters)
+            found['spread'] = stats.levene(*(means[g] for g in groups), center='median')
         if np.count_nonzero(follows) >= _FEWEST_PARTS:
-            tests.append(_memory(means, follows))
+            found['memory'] = stats.pearsonr(means[:-1][follows[1:]], means[follows])
+    tests = [_judged(name, *result) for name, result in found.items()]
     return tuple(test for test in tests if np.isfinite(test.p_value))
 
 
@@ -105,81 +109,50 @@ def _parts(used: BoolArray, length: int) -> tuple[IntArray, BoolArray]:
     return first[:, np.newaxis] + np.arange(length), follows
 
 
-def _normality(residual: FloatArray) -> ResidualTest:
-    found = stats.normaltest(residual) if len(residual) >= 20 else stats.shapiro(residual)
-    return ResidualTest(
-        name='normality',
-        statistic=float(found.statistic),
-        p_value=float(found.pvalue),
-        words=_words(
-            found.pvalue,
-            'the residuals are not normal: outliers move the estimates; the '
-            'estimator huber minds them less',
-            'the residuals are as good as normal',
+#: What each test says against the model, and for it.
+_WORDS: Final = {
+    'normality': (
+        (
+            'the residuals are not normal: outliers move the estimates; the estimator huber '
+            'minds them less'
         ),
+        'the residuals are as good as normal',
+    ),
+    'trend': (
+        'the residuals drift with time: sensor or tissue change during the recording',
+        'the residuals show no drift with time',
+    ),
+    'speed': (
+        'the residuals depend on the speed: the terms do not describe the friction',
+        'the residuals do not depend on the speed',
+    ),
+    'spread': (
+        'the noise depends on the speed: the estimator weighted uses that',
+        'the noise is the same at all speeds',
+    ),
+    'memory': (
+        'the residuals remember longer than the errors allow for: they are too small',
+        'the residuals forget as fast as the errors assume',
+    ),
+}
+
+
+def _judged(name: str, statistic: float, chance: float) -> ResidualTest:
+    against, fine = _WORDS[name]
+    return ResidualTest(
+        name=name,
+        statistic=float(statistic),
+        p_value=float(chance),
+        words=f'{against if chance < _LEVEL else fine} (p = {chance:.2g})',
     )
 
 
-def _trend(time: FloatArray, residual: FloatArray) -> ResidualTest:
-    found = stats.spearmanr(time, residual)
-    return ResidualTest(
-        name='trend',
-        statistic=float(found.statistic),
-        p_value=float(found.pvalue),
-        words=_words(
-            found.pvalue,
-            'the residuals drift with time: sensor or tissue change during the recording',
-            'the residuals show no drift with time',
-        ),
-    )
-
-
-def _structure(residual: FloatArray, groups: list[IntArray], parameters: int) -> ResidualTest:
-    """Compare misfit between speeds with noise within them (F test of lack of fit)."""
+def _lack_of_fit(
+    residual: FloatArray, groups: list[IntArray], parameters: int
+) -> tuple[float, float]:
+    """Compare misfit between speeds with noise within them: the F statistic, its probability."""
     between = sum(len(g) * float(residual[g].mean()) ** 2 for g in groups)
     within = sum(float(((residual[g] - residual[g].mean()) ** 2).sum()) for g in groups)
     free = len(groups) - parameters, len(residual) - len(groups)
     found = (between / free[0]) / (within / free[1])
-    chance = float(stats.f.sf(found, *free))
-    return ResidualTest(
-        name='speed',
-        statistic=found,
-        p_value=chance,
-        words=_words(
-            chance,
-            'the residuals depend on the speed: the terms do not describe the friction',
-            'the residuals do not depend on the speed',
-        ),
-    )
-
-
-def _spread(groups: list[FloatArray]) -> ResidualTest:
-    found = stats.levene(*groups, center='median')
-    return ResidualTest(
-        name='spread',
-        statistic=float(found.statistic),
-        p_value=float(found.pvalue),
-        words=_words(
-            found.pvalue,
-            'the noise depends on the speed: the estimator weighted uses that',
-            'the noise is the same at all speeds',
-        ),
-    )
-
-
-def _memory(residual: FloatArray, follows: BoolArray) -> ResidualTest:
-    found = stats.pearsonr(residual[:-1][follows[1:]], residual[follows])
-    return ResidualTest(
-        name='memory',
-        statistic=float(found.statistic),
-        p_value=float(found.pvalue),
-        words=_words(
-            found.pvalue,
-            'the residuals remember longer than the errors allow for: they are too small',
-            'the residuals forget as fast as the errors assume',
-        ),
-    )
-
-
-def _words(chance: float, against: str, fine: str) -> str:
-    return f'{against if chance < _LEVEL else fine} (p = {chance:.2g})'
+    return found, float(stats.f.sf(found, *free))

@@ -27,6 +27,7 @@ from needle_controller import (
 from needle_controller.axis import BREAKAWAY_TIME
 from needle_controller.in_loop import LoopBatch, run_batch
 from needle_dynamics import FloatArray, NeedleModel, NeedleParameters
+from needle_insertion.paper_figures import LAW_COLORS, LAWS
 from needle_insertion.report import Picture
 from needle_insertion.section import Grid, Section
 import numpy as np
@@ -44,8 +45,6 @@ DEFLECTION: Final = 5e-4
 #: Longest step [s]: the modal flow is exact, and a hundredth of it moves no error by a nanometer.
 STEP: Final = 1e-3
 
-_NAMES: Final = {'inverse_dynamics': 'inverse dynamics', 'pid': 'PID'}
-_COLORS: Final = {'inverse_dynamics': '#c25a00', 'pid': '#1f5fa8'}
 _MEASURES: Final = {
     'final': 'depth error at the end',
     'largest': 'largest depth error',
@@ -187,7 +186,7 @@ def table(found: Mismatch) -> Grid:
             known = 1e3 * abs(float(getattr(found.nominal[law], name)[0]))
             rows.append(
                 (
-                    f'{_NAMES[law]}, {words} [mm]',
+                    f'{LAWS[law]}, {words} [mm]',
                     *(f'{value:.3g}' for value in (known, middle, most, values.max())),
                 )
             )
@@ -207,9 +206,9 @@ def draw(found: Mismatch) -> Figure:
         for law, batch in found.batches.items():
             values = np.sort(1e3 * np.abs(getattr(batch, name)))
             share = np.arange(1, len(values) + 1) / len(values)
-            panel.step(values, share, where='post', color=_COLORS[law], label=_NAMES[law])
+            panel.step(values, share, where='post', color=LAW_COLORS[law], label=LAWS[law])
             known = 1e3 * abs(float(getattr(found.nominal[law], name)[0]))
-            panel.axvline(known, color=_COLORS[law], linestyle=':', linewidth=1.0)
+            panel.axvline(known, color=LAW_COLORS[law], linestyle=':', linewidth=1.0)
         panel.set(xscale='log', xlabel=f'{words} [mm]', ylim=(0.0, 1.0))
         panel.grid(visible=True, alpha=0.3)
     axes[0].set_ylabel('share of the runs')
@@ -220,9 +219,11 @@ def draw(found: Mismatch) -> Figure:
             1e3 * batch.final,
             '.',
             markersize=2.5,
-            color=_COLORS[law],
+            color=LAW_COLORS[law],
         )
-    axes[3].set(xlabel='true mu_s over believed - 1 [%]', ylabel='signed error at the end [mm]')
+    axes[3].set(
+        xlabel=r'true $\mu_s$ over believed - 1 [%]', ylabel='signed error at the end [mm]'
+    )
     axes[3].grid(visible=True, alpha=0.3)
     return figure
 

@@ -37,8 +37,14 @@ __all__ = [
     'write_whole',
 ]
 
-_SYMBOL = re.compile(r'\b(?:(mu|k|f)_(\w{1,3})|tau)\b')
-_POWER = re.compile(r'\^([2-4])(?!\d)')
+_GREEK = {'mu': 'μ', 'phi': 'φ', 'tau': 'τ', 'theta': 'θ', 'rho': 'ρ', 'omega': 'ω'}
+_SYMBOL = re.compile(
+    rf'\b({"|".join(_GREEK)}|q(?=\d)|[kfIqcde](?=_))(\d?)(?:_(d?dot))?(?:_(\w{{1,3}}))?\b'
+)
+#: Combining dots, which stand behind their letter.
+_DOTS = {None: '', 'dot': '\u0307', 'ddot': '\u0308'}
+_POWER = re.compile(r'\^(?:([2-4])(?![\d/])|(-?\d+(?:/\d+)?|T\b))')
+_MICROMETERS = re.compile(r'(?<=\d )um\b')
 _ROW_HEAD = 'th scope="row"'
 #: What begins as a number and is longer is a text, such as a checksum.
 _LONGEST_NUMBER = 40
@@ -153,13 +159,20 @@ def _check_rows(checks: Sequence[Check]) -> list[tuple[str, str, str, str]]:
 
 
 def _text(words: str) -> str:
-    """Escape, and write mu_s and its like, and powers, as in print."""
+    """Escape, and write mu_s, q1_dot and their like, powers and um as in print."""
 
     def symbol(found: re.Match[str]) -> str:
-        letter = {'mu': 'μ', None: 'τ'}.get(found[1], found[1])
-        return f'<i>{letter}</i>' + (f'<sub>{found[2]}</sub>' if found[2] else '')
+        letter, number, dots, index = found.groups()
+        below = f'{number}{"," if number and index else ""}{index or ""}'
+        return (
+            f'<i>{_GREEK.get(letter, letter)}{_DOTS[dots]}</i>'
+            f'{f"<sub>{below}</sub>" if below else ""}'
+        )
 
-    return _POWER.sub(lambda found: '⁰¹²³⁴'[int(found[1])], _SYMBOL.sub(symbol, escape(words)))
+    def power(found: re.Match[str]) -> str:
+        return '⁰¹²³⁴'[int(found[1])] if found[1] else f'<sup>{found[2]}</sup>'
+
+    return _MICROMETERS.sub('μm', _POWER.sub(power, _SYMBOL.sub(symbol, escape(words))))
 
 
 def heading(words: str) -> str:
@@ -298,7 +311,7 @@ td.pass { color: #17692f; } td.FAIL { color: #b00020; font-weight: bold; }
 pre { overflow-x: auto; background: #f4f6f8; padding: .7rem 1rem; font-size: .9rem; }
 figure { margin: 1.5rem 0; } figcaption { color: #47505c; }
 img { max-width: 100%; height: auto; display: block; }
-ul { padding-left: 1.3rem; } sub { line-height: 0; }
+ul { padding-left: 1.3rem; } sub, sup { line-height: 0; }
 @media (max-width: 40rem) {
   table, pre { font-size: .85rem; } th, td { padding-right: .7rem; }
   figure { overflow-x: auto; } img { max-width: none; width: 38rem; }

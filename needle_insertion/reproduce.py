@@ -257,6 +257,18 @@ _JUDGED_BY: Final[Mapping[str, tuple[str, ...]]] = {
     'all': tuple(TABLES),
 }
 
+#: The unit that each table does not print.
+_UNITS: Final[Mapping[str, str]] = {
+    'table-1': (
+        'The paper prints no unit of mu_v. Here 0.3 is read as N s/mm, 300 N s/m, as on the rig '
+        'of the recordings; figures 4 to 8 show it as N s/m as well.'
+    ),
+    'table-2': (
+        'The paper prints no unit of the stiffness. It is kN/m, if the 0.52 kN/m^2 of the text '
+        'are k_zz at 1.5 N.'
+    ),
+}
+
 #: Folder of the whole page if none is given.
 _OUTPUT: Final = Path('reproduce_output')
 
@@ -349,6 +361,7 @@ class Identified:
         return Section(
             title=_title(self.name),
             paragraphs=(
+                _UNITS[self.name],
                 (
                     'The paper prints mean and STD over repeated experiments. Both are compared '
                     'with the 95 % intervals that the recordings give. The recordings are of a '

@@ -96,7 +96,8 @@ def _in_browser(page: Path, browser: str) -> Seen:
                 ],
                 capture_output=True,
                 text=True,
-                timeout=60,
+                # Until then it hangs.
+                timeout=300,
                 check=True,
             )
     found = re.search(r'<pre>(.*)</pre>', ended.stdout, re.DOTALL)

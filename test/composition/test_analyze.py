@@ -11,7 +11,8 @@ from typing import Any
 from matplotlib.image import imread
 from needle_dynamics import NeedleError, NeedleModel, NeedleParameters
 from needle_dynamics.analysis import analyze, linearize, operating_point
-from needle_insertion.analyze import add_arguments, DEFLECTIONS, DEPTHS
+from needle_insertion import analyze as command
+from needle_insertion.analyze import add_arguments
 import numpy as np
 from numpy.testing import assert_array_equal
 import pytest
@@ -82,8 +83,12 @@ def test_constants_can_be_set(capsys: pytest.CaptureFixture[str]) -> None:
     assert found['points'][0]['states'][:6] == ['d', 'theta', 'q1', 'q2', 'q3', 'q4']
 
 
-def test_map_is_a_table_and_a_picture(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_map_is_a_table_and_a_picture(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The map covers the needle and goes up to the deflection given; its picture has content."""
+    monkeypatch.setattr(command, 'DEPTHS', 13)
+    monkeypatch.setattr(command, 'DEFLECTIONS', 11)
     folder = tmp_path / 'new' / 'folder'
     found = found_by(capsys, '--tip-deflection', '0.001', '--map', '-o', str(folder))
     assert found['files'] == [str(folder / f'controllability.{kind}') for kind in ('csv', 'png')]
@@ -93,7 +98,7 @@ def test_map_is_a_table_and_a_picture(tmp_path: Path, capsys: pytest.CaptureFixt
     ]
     with (folder / 'controllability.csv').open(encoding='utf-8') as file:
         rows = list(csv.DictReader(file))
-    assert len(rows) == DEPTHS * DEFLECTIONS
+    assert len(rows) == 13 * 11
     assert (float(rows[0]['depth_m']), float(rows[-1]['depth_m'])) == (0.01, 0.2)
     assert float(rows[-1]['tip_deflection_m']) == 0.001
     for row in rows:

@@ -80,7 +80,7 @@ def test_mcap_ros2_support_takes_the_numbers_that_we_do(bag, monkeypatch):
 
 def test_a_process_of_its_own_tells_its_time_and_memory(bag):
     figures = bench_identification.measured('needle_identification', bag, bag, 1)
-    assert 0.0 < figures['seconds'] < 60.0
+    assert figures['seconds'] > 0.0
     # NumPy alone takes 10 MB.
     assert 1e7 < figures['before'] <= figures['memory'] < 1e10
 

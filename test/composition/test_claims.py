@@ -9,11 +9,12 @@ import pytest
 
 @pytest.fixture(scope='module')
 def found():
-    return claims.claims(study=mismatch.study(60))
+    # Its verdicts are those of a thousand needles: what they rest on differs by factors.
+    return claims.claims(study=mismatch.study(8))
 
 
 def test_each_claim_has_a_verdict_with_evidence(found):
-    assert len(found) >= 35
+    assert len(found) >= 40
     assert len({one.claim for one in found}) == len(found)
     for one in found:
         assert one.verdict in (HOLDS, ONLY_IF, FAILS)
@@ -26,9 +27,11 @@ def test_each_claim_has_a_verdict_with_evidence(found):
 KNOWN = {
     'M(q) is symmetric': HOLDS,
     'The first two rows of N': ONLY_IF,
+    'Coriolis': ONLY_IF,
     'Without friction the system is conservative': ONLY_IF,
     'f_y enters the row of d with a plus': FAILS,
     'fully controllable': ONLY_IF,
+    'not necessarily output controllable': ONLY_IF,
     'rank deficiency of 2': ONLY_IF,
     'q1 and q2 are observable': HOLDS,
     'leads to zero deflection': ONLY_IF,

@@ -162,6 +162,6 @@ sys.meta_path.insert(0, Interrupt())
 main(['identify', 'friction', 'nowhere'])
 """
     done = subprocess.run(
-        [sys.executable, '-c', code], capture_output=True, text=True, timeout=60, check=False
+        [sys.executable, '-c', code], capture_output=True, text=True, timeout=300, check=False
     )
     assert (done.returncode, done.stderr) == (-signal.SIGINT, '')

@@ -135,7 +135,7 @@ def test_every_figure_is_drawn_and_says_what_is_seen():
 def test_the_section_compares_the_controllers():
     found = section()
     assert len(found.pictures) == 5
-    rows = found.tables[-1].rows
+    rows = found.tables[0].rows
     assert len(rows) == 8
-    assert all(len(row) == len(found.tables[-1].heads) for row in rows)
+    assert all(len(row) == len(found.tables[0].heads) for row in rows)
     assert '0.56 mm = mu_s / k_p' in found.paragraphs[2]

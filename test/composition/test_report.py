@@ -103,10 +103,11 @@ def test_no_text_can_be_taken_for_a_tag(text):
                 'td',
                 'i',
                 'sub',
+                'sup',
             ),
         }
         # Symbols are set in Greek; all else is as it was given.
-        if '_' not in text:
+        if not {'_', '^'} & {*text}:
             assert text in ''.join(reader.texts)
 
 
@@ -115,6 +116,10 @@ def test_symbols_are_written_as_in_print():
     assert '<i>μ</i><sub>s</sub> = 1' in paragraph('mu_s = 1')
     assert '<i>k</i><sub>zz</sub>' in paragraph('k_zz')
     assert 'k_coulomb' in paragraph('k_coulomb')
+    assert '<i>q\u0307</i><sub>1</sub> and <i>θ\u0308</i>' in paragraph('q1_dot and theta_ddot')
+    assert '<i>q\u0307</i><sub>e</sub>' in paragraph('q_dot_e')
+    assert 'a d e, 5 μm, an um' in paragraph('a d e, 5 um, an um')
+    assert 'm² M<sup>T</sup> m<sup>-1/2</sup>' in paragraph('m^2 M^T m^-1/2')
 
 
 def test_a_notice_of_nothing_is_nothing():

@@ -2,7 +2,7 @@
 
 from math import inf, nan
 
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from needle_dynamics import NeedleParameters, ParameterError
 from needle_identification import (
@@ -93,6 +93,7 @@ def test_a_mean_outside_the_range_is_moved_to_its_end():
     assert NeedleParameters.from_mapping(constants).friction_law == 'stribeck'
 
 
+@settings(deadline=None)
 @given(st.floats(1e-12, 1e12))
 def test_a_value_survives_the_file(value):
     """To seven digits, and as a number: YAML reads 5e-05 as a text."""
@@ -127,6 +128,7 @@ def test_names_the_file_that_cannot_be_written(tmp_path, name, complaint):
     assert not list(tmp_path.iterdir())
 
 
+@settings(deadline=None)
 @given(st.floats(-1e6, 1e6), st.floats(1e-6, 1e6))
 def test_a_number_is_told_to_two_digits_of_its_error(value, error):
     """What is not told of the value is within a twentieth of its error."""

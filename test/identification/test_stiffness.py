@@ -201,7 +201,7 @@ ROUND = {force: 800.0 * np.eye(2) for force in (1.1, 1.3, 1.5)}
 
 @pytest.fixture(
     scope='module',
-    params=[(TABLE, 60), (NEARLY, 30), (ROUND, 30)],
+    params=[(TABLE, 48), (NEARLY, 24), (ROUND, 24)],
     ids=['table 2', 'nearly round', 'round'],
 )
 def repeats(request):

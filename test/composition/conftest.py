@@ -1,0 +1,12 @@
+"""What the tests of this folder share."""
+
+from needle_insertion import paper_figures
+import pytest
+
+
+@pytest.fixture(scope='session', autouse=True)
+def brief_inverse_dynamics():
+    """Run figures 6 and 7 up to what they show; after that d alone goes on as exp(-0.05 t)."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(paper_figures.CLOSED_LOOP, 'inverse_dynamics', 40.0)
+        yield
