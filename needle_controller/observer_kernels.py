@@ -342,14 +342,15 @@ def begin(
     covariance[:] = 0.0
     for i in range(modal):
         covariance[i, i] = variance
+    tick = span / fixed[TICKS]
     for channel in range(2):
         reaction = 0.0
         for k in range(n):
             omega = basis[2 * n, k]
-            cc, cb, bc, bb = _swing(omega, fixed[DAMPING] / fixed[DENSITY], span)
+            cc, cb, bc, bb = _swing(omega, fixed[DAMPING] / fixed[DENSITY], tick)
             c, b = work[3, channel, k], work[3, channel, n + k]
             reaction += (c * (cc - 1.0) + b * bc) ** 2 + (c * cb + b * (bb - 1.0)) ** 2
-        reaction *= variance / (span * span)
+        reaction *= variance / (tick * tick)
         first = modal + channel * filters
         noise = fixed[FORCE_INPUT + channel]
         for i in range(filters):

@@ -427,6 +427,7 @@ class Plant:
         self.time = 0.0
         self._sensor = sensor
         self._tip = tip or TipSensor(TipParameters(), rate, 0)
+        self._felt = np.zeros((sensor.samples, 6))
         self._count = 0
 
     @property
@@ -513,7 +514,7 @@ class Plant:
         needle, base, interval = self.integrator, self.base, self.interval
         resolution = late = 0.0
         if base is None:
-            seen = needle.advance(interval, force, torque, modal)
+            seen = needle.advance(interval, force, torque, modal, self._sensor.samples)
         else:
             resolution = base.limits.encoder_resolution
             push = base.push(self.time, needle.depth, interval / _PUSHES)
@@ -527,9 +528,13 @@ class Plant:
         self._count += 1
         self.time = self._count * interval
         axial = seen.axial_force + late
-        wrench = np.array([0.0, axial, seen.lateral_force, seen.moment, 0.0, 0.0])
-        start = wrench.copy()
-        start[1] -= 2.0 * late
+        wrench, start = self._felt, None
+        wrench[:, 1:4] = seen.felt
+        if base is not None:
+            # The base has no course within the interval that is known: a straight line.
+            wrench, start = np.zeros((2, 6))
+            wrench[1:4] = start[1:4] = axial, seen.lateral_force, seen.moment
+            start[1] -= 2.0 * late
         depth, speed = needle.depth, needle.speed
         return Sample(
             state=needle.state,
