@@ -6,7 +6,7 @@ from collections import deque
 from dataclasses import dataclass, field, fields
 from typing import Final
 
-from needle_dynamics.errors import JobError, ParameterError
+from needle_dynamics.errors import JobError, ParameterError, ShapeError
 from needle_dynamics.kernels import FloatArray, sense, straight
 from needle_dynamics.parameters import check_constants, constant
 import numpy as np
@@ -187,8 +187,17 @@ class ForceSensor:
         ndarray, shape (6,)
             What the sensor reports.
 
+        Raises
+        ------
+        ShapeError
+            If what each sample feels is not given for all of them.
+
         """
         felt = np.array(wrench, dtype=np.float64)
+        if felt.ndim == 2 and len(felt) != self.samples:
+            raise ShapeError(
+                f'wrench must have shape (6,) or ({self.samples}, 6), got {felt.shape}'
+            )
         if self._next == len(self._drawn):
             self._drawn = self._rng.standard_normal(self._block)
             self._next = 0
