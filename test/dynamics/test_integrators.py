@@ -295,8 +295,8 @@ def test_agrees_with_an_ode_solver_on_the_open_loop_run_of_the_paper() -> None:
         (0.0, 0.02),
         start,
         method='DOP853',
-        rtol=1e-10,
-        atol=1e-14,
+        rtol=1e-8,
+        atol=1e-12,
         t_eval=run.time,
     )
     tips = np.array([model.tip_deflection(x) for x in solved.y.T])
@@ -1014,10 +1014,11 @@ def test_generalized_forces_act_as_in_the_equations_of_motion(
     forces, state = np.array([0.2, -0.3, 0.2])[:modes], it.state
     state[2 + modes] = -0.05
     exact = solve_ivp(
-        driven(it.model, forces, 0.1), (0.0, 4e-3), state, rtol=1e-11, atol=1e-15, method='DOP853'
+        driven(it.model, forces, 0.1), (0.0, 4e-3), state, rtol=1e-10, atol=1e-14, method='DOP853'
     ).y[:, -1]
+    # For its size only.
     free = solve_ivp(
-        driven(it.model, 0.0 * forces, 0.1), (0.0, 4e-3), state, rtol=1e-9, atol=1e-15
+        driven(it.model, 0.0 * forces, 0.1), (0.0, 4e-3), state, rtol=1e-5, atol=1e-9
     ).y[:, -1]
     scale = np.abs(exact - free)[2 : 2 + modes].max()
     steps, errors = 2e-5 / 2.0 ** np.arange(4), []
