@@ -306,7 +306,7 @@ def test_force_and_speed_of_a_carried_base_are_of_one_instant() -> None:
 def test_the_sensor_feels_the_needle_as_it_rings_within_a_sample() -> None:
     """Under a commanded wrench each of its samples is the true mean over it: SciPy's cascade."""
     parameters = PRESETS['paper_mm']
-    # Modes of 0.5 and 3.5 kHz.
+    # Modes of 0.36 and 3.4 kHz.
     state = NeedleModel(parameters).state_at(0.05, 5e-4)
     inputs = 3.0, 1e-6, np.array([1e-3, 2e-3])
     sensor = ForceSensor(replace(PERFECT, filter=2), 1000.0, 0)
