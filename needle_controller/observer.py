@@ -29,7 +29,6 @@ from needle_controller.observer_kernels import (
     FORCE_NOISE,
     FORCE_VARIANCE,
     HEADER,
-    INPUT,
     LATERAL,
     LENGTH,
     LOAD,
@@ -44,9 +43,9 @@ from needle_controller.observer_kernels import (
     outputs,
     PRINTED,
     replay,
+    RESPONSE,
     SENSOR,
     STEADY,
-    TICK,
     TICKS,
     TIME,
     TIP,
@@ -57,6 +56,7 @@ from needle_controller.observer_kernels import (
 )
 from needle_dynamics import (
     FloatArray,
+    ForceSensorParameters,
     InsertedLengthError,
     NeedleError,
     NeedleModel,
@@ -67,6 +67,7 @@ from needle_dynamics import (
 from needle_dynamics.kernels import evaluate, evaluate_many
 from needle_dynamics.model import ROUNDING
 from needle_dynamics.parameters import check_constants, constant
+from needle_dynamics.plant import TipParameters
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import cholesky, solve_discrete_lyapunov, solve_triangular
@@ -86,9 +87,61 @@ _WAITING: Final = 16
 _OVERLAP: Final = 0.1
 
 
+#: What the plant feels with as it is by default, and hence what the observer believes in.
+_SENSOR: Final = ForceSensorParameters()
+
+
+@lru_cache(maxsize=32)
+def _low_pass(
+    cutoffs: tuple[float, ...], rate: float
+) -> tuple[FloatArray, FloatArray, FloatArray, float]:
+    """
+    Return the low-pass as transition, input and steady state of memory and reading, and its gain.
+
+    The memory is scaled so that white noise of one before the filter makes it white, of one.
+    """
+    a: FloatArray = np.zeros((0, 0))
+    b: FloatArray = np.zeros(0)
+    c: FloatArray = np.zeros(0)
+    d = 1.0
+    for cutoff in cutoffs:
+        over, under = butter(2, cutoff, fs=rate)
+        # Transposed direct form II behind what there is.
+        own = np.array([[-under[1], 1.0], [-under[2], 0.0]])
+        drive = over[1:] - under[1:] * over[0]
+        order = len(b)
+        a = np.block([[a, np.zeros((order, 2))], [np.outer(drive, c), own]])
+        b = np.concatenate([b, drive * d])
+        c, d = np.concatenate([over[0] * c, [1.0, 0.0]]), over[0] * d
+    order = len(b)
+    if order:
+        root = cholesky(solve_discrete_lyapunov(a, np.outer(b, b)), lower=True)
+        a, b = (solve_triangular(root, value, lower=True) for value in (a @ root, b))
+        c = c @ root
+    transition, drive = np.zeros((order + 1, order + 1)), np.append(b, d)
+    transition[:order, :order], transition[order, :order] = a, c
+    steady = np.linalg.solve(np.eye(order + 1) - transition, drive)
+    return transition, drive, steady, float(np.sqrt(c @ c + d * d))
+
+
+def _of_sensor(name: str, channel: int) -> float:
+    """Return a constant of the plant's force sensor as it is by default."""
+    return float(_SENSOR.per_axis(name)[channel])
+
+
+def _read_noise(channel: int, digits: int) -> float:
+    """Return the noise with which that sensor is read, behind its filters."""
+    gain = _low_pass(_SENSOR.cutoffs, _SENSOR.rate)[3]
+    return round(_of_sensor('noise', channel) * gain, digits)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ObserverSettings:
-    """What the observer believes of sensors and tissue beside `NeedleParameters`."""
+    """
+    What the observer believes of sensors and tissue beside `NeedleParameters`.
+
+    The defaults are those of the plant's sensors as they are by default.
+    """
 
     irregularity: float = constant(
         1e-3, 'N s^(1/2) m^(-1/2)',
@@ -100,28 +153,30 @@ class ObserverSettings:
         1e-3, 'm', 'standard deviation of the tip deflection at the start', open_low=True
     )
     tip_noise: float = constant(
-        1e-4, 'm', 'standard deviation of a sample of the tip deflection', open_low=True
-    )
+        TipParameters().noise, 'm', 'standard deviation of a sample of the tip deflection',
+        open_low=True,
+    )  # fmt: skip
     tip_exposure: float = constant(
         1e-3, 's', 'time before its stamp over which a tip sample is the mean', open_low=True
     )
     force_noise: float = constant(
-        0.01, 'N', 'standard deviation of the lateral force as it is read', open_low=True
-    )
+        _read_noise(2, 6), 'N', 'standard deviation of the lateral force as it is read',
+        open_low=True,
+    )  # fmt: skip
     torque_noise: float = constant(
-        2.5e-4, 'N m', 'standard deviation of the moment as it is read', open_low=True
+        _read_noise(3, 8), 'N m', 'standard deviation of the moment as it is read', open_low=True
     )
-    force_resolution: float = constant(0.0025, 'N', 'force per count')
-    torque_resolution: float = constant(1e-4, 'N m', 'torque per count')
+    force_resolution: float = constant(_of_sensor('resolution', 2), 'N', 'force per count')
+    torque_resolution: float = constant(_of_sensor('resolution', 3), 'N m', 'torque per count')
     cutoffs: tuple[float, ...] = field(
-        default=(125.0,),
+        default=_SENSOR.cutoffs,
         metadata={
             'description': 'low-pass filters of the wrench one after the other '
             '(Butterworth, second order) [Hz]'
         },
     )
     filter_rate: float = constant(
-        1000.0, 'Hz', 'rate at which these filters run, each on means over its samples',
+        _SENSOR.rate, 'Hz', 'rate at which these filters run, each on means over its samples',
         open_low=True,
     )  # fmt: skip
     history: float = constant(
@@ -258,7 +313,9 @@ class Observer:
             [np.array(tissue.starts), np.array(tissue.stiffnesses), tissue.offsets(modes)]
         )
         self._reach = modes.reach * parameters.length
-        size = 2 * n + 2 * self._sensor.shape[1] + 1
+        slack = ROUNDING * parameters.length
+        self._least, self._most = parameters.minimum_depth - slack, self._reach + slack
+        size = 2 * n + 2 * self._sensor.shape[2] + 1
         slots = ceil(settings.history / period) + 2
         self._size = size
         self._at = np.zeros(n * (n + 1) + 4 * n)
@@ -335,9 +392,8 @@ class Observer:
             raise ParameterError(
                 f'time, depth and speed must be finite, got {time!r}, {depth!r} and {speed!r}'
             )
-        low = self.model.parameters.minimum_depth
-        slack = ROUNDING * self.model.parameters.length
-        if not low - slack <= depth <= self._reach + slack:
+        if not self._least <= depth <= self._most:
+            low = self.model.parameters.minimum_depth
             raise InsertedLengthError(
                 f'inserted length {depth:.6g} m is outside [{low:g}, {self._reach:g}] m '
                 '(minimum_depth to the hub); the estimate is held'
@@ -627,39 +683,6 @@ class Observer:
         return self._pairs[self._slot, 0, :modal, :modal]
 
 
-@lru_cache(maxsize=32)
-def _low_pass(
-    cutoffs: tuple[float, ...], rate: float
-) -> tuple[FloatArray, FloatArray, FloatArray, float]:
-    """
-    Return the low-pass as transition, input and steady state of memory and reading, and its gain.
-
-    The memory is scaled so that white noise of one before the filter makes it white, of one.
-    """
-    a: FloatArray = np.zeros((0, 0))
-    b: FloatArray = np.zeros(0)
-    c: FloatArray = np.zeros(0)
-    d = 1.0
-    for cutoff in cutoffs:
-        over, under = butter(2, cutoff, fs=rate)
-        # Transposed direct form II behind what there is.
-        own = np.array([[-under[1], 1.0], [-under[2], 0.0]])
-        drive = over[1:] - under[1:] * over[0]
-        order = len(b)
-        a = np.block([[a, np.zeros((order, 2))], [np.outer(drive, c), own]])
-        b = np.concatenate([b, drive * d])
-        c, d = np.concatenate([over[0] * c, [1.0, 0.0]]), over[0] * d
-    order = len(b)
-    if order:
-        root = cholesky(solve_discrete_lyapunov(a, np.outer(b, b)), lower=True)
-        a, b = (solve_triangular(root, value, lower=True) for value in (a @ root, b))
-        c = c @ root
-    transition, drive = np.zeros((order + 1, order + 1)), np.append(b, d)
-    transition[:order, :order], transition[order, :order] = a, c
-    steady = np.linalg.solve(np.eye(order + 1) - transition, drive)
-    return transition, drive, steady, float(np.sqrt(c @ c + d * d))
-
-
 def _constants(
     parameters: NeedleParameters, settings: ObserverSettings, ticks: int
 ) -> tuple[FloatArray, FloatArray]:
@@ -681,13 +704,14 @@ def _constants(
     fixed[FORCE_INPUT] = (settings.force_noise / gain) ** 2
     fixed[MOMENT_INPUT] = (settings.torque_noise / gain) ** 2
     order = len(drive)
-    sensor = np.zeros((SENSOR, order, order))
-    sensor[TICK] = transition
-    sensor[WHOLE] = np.linalg.matrix_power(transition, ticks)
-    spread = np.zeros((order, order))
-    for _ in range(ticks):
-        spread = transition @ spread @ transition.T + np.outer(drive, drive)
-    sensor[FORCE_NOISE] = fixed[FORCE_INPUT] * spread
-    sensor[MOMENT_NOISE] = fixed[MOMENT_INPUT] * spread
-    sensor[INPUT, 0], sensor[STEADY, 0] = drive, steady
+    sensor = np.zeros((SENSOR, max(order, ticks), order))
+    response, spread = drive, np.zeros((order, order))
+    for tick in range(ticks):
+        sensor[RESPONSE, tick] = response
+        spread += np.outer(response, response)
+        response = transition @ response
+    sensor[WHOLE, :order] = np.linalg.matrix_power(transition, ticks)
+    sensor[FORCE_NOISE, :order] = fixed[FORCE_INPUT] * spread
+    sensor[MOMENT_NOISE, :order] = fixed[MOMENT_INPUT] * spread
+    sensor[STEADY, 0] = steady
     return fixed, sensor

@@ -29,10 +29,10 @@ TICKS, TIP_PRIOR = 9, 10
 FORCE_INPUT, MOMENT_INPUT = 11, 12
 FIXED = 13
 
-# Slots of `sensor`: transition over a tick and over a sample, noise of both channels over a
-# sample; and as first rows what an input of one adds, and what it leaves in the long run.
-TICK, WHOLE, FORCE_NOISE, MOMENT_NOISE, INPUT, STEADY = 0, 1, 2, 3, 4, 5
-SENSOR = 6
+# Slots of `sensor`: transition over a sample, noise of both channels over a sample; as rows what
+# an input of one leaves so many ticks later; and as first row what it leaves in the long run.
+WHOLE, FORCE_NOISE, MOMENT_NOISE, RESPONSE, STEADY = 0, 1, 2, 3, 4
+SENSOR = 5
 
 # Slots of a row of `book` after the state; then g, omega (n each) and two changes of basis.
 TIME, SPAN, LATERAL, MOMENT, NIS, DEGREES = 0, 1, 2, 3, 4, 5
@@ -324,7 +324,7 @@ def begin(
     Every c and b has the same variance: the one that gives the tip its variance. What the memory
     of the low-pass holds is a constant and a white wrench as large as such a needle exerts.
     """
-    n, filters = basis.shape[1], sensor.shape[1]
+    n, filters = basis.shape[1], sensor.shape[2]
     modal, tip = 2 * n, n * (n + 1)
     _normal_modes(fixed, tissue, at, depth, growth, basis, work)
     _reaction(fixed, tissue, at, basis, depth, 0.0, growth, work[3])
@@ -342,14 +342,15 @@ def begin(
     covariance[:] = 0.0
     for i in range(modal):
         covariance[i, i] = variance
+    tick = span / fixed[TICKS]
     for channel in range(2):
         reaction = 0.0
         for k in range(n):
             omega = basis[2 * n, k]
-            cc, cb, bc, bb = _swing(omega, fixed[DAMPING] / fixed[DENSITY], span)
+            cc, cb, bc, bb = _swing(omega, fixed[DAMPING] / fixed[DENSITY], tick)
             c, b = work[3, channel, k], work[3, channel, n + k]
             reaction += (c * (cc - 1.0) + b * bc) ** 2 + (c * cb + b * (bb - 1.0)) ** 2
-        reaction *= variance / (span * span)
+        reaction *= variance / (tick * tick)
         first = modal + channel * filters
         noise = fixed[FORCE_INPUT + channel]
         for i in range(filters):
@@ -380,7 +381,7 @@ def _prepare(  # noqa: C901
 
     ``page`` takes the tip's share in c, the frequencies, and the changes of basis of c and b.
     """
-    n, filters = basis.shape[1], sensor.shape[1]
+    n, filters = basis.shape[1], sensor.shape[2]
     modal, tip, square = 2 * n, n * (n + 1), n * n
     rate = fixed[DAMPING] / fixed[DENSITY]
     to_c, to_b = work[4], work[5]
@@ -421,41 +422,33 @@ def _prepare(  # noqa: C901
             transition[i, n + k] = cb * to_b[i, k]
             transition[n + i, k] = bc * to_c[i, k]
             transition[n + i, n + k] = bb * to_b[i, k]
-    rows, drive, before = work[3], work[0], work[1]
+    rows, drive = work[3], work[0]
     _reaction(fixed, tissue, at, basis, depth, speed, growth, rows)
     ticks = int(fixed[TICKS])
     tick = span / ticks
-    for channel in range(2):
-        first = modal + channel * filters
-        for i in range(filters):
-            for k in range(modal):
-                drive[i, k] = 0.0
-        for count in range(ticks):
-            for i in range(filters):
-                for k in range(modal):
-                    value = 0.0
-                    for j in range(filters):
-                        value += sensor[TICK, i, j] * drive[j, k]
-                    before[i, k] = value
-            for k in range(n):
-                # The mean over a tick is what the change of the state over it makes of it.
-                cc, cb, bc, bb = _swing(basis[modal, k], rate, (count + 1) * tick)
-                if count > 0:
-                    c1, c2, c3, c4 = _swing(basis[modal, k], rate, count * tick)
-                else:
-                    c1, c2, c3, c4 = 1.0, 0.0, 0.0, 1.0
-                c, b = rows[channel, k] / tick, rows[channel, n + k] / tick
-                by_c = c * (cc - c1) + b * (bc - c3)
-                by_b = c * (cb - c2) + b * (bb - c4)
+    for i in range(2 * filters):
+        for k in range(modal):
+            drive[i, k] = 0.0
+    for k in range(n):
+        cc, cb, bc, bb = _swing(basis[modal, k], rate, tick)
+        for channel in range(2):
+            # The mean over a tick is what the change of the state over it makes of it.
+            c, b = rows[channel, k] / tick, rows[channel, n + k] / tick
+            by_c, by_b = c * (cc - 1.0) + b * bc, c * cb + b * (bb - 1.0)
+            for count in range(ticks):
                 for i in range(filters):
-                    drive[i, k] = before[i, k] + sensor[INPUT, 0, i] * by_c
-                    drive[i, n + k] = before[i, n + k] + sensor[INPUT, 0, i] * by_b
+                    left = sensor[RESPONSE, ticks - 1 - count, i]
+                    drive[channel * filters + i, k] += left * by_c
+                    drive[channel * filters + i, n + k] += left * by_b
+                by_c, by_b = by_c * cc + by_b * bc, by_c * cb + by_b * bb
+    for channel in range(2):
+        own, first = channel * filters, modal + channel * filters
         for i in range(filters):
             for k in range(n):
                 by_c, by_b = 0.0, 0.0
                 for j in range(n):
-                    by_c += drive[i, j] * to_c[j, k]
-                    by_b += drive[i, n + j] * to_b[j, k]
+                    by_c += drive[own + i, j] * to_c[j, k]
+                    by_b += drive[own + i, n + j] * to_b[j, k]
                 transition[first + i, k] = by_c
                 transition[first + i, n + k] = by_b
             for j in range(filters):
@@ -545,7 +538,7 @@ def _forget(x: FloatArray, covariance: FloatArray) -> None:
 
 
 @compiled
-def _propagate(
+def _propagate(  # noqa: C901
     x: FloatArray,
     covariance: FloatArray,
     transition: FloatArray,
@@ -555,38 +548,49 @@ def _propagate(
     work: FloatArray,
 ) -> None:
     """Take state and covariance through the transition, in place; the last entry stays."""
-    half, fresh = work[0], work[1, 0]
+    # Rows of both are added up, which the processor does several entries at a time.
+    turned, fresh = work[0], work[1, 0]
     end = modal + 2 * filters
     for i in range(end):
         # Modes drive the low-pass of both channels; its reading is not remembered.
         low = modal + (i - modal) // filters * filters if i >= modal else 0
         high = low + filters - 1 if i >= modal else 0
         value = 0.0
+        row = work[2, 0]
+        for k in range(size):
+            row[k] = 0.0
         for m in range(modal):
-            value += transition[i, m] * x[m]
+            part = transition[i, m]
+            value += part * x[m]
+            for k in range(size):
+                row[k] += part * covariance[m, k]
         for m in range(low, high):
-            value += transition[i, m] * x[m]
+            part = transition[i, m]
+            value += part * x[m]
+            for k in range(size):
+                row[k] += part * covariance[m, k]
         fresh[i] = value
         for k in range(size):
-            value = 0.0
-            for m in range(modal):
-                value += transition[i, m] * covariance[m, k]
-            for m in range(low, high):
-                value += transition[i, m] * covariance[m, k]
-            half[i, k] = value
+            turned[k, i] = row[k]
     for i in range(end):
         x[i] = fresh[i]
         low = modal + (i - modal) // filters * filters if i >= modal else 0
         high = low + filters - 1 if i >= modal else 0
+        row = covariance[i]
         for k in range(i, end):
-            value = 0.0
-            for m in range(modal):
-                value += half[k, m] * transition[i, m]
-            for m in range(low, high):
-                value += half[k, m] * transition[i, m]
-            covariance[i, k] = covariance[k, i] = value
+            row[k] = 0.0
+        for m in range(modal):
+            part = transition[i, m]
+            for k in range(i, end):
+                row[k] += part * turned[m, k]
+        for m in range(low, high):
+            part = transition[i, m]
+            for k in range(i, end):
+                row[k] += part * turned[m, k]
+        for k in range(i, end):
+            covariance[k, i] = row[k]
         for k in range(end, size):
-            covariance[i, k] = covariance[k, i] = half[i, k]
+            covariance[i, k] = covariance[k, i] = turned[k, i]
 
 
 @compiled
@@ -602,7 +606,7 @@ def _advance(  # noqa: C901
     new: int,
 ) -> None:
     """Fill the slot ``new`` from the slot ``old``, with what was measured in between."""
-    size, filters = pairs.shape[2], sensor.shape[1]
+    size, filters = pairs.shape[2], sensor.shape[2]
     modal = size - 1 - 2 * filters
     n = modal // 2
     last = size - 1

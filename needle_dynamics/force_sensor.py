@@ -6,8 +6,8 @@ from collections import deque
 from dataclasses import dataclass, field, fields
 from typing import Final
 
-from needle_dynamics.errors import JobError, ParameterError
-from needle_dynamics.kernels import FloatArray, sense
+from needle_dynamics.errors import JobError, ParameterError, ShapeError
+from needle_dynamics.kernels import FloatArray, sense, straight
 from needle_dynamics.parameters import check_constants, constant
 import numpy as np
 from scipy.signal import butter
@@ -105,9 +105,9 @@ class ForceSensor:
     """
     Turns true wrenches into what the sensor reports.
 
-    The sensor samples faster than it is read; over each interval the wrench goes in a straight
-    line. Each sample takes offset and noise, saturates, and passes the filters,
-    second-order Butterworth in a cascade; what is read is zeroed and rounded to counts.
+    The sensor samples faster than it is read. Each sample takes offset and noise, saturates, and
+    passes the filters, second-order Butterworth in a cascade; what is read is zeroed and rounded
+    to counts.
 
     Parameters
     ----------
@@ -117,6 +117,11 @@ class ForceSensor:
         Readings per second [Hz].
     seed : int
         Seed of the noise: the same seed gives the same noise.
+
+    Attributes
+    ----------
+    samples : int
+        Samples of the sensor between two readings.
 
     Raises
     ------
@@ -137,6 +142,8 @@ class ForceSensor:
                 f'rate of the force sensor must be a whole multiple of {rate:g} Hz, got '
                 f'{p.rate:g} Hz; {fits:g} Hz would do'
             )
+        self.samples = samples
+        self._felt = np.empty((samples, 6))
         self._rng = np.random.default_rng(seed)
         self._constants = np.array(
             [
@@ -166,10 +173,12 @@ class ForceSensor:
 
         Parameters
         ----------
-        wrench : ndarray, shape (6,)
-            True force [N] and torque [N m] now, x y z each.
+        wrench : ndarray, shape (samples, 6) or (6,)
+            True force [N] and torque [N m], x y z each: what each sample feels, its mean over
+            the sample; or only what the last one does, to which the wrench then goes in a
+            straight line.
         start : ndarray, shape (6,), optional
-            That just after the reading before, if the wrench jumped there.
+            That just after the reading before, if the wrench jumped there; for a straight line.
         moving : bool
             Whether what it feels moves; such a reading is not used to zero it.
 
@@ -178,26 +187,39 @@ class ForceSensor:
         ndarray, shape (6,)
             What the sensor reports.
 
+        Raises
+        ------
+        ShapeError
+            If what each sample feels is not given for all of them.
+
         """
-        wrench = np.array(wrench, dtype=np.float64)
+        felt = np.array(wrench, dtype=np.float64)
+        if felt.ndim == 2 and len(felt) != self.samples:
+            raise ShapeError(
+                f'wrench must have shape (6,) or ({self.samples}, 6), got {felt.shape}'
+            )
         if self._next == len(self._drawn):
             self._drawn = self._rng.standard_normal(self._block)
             self._next = 0
         if self._before is None:
             # The filters start in the steady state of the first value.
             limit = self._constants[2]
-            first = np.clip(wrench + self._offset, -limit, limit)
+            first = felt if felt.ndim == 1 else felt[0]
+            value = np.clip(first + self._offset, -limit, limit)
             b, a = self._sections[:, :3], self._sections[:, 3:]
-            self._memory[:, 0] = (1.0 - b[:, :1]) * first
-            self._memory[:, 1] = (b[:, 2:] - a[:, 2:]) * first
-            self._before = wrench
+            self._memory[:, 0] = (1.0 - b[:, :1]) * value
+            self._memory[:, 1] = (b[:, 2:] - a[:, 2:]) * value
+            self._before = first
+        if felt.ndim == 1:
+            straight(self._before if start is None else start, felt, self._felt)
+            felt = self._felt
         reading = np.empty(6)
         sense(
-            self._before if start is None else start, wrench, self._drawn[self._next],
-            self._constants, self._sections, self._memory, self._offset, self._zero, reading,
+            felt, self._drawn[self._next], self._constants, self._sections, self._memory,
+            self._offset, self._zero, reading,
         )  # fmt: skip
         self._next += 1
-        self._before = wrench
+        self._before = felt[-1].copy()
         if moving:
             self._resting.clear()
         else:

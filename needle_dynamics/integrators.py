@@ -23,7 +23,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from math import copysign, inf, isfinite, isnan, sqrt
 import os
 from typing import Final
@@ -46,9 +46,6 @@ from needle_dynamics.kernels import (
     SUM_FRICTION_WORK,
     SUM_IMPACT,
     SUM_INPUT_WORK,
-    SUM_REACTION,
-    SUM_REACTION_MOMENT,
-    SUM_RESISTANCE,
     SUM_TIP,
     SUMS,
     Tables,
@@ -95,6 +92,7 @@ def kernel_constants(model: NeedleModel) -> Constants:
         smoothing_speed=friction.smoothing_speed,
         swelling=tissue.swelling,
         swelling_time=tissue.swelling_time,
+        carriage_mass=p.carriage_mass,
     )
 
 
@@ -125,6 +123,8 @@ class Interval:
         Mean force of the base on the needle along z [N], by balance of momentum.
     moment : float
         Mean moment of the base on the needle about x at the base [N m], with the torque.
+    felt : ndarray, shape (parts, 3)
+        These three over each of the equal parts of the interval.
     friction_work, damping_work : float
         Energy lost to friction and to tissue damping [J].
     input_work : float
@@ -140,6 +140,7 @@ class Interval:
     axial_force: float
     lateral_force: float
     moment: float
+    felt: FloatArray = field(compare=False)
     friction_work: float
     damping_work: float
     input_work: float
@@ -241,6 +242,7 @@ class Integrator:
         force: float = 0.0,
         torque: float = 0.0,
         modal: FloatArray | None = None,
+        parts: int = 1,
     ) -> Interval:
         """
         Advance under a constant force and torque at the base.
@@ -256,6 +258,9 @@ class Integrator:
         modal : ndarray, shape (n,), optional
             Constant generalized forces on q1..qn [N m^-1/2], what the source's modal inputs are.
             No force at the base belongs to them: the base does not feel them.
+        parts : int
+            In how many equal parts of the interval to tell what the base feels. Steps end where
+            these do.
 
         Returns
         -------
@@ -275,7 +280,7 @@ class Integrator:
             modal = _floats('modal', modal)
             if modal.shape != (n,) or not np.isfinite(modal).all():
                 raise ShapeError(f'modal must be finite with shape ({n},), got {modal.tolist()}')
-        return self._run(duration, force, torque, 0.0, modal, moved=False)
+        return self._run(duration, force, torque, 0.0, modal, parts, moved=False)
 
     def advance_moved(self, duration: float, speed: float) -> Interval:
         """
@@ -300,7 +305,7 @@ class Integrator:
             If the inserted length fell below its minimum; the state is the last valid one.
 
         """
-        return self._run(duration, 0.0, 0.0, speed, None, moved=True)
+        return self._run(duration, 0.0, 0.0, speed, None, 1, moved=True)
 
     def advance_pushed(self, duration: float, force: float, speed_limit: float) -> Interval:
         """
@@ -350,6 +355,7 @@ class Integrator:
         torque: float,
         speed: float,
         modal: FloatArray | None,
+        parts: int,
         *,
         moved: bool,
     ) -> Interval:
@@ -360,17 +366,17 @@ class Integrator:
                 raise ParameterError(f'{name} must be finite, got {value!r}')
         # An integer would have the kernel compiled anew for it.
         duration, force, torque, speed = map(float, (duration, force, torque, speed))
-        before = self._state.copy()
+        felt = np.empty((parts, 3))
 
         def take(longest: float) -> None:
-            self._take(duration, (force, torque, speed), modal, longest, moved=moved)
+            self._take(duration, (force, torque, speed), modal, longest, felt, moved=moved)
 
         if self.tolerance is None:
             take(self.step)
         else:
             self._refine(take, min(duration, self.step / self._refinement), self.tolerance)
         self.time += duration
-        return self._interval(before, duration, force, torque, moved=moved)
+        return self._interval(duration, felt)
 
     def _take(
         self,
@@ -378,6 +384,7 @@ class Integrator:
         inputs: tuple[float, float, float],
         modal: FloatArray | None,
         longest: float,
+        felt: FloatArray,
         *,
         moved: bool,
     ) -> None:
@@ -387,7 +394,7 @@ class Integrator:
             self._constants, self._tables, self._state, self.time,
             *inputs, moved, longest, self.graded, duration, self._sums,
         )  # fmt: skip
-        left = advance(*known) if modal is None else advance(*known, modal)
+        left = advance(*known, modal, felt)
         if isnan(left):
             raise NeedleError(
                 'the motion is not finite: constants, state or inputs are out of proportion'
@@ -450,27 +457,15 @@ class Integrator:
         part = sqrt(energy(two - one) / scale) if scale > 0.0 else 0.0
         return max(part, float(abs(two[0] - one[0])) / model.parameters.length)
 
-    def _interval(
-        self, before: FloatArray, duration: float, force: float, torque: float, *, moved: bool
-    ) -> Interval:
-        p, after, sums = self.model.parameters, self._state, self._sums
-        m, n = self.model.coordinates, self.model.modes.count
-        # Integrals of phi and of y phi are the last 2 n.
-        start = self.model.modes.packed(p.length - before[0])[-2 * n :].reshape(2, n)
-        end = self.model.modes.packed(p.length - after[0])[-2 * n :].reshape(2, n)
-        momentum, angular = end @ after[m + 2 :] - start @ before[m + 2 :]
-        lateral = (p.linear_density * momentum + sums[SUM_REACTION]) / duration
-        about_entry = (p.linear_density * angular + sums[SUM_REACTION_MOMENT]) / duration
-        gain = (before[m] - after[m]) / duration
-        if moved:
-            force = p.linear_density * p.length * gain + sums[SUM_RESISTANCE] / duration
-        else:
-            force = force - p.carriage_mass * gain
+    def _interval(self, duration: float, felt: FloatArray) -> Interval:
+        sums = self._sums
+        axial, lateral, moment = (felt.sum(axis=0) / len(felt)).tolist()
         return Interval(
             tip_deflection=float(sums[SUM_TIP] / duration),
-            axial_force=float(force),
-            lateral_force=float(lateral),
-            moment=float(about_entry + 0.5 * (before[0] + after[0]) * lateral + torque),
+            axial_force=axial,
+            lateral_force=lateral,
+            moment=moment,
+            felt=felt,
             friction_work=float(sums[SUM_FRICTION_WORK]),
             damping_work=float(sums[SUM_DAMPING_WORK]),
             input_work=float(sums[SUM_INPUT_WORK]),

@@ -80,6 +80,7 @@ class Constants(NamedTuple):
     smoothing_speed: float
     swelling: float
     swelling_time: float
+    carriage_mass: float
 
 
 class Tables(NamedTuple):
@@ -837,6 +838,29 @@ def _shift(
 
 
 @compiled
+def _carried(
+    c: Constants,
+    at: FloatArray,
+    z: FloatArray,
+    rates: FloatArray,
+    factor: FloatArray,
+) -> tuple[float, float]:
+    """Return the needle's momentum along z and its moment about the entry point, from `z`."""
+    n = z.shape[0]
+    rates[:] = z
+    if not c.as_printed:
+        _cholesky(c, at, factor)
+        _forward(factor, rates)
+        _backward(factor, rates)
+    momentum, angular = 0.0, 0.0
+    first = n * (n + 1) + 2 * n
+    for i in range(n):
+        momentum += at[first + i] * rates[i]
+        angular += at[first + n + i] * rates[i]
+    return c.linear_density * momentum, c.linear_density * angular
+
+
+@compiled
 def advance(  # noqa: C901
     c: Constants,
     tables: Tables,
@@ -851,6 +875,7 @@ def advance(  # noqa: C901
     duration: float,
     sums: FloatArray,
     modal: FloatArray | None = None,
+    felt: FloatArray | None = None,
 ) -> float:
     """
     Advance ``state`` in place under constant inputs; return the time that was left undone.
@@ -862,6 +887,10 @@ def advance(  # noqa: C901
     once it exceeds a tenth of the needle's, since the modes slow down. With ``moved`` the speed
     goes evenly to ``base_speed``, whatever force that takes. Time is left undone when the
     inserted length would leave its range; it is not a number when the motion is none.
+
+    ``felt``, shape (parts, 3), takes what the base feels in equal parts of the duration, where
+    steps then end: the mean force of the base on the needle along y and along z, and the mean
+    moment about x at the base. That is by balance of momentum, exact whatever the modes do.
     """
     series, terms, modes, layer_start, layer_stiffness, layer_offset = tables
     n = modes.shape[1]
@@ -874,6 +903,7 @@ def advance(  # noqa: C901
     damping, printed = c.tissue_damping, c.as_printed
     s = c.length - state[0]
     u = -state[2 + n]
+    factor, rates = np.zeros((n, n)), np.empty(n)
     if not c.as_printed:
         # From rates to momenta p = rho A G q_dot, in which dG/dt needs no term.
         _integrals(c.length, s, series, terms, modes, work, at)
@@ -892,7 +922,18 @@ def advance(  # noqa: C901
         for i in range(n):
             sums[SUM_INPUT_WORK] -= modal[i] * q[i]
     count, whole, renew = 0, longest, True
-    left = duration
+    # Time left in the part, and of the parts after it.
+    left, later = duration, 0.0
+    if felt is not None:
+        row, parts = 0, felt.shape[0]
+        part = duration / parts
+        left, later = part, (parts - 1) * part
+        if c.as_printed:
+            _integrals(c.length, s, series, terms, modes, work, at)
+        momentum, angular = _carried(c, at, z, rates, factor)
+        s_before, u_before = s, u
+        resistance, reaction = sums[SUM_RESISTANCE], sums[SUM_REACTION]
+        turning = sums[SUM_REACTION_MOMENT]
     while left > 0.0:
         if renew:
             if graded:
@@ -924,7 +965,7 @@ def advance(  # noqa: C901
         if layer_start.shape[0] > 1:
             layer = _layer(layer_start, middle, layer)
         if c.swelling != 0.0:
-            now = time + duration - left + 0.5 * h
+            now = time + duration - (left + later) + 0.5 * h
             growth = 1.0 - c.swelling * expm1(-now / c.swelling_time)
         if c.tissue_damping != 0.0:
             decay = exp(-0.5 * h * c.tissue_damping / c.linear_density)
@@ -951,7 +992,7 @@ def advance(  # noqa: C901
         drive = force - impulse / h
         if moved:
             # Counted from the end, so that a base that shall rest does so exactly.
-            new_u = base_speed - rest * gain
+            new_u = base_speed - (rest + later) * gain
             step = 0.5 * h * (u + new_u)
         elif c.friction_law == COULOMB:
             new_u, step = slide(u, drive, c.moving_mass, c.coulomb, c.viscous, h, c.withdrawal)
@@ -984,12 +1025,12 @@ def advance(  # noqa: C901
                     new_u = u + late * gain
                 else:
                     new_u, _ = _flow(c, u, drive, late)
-                sums[SUM_CONTACT] = time + duration - left + late
+                sums[SUM_CONTACT] = time + duration - (left + later) + late
                 sums[SUM_IMPACT] += 0.5 * c.moving_mass * new_u * new_u
             elif u > 0.0:
                 # It started on the hub: all its speed is lost at once.
                 new_u = u
-                sums[SUM_CONTACT] = time + duration - left
+                sums[SUM_CONTACT] = time + duration - (left + later)
                 sums[SUM_IMPACT] += 0.5 * c.moving_mass * u * u
             else:
                 new_u = 0.0
@@ -1020,6 +1061,26 @@ def advance(  # noqa: C901
             s = c.length
             u = 0.0
         left = rest
+        if felt is not None and left <= 0.0:
+            if n == 2:
+                z[0], z[1] = z1, z2
+            _integrals(c.length, s, series, terms, modes, work, at)
+            momentum_now, angular_now = _carried(c, at, z, rates, factor)
+            if moved:
+                axial = c.linear_density * c.length * (u - u_before)
+                felt[row, 0] = (axial + sums[SUM_RESISTANCE] - resistance) / part
+            else:
+                felt[row, 0] = force - c.carriage_mass * (u - u_before) / part
+            lateral = (momentum_now - momentum + sums[SUM_REACTION] - reaction) / part
+            about = (angular_now - angular + sums[SUM_REACTION_MOMENT] - turning) / part
+            lever = c.length - 0.5 * (s_before + s)
+            felt[row, 1], felt[row, 2] = lateral, about + lever * lateral + torque
+            momentum, angular, s_before, u_before = momentum_now, angular_now, s, u
+            resistance, reaction = sums[SUM_RESISTANCE], sums[SUM_REACTION]
+            turning = sums[SUM_REACTION_MOMENT]
+            row += 1
+            if row < parts:
+                left, later, renew = part, (parts - 1 - row) * part, True
     if n == 2:
         q[0], q[1], z[0], z[1] = q1, q2, z1, z2
     if modal is not None:
@@ -1027,10 +1088,10 @@ def advance(  # noqa: C901
             sums[SUM_INPUT_WORK] += modal[i] * q[i]
     if not c.as_printed:
         _integrals(c.length, s, series, terms, modes, work, at)
-        factor = np.zeros((n, n))
         _cholesky(c, at, factor)
         _forward(factor, z)
         _backward(factor, z)
+    left += later
     done = duration - left
     turn = 2.0 * torque / c.rotary_inertia
     turned = (state[3 + n] + 0.5 * turn * done) * done
@@ -1085,9 +1146,19 @@ def run(
 
 
 @compiled
+def straight(before: FloatArray, now: FloatArray, felt: FloatArray) -> None:
+    """Fill ``felt``, shape (k, 6), with a straight line that ends with ``now``."""
+    samples = felt.shape[0]
+    for j in range(samples):
+        # The last sample is the wrench now, to the bit.
+        back = (samples - 1.0 - j) / samples
+        for i in range(6):
+            felt[j, i] = now[i] + back * (before[i] - now[i])
+
+
+@compiled
 def sense(
-    before: FloatArray,
-    now: FloatArray,
+    felt: FloatArray,
     drawn: FloatArray,
     constants: FloatArray,
     sections: FloatArray,
@@ -1097,14 +1168,14 @@ def sense(
     reading: FloatArray,
 ) -> None:
     """
-    Take the samples of a force sensor between two wrenches; read the last of them.
+    Take the samples of a force sensor since its last reading; read the last of them.
 
     Parameters
     ----------
-    before, now : ndarray, shape (6,)
-        True wrenches after the last reading and now; a straight line between them.
+    felt : ndarray, shape (k, 6)
+        True wrench of each of the k samples.
     drawn : ndarray, shape (k + 1, 6)
-        Standard normal numbers: noise of each of the k samples, then the step of the offset.
+        Standard normal numbers: noise of each sample, then the step of the offset.
     constants : ndarray, shape (4, 6)
         Standard deviations of noise and step, range, and resolution (0 for none) of each axis.
     sections : ndarray, shape (filters, 6)
@@ -1119,15 +1190,13 @@ def sense(
         Overwritten with the reading.
 
     """
-    samples = drawn.shape[0] - 1
+    samples = felt.shape[0]
     for i in range(6):
         noise, limit, count = constants[0, i], constants[2, i], constants[3, i]
         offset[i] += constants[1, i] * drawn[samples, i]
         value = 0.0
         for j in range(samples):
-            # The last sample is the wrench now, to the bit.
-            back = (samples - 1.0 - j) / samples
-            value = now[i] + back * (before[i] - now[i]) + offset[i] + noise * drawn[j, i]
+            value = felt[j, i] + offset[i] + noise * drawn[j, i]
             value = min(max(value, -limit), limit)
             for k in range(sections.shape[0]):
                 x = value

@@ -266,7 +266,7 @@ class TipParameters:
     """What sees the tip: a tracker or imager, exposed all the time from one sample to the next."""
 
     rate: float = constant(0.0, 'Hz', 'samples per second; 0: one with every sample of the plant')
-    noise: float = constant(0.0, 'm', 'standard deviation of a sample')
+    noise: float = constant(1e-4, 'm', 'standard deviation of a sample')
     delay: float = constant(0.0, 's', 'time from a sample to its message', high=1.0)
 
     def __post_init__(self) -> None:
@@ -426,7 +426,8 @@ class Plant:
         self.interval = 1.0 / rate
         self.time = 0.0
         self._sensor = sensor
-        self._tip = tip or TipSensor(TipParameters(), rate, 0)
+        self._tip = tip or TipSensor(TipParameters(noise=0.0), rate, 0)
+        self._felt = np.zeros((sensor.samples, 6))
         self._count = 0
 
     @property
@@ -513,7 +514,7 @@ class Plant:
         needle, base, interval = self.integrator, self.base, self.interval
         resolution = late = 0.0
         if base is None:
-            seen = needle.advance(interval, force, torque, modal)
+            seen = needle.advance(interval, force, torque, modal, self._sensor.samples)
         else:
             resolution = base.limits.encoder_resolution
             push = base.push(self.time, needle.depth, interval / _PUSHES)
@@ -527,9 +528,15 @@ class Plant:
         self._count += 1
         self.time = self._count * interval
         axial = seen.axial_force + late
-        wrench = np.array([0.0, axial, seen.lateral_force, seen.moment, 0.0, 0.0])
-        start = wrench.copy()
-        start[1] -= 2.0 * late
+        start = None
+        if base is None:
+            wrench = self._felt
+            wrench[:, 1:4] = seen.felt
+        else:
+            # Force and speed that are recorded beside each other shall be of one instant.
+            wrench, start = np.zeros((2, 6))
+            wrench[1:4] = start[1:4] = axial, seen.lateral_force, seen.moment
+            start[1] -= 2.0 * late
         depth, speed = needle.depth, needle.speed
         return Sample(
             state=needle.state,
@@ -551,7 +558,12 @@ class Plant:
             push = base.push(self.time + k * part, needle.depth, part)
             force = force if push is None else push
             parts.append(needle.advance_pushed(part, force, limit))
-        names = ('tip_deflection', 'axial_force', 'lateral_force', 'moment')
-        means = {name: fmean(getattr(one, name) for one in parts) for name in names}
         rise = (parts[-1].axial_force - parts[0].axial_force) * _PUSHES / (_PUSHES - 1)
-        return replace(parts[-1], **means), 0.5 * rise
+        means = replace(
+            parts[-1],
+            tip_deflection=fmean(one.tip_deflection for one in parts),
+            axial_force=fmean(one.axial_force for one in parts),
+            lateral_force=fmean(one.lateral_force for one in parts),
+            moment=fmean(one.moment for one in parts),
+        )
+        return means, 0.5 * rise

@@ -4,7 +4,13 @@ from __future__ import annotations
 
 from typing import Any
 
-from needle_dynamics import FloatArray, ForceSensor, ForceSensorParameters, ParameterError
+from needle_dynamics import (
+    FloatArray,
+    ForceSensor,
+    ForceSensorParameters,
+    ParameterError,
+    ShapeError,
+)
 from needle_dynamics.errors import JobError
 import numpy as np
 from numpy.testing import assert_allclose
@@ -117,6 +123,26 @@ def test_the_cascade_is_that_of_scipy_at_the_rate_of_the_sensor(filters: int, ra
     expected = sosfilt(cascade(filters), lines)[:, per - 1 :: per].T
     # Rounding, kept by poles close to 1: (8000 / 31)^2 eps.
     assert_allclose(seen[1:], expected, rtol=0.0, atol=1e-10)
+
+
+@pytest.mark.parametrize('filters', [0, 1, 2])
+def test_each_sample_feels_its_own_wrench(filters: int) -> None:
+    """Given what all samples feel, readings are every eighth of SciPy's cascade fed with that."""
+    truth = wrenches(800)
+    truth[0] = 0.0
+    of = sensor(filter=filters)
+    assert of.samples == 8
+    seen = readings(of, truth.reshape(100, 8, 6))
+    filtered = sosfilt(cascade(filters), truth, axis=0) if filters else truth
+    # Rounding, kept by poles close to 1.
+    assert_allclose(seen, filtered[7::8], rtol=0.0, atol=1e-10)
+    if not filters:
+        # A straight line goes on from there.
+        assert np.array_equal(of.measure(truth[0]), truth[0])
+    with pytest.raises(
+        ShapeError, match=r'wrench must have shape \(6,\) or \(8, 6\), got \(7, 6\)'
+    ):
+        of.measure(truth[:7])
 
 
 @pytest.mark.parametrize('filters', range(1, 7))

@@ -31,6 +31,7 @@ from needle_dynamics.plant import (
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest
+from scipy.signal import butter, sosfilt, sosfilt_zi
 
 RATE = 500.0
 DEPTH = 0.1
@@ -300,6 +301,30 @@ def test_force_and_speed_of_a_carried_base_are_of_one_instant() -> None:
     assert_allclose(
         column(samples, 'force')[moving], (friction + inertia)[moving], rtol=0.0, atol=1e-11
     )
+
+
+def test_the_sensor_feels_the_needle_as_it_rings_within_a_sample() -> None:
+    """Under a commanded wrench each of its samples is the true mean over it: SciPy's cascade."""
+    parameters = PRESETS['paper_mm']
+    # Modes of 0.36 and 3.4 kHz.
+    state = NeedleModel(parameters).state_at(0.05, 5e-4)
+    inputs = 3.0, 1e-6, np.array([1e-3, 2e-3])
+    sensor = ForceSensor(replace(PERFECT, filter=2), 1000.0, 0)
+    plant = Plant(Integrator(parameters, state, 2e-5), sensor, 1000.0)
+    samples = [plant.advance(*inputs) for _ in range(40)]
+    needle = Integrator(parameters, state, 2e-5)
+    parts = [needle.advance(1.25e-4, *inputs) for _ in range(320)]
+    true = np.array([[part.axial_force, part.lateral_force, part.moment] for part in parts])
+    cascade = np.concatenate([butter(2, cut, fs=8000.0, output='sos') for cut in (500.0, 125.0)])
+    start = sosfilt_zi(cascade)[:, :, np.newaxis] * true[0]
+    felt, _ = sosfilt(cascade, true, axis=0, zi=start)
+    wrench = column(samples, 'wrench')
+    # Rounding of rates to momenta and back in each part.
+    assert_allclose(wrench[:, 1:4], felt[7::8], rtol=0.0, atol=1e-8 * np.abs(true).max())
+    assert np.all(wrench[:, [0, 4, 5]] == 0.0)
+    # It rings within the samples: their means would not do.
+    means = true.reshape(40, 8, 3).mean(axis=1)
+    assert np.abs(true[:, 1] - np.repeat(means[:, 1], 8)).max() > 0.1 * np.abs(true[:, 1]).max()
 
 
 def watched(rate: float = 0.0, noise: float = 0.0, delay: float = 0.0) -> list[TipReading | None]:
