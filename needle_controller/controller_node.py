@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import fields, replace
+from dataclasses import fields
 from math import isfinite
 import sys
 from time import monotonic
@@ -37,7 +37,6 @@ from needle_controller.safety import (
 )
 from needle_dynamics import (
     FloatArray,
-    ForceSensorParameters,
     NeedleError,
     NeedleModel,
     NeedleParameters,
@@ -74,18 +73,6 @@ _GAINS: dict[str, dict[str, InverseDynamicsGains | PidGains]] = {
 
 #: Sources of what is known of the bending.
 FEEDBACKS = ('observer', 'ground_truth', 'none')
-
-
-def _observer_defaults() -> ObserverSettings:
-    """Return the settings that fit the force sensor of the plant as it is by default."""
-    sensor = ForceSensorParameters()
-    settings = ObserverSettings(cutoffs=sensor.cutoffs, filter_rate=sensor.rate)
-    force, torque = sensor.per_axis('noise')[2:4]
-    return replace(
-        settings,
-        force_noise=round(float(force) * settings.noise_gain, 6),
-        torque_noise=round(float(torque) * settings.noise_gain, 8),
-    )
 
 
 def _stamp(header: Header) -> int:
@@ -151,7 +138,7 @@ class ControllerNode(NeedleNode):
         self.declare_settings('', ControllerSettings())
         self.declare_settings('reference.', ReferenceLimits())
         self.declare_settings('safety.', SafetyLimits())
-        self.declare_settings('observer.', _observer_defaults())
+        self.declare_settings('observer.', ObserverSettings())
         for law, axes in _GAINS.items():
             for axis, gains in axes.items():
                 self.declare_settings(f'{law}.{axis}.', gains)

@@ -200,11 +200,6 @@ class ObserverSettings:
             )
         object.__setattr__(self, 'cutoffs', cutoffs)
 
-    @property
-    def noise_gain(self) -> float:
-        """Standard deviation behind the low-pass for white noise of one before it."""
-        return _low_pass(self.cutoffs, self.filter_rate)[3]
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Consistency:

@@ -241,8 +241,13 @@ def test_a_killed_controller_leaves_the_needle_at_rest(ros_graph):
     ros_graph.spin_until(lambda: truth.message.velocity[0] == 0.0, 'rest')
     assert plant.diagnose()[2]['commands refused'] == 0
     ros_graph.start('controller', parameters)
-    # The dead one commands, as far as others know, until its lease of 20 s has ended.
-    ros_graph.spin_until(moves, 'motion', timeout=90.0)
+    # The dead one commands, as far as the plant knows, until its lease of 20 s has ended.
+    ros_graph.spin_until(lambda: 'nodes command' in plant.diagnose()[1], 'the successor')
+    assert truth.message.velocity[0] == 0.0
+    ros_graph.spin_until(
+        lambda: 'nodes command' not in plant.diagnose()[1], 'the lease', timeout=60.0
+    )
+    ros_graph.spin_until(moves, 'motion')
 
 
 def test_a_killed_plant_is_waited_for(ros_graph):
@@ -306,7 +311,7 @@ def test_a_clock_that_jumps_moves_nothing(ros_graph):
     simulated = {'rate': RATE, 'use_sim_time': True}
     ros_graph.add(PlantNode, parameters=simulated)
     controller = ros_graph.add(ControllerNode, parameters=simulated)
-    now = [100_000_000_000]
+    now = [10_000_000_000_000]
     # A clock that goes on before all have taken notice would make every message late.
     seen, waited = [None], [0]
 
