@@ -180,7 +180,8 @@ class BareSource(Clocked):
     Numbers messages for a recorder: the plant's four streams and the command.
 
     The stamp is the number of the sample, in periods. Numbers begin once each stream has a
-    reader; how many have been sent is said on stdout when ``run`` becomes false.
+    reader; how many have been sent, in how many seconds, is said on stdout when ``run`` becomes
+    false.
     """
 
     def __init__(self, **options: Any) -> None:
@@ -193,12 +194,14 @@ class BareSource(Clocked):
     def _on_run(self, message: Bool) -> None:
         super()._on_run(message)
         if not message.data and self._sent:
-            sys.stdout.write(f'{self._sent}\n')
+            sys.stdout.write(f'{self._sent} {time.monotonic() - self._begin}\n')
             sys.stdout.flush()
 
     def sample(self, _stamp: int) -> None:
         """Send the next number in each stream, if all are read."""
         if self._sent or (self._sender.has_readers() and self._command.get_subscription_count()):
+            if not self._sent:
+                self._begin = time.monotonic()
             self._sent += 1
             self._sender.send(self._sent * PERIOD)
             self._wrench.header.stamp = time_message(self._sent * PERIOD)
@@ -216,7 +219,7 @@ def main(role: str, executor_name: str) -> None:
     executor: Executor = EXECUTORS[executor_name]()
     executor.add_node(ROLES[role]())
     while True:
-        # The spin of rclpy 7.1's events executor returns at once; spin_once returns for each event.
+        # In rclpy 7.1 spin of the events executor returns at once, and spin_once at each event.
         executor.spin_until_future_complete(Future(), timeout_sec=0.5)
 
 

@@ -19,6 +19,7 @@ from contextlib import contextmanager, ExitStack
 from dataclasses import dataclass
 from functools import partial
 import gc
+from itertools import pairwise
 import os
 from pathlib import Path
 import subprocess
@@ -36,7 +37,6 @@ from needle_insertion.bench_measure import Bar, version
 from needle_insertion.graph import ACTIVATE, CONFIGURE, DEACTIVATE, Graph, GraphError
 from needle_insertion.report import table
 import numpy as np
-from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool
@@ -283,9 +283,7 @@ def loop(camp: Camp, turn: float) -> Figures:
         return {
             **quantiles('sample to command', [at - s for at, s in commands if s in arrived]),
             **quantiles('sample to joint_states', [at - s for at, s in samples]),
-            **quantiles(
-                'period', [b[0] - a[0] for a, b in zip(samples, samples[1:], strict=False)], True
-            ),
+            **quantiles('period', [b[0] - a[0] for a, b in pairwise(samples)], True),
             'samples late by a period [%]': 100.0
             * float(np.mean([at - s > PERIOD for at, s in samples])),
             **found,
@@ -293,14 +291,14 @@ def loop(camp: Camp, turn: float) -> Figures:
 
 
 def answer(camp: Camp, turn: float) -> Figures:
-    """Stand where the plant is and send its messages: when does the command come back?"""
+    """Stand where the plant is and send its messages; time the commands that come back."""
     left: dict[int, int] = {}
-    sender, start, sent = Sender(camp.node), time.time_ns(), 0
+    sender, start, sent, over = Sender(camp.node), time.time_ns(), 0, False
 
     def tick() -> None:
         nonlocal sent
-        # No more than one at a time: what is late is left out.
-        if (due := (time.time_ns() - start) // PERIOD) > sent:
+        # No more than one at a time: what is late is left out. A tick may be under way at the end.
+        if not over and (due := (time.time_ns() - start) // PERIOD) > sent:
             sent = due
             left[start + sent * PERIOD] = sender.send(start + sent * PERIOD, _TARGETS[0])
 
@@ -310,6 +308,7 @@ def answer(camp: Camp, turn: float) -> Figures:
         camp.aim(_TARGETS[0])
         camp.measure(turn, seen)
         times = [at - left[s] for at, s in seen['wrench_command'] if s in left]
+    over = True
     camp.node.destroy_timer(timer)
     sender.destroy(camp.node)
     return quantiles('round trip', times, True)
@@ -338,9 +337,10 @@ def middle(figures: Sequence[Figures], what: str) -> float:
 
 
 def ratio(ours: Sequence[Figures], theirs: Sequence[Figures], what: str) -> float:
-    """Return the median of the ratios within the rounds; not a number where it has none."""
+    """Return the median of the ratios within the rounds; not a number if there is none."""
     pairs = [(a[what], b[what]) for a, b in zip(ours, theirs, strict=True)]
-    return float(np.median([a / b if b else np.nan for a, b in pairs]))
+    ratios = [a / b for a, b in pairs if b]
+    return float(np.median(ratios)) if ratios else float('nan')
 
 
 def record(folder: Path, duration: float) -> tuple[str, list[Bar]]:
@@ -381,18 +381,15 @@ def record(folder: Path, duration: float) -> tuple[str, list[Bar]]:
         shares = {n: 100.0 * (cpu_seconds(p) - spent[n]) / wall for n, p in pids.items()}
         camp.say(False)
         # Nothing more is sent after this line.
-        sent = int(source.stdout.readline()) if source.stdout else 0
+        said = source.stdout.readline().split() if source.stdout else []
         camp.spin(_FIRST)
         recorder.interrupt()
+    sent, taken = int(said[0]), float(said[1])
     numbers = sample_numbers(folder / 'bag')
-    first = round(_FIRST * RATE)
-    lost = {
-        topic: sent - first - len(np.unique(found[(found > first) & (found <= sent)]))
-        for topic, found in numbers.items()
-    }
+    lost = losses(numbers, sent)
     rows = [
-        ('messages sent', f'{len(topics) * (sent - first)}'),
-        ('per second', f'{len(topics) * (sent - first) / duration:.0f}'),
+        ('messages sent', f'{len(topics) * sent}'),
+        ('per second', f'{len(topics) * sent / taken:.0f}'),
         ('lost', ', '.join(f'{n} of {t}' for t, n in lost.items() if n) or 'none'),
         ('doubled', f'{sum(len(n) - len(np.unique(n)) for n in numbers.values())}'),
         *((f'CPU of the {name} [%]', f'{share:.1f}') for name, share in shares.items()),
@@ -406,6 +403,30 @@ def record(folder: Path, duration: float) -> tuple[str, list[Bar]]:
         at_least=False,
     )
     return text, [most]
+
+
+def losses(numbers: Mapping[str, Any], sent: int) -> dict[str, int]:
+    """
+    Count the samples that are missing after the first second.
+
+    Parameters
+    ----------
+    numbers : Mapping[str, ndarray]
+        Numbers of the samples that are there by topic; the first has the number 1.
+    sent : int
+        Number of the last sample.
+
+    Returns
+    -------
+    dict[str, int]
+        Missing samples by topic.
+
+    """
+    first = round(_FIRST * RATE)
+    return {
+        topic: sent - first - len(np.unique(found[(found > first) & (found <= sent)]))
+        for topic, found in numbers.items()
+    }
 
 
 def sample_numbers(path: Path) -> dict[str, Any]:
@@ -480,11 +501,8 @@ def watch_memory(
     growth = around(1.0) - around(0.0)
     columns = [around(0.0), *shown, growth]
     heads = ('[MB]', 'warm', *(f'{100 * share:.0f} %' for share in _SHOWN), 'growth')
-    text = (
-        f'Memory (resident) over {duration:g} s, of which {warm:g} s of warm-up\n'
-        + table(
-            [(name, *(f'{c[k]:.2f}' for c in columns)) for k, name in enumerate(names)], heads
-        )
+    text = f'Memory (resident) over {duration:g} s, of which {warm:g} s of warm-up\n' + table(
+        [(name, *(f'{c[k]:.2f}' for c in columns)) for k, name in enumerate(names)], heads
     )
     worst = int(np.argmax(growth))
     bar = Bar(
@@ -565,14 +583,18 @@ def compare_camps(
 def tabled(found: Mapping[str, list[Figures]], plan: Plan) -> tuple[str, list[Bar]]:
     """Return the figures of the camps side by side, and the bars."""
     ours, bare, usual = (found[name] for name in CAMPS)
+
+    def times(value: float) -> str:
+        return '' if np.isnan(value) else f'{value:.2f} x'
+
     rows = [
         (
             what,
             f'{middle(ours, what):.4g}',
             f'{middle(bare, what):.4g}',
-            f'{ratio(ours, bare, what):.2f} x',
+            times(ratio(ours, bare, what)),
             f'{middle(usual, what):.4g}',
-            f'{ratio(ours, usual, what):.2f} x',
+            times(ratio(ours, usual, what)),
         )
         for what in ours[0]
     ]
@@ -594,7 +616,7 @@ def tabled(found: Mapping[str, list[Figures]], plan: Plan) -> tuple[str, list[Ba
         for what in ('CPU of the plant, no commands', 'CPU of the plant')
     ]  # fmt: skip
     text = (
-        f'{version("rclpy")}, {version("rmw_fastrtps_cpp")}; {plan.rounds} rounds of '
+        f'{version("rclpy")}; {plan.rounds} rounds of '
         f'{plan.turn:g} s; medians over rounds, of ratios too\n{table(rows, heads)}\n'
         'round trip: joint_states out, wrench_command back, from a probe in the place of the '
         'plant\n'
@@ -605,19 +627,7 @@ def tabled(found: Mapping[str, list[Figures]], plan: Plan) -> tuple[str, list[Ba
     return text, bars
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options of ``needle bench graph``."""
-    length = parser.add_mutually_exclusive_group()
-    length.add_argument(
-        '--full', action='store_const', dest='plan', const=FULL,
-        help='record for 60 s and watch the memory for 10 min',
-    )  # fmt: skip
-    length.add_argument(
-        '--quick', action='store_const', dest='plan', const=QUICK,
-        help='a trial: times too short for figures',
-    )  # fmt: skip
-
-
 def run(options: argparse.Namespace) -> int:
     """Run ``needle bench graph``; return its exit status."""
-    return bench.ask([partial(compare, plan=options.plan)])
+    plan = FULL if options.full else QUICK if options.quick else Plan()
+    return bench.ask([partial(compare, plan=plan)])
