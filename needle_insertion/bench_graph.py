@@ -167,7 +167,7 @@ class Camp:
             if process.stdout is not None:
                 process.stdout.close()
 
-    def until(self, condition: Callable[[], Any], what: str) -> None:
+    def until(self, condition: Callable[[], Any], what: str, timeout: float = 30.0) -> None:
         """Spin until a condition holds; raise `GraphError` if it does not, or a node ends."""
 
         def holds() -> Any:
@@ -176,12 +176,12 @@ class Camp:
                 raise GraphError(f'a bare node ended early: {ended}')
             return condition()
 
-        self.graph.spin_until(holds, what)
+        self.graph.spin_until(holds, what, timeout)
 
     def spin(self, duration: float) -> None:
         """Spin for a time [s]."""
         end = time.monotonic() + duration
-        self.until(lambda: time.monotonic() >= end, 'the end')
+        self.until(lambda: time.monotonic() >= end, 'the end', duration + 30.0)
 
     @contextmanager
     def running(self) -> Iterator[None]:
@@ -335,7 +335,9 @@ def middle(figures: Sequence[Figures], what: str) -> float:
 
 
 def ratio(ours: Sequence[Figures], theirs: Sequence[Figures], what: str) -> float:
-    """Return the median of the ratios within the rounds; not a number if there is none."""
+    """Return the median of the ratios within the rounds; not a number if it says nothing."""
+    if 'worst' in what:
+        return float('nan')
     pairs = [(a[what], b[what]) for a, b in zip(ours, theirs, strict=True)]
     ratios = [a / b for a, b in pairs if b]
     return float(np.median(ratios)) if ratios else float('nan')
@@ -615,7 +617,7 @@ def tabled(found: Mapping[str, list[Figures]], plan: Plan) -> tuple[str, list[Ba
     ]  # fmt: skip
     text = (
         f'{version("rclpy")}; {plan.rounds} rounds of '
-        f'{plan.turn:g} s; medians over rounds, of ratios too\n{table(rows, heads)}\n'
+        f'{plan.turn:g} s; medians over rounds, of ratios too; the worst of all\n{table(rows, heads)}\n'
         'round trip: joint_states out, wrench_command back, from a probe in the place of the '
         'plant\n'
         'sample to command: from the time of a sample of the plant to the arrival of the command '
