@@ -85,7 +85,7 @@ class Plan:
     rounds: int = 5
     turn: float = 1.5
     recording: float = 10.0
-    memory: float = 30.0
+    memory: float = 20.0
 
 
 QUICK: Final = Plan(rounds=1, turn=0.5, recording=2.0, memory=2.0)
@@ -617,7 +617,8 @@ def tabled(found: Mapping[str, list[Figures]], plan: Plan) -> tuple[str, list[Ba
     ]  # fmt: skip
     text = (
         f'{version("rclpy")}; {plan.rounds} rounds of '
-        f'{plan.turn:g} s; medians over rounds, of ratios too; the worst of all\n{table(rows, heads)}\n'
+        f'{plan.turn:g} s; medians over rounds, of ratios too; the worst of all\n'
+        f'{table(rows, heads)}\n'
         'round trip: joint_states out, wrench_command back, from a probe in the place of the '
         'plant\n'
         'sample to command: from the time of a sample of the plant to the arrival of the command '
