@@ -485,17 +485,14 @@ def watch_memory(
                 camp.aim()
             rows.append((now, [resident_memory(one.process.pid) for one in pids]))
             camp.spin(0.1)
-        for started in pids:
-            started.interrupt()
-    times = np.array([at for at, _ in rows])
-    memory = np.array([values for _, values in rows]) / 1e6
     warm = min(_WARM_UP, 0.1 * duration)
-    span = 0.1 * (duration - warm)
+    memory = np.array([values for at, values in rows if at >= warm or at == rows[-1][0]]) / 1e6
+    tenth = max(1, len(memory) // 10)
 
     def around(share: float) -> Any:
         """Return the median over a tenth that ends at a share of the time after the warm-up."""
-        end = warm + span + share * (duration - warm - span)
-        return np.median(memory[(times >= end - span) & (times <= end)], axis=0)
+        end = tenth + round(share * (len(memory) - tenth))
+        return np.median(memory[end - tenth : end], axis=0)
 
     shown = [around(share) for share in _SHOWN]
     growth = around(1.0) - around(0.0)
