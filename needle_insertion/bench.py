@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 import sys
 import time
+from typing import TypeAlias
 
 from needle_insertion import (
     bench_batches,
@@ -18,8 +19,11 @@ from needle_insertion.bench_measure import Bar, environment
 from needle_insertion.report import table
 from tqdm import tqdm
 
-#: Questions by subject: each returns its text and what it says of the bars.
-QUESTIONS: dict[str, tuple[Callable[[Callable[[str], None]], tuple[str, list[Bar]]], ...]] = {
+#: Returns its text and what it says of the bars; it is given what to tell its stages to.
+Question: TypeAlias = Callable[[Callable[[str], None]], tuple[str, list[Bar]]]
+
+#: Questions by subject. That of the graph is asked by `bench_graph`: it needs ROS.
+QUESTIONS: dict[str, tuple[Question, ...]] = {
     'dynamics': (
         bench_step.compare,
         bench_solvers.compare,
@@ -46,6 +50,11 @@ def run(subject: str) -> int:
         0, whatever was measured.
 
     """
+    return ask(QUESTIONS[subject])
+
+
+def ask(questions: Sequence[Question]) -> int:
+    """Ask questions as `run` does."""
     begin = time.perf_counter()
     sys.stdout.write(f'{environment()}\n')
     bars: list[Bar] = []
@@ -55,7 +64,7 @@ def run(subject: str) -> int:
             progress.set_description(what, refresh=False)
             progress.update()
 
-        for question in QUESTIONS[subject]:
+        for question in questions:
             text, found = question(tick)
             bars += found
             progress.clear()

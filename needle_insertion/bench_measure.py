@@ -51,8 +51,11 @@ class Bar:
         """Say whether the bar is met, or by what factor it is missed."""
         if self.found is None:
             return NOT_INSTALLED
-        share = self.found / self.bar if self.at_least else self.bar / self.found
-        return 'met' if share >= 1.0 else f'missed by a factor {1.0 / share:.2f}'
+        found, bar = (self.found, self.bar) if self.at_least else (self.bar, self.found)
+        if found >= bar:
+            return 'met'
+        # Nothing at all is no factor away from something.
+        return f'missed by a factor {bar / found:.2f}' if found > 0.0 else 'missed'
 
     def row(self) -> tuple[str, str, str, str]:
         """Return the cells of a table."""

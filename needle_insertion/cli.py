@@ -117,6 +117,11 @@ def _parser() -> argparse.ArgumentParser:
         ('control', 'a control step'),
     ):
         subjects.add_parser(subject, help=f'speed: {asked}').set_defaults(command=_bench)
+    graph = subjects.add_parser('graph', help='speed: the nodes beside bare ones')
+    length = graph.add_mutually_exclusive_group()
+    length.add_argument('--full', action='store_true', help='record 60 s, watch memory 10 min')
+    length.add_argument('--quick', action='store_true', help='a trial, too short for figures')
+    graph.set_defaults(command=_graph)
     intervals = subjects.add_parser('calibration', help='do the intervals hold the truth?')
     intervals.add_argument(
         '--recordings', type=int, default=1000, metavar='N', help='simulated ones of each kind'
@@ -131,6 +136,12 @@ def _bench(options: argparse.Namespace) -> int:
     from needle_insertion import bench
 
     return bench.run(options.subject)
+
+
+def _graph(options: argparse.Namespace) -> int:
+    from needle_insertion import bench_graph
+
+    return bench_graph.run(options)
 
 
 def _calibration(options: argparse.Namespace) -> int:

@@ -1,0 +1,117 @@
+"""The benchmark of the graph says all it shall say and counts what it shall count; no times."""
+
+from __future__ import annotations
+
+from needle_identification import BagWriter, encode, message_type
+from needle_insertion import bench_graph
+from needle_insertion.bench_bare import PERIOD, STREAMS
+from needle_insertion.bench_graph import Plan
+from needle_insertion.bench_measure import Bar
+from needle_insertion.cli import main
+import numpy as np
+import pytest
+
+
+@pytest.fixture(scope='module')
+def found(tmp_path_factory):
+    plan = Plan(rounds=1, turn=0.2, recording=1.0, memory=1.0)
+    told = []
+    folder = tmp_path_factory.mktemp('graph')
+    camps = bench_graph.compare_camps(folder, plan, told.append)
+    return plan, told, camps
+
+
+def test_every_camp_has_every_figure(found):
+    plan, told, camps = found
+    assert tuple(camps) == bench_graph.CAMPS
+    names = list(camps['needle'][0])
+    assert len(names) == len(set(names)) == 14
+    for [figures] in camps.values():
+        assert list(figures) == names
+        assert all(np.isfinite(value) and value >= 0.0 for value in figures.values())
+        assert figures['round trip, p50 [us]'] > 0.0
+    assert 'starting: needle' in told
+    text, bars = bench_graph.tabled(camps, plan)
+    assert all(name in text for name in (*names, *bench_graph.CAMPS))
+    assert [bar.bar for bar in bars] == [1.3, 1.5, 1.3, 1.5, 1.5, 1.5]
+    assert all(bar.found > 0.0 and not bar.at_least for bar in bars)
+
+
+def test_the_recorder_is_given_what_is_counted(tmp_path):
+    text, [bar] = bench_graph.record(tmp_path, 1.0)
+    assert 'lost' in text
+    # What is lost depends on the machine; most of it is there.
+    assert 0.0 <= bar.found < 5000.0
+    numbers = bench_graph.sample_numbers(tmp_path / 'bag')
+    assert set(numbers) == {*STREAMS, 'wrench_command'}
+    for found in numbers.values():
+        assert 0 < found.min() < found.max()
+
+
+def test_memory_is_watched_over_time(tmp_path):
+    text, [bar] = bench_graph.watch_memory(tmp_path, 1.0, lambda _what: None)
+    for name in ('plant', 'controller', 'recorder'):
+        assert name in text
+    assert bar.what.startswith('growth in 1 s')
+
+
+def write_bag(path, numbers):
+    """Write one message of a kind, and those of another with given numbers in their stamps."""
+    time_of, header = (
+        message_type(n) for n in ('builtin_interfaces/msg/Time', 'std_msgs/msg/Header')
+    )
+    kind = 'geometry_msgs/msg/PointStamped'
+    point = message_type('geometry_msgs/msg/Point')(0.0, 0.0, 0.0)
+    with BagWriter(path) as bag:
+        for topic in ('/tip_deflection', '/target'):
+            bag.add_topic(topic, kind)
+        bag.write('/target', encode(message_type(kind)(header(time_of(0, 0), ''), point)), 1)
+        for number in numbers:
+            stamp = time_of(*divmod(number * PERIOD, 1_000_000_000))
+            message = message_type(kind)(header(stamp, 'needle_entry'), point)
+            bag.write('/tip_deflection', encode(message), 1)
+
+
+def test_numbers_in_a_bag_are_those_of_the_stamps(tmp_path):
+    expected = [1, 2, 2, 5, 1234]
+    write_bag(tmp_path / 'bag', expected)
+    numbers = bench_graph.sample_numbers(tmp_path / 'bag')
+    assert numbers.pop('tip_deflection').tolist() == expected
+    assert all(len(others) == 0 for others in numbers.values())
+
+
+def test_losses_are_what_is_missing_after_the_first_second():
+    numbers = {'a': np.array([900, 1001, 1002, 1002, 1004, 1005]), 'b': np.arange(1000, 1006)}
+    assert bench_graph.losses(numbers, 1005) == {'a': 1, 'b': 0}
+
+
+def test_a_ratio_is_the_median_of_those_within_rounds():
+    ours = [{'x': 2.0}, {'x': 30.0}, {'x': 3.0}]
+    theirs = [{'x': 1.0}, {'x': 10.0}, {'x': 0.0}]
+    assert bench_graph.ratio(ours, theirs, 'x') == 2.5
+    assert np.isnan(bench_graph.ratio(ours[2:], theirs[2:], 'x'))
+
+
+def test_the_command_prints_tables_and_verdicts(found, monkeypatch, capsys):
+    camps = found[2]
+    lost = Bar('messages lost', 'none', 0.0, 0.0, at_least=False)
+    grown = Bar('growth', '<= 2', 3.0, 2.0, at_least=False)
+    monkeypatch.setattr(bench_graph, 'compare_camps', lambda *_: camps)
+    monkeypatch.setattr(bench_graph, 'record', lambda *_: ('the recorder', [lost]))
+    monkeypatch.setattr(bench_graph, 'watch_memory', lambda *_: ('the memory', [grown]))
+    assert main(['bench', 'graph', '--quick']) == 0
+    text = capsys.readouterr().out
+    assert 'the recorder' in text
+    assert 'the memory' in text
+    lines = text.splitlines()
+    for what, verdict in (('messages lost', 'met'), ('growth', 'missed by a factor 1.50')):
+        [line] = [line for line in lines if line.startswith(what)]
+        assert line.split('  ')[-1] == verdict
+
+
+def test_nothing_lost_is_met_and_anything_is_not():
+    verdicts = [Bar('lost', 'none', n, 0.0, at_least=False).verdict for n in (0.0, 1.0)]
+    assert verdicts[0] == 'met'
+    assert verdicts[1].startswith('missed')
+    # Memory may shrink.
+    assert Bar('growth', '<= 2', -0.1, 2.0, at_least=False).verdict == 'met'
