@@ -12,11 +12,11 @@ from bisect import bisect_right
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from copy import deepcopy
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, is_dataclass, replace
 from math import ceil, inf, isfinite
 from typing import Any, Final, NamedTuple
 
-from needle_dynamics import ForceSensor, NeedleError, ParameterError
+from needle_dynamics import ForceSensor, NeedleError, NeedleModel, ParameterError
 from needle_dynamics.indenter import Indenter, Press
 from needle_dynamics.kernels import FloatArray
 from needle_dynamics.plant import Plant, Sample, TipReading
@@ -38,13 +38,20 @@ _BROKEN: Final = 3
 
 #: Samples that show by their noise which ones they are, and how far they are looked for.
 _FINGERPRINT: Final = 20
-_FARTHEST: Final = 2**19
+_FARTHEST: Final = 2**17
 
 #: How far from where it was recorded a message may have been taken, by the recorder's clock [s]:
 #: first, and if that does not do; and the most samples.
 _NEAR: Final = 0.02
 _FAR: Final = 0.25
 _MOST: Final = 300
+
+#: Stands for the command that joint_states shows.
+_TOLD: Final = -2
+
+#: Commands that are tried beyond those that their stamps allow: a plant that makes up for a stall
+#: takes many samples under a command of after them.
+_AHEAD: Final = 100
 
 #: Samples back at which a tare is tried: it shows as soon as a reading is rounded otherwise.
 _BACK: Final = 5
@@ -93,6 +100,21 @@ class _State:
     current: int = -1
     lag: int = 1
 
+    def copy(self) -> _State:
+        """Return a copy; constants, most of what a plant holds, are shared."""
+        shared = {id(constant): constant for constant in _constants(self.plant)}
+        return _State(deepcopy(self.plant, shared), self.current, self.lag)
+
+
+def _constants(thing: object) -> Iterator[object]:
+    """Yield models and frozen values that a thing holds."""
+    for value in vars(thing).values():
+        frozen = is_dataclass(value) and value.__dataclass_params__.frozen  # type: ignore[union-attr]
+        if frozen or isinstance(value, NeedleModel):
+            yield value
+        elif hasattr(value, '__dict__'):
+            yield from _constants(value)
+
 
 @dataclass(slots=True)
 class _Run:
@@ -101,10 +123,12 @@ class _Run:
     state: _State
     tallies: dict[str, Tally]
     notes: list[str] = field(default_factory=list)
-    #: How many commands acted so many samples after the one they answer; -1: that never acted.
-    delays: Counter[int] = field(default_factory=Counter)
+    #: How many commands acted so many samples after the one they answer, None: never.
+    delays: Counter[int | None] = field(default_factory=Counter)
     #: States before the latest samples, and the commands taken then.
     before: list[tuple[int, _State, list[int]]] = field(default_factory=list)
+    #: Intervals under a command that is not in the bag.
+    told: int = 0
     differing: int = 0
     exact: bool = True
     halted: str = ''
@@ -112,9 +136,9 @@ class _Run:
     def branch(self) -> _Run:
         """Return a copy that can go another way."""
         return _Run(
-            deepcopy(self.state), deepcopy(self.tallies), list(self.notes), Counter(self.delays),
+            self.state.copy(), deepcopy(self.tallies), list(self.notes), Counter(self.delays),
             # These are never changed.
-            list(self.before), self.differing, self.exact, self.halted,
+            list(self.before), self.told, self.differing, self.exact, self.halted,
         )  # fmt: skip
 
     @property
@@ -293,7 +317,7 @@ class Rerun:
     def _step(self, run: _Run, k: int) -> float:
         """Take a sample, as it most likely was; return its largest difference over tolerance."""
         watched = bool(self._entries[k].rows) and not run.is_broken
-        before = deepcopy(run.state) if watched else run.state
+        before = run.state.copy() if watched else run.state
         newest = run.state.current
         best = self._tried(k, _Other(run.state, self._due(run.state, k, run.state.lag)))
         if best.halted:
@@ -302,7 +326,8 @@ class Rerun:
         if watched and (best.error > 1.0 or (best.error > 0.0 and run.exact)):
             for other in self._alternatives(run, before, k):
                 found = self._tried(k, other)
-                if found.error < best.error:
+                # What is only less wrong explains nothing.
+                if found.error <= 1.0 and found.error < best.error:
                     best = found
                 if best.error == 0.0:
                     break
@@ -319,7 +344,7 @@ class Rerun:
     def _tried(self, k: int, other: _Other) -> _Other:
         """Take a sample one way, and say how far it is off."""
         try:
-            other.seen = self._advance(other.state, other.takes)
+            other.seen = self._advance(other.state, other.takes, k)
             other.error = self._error(k, other.seen)
         except NeedleError as error:
             other.error, other.halted = inf, str(error)
@@ -336,28 +361,30 @@ class Rerun:
             tried.append(takes)
             return True
 
-        if self._recorded.commands:
+        if self._recorded.mode == 'simulation':
             ways = [self._due(before, k, lag) for lag in (1, 0, 2, 3)]
-            newest = self._due(before, k, -1)
-            ways += [[before.current] * n + newest[n:] for n in range(1, gap + 1)]
-            if gap == 1:
-                ways += [[c] for c in range(newest[-1], before.current, -1)][:_MOST]
+            held, last = before.current, len(self._stamps) - 1
+            newest = bisect_right(self._stamps, self._entries[k].stamp) - 1
+            newest = min(max(newest, held + _AHEAD), last)
+            ways += [[held] * n + ways[0][n:] for n in range(1, gap + 1)]
+            ways += [[held] * (gap - 1) + [c] for c in range(held + 1, newest + 1)][-_MOST:]
             ways.append([-1] * gap)
+            ways += [[_TOLD] * gap] if self._told(k) else []
             for takes in filter(fresh, ways):
-                yield _Other(deepcopy(before), takes)
+                yield _Other(before.copy(), takes)
         if gap > 1:
             # Time stood still for the plant: it took one sample.
             takes = self._due(before, k, before.lag)[-1:]
             note = f'no samples were taken for {gap - 1} periods before sample {k + 1}'
-            yield _Other(deepcopy(before), takes, note)
+            yield _Other(before.copy(), takes, note)
         behind = [*run.before, (k, before, tried[0])]
         for back in range(1, min(_BACK, len(behind)) + 1):
             j, state, _ = behind[-back]
-            state = deepcopy(state)
+            state = state.copy()
             try:
                 state.plant.tare()
-                for _, _, takes in behind[-back:-1]:
-                    self._advance(state, takes)
+                for i, _, takes in behind[-back:-1]:
+                    self._advance(state, takes, i)
             except NeedleError:
                 continue
             yield _Other(state, tried[0], f'the sensor was zeroed (~/tare) before sample {j + 1}')
@@ -379,12 +406,25 @@ class Rerun:
             takes.append(-1 if late else newest)
         return takes
 
-    def _advance(self, state: _State, takes: Sequence[int]) -> _Seen:
+    def _command(self, take: int, k: int) -> Command:
+        if take == _TOLD:
+            return self._told(k) or Command(0)
+        return self._recorded.commands[take] if take >= 0 else Command(0)
+
+    def _told(self, k: int) -> Command | None:
+        """Return the forces that acted before a sample by its joint_states, if it has them."""
+        for topic, rows in self._entries[k].rows.items():
+            if self._recorded.topics[topic] == 'joint_states':
+                *_, force, torque = rows[0]
+                return Command(0, force, torque)
+        return None
+
+    def _advance(self, state: _State, takes: Sequence[int], k: int) -> _Seen:
         """Let the plant take a sample, over as many intervals as there are commands."""
         plant = state.plant
         for take in takes:
             state.current = max(state.current, take)
-            command = self._recorded.commands[take] if take >= 0 else Command(0)
+            command = self._command(take, k)
             if isinstance(plant, Plant):
                 sample: Sample | Press = plant.advance(
                     command.force, command.torque, command.modal
@@ -463,13 +503,14 @@ class Rerun:
 
     def _follow_commands(self, run: _Run, newest: int, takes: Sequence[int], k: int) -> None:
         """Count how late the commands act that are new."""
+        run.told += takes.count(_TOLD)
         for i, take in enumerate(takes):
             if take <= newest:
                 continue
             tick = self._entries[k].stamp - (len(takes) - i) * self._recorded.period
             late = round((tick - self._recorded.commands[take].stamp) / self._recorded.period)
             run.delays[late] += 1
-            run.delays[-1] += take - newest - 1
+            run.delays[None] += take - newest - 1
             run.state.lag = max(0, late)
             newest = take
 
@@ -483,15 +524,19 @@ class Rerun:
             notes.append(f'not in the bag: {", ".join(recorded.missing)}')
         if recorded.foreign:
             notes.append(f'recorded by another version: {", ".join(recorded.foreign)}')
-        acted = {late: number for late, number in sorted(run.delays.items()) if number}
-        if any(late != 1 for late in acted):
-            words = [
-                f'{number} after {late} period{"s"[: late != 1]}'
-                if late >= 0
-                else f'{number} never'
-                for late, number in acted.items()
-            ]
-            notes.append(f'commands acted: {", ".join(words)}')
+        never = run.delays.pop(None, 0)
+        usual = run.delays.pop(1, 0)
+        if never or run.delays:
+            most = max((abs(periods or 0) for periods in run.delays), default=1)
+            notes.append(
+                f'{usual} commands acted one period after the sample they answer, '
+                f'{run.delays.total()} sooner or later (up to {most} periods), {never} never'
+            )
+        if run.told:
+            notes.append(
+                f'{run.told} samples are under a force that no command in the bag asks for; '
+                'joint_states shows it'
+            )
         return notes
 
     def _reason(self, run: _Run, first: Mapping[str, Any]) -> str:

@@ -145,8 +145,9 @@ def _remarks(results: Sequence[Result]) -> Iterator[str]:
             yield f'{name}: {note}'
         if result.first is not None:
             at = result.first
+            seconds, rest = divmod(at['stamp'], NANOSECONDS)
             yield (
-                f'{name}: diverges first at {at["stamp"] / NANOSECONDS:.9f} s (sample '
+                f'{name}: diverges first at {seconds}.{rest:09d} s (sample '
                 f'{at["sample"]}), {at["topic"]} {at["quantity"]}: recorded {at["recorded"]!r}, '
                 f'computed {at["computed"]!r} {at["unit"]}; {result.reason}'
             )
