@@ -28,9 +28,10 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock as ClockMessage
 from std_srvs.srv import SetBool, Trigger
 
-#: Time between looks at what is due [s], and the most that one may take: services wait meanwhile.
+#: Time between looks at what is due [s], and the most that one may take: a longer burst after a
+#: stall would overrun readers, and services wait meanwhile.
 _TICK: Final = 1e-3
-_BUSY: Final = 5e-3
+_BUSY: Final = 1e-3
 
 #: Time between looks at who else publishes [s].
 _LOOK: Final = 0.25

@@ -149,8 +149,10 @@ def _foreign(values: Mapping[str, Any]) -> list[str]:
         for name in known - given - {'model.preset'}
         if getattr(settings(f'{name.partition(".")[0]}.', {}), name.partition('.')[2]) != ()
     }
-    return [f'{name} is unknown to this version' for name in sorted(given - known)] + [
-        f'{name} was unknown to it' for name in sorted(lacking)
+    return [
+        f'{words} {", ".join(sorted(names))}'
+        for words, names in (('with', given - known), ('without', lacking))
+        if names
     ]
 
 
@@ -385,7 +387,7 @@ class RecordedRun:
         if self.mode != 'simulation':
             found += [(at, kind, m) for at, kind, m in asked if kind == 'joint_trajectory']
         for (_, before), (at, after) in pairwise(configurations):
-            if before != after:
+            if _without_faults(before) != _without_faults(after):
                 found.append((at, 'configuration', (before, after)))
         found.sort(key=lambda event: event[0])
         stamps = [entry.stamp for entry in self.entries]
@@ -435,6 +437,11 @@ def _command(stamp: int, message: Any, limits: Sequence[float]) -> Command:
     if all(abs(value) <= bound for value, bound in zip(values, bounds, strict=True)):
         return Command(stamp, force, torque, modal)
     return Command(stamp)
+
+
+def _without_faults(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Leave out what does not reach the plant, but what it measures."""
+    return {name: value for name, value in values.items() if not name.startswith('fault.')}
 
 
 def _faults(configurations: Sequence[tuple[int, Mapping[str, Any]]]) -> str:

@@ -294,10 +294,7 @@ class Rerun:
         old, new = event.content
         changed = (name for name in old.keys() | new.keys() if old.get(name) != new.get(name))
         relevant = sorted(name for name in changed if not name.startswith('fault.'))
-        if relevant:
-            run.notes.append(f'{", ".join(relevant)} changed before sample {number}')
-        if not relevant:
-            return
+        run.notes.append(f'{", ".join(relevant)} changed before sample {number}')
         if isinstance(plant, Plant) and all(name.startswith('model.') for name in relevant):
             plant.integrator.change(settings('model.', new))
         else:

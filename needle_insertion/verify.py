@@ -139,18 +139,22 @@ def _table(results: Sequence[Result]) -> str:
 
 
 def _remarks(results: Sequence[Result]) -> Iterator[str]:
+    shared: dict[str, list[str]] = {}
     for result in results:
         name = Path(result.bag).name
         for note in result.notes:
-            yield f'{name}: {note}'
+            shared.setdefault(note, []).append(name)
         if result.first is not None:
             at = result.first
             seconds, rest = divmod(at['stamp'], NANOSECONDS)
             yield (
-                f'{name}: diverges first at {seconds}.{rest:09d} s (sample '
-                f'{at["sample"]}), {at["topic"]} {at["quantity"]}: recorded {at["recorded"]!r}, '
-                f'computed {at["computed"]!r} {at["unit"]}; {result.reason}'
+                f'{name}: diverges first at {seconds}.{rest:09d} s (sample {at["sample"]}), '
+                f'{at["topic"]} {at["quantity"]}: recorded {at["recorded"]!r}, computed '
+                f'{at["computed"]!r} {at["unit"]}; {result.reason}'
             )
+    for note, names in shared.items():
+        more = f' and {len(names) - 2} more' if len(names) > 2 else ''
+        yield f'{", ".join(names[:2])}{more}: {note}'
     counts = Counter(result.verdict for result in results)
     total = ', '.join(f'{number} {verdict}' for verdict, number in sorted(counts.items()))
     yield f'{len(results)} runs: {total}'
