@@ -196,6 +196,7 @@ class Rerun:
         topic = next(name for name, kind in recorded.topics.items() if kind == 'base_wrench')
         found = recorded.rows[topic][:_FINGERPRINT]
         if not found:
+            self._recognized = True
             return 1
         # Directions in which nothing pushes: noise, drift and bias only.
         idle = [1, 3, 4, 5] if recorded.mode == 'indenter' else [0, 4, 5]
