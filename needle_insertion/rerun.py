@@ -367,7 +367,8 @@ class Rerun:
             ways += [[held] * n + ways[0][n:] for n in range(1, gap + 1)]
             ways += [[held] * (gap - 1) + [c] for c in range(held + 1, newest + 1)][-_MOST:]
             ways.append([-1] * gap)
-            ways += [[_TOLD] * gap] if self._told(k) else []
+            if self._told(k):
+                ways += [[held] * n + [_TOLD] * (gap - n) for n in range(min(gap, _MOST))]
             for takes in filter(fresh, ways):
                 yield _Other(before.copy(), takes)
         if gap > 1:
