@@ -13,6 +13,7 @@ NODES = {
     'controller': 'needle_controller.controller_node',
     'identification': 'needle_identification.identification_node',
     'recorder': 'needle_identification.recorder_node',
+    'player': 'needle_identification.player_node',
 }
 
 

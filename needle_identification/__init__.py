@@ -11,7 +11,6 @@ from needle_identification.bag_io import (
     encode,
     message_counts,
     message_type,
-    OfferedQos,
     read_topic,
 )
 from needle_identification.errors import IdentificationError, RecordingError
@@ -41,6 +40,7 @@ from needle_identification.stiffness import (
     StiffnessSummary,
     summarize_stiffness,
 )
+from needle_identification.storage import OfferedQos
 
 __all__ = [
     'COMPRESSIONS',

@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from functools import lru_cache
+from heapq import heappop, heappush
 from io import BytesIO
 from pathlib import Path
 import re
@@ -37,6 +38,7 @@ from needle_identification.storage import (
     LARGEST,
     LATEST,
     MOST,
+    OfferedQos,
     opened,
     skip,
     taken,
@@ -67,6 +69,10 @@ COMPRESSIONS: Final = {
 
 _MAGIC: Final = b'\x89MCAP0\r\n'
 _METADATA: Final = 'metadata.yaml'
+
+#: Messages that are put in order of time while a bag is played [bytes].
+_WINDOW: Final = 2**22
+
 _FORMS: Final = 'valid: a rosbag2 folder, an .mcap or a .db3 file'
 
 #: Kind and length of a record; start, end, size, checksum and the length of a name of a chunk;
@@ -77,30 +83,6 @@ _TAIL: Final = struct.Struct('<BQQQI8s')
 
 #: What readers of the storage formats raise at bytes that make no sense.
 _BROKEN: Final = (*BROKEN, McapError, SerdeError, sqlite3.Error)
-
-
-class OfferedQos(NamedTuple):
-    """Quality of service that a publisher offers, in the words of rosbag2."""
-
-    reliability: str = 'reliable'
-    durability: str = 'volatile'
-    history: str = 'keep_last'
-    depth: int = 10
-
-    def as_mapping(self) -> dict[str, Any]:
-        """Return the profile as rosbag2 stores it; what is not known is without limit."""
-        forever = {'sec': 9223372036, 'nsec': 854775807}
-        return {
-            'history': self.history,
-            'depth': self.depth,
-            'reliability': self.reliability,
-            'durability': self.durability,
-            'deadline': dict(forever),
-            'lifespan': dict(forever),
-            'liveliness': 'automatic',
-            'liveliness_lease_duration': dict(forever),
-            'avoid_ros_namespace_conventions': False,
-        }
 
 
 @lru_cache(maxsize=1)
@@ -134,6 +116,14 @@ def message_type(type_name: str) -> Any:
 def encode(message: Any) -> bytes:
     """Serialize a message made from a `message_type`."""
     return bytes(_jazzy().serialize_cdr(message, message.__msgtype__))
+
+
+class Recorded(NamedTuple):
+    """A message of a bag: when it was received [ns], its topic, its bytes."""
+
+    received: int
+    topic: Topic
+    data: bytes
 
 
 class BagWriter:
@@ -372,13 +362,45 @@ class Bag:
 
     def batches(self, wanted: Callable[[Topic], bool]) -> Iterator[Batch]:
         """Go through the bag from its start, yielding the messages of the topics wanted."""
+        for _, batch in self._pieces(wanted):
+            yield batch
+
+    def messages(self, wanted: Callable[[Topic], bool]) -> Iterator[Recorded]:
+        """
+        Go through the bag in the order of receive time.
+
+        A message of the topics wanted that lies further behind in the file than `_WINDOW` comes
+        when it is met.
+        """
+        waiting: list[tuple[int, int, Topic, bytes]] = []
+        size = order = 0
+        piece: tuple[Path, int] | None = None
+        for current, batch in self._pieces(wanted):
+            # The messages of a piece come topic by topic.
+            while current != piece and size > _WINDOW:
+                received, _, topic, data = heappop(waiting)
+                size -= len(data)
+                yield Recorded(received, topic, data)
+            piece = current
+            for received, data in batch.messages():
+                # In the file's order where times are equal, and topics never compared.
+                heappush(waiting, (received, order, batch.topic, data))
+                size += len(data)
+                order += 1
+        while waiting:
+            received, _, topic, data = heappop(waiting)
+            yield Recorded(received, topic, data)
+
+    def _pieces(self, wanted: Callable[[Topic], bool]) -> Iterator[tuple[tuple[Path, int], Batch]]:
+        """Yield batches with the piece of the bag that each is from."""
         self.counts.clear()
         self.losses[:] = self._missing
         for file in self._files:
             faults: list[str] = []
             tally = Tally(self.counts, wanted, faults)
             try:
-                yield from _BATCHES[_form(file)](file, tally)
+                for batch in _BATCHES[_form(file)](file, tally):
+                    yield (file, tally.piece), batch
             except RecordingError as error:
                 self.losses.append(str(error))
                 continue
@@ -499,6 +521,7 @@ class _Channels:
                 channel.message_encoding,
                 schema.encoding,
                 schema.data.decode(errors='replace'),
+                channel.metadata.get('offered_qos_profiles', ''),
             )
         elif kind == Opcode.STATISTICS:
             self.counts = Statistics.read(stream).channel_message_counts
@@ -613,6 +636,7 @@ def _records(content: bytes, channels: _Channels, tally: Tally) -> Iterator[Batc
             with suppress(*_BROKEN):
                 channels.define(kinds[k], content[begin[k] : end[k]])
         messages = kinds == Opcode.MESSAGE
+        tally.piece += 1
         for id_ in np.flatnonzero(np.bincount(ids[messages])):
             rows = np.flatnonzero(messages & (ids == id_))
             topic = channels.topics.get(int(id_))

@@ -56,8 +56,16 @@ def _rows(database: sqlite3.Connection, tally: Tally) -> Iterator[Batch]:
                 'SELECT topic_type, encoding, encoded_message_definition FROM message_definitions'
             )
         }
+    profiles: dict[Any, Any] = {}
+    with suppress(sqlite3.Error):
+        # Nor have the oldest this column.
+        profiles.update(database.execute('SELECT id, offered_qos_profiles FROM topics'))
     topics = {
-        key: topic_of(*map(_word, (name, kind, form, *definitions.get(kind, ('', '')))))
+        key: topic_of(
+            *map(
+                _word, (name, kind, form, *definitions.get(kind, ('', '')), profiles.get(key, ''))
+            )
+        )
         for key, name, kind, form in database.execute(
             'SELECT id, name, type, serialization_format FROM topics'
         )
@@ -78,6 +86,7 @@ def _rows(database: sqlite3.Connection, tally: Tally) -> Iterator[Batch]:
             fault = error
         if not some:
             break
+        tally.piece += 1
         groups: dict[int, list[tuple[int, bytes]]] = {}
         for key, received, data in some:
             groups.setdefault(key, []).append((received, data))

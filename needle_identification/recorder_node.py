@@ -11,8 +11,9 @@ from typing import Any, Final, NamedTuple
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from needle_dynamics.base_node import NeedleNode, run
-from needle_identification.bag_io import BagWriter, COMPRESSIONS, OfferedQos
+from needle_identification.bag_io import BagWriter, COMPRESSIONS
 from needle_identification.errors import RecordingError
+from needle_identification.storage import OfferedQos
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.event_handler import SubscriptionEventCallbacks
@@ -174,8 +175,8 @@ class RecorderNode(NeedleNode):
                     self._take(self._bag, topic, types, publishers)
 
     def _is_wanted(self, topic: str) -> bool:
-        hidden = '/_' in topic or topic in _NOT_FOR_ALL
-        return topic not in self._left_out and (topic in self._names or (self._all and not hidden))
+        wanted = topic in self._names or (self._all and not is_hidden(topic))
+        return wanted and topic not in self._left_out
 
     def _take(
         self, bag: BagWriter, topic: str, types: list[str], publishers: list[TopicEndpointInfo]
@@ -188,7 +189,7 @@ class RecorderNode(NeedleNode):
         if taken and taken.best_effort >= best_effort and taken.latched <= latched:
             return
         try:
-            kind = _message_class(types)
+            kind = message_class(types)
             if taken:
                 self.destroy_subscription(taken.subscription)
             else:
@@ -214,14 +215,32 @@ class RecorderNode(NeedleNode):
         self._taken[topic] = _Taken(subscription, best_effort, latched)
 
 
-def _message_class(types: list[str]) -> Any:
-    """Import the class of a message; rosidl_runtime_py, which does this, is not in the wheels."""
+def is_hidden(topic: str) -> bool:
+    """Tell whether a topic is one of the middleware or of a tool: * does not stand for it."""
+    return '/_' in topic or topic in _NOT_FOR_ALL
+
+
+def message_class(types: list[str]) -> Any:
+    """
+    Import the class of a message; rosidl_runtime_py, which does this, is not in the wheels.
+
+    Parameters
+    ----------
+    types : list of str
+        Types of the topic, such as ``sensor_msgs/msg/JointState``.
+
+    Raises
+    ------
+    RecordingError
+        If there are several, or the package of the one is not installed.
+
+    """
     if len(types) > 1:
         raise RecordingError(f'it has several types: {", ".join(types)}')
     package, _, name = types[0].partition('/msg/')
     try:
         return getattr(import_module(f'{package}.msg'), name)
-    except (ImportError, AttributeError) as error:
+    except (ImportError, AttributeError, TypeError) as error:
         raise RecordingError(f'{types[0]} is not installed') from error
 
 

@@ -13,6 +13,7 @@ from typing import Any, Final, NamedTuple
 import lz4.frame  # type: ignore[import-untyped]
 import numpy as np
 from numpy.typing import NDArray
+import yaml
 import zstandard
 
 #: Endings of compressed files.
@@ -50,6 +51,53 @@ BROKEN: Final = (
 )
 
 
+#: Numbers that older recordings have for the words of rosbag2.
+_WORDS: Final = {
+    'reliability': {1: 'reliable', 2: 'best_effort'},
+    'durability': {1: 'transient_local', 2: 'volatile'},
+    'history': {1: 'keep_last', 2: 'keep_all'},
+}
+
+
+class OfferedQos(NamedTuple):
+    """Quality of service that a publisher offers, in the words of rosbag2."""
+
+    reliability: str = 'reliable'
+    durability: str = 'volatile'
+    history: str = 'keep_last'
+    depth: int = 10
+
+    def as_mapping(self) -> dict[str, Any]:
+        """Return the profile as rosbag2 stores it; what is not known is without limit."""
+        forever = {'sec': 9223372036, 'nsec': 854775807}
+        return {
+            'history': self.history,
+            'depth': self.depth,
+            'reliability': self.reliability,
+            'durability': self.durability,
+            'deadline': dict(forever),
+            'lifespan': dict(forever),
+            'liveliness': 'automatic',
+            'liveliness_lease_duration': dict(forever),
+            'avoid_ros_namespace_conventions': False,
+        }
+
+
+def offered_qos(text: str) -> tuple[OfferedQos, ...]:
+    """Read the profiles stored with a topic; none if there are none or they are not readable."""
+    try:
+        profiles = yaml.safe_load(text) or []
+        return tuple(
+            OfferedQos(
+                **{name: words.get(stored[name], stored[name]) for name, words in _WORDS.items()},
+                depth=int(stored['depth']),
+            )
+            for stored in profiles
+        )
+    except (yaml.YAMLError, KeyError, TypeError, ValueError, RecursionError):
+        return ()
+
+
 @dataclass(frozen=True, slots=True)
 class Topic:
     """
@@ -62,6 +110,8 @@ class Topic:
         in brackets where that is not the one of ROS 2, so that it is no type we know.
     encoding, definition : str
         Language of the definition of the type, ros2msg or ros2idl, and the definition.
+    profiles : str
+        What its publishers offered, for `offered_qos`.
 
     """
 
@@ -69,6 +119,7 @@ class Topic:
     type_name: str
     encoding: str = field(default='', compare=False)
     definition: str = field(default='', compare=False, repr=False)
+    profiles: str = field(default='', compare=False, repr=False)
 
     def __str__(self) -> str:
         return f'{self.name} ({self.type_name})'
@@ -102,13 +153,14 @@ class Batch(NamedTuple):
 
 @dataclass(slots=True)
 class Tally:
-    """Keeps count of what is read of a file."""
+    """Keeps count of what is read of a file; pieces of it follow each other in time."""
 
     counts: dict[Topic, int]
     wanted: Callable[[Topic], bool]
     faults: list[str]
     count: int = 0
     written: int | None = None
+    piece: int = 0
 
     def __str__(self) -> str:
         of = '' if self.written is None else f' of {self.written}'
@@ -121,14 +173,16 @@ class Tally:
         return self.wanted(topic)
 
 
-def topic_of(name: str, type_name: str, form: str, encoding: str, definition: str) -> Topic:
+def topic_of(
+    name: str, type_name: str, form: str, encoding: str, definition: str, profiles: str
+) -> Topic:
     """Return a topic whose messages are in a form, such as cdr, under the name its type has."""
     # Some writers leave the middle out, as ROS 1 did.
     full = re.sub(r'^(\w+)/(\w+)$', r'\1/msg/\2', type_name)
     full = full if form == 'cdr' else f'{full} [{form}]'
     # Messages about a topic are one line, whatever a broken file calls it.
     name, full = (re.sub(r'[\x00-\x1f\x7f]', '?', word) for word in (name, full))
-    return Topic(name, full, encoding, definition)
+    return Topic(name, full, encoding, definition, profiles)
 
 
 def joined(topic: Topic, received: NDArray[np.int64], parts: Sequence[bytes]) -> Batch:

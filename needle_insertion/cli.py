@@ -81,7 +81,7 @@ def _joined(words: list[str]) -> list[str]:
 
 
 def _parser() -> argparse.ArgumentParser:
-    from needle_insertion import analyze, identify, protocol, reproduce, simulate
+    from needle_insertion import analyze, identify, protocol, reproduce, simulate, verify
 
     parser = argparse.ArgumentParser(prog='needle', description='Robot-assisted needle insertion.')
     commands = parser.add_subparsers(required=True, metavar='COMMAND')
@@ -108,6 +108,10 @@ def _parser() -> argparse.ArgumentParser:
     open_loop.set_defaults(command=simulate.run)
 
     analyze.add_arguments(commands.add_parser('analyze', help='controllability and observability'))
+
+    again = commands.add_parser('verify', help='compute recorded runs anew and compare')
+    verify.add_arguments(again)
+    again.set_defaults(command=verify.run)
 
     bench = commands.add_parser('bench', help='measure speed as ratios, and errors')
     subjects = bench.add_subparsers(required=True, dest='subject', metavar='SUBJECT')

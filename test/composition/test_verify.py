@@ -1,0 +1,563 @@
+"""A recorded run computed anew is the run; what is not, is named: where, what, and why."""
+
+from dataclasses import dataclass, fields, replace
+import json
+from math import sin
+
+from geometry_msgs.msg import WrenchStamped
+from needle_dynamics import (
+    ForceSensor,
+    ForceSensorParameters,
+    Integrator,
+    NeedleModel,
+    NeedleParameters,
+)
+from needle_dynamics.base_node import COMMAND, SENSOR
+from needle_dynamics.indenter import IndenterParameters
+from needle_dynamics.plant import BaseMotion, BaseParameters, Plant, TipParameters, TipSensor
+from needle_identification import BagWriter, encode, message_type, RecordingError
+from needle_insertion.cli import main
+from needle_insertion.experiment import record
+from needle_insertion.graph import ACTIVATE, CONFIGURE, Graph
+from needle_insertion.protocol import Campaign, PROTOCOLS, SHIPPED_BAGS
+from needle_insertion.verify import verify
+import numpy as np
+import pytest
+from sensor_msgs.msg import JointState
+import yaml
+
+RATE = 200.0
+PERIOD = 5_000_000
+#: Activation of the plant [ns]; its first sample is a period later.
+BEGIN = 1_700_000_000_123_456_789
+SAMPLES = 120
+
+KINDS = {
+    '/plant/configuration': 'std_msgs/msg/String',
+    '/wrench_command': 'geometry_msgs/msg/WrenchStamped',
+    '/joint_trajectory': 'trajectory_msgs/msg/JointTrajectory',
+    '/joint_states': 'sensor_msgs/msg/JointState',
+    '/base_wrench': 'geometry_msgs/msg/WrenchStamped',
+    '/tip_deflection': 'geometry_msgs/msg/PointStamped',
+    '/ground_truth': 'sensor_msgs/msg/JointState',
+}
+NODE = {
+    'rate': RATE,
+    'seed': 7,
+    'mode': 'simulation',
+    'depth': 0.03,
+    'tip_deflection': 5e-4,
+    'step': 2e-5,
+    'command_timeout': 0.1,
+    'force_limit': 100.0,
+    'torque_limit': 1.0,
+    'modal_limit': 1e4,
+    'real_time_factor': 1.0,
+    'model.preset': 'phantom',
+}
+MODEL = NeedleParameters.preset('phantom')
+TIP = TipParameters(rate=50.0, noise=1e-5, delay=0.012)
+
+
+def configuration(**changes: object) -> dict[str, object]:
+    """Return the parameters as the node says them."""
+    values = dict(NODE)
+    for prefix, constants in (
+        ('model.', MODEL),
+        ('sensor.', ForceSensorParameters()),
+        ('tip.', TIP),
+        ('base.', BaseParameters()),
+        ('indenter.', IndenterParameters()),
+    ):
+        for item in fields(constants):
+            value = getattr(constants, item.name)
+            if value != ():
+                values[prefix + item.name] = list(value) if isinstance(value, tuple) else value
+    return {**values, **changes}
+
+
+def needle(mode: str = 'simulation', parameters: NeedleParameters = MODEL) -> Plant:
+    """Make the plant as the node does."""
+    state = NeedleModel(parameters).state_at(NODE['depth'], NODE['tip_deflection'])
+    reach = parameters.minimum_depth, parameters.length
+    return Plant(
+        Integrator(parameters, state, NODE['step']),
+        ForceSensor(ForceSensorParameters(), RATE, NODE['seed']),
+        RATE,
+        BaseMotion(BaseParameters(), NODE['depth'], reach, 100.0) if mode == 'robot' else None,
+        TipSensor(TIP, RATE, NODE['seed']),
+    )
+
+
+def stamp(k: int) -> int:
+    """Return the time of a sample, counted from 1 [ns]."""
+    return BEGIN + k * PERIOD
+
+
+def header(at: int):
+    time = message_type('builtin_interfaces/msg/Time')(*divmod(at, 10**9))
+    return message_type('std_msgs/msg/Header')(time, '')
+
+
+def vector(values):
+    return message_type('geometry_msgs/msg/Vector3')(*map(float, values))
+
+
+def wrench(at: int, numbers) -> bytes:
+    pair = message_type('geometry_msgs/msg/Wrench')(vector(numbers[:3]), vector(numbers[3:]))
+    return encode(message_type(KINDS['/base_wrench'])(header(at), pair))
+
+
+def joints(at: int, names, position, velocity, effort=()) -> bytes:
+    arrays = (np.array(values, dtype=float) for values in (position, velocity, effort))
+    return encode(message_type(KINDS['/joint_states'])(header(at), list(names), *arrays))
+
+
+def tip(at: int, depth: float, deflection: float) -> bytes:
+    point = message_type('geometry_msgs/msg/Point')(0.0, depth, deflection)
+    return encode(message_type(KINDS['/tip_deflection'])(header(at), point))
+
+
+def text(values) -> bytes:
+    document = yaml.safe_dump({'/plant': {'ros__parameters': values}})
+    return encode(message_type(KINDS['/plant/configuration'])(document))
+
+
+def trajectory(points) -> bytes:
+    duration = message_type('builtin_interfaces/msg/Duration')
+    numbers = [np.zeros(0)] * 3
+    made = [
+        message_type('trajectory_msgs/msg/JointTrajectoryPoint')(
+            np.array([depth]), *numbers, duration(*divmod(round(time * 1e9), 10**9))
+        )
+        for time, depth in points
+    ]
+    kind = message_type(KINDS['/joint_trajectory'])
+    return encode(kind(header(0), ['insertion'], made))
+
+
+@dataclass
+class Message:
+    """What goes into a bag."""
+
+    topic: str
+    received: int
+    stamp: int
+    data: bytes
+
+
+def measured(sample, k: int, torque: float) -> list[Message]:
+    """Return what the node publishes of a sample."""
+    state, at = sample.state, stamp(k)
+    m = len(state) // 2
+    names = ['d', 'theta', 'q1', 'q2']
+    result = [Message('/base_wrench', 0, at, wrench(at, sample.wrench))]
+    if sample.tip is not None:
+        seen = at - sample.tip.age * PERIOD
+        data = tip(seen, sample.tip.depth, sample.tip.deflection)
+        result.append(Message('/tip_deflection', 0, seen, data))
+    data = joints(at, names, state[:m], state[m:])
+    result.append(Message('/ground_truth', 0, at, data))
+    position, velocity = [sample.joint_position, state[1]], [sample.speed, state[m + 1]]
+    data = joints(at, ['insertion', 'rotation'], position, velocity, [sample.force, torque])
+    result.append(Message('/joint_states', 0, at, data))
+    for n, message in enumerate(result):
+        message.received = at + 1000 + n
+    return result
+
+
+def force(k: int) -> float:
+    """Return what answers a sample [N]: no two are alike."""
+    return 2.0 + 1.5 * sin(0.3 * k)
+
+
+def simulated(late=(), lost=(), before=None) -> list[Message]:
+    """
+    Run under commands, each an answer to a sample, which act one period later.
+
+    Those to the samples ``late`` arrive a period too late, those ``lost`` at the recorder only.
+    ``before`` is called before each sample.
+    """
+    plant = needle()
+    messages = [Message('/plant/configuration', BEGIN - 1, 0, text(configuration()))]
+    held, newest, coming = 0.0, 0.0, None
+    for k in range(1, SAMPLES + 1):
+        if before is not None:
+            before(plant, k)
+        messages += measured(plant.advance(held, 1e-10 * held), k, 1e-10 * held)
+        # The command newest at a sample acts until the next.
+        held = newest
+        if coming is not None:
+            newest, coming = coming, None
+        numbers = [0.0, force(k), 0.0, 1e-10 * force(k), 0.0, 0.0]
+        command = Message('/wrench_command', stamp(k) + 2_000_000, stamp(k), b'')
+        command.data = wrench(stamp(k), numbers)
+        if k in late:
+            coming = force(k)
+            command.received += PERIOD
+        else:
+            newest = force(k)
+        if k not in lost:
+            messages.append(command)
+    return messages
+
+
+def carried(
+    comes: int, recorded: int, points=((0.1, 0.032), (0.2, 0.031), (0.25, 0.031))
+) -> list[Message]:
+    """Run with a base that takes a trajectory before a sample; it is recorded near another."""
+    plant = needle('robot')
+    values = configuration(mode='robot')
+    messages = [Message('/plant/configuration', BEGIN - 1, 0, text(values))]
+    messages.append(
+        Message('/joint_trajectory', stamp(recorded) - 1_000_000, 0, trajectory(points))
+    )
+    for k in range(1, SAMPLES + 1):
+        if k == comes:
+            times, depths = zip(*points, strict=True)
+            plant.follow(['insertion'], times, [[at] for at in depths], [[]] * len(points))
+        messages += measured(plant.advance(), k, 0.0)
+    return messages
+
+
+def written(path, messages) -> object:
+    """Write messages into a bag, in the order in which they were received."""
+    with BagWriter(path) as bag:
+        for topic, kind in KINDS.items():
+            bag.add_topic(topic, kind)
+        for message in sorted(messages, key=lambda message: message.received):
+            bag.write(message.topic, message.data, message.received)
+    return path
+
+
+def only(path):
+    (result,) = verify(path)
+    return result
+
+
+def exact(result) -> None:
+    """Every number of every topic is the same to the last bit."""
+    assert result.verdict == 'identical', result
+    assert {tally.verdict for tally in result.topics.values()} == {'identical'}
+    assert all(tally.compared for tally in result.topics.values())
+
+
+# What is the same.
+
+
+def test_a_run_under_commands_is_the_same(tmp_path):
+    """All numbers are identical, and each command acted one period after its sample."""
+    result = only(written(tmp_path / 'bag', simulated()))
+    exact(result)
+    assert result.start == 1
+    assert {name: tally.compared for name, tally in result.topics.items()} == {
+        '/joint_states': SAMPLES,
+        '/base_wrench': SAMPLES,
+        # Every fourth sample; three samples of delay hold the last one back.
+        '/tip_deflection': SAMPLES // 4 - 1,
+        '/ground_truth': SAMPLES,
+    }
+    assert result.notes == ()
+
+
+def test_commands_that_came_late_or_are_not_in_the_bag_are_found(tmp_path):
+    """The run is the same all the same, and what happened is said."""
+    result = only(written(tmp_path / 'bag', simulated(late=(20, 21, 60), lost=(40,))))
+    exact(result)
+    late, missing = result.notes
+    # Late are 20, 21 and 60, each overtaken or not by the next; the last two are yet to act.
+    assert 'sooner or later (up to 2 periods)' in late
+    assert missing.startswith('1 samples are under a force that no command in the bag asks for')
+
+
+@pytest.mark.parametrize('shift', [-4, 0, 3])
+def test_a_trajectory_begins_where_it_makes_the_run(tmp_path, shift):
+    """The sample at which the base took it is found, whatever the recorder saw."""
+    result = only(written(tmp_path / 'bag', carried(40, 40 + shift)))
+    exact(result)
+    assert result.notes == ('joint_trajectory from sample 40 on',)
+
+
+def test_a_recording_that_begins_late_is_placed_by_the_noise(tmp_path):
+    """The first samples are not there: which one is the first is known by its noise."""
+    messages = [m for m in carried(40, 40) if m.stamp == 0 or m.stamp >= stamp(8)]
+    result = only(written(tmp_path / 'bag', messages))
+    exact(result)
+    assert result.start == 8
+    assert result.notes == ('joint_trajectory from sample 40 on',)
+
+
+def test_samples_lost_on_the_way_are_made_up(tmp_path):
+    """A best-effort reader loses some: what lies between is computed."""
+    gone = {stamp(k) for k in (30, 31, 32, 77)}
+    measures = {'/joint_states', '/base_wrench', '/ground_truth'}
+    messages = [m for m in simulated() if m.topic not in measures or m.stamp not in gone]
+    result = only(written(tmp_path / 'bag', messages))
+    exact(result)
+    assert result.samples == SAMPLES - 4
+
+
+def test_time_that_stood_still_is_told_from_samples_lost(tmp_path):
+    """After a stall the plant goes on where it was, though stamps have gone on."""
+    shifted = []
+    for message in carried(40, 40):
+        pause = 50 * PERIOD if message.received > stamp(80) else 0
+        at = message.stamp + pause
+        data = message.data
+        if message.stamp:
+            # The stamp stands behind the encapsulation.
+            seconds, rest = divmod(at, 10**9)
+            data = (
+                data[:4] + seconds.to_bytes(4, 'little') + rest.to_bytes(4, 'little') + data[12:]
+            )
+        shifted.append(Message(message.topic, message.received + pause, at, data))
+    shifted = [m for m in shifted if m.topic != '/tip_deflection']
+    result = only(written(tmp_path / 'bag', shifted))
+    assert result.verdict == 'identical', result
+    assert 'no samples were taken for 50 periods before sample 80' in result.notes
+
+
+def test_tare_and_reset_are_found(tmp_path):
+    """Services leave no message: they show in what follows."""
+    plant = needle('robot')
+    messages = [Message('/plant/configuration', BEGIN, 0, text(configuration(mode='robot')))]
+    for k in range(1, SAMPLES + 1):
+        if k == 50:
+            plant.tare()
+        if k == 90:
+            plant = needle('robot')
+        messages += measured(plant.advance(), k, 0.0)
+    result = only(written(tmp_path / 'bag', messages))
+    exact(result)
+    assert result.notes == (
+        'the sensor was zeroed (~/tare) before sample 50',
+        'the plant was put back (~/reset) before sample 90',
+    )
+
+
+def test_friction_that_changed_in_the_run_is_followed(tmp_path):
+    """The new configuration is in the bag; where it took effect is found."""
+    other = replace(MODEL, coulomb_friction=0.8)
+
+    def changed(plant: Plant, k: int) -> None:
+        if k == 50:
+            plant.integrator.change(other)
+
+    messages = simulated(before=changed)
+    values = configuration(**{'model.coulomb_friction': 0.8})
+    messages.append(Message('/plant/configuration', stamp(51) + 5, 0, text(values)))
+    result = only(written(tmp_path / 'bag', messages))
+    exact(result)
+    assert result.notes == ('model.coulomb_friction changed before sample 50',)
+
+
+# What is not.
+
+
+@pytest.mark.parametrize(
+    ('topic', 'offset', 'quantity'),
+    [
+        ('/base_wrench', 20, 'force.x'),
+        ('/joint_states', 60, 'position of insertion'),
+        ('/ground_truth', 76, 'theta'),
+    ],
+)
+def test_a_single_changed_sample_is_named(tmp_path, topic, offset, quantity):
+    """Stamp, topic and number are those of the message that was altered, and nothing else is."""
+    messages = simulated()
+    message = next(m for m in messages if m.topic == topic and m.stamp == stamp(70))
+    data = bytearray(message.data)
+    recorded = np.frombuffer(bytes(data[offset : offset + 8]), dtype='<f8')[0] + 0.125
+    data[offset : offset + 8] = np.float64(recorded).tobytes()
+    message.data = bytes(data)
+    result = only(written(tmp_path / 'bag', messages))
+    assert result.verdict == 'diverges'
+    assert {name: tally.differing for name, tally in result.topics.items()} == {
+        name: int(name == topic) for name in result.topics
+    }
+    first = result.first
+    found = first['stamp'], first['sample'], first['topic'], first['quantity'], first['recorded']
+    assert found == (stamp(70), 70, topic, quantity, recorded)
+    # 1e-12: the sum above is rounded.
+    assert first['computed'] == pytest.approx(recorded - 0.125, abs=1e-12)
+    assert 'this one was altered' in result.reason
+
+
+@pytest.mark.parametrize(
+    ('changes', 'reason'),
+    [
+        ({'model.viscous_friction': 250.0}, 'the plant was of another version, or its parameters'),
+        ({'seed': 8}, 'the noise is not that of seed 8'),
+        ({'model.tissue_density': 3.0}, 'it was recorded by another version'),
+        (
+            {'fault.kind': 'bias', 'fault.topic': 'joint_states'},
+            'fault.kind = bias on joint_states',
+        ),
+    ],
+    ids=['friction', 'seed', 'version', 'fault'],
+)
+def test_another_plant_diverges_and_the_reason_is_told(tmp_path, changes, reason):
+    """Parameters that are not those of the run do not give its samples."""
+    changes = {'model.viscous_friction': 250.0, **changes}
+    messages = simulated()
+    messages[0].data = text(configuration(**changes))
+    result = only(written(tmp_path / 'bag', messages))
+    assert result.verdict == 'diverges'
+    assert reason in result.reason
+    # The needle moves as soon as the first command acts: it answers sample 1.
+    assert result.first['sample'] <= 5
+
+
+def test_a_bag_without_commands_says_what_to_record(tmp_path):
+    """The motion has no cause in the bag."""
+    silent = [m for m in simulated() if m.topic not in ('/wrench_command', '/joint_states')]
+    result = only(written(tmp_path / 'bag', silent))
+    assert result.verdict == 'diverges'
+    assert result.reason == 'the bag holds no wrench_command: record it with the rest'
+    still = [m for m in carried(40, 40) if m.topic != '/joint_trajectory']
+    result = only(written(tmp_path / 'still', still))
+    assert result.reason == 'the bag holds no joint_trajectory: record it with the rest'
+    # It was to be there from sample 40 on.
+    assert result.first['sample'] == 40
+
+
+def test_differences_within_the_tolerance_are_no_divergence(tmp_path):
+    """A tolerance takes what is smaller, and says how large it was."""
+    messages = simulated()
+    values = configuration(**{'model.viscous_friction': MODEL.viscous_friction * (1.0 + 1e-9)})
+    messages[0].data = text(values)
+    path = written(tmp_path / 'bag', messages)
+    (result,) = verify(path)
+    assert result.verdict == 'within tolerance'
+    quantity, difference = result.topics['/joint_states'].what
+    assert quantity.name == 'velocity of insertion'
+    assert 0.0 < difference < 1e-9
+    (result,) = verify(path, 0.0)
+    assert result.verdict == 'diverges'
+
+
+# What cannot be verified.
+
+
+@pytest.mark.parametrize(
+    ('kept', 'changes', 'complaint'),
+    [
+        (lambda m: m.stamp, {}, 'holds no parameters of a plant; record /plant/configuration'),
+        (
+            lambda m: m.stamp == 0 or m.topic == '/wrench_command',
+            {},
+            'holds nothing that was measured; record /joint_states, /base_wrench, /ground_truth',
+        ),
+        (bool, {'depth': 5.0}, 'the parameters of /plant: inserted length'),
+        (bool, {'mode': 'indenter'}, 'holds nothing'),
+    ],
+    ids=['parameters', 'measurements', 'value', 'mode'],
+)
+def test_bad_input_is_named(tmp_path, capsys, kept, changes, complaint):
+    """One line names the bag and what it lacks; the exit status is 2."""
+    messages = simulated()
+    messages[0].data = text(configuration(**changes))
+    if changes.get('mode'):
+        messages = [m for m in messages if m.topic != '/base_wrench']
+    path = written(tmp_path / 'bag', filter(kept, messages))
+    assert main(['verify', str(path)]) == 2
+    said = capsys.readouterr().err
+    assert str(path) in said
+    assert complaint in said
+    assert said.count('\n') == 1
+
+
+def test_a_parameter_that_is_missing_is_named(tmp_path):
+    """Without the rate there is no time."""
+    messages = simulated()
+    values = configuration()
+    del values['rate']
+    messages[0].data = text(values)
+    with pytest.raises(RecordingError, match=r"the parameters of /plant lack 'rate'"):
+        verify(written(tmp_path / 'bag', messages))
+
+
+def test_the_command_line_tells_people_and_machines(tmp_path, capsys):
+    """Exit status 0 for what is the same, 1 for what is not; JSON has the first divergence."""
+    same = written(tmp_path / 'same', simulated())
+    messages = simulated()
+    messages[0].data = text(configuration(seed=8))
+    other = written(tmp_path / 'other', messages)
+    assert main(['verify', str(same)]) == 0
+    said = capsys.readouterr().out
+    assert '/joint_states' in said
+    assert said.splitlines()[-1] == '1 runs: 1 identical'
+    assert main(['verify', str(same), str(other), '--json']) == 1
+    first, second = json.loads(capsys.readouterr().out)
+    assert (first['verdict'], first['first divergence']) == ('identical', None)
+    assert second['verdict'] == 'diverges'
+    assert second['first divergence']['topic'] == '/base_wrench'
+    assert second['topics']['/base_wrench']['unit'] in ('N', 'N m')
+    assert main(['verify', str(other)]) == 1
+    said = capsys.readouterr().out
+    at = second['first divergence']['stamp']
+    assert f'other: diverges first at {at // 10**9}.{at % 10**9:09d} s (sample ' in said
+    assert main(['verify', str(same), '--tolerance', '2']) == 2
+    assert '--tolerance must be in [0, 1), got 2' in capsys.readouterr().err
+
+
+# What real nodes recorded.
+
+
+@pytest.mark.parametrize('name', ['stiffness'])
+def test_the_shipped_bags_are_what_the_plant_computes(name):
+    """All of them, but for how another machine may round."""
+    for path in sorted(SHIPPED_BAGS.glob(f'{name}_*')):
+        (result,) = verify(path)
+        assert result.verdict in ('identical', 'within tolerance'), result
+        assert result.start == 1
+
+
+@pytest.mark.parametrize(
+    ('name', 'rate', 'speed'), [('friction', 100.0, 20.0), ('stiffness', 40.0, 40.0)]
+)
+def test_an_experiment_over_dds_is_computed_anew(tmp_path, name, rate, speed):
+    """What nodes have recorded a moment ago on this machine is the same to the last bit."""
+    campaign = Campaign(protocol=PROTOCOLS[name], repeats=1, rate=rate)
+    (path,) = record(campaign, tmp_path, speed)
+    result = only(path)
+    exact(result)
+    assert 'joint_trajectory from sample 1 on' in result.notes
+
+
+def test_a_run_under_commands_over_dds_is_computed_anew(tmp_path):
+    """Whenever a command arrived at the plant, on however busy a machine: the run is the same."""
+    path = tmp_path / 'bag'
+    with Graph(tmp_path / 'logs') as graph:
+        node = graph.node('commander')
+        publisher = node.create_publisher(WrenchStamped, 'wrench_command', COMMAND)
+        heard = []
+
+        def answer(message: JointState) -> None:
+            heard.append(message)
+            command = WrenchStamped()
+            command.header.stamp = message.header.stamp
+            command.wrench.force.y = force(len(heard))
+            command.wrench.torque.x = 1e-3
+            publisher.publish(command)
+
+        node.create_subscription(JointState, 'joint_states', answer, SENSOR)
+        recorder = graph.start('recorder', {'path': str(path)})
+        graph.start('plant', {'autostart': False, 'rate': RATE, 'seed': 3})
+        graph.wait_for(node, 'plant')
+        topics = ['joint_states', 'base_wrench', 'tip_deflection', 'ground_truth']
+        graph.change(node, 'plant', CONFIGURE)
+        graph.spin_until(
+            lambda: (
+                publisher.get_subscription_count() == 2
+                and all(node.count_subscribers(topic) for topic in topics)
+                and node.count_subscribers('joint_states') == 2
+            ),
+            'the nodes',
+        )
+        graph.change(node, 'plant', ACTIVATE)
+        graph.spin_until(lambda: len(heard) > 300, 'the samples')
+        recorder.interrupt()
+    result = only(path)
+    exact(result)
+    assert result.topics['/joint_states'].compared > 250

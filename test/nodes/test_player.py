@@ -1,0 +1,487 @@
+"""What is in a bag goes into the graph: every byte, in order, at the pace that was asked for."""
+
+from itertools import pairwise
+from pathlib import Path
+import signal
+import subprocess
+import sys
+import time
+
+from diagnostic_msgs.msg import DiagnosticStatus
+from mcap.writer import Writer as McapWriter
+from needle_dynamics.base_node import LATCHED, SENSOR
+from needle_identification import BagWriter, OfferedQos, read_topic
+from needle_identification.bag_io import Bag
+from needle_identification.player_node import PlayerNode
+from needle_identification.recorder_node import RecorderNode
+import pytest
+from rclpy.node import Node as RosNode
+from rclpy.parameter import Parameter
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.serialization import deserialize_message, serialize_message
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import get_typestore, Stores
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import JointState
+from std_msgs.msg import String
+from std_srvs.srv import SetBool, Trigger
+
+MILLISECOND = 1_000_000
+#: Start of the recordings [ns].
+EPOCH = 1_700_000_000_123_456_789
+
+#: Everything that a topic can hold while the test is busy.
+EVERYTHING = QoSProfile(depth=10_000, reliability=ReliabilityPolicy.RELIABLE)
+WEAK = QoSProfile(depth=10_000, reliability=ReliabilityPolicy.BEST_EFFORT)
+
+#: Nothing is lost while readers look for the player: the test lets it go.
+HELD = {'delay': 0.0, 'paused': True}
+
+
+def text(data: str) -> bytes:
+    # Three letters: the middleware fills the last word of a message up, here none is open.
+    return serialize_message(String(data=data))
+
+
+def joints(position: float) -> bytes:
+    return serialize_message(JointState(name=['insertion'], position=[position]))
+
+
+def small_bag(path: Path, count: int = 20, step: int = 10, extra: str = '') -> Path:
+    """Write two topics, one message of each every ``step`` ms, and what was latched before."""
+    with BagWriter(path) as bag:
+        bag.add_topic('/text', 'std_msgs/msg/String', [OfferedQos(depth=1)])
+        offered = OfferedQos('best_effort', 'volatile', 'unknown', 0)
+        bag.add_topic('/joints', 'sensor_msgs/msg/JointState', [offered])
+        offered = OfferedQos('reliable', 'transient_local', 'unknown', 0)
+        bag.add_topic('/latched', 'std_msgs/msg/String', [offered])
+        bag.write('/latched', text('old'), EPOCH)
+        bag.write('/latched', text('new'), EPOCH + 1)
+        if extra:
+            bag.add_topic(extra, 'rosgraph_msgs/msg/Clock')
+            bag.write(extra, serialize_message(Clock()), EPOCH + 2)
+        for k in range(count):
+            at = EPOCH + k * step * MILLISECOND + 3
+            bag.write('/joints', joints(k / 3.0), at)
+            bag.write('/text', text(f'{k:03d}'), at + 1)
+            if k % 100 == 99:
+                bag.flush()
+    return path
+
+
+def bytes_of(bag: Path, topic: str) -> list[bytes]:
+    """Return what a bag holds of a topic."""
+    return [
+        data
+        for batch in Bag(bag).batches(lambda known: known.name == topic)
+        for _, data in batch.messages()
+    ]
+
+
+class Listener:
+    """Hears topics as bytes, in order, with the time at which each came."""
+
+    def __init__(self, ros_graph, **topics) -> None:
+        self._graph = ros_graph
+        self._node = ros_graph.node('listener')
+        self.heard: list[tuple[str, bytes, float]] = []
+        self._subscriptions = [
+            self._node.create_subscription(kind, name, self._taker(name), qos, raw=True)
+            for name, (kind, qos) in topics.items()
+        ]
+
+    def _taker(self, name: str):
+        return lambda data: self.heard.append((name, data, time.monotonic()))
+
+    def of(self, name: str) -> list[bytes]:
+        return [data for topic, data, _ in self.heard if topic == name]
+
+    def wait(self) -> None:
+        """Wait until every topic has its publisher."""
+        self._graph.spin_until(
+            lambda: all(each.get_publisher_count() for each in self._subscriptions), 'the player'
+        )
+
+
+def call(ros_graph, kind, service, request):
+    client = ros_graph.node('caller').create_client(kind, f'player/{service}')
+    ros_graph.spin_until(client.service_is_ready, service)
+    # An answer to a client that the other side does not know yet is lost: a harmless question
+    # first, until it is answered.
+    probe = Trigger.Request() if kind is Trigger else SetBool.Request(data=True)
+    if kind is SetBool:
+        answers = []
+
+        def answered() -> bool:
+            answers.append(client.call_async(probe))
+            return any(answer.done() for answer in answers)
+
+        ros_graph.spin_until(answered, 'answer')
+    answer = client.call_async(request)
+    ros_graph.spin_until(answer.done, 'answer')
+    return answer.result().success, answer.result().message
+
+
+def go(ros_graph) -> None:
+    """Let a player that began paused play."""
+    assert call(ros_graph, SetBool, 'pause', SetBool.Request(data=False))[0]
+
+
+def play(ros_graph, bag: Path, **parameters) -> PlayerNode:
+    return ros_graph.add(PlayerNode, parameters={'path': str(bag), **HELD, **parameters})
+
+
+BOTH = {'text': (String, EVERYTHING), 'joints': (JointState, WEAK)}
+
+
+@pytest.mark.parametrize('rate', [0.0, 1.0, 20.0])
+def test_plays_every_byte_in_order(ros_graph, tmp_path, rate):
+    """What is heard is what was written, per topic and across topics, at any rate."""
+    bag = small_bag(tmp_path / 'bag')
+    player = play(ros_graph, bag, rate=rate)
+    listener = Listener(ros_graph, **BOTH)
+    listener.wait()
+    go(ros_graph)
+    ros_graph.spin_until(lambda: len(listener.heard) >= 40, 'the messages')
+    for topic in BOTH:
+        assert listener.of(topic) == bytes_of(bag, f'/{topic}')
+    assert player.diagnose()[2]['messages'] == 42
+
+
+def test_what_is_recorded_of_a_replay_is_the_recording(ros_graph, tmp_path):
+    """Recorder, player, recorder: the second bag holds the bytes of the first."""
+    bag = small_bag(tmp_path / 'bag')
+    play(ros_graph, bag, rate=2.0)
+    topics = ['/text', '/joints', '/latched']
+    again = tmp_path / 'again'
+    recorder = ros_graph.add(RecorderNode, parameters={'path': str(again), 'topics': topics})
+    probe = ros_graph.node('probe')
+    ros_graph.spin_until(
+        lambda: all(probe.count_subscribers(topic) for topic in topics), 'the recorder'
+    )
+    go(ros_graph)
+    ros_graph.spin_until(
+        lambda: all(recorder.diagnose()[2].get(topic) == 20 for topic in topics[:2]),
+        'the messages in the bag',
+    )
+    recorder.stop()
+    for topic in ('/text', '/joints'):
+        assert bytes_of(again, topic) == bytes_of(bag, topic)
+    assert bytes_of(again, '/latched')[-1] == text('new')
+    # The player cannot be early: the second bag lasts as long as it must, but for the delivery
+    # of its first message.
+    times = [received for received, _ in read_topic(again, '/text')]
+    assert times[-1] - times[0] > 0.9 * 190 * MILLISECOND / 2.0
+
+
+@pytest.mark.parametrize('rate', [0.5, 10.0])
+def test_keeps_the_pace_of_the_recording(ros_graph, tmp_path, rate):
+    """No message is early; the machine may make it late, which the player says."""
+    step = 20 if rate < 1.0 else 200
+    bag = small_bag(tmp_path / 'bag', step=step)
+    player = play(ros_graph, bag, rate=rate)
+    listener = Listener(ros_graph, text=(String, EVERYTHING))
+    listener.wait()
+    begin = time.monotonic()
+    go(ros_graph)
+    ros_graph.spin_until(lambda: len(listener.heard) == 20, 'the messages')
+    due = [k * step * 1e-3 / rate for k in range(20)]
+    came = [at - begin for _, _, at in listener.heard]
+    assert all(at >= wanted for at, wanted in zip(came, due, strict=True))
+    values = player.diagnose()[2]
+    assert 0.0 <= float(values['late [s]']) <= float(values['latest so far [s]'])
+    ros_graph.spin_until(
+        lambda: player.diagnose()[2]['position [s]'] == f'{19 * step * 1e-3:.3f}', 'the end'
+    )
+
+
+def test_a_latched_message_reaches_who_comes_late(ros_graph, tmp_path):
+    """Readers that come after the end get the last latched message, as of the plant itself."""
+    bag = small_bag(tmp_path / 'bag')
+    player = ros_graph.add(PlayerNode, parameters={'path': str(bag), 'rate': 0.0, 'delay': 0.0})
+    ros_graph.spin_until(lambda: player.diagnose()[2]['messages'] == 42, 'the end')
+    probe = ros_graph.node('probe')
+    heard = ros_graph.listen(probe, String, 'latched', LATCHED)
+    ros_graph.spin_until(lambda: heard, 'the latched message')
+    assert [message.data for message in heard] == ['new']
+    assert player.diagnose()[1] == f'at the end of {bag}'
+
+
+def test_offers_what_was_offered(ros_graph, tmp_path):
+    """Best effort, reliable and latched topics are offered as such."""
+    play(ros_graph, small_bag(tmp_path / 'bag'))
+    probe = ros_graph.node('probe')
+
+    def offered(topic):
+        return [each.qos_profile for each in probe.get_publishers_info_by_topic(topic)]
+
+    ros_graph.spin_until(
+        lambda: all(offered(topic) for topic in ('/text', '/joints', '/latched')), 'the topics'
+    )
+    (weak,), (strong,), (latched,) = map(offered, ('/joints', '/text', '/latched'))
+    assert weak.reliability == ReliabilityPolicy.BEST_EFFORT
+    assert strong.reliability == latched.reliability == ReliabilityPolicy.RELIABLE
+    assert strong.durability == DurabilityPolicy.VOLATILE
+    assert latched.durability == DurabilityPolicy.TRANSIENT_LOCAL
+
+
+def test_begins_and_ends_where_it_is_told(ros_graph, tmp_path):
+    """Only what lies between is played, but for what was latched before: it comes first."""
+    play(ros_graph, small_bag(tmp_path / 'bag'), rate=0.0, start=0.05, end=0.1)
+    listener = Listener(ros_graph, latched=(String, EVERYTHING), text=(String, EVERYTHING))
+    listener.wait()
+    go(ros_graph)
+    ros_graph.spin_until(lambda: len(listener.heard) >= 6, 'the messages')
+    # From 50 ms to 100 ms of the recording; the message at 100 ms lies 3 ns beyond.
+    assert sorted(listener.of('text')) == [text(f'{k:03d}') for k in range(5, 10)]
+    assert listener.of('latched') == [text('new')]
+
+
+def test_begins_again_at_the_end(ros_graph, tmp_path):
+    """With ``loop`` the messages come over and over, whole and in order."""
+    player = play(ros_graph, small_bag(tmp_path / 'bag', step=1), rate=10.0, loop=True)
+    listener = Listener(ros_graph, text=(String, EVERYTHING))
+    listener.wait()
+    go(ros_graph)
+    ros_graph.spin_until(lambda: len(listener.heard) >= 70, 'three rounds')
+    assert listener.of('text')[:60] == 3 * [text(f'{k:03d}') for k in range(20)]
+    assert player.diagnose()[2]['loops'] >= 3
+
+
+def test_pauses_steps_and_goes_on(ros_graph, tmp_path):
+    """A step plays one message and names it; nothing else comes while paused."""
+    bag = small_bag(tmp_path / 'bag')
+    play(ros_graph, bag, rate=0.0, publish_clock=True, topics=['/text', '/joints'])
+    topics = {**BOTH, 'clock': (Clock, WEAK)}
+    listener = Listener(ros_graph, **topics)
+    listener.wait()
+    said = [call(ros_graph, Trigger, 'step', Trigger.Request()) for _ in range(3)]
+    assert said == [
+        (True, '/joints at 0.000000 s'),
+        (True, '/text at 0.000000 s'),
+        (True, '/joints at 0.010000 s'),
+    ]
+    ros_graph.spin_until(lambda: len(listener.heard) >= 6, 'three messages and their times')
+    assert listener.of('text') == [text('000')]
+    assert listener.of('joints') == [joints(0.0), joints(1.0 / 3.0)]
+    assert listener.of('clock') == [
+        serialize_message(Clock(clock=at)) for at in map(_time, (3, 4, 3 + 10 * MILLISECOND))
+    ]
+    go(ros_graph)
+    ros_graph.spin_until(lambda: len(listener.of('text')) == 20, 'the rest')
+    assert call(ros_graph, Trigger, 'step', Trigger.Request()) == (
+        False,
+        'not paused; call ~/pause first',
+    )
+    success, message = call(ros_graph, SetBool, 'pause', SetBool.Request(data=True))
+    assert success
+    assert message.startswith('paused at 0.19')
+    assert call(ros_graph, Trigger, 'step', Trigger.Request()) == (
+        False,
+        'at the end of the recording',
+    )
+    assert listener.of('joints') == bytes_of(bag, '/joints')
+
+
+def _time(since: int):
+    seconds, rest = divmod(EPOCH + since, 10**9)
+    clock = Clock()
+    clock.clock.sec, clock.clock.nanosec = seconds, rest
+    return clock.clock
+
+
+def test_the_recorded_time_is_the_clock_of_who_wants_it(ros_graph, tmp_path):
+    """With ``publish_clock`` a node with `use_sim_time` lives in the recording, not now."""
+    bag = small_bag(tmp_path / 'bag', extra='/clock')
+    play(ros_graph, bag, rate=0.1, publish_clock=True)
+    node = ros_graph.add(RosNode, 'follower', parameters={'use_sim_time': True})
+    listener = Listener(ros_graph, clock=(Clock, WEAK))
+    listener.wait()
+    ros_graph.spin_until(lambda: node.count_publishers('/clock') == 1, 'the clock')
+    go(ros_graph)
+    last = EPOCH + 190 * MILLISECOND + 4
+    ros_graph.spin_until(
+        lambda: node.get_clock().now().nanoseconds >= last - 2 * MILLISECOND, 'the end'
+    )
+    assert node.get_clock().now().nanoseconds <= last
+    # The clock in the bag says zero; it is not played, and ours never runs back.
+    times = [deserialize_message(data, Clock).clock for data in listener.of('clock')]
+    stamps = [at.sec * 10**9 + at.nanosec for at in times]
+    assert stamps[0] >= EPOCH
+    assert all(late > early for early, late in pairwise(stamps))
+    # Beside the 20 times at which messages came, many between: two seconds are 2000 ticks.
+    assert len(stamps) > 100
+
+
+def test_the_pace_changes_while_playing(ros_graph, tmp_path):
+    """``rate`` is live, and refused when it is none."""
+    player = play(ros_graph, small_bag(tmp_path / 'bag', step=60_000), rate=1.0)
+    listener = Listener(ros_graph, text=(String, EVERYTHING))
+    listener.wait()
+    go(ros_graph)
+    (refused,) = player.set_parameters([Parameter('rate', value=float('inf'))])
+    assert not refused.successful
+    assert 'rate must be finite, >= 0' in refused.reason
+    (fixed,) = player.set_parameters([Parameter('loop', value=True)])
+    assert 'cannot change while configured' in fixed.reason
+    ros_graph.spin_until(lambda: listener.heard, 'the first message')
+    # An hour of recording per second: 19 minutes last a third of a second.
+    assert player.set_parameters([Parameter('rate', value=3600.0)])[0].successful
+    ros_graph.spin_until(lambda: len(listener.heard) == 20, 'the rest')
+
+
+def test_a_recording_that_is_cut_off_is_played_as_far_as_it_goes(ros_graph, tmp_path):
+    """What can be read is played; what is missing is said in the end."""
+    bag = small_bag(tmp_path / 'bag', count=600, step=1)
+    file = bag / 'bag_0.mcap'
+    content = file.read_bytes()
+    file.write_bytes(content[: -len(content) // 4])
+    (bag / 'metadata.yaml').unlink()
+    whole = bytes_of(bag, '/text')
+    assert 0 < len(whole) < 600
+    player = play(ros_graph, bag, rate=0.0)
+    listener = Listener(ros_graph, text=(String, EVERYTHING))
+    listener.wait()
+    go(ros_graph)
+    ros_graph.spin_until(lambda: len(listener.heard) == len(whole), 'the messages')
+    assert listener.of('text') == whole == [text(f'{k:03d}') for k in range(len(whole))]
+    ros_graph.spin_until(lambda: player.diagnose()[0] == DiagnosticStatus.WARN, 'the report')
+    said = player.diagnose()[1]
+    assert 'bag_0.mcap is cut off' in said
+    assert 'the recording was not closed' in said
+
+
+def test_plays_sqlite_and_bare_files(ros_graph, tmp_path):
+    """Recordings of other tools are played, with what they know of the quality of service."""
+    store = get_typestore(Stores.ROS2_JAZZY)
+    with Writer(tmp_path / 'bag', version=8, storage_plugin=StoragePlugin.SQLITE3) as writer:
+        connection = writer.add_connection('/text', 'std_msgs/msg/String', typestore=store)
+        # The later one first: it is played in the order of time.
+        for k in (1, 0, 2):
+            writer.write(connection, EPOCH + k * MILLISECOND, text(f'{k:03d}'))
+    play(ros_graph, next((tmp_path / 'bag').glob('*.db3')), rate=0.0)
+    listener = Listener(ros_graph, text=(String, EVERYTHING))
+    listener.wait()
+    go(ros_graph)
+    ros_graph.spin_until(lambda: len(listener.heard) == 3, 'the messages')
+    assert listener.of('text') == [text('000'), text('001'), text('002')]
+
+
+def test_a_type_that_is_not_installed_is_left_out_and_said(ros_graph, tmp_path):
+    """The rest is played."""
+    path = tmp_path / 'bag'
+    path.mkdir()
+    foreign_bag(path / 'bag_0.mcap')
+    player = play(ros_graph, path)
+    assert player.diagnose()[2]['left out'] == '/foreign'
+    assert player._left_out == {'/foreign': 'lab_msgs/msg/Force is not installed'}
+    go(ros_graph)
+    ros_graph.spin_until(lambda: player.diagnose()[2]['messages'] == 1, 'the rest')
+
+
+def foreign_bag(file: Path) -> None:
+    """Write a message of a type that is installed, and one of a type that is not."""
+    with file.open('wb') as stream:
+        writer = McapWriter(stream)
+        writer.start('ros2')
+        for topic, kind in (('/text', 'std_msgs/msg/String'), ('/foreign', 'lab_msgs/msg/Force')):
+            schema = writer.register_schema(kind, 'ros2msg', b'string data')
+            channel = writer.register_channel(topic, 'cdr', schema)
+            writer.add_message(channel, EPOCH, text('here'), EPOCH)
+        writer.finish()
+
+
+def test_another_publisher_of_a_topic_is_said(ros_graph, tmp_path):
+    """Readers would get both: /diagnostics warns, and it is played all the same."""
+    probe = ros_graph.node('probe')
+    probe.create_publisher(JointState, 'joints', SENSOR)
+    player = play(ros_graph, small_bag(tmp_path / 'bag'))
+    ros_graph.spin_until(lambda: player.diagnose()[0] == DiagnosticStatus.WARN, 'the warning')
+    assert player.diagnose()[1] == '/joints: others publish there, too'
+
+
+@pytest.mark.parametrize(
+    ('parameters', 'complaint'),
+    [
+        ({'path': ''}, 'path must name a recording to play, got nothing'),
+        ({'path': 'none'}, 'none does not exist; valid: a rosbag2 folder, an .mcap or a .db3'),
+        ({'path': 'empty'}, 'empty holds no recording'),
+        ({'topics': ['/x']}, 'bag has no topic /x; it has /joints (sensor_msgs/msg/JointState), '),
+        (
+            {'start': 30.0},
+            'start = 30 s is beyond the end of bag, whose topics to play end at 0.19',
+        ),
+        ({'start': 0.061, 'end': 0.062}, 'bag has no message to play from 0.061 s to 0.062 s'),
+        ({'start': 3.0, 'end': 2.0}, 'end must be beyond start = 3 s, or 0, got 2 s'),
+        ({'rate': float('inf')}, 'rate must be finite, >= 0'),
+        ({'speed': 2.0}, "unknown parameter 'speed'"),
+        ({'publish_clock': True, 'use_sim_time': True}, 'cannot both be true'),
+    ],
+)
+def test_refuses_to_start_and_says_why(ros_graph, tmp_path, monkeypatch, parameters, complaint):
+    """Bad input is named in one line, and nothing is played."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / 'empty').mkdir()
+    small_bag(Path('bag'))
+    node = ros_graph.add(PlayerNode, start=False, parameters={'path': 'bag', **parameters})
+    assert not node.start()
+    assert complaint in node.failure
+    assert '\n' not in node.failure
+
+
+def test_a_recording_of_unknown_types_only_is_refused(ros_graph, tmp_path):
+    """There is nothing to play, and the reason is given."""
+    foreign_bag(tmp_path / 'bag.mcap')
+    parameters = {'path': str(tmp_path / 'bag.mcap'), 'topics': ['/foreign']}
+    node = ros_graph.add(PlayerNode, start=False, parameters=parameters)
+    assert not node.start()
+    assert 'has nothing to play; /foreign: lab_msgs/msg/Force is not installed' in node.failure
+
+
+def process(ros_graph, bag: Path, *settings: str) -> subprocess.Popen:
+    """Start the player as ``ros2 run`` does."""
+    words = [f'path:={bag}', *settings]
+    options = [word for setting in words for word in ('-p', setting)]
+    return subprocess.Popen(
+        [sys.executable, '-m', 'needle_identification.player_node', '--ros-args', *options],
+        env=ros_graph.environment,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def test_the_process_ends_well_when_all_is_played_and_delivered(ros_graph, tmp_path):
+    """As `ros2 bag play`: exit status 0 at the end, and the reader has every message."""
+    bag = small_bag(tmp_path / 'bag')
+    listener = Listener(ros_graph, text=(String, EVERYTHING))
+    with process(ros_graph, bag, 'rate:=5.0', 'paused:=true') as player:
+        listener.wait()
+        go(ros_graph)
+        ros_graph.spin_until(lambda: player.poll() is not None, 'the end of the player')
+        _, said = player.communicate()
+    assert player.returncode == 0, said
+    assert f'played 42 messages of {bag}' in said
+    ros_graph.spin_until(lambda: len(listener.heard) >= 20, 'the messages')
+    assert listener.of('text') == bytes_of(bag, '/text')
+
+
+def test_the_process_stays_if_it_shall_and_ends_with_ctrl_c(ros_graph, tmp_path):
+    """Without ``exit_at_end`` latched messages stay to be had; SIGINT ends it with status 0."""
+    bag = small_bag(tmp_path / 'bag')
+    probe = ros_graph.node('probe')
+    with process(ros_graph, bag, 'rate:=0.0', 'delay:=0.0', 'exit_at_end:=false') as player:
+        heard = ros_graph.listen(probe, String, 'latched', LATCHED)
+        ros_graph.spin_until(
+            lambda: heard and heard[-1].data == 'new', 'the message that was latched last'
+        )
+        player.send_signal(signal.SIGINT)
+        _, said = player.communicate(timeout=30.0)
+    assert player.returncode == 0, said
+
+
+def test_the_process_says_why_it_does_not_start(ros_graph, tmp_path):
+    """Exit status 2 and one line."""
+    with process(ros_graph, tmp_path / 'none') as player:
+        _, said = player.communicate(timeout=60.0)
+    assert player.returncode == 2
+    assert f'{tmp_path / "none"} does not exist' in said
