@@ -42,14 +42,13 @@ from needle_dynamics import (
     NeedleParameters,
     ParameterError,
 )
-from needle_dynamics.base_node import COMMAND, NeedleNode, run, SENSOR
+from needle_dynamics.base_node import CHANGES, COMMAND, NeedleNode, Packed, run, SENSOR
 from needle_dynamics.plant import joint_values
 import numpy as np
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.subscription import Subscription
-from rclpy.time import Time
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
 from std_srvs.srv import SetBool, Trigger
@@ -153,7 +152,7 @@ class ControllerNode(NeedleNode):
         self._truth: tuple[int, tuple[FloatArray, FloatArray]] | None = None
         self._truths: Subscription | None = None
         #: Measurement that waits for the ground truth of its time, and looks that found one.
-        self._pending: tuple[int, Measurement, JointState] | None = None
+        self._pending: tuple[int, Measurement] | None = None
         self._waits = 0
         #: Stamp, lateral force and moment of the last wrench that no measurement has taken.
         self._wrench_now: tuple[int, float, float] | None = None
@@ -183,11 +182,13 @@ class ControllerNode(NeedleNode):
         #: One that stands still or jumps does not take the watchdog along.
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
 
-        self._wrench = WrenchStamped()
-        self._wrench.header.frame_id = 'needle_base'
-        self._generalized = JointState()
-        self._aim = JointState(name=['insertion'])
-        self._error = JointState(name=['insertion'])
+        wrench = WrenchStamped()
+        wrench.header.frame_id = 'needle_base'
+        wrench.wrench.force.y = wrench.wrench.torque.x = CHANGES
+        self._wrench = Packed(wrench)
+        self._aim = Packed(JointState(name=['insertion'], position=[CHANGES], velocity=[CHANGES]))
+        #: What was commanded last: stamp, torque and message.
+        self._last: tuple[int, float, bytes] = (0, 0.0, b'')
 
     # Transitions.
 
@@ -245,7 +246,8 @@ class ControllerNode(NeedleNode):
 
     def _take_model(self, parameters: NeedleParameters) -> None:
         self._model = NeedleModel(parameters)
-        self._generalized.name = list(self._model.coordinate_names)
+        names = list(self._model.coordinate_names)
+        self._generalized = Packed(JointState(name=names, effort=[CHANGES] * len(names)))
 
     def _retract_depth(self, changes: Mapping[str, Any]) -> float:
         """Return the depth to retract to, or refuse it."""
@@ -408,7 +410,7 @@ class ControllerNode(NeedleNode):
             return
         stamp = _stamp(message.header)
         # The sensor also feels the torque that turns the base.
-        moment -= self._wrench.wrench.torque.x
+        moment -= self._last[1]
         if stamp > self._safety.streams['joint_states'].last:
             self._wrench_now = stamp, force.z, moment
         else:
@@ -438,7 +440,7 @@ class ControllerNode(NeedleNode):
         pending, self._pending = self._pending, None
         self._waits = 0
         if pending is not None and pending[0] == stamp:
-            self._answer(pending[1], pending[2], bend)
+            self._answer(*pending, bend)
 
     def _observe(self, stamp: int, measured: Measurement) -> None:
         """Renew what the observer says of the bending."""
@@ -483,28 +485,24 @@ class ControllerNode(NeedleNode):
             self._observe(stamp, measured)
         waits = self._is_modal and self._safety.stop is None
         if waits and (self._truth is None or self._truth[0] != stamp):
-            self._pending = stamp, measured, message
+            self._pending = stamp, measured
         else:
-            self._answer(measured, message, self._truth[1] if self._truth else None)
+            self._answer(stamp, measured, self._truth[1] if self._truth else None)
 
     def _repeat(self, stamp: int) -> None:
         """Command the same again, or nothing if that was not the last word."""
-        last = self._generalized if self._is_modal else self._wrench
         if self._pending is not None and self._pending[0] == stamp:
             return
-        if _stamp(last.header) == stamp:
-            self._commands[self._is_modal].publish(last)
+        if self._last[0] == stamp:
+            self._commands[self._is_modal].publish(self._last[2])
         else:
             self._publish(0.0, 0.0, stamp=stamp)
 
     def _answer(
-        self,
-        measured: Measurement,
-        message: JointState,
-        bend: tuple[FloatArray, FloatArray] | None,
+        self, stamp: int, measured: Measurement, bend: tuple[FloatArray, FloatArray] | None
     ) -> None:
         """Command what the controller says."""
-        stamp, safety = _stamp(message.header), self._safety
+        safety = self._safety
         if self._controller is None:
             return
         if safety.stop is not None:
@@ -539,7 +537,7 @@ class ControllerNode(NeedleNode):
             abs(command.force) >= limits.force_limit or abs(command.torque) >= limits.torque_limit,
         )
         self._publish(command.force, command.torque, command.modal, stamp)
-        self._show(message, measured, command)
+        self._show(stamp, measured, command)
 
     def _count_commanders(self) -> None:
         """See who else commands; those that are not active count too."""
@@ -653,30 +651,23 @@ class ControllerNode(NeedleNode):
         stamp: int | None = None,
     ) -> None:
         """Command forces with the stamp of the measurement that they answer, or of now."""
-        moment = Time(nanoseconds=stamp) if stamp is not None else self.get_clock().now()
+        at = self.get_clock().now().nanoseconds if stamp is None else stamp
         if self._is_modal:
-            forces = self._generalized
-            forces.header.stamp = moment.to_msg()
-            rest = [0.0] * (len(forces.name) - 2) if modal is None else modal.tolist()
+            count = self._model.modes.count
+            rest = [0.0] * count if modal is None else modal.tolist()
             # Insertion makes d smaller.
-            forces.effort = [-force, torque, *rest]
-            self._generalized_command.publish(forces)
-            return
-        message = self._wrench
-        message.header.stamp = moment.to_msg()
-        message.wrench.force.y = force
-        message.wrench.torque.x = torque
-        self._wrench_command.publish(message)
+            message = self._generalized.at(at, -force, torque, *rest)
+        else:
+            message = self._wrench.at(at, force, torque)
+        self._last = at, torque, message
+        self._commands[self._is_modal].publish(message)
 
-    def _show(self, message: JointState, measured: Measurement, command: Command) -> None:
+    def _show(self, stamp: int, measured: Measurement, command: Command) -> None:
         aim: Setpoint = command.setpoint
-        self._aim.header.stamp = self._error.header.stamp = message.header.stamp
-        self._aim.position = [aim.position]
-        self._aim.velocity = [aim.speed]
-        self._error.position = [aim.position - measured.depth]
-        self._error.velocity = [aim.speed - measured.speed]
-        self._reference.publish(self._aim)
-        self._tracking_error.publish(self._error)
+        self._reference.publish(self._aim.at(stamp, aim.position, aim.speed))
+        self._tracking_error.publish(
+            self._aim.at(stamp, aim.position - measured.depth, aim.speed - measured.speed)
+        )
 
     def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
         """Say what it aims at and what holds it back."""

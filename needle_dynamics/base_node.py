@@ -12,8 +12,10 @@ from array import array
 from collections.abc import Callable, Mapping
 import ctypes
 from dataclasses import fields
+import gc
 import os
 import signal
+import struct
 import sys
 import time
 import traceback
@@ -33,6 +35,8 @@ from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.serialization import serialize_message
+from rclpy.task import Future
 from std_msgs.msg import String
 import yaml
 
@@ -56,6 +60,41 @@ _PR_SET_PDEATHSIG = 1
 
 _Settings = TypeVar('_Settings')
 _SUCCESS = TransitionCallbackReturn.SUCCESS
+
+
+#: Stands for each number that changes in the message that `Packed` is made of.
+CHANGES = float.fromhex('0x1.6e6565646c65p+700')
+
+
+class Packed:
+    """
+    The bytes of a message of which only the stamp and some numbers change.
+
+    To write them takes a third of what rclpy takes to convert and serialize the message.
+
+    Parameters
+    ----------
+    message : message with a header
+        Its numbers that change are `CHANGES`, all of them doubles.
+
+    """
+
+    def __init__(self, message: Any) -> None:
+        data = serialize_message(message)
+        # Four bytes on the encoding, then the stamp: two numbers of four bytes.
+        between = data[12:].split(struct.pack('=d', CHANGES))
+        self._pack = struct.Struct('=4siI' + 'd'.join(f'{len(part)}s' for part in between)).pack
+        # What is between the numbers, and the numbers.
+        self._parts: list[Any] = [data[:4], 0, 0, between[0]]
+        for part in between[1:]:
+            self._parts += [0.0, part]
+
+    def at(self, stamp: int, *numbers: float) -> bytes:
+        """Return the message with a stamp [ns] and numbers, in the order of its fields."""
+        parts = self._parts
+        parts[1], parts[2] = divmod(stamp, 1_000_000_000)
+        parts[4::2] = numbers
+        return self._pack(*parts)
 
 
 class Meter:
@@ -435,8 +474,11 @@ def run(kind: Callable[[], NeedleNode], arguments: list[str] | None = None) -> i
             # Give the reason on /diagnostics a moment to leave, then end.
             node.publish_diagnostics()
             status = 2
+        # A look through all that was imported takes 0.2 s, and would come some time later.
+        gc.freeze()
         while not stopping and status == 0:
-            executor.spin_once(timeout_sec=0.1)
+            # Unlike spin_once it does not come back to Python at each event.
+            executor.spin_until_future_complete(Future(), timeout_sec=0.1)
         node.stop()
         # What was published last (a zero force, a latched result) is still on its way.
         deadline = time.monotonic() + 0.1

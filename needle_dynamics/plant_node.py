@@ -11,7 +11,7 @@ from typing import Any
 from builtin_interfaces.msg import Time as TimeMessage
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import Point, PointStamped, Pose, PoseArray, PoseStamped, WrenchStamped
-from needle_dynamics.base_node import COMMAND, Meter, NeedleNode, run, SENSOR
+from needle_dynamics.base_node import CHANGES, COMMAND, Meter, NeedleNode, Packed, run, SENSOR
 from needle_dynamics.errors import JobError, NeedleError, ParameterError
 from needle_dynamics.faults import Fault, FaultParameters, FAULTS
 from needle_dynamics.force_sensor import ForceSensor, ForceSensorParameters, HIGHEST_RATE
@@ -202,12 +202,14 @@ class PlantNode(NeedleNode):
         self.create_service(Trigger, '~/step', self._on_step)
         self.create_service(Trigger, '~/reset', self._on_reset)
 
-        self._joints = JointState(name=['insertion', 'rotation'])
-        self._truth = JointState()
-        self._wrench = WrenchStamped()
-        self._wrench.header.frame_id = 'needle_base'
-        self._tip = PointStamped()
-        self._tip.header.frame_id = 'needle_entry'
+        wrench, tip = WrenchStamped(), PointStamped()
+        wrench.header.frame_id, tip.header.frame_id = 'needle_base', 'needle_entry'
+        for part in (wrench.wrench.force, wrench.wrench.torque):
+            part.x = part.y = part.z = CHANGES
+        tip.point.y = tip.point.z = CHANGES
+        joints = JointState(name=['insertion', 'rotation'])
+        joints.position = joints.velocity = joints.effort = [CHANGES] * 2
+        self._wrench, self._tip, self._joints = Packed(wrench), Packed(tip), Packed(joints)
         self._pose = PoseStamped()
         self._pose.header.frame_id = 'needle_entry'
         self._pose.pose.orientation.w = 1.0
@@ -272,7 +274,9 @@ class PlantNode(NeedleNode):
         if mode == 'indenter':
             return Indenter(tissue, sensor, settings.rate, seed, settings.force_limit)
         model = NeedleModel(parameters)
-        self._truth.name = list(model.coordinate_names)
+        self._names = names = list(model.coordinate_names)
+        numbers = [CHANGES] * len(names)
+        self._truth = Packed(JointState(name=names, position=numbers, velocity=numbers))
         state = model.state_at(settings.depth, settings.tip_deflection)
         reach = parameters.minimum_depth, parameters.length
         return Plant(
@@ -381,10 +385,10 @@ class PlantNode(NeedleNode):
             )
 
     def _on_generalized(self, message: JointState) -> None:
-        settings, names = self._settings, self._truth.name
         stamp = self._counts_from(message.header)
         if stamp is None or not isinstance(self._plant, Plant):
             return
+        settings, names = self._settings, self._names
         efforts = dict(zip(message.name, message.effort, strict=False))
         if sorted(message.name) != sorted(names) or len(message.effort) != len(names):
             self._refuse(
@@ -565,42 +569,29 @@ class PlantNode(NeedleNode):
             publish(at, left)
 
     def _publish_wrench(self, stamp: int, values: list[float]) -> None:
-        self._wrench.header.stamp = _message(stamp)
-        force, torque = self._wrench.wrench.force, self._wrench.wrench.torque
-        force.x, force.y, force.z, torque.x, torque.y, torque.z = values
-        self._base_wrench.publish(self._wrench)
+        self._base_wrench.publish(self._wrench.at(stamp, *values))
 
     def _publish_joints(self, stamp: int, values: list[float]) -> None:
-        joints = self._joints
-        joints.header.stamp = _message(stamp)
-        depth, speed, angle, angular_speed, force, torque = values
-        joints.position = [depth, angle]
-        joints.velocity = [speed, angular_speed]
-        joints.effort = [force, torque]
-        self._joint_states.publish(joints)
+        self._joint_states.publish(self._joints.at(stamp, *values))
 
     def _publish_tip(self, stamp: int, values: list[float]) -> None:
-        self._tip.header.stamp = _message(stamp)
-        self._tip.point.z, self._tip.point.y = values
-        self._tip_deflection.publish(self._tip)
+        deflection, depth = values
+        self._tip_deflection.publish(self._tip.at(stamp, depth, deflection))
 
     def _show_needle(self, sample: Sample, stamp: int) -> None:
         state = sample.state.tolist()
         middle = len(state) // 2
-        truth, seen = self._truth, sample.tip
+        seen = sample.tip
         if seen is not None:
             late = round(seen.age / self._settings.rate * NANOSECONDS)
             self._pass(
                 'tip_deflection', stamp - late, [seen.deflection, seen.depth], self._publish_tip
             )
-        truth.header.stamp = _message(stamp)
-        truth.position = state[:middle]
-        truth.velocity = state[middle:]
-        self._ground_truth.publish(truth)
+        self._ground_truth.publish(self._truth.at(stamp, *state))
         if self._sampled % self._picture == 0:
-            self._draw(sample, truth.header.stamp)
+            self._draw(sample, _message(stamp))
         values = [
-            sample.joint_position, sample.speed, state[1], state[middle + 1],
+            sample.joint_position, state[1], sample.speed, state[middle + 1],
             sample.force, self._held.torque,
         ]  # fmt: skip
         self._last_joints = stamp, values
