@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import ast
 from collections.abc import Mapping
+from importlib import import_module
+import inspect
 from pathlib import Path
+
+from needle_dynamics.base_node import NeedleNode
 
 ROOT = Path(__file__).parent.parent.parent
 
@@ -19,3 +23,14 @@ def _constant(name: str) -> Mapping[str, str]:
 
 #: Modules of the nodes by the name of their executable.
 NODES = _constant('NODES')
+
+
+def node_class(name: str) -> type[NeedleNode]:
+    """Return the class of the node that an executable runs."""
+    module = NODES[name]
+    (kind,) = (
+        item
+        for _, item in inspect.getmembers(import_module(module), inspect.isclass)
+        if issubclass(item, NeedleNode) and item.__module__ == module
+    )
+    return kind
