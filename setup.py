@@ -15,6 +15,7 @@ NODES = {
     'recorder': 'needle_identification.recorder_node',
     'player': 'needle_identification.player_node',
 }
+TEST = ['hypothesis>=6.100', 'lxml>=5.0', 'mpmath>=1.3', 'pytest>=8.0', 'sympy>=1.12']
 
 
 def files(folder: str, pattern: str) -> list[str]:
@@ -37,7 +38,8 @@ setup(
     data_files=[
         ('share/ament_index/resource_index/packages', ['resource/needle_insertion']),
         (f'share/{NAME}', ['package.xml']),
-        (f'share/{NAME}/config', files('config', '*.yaml')),
+        (f'share/{NAME}/config', files('config', '*.*')),
+        (f'share/{NAME}/config/security', files('config/security', '*.xml')),
         (f'share/{NAME}/launch', files('launch', '*.launch.py')),
         # ros2 run looks here; pip puts the same nodes on PATH as needle-<name>.
         (f'lib/{NAME}', [f'scripts/{node}' for node in NODES]),
@@ -63,15 +65,9 @@ setup(
             'ros-jazzy-rclpy>=7.1.6',
             'ros-jazzy-rmw-fastrtps-cpp>=8.4',
         ],
-        'dev': [
-            'colcon-common-extensions>=0.3',
-            'hypothesis>=6.100',
-            'mpmath>=1.3',
-            'mypy>=1.14',
-            'pytest>=8.0',
-            'ruff>=0.9',
-            'sympy>=1.12',
-        ],
+        # The name by which colcon test knows pytest.
+        'test': TEST,
+        'dev': [*TEST, 'colcon-common-extensions>=0.3', 'mypy>=1.14', 'ruff>=0.9'],
         # What `needle bench` is measured beside.
         'bench': ['mcap-ros2-support>=0.5.6', 'mujoco>=3.2', 'pyelastica>=0.3.3'],
     },
