@@ -464,8 +464,9 @@ def run(kind: Callable[[], NeedleNode], arguments: list[str] | None = None) -> i
     try:
         try:
             node = kind()
-        except (ParameterException, NeedleError) as error:
-            sys.stderr.write(f'error: {error}\n')
+        except (ParameterException, NeedleError, RuntimeError) as error:
+            # The last is rcl's: a node that its security refuses.
+            sys.stderr.write(f'error: {" ".join(str(error).split())}\n')
             return 2
         executor: Executor = EventsExecutor()
         executor.add_node(node)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from importlib.metadata import version
 from pathlib import Path
 import signal
 import sys
@@ -84,6 +85,7 @@ def _parser() -> argparse.ArgumentParser:
     from needle_insertion import analyze, identify, protocol, reproduce, simulate, verify
 
     parser = argparse.ArgumentParser(prog='needle', description='Robot-assisted needle insertion.')
+    parser.add_argument('--version', action='version', version=version('needle_insertion'))
     commands = parser.add_subparsers(required=True, metavar='COMMAND')
 
     demo = commands.add_parser('demo', help='insertion, recording, identification, one report')

@@ -31,6 +31,7 @@ MODULES: Mapping[str, str] = {
     'plant': 'needle_dynamics.plant_node',
     'controller': 'needle_controller.controller_node',
     'identification': 'needle_identification.identification_node',
+    'player': 'needle_identification.player_node',
     'recorder': 'needle_identification.recorder_node',
 }
 
