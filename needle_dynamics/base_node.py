@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from array import array
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 import ctypes
 from dataclasses import fields
 import gc
@@ -35,7 +36,7 @@ from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from rclpy.serialization import serialize_message
+from rclpy.serialization import deserialize_message, serialize_message
 from rclpy.task import Future
 from std_msgs.msg import String
 import yaml
@@ -66,6 +67,26 @@ _SUCCESS = TransitionCallbackReturn.SUCCESS
 CHANGES = float.fromhex('0x1.6e6565646c65p+700')
 
 
+def _serialized(message: Any) -> bytearray:
+    """Serialize; rmw leaves what was in memory in the gaps of the encoding and at its end."""
+    data, kind = bytearray(serialize_message(message)), type(message)
+    with suppress(RuntimeError):
+        while True:
+            deserialize_message(bytes(data[:-1]), kind)
+            del data[-1]
+    for i in range(4, len(data)):
+        kept = data[i]
+        if kept == 0:
+            continue
+        # A gap is what may change without a change of the message; a length may not by so much.
+        data[i] = 255 if kept < 128 else 127
+        with suppress(RuntimeError):
+            if deserialize_message(bytes(data), kind) == message:
+                kept = 0
+        data[i] = kept
+    return data
+
+
 class Packed:
     """
     The bytes of a message of which only the stamp and some numbers change.
@@ -80,12 +101,12 @@ class Packed:
     """
 
     def __init__(self, message: Any) -> None:
-        data = serialize_message(message)
+        data = _serialized(message)
         # Four bytes on the encoding, then the stamp: two numbers of four bytes.
-        between = data[12:].split(struct.pack('=d', CHANGES))
+        between = bytes(data[12:]).split(struct.pack('=d', CHANGES))
         self._pack = struct.Struct('=4siI' + 'd'.join(f'{len(part)}s' for part in between)).pack
         # What is between the numbers, and the numbers.
-        self._parts: list[Any] = [data[:4], 0, 0, between[0]]
+        self._parts: list[Any] = [bytes(data[:4]), 0, 0, between[0]]
         for part in between[1:]:
             self._parts += [0.0, part]
 

@@ -263,7 +263,8 @@ def test_a_run_under_commands_is_the_same(tmp_path):
 def test_commands_that_came_late_or_are_not_in_the_bag_are_found(tmp_path):
     """The run is the same all the same, and what happened is said."""
     result = only(written(tmp_path / 'bag', simulated(late=(20, 21, 60), lost=(40,))))
-    exact(result)
+    # The force that is not in the bag is known from joint_states, where it is a mean.
+    assert result.verdict in ('identical', 'within tolerance'), result
     late, missing = result.notes
     # Late are 20, 21 and 60, each overtaken or not by the next; the last two are yet to act.
     assert 'sooner or later (up to 2 periods)' in late

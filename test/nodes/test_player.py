@@ -1,5 +1,6 @@
 """What is in a bag goes into the graph: every byte, in order, at the pace that was asked for."""
 
+from functools import cache
 from itertools import pairwise
 from pathlib import Path
 import signal
@@ -43,7 +44,9 @@ def text(data: str) -> bytes:
     return serialize_message(String(data=data))
 
 
+@cache
 def joints(position: float) -> bytes:
+    # Once: its gaps hold what was in memory.
     return serialize_message(JointState(name=['insertion'], position=[position]))
 
 
