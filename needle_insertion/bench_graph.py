@@ -167,7 +167,7 @@ class Camp:
             if process.stdout is not None:
                 process.stdout.close()
 
-    def until(self, condition: Callable[[], Any], what: str, timeout: float = 30.0) -> None:
+    def until(self, condition: Callable[[], Any], what: str, timeout: float = 120.0) -> None:
         """Spin until a condition holds; raise `GraphError` if it does not, or a node ends."""
 
         def holds() -> Any:

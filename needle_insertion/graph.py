@@ -42,6 +42,9 @@ DEACTIVATE = Transition.TRANSITION_DEACTIVATE
 CLEANUP = Transition.TRANSITION_CLEANUP
 
 
+#: Time that a node may take to start, with all to be compiled on a busy machine [s].
+_START: Final = 180.0
+
 #: Time that the nodes have to end by themselves at the end of a graph [s].
 _PATIENCE: Final = 3.0
 
@@ -255,7 +258,7 @@ class Graph:
                 answers.append(probe.call_async(GetState.Request()))
             return any(answer.done() for answer in answers)
 
-        self.spin_until(answered, f'the answer of {name}')
+        self.spin_until(answered, f'the answer of {name}', _START)
         node.destroy_client(probe)
 
     def change(self, node: Node, name: str, *transitions: int) -> None:
@@ -281,12 +284,12 @@ class Graph:
         client = self._life_cycles[name]
         for transition in transitions:
             answer = client.call_async(ChangeState.Request(transition=Transition(id=transition)))
-            self.spin_until(answer.done, f'the answer of {name}')
+            self.spin_until(answer.done, f'the answer of {name}', _START)
             if not answer.result().success:
                 said = [p.last_words() for p in self._processes if p.name == name]
                 raise GraphError(f'{name} refused to start: {"".join(said[-1:])}')
 
-    def spin_until(self, condition: Callable[[], Any], what: str, timeout: float = 30.0) -> None:
+    def spin_until(self, condition: Callable[[], Any], what: str, timeout: float = 60.0) -> None:
         """
         Spin until a condition holds.
 

@@ -505,7 +505,7 @@ def test_the_command_line_tells_people_and_machines(tmp_path, capsys):
 # What real nodes recorded.
 
 
-@pytest.mark.parametrize('name', ['stiffness'])
+@pytest.mark.parametrize('name', ['friction', 'stiffness'])
 def test_the_shipped_bags_are_what_the_plant_computes(name):
     """All of them, but for how another machine may round."""
     for path in sorted(SHIPPED_BAGS.glob(f'{name}_*')):
