@@ -59,11 +59,11 @@ class Pace:
         self.tick = max(1.0 / (rate * factor), min(1.0 / rate, _TICK)) if factor else _TICK
         #: Most samples at one tick when time may wait: a burst would overrun readers.
         self._burst = ceil(2.0 * rate * factor * self.tick) if factor else _AT_ONCE
-        self.paused = False
         self.begin(0)
 
-    def begin(self, now: int) -> None:
+    def begin(self, now: int, *, paused: bool = False) -> None:
         """Let time begin at the clock's now [ns]."""
+        self.paused = paused
         self.lost = self.waited = 0
         self._awaited: int | None = None
         self._start = 0 if self._lockstep else now

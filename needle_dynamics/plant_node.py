@@ -324,9 +324,7 @@ class PlantNode(NeedleNode):
         pictured = self._settings.rate * max(1.0, self._settings.real_time_factor)
         #: Samples from one picture to the next.
         self._picture = max(1, round(pictured / _PICTURES))
-        self._pace.begin(self._now())
-        if self.get_parameter('paused').value:
-            self._pace.pause()
+        self._pace.begin(self._now(), paused=bool(self.get_parameter('paused').value))
         self._timer = self.create_timer(self._pace.tick, self._on_timer)
         steady = NodeClock(clock_type=ClockType.STEADY_TIME)
         self._watch = self.create_timer(_WATCH, self._on_watch, clock=steady)

@@ -105,6 +105,17 @@ def test_in_lockstep_it_is_no_faster_than_its_pace():
 
 
 @pytest.mark.parametrize('own', [False, True])
+def test_a_pause_ends_with_the_run(own):
+    """Who begins again is not held by a pause of before."""
+    pace = make(own=own)
+    pace.pause()
+    pace.begin(BEGIN)
+    assert take(pace, BEGIN + 5_000_000)
+    pace.begin(BEGIN, paused=True)
+    assert not take(pace, BEGIN + 5_000_000)
+
+
+@pytest.mark.parametrize('own', [False, True])
 def test_in_a_pause_time_stands_still(own):
     """Afterwards a time of its own goes on where it stood, the clock's at the clock's now."""
     pace = make(own=own)
