@@ -42,7 +42,7 @@ from needle_dynamics import (
     NeedleParameters,
     ParameterError,
 )
-from needle_dynamics.base_node import CHANGES, COMMAND, NeedleNode, Packed, run, SENSOR
+from needle_dynamics.base_node import COMMAND, NeedleNode, Packed, run, SENSOR
 from needle_dynamics.plant import joint_values
 import numpy as np
 from rcl_interfaces.msg import ParameterDescriptor
@@ -182,11 +182,8 @@ class ControllerNode(NeedleNode):
         #: One that stands still or jumps does not take the watchdog along.
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
 
-        wrench = WrenchStamped()
-        wrench.header.frame_id = 'needle_base'
-        wrench.wrench.force.y = wrench.wrench.torque.x = CHANGES
-        self._wrench = Packed(wrench)
-        self._aim = Packed(JointState(name=['insertion'], position=[CHANGES], velocity=[CHANGES]))
+        self._wrench = Packed('needle_base', numbers=6)
+        self._aim = Packed('', names=['insertion'], counts=(1, 1, 0))
         #: What was commanded last: stamp, torque and message.
         self._last: tuple[int, float, bytes] = (0, 0.0, b'')
 
@@ -246,8 +243,8 @@ class ControllerNode(NeedleNode):
 
     def _take_model(self, parameters: NeedleParameters) -> None:
         self._model = NeedleModel(parameters)
-        names = list(self._model.coordinate_names)
-        self._generalized = Packed(JointState(name=names, effort=[CHANGES] * len(names)))
+        names = self._model.coordinate_names
+        self._generalized = Packed('', names=names, counts=(0, 0, len(names)))
 
     def _retract_depth(self, changes: Mapping[str, Any]) -> float:
         """Return the depth to retract to, or refuse it."""
@@ -658,7 +655,7 @@ class ControllerNode(NeedleNode):
             # Insertion makes d smaller.
             message = self._generalized.at(at, -force, torque, *rest)
         else:
-            message = self._wrench.at(at, force, torque)
+            message = self._wrench.at(at, 0.0, force, 0.0, torque, 0.0, 0.0)
         self._last = at, torque, message
         self._commands[self._is_modal].publish(message)
 

@@ -11,7 +11,7 @@ from typing import Any
 from builtin_interfaces.msg import Time as TimeMessage
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import Point, PointStamped, Pose, PoseArray, PoseStamped, WrenchStamped
-from needle_dynamics.base_node import CHANGES, COMMAND, Meter, NeedleNode, Packed, run, SENSOR
+from needle_dynamics.base_node import COMMAND, Meter, NeedleNode, Packed, run, SENSOR
 from needle_dynamics.errors import JobError, NeedleError, ParameterError
 from needle_dynamics.faults import Fault, FaultParameters, FAULTS
 from needle_dynamics.force_sensor import ForceSensor, ForceSensorParameters, HIGHEST_RATE
@@ -202,14 +202,9 @@ class PlantNode(NeedleNode):
         self.create_service(Trigger, '~/step', self._on_step)
         self.create_service(Trigger, '~/reset', self._on_reset)
 
-        wrench, tip = WrenchStamped(), PointStamped()
-        wrench.header.frame_id, tip.header.frame_id = 'needle_base', 'needle_entry'
-        for part in (wrench.wrench.force, wrench.wrench.torque):
-            part.x = part.y = part.z = CHANGES
-        tip.point.y = tip.point.z = CHANGES
-        joints = JointState(name=['insertion', 'rotation'])
-        joints.position = joints.velocity = joints.effort = [CHANGES] * 2
-        self._wrench, self._tip, self._joints = Packed(wrench), Packed(tip), Packed(joints)
+        self._wrench = Packed('needle_base', numbers=6)
+        self._tip = Packed('needle_entry', numbers=3)
+        self._joints = Packed('', names=['insertion', 'rotation'], counts=(2, 2, 2))
         self._pose = PoseStamped()
         self._pose.header.frame_id = 'needle_entry'
         self._pose.pose.orientation.w = 1.0
@@ -275,8 +270,7 @@ class PlantNode(NeedleNode):
             return Indenter(tissue, sensor, settings.rate, seed, settings.force_limit)
         model = NeedleModel(parameters)
         self._names = names = list(model.coordinate_names)
-        numbers = [CHANGES] * len(names)
-        self._truth = Packed(JointState(name=names, position=numbers, velocity=numbers))
+        self._truth = Packed('', names=names, counts=(len(names), len(names), 0))
         state = model.state_at(settings.depth, settings.tip_deflection)
         reach = parameters.minimum_depth, parameters.length
         return Plant(
@@ -574,7 +568,7 @@ class PlantNode(NeedleNode):
 
     def _publish_tip(self, stamp: int, values: list[float]) -> None:
         deflection, depth = values
-        self._tip_deflection.publish(self._tip.at(stamp, depth, deflection))
+        self._tip_deflection.publish(self._tip.at(stamp, 0.0, depth, deflection))
 
     def _show_needle(self, sample: Sample, stamp: int) -> None:
         state = sample.state.tolist()

@@ -222,7 +222,7 @@ def test_a_load_beyond_the_limits_latches_a_stop(ros_graph, topic, size, why):
 
 
 def test_a_killed_controller_leaves_the_needle_at_rest(ros_graph):
-    """The plant lets go after command_timeout; a new controller takes over."""
+    """The plant lets go after command_timeout; a successor has to wait for the lease."""
     probe = ros_graph.node('probe')
     truth = ros_graph.latest(probe, JointState, 'ground_truth', SENSOR)
     targets = probe.create_publisher(PointStamped, 'target', COMMAND)
@@ -241,13 +241,9 @@ def test_a_killed_controller_leaves_the_needle_at_rest(ros_graph):
     ros_graph.spin_until(lambda: truth.message.velocity[0] == 0.0, 'rest')
     assert plant.diagnose()[2]['commands refused'] == 0
     ros_graph.start('controller', parameters)
-    # The dead one commands, as far as the plant knows, until its lease of 20 s has ended.
+    # The dead one commands, as far as others know, until its lease of 20 s has ended.
     ros_graph.spin_until(lambda: 'nodes command' in plant.diagnose()[1], 'the successor')
     assert truth.message.velocity[0] == 0.0
-    ros_graph.spin_until(
-        lambda: 'nodes command' not in plant.diagnose()[1], 'the lease', timeout=60.0
-    )
-    ros_graph.spin_until(moves, 'motion')
 
 
 def test_a_killed_plant_is_waited_for(ros_graph):
