@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+import gc
 import os
 from pathlib import Path
 import signal
@@ -186,6 +187,12 @@ class Graph:
                 node.destroy_node()
             self.executor.shutdown()
             self.context.try_shutdown()
+            self._nodes.clear()
+            self._life_cycles.clear()
+            del self.executor
+            # rclpy's nodes are in cycles; until these are gone DDS keeps them in the domain, where
+            # the next graph would find them.
+            gc.collect()
             # Who is killed leaves its shared memory behind.
             for started in self._processes:
                 if started.process.poll() is None:

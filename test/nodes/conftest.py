@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+import gc
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +36,12 @@ class RosGraph(Graph):
         received: list[Any] = []
         node.create_subscription(kind, topic, received.append, qos)
         return received
+
+
+@pytest.fixture(scope='session', autouse=True)
+def quick_collection() -> None:
+    """Keep what was imported out of the collections at the end of each graph."""
+    gc.freeze()
 
 
 @pytest.fixture(autouse=True)
