@@ -28,7 +28,6 @@ from needle_controller.reference import ReferenceLimits, REFERENCES
 from needle_controller.safety import (
     BY_HAND,
     DROPPED,
-    NANOSECONDS,
     read_encoders,
     REPEATED,
     Safety,
@@ -44,6 +43,7 @@ from needle_dynamics import (
 )
 from needle_dynamics.base_node import COMMAND, NeedleNode, Packed, run, SENSOR
 from needle_dynamics.plant import joint_values
+from needle_dynamics.timing import NANOSECONDS, nanoseconds, seconds
 import numpy as np
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.clock import Clock
@@ -72,10 +72,6 @@ _GAINS: dict[str, dict[str, InverseDynamicsGains | PidGains]] = {
 
 #: Sources of what is known of the bending.
 FEEDBACKS = ('observer', 'ground_truth', 'none')
-
-
-def _stamp(header: Header) -> int:
-    return int(header.stamp.sec) * NANOSECONDS + int(header.stamp.nanosec)
 
 
 class ControllerNode(NeedleNode):
@@ -333,7 +329,9 @@ class ControllerNode(NeedleNode):
         if self._controller is None or not self.is_active:
             self._refuse(f'{name} refused: the controller is not active')
             return False
-        refusal = self._safety.streams[name].check(_stamp(header), self._now(), header.frame_id)
+        refusal = self._safety.streams[name].check(
+            nanoseconds(header.stamp), self._now(), header.frame_id
+        )
         if refusal is not None and refusal.kind not in (REPEATED, DROPPED):
             self._refuse(f'{name} refused: {refusal.line}')
         return refusal is None
@@ -341,7 +339,7 @@ class ControllerNode(NeedleNode):
     def _counts(self, name: str, header: Header, values: Sequence[float]) -> bool:
         """Return whether a reading of a sensor counts; say once a second why if it does not."""
         refusal = self._safety.streams[name].check(
-            _stamp(header), self._now(), header.frame_id, values
+            nanoseconds(header.stamp), self._now(), header.frame_id, values
         )
         if refusal is not None and refusal.kind not in (REPEATED, DROPPED):
             self._warn(f'{name} {refusal.kind}', f'{refusal.line}; not taken in')
@@ -372,10 +370,7 @@ class ControllerNode(NeedleNode):
         if self._controller is None or not self._takes('joint_trajectory', message.header):
             return
         points, names = message.points, message.joint_names
-        times = [
-            point.time_from_start.sec + point.time_from_start.nanosec / NANOSECONDS
-            for point in points
-        ]
+        times = [seconds(point.time_from_start) for point in points]
         try:
             positions, speeds = (
                 [value for value in joint_values('insertion', names, values) if value is not None]
@@ -394,7 +389,7 @@ class ControllerNode(NeedleNode):
             return
         self._stop_for(self._safety.guard.tip(deflection))
         if self._observer is not None:
-            self._observer.add_tip(_stamp(message.header) / NANOSECONDS, deflection)
+            self._observer.add_tip(nanoseconds(message.header.stamp) / NANOSECONDS, deflection)
 
     def _on_wrench(self, message: WrenchStamped) -> None:
         force, moment = message.wrench.force, message.wrench.torque.x
@@ -405,7 +400,7 @@ class ControllerNode(NeedleNode):
         self._stop_for(self._safety.guard.wrench(force.y, force.z, moment))
         if self._observer is None:
             return
-        stamp = _stamp(message.header)
+        stamp = nanoseconds(message.header.stamp)
         # The sensor also feels the torque that turns the base.
         moment -= self._last[1]
         if stamp > self._safety.streams['joint_states'].last:
@@ -431,7 +426,7 @@ class ControllerNode(NeedleNode):
         self._load = load
         if not self._is_modal:
             return
-        stamp = _stamp(message.header)
+        stamp = nanoseconds(message.header.stamp)
         bend = np.array(message.position[2:]), np.array(message.velocity[2:])
         self._truth = stamp, bend
         pending, self._pending = self._pending, None
@@ -458,7 +453,7 @@ class ControllerNode(NeedleNode):
         """Answer a measurement at once, a repeated one as before, one that is late not at all."""
         if not self.is_active or self._controller is None:
             return
-        stamp, now = _stamp(message.header), self._now()
+        stamp, now = nanoseconds(message.header.stamp), self._now()
         refusal = self._safety.streams['joint_states'].check(stamp, now)
         if refusal is not None:
             if refusal.kind == REPEATED:

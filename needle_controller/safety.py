@@ -17,8 +17,7 @@ from typing import Final, NamedTuple
 from needle_controller.controller import ControllerSettings, Measurement
 from needle_dynamics import NeedleParameters, ParameterError
 from needle_dynamics.parameters import check_constants, constant
-
-NANOSECONDS: Final = 1_000_000_000
+from needle_dynamics.timing import NANOSECONDS, Window
 
 #: What happens to messages that do not count but do no harm either: nobody is told.
 REPEATED: Final = 'repeated'
@@ -96,40 +95,6 @@ class SafetyLimits:
             raise ParameterError(
                 f'sensors_required must be true or false, got {self.sensors_required!r}'
             )
-
-
-class Window:
-    """How many per second, and which share of them was marked, over the last full second."""
-
-    def __init__(self) -> None:
-        self._start: int | None = None
-        self._count = self._marked = 0
-        self._rate = self._share = 0.0
-
-    def add(self, now: int, marked: bool = False) -> None:
-        """Count one at a time [ns]."""
-        self._roll(now)
-        self._count += 1
-        self._marked += marked
-
-    def _roll(self, now: int) -> None:
-        elapsed = now - self._start if self._start is not None else -1
-        if 0 <= elapsed < NANOSECONDS:
-            return
-        if elapsed > 0:
-            self._rate = self._count * NANOSECONDS / elapsed
-            self._share = self._marked / self._count if self._count else 0.0
-        self._start, self._count, self._marked = now, 0, 0
-
-    def rate(self, now: int) -> float:
-        """Return the rate [Hz] of the last full second before a time [ns]."""
-        self._roll(now)
-        return self._rate
-
-    def share(self, now: int) -> float:
-        """Return the marked part of the last full second before a time [ns]."""
-        self._roll(now)
-        return self._share
 
 
 class Refusal(NamedTuple):

@@ -25,6 +25,7 @@ from typing import Any, ClassVar, TypeVar
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from needle_dynamics.errors import NeedleError, ParameterError
 from needle_dynamics.parameters import as_number, NeedleParameters, PRESETS, unknown_name
+from needle_dynamics.timing import NANOSECONDS
 from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor, SetParametersResult
 import rclpy
 from rclpy.clock import Clock
@@ -136,32 +137,10 @@ class Packed:
     def at(self, stamp: int, *numbers: float) -> bytes:
         """Return the message with a stamp [ns] and numbers, in the order of its fields."""
         parts = self._parts
-        parts[1], parts[2] = divmod(stamp, 1_000_000_000)
+        parts[1], parts[2] = divmod(stamp, NANOSECONDS)
         for place, own in self._blocks:
             parts[place] = numbers[own]
         return self._pack(*parts)
-
-
-class Meter:
-    """How often something happens: events per second, over the last second or more."""
-
-    def __init__(self) -> None:
-        self._since = time.monotonic()
-        self._events = 0
-        self._rate = 0.0
-
-    def count(self) -> None:
-        """Take note of an event."""
-        self._events += 1
-
-    @property
-    def rate(self) -> float:
-        """Events per second [Hz]."""
-        elapsed = time.monotonic() - self._since
-        if elapsed >= 1.0:
-            self._rate = self._events / elapsed
-            self._since, self._events = time.monotonic(), 0
-        return self._rate
 
 
 class NeedleNode(LifecycleNode):

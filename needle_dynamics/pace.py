@@ -6,8 +6,7 @@ from math import ceil
 from typing import Final
 
 from needle_dynamics.errors import JobError
-
-NANOSECONDS: Final = 1_000_000_000
+from needle_dynamics.timing import NANOSECONDS
 
 #: Time between looks that is short enough for whoever listens [s].
 _TICK: Final = 1e-3

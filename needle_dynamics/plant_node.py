@@ -6,29 +6,23 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from math import cos, sin
 import sys
+from time import monotonic_ns
 from typing import Any
 
 from builtin_interfaces.msg import Time as TimeMessage
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import Point, PointStamped, Pose, PoseArray, PoseStamped, WrenchStamped
-from needle_dynamics.base_node import COMMAND, Meter, NeedleNode, Packed, run, SENSOR
+from needle_dynamics.assembly import assemble, MODES
+from needle_dynamics.base_node import COMMAND, NeedleNode, Packed, run, SENSOR
 from needle_dynamics.errors import JobError, NeedleError, ParameterError
 from needle_dynamics.faults import Fault, FaultParameters, FAULTS
-from needle_dynamics.force_sensor import ForceSensor, ForceSensorParameters, HIGHEST_RATE
+from needle_dynamics.force_sensor import ForceSensorParameters, HIGHEST_RATE
 from needle_dynamics.indenter import Indenter, IndenterParameters, Press
-from needle_dynamics.integrators import Integrator
 from needle_dynamics.kernels import FloatArray
-from needle_dynamics.model import NeedleModel
-from needle_dynamics.pace import NANOSECONDS, Pace
+from needle_dynamics.pace import Pace
 from needle_dynamics.parameters import check_constants, constant
-from needle_dynamics.plant import (
-    BaseMotion,
-    BaseParameters,
-    Plant,
-    Sample,
-    TipParameters,
-    TipSensor,
-)
+from needle_dynamics.plant import BaseParameters, Plant, Sample, TipParameters
+from needle_dynamics.timing import NANOSECONDS, nanoseconds, seconds, Window
 import numpy as np
 from rcl_interfaces.msg import IntegerRange, ParameterDescriptor
 from rclpy.clock import Clock as NodeClock
@@ -41,9 +35,6 @@ from std_msgs.msg import Header
 from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import JointTrajectory
 from visualization_msgs.msg import Marker
-
-#: What the node stands in for.
-MODES = ('simulation', 'robot', 'indenter')
 
 #: As rclpy listens to it.
 CLOCK = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -181,7 +172,8 @@ class PlantNode(NeedleNode):
         self._looks = 0
         self._sampled = self._made_up = 0
         self._saturated = 0
-        self._commands, self._samples = Meter(), Meter()
+        #: By a steady clock.
+        self._commands, self._samples = Window(), Window()
         #: Commands not taken: not valid, of too long ago, older than one that came before.
         self._refused = self._stale = self._overtaken = 0
 
@@ -255,33 +247,28 @@ class PlantNode(NeedleNode):
             self._clock_topic = self.create_publisher(Clock, '/clock', CLOCK)
 
     def _make_plant(self) -> Plant | Indenter:
-        settings, seed = self._settings, self.get_parameter('seed').value
-        mode = self.text('mode', MODES)
-        sensed = self.settings('sensor.', ForceSensorParameters)
-        sensor = ForceSensor(sensed, settings.rate, seed)
-        limits = sensed.per_axis('range').tolist()
+        settings, sensor = self._settings, self.settings('sensor.', ForceSensorParameters)
+        limits = sensor.per_axis('range').tolist()
         # Rounding to counts may leave a saturated reading just below.
         self._full_scale = [limit * (1.0 - 1e-9) for limit in limits]
-        base = self.settings('base.', BaseParameters)
-        tip = TipSensor(self.settings('tip.', TipParameters), settings.rate, seed)
-        tissue = self.settings('indenter.', IndenterParameters)
-        parameters = self.model_parameters()
-        if mode == 'indenter':
-            return Indenter(tissue, sensor, settings.rate, seed, settings.force_limit)
-        model = NeedleModel(parameters)
-        self._names = names = list(model.coordinate_names)
-        self._truth = Packed('', names=names, counts=(len(names), len(names), 0))
-        state = model.state_at(settings.depth, settings.tip_deflection)
-        reach = parameters.minimum_depth, parameters.length
-        return Plant(
-            Integrator(parameters, state, settings.step),
-            sensor,
-            settings.rate,
-            BaseMotion(base, settings.depth, reach, settings.force_limit)
-            if mode == 'robot'
-            else None,
-            tip,
+        plant = assemble(
+            self.text('mode', MODES),
+            rate=settings.rate,
+            seed=self.get_parameter('seed').value,
+            step=settings.step,
+            depth=settings.depth,
+            tip_deflection=settings.tip_deflection,
+            force_limit=settings.force_limit,
+            model=self.model_parameters(),
+            sensor=sensor,
+            tip=self.settings('tip.', TipParameters),
+            base=self.settings('base.', BaseParameters),
+            indenter=self.settings('indenter.', IndenterParameters),
         )
+        if isinstance(plant, Plant):
+            self._names = names = plant.integrator.model.coordinate_names
+            self._truth = Packed('', names=names, counts=(len(names), len(names), 0))
+        return plant
 
     def cleanup(self) -> None:
         """Forget the plant."""
@@ -337,9 +324,9 @@ class PlantNode(NeedleNode):
         """Return the time from which a command counts [ns]; None if it is not taken."""
         if not self.is_active:
             return None
-        self._commands.count()
+        self._commands.add(monotonic_ns())
         now = self._pace.simulated(self._now())
-        stamp = int(header.stamp.sec) * NANOSECONDS + int(header.stamp.nanosec)
+        stamp = nanoseconds(header.stamp)
         # Who has no clock leaves the stamp empty: it counts from now.
         stamp = stamp or now
         timeout = self._settings.command_timeout
@@ -430,10 +417,7 @@ class PlantNode(NeedleNode):
                 raise ParameterError('the plant is not configured')
             self._plant.follow(
                 message.joint_names,
-                [
-                    point.time_from_start.sec + point.time_from_start.nanosec / NANOSECONDS
-                    for point in points
-                ],
+                [seconds(point.time_from_start) for point in points],
                 [point.positions for point in points],
                 [point.effort for point in points],
             )
@@ -532,7 +516,7 @@ class PlantNode(NeedleNode):
             self.report_change()
             return
         self._sampled += 1
-        self._samples.count()
+        self._samples.add(monotonic_ns())
         reading = sample.wrench.tolist()
         for value, limit in zip(reading, self._full_scale, strict=True):
             if abs(value) >= limit:
@@ -624,7 +608,8 @@ class PlantNode(NeedleNode):
         if self._plant is None:
             return super().diagnose()
         pace, rate = self._pace, self._settings.rate
-        samples, commands = self._samples.rate, self._commands.rate
+        now = monotonic_ns()
+        samples, commands = self._samples.rate(now), self._commands.rate(now)
         values: dict[str, object] = {
             **self._plant.report,
             'real-time factor': f'{samples / rate:.3f}',

@@ -14,6 +14,7 @@ from geometry_msgs.msg import WrenchStamped
 from needle_dynamics.base_node import LATCHED, NeedleNode, run, SENSOR
 from needle_dynamics.errors import NeedleError, ParameterError
 from needle_dynamics.parameters import check_constants, constant
+from needle_dynamics.timing import nanoseconds
 from needle_identification.bag_io import check_distinct
 from needle_identification.estimate import Statistic, statistic
 from needle_identification.friction import (
@@ -58,7 +59,6 @@ _IDENTIFY: Final[Mapping[str, Callable[[Any, Any], Any]]] = {
 }
 _AXES: Final = ('x', 'y', 'z')
 _COEFFICIENTS: Final = ('model.coulomb_friction', 'model.viscous_friction')
-_NANOSECONDS: Final = 1_000_000_000
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -275,12 +275,12 @@ class IdentificationNode(NeedleNode):
         at, sign = list(message.name).index(self._joint), self._joint_sign
         if len(message.position) > at:
             speed = sign * message.velocity[at] if len(message.velocity) > at else None
-            live.take_motion(_stamp(message), sign * message.position[at], speed)
+            live.take_motion(nanoseconds(message.header.stamp), sign * message.position[at], speed)
 
     def _on_force(self, message: WrenchStamped) -> None:
         if self._live is not None:
             force = getattr(message.wrench.force, self._force_axis)
-            self._live.take_force(_stamp(message), self._force_sign * force)
+            self._live.take_force(nanoseconds(message.header.stamp), self._force_sign * force)
 
     def _live_statistics(self) -> list[Statistic]:
         estimates = () if self._live is None else self._live.estimate()
@@ -403,11 +403,6 @@ def _paths(names: Sequence[str]) -> list[Path]:
 
 def _signed(axis: str) -> tuple[float, str]:
     return (-1.0, axis[1:]) if axis.startswith('-') else (1.0, axis)
-
-
-def _stamp(message: Any) -> int:
-    stamp = message.header.stamp
-    return int(stamp.sec * _NANOSECONDS + stamp.nanosec)
 
 
 def _brief(value: float | str) -> str:

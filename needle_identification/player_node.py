@@ -16,6 +16,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from needle_dynamics.base_node import NeedleNode, run
 from needle_dynamics.errors import NeedleError, ParameterError
 from needle_dynamics.parameters import as_number, check_constants, constant
+from needle_dynamics.timing import NANOSECONDS
 from needle_identification.bag_io import Bag, Recorded
 from needle_identification.errors import RecordingError
 from needle_identification.recorder_node import is_hidden, message_class
@@ -47,8 +48,6 @@ _LATE: Final = 0.1
 
 #: Time that readers have to take in the last messages [s].
 _FAREWELL: Final = 2.0
-
-_NANOSECONDS: Final = 1_000_000_000
 
 #: As rclpy listens to it.
 _CLOCK: Final = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -230,18 +229,18 @@ class PlayerNode(NeedleNode):
         if self._paused or self._ended or self._settings.rate == 0.0:
             return self._now
         elapsed = max(0.0, time.monotonic() - self._then)
-        return self._now + round(elapsed * self._settings.rate * _NANOSECONDS)
+        return self._now + round(elapsed * self._settings.rate * NANOSECONDS)
 
     def _seconds(self, position: int) -> float:
-        return (position - self._origin) / _NANOSECONDS
+        return (position - self._origin) / NANOSECONDS
 
     # Messages.
 
     def _rewind(self) -> None:
         """Go to the start: gather what was latched before, and have the first message ready."""
         settings = self._settings
-        self._begin = self._origin + round(settings.start * _NANOSECONDS)
-        self._stop = self._origin + round(settings.end * _NANOSECONDS) if settings.end else None
+        self._begin = self._origin + round(settings.start * NANOSECONDS)
+        self._stop = self._origin + round(settings.end * NANOSECONDS) if settings.end else None
         self._before: dict[str, deque[Recorded]] = {}
         messages = self._bag.messages(lambda topic: topic.name in self._wanted)
         last = self._origin
@@ -292,7 +291,7 @@ class PlayerNode(NeedleNode):
                 if late < 0:
                     self._show_time(self._position())
                     return
-                self._late = late / rate / _NANOSECONDS
+                self._late = late / rate / NANOSECONDS
                 self._latest = max(self._latest, self._late)
             self._publish(self._next)
             if time.monotonic() > enough:
@@ -341,7 +340,7 @@ class PlayerNode(NeedleNode):
         if self._clock_topic is None or position - self._clocked < least:
             return
         self._clocked = position
-        sec, nanosec = divmod(position, _NANOSECONDS)
+        sec, nanosec = divmod(position, NANOSECONDS)
         self._clock_topic.publish(ClockMessage(clock=Time(sec=sec, nanosec=nanosec)))
 
     # Services.

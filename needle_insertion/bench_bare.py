@@ -7,6 +7,7 @@ so that neither its memory nor its garbage weighs on them.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 import ctypes
 import signal
 import sys
@@ -95,7 +96,7 @@ class Sender:
         return left
 
 
-class Clocked(Node):
+class Clocked(Node, ABC):
     """Does something at every period while ``run`` says so; what is missed is made up."""
 
     def __init__(self, name: str, **options: Any) -> None:
@@ -117,9 +118,9 @@ class Clocked(Node):
             self._done += 1
             self.sample(self._start + self._done * PERIOD)
 
+    @abstractmethod
     def sample(self, stamp: int) -> None:
         """Do what is due at a time [ns]."""
-        raise NotImplementedError
 
 
 class BarePlant(Clocked):

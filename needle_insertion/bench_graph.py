@@ -30,6 +30,7 @@ from typing import Any, Final, TypeAlias
 
 from geometry_msgs.msg import PointStamped, WrenchStamped
 from needle_dynamics.base_node import COMMAND, LATCHED, SENSOR
+from needle_dynamics.timing import nanoseconds
 from needle_identification.bag_io import Bag
 from needle_insertion import bench
 from needle_insertion.bench_bare import PERIOD, RATE, Sender, STREAMS
@@ -101,11 +102,6 @@ def cpu_seconds(process: int) -> float:
 def resident_memory(process: int) -> int:
     """Return the memory of a process that is in RAM [bytes]."""
     return int(Path(f'/proc/{process}/statm').read_text('ascii').split()[1]) * _PAGE
-
-
-def stamp_of(message: Any) -> int:
-    """Return the stamp of a message [ns]."""
-    return int(message.header.stamp.sec) * 1_000_000_000 + int(message.header.stamp.nanosec)
 
 
 class Camp:
@@ -215,7 +211,7 @@ class Camp:
         seen: dict[str, list[tuple[int, int]]] = {topic: [] for topic in topics}
 
         def note(rows: list[tuple[int, int]], message: Any) -> None:
-            rows.append((time.time_ns(), stamp_of(message)))
+            rows.append((time.time_ns(), nanoseconds(message.header.stamp)))
 
         subscriptions = [
             self.node.create_subscription(kind, topic, partial(note, seen[topic]), qos)

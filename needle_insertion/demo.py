@@ -14,6 +14,7 @@ from geometry_msgs.msg import PointStamped
 from matplotlib.figure import Figure
 from needle_dynamics import FloatArray, NeedleError
 from needle_dynamics.base_node import COMMAND, SENSOR
+from needle_dynamics.timing import seconds
 from needle_identification import (
     FrictionEstimate,
     identify_friction,
@@ -297,10 +298,7 @@ def read_insertion(law: str, bag: Path) -> Insertion:
     """
 
     def series(topic: str, value: Callable[[Any], float]) -> FloatArray:
-        pairs = [
-            (m.header.stamp.sec + 1e-9 * m.header.stamp.nanosec, value(m))
-            for _, m in read_topic(bag, f'/{topic}')
-        ]
+        pairs = [(seconds(m.header.stamp), value(m)) for _, m in read_topic(bag, f'/{topic}')]
         return np.array(pairs).T
 
     curves = {

@@ -13,6 +13,7 @@ from typing import Any
 from geometry_msgs.msg import WrenchStamped
 from needle_dynamics import JobError, ParameterError
 from needle_dynamics.base_node import COMMAND, SENSOR
+from needle_dynamics.timing import seconds
 from needle_identification import message_counts, read_topic, RecordingError
 from needle_insertion.graph import ACTIVATE, CLEANUP, CONFIGURE, DEACTIVATE, Graph
 from needle_insertion.protocol import Campaign, FASTEST, Protocol, PROTOCOLS, SPEED
@@ -223,10 +224,10 @@ class Rig:
         self._wrench.message = None
         graph.change(node, 'plant', ACTIVATE)
         graph.spin_until(lambda: self._wrench.message, 'base_wrench')
-        start = _seconds(self._wrench.message)
+        start = seconds(self._wrench.message.header.stamp)
 
         def done() -> bool:
-            elapsed = _seconds(self._wrench.message) - start
+            elapsed = seconds(self._wrench.message.header.stamp) - start
             progress(min(elapsed / protocol.duration, 1.0))
             return elapsed > protocol.duration
 
@@ -261,10 +262,6 @@ def _trajectory(protocol: Protocol) -> JointTrajectory:
     return JointTrajectory(joint_names=protocol.joints, points=points)
 
 
-def _seconds(message: Any) -> float:
-    return float(message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec)
-
-
 def _lost(bag: Path, protocol: Protocol, rate: float) -> str:
     """Say what a recorded run lacks, '' if it is whole."""
     counts = message_counts(bag)
@@ -272,7 +269,7 @@ def _lost(bag: Path, protocol: Protocol, rate: float) -> str:
         if not counts.get(topic):
             return f'{topic} has no messages'
     for topic in protocol.sampled:
-        stamps = np.array([_seconds(message) for _, message in read_topic(bag, topic)])
+        stamps = np.array([seconds(message.header.stamp) for _, message in read_topic(bag, topic)])
         span = float(stamps.max() - stamps.min())
         if span < protocol.duration - 1.5 / rate:
             return f'{topic} lasts {span:.2f} s of {protocol.duration:.2f} s'

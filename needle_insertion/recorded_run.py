@@ -12,25 +12,22 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from needle_dynamics import (
-    ForceSensor,
     ForceSensorParameters,
-    Integrator,
     NeedleError,
-    NeedleModel,
     NeedleParameters,
     PRESETS,
 )
+from needle_dynamics.assembly import assemble
 from needle_dynamics.indenter import Indenter, IndenterParameters
 from needle_dynamics.kernels import FloatArray
 from needle_dynamics.parameters import as_number
-from needle_dynamics.plant import BaseMotion, BaseParameters, Plant, TipParameters, TipSensor
+from needle_dynamics.plant import BaseParameters, Plant, TipParameters
+from needle_dynamics.timing import NANOSECONDS, nanoseconds
 from needle_identification import RecordingError
 from needle_identification.bag_io import Bag, deserialize
 from needle_identification.storage import Topic
 import numpy as np
 import yaml
-
-NANOSECONDS: Final = 1_000_000_000
 
 #: The numbers of a message.
 Values = tuple[float, ...]
@@ -158,7 +155,7 @@ def _foreign(values: Mapping[str, Any]) -> list[str]:
 
 def plant_from(values: Mapping[str, Any]) -> Plant | Indenter:
     """
-    Make a plant as the node does.
+    Make the plant that parameters describe.
 
     Parameters
     ----------
@@ -173,28 +170,20 @@ def plant_from(values: Mapping[str, Any]) -> Plant | Indenter:
         If one is missing.
 
     """
-    rate, seed, mode = float(values['rate']), values['seed'], values['mode']
-    sensor = ForceSensor(settings('sensor.', values), rate, seed)
-    limit = float(values['force_limit'])
-    if mode == 'indenter':
-        return Indenter(settings('indenter.', values), sensor, rate, seed, limit)
-    parameters = settings('model.', values)
-    depth = float(values['depth'])
-    state = NeedleModel(parameters).state_at(depth, float(values['tip_deflection']))
-    reach = parameters.minimum_depth, parameters.length
-    base = BaseMotion(settings('base.', values), depth, reach, limit)
-    return Plant(
-        Integrator(parameters, state, float(values['step'])),
-        sensor,
-        rate,
-        base if mode == 'robot' else None,
-        TipSensor(settings('tip.', values), rate, seed),
+    return assemble(
+        values['mode'],
+        rate=float(values['rate']),
+        seed=values['seed'],
+        step=float(values['step']),
+        depth=float(values['depth']),
+        tip_deflection=float(values['tip_deflection']),
+        force_limit=float(values['force_limit']),
+        model=settings('model.', values),
+        sensor=settings('sensor.', values),
+        tip=settings('tip.', values),
+        base=settings('base.', values),
+        indenter=settings('indenter.', values),
     )
-
-
-def nanoseconds(stamp: Any) -> int:
-    """Return a time or duration of a message [ns]."""
-    return int(stamp.sec * NANOSECONDS + stamp.nanosec)
 
 
 def _vector(vector: Any) -> Values:

@@ -20,11 +20,11 @@ from needle_dynamics import ForceSensor, NeedleError, NeedleModel, ParameterErro
 from needle_dynamics.indenter import Indenter, Press
 from needle_dynamics.kernels import FloatArray
 from needle_dynamics.plant import Plant, Sample, TipReading
+from needle_dynamics.timing import NANOSECONDS, seconds
 from needle_insertion.recorded_run import (
     Command,
     Entry,
     Event,
-    NANOSECONDS,
     plant_from,
     Quantity,
     RecordedRun,
@@ -280,10 +280,7 @@ class Rerun:
                 plant.follow(
                     event.content.joint_names,
                     # As the node has it, to the last bit.
-                    [
-                        point.time_from_start.sec + point.time_from_start.nanosec / NANOSECONDS
-                        for point in points
-                    ],
+                    [seconds(point.time_from_start) for point in points],
                     [point.positions.tolist() for point in points],
                     [point.effort.tolist() for point in points],
                 )

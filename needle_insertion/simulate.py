@@ -19,12 +19,11 @@ from needle_dynamics import (
     Trajectory,
 )
 from needle_dynamics.integrators import DEFAULT_TOLERANCE
+from needle_dynamics.timing import NANOSECONDS
 from needle_identification import BagWriter, encode, message_type
 from needle_insertion.options import constants
 from needle_insertion.report import png, table, write_whole
 import numpy as np
-
-_NANOSECONDS = 1_000_000_000
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -150,8 +149,8 @@ def _write_bag(trajectory: Trajectory, path: Path) -> None:
         tips = trajectory.tip_deflection
         forces = np.append(trajectory.forces, trajectory.forces[-1])
         for k, state in enumerate(trajectory.states):
-            ns = round(trajectory.time[k] * _NANOSECONDS)
-            at = stamp(sec=ns // _NANOSECONDS, nanosec=ns % _NANOSECONDS)
+            ns = round(trajectory.time[k] * NANOSECONDS)
+            at = stamp(sec=ns // NANOSECONDS, nanosec=ns % NANOSECONDS)
             depth = trajectory.depth[k]
             messages = {
                 '/joint_states': joint(

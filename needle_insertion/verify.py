@@ -12,7 +12,8 @@ import sys
 from typing import Any, Final
 
 from needle_dynamics import ParameterError
-from needle_insertion.recorded_run import configurations, NANOSECONDS, RecordedRun
+from needle_dynamics.timing import NANOSECONDS
+from needle_insertion.recorded_run import configurations, RecordedRun
 from needle_insertion.report import table
 from needle_insertion.rerun import Rerun, Tally
 from tqdm import tqdm

@@ -10,8 +10,9 @@ from needle_controller import (
     SafetyLimits,
     Stream,
 )
-from needle_controller.safety import read_encoders, Window
+from needle_controller.safety import read_encoders
 from needle_dynamics import NeedleParameters, ParameterError
+from needle_dynamics.timing import Window
 import numpy as np
 import pytest
 

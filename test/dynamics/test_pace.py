@@ -5,7 +5,8 @@ from itertools import pairwise
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from needle_dynamics.errors import JobError
-from needle_dynamics.pace import NANOSECONDS, Pace
+from needle_dynamics.pace import Pace
+from needle_dynamics.timing import NANOSECONDS
 import pytest
 
 #: A clock is never at zero.

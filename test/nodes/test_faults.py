@@ -190,13 +190,7 @@ def test_encoders_that_lie_end_the_motion(ros_graph, kind, values, why):
     loop.aim(0.1)
     loop.moves()
     loop.break_down(kind, 'joint_states', **values)
-    said = []
-
-    def tells():
-        said.append(str(loop.controller.diagnose()))
-        return why in said[-1]
-
-    loop.until(tells, why)
+    loop.until(lambda: why in str(loop.controller.diagnose()), why)
     loop.until(lambda: loop.speed == 0.0, 'rest')
 
 
