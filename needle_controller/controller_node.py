@@ -41,7 +41,8 @@ from needle_dynamics import (
     NeedleParameters,
     ParameterError,
 )
-from needle_dynamics.base_node import COMMAND, NeedleNode, Packed, run, SENSOR
+from needle_dynamics.base_node import COMMAND, NeedleNode, run, SENSOR
+from needle_dynamics.packed import Packed, Reading
 from needle_dynamics.plant import joint_values
 from needle_dynamics.timing import NANOSECONDS, nanoseconds, seconds
 import numpy as np
@@ -165,11 +166,11 @@ class ControllerNode(NeedleNode):
         self._generalized_command = publisher(JointState, 'generalized_command', COMMAND)
         self._reference = publisher(JointState, 'reference', SENSOR)
         self._tracking_error = publisher(JointState, 'tracking_error', SENSOR)
-        self.create_subscription(JointState, 'joint_states', self._on_joint_states, SENSOR)
+        self.listen(JointState, 'joint_states', SENSOR, self._on_joint_states)
         self.create_subscription(PointStamped, 'target', self._on_target, COMMAND)
         self.create_subscription(JointTrajectory, 'joint_trajectory', self._on_trajectory, COMMAND)
-        self.create_subscription(WrenchStamped, 'base_wrench', self._on_wrench, SENSOR)
-        self.create_subscription(PointStamped, 'tip_deflection', self._on_tip, SENSOR)
+        self.listen(WrenchStamped, 'base_wrench', SENSOR, self._on_wrench)
+        self.listen(PointStamped, 'tip_deflection', SENSOR, self._on_tip)
         self.create_service(Trigger, '~/emergency_stop', self._on_emergency_stop)
         self.create_service(Trigger, '~/clear_stop', self._on_clear_stop)
         self.create_service(SetBool, '~/pause', self._on_pause)
@@ -211,9 +212,7 @@ class ControllerNode(NeedleNode):
         self._take_model(parameters)
         noise: dict[str, tuple[float, ...]] = {}
         if feedback == 'ground_truth':
-            self._truths = self.create_subscription(
-                JointState, 'ground_truth', self._on_ground_truth, SENSOR
-            )
+            self._truths = self.listen(JointState, 'ground_truth', SENSOR, self._on_ground_truth)
         elif feedback == 'observer':
             observed = self.settings('observer.', ObserverSettings)
             try:
@@ -293,7 +292,7 @@ class ControllerNode(NeedleNode):
 
     def _begin(self) -> None:
         """Know nothing of what was measured."""
-        self._safety.begin(self.get_clock().now().nanoseconds)
+        self._safety.begin(self.now())
         self._load, self._truth = 0.0, None
         self._pending = self._wrench_now = None
         if self._observer is not None:
@@ -301,7 +300,7 @@ class ControllerNode(NeedleNode):
 
     def _now(self) -> int:
         """Return the time [ns]; let go and know nothing if it was set back."""
-        now = self.get_clock().now().nanoseconds
+        now = self.now()
         back = self._safety.clock_went_back(now)
         if back:
             self._begin()
@@ -336,10 +335,10 @@ class ControllerNode(NeedleNode):
             self._refuse(f'{name} refused: {refusal.line}')
         return refusal is None
 
-    def _counts(self, name: str, header: Header, values: Sequence[float]) -> bool:
+    def _counts(self, name: str, reading: Reading, values: Sequence[float]) -> bool:
         """Return whether a reading of a sensor counts; say once a second why if it does not."""
         refusal = self._safety.streams[name].check(
-            nanoseconds(header.stamp), self._now(), header.frame_id, values
+            reading.stamp, self._now(), reading.frame, values
         )
         if refusal is not None and refusal.kind not in (REPEATED, DROPPED):
             self._warn(f'{name} {refusal.kind}', f'{refusal.line}; not taken in')
@@ -383,35 +382,36 @@ class ControllerNode(NeedleNode):
         except ParameterError as error:
             self._refuse(f'joint_trajectory refused: {error}')
 
-    def _on_tip(self, message: PointStamped) -> None:
-        deflection = message.point.z
-        if not self.is_active or not self._counts('tip_deflection', message.header, [deflection]):
+    def _on_tip(self, reading: Reading) -> None:
+        _, _, deflection = reading.numbers[0]
+        if not self.is_active or not self._counts('tip_deflection', reading, [deflection]):
             return
         self._stop_for(self._safety.guard.tip(deflection))
         if self._observer is not None:
-            self._observer.add_tip(nanoseconds(message.header.stamp) / NANOSECONDS, deflection)
+            self._observer.add_tip(reading.stamp / NANOSECONDS, deflection)
 
-    def _on_wrench(self, message: WrenchStamped) -> None:
-        force, moment = message.wrench.force, message.wrench.torque.x
+    def _on_wrench(self, reading: Reading) -> None:
+        _, axial, lateral, moment, _, _ = reading.numbers[0]
         if not self.is_active or not self._counts(
-            'base_wrench', message.header, [force.z, moment, force.y]
+            'base_wrench', reading, [lateral, moment, axial]
         ):
             return
-        self._stop_for(self._safety.guard.wrench(force.y, force.z, moment))
+        self._stop_for(self._safety.guard.wrench(axial, lateral, moment))
         if self._observer is None:
             return
-        stamp = nanoseconds(message.header.stamp)
+        stamp = reading.stamp
         # The sensor also feels the torque that turns the base.
         moment -= self._last[1]
         if stamp > self._safety.streams['joint_states'].last:
-            self._wrench_now = stamp, force.z, moment
+            self._wrench_now = stamp, lateral, moment
         else:
-            self._observer.add_wrench(stamp / NANOSECONDS, force.z, moment)
+            self._observer.add_wrench(stamp / NANOSECONDS, lateral, moment)
 
-    def _on_ground_truth(self, message: JointState) -> None:
+    def _on_ground_truth(self, reading: Reading) -> None:
         """Take the load of the bent needle, or all of its bending, from the simulation."""
-        state = [*message.position, *message.velocity]
-        if not self.is_active or not self._counts('ground_truth', message.header, state):
+        positions, speeds, _ = reading.numbers
+        state = [*positions, *speeds]
+        if not self.is_active or not self._counts('ground_truth', reading, state):
             return
         try:
             # What is finite may be too large all the same.
@@ -426,8 +426,7 @@ class ControllerNode(NeedleNode):
         self._load = load
         if not self._is_modal:
             return
-        stamp = nanoseconds(message.header.stamp)
-        bend = np.array(message.position[2:]), np.array(message.velocity[2:])
+        stamp, bend = reading.stamp, (np.array(positions[2:]), np.array(speeds[2:]))
         self._truth = stamp, bend
         pending, self._pending = self._pending, None
         self._waits = 0
@@ -449,11 +448,11 @@ class ControllerNode(NeedleNode):
         except NeedleError as error:
             self._warn('observer', f'observer: {error}')
 
-    def _on_joint_states(self, message: JointState) -> None:
+    def _on_joint_states(self, reading: Reading) -> None:
         """Answer a measurement at once, a repeated one as before, one that is late not at all."""
         if not self.is_active or self._controller is None:
             return
-        stamp, now = nanoseconds(message.header.stamp), self._now()
+        stamp, now = reading.stamp, self._now()
         refusal = self._safety.streams['joint_states'].check(stamp, now)
         if refusal is not None:
             if refusal.kind == REPEATED:
@@ -466,9 +465,8 @@ class ControllerNode(NeedleNode):
         self._late += age > (self._settings.delay + 1.0) / self._settings.rate
         self._oldest = max(self._oldest, age)
         try:
-            measured = read_encoders(
-                stamp / NANOSECONDS, message.name, message.position, message.velocity
-            )
+            positions, speeds, _ = reading.numbers
+            measured = read_encoders(stamp / NANOSECONDS, reading.names, positions, speeds)
         except ParameterError as error:
             self._let_go(str(error), stamp)
             return
@@ -643,7 +641,7 @@ class ControllerNode(NeedleNode):
         stamp: int | None = None,
     ) -> None:
         """Command forces with the stamp of the measurement that they answer, or of now."""
-        at = self.get_clock().now().nanoseconds if stamp is None else stamp
+        at = self.now() if stamp is None else stamp
         if self._is_modal:
             count = self._model.modes.count
             rest = [0.0] * count if modal is None else modal.tolist()
@@ -690,7 +688,7 @@ class ControllerNode(NeedleNode):
         values['oldest measurement answered [s]'] = f'{self._oldest:.4f}'
         values['inputs refused'] = self._refused
         values['last complaint'] = self._refusal or ''
-        now = self.get_clock().now().nanoseconds
+        now = self.now()
         values.update(self._safety.describe(now))
         if self._safety.stop is not None:
             return DiagnosticStatus.ERROR, f'{self._safety.stop}; ~/clear_stop releases', values

@@ -458,19 +458,19 @@ class Integrator:
         return max(part, float(abs(two[0] - one[0])) / model.parameters.length)
 
     def _interval(self, duration: float, felt: FloatArray) -> Interval:
-        sums = self._sums
-        axial, lateral, moment = (felt.sum(axis=0) / len(felt)).tolist()
+        sums = self._sums.tolist()
+        axial, lateral, moment = (np.add.reduce(felt) / len(felt)).tolist()
         return Interval(
-            tip_deflection=float(sums[SUM_TIP] / duration),
+            tip_deflection=sums[SUM_TIP] / duration,
             axial_force=axial,
             lateral_force=lateral,
             moment=moment,
             felt=felt,
-            friction_work=float(sums[SUM_FRICTION_WORK]),
-            damping_work=float(sums[SUM_DAMPING_WORK]),
-            input_work=float(sums[SUM_INPUT_WORK]),
-            impact_loss=float(sums[SUM_IMPACT]),
-            contact_time=float(sums[SUM_CONTACT]) if sums[SUM_CONTACT] >= 0.0 else None,
+            friction_work=sums[SUM_FRICTION_WORK],
+            damping_work=sums[SUM_DAMPING_WORK],
+            input_work=sums[SUM_INPUT_WORK],
+            impact_loss=sums[SUM_IMPACT],
+            contact_time=sums[SUM_CONTACT] if sums[SUM_CONTACT] >= 0.0 else None,
         )
 
 

@@ -13,16 +13,17 @@ from builtin_interfaces.msg import Time as TimeMessage
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import Point, PointStamped, Pose, PoseArray, PoseStamped, WrenchStamped
 from needle_dynamics.assembly import assemble, MODES
-from needle_dynamics.base_node import COMMAND, NeedleNode, Packed, run, SENSOR
+from needle_dynamics.base_node import COMMAND, NeedleNode, run, SENSOR
 from needle_dynamics.errors import JobError, NeedleError, ParameterError
 from needle_dynamics.faults import Fault, FaultParameters, FAULTS
 from needle_dynamics.force_sensor import ForceSensorParameters, HIGHEST_RATE
 from needle_dynamics.indenter import Indenter, IndenterParameters, Press
 from needle_dynamics.kernels import FloatArray
 from needle_dynamics.pace import Pace
+from needle_dynamics.packed import Packed, Reading
 from needle_dynamics.parameters import check_constants, constant
 from needle_dynamics.plant import BaseParameters, Plant, Sample, TipParameters
-from needle_dynamics.timing import NANOSECONDS, nanoseconds, seconds, Window
+from needle_dynamics.timing import NANOSECONDS, seconds, Window
 import numpy as np
 from rcl_interfaces.msg import IntegerRange, ParameterDescriptor
 from rclpy.clock import Clock as NodeClock
@@ -31,7 +32,6 @@ from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Header
 from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import JointTrajectory
 from visualization_msgs.msg import Marker
@@ -186,8 +186,8 @@ class PlantNode(NeedleNode):
         self._needle_shape = publisher(Marker, 'needle_shape', SENSOR)
         self._needle_poses = publisher(PoseArray, 'needle_poses', SENSOR)
         self._clock_topic: Publisher | None = None
-        self.create_subscription(WrenchStamped, 'wrench_command', self._on_command, COMMAND)
-        self.create_subscription(JointState, 'generalized_command', self._on_generalized, COMMAND)
+        self.listen(WrenchStamped, 'wrench_command', COMMAND, self._on_command)
+        self.listen(JointState, 'generalized_command', COMMAND, self._on_generalized)
         self.create_subscription(JointTrajectory, 'joint_trajectory', self._on_trajectory, COMMAND)
         self.create_service(Trigger, '~/tare', self._on_tare)
         self.create_service(SetBool, '~/pause', self._on_pause)
@@ -305,7 +305,7 @@ class PlantNode(NeedleNode):
         pictured = self._settings.rate * max(1.0, self._settings.real_time_factor)
         #: Samples from one picture to the next.
         self._picture = max(1, round(pictured / _PICTURES))
-        self._pace.begin(self._now(), paused=bool(self.get_parameter('paused').value))
+        self._pace.begin(self.now(), paused=bool(self.get_parameter('paused').value))
         self._timer = self.create_timer(self._pace.tick, self._on_timer)
         steady = NodeClock(clock_type=ClockType.STEADY_TIME)
         self._watch = self.create_timer(_WATCH, self._on_watch, clock=steady)
@@ -315,18 +315,14 @@ class PlantNode(NeedleNode):
         self.destroy_timer(self._timer)
         self.destroy_timer(self._watch)
 
-    def _now(self) -> int:
-        return int(self.get_clock().now().nanoseconds)
-
     # Commands.
 
-    def _counts_from(self, header: Header) -> int | None:
+    def _counts_from(self, stamp: int) -> int | None:
         """Return the time from which a command counts [ns]; None if it is not taken."""
         if not self.is_active:
             return None
         self._commands.add(monotonic_ns())
-        now = self._pace.simulated(self._now())
-        stamp = nanoseconds(header.stamp)
+        now = self._pace.simulated(self.now())
         # Who has no clock leaves the stamp empty: it counts from now.
         stamp = stamp or now
         timeout = self._settings.command_timeout
@@ -344,15 +340,14 @@ class PlantNode(NeedleNode):
             return None
         return stamp
 
-    def _on_command(self, message: WrenchStamped) -> None:
-        stamp = self._counts_from(message.header)
+    def _on_command(self, reading: Reading) -> None:
+        stamp = self._counts_from(reading.stamp)
         if stamp is None:
             return
-        force, torque = message.wrench.force.y, message.wrench.torque.x
+        _, force, _, torque, _, _ = reading.numbers[0]
         limits = self._settings.force_limit, self._settings.torque_limit
-        frame = message.header.frame_id
-        if frame not in ('', 'needle_base'):
-            self._refuse(f'wrench_command must be in needle_base, got {frame!r}', stamp)
+        if reading.frame not in ('', 'needle_base'):
+            self._refuse(f'wrench_command must be in needle_base, got {reading.frame!r}', stamp)
         # Written so that NaN is refused too.
         elif abs(force) <= limits[0] and abs(torque) <= limits[1]:
             self._take(_Command(stamp, force, torque))
@@ -363,20 +358,21 @@ class PlantNode(NeedleNode):
                 stamp,
             )
 
-    def _on_generalized(self, message: JointState) -> None:
-        stamp = self._counts_from(message.header)
+    def _on_generalized(self, reading: Reading) -> None:
+        stamp = self._counts_from(reading.stamp)
         if stamp is None or not isinstance(self._plant, Plant):
             return
         settings, names = self._settings, self._names
-        efforts = dict(zip(message.name, message.effort, strict=False))
-        if sorted(message.name) != sorted(names) or len(message.effort) != len(names):
+        _, _, efforts = reading.numbers
+        if sorted(reading.names) != sorted(names) or len(efforts) != len(names):
             self._refuse(
                 f'generalized_command needs an effort for each of {", ".join(names)}, got '
-                f'{list(message.effort)} for {", ".join(message.name) or "none"}',
+                f'{list(efforts)} for {", ".join(reading.names) or "none"}',
                 stamp,
             )
             return
-        forces = [efforts[name] for name in names]
+        by_name = dict(zip(reading.names, efforts, strict=True))
+        forces = [by_name[name] for name in names]
         limits = settings.force_limit, settings.torque_limit, settings.modal_limit
         bounds = [*limits[:2], *limits[2:] * (len(names) - 2)]
         if all(abs(force) <= bound for force, bound in zip(forces, bounds, strict=True)):
@@ -452,14 +448,14 @@ class PlantNode(NeedleNode):
             if request.data:
                 self._pace.pause()
                 return f'paused at {self._pace.stamp / NANOSECONDS:.6f} s'
-            self._pace.resume(self._now())
+            self._pace.resume(self.now())
             return 'time goes on'
 
         return self._answer(response, 'pause', pause)
 
     def _on_step(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         def step() -> str:
-            self._sample(self._pace.step(self._now()))
+            self._sample(self._pace.step(self.now()))
             return f'stepped to {self._pace.stamp / NANOSECONDS:.6f} s'
 
         return self._answer(response, 'step', step)
@@ -478,7 +474,7 @@ class PlantNode(NeedleNode):
 
     def _on_timer(self) -> None:
         """Take every sample that is due, each stamped with its own time."""
-        due = self._pace.due(self._now())
+        due = self._pace.due(self.now())
         self._made_up += max(0, due - 1)
         for _ in range(due):
             self._sample(self._pace.take())

@@ -84,7 +84,7 @@ class Plan:
     """
 
     rounds: int = 5
-    turn: float = 1.5
+    turn: float = 3.0
     recording: float = 10.0
     memory: float = 20.0
 
