@@ -212,14 +212,15 @@ class ForceSensor:
             self._before = first
         if felt.ndim == 1:
             straight(self._before if start is None else start, felt, self._felt)
-            felt = self._felt
+            self._before, felt = felt, self._felt
+        else:
+            self._before = felt[-1]
         reading = np.empty(6)
         sense(
             felt, self._drawn[self._next], self._constants, self._sections, self._memory,
             self._offset, self._zero, reading,
         )  # fmt: skip
         self._next += 1
-        self._before = felt[-1].copy()
         if moving:
             self._resting.clear()
         else:

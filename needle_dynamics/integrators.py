@@ -23,10 +23,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from math import copysign, inf, isfinite, isnan, sqrt
 import os
-from typing import Final
+from typing import Final, NamedTuple
 
 from needle_dynamics.errors import (
     InsertedLengthError,
@@ -108,8 +108,7 @@ def kernel_tables(model: NeedleModel) -> Tables:
     )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Interval:
+class Interval(NamedTuple):
     """
     What a sensor that averages over an interval would have seen of it.
 
@@ -140,7 +139,7 @@ class Interval:
     axial_force: float
     lateral_force: float
     moment: float
-    felt: FloatArray = field(compare=False)
+    felt: FloatArray
     friction_work: float
     damping_work: float
     input_work: float

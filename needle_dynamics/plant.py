@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise, zip_longest
 from math import ceil, copysign, inf, sqrt
 from statistics import fmean
-from typing import Final
+from typing import Final, NamedTuple
 
 from needle_dynamics.errors import JobError, ParameterError
 from needle_dynamics.force_sensor import ForceSensor
@@ -360,8 +360,7 @@ class TipSensor:
         return TipReading(age=self._count - taken, depth=at, deflection=value)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Sample:
+class Sample(NamedTuple):
     """
     What the plant shows at the end of one sample interval.
 
@@ -559,8 +558,7 @@ class Plant:
             force = force if push is None else push
             parts.append(needle.advance_pushed(part, force, limit))
         rise = (parts[-1].axial_force - parts[0].axial_force) * _PUSHES / (_PUSHES - 1)
-        means = replace(
-            parts[-1],
+        means = parts[-1]._replace(
             tip_deflection=fmean(one.tip_deflection for one in parts),
             axial_force=fmean(one.axial_force for one in parts),
             lateral_force=fmean(one.lateral_force for one in parts),

@@ -83,8 +83,8 @@ class Plan:
 
     """
 
-    rounds: int = 5
-    turn: float = 3.0
+    rounds: int = 8
+    turn: float = 2.0
     recording: float = 10.0
     memory: float = 20.0
 
