@@ -23,10 +23,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from math import copysign, inf, isfinite, isnan, sqrt
 import os
-from typing import Final, NamedTuple
+from typing import Final
 
 from needle_dynamics.errors import (
     InsertedLengthError,
@@ -108,7 +108,8 @@ def kernel_tables(model: NeedleModel) -> Tables:
     )
 
 
-class Interval(NamedTuple):
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Interval:
     """
     What a sensor that averages over an interval would have seen of it.
 
@@ -139,7 +140,7 @@ class Interval(NamedTuple):
     axial_force: float
     lateral_force: float
     moment: float
-    felt: FloatArray
+    felt: FloatArray = field(compare=False)
     friction_work: float
     damping_work: float
     input_work: float

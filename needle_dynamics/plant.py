@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise, zip_longest
 from math import ceil, copysign, inf, sqrt
 from statistics import fmean
@@ -558,7 +558,8 @@ class Plant:
             force = force if push is None else push
             parts.append(needle.advance_pushed(part, force, limit))
         rise = (parts[-1].axial_force - parts[0].axial_force) * _PUSHES / (_PUSHES - 1)
-        means = parts[-1]._replace(
+        means = replace(
+            parts[-1],
             tip_deflection=fmean(one.tip_deflection for one in parts),
             axial_force=fmean(one.axial_force for one in parts),
             lateral_force=fmean(one.lateral_force for one in parts),
