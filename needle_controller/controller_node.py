@@ -42,7 +42,7 @@ from needle_dynamics import (
     ParameterError,
 )
 from needle_dynamics.base_node import COMMAND, NeedleNode, run, SENSOR
-from needle_dynamics.packed import Packed, Reading
+from needle_dynamics.layout import Layout, Reading
 from needle_dynamics.plant import joint_values
 from needle_dynamics.timing import NANOSECONDS, nanoseconds, seconds
 import numpy as np
@@ -179,8 +179,8 @@ class ControllerNode(NeedleNode):
         #: One that stands still or jumps does not take the watchdog along.
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
 
-        self._wrench = Packed('needle_base', numbers=6)
-        self._aim = Packed('', names=['insertion'], counts=(1, 1, 0))
+        self._wrench = Layout('needle_base', numbers=6)
+        self._aim = Layout('', names=['insertion'], counts=(1, 1, 0))
         #: What was commanded last: stamp, torque and message.
         self._last: tuple[int, float, bytes] = (0, 0.0, b'')
 
@@ -239,7 +239,7 @@ class ControllerNode(NeedleNode):
     def _take_model(self, parameters: NeedleParameters) -> None:
         self._model = NeedleModel(parameters)
         names = self._model.coordinate_names
-        self._generalized = Packed('', names=names, counts=(0, 0, len(names)))
+        self._generalized = Layout('', names=names, counts=(0, 0, len(names)))
 
     def _retract_depth(self, changes: Mapping[str, Any]) -> float:
         """Return the depth to retract to, or refuse it."""
@@ -298,7 +298,7 @@ class ControllerNode(NeedleNode):
         if self._observer is not None:
             self._observer.reset()
 
-    def _now(self) -> int:
+    def _checked_now(self) -> int:
         """Return the time [ns]; let go and know nothing if it was set back."""
         now = self.now()
         back = self._safety.clock_went_back(now)
@@ -329,7 +329,7 @@ class ControllerNode(NeedleNode):
             self._refuse(f'{name} refused: the controller is not active')
             return False
         refusal = self._safety.streams[name].check(
-            nanoseconds(header.stamp), self._now(), header.frame_id
+            nanoseconds(header.stamp), self._checked_now(), header.frame_id
         )
         if refusal is not None and refusal.kind not in (REPEATED, DROPPED):
             self._refuse(f'{name} refused: {refusal.line}')
@@ -338,7 +338,7 @@ class ControllerNode(NeedleNode):
     def _counts(self, name: str, reading: Reading, values: Sequence[float]) -> bool:
         """Return whether a reading of a sensor counts; say once a second why if it does not."""
         refusal = self._safety.streams[name].check(
-            reading.stamp, self._now(), reading.frame, values
+            reading.stamp, self._checked_now(), reading.frame, values
         )
         if refusal is not None and refusal.kind not in (REPEATED, DROPPED):
             self._warn(f'{name} {refusal.kind}', f'{refusal.line}; not taken in')
@@ -383,7 +383,7 @@ class ControllerNode(NeedleNode):
             self._refuse(f'joint_trajectory refused: {error}')
 
     def _on_tip(self, reading: Reading) -> None:
-        _, _, deflection = reading.numbers[0]
+        _, _, deflection = reading.values[0]
         if not self.is_active or not self._counts('tip_deflection', reading, [deflection]):
             return
         self._stop_for(self._safety.guard.tip(deflection))
@@ -391,7 +391,7 @@ class ControllerNode(NeedleNode):
             self._observer.add_tip(reading.stamp / NANOSECONDS, deflection)
 
     def _on_wrench(self, reading: Reading) -> None:
-        _, axial, lateral, moment, _, _ = reading.numbers[0]
+        _, axial, lateral, moment, _, _ = reading.values[0]
         if not self.is_active or not self._counts(
             'base_wrench', reading, [lateral, moment, axial]
         ):
@@ -409,7 +409,7 @@ class ControllerNode(NeedleNode):
 
     def _on_ground_truth(self, reading: Reading) -> None:
         """Take the load of the bent needle, or all of its bending, from the simulation."""
-        positions, speeds, _ = reading.numbers
+        positions, speeds, _ = reading.values
         state = [*positions, *speeds]
         if not self.is_active or not self._counts('ground_truth', reading, state):
             return
@@ -452,7 +452,7 @@ class ControllerNode(NeedleNode):
         """Answer a measurement at once, a repeated one as before, one that is late not at all."""
         if not self.is_active or self._controller is None:
             return
-        stamp, now = reading.stamp, self._now()
+        stamp, now = reading.stamp, self._checked_now()
         refusal = self._safety.streams['joint_states'].check(stamp, now)
         if refusal is not None:
             if refusal.kind == REPEATED:
@@ -465,7 +465,7 @@ class ControllerNode(NeedleNode):
         self._late += age > (self._settings.delay + 1.0) / self._settings.rate
         self._oldest = max(self._oldest, age)
         try:
-            positions, speeds, _ = reading.numbers
+            positions, speeds, _ = reading.values
             measured = read_encoders(stamp / NANOSECONDS, reading.names, positions, speeds)
         except ParameterError as error:
             self._let_go(str(error), stamp)
@@ -536,7 +536,7 @@ class ControllerNode(NeedleNode):
 
     def _on_watchdog(self) -> None:
         """Look for what does not come, and for who should not be there."""
-        now, safety = self._now(), self._safety
+        now, safety = self._checked_now(), self._safety
         self._count_commanders()
         silence = safety.streams['joint_states'].silence(now)
         if silence > self._settings.measurement_timeout:
@@ -579,7 +579,7 @@ class ControllerNode(NeedleNode):
         if self._safety.stop is None:
             response.success, response.message = True, 'there was no stop'
             return response
-        reason = self._safety.clear(self._now())
+        reason = self._safety.clear(self._checked_now())
         if reason is not None:
             response.message = f'clear_stop refused: {reason}'
             self._refuse(response.message)
@@ -646,17 +646,17 @@ class ControllerNode(NeedleNode):
             count = self._model.modes.count
             rest = [0.0] * count if modal is None else modal.tolist()
             # Insertion makes d smaller.
-            message = self._generalized.at(at, -force, torque, *rest)
+            message = self._generalized.serialize(at, -force, torque, *rest)
         else:
-            message = self._wrench.at(at, 0.0, force, 0.0, torque, 0.0, 0.0)
+            message = self._wrench.serialize(at, 0.0, force, 0.0, torque, 0.0, 0.0)
         self._last = at, torque, message
         self._commands[self._is_modal].publish(message)
 
     def _show(self, stamp: int, measured: Measurement, command: Command) -> None:
         aim: Setpoint = command.setpoint
-        self._reference.publish(self._aim.at(stamp, aim.position, aim.speed))
+        self._reference.publish(self._aim.serialize(stamp, aim.position, aim.speed))
         self._tracking_error.publish(
-            self._aim.at(stamp, aim.position - measured.depth, aim.speed - measured.speed)
+            self._aim.serialize(stamp, aim.position - measured.depth, aim.speed - measured.speed)
         )
 
     def diagnose(self) -> tuple[bytes, str, dict[str, object]]:

@@ -9,6 +9,7 @@ parameter file ends in a refused `configure` with one line that names the parame
 from __future__ import annotations
 
 from array import array
+from collections import Counter
 from collections.abc import Callable, Mapping
 import ctypes
 from dataclasses import fields
@@ -24,7 +25,7 @@ from typing import Any, ClassVar, TypeVar
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import WrenchStamped
 from needle_dynamics.errors import NeedleError, ParameterError
-from needle_dynamics.packed import Packed, Reading
+from needle_dynamics.layout import Layout, Reading
 from needle_dynamics.parameters import as_number, NeedleParameters, PRESETS, unknown_name
 from needle_dynamics.timing import nanoseconds
 from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor, SetParametersResult
@@ -70,16 +71,24 @@ def reading_of(message: Any) -> Reading:
     """Return what a joint state, wrench or point with a header says."""
     header = message.header
     stamp, names = nanoseconds(header.stamp), ()
-    numbers: tuple[tuple[float, ...], ...]
+    values: tuple[tuple[float, ...], ...]
     if isinstance(message, JointState):
         names = tuple(message.name)
-        numbers = tuple(message.position), tuple(message.velocity), tuple(message.effort)
+        values = tuple(message.position), tuple(message.velocity), tuple(message.effort)
     elif isinstance(message, WrenchStamped):
         force, torque = message.wrench.force, message.wrench.torque
-        numbers = ((force.x, force.y, force.z, torque.x, torque.y, torque.z),)
+        values = ((force.x, force.y, force.z, torque.x, torque.y, torque.z),)
     else:
-        numbers = ((message.point.x, message.point.y, message.point.z),)
-    return Reading(stamp, header.frame_id, names, numbers)
+        values = ((message.point.x, message.point.y, message.point.z),)
+    return Reading(stamp, header.frame_id, names, values)
+
+
+def layout_of(kind: type, reading: Reading) -> Layout:
+    """Return the layout of the message of a type that says this."""
+    counts = [len(block) for block in reading.values]
+    if kind is JointState:
+        return Layout(reading.frame, names=reading.names, counts=counts)
+    return Layout(reading.frame, numbers=counts[0])
 
 
 class NeedleNode(LifecycleNode):
@@ -98,6 +107,8 @@ class NeedleNode(LifecycleNode):
     def __init__(self, name: str, **node_options: Any) -> None:
         super().__init__(name, **node_options)
         self.failure: str | None = None
+        #: Messages that were none, by topic.
+        self.unreadable: Counter[str] = Counter()
         self._descriptions: dict[str, Mapping[str, Any]] = {}
         self._configured = False
         self.declare_text('autostart', True, 'configure and activate at start')
@@ -113,7 +124,7 @@ class NeedleNode(LifecycleNode):
     # What a subclass fills in.
 
     def cleanup(self) -> None:
-        """Undo `configure`."""
+        """Undo `configure`, as far as it came."""
 
     def configure(self) -> None:
         """Read the parameters and make what the node needs; raise `NeedleError` to refuse."""
@@ -156,26 +167,22 @@ class NeedleNode(LifecycleNode):
             Called with each `Reading`.
 
         """
-        layout: Packed | None = None
+        layout: Layout | None = None
 
         def on_bytes(data: bytes) -> None:
             nonlocal layout
-            reading = layout.read(data) if layout is not None else None
+            reading = layout.deserialize(data) if layout is not None else None
             if reading is None:
                 try:
                     reading = reading_of(deserialize_message(data, kind))
                 except RuntimeError as error:
+                    self.unreadable[topic] += 1
                     reason = ' '.join(str(error).split())
                     self.get_logger().error(
                         f'{topic} cannot be read: {reason}', throttle_duration_sec=1.0
                     )
                     return
-                lengths = [len(block) for block in reading.numbers]
-                layout = (
-                    Packed(reading.frame, names=reading.names, counts=lengths)
-                    if kind is JointState
-                    else Packed(reading.frame, numbers=lengths[0])
-                )
+                layout = layout_of(kind, reading)
             take(reading)
 
         return self.create_subscription(kind, topic, on_bytes, qos, raw=True)
@@ -359,7 +366,11 @@ class NeedleNode(LifecycleNode):
 
         def configure() -> None:
             self._check_overrides()
-            self.configure()
+            try:
+                self.configure()
+            except NeedleError:
+                self.cleanup()
+                raise
             self._configured = True
             if self._parameter_overrides:
                 count = len(self._parameter_overrides)
@@ -393,6 +404,7 @@ class NeedleNode(LifecycleNode):
     def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Return to unconfigured after an error that was not foreseen."""
         self._configured = False
+        self.cleanup()
         return super().on_error(state)
 
     def _attempt(
@@ -423,6 +435,8 @@ class NeedleNode(LifecycleNode):
         if self.failure:
             level, message = DiagnosticStatus.ERROR, self.failure
         self._last_level = level
+        for topic, count in self.unreadable.items():
+            values[f'messages of {topic} that cannot be read'] = count
         status = DiagnosticStatus(
             level=level,
             name=self.get_fully_qualified_name(),

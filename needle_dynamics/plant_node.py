@@ -19,8 +19,8 @@ from needle_dynamics.faults import Fault, FaultParameters, FAULTS
 from needle_dynamics.force_sensor import ForceSensorParameters, HIGHEST_RATE
 from needle_dynamics.indenter import Indenter, IndenterParameters, Press
 from needle_dynamics.kernels import FloatArray
+from needle_dynamics.layout import Layout, Reading
 from needle_dynamics.pace import Pace
-from needle_dynamics.packed import Packed, Reading
 from needle_dynamics.parameters import check_constants, constant
 from needle_dynamics.plant import BaseParameters, Plant, Sample, TipParameters
 from needle_dynamics.timing import NANOSECONDS, seconds, Window
@@ -194,9 +194,9 @@ class PlantNode(NeedleNode):
         self.create_service(Trigger, '~/step', self._on_step)
         self.create_service(Trigger, '~/reset', self._on_reset)
 
-        self._wrench = Packed('needle_base', numbers=6)
-        self._tip = Packed('needle_entry', numbers=3)
-        self._joints = Packed('', names=['insertion', 'rotation'], counts=(2, 2, 2))
+        self._wrench = Layout('needle_base', numbers=6)
+        self._tip = Layout('needle_entry', numbers=3)
+        self._joints = Layout('', names=['insertion', 'rotation'], counts=(2, 2, 2))
         self._pose = PoseStamped()
         self._pose.header.frame_id = 'needle_entry'
         self._pose.pose.orientation.w = 1.0
@@ -267,7 +267,7 @@ class PlantNode(NeedleNode):
         )
         if isinstance(plant, Plant):
             self._names = names = plant.integrator.model.coordinate_names
-            self._truth = Packed('', names=names, counts=(len(names), len(names), 0))
+            self._truth = Layout('', names=names, counts=(len(names), len(names), 0))
         return plant
 
     def cleanup(self) -> None:
@@ -344,7 +344,7 @@ class PlantNode(NeedleNode):
         stamp = self._counts_from(reading.stamp)
         if stamp is None:
             return
-        _, force, _, torque, _, _ = reading.numbers[0]
+        _, force, _, torque, _, _ = reading.values[0]
         limits = self._settings.force_limit, self._settings.torque_limit
         if reading.frame not in ('', 'needle_base'):
             self._refuse(f'wrench_command must be in needle_base, got {reading.frame!r}', stamp)
@@ -363,7 +363,7 @@ class PlantNode(NeedleNode):
         if stamp is None or not isinstance(self._plant, Plant):
             return
         settings, names = self._settings, self._names
-        _, _, efforts = reading.numbers
+        _, _, efforts = reading.values
         if sorted(reading.names) != sorted(names) or len(efforts) != len(names):
             self._refuse(
                 f'generalized_command needs an effort for each of {", ".join(names)}, got '
@@ -541,14 +541,14 @@ class PlantNode(NeedleNode):
             publish(at, left)
 
     def _publish_wrench(self, stamp: int, values: list[float]) -> None:
-        self._base_wrench.publish(self._wrench.at(stamp, *values))
+        self._base_wrench.publish(self._wrench.serialize(stamp, *values))
 
     def _publish_joints(self, stamp: int, values: list[float]) -> None:
-        self._joint_states.publish(self._joints.at(stamp, *values))
+        self._joint_states.publish(self._joints.serialize(stamp, *values))
 
     def _publish_tip(self, stamp: int, values: list[float]) -> None:
         deflection, depth = values
-        self._tip_deflection.publish(self._tip.at(stamp, 0.0, depth, deflection))
+        self._tip_deflection.publish(self._tip.serialize(stamp, 0.0, depth, deflection))
 
     def _show_needle(self, sample: Sample, stamp: int) -> None:
         state = sample.state.tolist()
@@ -559,7 +559,7 @@ class PlantNode(NeedleNode):
             self._pass(
                 'tip_deflection', stamp - late, [seen.deflection, seen.depth], self._publish_tip
             )
-        self._ground_truth.publish(self._truth.at(stamp, *state))
+        self._ground_truth.publish(self._truth.serialize(stamp, *state))
         if self._sampled % self._picture == 0:
             self._draw(sample, _message(stamp))
         values = [

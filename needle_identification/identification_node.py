@@ -154,6 +154,7 @@ class IdentificationNode(NeedleNode):
         """Let go of the nodes that results are applied to."""
         for client in self._setters.values():
             self.destroy_client(client)
+        self._setters.clear()
 
     def activate(self) -> None:
         """Identify, if there is something to identify from, and listen, if that is wanted."""

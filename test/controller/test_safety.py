@@ -12,7 +12,6 @@ from needle_controller import (
 )
 from needle_controller.safety import read_encoders
 from needle_dynamics import NeedleParameters, ParameterError
-from needle_dynamics.timing import Window
 import numpy as np
 import pytest
 
@@ -133,21 +132,6 @@ def test_a_noisy_reading_that_stands_still_is_frozen():
 def test_a_reading_without_noise_may_stand_still(readings):
     """A perfect sensor at rest is not frozen."""
     assert set(feed(stream(noise=[0.01]), readings)) == {''}
-
-
-def test_rates_and_shares_are_those_of_the_last_second():
-    """In any second that is full; of a time that went back nothing is left."""
-    window = Window()
-    for i in range(2001):
-        window.add(i * MILLISECOND, i % 4 == 0)
-    # 1000 in the second, and a quarter of them: whole numbers.
-    assert window.rate(2000 * MILLISECOND) == 1000.0
-    assert window.share(2000 * MILLISECOND) == 0.25
-    # Only the one of 2 s in the five seconds since.
-    assert window.rate(7 * SECOND) == pytest.approx(0.2, rel=1e-12)
-    window.add(SECOND)
-    assert window.rate(SECOND) == pytest.approx(0.2, rel=1e-12)
-    assert window.rate(2 * SECOND) == 1.0
 
 
 GUARD = [

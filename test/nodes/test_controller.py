@@ -278,6 +278,23 @@ def test_configuring_again_doubles_nothing(ros_graph):
     assert topics.count('/joint_states') == 1
 
 
+def test_a_refused_configuration_leaves_nothing_behind(ros_graph):
+    """What was made before the parameter that is not valid is undone."""
+    wrong = {'deflection_feedback': 'ground_truth', 'safety.sensor_timeout': 0.0}
+    controller = ros_graph.add(ControllerNode, start=False, parameters={**SLOW, **wrong})
+    assert controller.trigger_configure() == TransitionCallbackReturn.FAILURE
+    assert 'safety.sensor_timeout' in controller.failure
+    assert '/ground_truth' not in [one.topic_name for one in controller.subscriptions]
+    controller.set_parameters(
+        [
+            Parameter('safety.sensor_timeout', value=1.0),
+            Parameter('deflection_feedback', value='none'),
+        ]
+    )
+    assert controller.start()
+    assert '/ground_truth' not in [one.topic_name for one in controller.subscriptions]
+
+
 class Loop:
     """Controller and simulated plant in one thread, with a probe."""
 

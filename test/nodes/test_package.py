@@ -102,6 +102,7 @@ def test_the_manifest_is_valid():
         ('<version>0.1.0</version>', '<version>0.1</version>'),
         ('<license>Apache-2.0</license>', ''),
         (' email="maintainers@needle-insertion.example"', ''),
+        ('maintainers@', 'maint..ainers@'),
         ('exec_depend>rclpy</exec_depend', 'run_depend>rclpy</run_depend'),
         ('<name>needle_insertion</name>', '<name>Needle__Insertion</name>'),
         ('<package format="3">', '<package format="2">'),

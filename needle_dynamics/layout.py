@@ -1,4 +1,4 @@
-"""Messages with a header as bytes (CDR), of which only the stamp and numbers change."""
+"""Messages with a header as bytes (CDR), of which only the stamp and values change."""
 
 from __future__ import annotations
 
@@ -6,10 +6,11 @@ from collections.abc import Sequence
 import struct
 from typing import Any, Final, NamedTuple
 
+from needle_dynamics.errors import ShapeError
 from needle_dynamics.timing import NANOSECONDS
 
-#: Little-endian CDR.
-_ENCODING: Final = b'\0\1\0\0'
+#: Little-endian CDR; two bytes of options follow, which say nothing of such messages.
+_ENCODING: Final = b'\0\1'
 
 
 class Reading(NamedTuple):
@@ -24,7 +25,7 @@ class Reading(NamedTuple):
         Frame of the header.
     names : tuple of str
         Joints, none if the message has no such field.
-    numbers : tuple of tuple of float
+    values : tuple of tuple of float
         Positions, speeds and efforts of joints; else one tuple of all numbers, in the order of
         the fields.
 
@@ -33,16 +34,16 @@ class Reading(NamedTuple):
     stamp: int
     frame: str
     names: tuple[str, ...]
-    numbers: tuple[tuple[float, ...], ...]
+    values: tuple[tuple[float, ...], ...]
 
 
-class Packed:
+class Layout:
     """
-    One layout of a message: where the stamp and the numbers are among bytes that stay.
+    Where the stamp and the values of a message are, among bytes that stay.
 
-    To write or to read them takes a fraction of what rclpy takes to convert the message, see
-    ``needle bench graph``. Gaps before aligned fields are written as zeros, where rmw leaves
-    what was in memory, and read as whatever they are.
+    To write or to read them takes a tenth of what rclpy takes to convert the message. Gaps
+    before aligned fields are written as zeros, where rmw leaves what was in memory, and read as
+    whatever they are.
 
     Parameters
     ----------
@@ -66,12 +67,12 @@ class Packed:
         numbers: int = 0,
     ) -> None:
         self._frame, self._names = frame, tuple(names or ())
-        #: Encoding, stamp [s] and [ns], then bytes and numbers in turn; where numbers go in it.
+        #: Encoding, stamp [s] and [ns], then bytes and values in turn; where values go in it.
         self._parts: list[Any] = [_ENCODING, 0, 0]
         self._places: list[tuple[slice, slice]] = []
         blocks: list[slice] = []
         # The whole, what stays and what changes; x is a byte that is passed over.
-        whole, stays, changes = '<4siI', '<4s8x', '<4xiI'
+        whole, stays, changes = '<2s2xiI', '<2s10x', '<4xiI'
         taken = 0
         for form, size, data in _fields(frame, names, counts, numbers):
             whole += f'{size}{form}'
@@ -86,19 +87,21 @@ class Packed:
                 blocks.append(slice(2 + taken, 2 + taken + size))
                 self._parts += [0.0] * size
                 taken += size
-        self._blocks = tuple(blocks)
+        self._blocks, self._count = tuple(blocks), taken
         self._whole, self._stays, self._changes = map(struct.Struct, (whole, stays, changes))
         self._bytes = self._stays.unpack(self._whole.pack(*self._parts))
 
-    def at(self, stamp: int, *numbers: float) -> bytes:
-        """Return the message with a stamp [ns] and numbers, in the order of its fields."""
+    def serialize(self, stamp: int, *values: float) -> bytes:
+        """Return the message with a stamp [ns] and values, in the order of its fields."""
+        if len(values) != self._count:
+            raise ShapeError(f'the message has {self._count} values, got {len(values)}')
         parts = self._parts
         parts[1], parts[2] = divmod(stamp, NANOSECONDS)
         for place, own in self._places:
-            parts[place] = numbers[own]
+            parts[place] = values[own]
         return self._whole.pack(*parts)
 
-    def read(self, data: bytes) -> Reading | None:
+    def deserialize(self, data: bytes) -> Reading | None:
         """Return what a message says, None if it is not of this layout."""
         # A message that begins alike and is longer cannot be: its counts would be others.
         if len(data) < self._whole.size or self._stays.unpack_from(data) != self._bytes:
