@@ -1,21 +1,23 @@
 """Stamps and rates."""
 
+from fractions import Fraction
+
 from builtin_interfaces.msg import Time
 from hypothesis import given
 from hypothesis import strategies as st
 from needle_dynamics.timing import NANOSECONDS, nanoseconds, seconds, Window
-import pytest
 
 MILLISECOND = NANOSECONDS // 1000
 
 
 @given(st.integers(0, 2**31 - 1), st.integers(0, NANOSECONDS - 1))
 def test_times_are_those_of_the_message(sec, nanosec):
-    """Nanoseconds to the last digit; seconds to the last bit of what a double can hold."""
+    """Nanoseconds to the last digit; seconds but for two roundings."""
     time = Time(sec=sec, nanosec=nanosec)
     assert divmod(nanoseconds(time), NANOSECONDS) == (sec, nanosec)
-    # Two roundings: of the fraction, and of the sum.
-    assert seconds(time) == pytest.approx(nanoseconds(time) / NANOSECONDS, rel=2.0**-51, abs=0.0)
+    exact = sec + Fraction(nanosec, NANOSECONDS)
+    # Half a unit in the last place, 2^-53, for the fraction, and for the sum.
+    assert abs(Fraction(seconds(time)) - exact) <= exact / 2**52
 
 
 def test_rates_and_shares_are_those_of_the_last_second():
@@ -26,8 +28,8 @@ def test_rates_and_shares_are_those_of_the_last_second():
     # 1000 in the second, and a quarter of them: whole numbers.
     assert window.rate(2000 * MILLISECOND) == 1000.0
     assert window.share(2000 * MILLISECOND) == 0.25
-    # Only the one of 2 s in the five seconds since.
-    assert window.rate(7 * NANOSECONDS) == pytest.approx(0.2, rel=1e-12)
+    # Only the one of 2 s in the five seconds since: a quotient of integers, rounded once.
+    assert window.rate(7 * NANOSECONDS) == 0.2
     window.add(NANOSECONDS)
-    assert window.rate(NANOSECONDS) == pytest.approx(0.2, rel=1e-12)
+    assert window.rate(NANOSECONDS) == 0.2
     assert window.rate(2 * NANOSECONDS) == 1.0

@@ -7,6 +7,7 @@ from geometry_msgs.msg import PointStamped, WrenchStamped
 from needle_controller.controller_node import ControllerNode
 from needle_dynamics.base_node import COMMAND, SENSOR
 from needle_dynamics.plant_node import PlantNode
+from needle_dynamics.timing import seconds
 from needle_identification.bag_io import Bag
 import numpy as np
 import pytest
@@ -66,8 +67,7 @@ class Loop:
     @property
     def time(self):
         """Time of the newest sample [s]."""
-        stamp = self.truth.message.header.stamp
-        return stamp.sec + 1e-9 * stamp.nanosec
+        return seconds(self.truth.message.header.stamp)
 
     def aim(self, depth=TARGET):
         """Send a target until it is taken."""
@@ -216,7 +216,7 @@ def test_a_load_beyond_the_limits_latches_a_stop(ros_graph, topic, size, why):
 
 
 def test_a_killed_controller_leaves_the_needle_at_rest(ros_graph):
-    """The plant lets go after command_timeout; a successor has to wait for the lease."""
+    """The plant lets go after command_timeout; a new controller takes over after the lease."""
     probe = ros_graph.node('probe')
     truth = ros_graph.latest(probe, JointState, 'ground_truth', SENSOR)
     targets = probe.create_publisher(PointStamped, 'target', COMMAND)
@@ -238,6 +238,10 @@ def test_a_killed_controller_leaves_the_needle_at_rest(ros_graph):
     # The dead one commands, as far as others know, until its lease of 20 s has ended.
     ros_graph.spin_until(lambda: 'nodes command' in plant.diagnose()[1], 'the successor')
     assert truth.message.velocity[0] == 0.0
+    ros_graph.spin_until(
+        lambda: 'nodes command' not in plant.diagnose()[1], 'the lease', timeout=60.0
+    )
+    ros_graph.spin_until(moves, 'motion')
 
 
 def test_a_killed_plant_is_waited_for(ros_graph):

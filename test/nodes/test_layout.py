@@ -119,11 +119,11 @@ def test_a_node_takes_any_layout(ros_graph, monkeypatch, messages):
     node.listen(kind, 'words', SENSOR, taken.append)
     sender = teller.create_publisher(kind, 'words', SENSOR)
     ros_graph.spin_until(sender.get_subscription_count, 'the reader')
-    told = [message for message in messages for _ in range(2)]
-    for message in [*JUNK, *told]:
+    twice = [message for message in messages for _ in range(2)]
+    for message in [*JUNK, *twice]:
         sender.publish(message)
-    ros_graph.spin_until(lambda: len(taken) == len(told), 'the messages')
-    assert taken == [reading_of(message) for message in told]
+    ros_graph.spin_until(lambda: len(taken) == len(twice), 'the messages')
+    assert taken == [reading_of(message) for message in twice]
     shapes = [(one.frame, one.names, [len(block) for block in one.values]) for one in taken]
     assert len(asked) == len(JUNK) + 1 + sum(a != b for a, b in pairwise(shapes))
     assert node.unreadable['words'] == len(JUNK)

@@ -8,6 +8,7 @@ from geometry_msgs.msg import PointStamped
 from needle_controller import closed_loop, ContinuousInverseDynamics
 from needle_dynamics import NeedleModel, NeedleParameters
 from needle_dynamics.base_node import COMMAND, SENSOR
+from needle_dynamics.timing import seconds
 from needle_identification.bag_io import Bag, deserialize, encode
 from needle_identification.recorder_node import is_hidden
 from needle_insertion.graph import Graph
@@ -97,7 +98,7 @@ def records_all(probe):
     """
     Tell whether the recorder has subscribed to all that is published.
 
-    With Fast DDS 2.14 it may take 0.3 s to make a subscription; the process receives nothing then.
+    With Fast DDS 2.14 it may take 0.3 s to make one; what else comes meanwhile may be lost.
     """
     published = [
         name
@@ -108,11 +109,6 @@ def records_all(probe):
         'recorder' in [one.node_name for one in probe.get_subscriptions_info_by_topic(name)]
         for name in published
     )
-
-
-def seconds(stamp):
-    """Return a stamp in seconds."""
-    return stamp.sec + 1e-9 * stamp.nanosec
 
 
 def contents(bag, until):
