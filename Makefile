@@ -2,7 +2,7 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-SOURCES := needle_dynamics needle_controller needle_identification needle_insertion test launch setup.py
+SOURCES := needle_ros needle_dynamics needle_controller needle_identification needle_insertion benchmarks test launch setup.py
 
 .PHONY: demo test check format setup lock bags clean
 

@@ -1,14 +1,5 @@
 """Control laws of the source in sampled form, references, and the controller node."""
 
-from needle_controller.axis import Axis, Law, no_memory, Response, SampledLoop, Setpoint
-from needle_controller.continuous import (
-    ACTUATIONS,
-    closed_loop,
-    closed_loop_matrix,
-    ContinuousInverseDynamics,
-    ContinuousLaw,
-    ContinuousPid,
-)
 from needle_controller.controller import (
     Command,
     Controller,
@@ -16,11 +7,25 @@ from needle_controller.controller import (
     LAWS,
     Measurement,
 )
-from needle_controller.inverse_dynamics import InverseDynamics, InverseDynamicsGains
-from needle_controller.modal import DeflectionLaw, DeflectionLoop, ModalLoop, NormalModes
-from needle_controller.observer import Consistency, Observer, ObserverSettings
-from needle_controller.pid import ANTI_WINDUP, Pid, PidGains
-from needle_controller.reference import MinimumJerk, ReferenceLimits, REFERENCES, Trapezoid
+from needle_controller.laws.axis import Axis, Law, no_memory, Response, SampledLoop, Setpoint
+from needle_controller.laws.continuous import (
+    ACTUATIONS,
+    closed_loop,
+    closed_loop_matrix,
+    ContinuousInverseDynamics,
+    ContinuousLaw,
+    ContinuousPid,
+)
+from needle_controller.laws.inverse_dynamics import InverseDynamics, InverseDynamicsGains
+from needle_controller.laws.modal import DeflectionLaw, DeflectionLoop, ModalLoop, NormalModes
+from needle_controller.laws.pid import ANTI_WINDUP, Pid, PidGains
+from needle_controller.observer.observer import Consistency, Observer, ObserverSettings
+from needle_controller.reference.reference import (
+    MinimumJerk,
+    ReferenceLimits,
+    REFERENCES,
+    Trapezoid,
+)
 from needle_controller.safety import Guard, Refusal, Safety, SafetyLimits, Stream
 from needle_controller.stability import (
     check_stability,

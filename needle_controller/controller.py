@@ -7,15 +7,22 @@ from dataclasses import dataclass, replace
 from math import isfinite, sqrt
 from typing import Final, TypeAlias
 
-from needle_controller.axis import Axis, Law, SampledLoop, Setpoint
-from needle_controller.continuous import ACTUATIONS
-from needle_controller.inverse_dynamics import InverseDynamics, InverseDynamicsGains
-from needle_controller.modal import DeflectionLaw, ModalLoop
-from needle_controller.pid import Pid, PidGains
-from needle_controller.reference import Guide, Quintic, ReferenceLimits
+from needle_controller.laws.axis import Axis, Law, SampledLoop, Setpoint
+from needle_controller.laws.continuous import ACTUATIONS
+from needle_controller.laws.inverse_dynamics import InverseDynamics, InverseDynamicsGains
+from needle_controller.laws.modal import DeflectionLaw, ModalLoop
+from needle_controller.laws.pid import Pid, PidGains
+from needle_controller.reference.reference import Guide, Quintic, ReferenceLimits
 from needle_controller.stability import check_stability, Limit, MARGIN
-from needle_dynamics import FloatArray, NeedleModel, NeedleParameters, ParameterError
-from needle_dynamics.parameters import check_constants, constant
+from needle_dynamics import (
+    FloatArray,
+    NeedleModel,
+    NeedleParameters,
+)
+from needle_ros.errors import (
+    ParameterError,
+)
+from needle_ros.settings import check_constants, constant
 import numpy as np
 
 #: Control laws by name.

@@ -11,8 +11,6 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PointStamped, WrenchStamped
-from needle_controller.axis import Setpoint
-from needle_controller.continuous import ACTUATIONS
 from needle_controller.controller import (
     AXES,
     Command,
@@ -21,10 +19,12 @@ from needle_controller.controller import (
     LAWS,
     Measurement,
 )
-from needle_controller.inverse_dynamics import InverseDynamicsGains
-from needle_controller.observer import Observer, ObserverSettings
-from needle_controller.pid import PidGains
-from needle_controller.reference import ReferenceLimits, REFERENCES
+from needle_controller.laws.axis import Setpoint
+from needle_controller.laws.continuous import ACTUATIONS
+from needle_controller.laws.inverse_dynamics import InverseDynamicsGains
+from needle_controller.laws.pid import PidGains
+from needle_controller.observer.observer import Observer, ObserverSettings
+from needle_controller.reference.reference import ReferenceLimits, REFERENCES
 from needle_controller.safety import (
     BY_HAND,
     DROPPED,
@@ -36,15 +36,17 @@ from needle_controller.safety import (
 )
 from needle_dynamics import (
     FloatArray,
-    NeedleError,
     NeedleModel,
     NeedleParameters,
+)
+from needle_dynamics.simulated.plant import joint_values
+from needle_ros.base_node import COMMAND, NeedleNode, run, SENSOR
+from needle_ros.errors import (
+    NeedleError,
     ParameterError,
 )
-from needle_dynamics.base_node import COMMAND, NeedleNode, run, SENSOR
-from needle_dynamics.layout import Layout, Reading
-from needle_dynamics.plant import joint_values
-from needle_dynamics.timing import NANOSECONDS, nanoseconds, seconds
+from needle_ros.packed import Layout, Reading
+from needle_ros.timing import NANOSECONDS, nanoseconds, seconds
 import numpy as np
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.clock import Clock

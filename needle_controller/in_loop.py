@@ -16,23 +16,25 @@ from math import inf, isfinite, sqrt
 import os
 from typing import Final
 
-from needle_controller.axis import Law
-from needle_controller.continuous import acceleration, ContinuousLaw
+from needle_controller.compiled.laws import law_step
 from needle_controller.controller import Controller, Measurement
-from needle_controller.kernels import law_step
-from needle_controller.reference import Reference
+from needle_controller.laws.axis import Law
+from needle_controller.laws.continuous import acceleration, ContinuousLaw
+from needle_controller.reference.reference import Reference
 from needle_dynamics import (
     FloatArray,
     InsertedLengthError,
     Integrator,
-    NeedleError,
     NeedleModel,
     NeedleParameters,
+)
+from needle_dynamics.compiled.kernels import advance, Constants, slide, SUMS, Tables
+from needle_dynamics.simulated.integrators import DEFAULT_STEP, kernel_constants, kernel_tables
+from needle_ros.errors import (
+    NeedleError,
     ParameterError,
     ShapeError,
 )
-from needle_dynamics.integrators import DEFAULT_STEP, kernel_constants, kernel_tables
-from needle_dynamics.kernels import advance, Constants, slide, SUMS, Tables
 import numba
 import numpy as np
 from numpy.typing import ArrayLike

@@ -15,9 +15,14 @@ from math import isfinite
 from typing import Final, NamedTuple
 
 from needle_controller.controller import ControllerSettings, Measurement
-from needle_dynamics import NeedleParameters, ParameterError
-from needle_dynamics.parameters import check_constants, constant
-from needle_dynamics.timing import NANOSECONDS, Window
+from needle_dynamics import (
+    NeedleParameters,
+)
+from needle_ros.errors import (
+    ParameterError,
+)
+from needle_ros.settings import check_constants, constant
+from needle_ros.timing import NANOSECONDS, Window
 
 #: What happens to messages that do not count but do no harm either: nobody is told.
 REPEATED: Final = 'repeated'

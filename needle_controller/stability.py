@@ -15,10 +15,15 @@ from dataclasses import dataclass, replace
 from math import ceil, inf, log10, pi
 from typing import Final
 
-from needle_controller import kernels
-from needle_controller.axis import Law, SampledLoop, Setpoint
-from needle_controller.modal import DeflectionLaw, NormalModes
-from needle_dynamics import FloatArray, ParameterError
+from needle_controller.compiled import laws as kernels
+from needle_controller.laws.axis import Law, SampledLoop, Setpoint
+from needle_controller.laws.modal import DeflectionLaw, NormalModes
+from needle_dynamics import (
+    FloatArray,
+)
+from needle_ros.errors import (
+    ParameterError,
+)
 import numpy as np
 
 #: By how much a spectral radius has to be less than one, by default.

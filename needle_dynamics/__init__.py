@@ -4,18 +4,18 @@ Mathematics of a flexible needle in soft tissue, and the plant node around it.
 Units are SI throughout; signs and frames are those of docs/architecture.md.
 """
 
+from needle_dynamics.compiled.kernels import FloatArray
 from needle_dynamics.errors import (
     InsertedLengthError,
-    JobError,
-    NeedleError,
-    ParameterError,
-    ShapeError,
     ToleranceError,
 )
-from needle_dynamics.force_sensor import ForceSensor, ForceSensorParameters
 from needle_dynamics.friction import Friction, FRICTION_LAWS
-from needle_dynamics.indenter import Indenter, IndenterParameters
-from needle_dynamics.integrators import (
+from needle_dynamics.model import NeedleModel
+from needle_dynamics.modes import mode_shapes, ModeIntegrals, ModeShapes
+from needle_dynamics.parameters import FORMULATIONS, NeedleParameters, PRESETS
+from needle_dynamics.simulated.force_sensor import ForceSensor, ForceSensorParameters
+from needle_dynamics.simulated.indenter import Indenter, IndenterParameters
+from needle_dynamics.simulated.integrators import (
     Batch,
     Integrator,
     Interval,
@@ -23,11 +23,13 @@ from needle_dynamics.integrators import (
     simulate_batch,
     Trajectory,
 )
-from needle_dynamics.kernels import FloatArray
-from needle_dynamics.model import NeedleModel
-from needle_dynamics.modes import mode_shapes, ModeIntegrals, ModeShapes
-from needle_dynamics.parameters import FORMULATIONS, NeedleParameters, PRESETS
 from needle_dynamics.tissue import Tissue
+from needle_ros.errors import (
+    JobError,
+    NeedleError,
+    ParameterError,
+    ShapeError,
+)
 
 __all__ = [
     'FORMULATIONS',

@@ -16,11 +16,15 @@ from dataclasses import dataclass, replace
 from math import exp, inf, isfinite, tanh
 from typing import Final
 
-from needle_dynamics.errors import NeedleError, ParameterError, ShapeError
+from needle_dynamics.compiled.kernels import FloatArray
 from needle_dynamics.friction import Friction
-from needle_dynamics.kernels import FloatArray
 from needle_dynamics.model import NeedleModel
 from needle_dynamics.parameters import NeedleParameters
+from needle_ros.errors import (
+    NeedleError,
+    ParameterError,
+    ShapeError,
+)
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import eigh

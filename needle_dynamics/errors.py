@@ -1,20 +1,6 @@
-"""What can go wrong, as types: every error of this package is a `NeedleError`."""
+"""What can go wrong in the model."""
 
-
-class NeedleError(Exception):
-    """Base of all errors raised on purpose; its message is one line for a person."""
-
-
-class JobError(NeedleError):
-    """A job failed though nothing was wrong with what it was given."""
-
-
-class ParameterError(NeedleError, ValueError):
-    """A parameter is unknown, missing, or outside its valid range."""
-
-
-class ShapeError(NeedleError, ValueError):
-    """An array does not have the shape the model needs."""
+from needle_ros.errors import NeedleError
 
 
 class ToleranceError(NeedleError):

@@ -6,10 +6,12 @@ from dataclasses import dataclass
 from math import exp, inf, tanh
 from typing import Final
 
-from needle_dynamics.errors import ParameterError
+from needle_ros.errors import (
+    ParameterError,
+)
 import numpy as np
 
-#: Laws by name, in the order of their numbers in `needle_dynamics.kernels`.
+#: Laws by name, in the order of their numbers in `needle_dynamics.compiled.kernels`.
 FRICTION_LAWS: Final = ('coulomb', 'stribeck', 'tanh')
 
 

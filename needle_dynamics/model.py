@@ -14,12 +14,18 @@ from dataclasses import dataclass, field
 from math import isfinite
 from typing import Final
 
-from needle_dynamics.errors import InsertedLengthError, ParameterError, ShapeError
+from needle_dynamics.compiled.kernels import FloatArray
+from needle_dynamics.errors import (
+    InsertedLengthError,
+)
 from needle_dynamics.friction import Friction
-from needle_dynamics.kernels import FloatArray
 from needle_dynamics.modes import mode_shapes, ModeShapes
 from needle_dynamics.parameters import NeedleParameters
 from needle_dynamics.tissue import Tissue
+from needle_ros.errors import (
+    ParameterError,
+    ShapeError,
+)
 import numpy as np
 from numpy.typing import ArrayLike
 

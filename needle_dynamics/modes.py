@@ -15,13 +15,15 @@ from functools import cache, cached_property, lru_cache
 from math import cos, cosh, factorial, pi
 from typing import Final
 
-from needle_dynamics.errors import ParameterError
-from needle_dynamics.kernels import (
+from needle_dynamics.compiled.kernels import (
     evaluate,
     evaluate_many,
     FloatArray,
     SERIES_END,
     TERMS_PER_LENGTH,
+)
+from needle_ros.errors import (
+    ParameterError,
 )
 import numpy as np
 from numpy.typing import ArrayLike, NDArray

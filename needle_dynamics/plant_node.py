@@ -12,18 +12,22 @@ from typing import Any
 from builtin_interfaces.msg import Time as TimeMessage
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import Point, PointStamped, Pose, PoseArray, PoseStamped, WrenchStamped
-from needle_dynamics.assembly import assemble, MODES
-from needle_dynamics.base_node import COMMAND, NeedleNode, run, SENSOR
-from needle_dynamics.errors import JobError, NeedleError, ParameterError
-from needle_dynamics.faults import Fault, FaultParameters, FAULTS
-from needle_dynamics.force_sensor import ForceSensorParameters, HIGHEST_RATE
-from needle_dynamics.indenter import Indenter, IndenterParameters, Press
-from needle_dynamics.kernels import FloatArray
-from needle_dynamics.layout import Layout, Reading
-from needle_dynamics.pace import Pace
-from needle_dynamics.parameters import check_constants, constant
-from needle_dynamics.plant import BaseParameters, Plant, Sample, TipParameters
-from needle_dynamics.timing import NANOSECONDS, seconds, Window
+from needle_dynamics.compiled.kernels import FloatArray
+from needle_dynamics.simulated.assembly import assemble, MODES
+from needle_dynamics.simulated.faults import Fault, FaultParameters, FAULTS
+from needle_dynamics.simulated.force_sensor import ForceSensorParameters, HIGHEST_RATE
+from needle_dynamics.simulated.indenter import Indenter, IndenterParameters, Press
+from needle_dynamics.simulated.plant import BaseParameters, Plant, Sample, TipParameters
+from needle_ros.base_node import COMMAND, NeedleNode, run, SENSOR
+from needle_ros.errors import (
+    JobError,
+    NeedleError,
+    ParameterError,
+)
+from needle_ros.pace import Pace
+from needle_ros.packed import Layout, Reading
+from needle_ros.settings import check_constants, constant
+from needle_ros.timing import NANOSECONDS, seconds, Window
 import numpy as np
 from rcl_interfaces.msg import IntegerRange, ParameterDescriptor
 from rclpy.clock import Clock as NodeClock

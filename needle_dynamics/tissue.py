@@ -6,9 +6,11 @@ from dataclasses import dataclass
 from itertools import pairwise
 from math import expm1, inf
 
-from needle_dynamics.errors import ParameterError
-from needle_dynamics.kernels import FloatArray
+from needle_dynamics.compiled.kernels import FloatArray
 from needle_dynamics.modes import ModeShapes
+from needle_ros.errors import (
+    ParameterError,
+)
 import numpy as np
 
 

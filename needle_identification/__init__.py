@@ -4,7 +4,7 @@ Recordings of the needle base, and friction identified from them.
 Reading, writing and mathematics, without ROS; the nodes are in ``*_node.py``.
 """
 
-from needle_identification.bag_io import (
+from needle_identification.bags.bag import (
     BagWriter,
     check_distinct,
     COMPRESSIONS,
@@ -13,9 +13,12 @@ from needle_identification.bag_io import (
     message_type,
     read_topic,
 )
+from needle_identification.bags.storage import OfferedQos
 from needle_identification.errors import IdentificationError, RecordingError
-from needle_identification.estimate import ParameterEstimate, Statistic, statistic
-from needle_identification.friction import (
+from needle_identification.estimation.estimate import ParameterEstimate, Statistic, statistic
+from needle_identification.estimation.goodness import ResidualTest
+from needle_identification.estimation.regression import ESTIMATORS, regress, Regression
+from needle_identification.friction.fit import (
     Comparison,
     Fit,
     FrictionEstimate,
@@ -23,14 +26,15 @@ from needle_identification.friction import (
     identify_friction,
     summarize,
 )
-from needle_identification.friction_terms import FrictionSettings, TERMS
-from needle_identification.goodness import ResidualTest
-from needle_identification.reading import read_friction_recording, read_indentation_recording
-from needle_identification.recording import IndentationRecording, Recording
-from needle_identification.recursive import RecursiveFriction
-from needle_identification.regression import ESTIMATORS, regress, Regression
+from needle_identification.friction.recursive import RecursiveFriction
+from needle_identification.friction.terms import FrictionSettings, TERMS
+from needle_identification.recordings.reading import (
+    read_friction_recording,
+    read_indentation_recording,
+)
+from needle_identification.recordings.recording import IndentationRecording, Recording
 from needle_identification.result import result_yaml, write_result
-from needle_identification.stiffness import (
+from needle_identification.stiffness.fit import (
     identify_stiffness,
     LevelEstimate,
     LevelSummary,
@@ -40,7 +44,6 @@ from needle_identification.stiffness import (
     StiffnessSummary,
     summarize_stiffness,
 )
-from needle_identification.storage import OfferedQos
 
 __all__ = [
     'COMPRESSIONS',

@@ -1,6 +1,8 @@
 """What can go wrong with recordings and with identification, as types."""
 
-from needle_dynamics.errors import NeedleError
+from needle_ros.errors import (
+    NeedleError,
+)
 
 
 class RecordingError(NeedleError):

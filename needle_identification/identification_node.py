@@ -11,31 +11,34 @@ from typing import Any, ClassVar, Final
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import WrenchStamped
-from needle_dynamics.base_node import LATCHED, NeedleNode, run, SENSOR
-from needle_dynamics.errors import NeedleError, ParameterError
-from needle_dynamics.parameters import check_constants, constant
-from needle_dynamics.timing import nanoseconds
-from needle_identification.bag_io import check_distinct
-from needle_identification.estimate import Statistic, statistic
-from needle_identification.friction import (
+from needle_identification.bags.bag import check_distinct
+from needle_identification.estimation.estimate import Statistic, statistic
+from needle_identification.friction.fit import (
     FrictionEstimate,
     identify_friction,
     summarize,
 )
-from needle_identification.friction_terms import FrictionSettings
-from needle_identification.live import LiveFriction
-from needle_identification.reading import (
+from needle_identification.friction.live import LiveFriction
+from needle_identification.friction.terms import FrictionSettings
+from needle_identification.recordings.reading import (
     read_friction_recording,
     read_indentation_recording,
     TIMES,
 )
 from needle_identification.result import measured, model_parameters, NODES, write_result
-from needle_identification.stiffness import (
+from needle_identification.stiffness.fit import (
     identify_stiffness,
     StiffnessEstimate,
     StiffnessSettings,
     summarize_stiffness,
 )
+from needle_ros.base_node import LATCHED, NeedleNode, run, SENSOR
+from needle_ros.errors import (
+    NeedleError,
+    ParameterError,
+)
+from needle_ros.settings import check_constants, constant
+from needle_ros.timing import nanoseconds
 from rcl_interfaces.srv import SetParameters
 from rclpy.client import Client
 from rclpy.clock import Clock

@@ -13,14 +13,17 @@ from typing import Any, Final
 
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticStatus
-from needle_dynamics.base_node import NeedleNode, run
-from needle_dynamics.errors import NeedleError, ParameterError
-from needle_dynamics.parameters import as_number, check_constants, constant
-from needle_dynamics.timing import NANOSECONDS
-from needle_identification.bag_io import Bag, Recorded
+from needle_identification.bags.bag import Bag, Recorded
+from needle_identification.bags.storage import offered_qos, OfferedQos, Topic
 from needle_identification.errors import RecordingError
 from needle_identification.recorder_node import is_hidden, message_class
-from needle_identification.storage import offered_qos, OfferedQos, Topic
+from needle_ros.base_node import NeedleNode, run
+from needle_ros.errors import (
+    NeedleError,
+    ParameterError,
+)
+from needle_ros.settings import as_number, check_constants, constant
+from needle_ros.timing import NANOSECONDS
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.duration import Duration

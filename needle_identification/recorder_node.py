@@ -10,10 +10,10 @@ import time
 from typing import Any, Final, NamedTuple
 
 from diagnostic_msgs.msg import DiagnosticStatus
-from needle_dynamics.base_node import NeedleNode, run
-from needle_identification.bag_io import BagWriter, COMPRESSIONS
+from needle_identification.bags.bag import BagWriter, COMPRESSIONS
+from needle_identification.bags.storage import OfferedQos
 from needle_identification.errors import RecordingError
-from needle_identification.storage import OfferedQos
+from needle_ros.base_node import NeedleNode, run
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.event_handler import SubscriptionEventCallbacks

@@ -10,11 +10,16 @@ import os
 from pathlib import Path
 from typing import Final
 
-from needle_dynamics import NeedleParameters, ParameterError
+from needle_dynamics import (
+    NeedleParameters,
+)
 from needle_identification.errors import IdentificationError
-from needle_identification.estimate import Statistic
-from needle_identification.friction import FrictionSummary
-from needle_identification.stiffness import StiffnessSummary
+from needle_identification.estimation.estimate import Statistic
+from needle_identification.friction.fit import FrictionSummary
+from needle_identification.stiffness.fit import StiffnessSummary
+from needle_ros.errors import (
+    ParameterError,
+)
 import yaml
 
 #: What is said of a parameter that the data do not determine.

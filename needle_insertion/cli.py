@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
 import signal
@@ -69,7 +70,7 @@ def _interrupt(_signal: int, _frame: FrameType | None) -> NoReturn:
 
 def _joined(words: list[str]) -> list[str]:
     """Join ``--force-axis -y``, which argparse would take for two options."""
-    from needle_insertion.identify import SIGNED
+    from needle_insertion.commands.identify import SIGNED
 
     joined: list[str] = []
     for word in words:
@@ -82,7 +83,14 @@ def _joined(words: list[str]) -> list[str]:
 
 
 def _parser() -> argparse.ArgumentParser:
-    from needle_insertion import analyze, identify, protocol, reproduce, simulate, verify
+    from needle_insertion.commands import (
+        analyze,
+        identify,
+        reproduce,
+        simulate,
+        verify,
+    )
+    from needle_insertion.experiment import protocol
 
     parser = argparse.ArgumentParser(prog='needle', description='Robot-assisted needle insertion.')
     parser.add_argument('--version', action='version', version=version('needle_insertion'))
@@ -127,53 +135,48 @@ def _parser() -> argparse.ArgumentParser:
     length = graph.add_mutually_exclusive_group()
     length.add_argument('--full', action='store_true', help='record 60 s, watch memory 10 min')
     length.add_argument('--quick', action='store_true', help='a trial, too short for figures')
-    graph.set_defaults(command=_graph)
+    graph.set_defaults(command=_bench)
     intervals = subjects.add_parser('calibration', help='do the intervals hold the truth?')
     intervals.add_argument(
         '--recordings', type=int, default=1000, metavar='N', help='simulated ones of each kind'
     )
     intervals.add_argument('--seed', type=int, default=2014, help='of the truth and of the noise')
     intervals.add_argument('--json', action='store_true', help='print JSON instead')
-    intervals.set_defaults(command=_calibration)
+    intervals.set_defaults(command=_bench)
     return parser
 
 
 def _bench(options: argparse.Namespace) -> int:
-    from needle_insertion import bench
+    # The benchmarks are not installed: they are run from a clone, which is not on the path.
+    from needle_ros.errors import ParameterError
 
-    return bench.run(options.subject)
-
-
-def _graph(options: argparse.Namespace) -> int:
-    from needle_insertion import bench_graph
-
-    return bench_graph.run(options)
-
-
-def _calibration(options: argparse.Namespace) -> int:
-    from needle_insertion import bench_calibration
-
-    return bench_calibration.run(options)
+    root = Path(__file__).parents[1]
+    if not (root / 'benchmarks').is_dir():
+        raise ParameterError('needle bench needs a clone of the repository: benchmarks/ is there')
+    sys.path.insert(0, str(root))
+    own = options.subject in ('graph', 'calibration')
+    benchmark = import_module(f'benchmarks.{options.subject}' if own else 'benchmarks.run')
+    return int(benchmark.run(options))
 
 
 def _demo(options: argparse.Namespace) -> int:
-    from needle_insertion import demo
+    from needle_insertion.commands import demo
 
     return demo.run(options.output, options.bags)
 
 
 def _experiment(options: argparse.Namespace) -> int:
-    from needle_insertion import experiment
+    from needle_insertion.experiment import experiment
 
     return experiment.run(options)
 
 
 def _reproduce(options: argparse.Namespace) -> int:
-    from needle_insertion import reproduce
+    from needle_insertion.commands import reproduce
 
     recorded = None
     if options.record is not None:
-        from needle_insertion import experiment
+        from needle_insertion.experiment import experiment
 
         recorded = {
             name: experiment.record(campaign, options.record)

@@ -1,6 +1,6 @@
 """What the tests of this folder share."""
 
-from needle_insertion import paper_figures
+from needle_insertion.paper import paper_figures
 import pytest
 
 

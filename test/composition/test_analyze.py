@@ -11,8 +11,8 @@ from typing import Any
 from matplotlib.image import imread
 from needle_dynamics import NeedleError, NeedleModel, NeedleParameters
 from needle_dynamics.analysis import analyze, linearize, operating_point
-from needle_insertion import analyze as command
-from needle_insertion.analyze import add_arguments
+from needle_insertion.commands import analyze as command
+from needle_insertion.commands.analyze import add_arguments
 import numpy as np
 from numpy.testing import assert_array_equal
 import pytest

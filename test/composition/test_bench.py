@@ -5,16 +5,24 @@ from __future__ import annotations
 from math import log1p, sin, sqrt
 from pathlib import Path
 
-from needle_dynamics import NeedleModel, NeedleParameters
-from needle_insertion import (
-    bench,
-    bench_batches,
-    bench_measure,
-    bench_rods,
-    bench_solvers,
-    bench_step,
+from benchmarks import (
+    batches as bench_batches,
 )
-from needle_insertion.bench_measure import Bar
+from benchmarks import (
+    measure as bench_measure,
+)
+from benchmarks import (
+    rods as bench_rods,
+)
+from benchmarks import run as bench
+from benchmarks import (
+    solvers as bench_solvers,
+)
+from benchmarks import (
+    step as bench_step,
+)
+from benchmarks.measure import Bar
+from needle_dynamics import NeedleModel, NeedleParameters
 from needle_insertion.cli import main
 import numba
 import numpy as np

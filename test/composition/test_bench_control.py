@@ -2,6 +2,8 @@
 
 from itertools import pairwise
 
+from benchmarks import control as bench_control
+from benchmarks.control import NumpyInverseDynamics, PERIOD
 from needle_controller import (
     DeflectionLaw,
     DeflectionLoop,
@@ -10,10 +12,8 @@ from needle_controller import (
     Setpoint,
 )
 from needle_dynamics import NeedleModel, NeedleParameters
-from needle_insertion import bench_control
-from needle_insertion.bench_control import NumpyInverseDynamics, PERIOD
 from needle_insertion.cli import main
-from needle_insertion.mismatch import sampled_laws
+from needle_insertion.paper.mismatch import sampled_laws
 import numpy as np
 from numpy.testing import assert_allclose
 

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+from benchmarks import graph as bench_graph
+from benchmarks.bare import PERIOD, STREAMS
+from benchmarks.graph import Plan
+from benchmarks.measure import Bar
 from needle_identification import BagWriter, encode, message_type
-from needle_insertion import bench_graph
-from needle_insertion.bench_bare import PERIOD, STREAMS
-from needle_insertion.bench_graph import Plan
-from needle_insertion.bench_measure import Bar
 from needle_insertion.cli import main
 import numpy as np
 import pytest

@@ -5,10 +5,12 @@ from __future__ import annotations
 import json
 from math import nan, pi
 
+from benchmarks import calibration as bench_calibration
+from benchmarks import identification as bench_identification
+from benchmarks import measure as bench_measure
+from benchmarks.calibration import Found
 from needle_dynamics import ForceSensorParameters, IndenterParameters, NeedleParameters
 from needle_identification import FrictionSettings, message_counts, read_friction_recording
-from needle_insertion import bench_calibration, bench_identification, bench_measure
-from needle_insertion.bench_calibration import Found
 from needle_insertion.cli import main
 import numpy as np
 from numpy.testing import assert_allclose

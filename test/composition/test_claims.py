@@ -2,8 +2,8 @@
 
 from dataclasses import replace
 
-from needle_insertion import claims, mismatch
-from needle_insertion.claims import FAILS, HOLDS, ONLY_IF, Tables
+from needle_insertion.paper import claims, mismatch
+from needle_insertion.paper.claims import FAILS, HOLDS, ONLY_IF, Tables
 import pytest
 
 

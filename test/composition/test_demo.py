@@ -10,7 +10,7 @@ from needle_identification import (
     read_friction_recording,
     read_indentation_recording,
 )
-from needle_insertion.demo import (
+from needle_insertion.commands.demo import (
     Comparison,
     COUNTED,
     DemoError,
@@ -25,7 +25,7 @@ from needle_insertion.demo import (
     stiffness_figure,
     TARGET_DEPTH,
 )
-from needle_insertion.protocol import SHIPPED_BAGS
+from needle_insertion.experiment.protocol import SHIPPED_BAGS
 import numpy as np
 import pytest
 

@@ -2,7 +2,7 @@
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from needle_insertion.draw import (
+from needle_insertion.experiment.draw import (
     draw_friction,
     draw_stiffness,
     FORCE_LEVELS,

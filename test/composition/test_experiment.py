@@ -9,8 +9,8 @@ import sys
 import time
 
 from needle_dynamics import ParameterError
-from needle_dynamics.indenter import IndenterParameters
-from needle_dynamics.plant import BaseParameters
+from needle_dynamics.simulated.indenter import IndenterParameters
+from needle_dynamics.simulated.plant import BaseParameters
 from needle_identification import (
     BagWriter,
     encode,
@@ -21,11 +21,17 @@ from needle_identification import (
     read_indentation_recording,
     read_topic,
 )
-from needle_insertion import experiment
 from needle_insertion.cli import main
-from needle_insertion.draw import draw_friction, draw_stiffness, FORCE_LEVELS, TABLE_1, TABLE_2
-from needle_insertion.experiment import ExperimentError, record, rig
-from needle_insertion.protocol import (
+from needle_insertion.experiment import experiment
+from needle_insertion.experiment.draw import (
+    draw_friction,
+    draw_stiffness,
+    FORCE_LEVELS,
+    TABLE_1,
+    TABLE_2,
+)
+from needle_insertion.experiment.experiment import ExperimentError, record, rig
+from needle_insertion.experiment.protocol import (
     Campaign,
     DIRECTIONS,
     PROTOCOLS,

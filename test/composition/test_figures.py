@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from io import BytesIO
 
-from needle_insertion.figures import convergence_figure
+from needle_insertion.paper.figures import convergence_figure
 import numpy as np
 
 

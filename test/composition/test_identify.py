@@ -9,7 +9,7 @@ from composition.pages import look_at
 from composition.presses import STIFFNESS, write_presses
 from needle_identification import TERMS
 from needle_insertion.cli import main
-from needle_insertion.protocol import SHIPPED_BAGS
+from needle_insertion.experiment.protocol import SHIPPED_BAGS
 import pytest
 import yaml
 

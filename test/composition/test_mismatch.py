@@ -1,6 +1,6 @@
 """The mismatch study: drawn as stated, converged, and the same each time."""
 
-from needle_insertion import mismatch
+from needle_insertion.paper import mismatch
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest

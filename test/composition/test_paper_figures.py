@@ -6,8 +6,8 @@ from matplotlib.figure import Figure
 from needle_controller import ContinuousPid
 from needle_controller.in_loop import run_continuous
 from needle_dynamics import Integrator, NeedleParameters
-from needle_insertion import paper_figures
-from needle_insertion.paper_figures import (
+from needle_insertion.paper import paper_figures
+from needle_insertion.paper.paper_figures import (
     base_alone,
     CASES,
     closed_loop,
@@ -21,7 +21,7 @@ from needle_insertion.paper_figures import (
     READINGS,
     section,
 )
-from needle_insertion.report import png
+from needle_insertion.report.report import png
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest

@@ -6,11 +6,9 @@ import json
 
 from composition.pages import look_at
 from needle_identification import ParameterEstimate, Statistic
-from needle_insertion import analyze, claims, mismatch, paper_figures, reproduce
 from needle_insertion.cli import main
-from needle_insertion.draw import FORCE_LEVELS, TABLE_1, TABLE_2
-from needle_insertion.protocol import SHIPPED_BAGS
-from needle_insertion.reproduce import (
+from needle_insertion.commands import analyze, reproduce
+from needle_insertion.commands.reproduce import (
     as_table,
     count_held,
     deviation_interval,
@@ -18,6 +16,9 @@ from needle_insertion.reproduce import (
     Line,
     stiffness_truth,
 )
+from needle_insertion.experiment.draw import FORCE_LEVELS, TABLE_1, TABLE_2
+from needle_insertion.experiment.protocol import SHIPPED_BAGS
+from needle_insertion.paper import claims, mismatch, paper_figures
 import numpy as np
 import pytest
 

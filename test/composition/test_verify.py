@@ -12,15 +12,21 @@ from needle_dynamics import (
     NeedleModel,
     NeedleParameters,
 )
-from needle_dynamics.base_node import COMMAND, SENSOR
-from needle_dynamics.indenter import IndenterParameters
-from needle_dynamics.plant import BaseMotion, BaseParameters, Plant, TipParameters, TipSensor
+from needle_dynamics.simulated.indenter import IndenterParameters
+from needle_dynamics.simulated.plant import (
+    BaseMotion,
+    BaseParameters,
+    Plant,
+    TipParameters,
+    TipSensor,
+)
 from needle_identification import BagWriter, encode, message_type, RecordingError
 from needle_insertion.cli import main
-from needle_insertion.experiment import record
-from needle_insertion.graph import ACTIVATE, CONFIGURE, Graph
-from needle_insertion.protocol import Campaign, PROTOCOLS, SHIPPED_BAGS
-from needle_insertion.verify import verify
+from needle_insertion.commands.verify import verify
+from needle_insertion.experiment.experiment import record
+from needle_insertion.experiment.graph import ACTIVATE, CONFIGURE, Graph
+from needle_insertion.experiment.protocol import Campaign, PROTOCOLS, SHIPPED_BAGS
+from needle_ros.base_node import COMMAND, SENSOR
 import numpy as np
 import pytest
 from sensor_msgs.msg import JointState

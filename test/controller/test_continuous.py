@@ -17,7 +17,7 @@ from needle_controller import (
     SampledLoop,
     Setpoint,
 )
-from needle_controller.continuous import acceleration
+from needle_controller.laws.continuous import acceleration
 from needle_dynamics import Integrator, NeedleModel, NeedleParameters, ParameterError, ShapeError
 import numpy as np
 from numpy.testing import assert_allclose

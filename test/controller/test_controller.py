@@ -12,7 +12,7 @@ from needle_controller import (
     ReferenceLimits,
     Setpoint,
 )
-from needle_controller.kernels import INTEGRAL
+from needle_controller.compiled.laws import INTEGRAL
 from needle_dynamics import Integrator, NeedleModel, NeedleParameters, ParameterError
 import numpy as np
 import pytest

@@ -16,8 +16,8 @@ from needle_controller import (
     SampledLoop,
     Setpoint,
 )
-from needle_controller.axis import Axis
 from needle_controller.in_loop import run_batch, run_continuous, run_controller, tip_deflections
+from needle_controller.laws.axis import Axis
 from needle_dynamics import (
     InsertedLengthError,
     Integrator,

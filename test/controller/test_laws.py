@@ -20,7 +20,7 @@ from needle_controller import (
     SampledLoop,
     Setpoint,
 )
-from needle_controller.kernels import coupling, INTEGRAL, OFFSET, RATE
+from needle_controller.compiled.laws import coupling, INTEGRAL, OFFSET, RATE
 from needle_dynamics import NeedleModel, NeedleParameters, ParameterError, ShapeError
 import numpy as np
 from numpy.testing import assert_allclose

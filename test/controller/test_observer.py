@@ -25,7 +25,7 @@ from needle_dynamics import (
     ShapeError,
 )
 from needle_dynamics.analysis import linearize, observability, operating_point
-from needle_dynamics.plant import Plant, Sample, TipParameters, TipSensor
+from needle_dynamics.simulated.plant import Plant, Sample, TipParameters, TipSensor
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest

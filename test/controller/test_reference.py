@@ -3,7 +3,7 @@
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from needle_controller import MinimumJerk, ReferenceLimits, Setpoint, Trapezoid
-from needle_controller.reference import Guide, Joined, Path, Quintic
+from needle_controller.reference.reference import Guide, Joined, Path, Quintic
 from needle_dynamics import ParameterError
 import numpy as np
 from numpy.testing import assert_allclose

@@ -2,8 +2,10 @@
 
 from hypothesis import given
 from hypothesis import strategies as st
-from needle_dynamics.errors import ParameterError
-from needle_dynamics.faults import Fault, FaultParameters, FAULTS
+from needle_dynamics.simulated.faults import Fault, FaultParameters, FAULTS
+from needle_ros.errors import (
+    ParameterError,
+)
 import numpy as np
 import pytest
 

@@ -20,8 +20,8 @@ from needle_dynamics import (
     ShapeError,
     simulate,
 )
-from needle_dynamics.integrators import DEFAULT_STEP
-from needle_dynamics.kernels import decay_means, slide
+from needle_dynamics.compiled.kernels import decay_means, slide
+from needle_dynamics.simulated.integrators import DEFAULT_STEP
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest

@@ -16,9 +16,9 @@ from needle_dynamics import (
     ParameterError,
     ShapeError,
 )
-from needle_dynamics.integrators import kernel_constants
-from needle_dynamics.kernels import _rotate_many, _rotate_two, evaluate_many, SUMS
+from needle_dynamics.compiled.kernels import _rotate_many, _rotate_two, evaluate_many, SUMS
 from needle_dynamics.parameters import LARGEST_CONDITION, MOST_MODES
+from needle_dynamics.simulated.integrators import kernel_constants
 import numpy as np
 from numpy.polynomial.legendre import leggauss
 from numpy.testing import assert_allclose

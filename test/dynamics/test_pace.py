@@ -4,9 +4,11 @@ from itertools import pairwise
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from needle_dynamics.errors import JobError
-from needle_dynamics.pace import Pace
-from needle_dynamics.timing import NANOSECONDS
+from needle_ros.errors import (
+    JobError,
+)
+from needle_ros.pace import Pace
+from needle_ros.timing import NANOSECONDS
 import pytest
 
 #: A clock is never at zero.

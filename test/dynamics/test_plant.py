@@ -18,8 +18,7 @@ from needle_dynamics import (
     PRESETS,
     ShapeError,
 )
-from needle_dynamics.errors import JobError
-from needle_dynamics.plant import (
+from needle_dynamics.simulated.plant import (
     BaseMotion,
     BaseParameters,
     Plant,
@@ -27,6 +26,9 @@ from needle_dynamics.plant import (
     TipParameters,
     TipReading,
     TipSensor,
+)
+from needle_ros.errors import (
+    JobError,
 )
 import numpy as np
 from numpy.testing import assert_allclose

@@ -5,7 +5,7 @@ from fractions import Fraction
 from builtin_interfaces.msg import Time
 from hypothesis import given
 from hypothesis import strategies as st
-from needle_dynamics.timing import NANOSECONDS, nanoseconds, seconds, Window
+from needle_ros.timing import NANOSECONDS, nanoseconds, seconds, Window
 
 MILLISECOND = NANOSECONDS // 1000
 

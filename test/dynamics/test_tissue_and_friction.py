@@ -18,8 +18,8 @@ from needle_dynamics import (
     ParameterError,
     Tissue,
 )
-from needle_dynamics.integrators import kernel_constants
-from needle_dynamics.kernels import _flow
+from needle_dynamics.compiled.kernels import _flow
+from needle_dynamics.simulated.integrators import kernel_constants
 import numpy as np
 from numpy.polynomial.legendre import leggauss
 from numpy.testing import assert_allclose

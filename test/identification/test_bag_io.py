@@ -30,7 +30,7 @@ from needle_identification import (
     read_topic,
     RecordingError,
 )
-from needle_identification.bag_io import Bag
+from needle_identification.bags.bag import Bag
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 import pytest

@@ -4,7 +4,7 @@ import struct
 
 from hypothesis import given, settings, strategies
 from identification.samples import header, MOTION, STORE, WRENCH, wrench
-from needle_identification import cdr
+from needle_ros import cdr
 import numpy as np
 from numpy.testing import assert_array_equal
 import pytest

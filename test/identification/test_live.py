@@ -4,8 +4,8 @@ from math import inf, nan
 
 from identification.samples import IDEAL, simulated, TRUTH
 from needle_dynamics import ParameterError
-from needle_identification.friction_terms import FrictionSettings
-from needle_identification.live import LiveFriction
+from needle_identification.friction.live import LiveFriction
+from needle_identification.friction.terms import FrictionSettings
 import numpy as np
 import pytest
 

@@ -3,9 +3,10 @@
 from itertools import pairwise
 
 from identification.samples import EPOCH, STORE, TEXT, text
-from needle_identification import bag_io, BagWriter, OfferedQos
-from needle_identification.bag_io import Bag
-from needle_identification.storage import offered_qos
+from needle_identification import BagWriter, OfferedQos
+from needle_identification.bags import bag as bag_io
+from needle_identification.bags.bag import Bag
+from needle_identification.bags.storage import offered_qos
 import pytest
 from rosbags.interfaces import (
     Qos,

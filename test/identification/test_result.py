@@ -13,7 +13,7 @@ from needle_identification import (
     write_result,
 )
 from needle_identification.result import between, measured, model_parameters, rounded, UNKNOWN
-from needle_identification.stiffness import StiffnessSummary
+from needle_identification.stiffness.fit import StiffnessSummary
 import pytest
 import yaml
 

@@ -1,8 +1,8 @@
 """Samples keep their values and their means, in bounded memory."""
 
 from hypothesis import given, settings, strategies
-from needle_identification import series
-from needle_identification.series import FINEST, Series
+from needle_identification.recordings import series
+from needle_identification.recordings.series import FINEST, Series
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 import pytest

@@ -7,8 +7,8 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 from needle_dynamics import ParameterError
 from needle_identification import IdentificationError
-from needle_identification.recording import IndentationRecording
-from needle_identification.stiffness import (
+from needle_identification.recordings.recording import IndentationRecording
+from needle_identification.stiffness.fit import (
     identify_stiffness,
     StiffnessSettings,
     summarize_stiffness,

@@ -7,8 +7,8 @@ import gc
 from pathlib import Path
 from typing import Any
 
-from needle_dynamics.base_node import NeedleNode
-from needle_insertion.graph import Graph
+from needle_insertion.experiment.graph import Graph
+from needle_ros.base_node import NeedleNode
 import pytest
 from rclpy.node import Node
 from rclpy.parameter import Parameter

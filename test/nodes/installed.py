@@ -8,7 +8,7 @@ from importlib import import_module
 import inspect
 from pathlib import Path
 
-from needle_dynamics.base_node import NeedleNode
+from needle_ros.base_node import NeedleNode
 
 ROOT = Path(__file__).parent.parent.parent
 

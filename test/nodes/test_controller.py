@@ -7,10 +7,10 @@ from time import monotonic
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PointStamped, WrenchStamped
+from needle_controller.compiled.laws import INTEGRAL
 from needle_controller.controller_node import ControllerNode
-from needle_controller.kernels import INTEGRAL
-from needle_dynamics.base_node import COMMAND, SENSOR
 from needle_dynamics.plant_node import PlantNode
+from needle_ros.base_node import COMMAND, SENSOR
 import pytest
 from rclpy.duration import Duration
 from rclpy.lifecycle import TransitionCallbackReturn

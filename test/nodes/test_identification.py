@@ -7,9 +7,9 @@ from composition.presses import write_presses
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import WrenchStamped
 from identification.samples import NOISY, simulated, TRUTH, write_bag
-from needle_dynamics.base_node import COMMAND, LATCHED, SENSOR
 from needle_dynamics.plant_node import PlantNode
 from needle_identification.identification_node import IdentificationNode
+from needle_ros.base_node import COMMAND, LATCHED, SENSOR
 import pytest
 from rcl_interfaces.srv import GetParameters
 from rclpy.node import Node

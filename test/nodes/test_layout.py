@@ -6,11 +6,12 @@ from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PointStamped, WrenchStamped
 from hypothesis import given
 from hypothesis import strategies as st
-from needle_dynamics import base_node, ShapeError
-from needle_dynamics.base_node import layout_of, reading_of, SENSOR
-from needle_dynamics.layout import Layout, Reading
+from needle_dynamics import ShapeError
 from needle_dynamics.plant_node import PlantNode
-from needle_identification.bag_io import deserialize, encode, Topic
+from needle_identification.bags.bag import deserialize, encode, Topic
+from needle_ros import base_node
+from needle_ros.base_node import layout_of, reading_of, SENSOR
+from needle_ros.packed import Layout, Reading
 import pytest
 from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import JointState

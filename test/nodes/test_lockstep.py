@@ -7,11 +7,11 @@ from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PointStamped
 from needle_controller import closed_loop, ContinuousInverseDynamics
 from needle_dynamics import NeedleModel, NeedleParameters
-from needle_dynamics.base_node import COMMAND, SENSOR
-from needle_dynamics.timing import seconds
-from needle_identification.bag_io import Bag, deserialize, encode
+from needle_identification.bags.bag import Bag, deserialize, encode
 from needle_identification.recorder_node import is_hidden
-from needle_insertion.graph import Graph
+from needle_insertion.experiment.graph import Graph
+from needle_ros.base_node import COMMAND, SENSOR
+from needle_ros.timing import seconds
 import numpy as np
 import pytest
 from rclpy.qos import QoSProfile, ReliabilityPolicy

@@ -15,7 +15,7 @@ import xml.etree.ElementTree as ET
 
 from catkin_pkg.package import InvalidPackage, parse_package_string
 from lxml import etree
-from needle_insertion.protocol import SHIPPED_BAGS
+from needle_insertion.experiment.protocol import SHIPPED_BAGS
 from nodes.installed import NODES, ROOT
 import pytest
 import yaml

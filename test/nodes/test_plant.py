@@ -10,9 +10,9 @@ from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PointStamped, PoseStamped, WrenchStamped
 from needle_controller.controller_node import ControllerNode
 from needle_dynamics import ForceSensorParameters, IndenterParameters
-from needle_dynamics.base_node import COMMAND, LATCHED, SENSOR
 from needle_dynamics.plant_node import PlantNode
-from needle_insertion.graph import GraphError
+from needle_insertion.experiment.graph import GraphError
+from needle_ros.base_node import COMMAND, LATCHED, SENSOR
 import numpy as np
 import pytest
 from rclpy.duration import Duration

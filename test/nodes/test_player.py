@@ -10,11 +10,11 @@ import time
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from mcap.writer import Writer as McapWriter
-from needle_dynamics.base_node import LATCHED, SENSOR
 from needle_identification import BagWriter, OfferedQos, read_topic
-from needle_identification.bag_io import Bag
+from needle_identification.bags.bag import Bag
 from needle_identification.player_node import PlayerNode
 from needle_identification.recorder_node import RecorderNode
+from needle_ros.base_node import LATCHED, SENSOR
 import pytest
 from rclpy.node import Node as RosNode
 from rclpy.parameter import Parameter

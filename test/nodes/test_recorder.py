@@ -5,9 +5,9 @@ import time
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from nav_msgs.msg import Goals
-from needle_dynamics.base_node import COMMAND, LATCHED, SENSOR
 from needle_identification import BagWriter, message_counts, read_topic
 from needle_identification.recorder_node import RecorderNode
+from needle_ros.base_node import COMMAND, LATCHED, SENSOR
 import pytest
 from rcl_interfaces.msg import Log
 from rclpy.node import Node

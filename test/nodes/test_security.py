@@ -9,8 +9,8 @@ import sys
 from typing import NamedTuple
 
 from lxml import etree
-from needle_dynamics.base_node import NeedleNode
-from needle_insertion.protocol import SHIPPED_BAGS
+from needle_insertion.experiment.protocol import SHIPPED_BAGS
+from needle_ros.base_node import NeedleNode
 from nodes.installed import node_class, NODES, ROOT
 import pytest
 

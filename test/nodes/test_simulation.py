@@ -2,8 +2,8 @@
 
 from geometry_msgs.msg import PointStamped, PoseArray, WrenchStamped
 from needle_dynamics import NeedleModel, NeedleParameters
-from needle_dynamics.base_node import COMMAND, SENSOR
 from needle_dynamics.plant_node import PlantNode
+from needle_ros.base_node import COMMAND, SENSOR
 import numpy as np
 import pytest
 from rclpy.parameter import Parameter

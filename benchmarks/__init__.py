@@ -1,0 +1,1 @@
+"""Benchmarks: what it costs, beside what a user would otherwise use."""

@@ -1,0 +1,228 @@
+"""
+Bare rclpy nodes to compare with: they send what the suite's send, and do nothing else.
+
+Run as ``python -m benchmarks.bare ROLE EXECUTOR``; nothing of the suite is imported,
+so that neither its memory nor its garbage weighs on them.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+import ctypes
+import signal
+import sys
+import time
+from typing import Any, Final
+
+from builtin_interfaces.msg import Time
+from geometry_msgs.msg import PointStamped, WrenchStamped
+import rclpy
+from rclpy.executors import Executor, SingleThreadedExecutor
+from rclpy.experimental.events_executor import EventsExecutor
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.task import Future
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Bool
+
+#: Quality of service of the suite's topics.
+SENSOR: Final = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)
+COMMAND: Final = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE)
+LATCHED: Final = QoSProfile(
+    depth=1,
+    reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.TRANSIENT_LOCAL,
+)
+
+#: What the plant sends at each sample, in order.
+STREAMS: Final = {
+    'base_wrench': WrenchStamped,
+    'tip_deflection': PointStamped,
+    'ground_truth': JointState,
+    'joint_states': JointState,
+}
+
+#: Samples per second [Hz] and their period [ns].
+RATE: Final = 1000
+PERIOD: Final = 1_000_000_000 // RATE
+
+#: Most samples that are made up at one tick.
+_BURST: Final = 10
+
+_PR_SET_PDEATHSIG = 1
+
+
+def time_message(stamp: int) -> Time:
+    """Return a time [ns] as a message."""
+    return Time(sec=stamp // 1_000_000_000, nanosec=stamp % 1_000_000_000)
+
+
+class Sender:
+    """Sends one sample of each stream, filled as the plant fills it: from numbers, each time."""
+
+    def __init__(self, node: Node) -> None:
+        self._publishers = [node.create_publisher(t, n, SENSOR) for n, t in STREAMS.items()]
+        self._wrench, self._tip = WrenchStamped(), PointStamped()
+        self._wrench.header.frame_id, self._tip.header.frame_id = 'needle_base', 'needle_entry'
+        self._truth = JointState(name=['d', 'theta', 'q1', 'q2'])
+        self._joints = JointState(name=['insertion', 'rotation'])
+
+    def destroy(self, node: Node) -> None:
+        """Undo what was made."""
+        for publisher in self._publishers:
+            node.destroy_publisher(publisher)
+
+    def has_readers(self) -> bool:
+        """Tell whether each stream is read by someone."""
+        return all(publisher.get_subscription_count() for publisher in self._publishers)
+
+    def send(self, stamp: int, depth: float = 0.05) -> int:
+        """Send the sample of a time [ns]; return when joint_states, the last, left [ns]."""
+        wrench, tip, truth, joints = self._wrench, self._tip, self._truth, self._joints
+        stamped = time_message(stamp)
+        for message in (wrench, tip, truth, joints):
+            message.header.stamp = stamped
+        force, torque = wrench.wrench.force, wrench.wrench.torque
+        force.x, force.y, force.z, torque.x, torque.y, torque.z = 0.0, 0.5, 0.0, 0.0, 0.0, 0.0
+        tip.point.y, tip.point.z = depth, 0.0
+        truth.position, truth.velocity = [0.15, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 0.0]
+        joints.position, joints.velocity, joints.effort = [depth, 0.0], [0.0, 0.0], [0.5, 0.0]
+        publishers = self._publishers
+        publishers[0].publish(wrench)
+        publishers[1].publish(tip)
+        publishers[2].publish(truth)
+        left = time.time_ns()
+        publishers[3].publish(joints)
+        return left
+
+
+class Clocked(Node, ABC):
+    """Does something at every period while ``run`` says so; what is missed is made up."""
+
+    def __init__(self, name: str, **options: Any) -> None:
+        super().__init__(name, **options)
+        self._timer: Any = None
+        self.create_subscription(Bool, 'run', self._on_run, LATCHED)
+
+    def _on_run(self, message: Bool) -> None:
+        if self._timer is not None:
+            self.destroy_timer(self._timer)
+            self._timer = None
+        if message.data:
+            self._start, self._done = self.get_clock().now().nanoseconds, 0
+            self._timer = self.create_timer(1.0 / RATE, self._on_timer)
+
+    def _on_timer(self) -> None:
+        due = (self.get_clock().now().nanoseconds - self._start) // PERIOD - self._done
+        for _ in range(min(due, _BURST)):
+            self._done += 1
+            self.sample(self._start + self._done * PERIOD)
+
+    @abstractmethod
+    def sample(self, stamp: int) -> None:
+        """Do what is due at a time [ns]."""
+
+
+class BarePlant(Clocked):
+    """Sends the plant's messages and takes its command."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__('bare_plant', **options)
+        self._force = 0.0
+        self._sender = Sender(self)
+        self.create_subscription(WrenchStamped, 'wrench_command', self._on_command, COMMAND)
+
+    def sample(self, stamp: int) -> None:
+        """Send a sample."""
+        self._sender.send(stamp)
+
+    def _on_command(self, message: WrenchStamped) -> None:
+        self._force = message.wrench.force.y
+
+
+class BareEcho(Node):
+    """Answers each joint_states as the controller does: the command first, then two more."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__('bare_echo', **options)
+        self._command = self.create_publisher(WrenchStamped, 'wrench_command', COMMAND)
+        self._reference = self.create_publisher(JointState, 'reference', SENSOR)
+        self._error = self.create_publisher(JointState, 'tracking_error', SENSOR)
+        self._seen = 0.0
+        self._wrench = WrenchStamped()
+        self._wrench.header.frame_id = 'needle_base'
+        self._aim = JointState(name=['insertion'])
+        self._off = JointState(name=['insertion'])
+        self.create_subscription(PointStamped, 'tip_deflection', self._on_tip, SENSOR)
+        self.create_subscription(WrenchStamped, 'base_wrench', self._on_wrench, SENSOR)
+        self.create_subscription(JointState, 'joint_states', self._on_joint_states, SENSOR)
+
+    def _on_tip(self, message: PointStamped) -> None:
+        self._seen = message.point.z
+
+    def _on_wrench(self, message: WrenchStamped) -> None:
+        self._seen = message.wrench.force.z
+
+    def _on_joint_states(self, message: JointState) -> None:
+        depth, speed = message.position[0], message.velocity[0]
+        wrench, aim, off = self._wrench, self._aim, self._off
+        for answer in (wrench, aim, off):
+            answer.header.stamp = message.header.stamp
+        wrench.wrench.force.y, wrench.wrench.torque.x = depth, speed
+        self._command.publish(wrench)
+        aim.position, aim.velocity = [depth], [speed]
+        off.position, off.velocity = [depth], [speed]
+        self._reference.publish(aim)
+        self._error.publish(off)
+
+
+class BareSource(Clocked):
+    """
+    Numbers messages for a recorder: the plant's four streams and the command.
+
+    The stamp is the number of the sample, in periods. Numbers begin once each stream has a
+    reader; how many have been sent, in how many seconds, is said on stdout when ``run`` becomes
+    false.
+    """
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__('bare_source', **options)
+        self._sender = Sender(self)
+        self._wrench = WrenchStamped()
+        self._command = self.create_publisher(WrenchStamped, 'wrench_command', COMMAND)
+        self._sent = 0
+
+    def _on_run(self, message: Bool) -> None:
+        super()._on_run(message)
+        if not message.data and self._sent:
+            sys.stdout.write(f'{self._sent} {time.monotonic() - self._begin}\n')
+            sys.stdout.flush()
+
+    def sample(self, _stamp: int) -> None:
+        """Send the next number in each stream, if all are read."""
+        if self._sent or (self._sender.has_readers() and self._command.get_subscription_count()):
+            if not self._sent:
+                self._begin = time.monotonic()
+            self._sent += 1
+            self._sender.send(self._sent * PERIOD)
+            self._wrench.header.stamp = time_message(self._sent * PERIOD)
+            self._command.publish(self._wrench)
+
+
+ROLES: Final = {'plant': BarePlant, 'echo': BareEcho, 'source': BareSource}
+EXECUTORS: Final = {'events': EventsExecutor, 'single': SingleThreadedExecutor}
+
+
+def main(role: str, executor_name: str) -> None:
+    """Run one node until a signal ends the process, or the process that started it ends."""
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    rclpy.init(signal_handler_options=rclpy.signals.SignalHandlerOptions.NO)
+    executor: Executor = EXECUTORS[executor_name]()
+    executor.add_node(ROLES[role]())
+    while True:
+        # In rclpy 7.1 spin of the events executor returns at once, and spin_once at each event.
+        executor.spin_until_future_complete(Future(), timeout_sec=0.5)
+
+
+if __name__ == '__main__':
+    main(*sys.argv[1:])

@@ -1,0 +1,160 @@
+"""
+Many insertions at once: one thread beside two, and the memory that they take.
+
+How much a second thread can give depends on what else the machine does: a loop of sums and
+products, which shares nothing between its threads, is measured beside as the ceiling.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+import tracemalloc
+from typing import Final
+
+from benchmarks.measure import Bar, least_times
+from benchmarks.solvers import DEFLECTION, DEPTH, DURATION, FORCE
+from benchmarks.step import chains
+from needle_dynamics import Batch, NeedleModel, NeedleParameters, simulate_batch
+from needle_insertion.report.report import table
+import numpy as np
+
+#: Number of insertions.
+RUNS: Final = 2000
+
+#: Step [s] from which the steps grow.
+_STEP: Final = 1.4e-5
+
+#: Interval of the runs whose memory is looked at [s].
+_INTERVAL: Final = DURATION / 300
+
+#: Rounds of the loop in all threads together: it lasts about as long as the insertions.
+_ROUNDS: Final = 100_000_000
+
+_REPEATS: Final = 30
+
+
+class Batches:
+    """
+    The open-loop run under frictions from half to one and a half of that of the source.
+
+    Parameters
+    ----------
+    runs : int
+        Number of insertions.
+
+    """
+
+    def __init__(self, runs: int = RUNS) -> None:
+        preset = NeedleParameters.preset('paper_si')
+        self._start = NeedleModel(preset).state_at(DEPTH, DEFLECTION)
+        self._parameters = [
+            NeedleParameters.preset('paper_si', coulomb_friction=factor * preset.coulomb_friction)
+            for factor in np.linspace(0.5, 1.5, runs)
+        ]
+
+    def run(
+        self,
+        workers: int,
+        *,
+        duration: float = DURATION,
+        interval: float = DURATION,
+        keep: bool = False,
+    ) -> Batch:
+        """Simulate all insertions."""
+        return simulate_batch(
+            self._parameters,
+            self._start,
+            FORCE,
+            duration=duration,
+            interval=interval,
+            step=_STEP,
+            graded=True,
+            keep=keep,
+            workers=workers,
+        )
+
+    def peak_memory(self, part: float, *, keep: bool) -> int:
+        """Return the most memory that a part of the duration holds at once [bytes]."""
+        job = partial(self.run, 2, duration=part * DURATION, interval=_INTERVAL, keep=keep)
+        job()
+        tracemalloc.start()
+        try:
+            job()
+            return tracemalloc.get_traced_memory()[1]
+        finally:
+            tracemalloc.stop()
+
+
+def _spin(threads: int) -> None:
+    """Share the rounds of the loop among threads."""
+    with ThreadPoolExecutor(threads) as pool:
+        list(pool.map(partial(chains, 0.7, 0.6), [_ROUNDS // threads] * threads))
+
+
+def compare(tick: Callable[[str], None]) -> tuple[str, list[Bar]]:
+    """
+    Measure batches of insertions on one and two threads.
+
+    Parameters
+    ----------
+    tick : callable
+        Told what comes next.
+
+    Returns
+    -------
+    text : str
+        Table.
+    bars : list of Bar
+        Gain by the second thread, and growth of memory with the simulated time.
+
+    """
+    batches = Batches()
+    tick('batches, one thread and two')
+    times = least_times(
+        {
+            'insertions, 1': partial(batches.run, 1),
+            'insertions, 2': partial(batches.run, 2),
+            'ceiling, 1': partial(_spin, 1),
+            'ceiling, 2': partial(_spin, 2),
+        },
+        _REPEATS,
+    )
+    ratio = times['insertions, 1'] / times['insertions, 2']
+    ceiling = times['ceiling, 1'] / times['ceiling, 2']
+    one, two = batches.run(1).states, batches.run(2).states
+    tick('memory of batches')
+    short, long, kept = (
+        batches.peak_memory(part, keep=keep)
+        for part, keep in ((0.1, False), (1.0, False), (1.0, True))
+    )
+    rows = [
+        (
+            name,
+            *(f'{times[f"{name}, {threads}"] * 1e3:.4g}' for threads in (1, 2)),
+            f'{gain:.2f} x',
+            f'{RUNS / times[f"{name}, 2"]:.0f}' if name == 'insertions' else '',
+        )
+        for name, gain in (('insertions', ratio), ('ceiling', ceiling))
+    ]
+    heads = ('what', '1 thread [ms]', '2 threads [ms]', 'gain', 'per second')
+    text = (
+        f'Batches: {RUNS} open-loop runs, {DURATION * 1e3:g} ms each, friction from 0.5 to 1.5 '
+        f'times, steps from {_STEP:g} s growing with depth, ends kept\n{table(rows, heads)}\n'
+        f'ends bit-identical on 1 and 2 threads: {"yes" if np.array_equal(one, two) else "NO"}\n'
+        f'peak memory at intervals of {_INTERVAL * 1e3:g} ms, as tracemalloc sees it: ends of '
+        f'{0.1 * DURATION * 1e3:g} ms {short / 1e6:.2f} MB, ends of {DURATION * 1e3:g} ms '
+        f'{long / 1e6:.2f} MB, all states of {DURATION * 1e3:g} ms {kept / 1e6:.1f} MB'
+    )
+    bars = [
+        Bar('batches, 2 threads over 1', '>= 1.8 x', ratio, 1.8),
+        Bar(
+            'batches, memory for 10 times the time, ends kept',
+            '<= 1.05 x',
+            long / short,
+            1.05,
+            at_least=False,
+        ),
+    ]
+    return text, bars

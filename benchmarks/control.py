@@ -1,0 +1,271 @@
+"""`needle bench control`: what a control step costs, against the period of 1 kHz and a bar."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import cycle
+from math import exp, inf
+from typing import Final
+
+from benchmarks.measure import Bar, least_times
+from needle_controller import (
+    Axis,
+    DeflectionLaw,
+    InverseDynamics,
+    InverseDynamicsGains,
+    ModalLoop,
+    Observer,
+    ObserverSettings,
+    Pid,
+    PidGains,
+    SampledLoop,
+    Setpoint,
+)
+from needle_dynamics import FloatArray, NeedleModel, NeedleParameters
+from needle_insertion.paper.mismatch import sampled_laws
+from needle_insertion.report.report import table
+import numpy as np
+from scipy.linalg import eigh, expm
+
+#: Sample period [s], delay in periods, and the bar for a whole law with the observer [s].
+PERIOD: Final = 1e-3
+DELAY: Final = 1
+BUDGET: Final = 20e-6
+
+#: Calls in a job: one is too short for the clock.
+_CALLS: Final = 100
+_ROUNDS: Final = 15
+
+_DEPTH: Final = 0.1
+_SPEED: Final = 0.01
+_LIMIT: Final = 15.0
+
+
+class NumpyInverseDynamics:
+    """
+    The law of `InverseDynamics` with its delay, written plainly with NumPy, for comparison.
+
+    Parameters
+    ----------
+    parameters : NeedleParameters
+        Needle.
+    gains : InverseDynamicsGains
+        Gains.
+
+    """
+
+    def __init__(self, parameters: NeedleParameters, gains: InverseDynamicsGains) -> None:
+        self.p, self.gains = parameters, gains
+        self.last = 0.0
+
+    def command(self, position: float, speed: float, target: FloatArray) -> float:
+        """Return the force for a measurement of a needle that moves inward."""
+        p, g, h = self.p, self.gains, PERIOD
+        rate = p.viscous_friction / p.moving_mass
+        fall = exp(-rate * h)
+        drive = np.sign(speed) * p.coulomb_friction
+        steady = (self.last - drive) / p.viscous_friction
+        state = np.array([position, speed])
+        flow = np.array([[1.0, (1.0 - fall) / rate], [0.0, fall]])
+        push = np.array([h - (1.0 - fall) / rate, 1.0 - fall])
+        state = flow @ state + push * steady
+        wanted = target[2] + np.array([g.kp, g.kv]) @ (target[:2] - state)
+        ahead = state[1] + h * wanted
+        linear = (ahead - fall * state[1]) * p.viscous_friction / (1.0 - fall)
+        lean = np.clip((state[1] + h * wanted) / g.breakaway_speed, -1.0, 1.0)
+        self.last = float(np.clip(linear + lean * p.coulomb_friction, -_LIMIT, _LIMIT))
+        return self.last
+
+
+def numpy_deflection(
+    model: NeedleModel, gains: InverseDynamicsGains, x: FloatArray, speed: float
+) -> FloatArray:
+    """
+    Return what `DeflectionLaw` with inverse dynamics commands without delay, to no deflection.
+
+    Parameters
+    ----------
+    model : NeedleModel
+        Needle.
+    gains : InverseDynamicsGains
+        Gains of all deflections.
+    x : ndarray, shape (2, n)
+        Deflections q and their rates, at the depth that is measured.
+    speed : float
+        Insertion speed [m/s].
+
+    Returns
+    -------
+    ndarray, shape (n,)
+        Generalized forces.
+
+    """
+    p, n, h = model.parameters, model.modes.count, PERIOD
+    middle = _DEPTH + 0.5 * h * speed
+    at = model.modes.integrals(middle)
+    mass = p.linear_density * at.gram
+    squares, shapes = eigh(model.stiffness_matrix(middle), mass)
+    damping = p.tissue_damping / p.linear_density
+    wanted = -gains.kp * x[0] - gains.kv * x[1]
+    back = shapes.T @ mass
+    eta, rate, change = back @ x[0], back @ x[1], h * (back @ wanted)
+    force = np.empty(n)
+    for i, square in enumerate(squares):
+        system = np.zeros((3, 3))
+        system[0, 1], system[1, 0], system[1, 1], system[1, 2] = 1.0, -square, -damping, 1.0
+        end = expm(h * system)[1]
+        force[i] = (rate[i] + change[i] - end[0] * eta[i] - end[1] * rate[i]) / end[2]
+    held = p.linear_density * speed * float(at.value @ x[1]) * at.value
+    return np.asarray(back.T @ force + held)
+
+
+def jobs() -> dict[str, Callable[[], object]]:
+    """
+    Return what is measured: each job is one control step, on a needle that moves.
+
+    Returns
+    -------
+    dict[str, callable]
+        By name.
+
+    """
+    parameters = NeedleParameters.preset('phantom')
+    model = NeedleModel(parameters)
+    state = model.state_at(_DEPTH, 5e-4)
+    state[4] = -_SPEED
+    seen = state.copy()
+    goal, still = Setpoint(_DEPTH + _SPEED * PERIOD, _SPEED), Setpoint(0.0)
+    rest = np.zeros((3, parameters.modes))
+    observer = Observer(parameters, ObserverSettings(), PERIOD)
+    samples = cycle([(0.01, 0.001), (0.012, 0.0012), (0.009, 0.0009)])
+    clock = [0.0]
+
+    def observe() -> float:
+        clock[0] += PERIOD
+        # Back and forth within the tissue, so that it never runs out of needle.
+        phase = clock[0] % 10.0
+        depth = _DEPTH + _SPEED * min(phase, 10.0 - phase)
+        observer.update(clock[0], depth, _SPEED if phase < 5.0 else -_SPEED, next(samples))
+        return observer.load
+
+    found: dict[str, Callable[[], object]] = {}
+    for name, law in sampled_laws(parameters, PERIOD).items():
+        loop = SampledLoop(law, DELAY, _LIMIT)
+        rotation = sampled_loop(Axis.rotation(parameters), name)
+
+        def physical(
+            loop: SampledLoop = loop, rotation: SampledLoop = rotation, load: float = 0.0
+        ) -> float:
+            rotation.command(0.0, 0.0, still)
+            return loop.command(_DEPTH, _SPEED, goal, load)
+
+        found[f'{name}, physical'] = physical
+        found[f'{name}, physical, with observer'] = _observed(physical, observe)
+        deflections = modal_loop(model, name, loop)
+
+        def modal(deflections: ModalLoop = deflections) -> FloatArray:
+            return deflections.command(state, goal, still, rest)
+
+        def modal_observed(deflections: ModalLoop = deflections) -> FloatArray:
+            observe()
+            seen[2:4], seen[6:8] = observer.modal
+            return deflections.command(seen, goal, still, rest)
+
+        found[f'{name}, modal'] = modal
+        found[f'{name}, modal, with observer'] = modal_observed
+    found['observer'] = observe
+    gains = InverseDynamicsGains()
+    plain = NumpyInverseDynamics(parameters, gains)
+    target = np.array([goal.position, goal.speed, goal.acceleration])
+    found['inverse_dynamics, physical, NumPy'] = lambda: plain.command(_DEPTH, _SPEED, target)
+    x = np.array([state[2:4], state[6:8]])
+    found['inverse_dynamics, modal, NumPy'] = lambda: (
+        plain.command(_DEPTH, _SPEED, target),
+        numpy_deflection(model, gains, x, _SPEED),
+    )
+    return found
+
+
+def _observed(physical: Callable[..., float], observe: Callable[[], float]) -> Callable[[], float]:
+    """Return the step of a law that is told the load by the observer."""
+    return lambda: physical(load=observe())
+
+
+def sampled_loop(axis: Axis, name: str) -> SampledLoop:
+    """Return the loop of a law on an axis, with gains for what is light and free of friction."""
+    law = (
+        InverseDynamics(axis=axis, gains=InverseDynamicsGains(), period=PERIOD)
+        if name == 'inverse_dynamics'
+        else Pid(axis=axis, gains=PidGains(kp=1e-6, ki=1e-6, kd=1e-8), period=PERIOD)
+    )
+    return SampledLoop(law, DELAY, inf)
+
+
+def modal_loop(model: NeedleModel, name: str, insertion: SampledLoop) -> ModalLoop:
+    """Return the loop on all coordinates of a law; nothing is driven with it."""
+    gains = (
+        InverseDynamicsGains()
+        if name == 'inverse_dynamics'
+        else PidGains(kp=5.0, ki=20.0, kd=0.02)
+    )
+    law = DeflectionLaw(model=model, gains=gains, period=PERIOD)
+    return ModalLoop(
+        insertion.law,
+        sampled_loop(Axis.rotation(model.parameters), name).law,
+        law,
+        DELAY,
+        force_limit=_LIMIT,
+        torque_limit=0.01,
+    )
+
+
+def compare(tick: Callable[[str], None]) -> tuple[str, list[Bar]]:
+    """
+    Measure the control step.
+
+    Parameters
+    ----------
+    tick : callable
+        Called with the name of each stage.
+
+    Returns
+    -------
+    text : str
+        Costs, shares of the period, and what NumPy takes.
+    bars : list of Bar
+        Whole laws with the observer.
+
+    """
+
+    def several(job: Callable[[], object]) -> Callable[[], None]:
+        def run() -> None:
+            for _ in range(_CALLS):
+                job()
+
+        return run
+
+    tick('control step')
+    times = {
+        name: value / _CALLS
+        for name, value in least_times(
+            {name: several(job) for name, job in jobs().items()}, _ROUNDS
+        ).items()
+    }
+    rows = []
+    for name, value in times.items():
+        plain = times.get(f'{name.replace(", with observer", "")}, NumPy')
+        ratio = f'{plain / value:.1f} x' if plain and 'observer' not in name else ''
+        rows.append((name, f'{1e6 * value:.2f}', f'{100.0 * value / PERIOD:.2f} %', ratio))
+    heads = ('control step', 'cost [us]', 'of 1 ms', 'NumPy takes')
+    bars = [
+        Bar(
+            f'{name}, {how}, with observer [us]',
+            f'<= {1e6 * BUDGET:g}',
+            1e6 * times[f'{name}, {how}, with observer'],
+            1e6 * BUDGET,
+            at_least=False,
+        )
+        for name in ('inverse_dynamics', 'pid')
+        for how in ('physical', 'modal')
+    ]
+    return table(rows, heads), bars

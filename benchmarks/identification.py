@@ -1,0 +1,344 @@
+"""
+How fast a bag becomes a result, beside what else reads it, and in how much memory.
+
+A bag of one length is read and friction identified from it, and the same bag is read by the
+libraries that do so in Python: their messages are made into objects and the same numbers taken
+from these. Bags of ten and thirty times the length show what memory grows with. Each is done in a
+process of its own, whose peak is its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
+import json
+from pathlib import Path
+import resource
+import struct
+import subprocess
+import sys
+from tempfile import TemporaryDirectory
+import time
+from typing import Any, Final
+
+from benchmarks.measure import Bar, NOT_INSTALLED, optional
+from needle_identification import (
+    BagWriter,
+    encode,
+    FrictionEstimate,
+    identify_friction,
+    message_type,
+    read_friction_recording,
+)
+from needle_identification.recordings.series import LARGEST
+from needle_insertion.report.report import table
+import numpy as np
+from rosbags.highlevel import AnyReader
+from rosbags.typesys import get_typestore, Stores
+
+#: Messages of each of the two topics in the shortest bag, and how much longer the others are.
+MESSAGES: Final = 2**17
+LONGER: Final = (1, 10, 30)
+
+#: Messages per second of each topic [Hz], and time of one stroke [s].
+_RATE: Final = 250.0
+_STROKE: Final = 4.0
+
+#: Repeats with the shortest bag, of which the least time counts.
+_REPEATS: Final = 3
+
+#: Time one reading may take [s].
+_PATIENCE: Final = 600.0
+
+_WRENCH: Final = 'geometry_msgs/msg/WrenchStamped'
+_MOTION: Final = 'sensor_msgs/msg/JointState'
+_TOPICS: Final = {'/base_wrench': _WRENCH, '/joint_states': _MOTION}
+
+#: Number in a message that stands for what is patched into it later.
+_MARK: Final = struct.unpack('<d', b'needle!!')[0]
+
+_START: Final = 1_700_000_000
+
+
+def write_bag(path: Path, messages: int) -> None:
+    """
+    Write a bag with force and motion of strokes in and out at five speeds.
+
+    Parameters
+    ----------
+    path : Path
+        Folder to make.
+    messages : int
+        Messages of each topic.
+
+    """
+    header = message_type('std_msgs/msg/Header')(
+        message_type('builtin_interfaces/msg/Time')(_START, 0), 'needle_base'
+    )
+    vector = message_type('geometry_msgs/msg/Vector3')
+    wrench = message_type('geometry_msgs/msg/Wrench')(
+        vector(0.0, _MARK, 0.0), vector(0.0, 0.0, 0.0)
+    )
+    joints = message_type(_MOTION)(
+        header, ['insertion', 'rotation'], np.array([_MARK, 0.0]), np.array([_MARK, 0.0]),
+        np.array([0.0, 0.0]),
+    )  # fmt: skip
+    rng = np.random.default_rng(1)
+    with BagWriter(path) as bag:
+        for topic, type_name in _TOPICS.items():
+            bag.add_topic(topic, type_name)
+        for first in range(0, messages, 2**16):
+            count = np.arange(first, min(first + 2**16, messages))
+            depth, speed, force = _strokes(count / _RATE)
+            force += 0.01 * rng.standard_normal(len(force))
+            stamps = np.rint(count / _RATE * 1e9).astype(np.int64)
+            wrenches = _patched(encode(message_type(_WRENCH)(header, wrench)), stamps, [force])
+            motions = _patched(encode(joints), stamps, [depth, speed])
+            for stamp, one, other in zip(stamps.tolist(), wrenches, motions, strict=True):
+                received = _START * 10**9 + stamp + 100_000
+                bag.write('/base_wrench', one, received)
+                bag.write('/joint_states', other, received)
+
+
+def _strokes(time: np.ndarray[Any, Any]) -> tuple[np.ndarray[Any, Any], ...]:
+    """Return inserted length [m], speed [m/s] and force [N] of strokes eased by a sine."""
+    number, phase = np.divmod(time, _STROKE)
+    most = 0.004 * (1.0 + number % 5) * np.where(number // 5 % 2, -1.0, 1.0)
+    turn = 2.0 * np.pi / _STROKE
+    speed = most * np.sin(turn * phase)
+    depth = 0.1 + most / turn * (1.0 - np.cos(turn * phase))
+    return depth, speed, 0.56 * np.sign(speed) + 300.0 * speed
+
+
+def _patched(
+    message: bytes, stamps: np.ndarray[Any, Any], values: list[np.ndarray[Any, Any]]
+) -> Iterator[bytes]:
+    """Yield copies of a message with other stamps, and values in the place of the mark."""
+    size = len(message)
+    copies = np.tile(np.frombuffer(message, dtype=np.uint8), (len(stamps), 1))
+    # After the four bytes that say how the rest is encoded comes the stamp.
+    time = np.column_stack([_START + stamps // 10**9, stamps % 10**9]).astype('<i4')
+    copies[:, 4:12] = time.view(np.uint8)
+    at = -1
+    for column in values:
+        at = message.index(struct.pack('<d', _MARK), at + 1)
+        copies[:, at : at + 8] = column.astype('<f8')[:, np.newaxis].view(np.uint8)
+    data = copies.tobytes()
+    return (data[k : k + size] for k in range(0, len(data), size))
+
+
+def ours(path: Path) -> FrictionEstimate:
+    """Read a bag and identify friction from it."""
+    return identify_friction(read_friction_recording(path))
+
+
+def any_reader(path: Path) -> None:
+    """Take the same numbers from the objects that rosbags makes."""
+    rows: dict[str, list[tuple[float, ...]]] = {topic: [] for topic in _TOPICS}
+    with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
+        wanted = [connection for connection in reader.connections if connection.topic in rows]
+        for connection, _, data in reader.messages(connections=wanted):
+            message = reader.deserialize(data, connection.msgtype)
+            rows[connection.topic].append(_numbers(message))
+    _arrays(rows)
+
+
+def mcap_ros2(path: Path) -> None:
+    """Take the same numbers from the objects that mcap-ros2-support makes."""
+    reader = optional('mcap_ros2.reader')
+    rows: dict[str, list[tuple[float, ...]]] = {topic: [] for topic in _TOPICS}
+    [file] = path.glob('*.mcap')
+    for found in reader.read_ros2_messages(str(file), topics=list(rows)):  # type: ignore[union-attr]
+        rows[found.channel.topic].append(_numbers(found.ros_msg))
+    _arrays(rows)
+
+
+def _numbers(message: Any) -> tuple[float, ...]:
+    stamp = message.header.stamp
+    time = stamp.sec * 10**9 + stamp.nanosec
+    if hasattr(message, 'wrench'):
+        return time, message.wrench.force.y
+    return time, message.position[0], message.velocity[0]
+
+
+def _arrays(rows: Mapping[str, list[tuple[float, ...]]]) -> list[np.ndarray[Any, Any]]:
+    return [np.array(values) for values in rows.values()]
+
+
+#: What reads a bag, by name.
+READERS: Final[Mapping[str, Callable[[Path], object]]] = {
+    'needle_identification': ours,
+    'rosbags AnyReader': any_reader,
+    'mcap-ros2-support': mcap_ros2,
+}
+
+
+def peak_memory() -> float:
+    """Return the most memory that this process has had [bytes]."""
+    status = Path('/proc/self/status')
+    if status.exists():
+        for line in status.read_text('ascii').splitlines():
+            if line.startswith('VmHWM'):
+                return 1024.0 * float(line.split()[1])
+    # Elsewhere; on Linux it would hold what the process had before it became this one.
+    return float(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+
+
+def measure(reader: str, warm: Path, path: Path, repeats: int) -> dict[str, float]:
+    """
+    Read a bag in this process.
+
+    Parameters
+    ----------
+    reader : str
+        One of `READERS`.
+    warm : Path
+        A short bag to read beforehand, so that what is compiled is there.
+    path : Path
+        The bag.
+    repeats : int
+        How often; the least time counts.
+
+    Returns
+    -------
+    dict
+        ``seconds``, ``memory`` [bytes], and ``before``, that before the bag was read.
+
+    """
+    read = READERS[reader]
+    read(warm)
+    before = peak_memory()
+    times = []
+    for _ in range(repeats):
+        begin = time.perf_counter()
+        read(path)
+        times.append(time.perf_counter() - begin)
+    return {'seconds': min(times), 'memory': peak_memory(), 'before': before}
+
+
+def measured(reader: str, warm: Path, path: Path, repeats: int) -> dict[str, float]:
+    """Read a bag in a process of its own, as `measure` does."""
+    done = subprocess.run(
+        [sys.executable, '-m', __name__, reader, str(warm), str(path), str(repeats)],
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=_PATIENCE,
+    )
+    return dict(json.loads(done.stdout))
+
+
+def compare(tick: Callable[[str], None], messages: int = MESSAGES) -> tuple[str, list[Bar]]:
+    """
+    Measure reading and identifying beside reading alone.
+
+    Parameters
+    ----------
+    tick : callable
+        Told what comes next.
+    messages : int
+        Messages of each topic in the shortest bag.
+
+    Returns
+    -------
+    text : str
+        Tables.
+    bars : list of Bar
+        Speed beside that of the faster of the others, and growth of memory.
+
+    """
+    with TemporaryDirectory() as folder:
+        warm = Path(folder) / 'warm'
+        write_bag(warm, min(messages, 5000))
+        bags = {}
+        for times in LONGER:
+            tick(f'writing a bag {times} times as long')
+            bags[times] = Path(folder) / f'times_{times}'
+            write_bag(bags[times], times * messages)
+        sizes = {
+            times: sum(f.stat().st_size for f in bag.iterdir()) for times, bag in bags.items()
+        }
+        run = partial(measured, warm=warm)
+        found = {}
+        for name in READERS:
+            tick(f'reading with {name}')
+            if name != 'mcap-ros2-support' or optional('mcap_ros2.reader'):
+                found[name] = run(name, path=bags[1], repeats=_REPEATS)
+        lengths = {}
+        for times, bag in bags.items():
+            tick(f'memory, {times} times as long')
+            lengths[times] = run('needle_identification', path=bag, repeats=1)
+    return _told(messages, found, lengths, sizes)
+
+
+def _told(
+    messages: int,
+    found: Mapping[str, Mapping[str, float]],
+    lengths: Mapping[int, Mapping[str, float]],
+    sizes: Mapping[int, int],
+) -> tuple[str, list[Bar]]:
+    best = found['needle_identification']['seconds']
+    speeds = []
+    for name in READERS:
+        what = 'bag to result' if name == 'needle_identification' else 'reading alone'
+        if name not in found:
+            speeds.append((name, what, NOT_INSTALLED, '', ''))
+            continue
+        seconds, memory = found[name]['seconds'], found[name]['memory']
+        speeds.append(
+            (
+                name,
+                what,
+                f'{2 * messages / seconds:.3g}',
+                f'{seconds / best:.3g} x',
+                f'{memory / 1e6:.0f} MB',
+            )
+        )
+    memories = [
+        (
+            f'{times} x',
+            f'{2 * times * messages:.3g}',
+            f'{sizes[times] / 1e6:.0f} MB',
+            f'{one["seconds"]:.2f} s',
+            f'{2 * times * messages / one["seconds"]:.3g}',
+            f'{one["memory"] / 1e6:.0f} MB',
+            f'{(one["memory"] - one["before"]) / 1e6:.0f} MB',
+        )
+        for times, one in lengths.items()
+    ]
+    speed_heads = ('what', '', 'messages per second', 'time', 'peak memory')
+    length_heads = (
+        'length',
+        'messages',
+        'size',
+        'time',
+        'per second',
+        'peak memory',
+        'for the bag',
+    )
+    text = (
+        f'A bag (MCAP, zstd) with {messages} messages each of WrenchStamped and JointState at '
+        f'{_RATE:g} Hz; least of {_REPEATS} in one process each\n'
+        f'{table(speeds, speed_heads)}\n\n'
+        'Longer bags, from bag to result, once in one process each\n'
+        f'{table(memories, length_heads)}\n'
+        f'at most {LARGEST} samples of a topic are kept'
+    )
+    others = [one['seconds'] for name, one in found.items() if name != 'needle_identification']
+    longer, longest = LONGER[-2:]
+    bars = [
+        Bar('bag to result beside the faster reader', '>= 1 x', min(others) / best, 1.0),
+        Bar(
+            f'peak memory, {longest} times the length over {longer} times',
+            '<= 1.2 x',
+            lengths[longest]['memory'] / lengths[longer]['memory'],
+            1.2,
+            at_least=False,
+        ),
+    ]
+    return text, bars
+
+
+if __name__ == '__main__':
+    name, warm, path, repeats = sys.argv[1:]
+    sys.stdout.write(json.dumps(measure(name, Path(warm), Path(path), int(repeats))))

@@ -1,0 +1,590 @@
+"""
+A needle that vibrates with its base held: our integrator, MuJoCo's cable and PyElastica.
+
+Each tool takes, by search, the discretization and the time step that cost it least while its
+first frequency is within 1 % of the exact one of its own equations. The rods of the others have
+no tissue; half of their first element is inside the clamp, which is where a chain of rigid or
+constant-strain elements is best clamped (clamped at the element's end it converges one order
+slower). Neither is damped.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from importlib import metadata
+from math import cos, cosh, pi, sqrt
+from pathlib import Path
+from typing import Any, Final
+
+from benchmarks.measure import (
+    Bar,
+    geometric,
+    least_times,
+    NOT_INSTALLED,
+    optional,
+    seconds,
+)
+from needle_dynamics import (
+    FloatArray,
+    Integrator,
+    mode_shapes,
+    NeedleModel,
+    NeedleParameters,
+)
+from needle_dynamics.simulated.integrators import DEFAULT_STEP
+from needle_insertion.report.report import table
+import numpy as np
+from scipy.optimize import brentq, minimize_scalar
+
+#: Inserted length [m] that vibrates.
+LENGTH: Final = 0.15
+
+#: What the first frequency may be off.
+FREQUENCY_ERROR: Final = 0.01
+
+#: Our step has no limit from frequency; a period is then shown by this many.
+STEPS_PER_PERIOD: Final = 20
+
+#: Deflection of the tip at the start over the length: small, as the exact frequency is linear.
+_AMPLITUDE: Final = 1e-3
+
+#: Ratio of neighboring steps in a search.
+_STEP_RATIO: Final = 1.0 / 1.05
+
+
+def beam_frequency(
+    length: float, bending_stiffness: float, linear_density: float, foundation: float = 0.0
+) -> float:
+    """
+    First frequency of a clamped-free Euler-Bernoulli beam on an elastic foundation.
+
+    Parameters
+    ----------
+    length : float
+        Length [m].
+    bending_stiffness : float
+        E I [N m^2].
+    linear_density : float
+        rho A [kg/m].
+    foundation : float
+        Stiffness per length [N/m^2].
+
+    Returns
+    -------
+    float
+        Frequency [Hz].
+
+    """
+    root = brentq(lambda x: cos(x) * cosh(x) + 1.0, 1.5, 2.5, xtol=1e-14)
+    bending = bending_stiffness / linear_density * (root / length) ** 4
+    return float(sqrt(bending + foundation / linear_density) / (2.0 * pi))
+
+
+def measured_frequency(time: FloatArray, values: FloatArray, near: float) -> float:
+    """
+    Frequency of the sinusoid that fits samples best, between 0.7 and 1.3 of a guess.
+
+    Parameters
+    ----------
+    time, values : ndarray, shape (n,)
+        Samples.
+    near : float
+        Guess [Hz].
+
+    Returns
+    -------
+    float
+        Frequency [Hz].
+
+    """
+
+    def misfit(frequency: float) -> float:
+        phase = 2.0 * pi * frequency * time
+        basis = np.stack([np.cos(phase), np.sin(phase), np.ones_like(phase)], axis=1)
+        rest = values - basis @ np.linalg.lstsq(basis, values, rcond=None)[0]
+        return float(rest @ rest)
+
+    grid = np.linspace(0.7 * near, 1.3 * near, 61)
+    best = int(np.argmin([misfit(frequency) for frequency in grid]))
+    low, high = grid[max(best - 1, 0)], grid[min(best + 1, grid.size - 1)]
+    found = minimize_scalar(
+        misfit, bounds=(low, high), method='bounded', options={'xatol': 1e-7 * near}
+    )
+    return float(found.x)
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """
+    A tool with the discretization and the step it was given.
+
+    Attributes
+    ----------
+    tool, discretization : str
+        For people.
+    step : float
+        Time step [s].
+    frequency, exact : float
+        First frequency found, and that of the tool's own equations [Hz].
+    job : callable
+        Simulates for ``simulated`` seconds.
+    simulated : float
+        Time that one job simulates [s].
+
+    """
+
+    tool: str
+    discretization: str
+    step: float
+    frequency: float
+    exact: float
+    job: Callable[[], object]
+    simulated: float
+
+    @property
+    def error(self) -> float:
+        """Relative error of the first frequency."""
+        return self.frequency / self.exact - 1.0
+
+    def row(self, spent: float, ours: float) -> tuple[str, ...]:
+        """Return the cells of a table, given the least time of a job and ours per second."""
+        per_second = spent / self.simulated
+        return (
+            self.tool,
+            self.discretization,
+            f'{self.step:.3g}',
+            f'{self.exact:.2f}',
+            f'{self.error:+.2%}',
+            f'{per_second * 1e3:.3g}',
+            f'{per_second / ours:.3g} x',
+        )
+
+
+def needle_exact() -> float:
+    """Return the first frequency of the needle clamped at the entry, in its tissue [Hz]."""
+    p = NeedleParameters.preset('paper_si')
+    return beam_frequency(LENGTH, p.bending_stiffness, p.linear_density, p.tissue_stiffness)
+
+
+def needle(step: float) -> Setting:
+    """
+    Return our integrator with the base held, at a given step.
+
+    Parameters
+    ----------
+    step : float
+        Time step [s].
+
+    Returns
+    -------
+    Setting
+        With the first frequency as sampled at the steps, or every 1/20 period if these are finer.
+
+    """
+    p = NeedleParameters.preset('paper_si')
+    model = NeedleModel(p)
+    start = model.state_at(LENGTH, _AMPLITUDE * LENGTH)
+    exact = needle_exact()
+    interval = max(step, 1.0 / (STEPS_PER_PERIOD * exact))
+    integrator = Integrator(p, start, step)
+    time, tips = np.linspace(0.0, 199 * interval, 200), np.empty(200)
+    for i in range(time.size):
+        tips[i] = model.tip_deflection(integrator.state)
+        integrator.advance_moved(interval, 0.0)
+    simulated = 10.0
+    return Setting(
+        'needle_dynamics',
+        f'{integrator.state.size // 2 - 2} modes, tissue',
+        step,
+        measured_frequency(time, tips, exact),
+        exact,
+        lambda: Integrator(p, start, step).advance_moved(simulated, 0.0),
+        simulated,
+    )
+
+
+def _section() -> tuple[float, float, float, float]:
+    """Radius [m], density, Young's modulus for that circle, and the bare exact frequency [Hz]."""
+    p = NeedleParameters.preset('paper_si')
+    radius = sqrt(p.area / pi)
+    modulus = p.bending_stiffness / (0.25 * pi * radius**4)
+    exact = beam_frequency(LENGTH, p.bending_stiffness, p.linear_density)
+    return radius, p.density, modulus, exact
+
+
+_PLUGIN = """
+<mujoco>
+  <option timestep="{step}" gravity="0 0 0" integrator="{integrator}">
+    <flag contact="disable" constraint="disable"/>
+  </option>
+  <extension><plugin plugin="mujoco.elasticity.cable"/></extension>
+  <worldbody>
+    <composite type="cable" prefix="needle" curve="s" initial="none"
+        count="{points} 1 1" size="{size}" offset="{offset} 0 0">
+      <plugin plugin="mujoco.elasticity.cable">
+        <config key="bend" value="{modulus}"/><config key="twist" value="0"/>
+      </plugin>
+      <joint kind="main" damping="0"/>
+      <geom type="cylinder" size="{radius}" density="{density}"/>
+    </composite>
+  </worldbody>
+</mujoco>
+"""
+
+_FLEX = """
+<mujoco>
+  <option timestep="{step}" gravity="0 0 0" integrator="{integrator}">
+    <flag contact="disable"/>
+  </option>
+  <worldbody>
+    <flexcomp name="needle" type="direct" dim="1" radius="{radius}" mass="{mass}"
+        point="{points}" element="{elements}">
+      <edge equality="true"/>
+      <contact selfcollide="none" contype="0" conaffinity="0"/>
+      <elasticity young="{modulus}" poisson="0.3"/>
+      <pin id="0 1"/>
+    </flexcomp>
+  </worldbody>
+</mujoco>
+"""
+
+
+class _Cable:
+    """A cantilever of MuJoCo, as elastic cable (before 4.0) or as one-dimensional flex."""
+
+    def __init__(self, mujoco: Any, *, plugin: bool, elements: int, how: str, step: float) -> None:
+        self._mujoco = mujoco
+        radius, density, modulus, _ = _section()
+        common = {'step': step, 'integrator': how, 'radius': radius, 'modulus': modulus}
+        if plugin:
+            size = LENGTH / (elements - 0.5)
+            text = _PLUGIN.format(
+                **common,
+                points=elements + 1,
+                size=elements * size,
+                offset=-0.5 * size,
+                density=density,
+            )
+            self.model = mujoco.MjModel.from_xml_string(text)
+        else:
+            # Masses sit at the points: the last has half of the others'.
+            size = LENGTH / (elements - 0.5)
+            text = _FLEX.format(
+                **common,
+                points=' '.join(f'{(i - 0.5) * size} 0 0' for i in range(elements + 1)),
+                elements=' '.join(f'{i} {i + 1}' for i in range(elements)),
+                mass=density * pi * radius**2 * size * (elements + 1),
+            )
+            self.model = mujoco.MjModel.from_xml_string(text)
+            self._moving = [self.model.body(f'needle_{i}').id for i in range(2, elements + 1)]
+            self.model.body_mass[self._moving[-1]] *= 0.5
+        self.data = mujoco.MjData(self.model)
+        if plugin:
+            self._tip = self.model.nbody - 1
+        else:
+            mujoco.mj_setConst(self.model, self.data)
+            self._tip = self._moving[-1]
+        mujoco.mj_resetData(self.model, self.data)
+        self._deflect(plugin=plugin)
+        mujoco.mj_forward(self.model, self.data)
+
+    def _deflect(self, *, plugin: bool) -> None:
+        """Start as if held by a force at the tip."""
+        m, d = self.model, self.data
+        if plugin:
+            for j in range(m.njnt):
+                half = 0.5 * 3.0 * _AMPLITUDE * (1.0 - j / m.njnt) / m.njnt
+                address = m.jnt_qposadr[j]
+                d.qpos[address : address + 4] = [cos(half), 0.0, -sqrt(1.0 - cos(half) ** 2), 0.0]
+        else:
+            for body in self._moving:
+                x = m.body_pos[body][0] / LENGTH
+                third = m.jnt_qposadr[m.body_jntadr[body]] + 2
+                d.qpos[third] = _AMPLITUDE * LENGTH * 0.5 * x * x * (3.0 - x)
+
+    def advance(self, steps: int) -> None:
+        """Take steps in one call."""
+        self._mujoco.mj_step(self.model, self.data, steps)
+
+    def sample(self, duration: float) -> tuple[FloatArray, FloatArray] | None:
+        """Return time and tip deflection, or None if the run blew up."""
+        step = self.model.opt.timestep
+        stride = max(1, round(5e-4 / step))
+        count = int(duration / (stride * step))
+        time, tips = np.empty(count), np.empty(count)
+        for i in range(count):
+            self.advance(stride)
+            time[i], tips[i] = self.data.time, self.data.xpos[self._tip, 2]
+            if self.data.warning.number.any() or abs(tips[i]) > 10.0 * _AMPLITUDE * LENGTH:
+                return None
+        return time, tips
+
+
+def _cable_settings(mujoco: Any, *, plugin: bool) -> Iterator[tuple[float, Setting]]:
+    """Yield the largest fitting step of each discretization and integrator, with its cost."""
+    exact = _section()[-1]
+    names = (
+        ('Euler', 'implicitfast', 'implicit', 'RK4') if plugin else ('Euler', 'RK4', 'discrete')
+    )
+    for elements in range(3, 11):
+        for how in names:
+            make = partial(_Cable, mujoco, plugin=plugin, elements=elements, how=how)
+            for step in geometric(1e-3, 2e-5, _STEP_RATIO):
+                samples = make(step=step).sample(10.0 / exact)
+                if samples is None:
+                    continue
+                found = measured_frequency(*samples, exact)
+                if abs(found / exact - 1.0) > FREQUENCY_ERROR:
+                    if how != 'discrete':
+                        # Stable, and still off: the elements are too coarse, whatever the step.
+                        break
+                    continue
+                rod, steps = make(step=step), round(1.0 / step)
+                setting = Setting(
+                    f'MuJoCo {mujoco.__version__} {"cable" if plugin else "flex"}',
+                    f'{elements} elements, {how}',
+                    step,
+                    found,
+                    exact,
+                    partial(rod.advance, steps),
+                    steps * step,
+                )
+                cost = min(seconds(setting.job) for _ in range(3)) / setting.simulated
+                if not rod.data.warning.number.any():
+                    yield cost, setting
+                    break
+
+
+def mujoco_cable(tick: Callable[[str], None]) -> Setting | None:
+    """
+    Search the setting of MuJoCo that costs it least.
+
+    Parameters
+    ----------
+    tick : callable
+        Told what comes next.
+
+    Returns
+    -------
+    Setting or None
+        None if MuJoCo is not installed.
+
+    """
+    mujoco = optional('mujoco')
+    if mujoco is None:
+        return None
+    tick('step of MuJoCo')
+    # Up to 3.x the cable is a plugin in the wheel; since then flexes of one dimension are.
+    libraries = sorted((Path(str(mujoco.__file__)).parent / 'plugin').glob('*elasticity*'))
+    for library in libraries:
+        mujoco.mj_loadPluginLibrary(str(library))
+    # A step that is too large is part of the search, and none of its reports.
+    before = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(lambda _text: None)
+    try:
+        settings = list(_cable_settings(mujoco, plugin=bool(libraries)))
+    finally:
+        mujoco.set_mju_user_warning(before)
+    return min(settings, key=lambda item: item[0])[1]
+
+
+class _Rod:
+    """A cantilever of PyElastica."""
+
+    def __init__(self, elastica: Any, stepper: str, elements: int, step: float) -> None:
+        radius, density, modulus, _ = _section()
+        size = LENGTH / (elements - 0.5)
+        self.step = np.float64(step)
+        # Typed as Any: PyElastica has no stubs, and its simulator is made of mix-ins.
+        bases = (elastica.BaseSystemCollection, elastica.Constraints)
+        self._simulator: Any = type('Cantilever', bases, {})()
+        self.rod = elastica.CosseratRod.straight_rod(
+            elements,
+            np.array([-0.5 * size, 0.0, 0.0]),
+            np.array([1.0, 0.0, 0.0]),
+            np.array([0.0, 0.0, 1.0]),
+            elements * size,
+            radius,
+            density,
+            youngs_modulus=modulus,
+            shear_modulus=modulus / 2.6,
+        )
+        self._simulator.append(self.rod)
+        self._simulator.constrain(self.rod).using(
+            elastica.OneEndFixedBC, constrained_position_idx=(0,), constrained_director_idx=(0,)
+        )
+        x = np.maximum(self.rod.position_collection[0], 0.0) / LENGTH
+        # At rest and straight, with the speed of a static shape: no other mode to speak of.
+        speed = 2.0 * pi * _section()[-1] * _AMPLITUDE * LENGTH
+        self.rod.velocity_collection[2] = speed * x * x * (6.0 - 4.0 * x + x * x) / 3.0
+        self._simulator.finalize()
+        self._stepper: Any = getattr(elastica, stepper)()
+        self._time = np.float64(0.0)
+
+    def advance(self, steps: int) -> None:
+        """Take steps."""
+        for _ in range(steps):
+            self._time = self._stepper.step(self._simulator, self._time, self.step)
+
+    def holds(self, steps: int) -> bool:
+        """Say whether the step is stable, with every mode stirred."""
+        random = np.random.default_rng(1)
+        for rates in (self.rod.velocity_collection, self.rod.omega_collection):
+            rates[:, 1:] += 1e-2 * random.standard_normal(rates[:, 1:].shape)
+        with np.errstate(all='ignore'):
+            self.advance(steps)
+        tip = self.rod.position_collection[2, -1]
+        return bool(np.isfinite(tip) and abs(tip) < 10.0 * _AMPLITUDE * LENGTH)
+
+    def sample(self, duration: float) -> tuple[FloatArray, FloatArray]:
+        """Return time and tip deflection."""
+        stride = max(1, round(1e-4 / float(self.step)))
+        count = int(duration / (stride * float(self.step)))
+        time, tips = np.empty(count), np.empty(count)
+        for i in range(count):
+            self.advance(stride)
+            time[i], tips[i] = self._time, self.rod.position_collection[2, -1]
+        return time, tips
+
+
+def pyelastica_rod(tick: Callable[[str], None]) -> Setting | None:
+    """
+    Search the setting of PyElastica that costs it least.
+
+    Parameters
+    ----------
+    tick : callable
+        Told what comes next.
+
+    Returns
+    -------
+    Setting or None
+        None if PyElastica is not installed.
+
+    """
+    elastica = optional('elastica')
+    if elastica is None:
+        return None
+    exact = _section()[-1]
+    longest = {'PositionVerlet': 5e-6, 'PEFRL': 5e-6}
+    # Its cost hardly depends on the elements: the coarsest that will do.
+    for elements in range(3, 21):
+        choices = []
+        for stepper, first in longest.items():
+            tick(f'step of PyElastica, {elements} elements')
+            step = next(
+                h
+                for h in geometric(first, 1e-9, _STEP_RATIO)
+                if _Rod(elastica, stepper, elements, h).holds(3000)
+            )
+            # Its limit is the shear of the section, whatever the elements: look near it next.
+            longest[stepper] = 1.1 * step
+            rod = _Rod(elastica, stepper, elements, step)
+            rod.advance(100)
+            job = partial(rod.advance, 2000)
+            simulated = 2000 * step
+            choices.append((min(seconds(job) for _ in range(5)) / simulated, stepper, step, job))
+        _, stepper, step, job = min(choices, key=lambda item: item[0])
+        tick(f'frequency of PyElastica, {elements} elements')
+        samples = _Rod(elastica, stepper, elements, step).sample(2.0 / exact)
+        found = measured_frequency(*samples, exact)
+        if abs(found / exact - 1.0) <= FREQUENCY_ERROR:
+            return Setting(
+                f'PyElastica {metadata.version("pyelastica")}',
+                f'{elements} elements, {stepper}',
+                step,
+                found,
+                exact,
+                job,
+                2000 * step,
+            )
+    return None
+
+
+def mode_error(modes: NeedleModel) -> float:
+    """
+    Relative error of the first modal frequency at `LENGTH`, from the matrices themselves.
+
+    Parameters
+    ----------
+    modes : NeedleModel
+        Model with tissue.
+
+    Returns
+    -------
+    float
+        Error to `needle_exact`, positive as for any Ritz value.
+
+    """
+    p = modes.parameters
+    mass = p.linear_density * mode_shapes(p.length).integrals(LENGTH).gram
+    square = np.linalg.eigvals(np.linalg.solve(mass, modes.stiffness_matrix(LENGTH))).real.min()
+    return float(sqrt(square) / (2.0 * pi) / needle_exact() - 1.0)
+
+
+def compare(tick: Callable[[str], None]) -> tuple[str, list[Bar]]:
+    """
+    Compare what a simulated second of free vibration costs.
+
+    Parameters
+    ----------
+    tick : callable
+        Told what comes next.
+
+    Returns
+    -------
+    text : str
+        Table.
+    bars : list of Bar
+        Ratios to ours, and our own frequency.
+
+    """
+    exact = needle_exact()
+    ours = needle(1.0 / (STEPS_PER_PERIOD * exact))
+    default = needle(DEFAULT_STEP)
+    others = {'MuJoCo': mujoco_cable(tick), 'PyElastica': pyelastica_rod(tick)}
+    tick('free vibration, side by side')
+    settings = [ours, default, *(item for item in others.values() if item is not None)]
+    spent = list(least_times({str(i): item.job for i, item in enumerate(settings)}, 10).values())
+    own = spent[0] / ours.simulated
+    rows = [item.row(time, own) for item, time in zip(settings, spent, strict=True)]
+    rows += [(name, NOT_INSTALLED, *[''] * 5) for name, item in others.items() if item is None]
+    heads = (
+        'tool',
+        'discretization',
+        'step [s]',
+        'exact [Hz]',
+        'found',
+        'wall per simulated s [ms]',
+        'against ours',
+    )
+    per_second = {
+        name: None if item is None else spent[settings.index(item)] / item.simulated
+        for name, item in others.items()
+    }
+
+    def ratio(name: str) -> float | None:
+        value = per_second[name]
+        return None if value is None else value / own
+
+    modal = mode_error(NeedleModel(NeedleParameters.preset('paper_si')))
+    text = (
+        f'Free vibration, {LENGTH * 100:g} cm, base held; first frequency within '
+        f'{FREQUENCY_ERROR:.0%} of the exact one of the same equations\n{table(rows, heads)}\n'
+        f'ours: {STEPS_PER_PERIOD} steps a period (the modal flow is exact at any step), and the '
+        f'default step; the two-mode matrices alone are {modal:+.3%} off'
+    )
+    bars = [
+        Bar('free vibration, MuJoCo', '>= 50 x ours', ratio('MuJoCo'), 50.0),
+        Bar('free vibration, PyElastica', '>= 1000 x ours', ratio('PyElastica'), 1000.0),
+        Bar(
+            'our first frequency at 15 cm, error',
+            '<= 0.01',
+            max(abs(ours.error), abs(default.error)),
+            FREQUENCY_ERROR,
+            at_least=False,
+        ),
+    ]
+    return text, bars

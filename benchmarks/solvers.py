@@ -1,0 +1,460 @@
+"""
+The source's open-loop run: our integrator beside SciPy's solvers, at equal error.
+
+Every candidate is timed for the bare solution without output in between. SciPy's are judged at
+their own steps, so that no interpolation counts against them; ours, which does not show its
+steps, by a run in one call to each time of a grid, as the run that is timed is one call to the
+last. Each takes the loosest setting on a fine grid that meets the error.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, cast, Final, TypeVar
+from unittest import mock
+import warnings
+
+from benchmarks.measure import Bar, geometric, least_times, seconds
+from needle_dynamics import FloatArray, Integrator, NeedleModel, NeedleParameters
+from needle_dynamics.compiled.kernels import advance, evaluate, TERMS_PER_LENGTH
+from needle_insertion.report.report import table
+import numba
+import numpy as np
+from scipy.integrate import quad, solve_ivp
+
+#: The open-loop run of the source: 3 N, 2 cm inserted, 0.5 mm deflection; it ends before the hub.
+FORCE, DEPTH, DEFLECTION, DURATION = 3.0, 0.02, 5e-4, 0.0285
+
+#: Error that counts as equal: this part of the peak tip deflection.
+ACCURACY: Final = 1e-3
+
+METHODS: Final = ('RK45', 'DOP853', 'Radau', 'BDF', 'LSODA')
+
+#: Grids of settings, from loose to tight: ratio of neighbors.
+_TOLERANCE_RATIO: Final = 10.0**-0.125
+_STEP_RATIO: Final = 2.0**-0.0625
+
+#: Times at which ours is judged [s]: several in a period of the fastest mode.
+_GRID: Final = 1e-5
+
+#: Absolute tolerance over relative, where it is not in proportion to the peak of each number.
+_ABSOLUTE: Final = 1e-4
+
+_NODES: Final = 16
+
+RightHandSide = Callable[[float, FloatArray], FloatArray]
+
+_Function = TypeVar('_Function', bound=Callable[..., object])
+
+
+def _compiled(function: _Function) -> _Function:
+    # Not kept on disk: Numba would not notice a change of `evaluate`.
+    return cast(_Function, numba.njit(error_model='numpy')(function))
+
+
+@_compiled
+def _derivative(
+    x: FloatArray,
+    force: float,
+    constants: tuple[float, float, float, float, float, float, float, float],
+    series: FloatArray,
+    terms: FloatArray,
+    work: FloatArray,
+    at: FloatArray,
+    out: FloatArray,
+) -> None:
+    """Write the time derivative of the state into ``out``, without torque."""
+    length, rho, ei, ka, ca, mass, coulomb, viscous = constants
+    xi, reach = (length - x[0]) / length, (terms.shape[0] - 1) / TERMS_PER_LENGTH
+    # A trial of a solver may be anywhere, and no number at all.
+    if not xi >= 0.0:
+        xi = 0.0
+    elif xi > reach:
+        xi = reach
+    evaluate(xi, series, terms, work, at)
+    q1, q2, r1, r2 = x[2], x[3], x[6], x[7]
+    speed = -x[4]
+    value = at[6] * q1 + at[7] * q2
+    rate = at[6] * r1 + at[7] * r2
+    curvature = at[8] * q1 + at[9] * q2
+    drive = force + 0.5 * (rho * rate * rate - ei * curvature * curvature - ka * value * value)
+    if speed == 0.0:
+        friction = min(max(drive, -coulomb), coulomb)
+    else:
+        friction = (coulomb if speed > 0.0 else -coulomb) + viscous * speed
+    f1 = (
+        rho * x[4] * at[6] * rate - (ei * at[3] + ka * at[0]) * q1 - (ei * at[4] + ka * at[1]) * q2
+    )
+    f2 = (
+        rho * x[4] * at[7] * rate - (ei * at[4] + ka * at[1]) * q1 - (ei * at[5] + ka * at[2]) * q2
+    )
+    f1 -= ca * (at[0] * r1 + at[1] * r2)
+    f2 -= ca * (at[1] * r1 + at[2] * r2)
+    determinant = rho * (at[0] * at[2] - at[1] * at[1])
+    out[0] = x[4]
+    out[1] = x[5]
+    out[2] = r1
+    out[3] = r2
+    out[4] = (friction - drive) / mass
+    out[5] = 0.0
+    out[6] = (at[2] * f1 - at[1] * f2) / determinant
+    out[7] = (at[0] * f2 - at[1] * f1) / determinant
+
+
+def compiled_right_hand_side(model: NeedleModel, force: float) -> RightHandSide:
+    """
+    Return the equations of motion as SciPy wants them, compiled.
+
+    Parameters
+    ----------
+    model : NeedleModel
+        Needle and tissue.
+    force : float
+        Constant insertion force [N].
+
+    Returns
+    -------
+    callable
+        X_dot as a function of time and state.
+
+    """
+    p = model.parameters
+    constants = (
+        p.length,
+        p.linear_density,
+        p.bending_stiffness,
+        p.tissue_stiffness,
+        p.tissue_damping,
+        p.moving_mass,
+        p.coulomb_friction,
+        p.viscous_friction,
+    )
+    series, terms = model.modes.series, model.modes.terms
+    work, at = np.empty(series.shape[1]), np.empty(14)
+
+    def right_hand_side(_time: float, x: FloatArray) -> FloatArray:
+        out = np.empty(8)
+        _derivative(x, force, constants, series, terms, work, at, out)
+        return out
+
+    return right_hand_side
+
+
+def user_right_hand_side(
+    model: NeedleModel, force: float, *, adaptive: bool = False
+) -> RightHandSide:
+    """
+    Return the equations of motion as a user of NumPy and SciPy would write them.
+
+    G and H are integrated anew at each call. Someone who knows the integrands to be smooth takes
+    Gauss-Legendre nodes, tabulated once, and all nodes in one NumPy expression: that is the
+    default here, and the harder opponent. `scipy.integrate.quad` per entry is what one writes
+    first.
+
+    Parameters
+    ----------
+    model : NeedleModel
+        Needle and tissue; its modes give (11).
+    force : float
+        Constant insertion force [N].
+    adaptive : bool
+        Integrate by `scipy.integrate.quad`.
+
+    Returns
+    -------
+    callable
+        X_dot as a function of time and state.
+
+    """
+    p = model.parameters
+    rho, ei, ka, ca = (
+        p.linear_density,
+        p.bending_stiffness,
+        p.tissue_stiffness,
+        p.tissue_damping,
+    )
+    k, mu, c = model.modes.wavenumbers, model.modes.ratios, model.modes.scales
+    nodes, weights = np.polynomial.legendre.leggauss(_NODES)
+    nodes = 0.5 * (nodes + 1.0)[:, np.newaxis]
+    weights = 0.5 * weights[:, np.newaxis]
+
+    def shapes(y: Any) -> Any:
+        x = k * y
+        return c * (np.sin(x) - np.sinh(x) - mu * (np.cos(x) - np.cosh(x)))
+
+    def curvatures(y: Any) -> Any:
+        x = k * y
+        return k**2 * c * (-np.sin(x) - np.sinh(x) + mu * (np.cos(x) + np.cosh(x)))
+
+    def gauss(function: Any, s: float) -> Any:
+        at_nodes = function(s * nodes)
+        return at_nodes.T @ (s * weights * at_nodes)
+
+    def entries(function: Any, s: float) -> Any:
+        gram = np.empty((2, 2))
+        for i, j in ((0, 0), (0, 1), (1, 1)):
+            gram[i, j] = gram[j, i] = quad(
+                lambda y, i=i, j=j: function(y)[i] * function(y)[j], 0.0, s
+            )[0]
+        return gram
+
+    integral = entries if adaptive else gauss
+
+    def right_hand_side(_time: float, x: FloatArray) -> FloatArray:
+        s, q, d_rate, q_rate = p.length - x[0], x[2:4], x[4], x[6:]
+        gram, stiffness = integral(shapes, s), integral(curvatures, s)
+        value, curvature = shapes(s), curvatures(s)
+        drive = force + 0.5 * (
+            rho * (value @ q_rate) ** 2 - ei * (curvature @ q) ** 2 - ka * (value @ q) ** 2
+        )
+        if d_rate == 0.0:
+            friction = min(max(drive, -p.coulomb_friction), p.coulomb_friction)
+        else:
+            friction = -np.sign(d_rate) * p.coulomb_friction - p.viscous_friction * d_rate
+        modal = (
+            rho * d_rate * value * (value @ q_rate)
+            - (ei * stiffness + ka * gram) @ q
+            - ca * gram @ q_rate
+        )
+        d_acceleration = (friction - drive) / p.moving_mass
+        q_acceleration = np.linalg.solve(rho * gram, modal)
+        return np.array([*x[4:], d_acceleration, 0.0, *q_acceleration])
+
+    return right_hand_side
+
+
+@dataclass(frozen=True, slots=True)
+class Candidate:
+    """
+    A solver at the loosest setting that meets the error.
+
+    Attributes
+    ----------
+    name, setting : str
+        For people.
+    error : float
+        Largest error of the tip deflection over its peak.
+    evaluations : int
+        Calls of the right-hand side, or steps of ours.
+    run : callable
+        The bare run, given a right-hand side.
+
+    """
+
+    name: str
+    setting: str
+    error: float
+    evaluations: int
+    run: Callable[[RightHandSide], Any]
+
+
+class OpenLoop:
+    """The run, its reference, and the search for settings."""
+
+    def __init__(self) -> None:
+        self.parameters = NeedleParameters.preset('paper_si')
+        self.model = NeedleModel(self.parameters)
+        self.start = self.model.state_at(DEPTH, DEFLECTION)
+        self.right_hand_side = compiled_right_hand_side(self.model, FORCE)
+        # A peer of the reference at a tenth of its tolerance differs by 3e-11 of the peak.
+        reference = solve_ivp(
+            self.right_hand_side,
+            (0.0, DURATION),
+            self.start,
+            method='DOP853',
+            rtol=1e-11,
+            atol=1e-15,
+            dense_output=True,
+        )
+        self._solution = reference.sol
+        self.peak = float(np.abs(self._tips(reference.y)).max())
+        peaks = np.abs(reference.y).max(axis=1)
+        self._peaks = np.where(peaks > 0.0, peaks, 1.0)
+
+    def _tips(self, states: FloatArray) -> FloatArray:
+        """Tip deflections of states, shape (8, n); unchecked, as a solver may leave the range."""
+        values = self.model.modes.values(self.parameters.length - states[0])
+        return np.asarray((values * states[2:4].T).sum(axis=1))
+
+    def error(self, time: FloatArray, states: FloatArray) -> float:
+        """Return the largest error of the tip deflection over its peak; states of shape (8, n)."""
+        if time[-1] < DURATION * (1.0 - 1e-9) or not np.isfinite(states).all():
+            return float('inf')
+        exact = self._tips(self._solution(np.minimum(time, DURATION)))
+        return float(np.abs(self._tips(states) - exact).max() / self.peak)
+
+    def solve(
+        self, method: str, relative: float, absolute: Any, right_hand_side: RightHandSide
+    ) -> Any:
+        """Run a solver of SciPy."""
+        return solve_ivp(
+            right_hand_side,
+            (0.0, DURATION),
+            self.start,
+            method=method,
+            rtol=relative,
+            atol=absolute,
+        )
+
+    def integrate(self, step: float, duration: float, *, graded: bool) -> FloatArray:
+        """Run our integrator from the start in one call; the state at the end."""
+        integrator = Integrator(self.parameters, self.start, step, graded=graded)
+        integrator.advance(duration, FORCE)
+        return integrator.state
+
+    def own_error(self, step: float, *, graded: bool) -> float:
+        """Return the error of our integrator at a step, over runs to each time of the grid."""
+        count = round(DURATION / _GRID)
+        time = np.linspace(0.0, DURATION, count + 1)[1:]
+        states = [self.integrate(step, end, graded=graded) for end in time]
+        return self.error(time, np.array(states).T)
+
+    def steps(self, step: float, *, graded: bool) -> int:
+        """Count the steps of our integrator, one evaluation of the modes each."""
+        source = cast(Any, advance).py_func
+        with (
+            mock.patch('needle_dynamics.simulated.integrators.advance', source),
+            mock.patch('needle_dynamics.compiled.kernels.evaluate', wraps=evaluate) as call,
+        ):
+            self.integrate(step, DURATION, graded=graded)
+        return call.call_count
+
+    def ours(self, *, graded: bool) -> Candidate:
+        """Return our integrator at its longest step that meets the error."""
+
+        def run(_unused: RightHandSide) -> None:
+            # It has its own equations.
+            self.integrate(step, DURATION, graded=graded)
+
+        for step in geometric(3e-5, 1e-6, _STEP_RATIO):
+            error = self.own_error(step, graded=graded)
+            if error <= ACCURACY:
+                return Candidate(
+                    f'Integrator, {"graded" if graded else "uniform"}',
+                    f'step {step:.3g} s{", growing with depth" if graded else ""}',
+                    error,
+                    self.steps(step, graded=graded),
+                    run,
+                )
+        raise RuntimeError('the integrator does not reach the accuracy')
+
+    def scipy(self, method: str) -> Candidate:
+        """Return a solver of SciPy at its loosest tolerances that meet the error."""
+        found = []
+        for name, weights in (('1e-4 rtol', _ABSOLUTE), ('rtol x peaks', self._peaks)):
+            for relative in geometric(0.1, 1e-9, _TOLERANCE_RATIO):
+                run = partial(self.solve, method, relative, relative * weights)
+                with warnings.catch_warnings():
+                    # LSODA warns where it gives up: the error says so too.
+                    warnings.simplefilter('ignore')
+                    solution = run(self.right_hand_side)
+                    error = self.error(solution.t, solution.y)
+                if error <= ACCURACY:
+                    setting = f'rtol {relative:.2g}, atol {name}'
+                    spent = min(seconds(partial(run, self.right_hand_side)) for _ in range(3))
+                    found.append(
+                        (spent, Candidate(f'SciPy {method}', setting, error, solution.nfev, run))
+                    )
+                    break
+        return min(found, key=lambda item: item[0])[1]
+
+
+def compare(tick: Callable[[str], None]) -> tuple[str, list[Bar]]:
+    """
+    Compare our integrator with SciPy's solvers on the open-loop run.
+
+    Parameters
+    ----------
+    tick : callable
+        Told what comes next.
+
+    Returns
+    -------
+    text : str
+        Tables.
+    bars : list of Bar
+        Ratios to the best of SciPy.
+
+    """
+    tick('reference')
+    case = OpenLoop()
+    ours, uniform = case.ours(graded=True), case.ours(graded=False)
+    candidates = []
+    for method in METHODS:
+        tick(f'tolerance of {method}')
+        candidates.append(case.scipy(method))
+    user = user_right_hand_side(case.model, FORCE)
+    adaptive = user_right_hand_side(case.model, FORCE, adaptive=True)
+
+    tick('compiled right-hand side')
+    compiled_times = least_times(
+        {
+            item.name: partial(item.run, case.right_hand_side)
+            for item in (ours, uniform, *candidates)
+        },
+        15,
+    )
+    tick('right-hand side of a user')
+    user_times = least_times(
+        {item.name: partial(item.run, user) for item in (ours, *candidates)}, 3
+    )
+    tick('right-hand side of a user, quad')
+    first = min(candidates, key=lambda item: user_times[item.name])
+    adaptive_time = seconds(partial(first.run, adaptive))
+
+    own = min(compiled_times[ours.name], user_times[ours.name])
+
+    def row(item: Candidate, spent: float, right: str) -> tuple[str, ...]:
+        return (
+            item.name,
+            right,
+            item.setting,
+            f'{item.error:.1e}',
+            f'{item.evaluations}',
+            f'{spent * 1e3:.3g}',
+            f'{spent / DURATION:.3g}',
+            f'{spent / own:.3g} x',
+        )
+
+    rows = [row(ours, own, 'own'), row(uniform, compiled_times[uniform.name], 'own')]
+    rows += [row(item, compiled_times[item.name], 'compiled') for item in candidates]
+    rows += [row(item, user_times[item.name], 'NumPy, Gauss') for item in candidates]
+    rows.append(row(first, adaptive_time, 'NumPy, quad'))
+    heads = (
+        'solver',
+        'right-hand side',
+        'setting',
+        'error / peak',
+        'calls or steps',
+        'wall [ms]',
+        'wall / simulated',
+        'against ours',
+    )
+    text = (
+        f'Open-loop run: {FORCE:g} N, {DEPTH * 100:g} cm inserted, {DEFLECTION * 1e3:g} mm '
+        f'deflection, paper_si, {DURATION * 1e3:g} ms simulated, '
+        f'error <= {ACCURACY:.1%} of the peak\n{table(rows, heads)}'
+    )
+    bars = [
+        Bar(
+            'open loop, best SciPy, compiled right-hand side',
+            '>= 100 x ours',
+            min(compiled_times[item.name] for item in candidates) / own,
+            100.0,
+        ),
+        Bar(
+            'open loop, best SciPy, NumPy and Gauss nodes',
+            '>= 1000 x ours',
+            user_times[first.name] / own,
+            1000.0,
+        ),
+        Bar(
+            'open loop, the same solver, NumPy and quad',
+            '>= 1000 x ours',
+            adaptive_time / own,
+            1000.0,
+        ),
+    ]
+    return text, bars

@@ -1,0 +1,1 @@
+"""What the laws and the observer compile to machine code."""

@@ -1,0 +1,1 @@
+"""Control laws, sampled and in continuous time."""

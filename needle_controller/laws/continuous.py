@@ -1,0 +1,474 @@
+"""The control laws of section 3.2.7 as the source has them, in continuous time, for analysis."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from math import copysign, inf
+from typing import Final
+
+from needle_controller.laws.axis import BREAKAWAY_TIME
+from needle_dynamics import (
+    FloatArray,
+    NeedleModel,
+)
+from needle_dynamics.analysis import linearize, operating_point
+from needle_ros.errors import (
+    ParameterError,
+    ShapeError,
+)
+import numpy as np
+from numpy.typing import ArrayLike
+
+#: Which coordinates are driven: those of the base (f_y, tau), or every one.
+ACTUATIONS: Final = ('physical', 'modal')
+
+#: Coordinates of the base, d and theta.
+_BASE: Final = 2
+
+
+def gain_matrix(name: str, gains: ArrayLike, size: int, *, may_vanish: bool = False) -> FloatArray:
+    """
+    Return gains as a matrix.
+
+    Parameters
+    ----------
+    name : str
+        Name for the message.
+    gains : array_like, shape (size,) or (size, size)
+        One gain per driven coordinate, or a matrix.
+    size : int
+        Number of driven coordinates.
+    may_vanish : bool
+        Accept positive semidefinite gains too.
+
+    Returns
+    -------
+    ndarray, shape (size, size)
+        A copy, read-only.
+
+    Raises
+    ------
+    ShapeError
+        If the size is wrong or an entry is not a finite number.
+    ParameterError
+        If the matrix is not positive definite, that is x^T K x is not positive for some x.
+
+    """
+    try:
+        matrix = np.array(gains, dtype=float)
+    except (TypeError, ValueError):
+        raise ShapeError(f'{name} must be numbers, got {gains!r}') from None
+    if matrix.shape not in ((size,), (size, size)) or not np.isfinite(matrix).all():
+        raise ShapeError(
+            f'{name} must be finite with shape ({size},) or ({size}, {size}), one gain for each '
+            f'driven coordinate or a matrix; got shape {matrix.shape}'
+        )
+    if matrix.ndim == 1:
+        matrix = np.diag(matrix)
+    least = float(np.linalg.eigvalsh(0.5 * (matrix + matrix.T))[0])
+    # Rounding of the eigenvalues of a singular matrix.
+    floor = -1e-12 * np.abs(matrix).max() if may_vanish else 0.0
+    if least < floor or (least == 0.0 and not may_vanish):
+        kind = 'semidefinite' if may_vanish else 'definite'
+        raise ParameterError(
+            f'{name} must be positive {kind}, got a symmetric part with eigenvalue {least:.6g}'
+        )
+    matrix.setflags(write=False)
+    return matrix
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ContinuousLaw(ABC):
+    """
+    A control law in continuous time: a function of state, goal and integral of the error.
+
+    Attributes
+    ----------
+    model : NeedleModel
+        Needle and tissue as the law believes them to be; the plant may differ.
+    actuation : str
+        ``physical``: f_y and tau alone. ``modal``: a generalized force on every coordinate.
+
+    """
+
+    model: NeedleModel
+    actuation: str = 'physical'
+
+    @property
+    def driven(self) -> int:
+        """Number of driven coordinates, the first ones of q."""
+        return _BASE if self.actuation == 'physical' else self.model.coordinates
+
+    @property
+    def integrals(self) -> int:
+        """Number of integrals of the error that belong to the state of the closed loop."""
+        return 0
+
+    def _check_actuation(self) -> None:
+        if self.actuation not in ACTUATIONS:
+            raise ParameterError(
+                f'actuation must be one of {", ".join(ACTUATIONS)}, got {self.actuation!r}'
+            )
+
+    def errors(self, state: FloatArray, goal: ArrayLike) -> FloatArray:
+        """
+        Return the errors of the driven coordinates.
+
+        Parameters
+        ----------
+        state : ndarray, shape (2 (2 + n),)
+            State X = [d, theta, q1, ..., qn] and rates.
+        goal : array_like, shape (3, 2 + n)
+            Wanted q, q_dot and q_ddot.
+
+        Returns
+        -------
+        ndarray, shape (3, driven)
+            e = q_d - q, its rate, and the wanted acceleration.
+
+        Raises
+        ------
+        ShapeError
+            If the shape of the goal is wrong or a number is not finite.
+
+        """
+        m, k = self.model.coordinates, self.driven
+        wanted = np.array(goal, dtype=float)
+        if wanted.shape != (3, m) or not np.isfinite(wanted).all():
+            raise ShapeError(f'goal must be finite with shape (3, {m}), got {wanted.tolist()}')
+        wanted[0] -= state[:m]
+        wanted[1] -= state[m:]
+        return wanted[:, :k]
+
+    @abstractmethod
+    def forces(
+        self, state: ArrayLike, goal: ArrayLike, integral: ArrayLike = (), time: float = 0.0
+    ) -> FloatArray:
+        """
+        Return the forces.
+
+        Parameters
+        ----------
+        state : array_like, shape (2 (2 + n),)
+            State X = [d, theta, q1, ..., qn] and rates.
+        goal : array_like, shape (3, 2 + n)
+            Wanted q, q_dot and q_ddot.
+        integral : array_like, shape (integrals,)
+            Integral of the errors of the driven coordinates.
+        time : float
+            Time [s], for tissue that swells.
+
+        Returns
+        -------
+        ndarray, shape (2 + n,)
+            f_y [N], positive into the tissue, tau [N m], and the generalized force on each q_i.
+
+        Raises
+        ------
+        ShapeError, InsertedLengthError
+            If the state, the goal or the integral is not valid.
+
+        """
+
+    @abstractmethod
+    def feedback(self, mass: FloatArray, free: FloatArray) -> FloatArray:
+        """
+        Return the law linearized at a straight needle, for `closed_loop_matrix`.
+
+        Parameters
+        ----------
+        mass : ndarray, shape (2 + n, 2 + n)
+            Mass matrix of the law's model.
+        free : ndarray, shape (2 + n, 2 (2 + n))
+            Its accelerations under constant forces, per deviation of the state.
+
+        Returns
+        -------
+        ndarray, shape (driven, 2 (2 + n) + integrals)
+            Generalized forces per deviation of the state and per integral.
+
+        """
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ContinuousInverseDynamics(ContinuousLaw):
+    """
+    F_c = M(q) (q_ddot_d + k_v e_dot + k_p e) + N', section 3.2.7.1.
+
+    N' are the bias forces with friction, break-away included: at rest friction counts in the
+    direction of the wanted acceleration.
+
+    Attributes
+    ----------
+    kp, kv : array_like, shape (driven,) or (driven, driven)
+        Gains [1/s^2] and [1/s], positive definite.
+    breakaway_speed : float
+        If positive, dry friction is compensated in proportion to the speed wanted
+        BREAKAWAY_TIME ahead, up to this speed [m/s]: what the sampled law tends to. 0 is the
+        source's law, the limit of it.
+
+    """
+
+    kp: ArrayLike
+    kv: ArrayLike
+    breakaway_speed: float = 0.0
+    _gains: tuple[FloatArray, FloatArray] = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        self._check_actuation()
+        if not 0.0 <= self.breakaway_speed < inf:
+            raise ParameterError(
+                f'breakaway_speed must be finite and >= 0 m/s, got {self.breakaway_speed!r}'
+            )
+        gains = gain_matrix('kp', self.kp, self.driven), gain_matrix('kv', self.kv, self.driven)
+        object.__setattr__(self, '_gains', gains)
+
+    def forces(
+        self, state: ArrayLike, goal: ArrayLike, integral: ArrayLike = (), time: float = 0.0
+    ) -> FloatArray:
+        """Return the forces; see `ContinuousLaw.forces`. There is no integral."""
+        del integral
+        model, k, m = self.model, self.driven, self.model.coordinates
+        x = model.checked_state(state)
+        error, rate, wanted = self.errors(x, goal)
+        acceleration = np.zeros(m)
+        acceleration[:k] = wanted + self._gains[1] @ rate + self._gains[0] @ error
+        forces = model.inverse_dynamics(x, acceleration, time)
+        if self.breakaway_speed > 0.0:
+            inertial = model.mass_matrix(x)[0] @ acceleration + model.bias_forces(x, time)[0]
+            forces[0] = self._friction(-x[m], -acceleration[0]) - inertial
+        forces[k:] = 0.0
+        return forces
+
+    def _friction(self, speed: float, acceleration: float) -> float:
+        """Return viscous friction at the speed, and dry friction as far as it leans one way."""
+        law = self.model.friction
+        lean = (speed + BREAKAWAY_TIME * acceleration) / self.breakaway_speed
+        lean = min(max(lean, -1.0), 1.0)
+        # Friction in the direction that the law leans to; from rest that which it breaks.
+        sign, pace = copysign(1.0, lean), abs(speed)
+        ahead = 1.0 if lean > 0.0 else law.withdrawal
+        dry = law.force(sign * pace, sign * inf) - sign * ahead * law.viscous * pace
+        viscous = law.viscous * speed * (1.0 if speed > 0.0 else law.withdrawal)
+        return abs(lean) * dry + viscous
+
+    def feedback(self, mass: FloatArray, free: FloatArray) -> FloatArray:
+        """Return the linear law; see `ContinuousLaw.feedback`."""
+        k, m = self.driven, self.model.coordinates
+        wanted = np.zeros((m, 2 * m))
+        wanted[:k, :k], wanted[:k, m : m + k] = -self._gains[0], -self._gains[1]
+        # The forces that turn the accelerations under none into the wanted ones.
+        return np.asarray((mass @ (wanted - free))[:k])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ContinuousPid(ContinuousLaw):
+    """
+    F = k_p e + k_i int e dt + k_v e_dot, section 3.2.7.2.
+
+    Attributes
+    ----------
+    kp, kd : array_like, shape (driven,) or (driven, driven)
+        Gains, positive definite; the source writes k_v for kd.
+    ki : array_like, shape (driven,) or (driven, driven), optional
+        Gain of the integral, positive semidefinite; none if not given.
+
+    """
+
+    kp: ArrayLike
+    kd: ArrayLike
+    ki: ArrayLike | None = None
+    _gains: tuple[FloatArray, FloatArray, FloatArray] = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        self._check_actuation()
+        k = self.driven
+        ki = np.zeros(k) if self.ki is None else self.ki
+        gains = (
+            gain_matrix('kp', self.kp, k),
+            gain_matrix('kd', self.kd, k),
+            gain_matrix('ki', ki, k, may_vanish=True),
+        )
+        object.__setattr__(self, '_gains', gains)
+
+    @property
+    def integrals(self) -> int:
+        """One for each driven coordinate, none without a gain for it."""
+        return 0 if self.ki is None else self.driven
+
+    def forces(
+        self, state: ArrayLike, goal: ArrayLike, integral: ArrayLike = (), time: float = 0.0
+    ) -> FloatArray:
+        """Return the forces; see `ContinuousLaw.forces`. They do not depend on time."""
+        del time
+        x, k = self.model.checked_state(state), self.driven
+        error, rate, _ = self.errors(x, goal)
+        summed = np.array(integral, dtype=float)
+        if summed.shape != (self.integrals,) or not np.isfinite(summed).all():
+            raise ShapeError(
+                f'integral must be finite with shape ({self.integrals},), got {summed.tolist()}'
+            )
+        forces = np.zeros(self.model.coordinates)
+        forces[:k] = self._gains[0] @ error + self._gains[1] @ rate
+        if self.integrals:
+            forces[:k] += self._gains[2] @ summed
+        # Q_d = -f_y.
+        forces[0] = -forces[0]
+        return forces
+
+    def feedback(self, mass: FloatArray, free: FloatArray) -> FloatArray:
+        """Return the linear law; see `ContinuousLaw.feedback`."""
+        del mass, free
+        k, m = self.driven, self.model.coordinates
+        gains = np.zeros((k, 2 * m + self.integrals))
+        gains[:, :k], gains[:, m : m + k] = -self._gains[0], -self._gains[1]
+        if self.integrals:
+            gains[:, 2 * m :] = self._gains[2]
+        return gains
+
+
+def acceleration(
+    model: NeedleModel, state: ArrayLike, forces: ArrayLike, time: float = 0.0
+) -> FloatArray:
+    """
+    Forward dynamics (16)-(17) with a generalized force on every coordinate.
+
+    Parameters
+    ----------
+    model : NeedleModel
+        The model.
+    state : array_like, shape (2 (2 + n),)
+        State.
+    forces : array_like, shape (2 + n,)
+        f_y [N], positive into the tissue, tau [N m], and the generalized force on each q_i.
+    time : float
+        Time [s], for tissue that swells.
+
+    Returns
+    -------
+    ndarray, shape (2 + n,)
+        q_ddot.
+
+    Raises
+    ------
+    ShapeError, InsertedLengthError
+        If the state or the forces are not valid.
+
+    """
+    x, applied = model.checked_state(state), np.array(forces, dtype=float)
+    if applied.shape != (model.coordinates,) or not np.isfinite(applied).all():
+        raise ShapeError(
+            f'forces must be finite with shape ({model.coordinates},), got {applied.tolist()}'
+        )
+    result = model.acceleration(x, float(applied[0]), float(applied[1]), time)
+    if applied[_BASE:].any():
+        # The mass matrix is block diagonal: forces on q1..qn do not act on the base.
+        modal = model.mass_matrix(x)[_BASE:, _BASE:]
+        result[_BASE:] += np.linalg.solve(modal, applied[_BASE:])
+    return result
+
+
+def closed_loop(
+    law: ContinuousLaw, plant: NeedleModel, goal: ArrayLike | Callable[[float], ArrayLike]
+) -> Callable[[float, ArrayLike], FloatArray]:
+    """
+    Return the right-hand side of the closed loop, for any ODE solver.
+
+    Parameters
+    ----------
+    law : ContinuousLaw
+        Law.
+    plant : NeedleModel
+        The true needle.
+    goal : array_like, shape (3, 2 + n), or callable
+        Wanted q, q_dot and q_ddot, or a function of time [s] that returns them.
+
+    Returns
+    -------
+    callable
+        ``f(time, y)`` with y = [X, integral of the errors], shape (2 (2 + n) + integrals,).
+
+    Raises
+    ------
+    ParameterError
+        If law and plant do not have the same number of modes.
+
+    """
+    _check_modes(law, plant)
+    m = plant.coordinates
+
+    def derivative(time: float, y: ArrayLike) -> FloatArray:
+        whole = np.asarray(y, dtype=float)
+        x, integral = whole[: 2 * m], whole[2 * m :]
+        now = goal(time) if callable(goal) else goal
+        forces = law.forces(x, now, integral, time)
+        errors = law.errors(x, now)[0][: law.integrals]
+        return np.concatenate([x[m:], acceleration(plant, x, forces, time), errors])
+
+    return derivative
+
+
+def closed_loop_matrix(
+    law: ContinuousLaw,
+    plant: NeedleModel,
+    depth: float,
+    speed: float = 0.0,
+    sliding: str = 'insertion',
+    time: float = 0.0,
+) -> FloatArray:
+    """
+    Linearize the closed loop at a straight needle on its goal, where it has its equilibria.
+
+    Parameters
+    ----------
+    law : ContinuousLaw
+        Law.
+    plant : NeedleModel
+        The true needle.
+    depth, speed : float
+        Inserted length [m] and insertion speed [m/s].
+    sliding : str
+        As in `needle_dynamics.analysis.linearize`: which way it slides if it is at rest.
+    time : float
+        Time [s], for tissue that swells.
+
+    Returns
+    -------
+    ndarray, shape (N, N), N = 2 (2 + n) + integrals
+        Matrix for the deviations of [X, integral of the errors].
+
+    Raises
+    ------
+    ParameterError
+        If law and plant do not have the same number of modes.
+    InsertedLengthError
+        If ``depth`` is outside its range.
+
+    """
+    _check_modes(law, plant)
+    m, k = plant.coordinates, law.driven
+    rows = {}
+    for model in (plant, law.model):
+        state = operating_point(model, depth, 0.0, speed)
+        system = linearize(model, state, time=time, sliding=sliding)
+        rows[id(model)] = model.mass_matrix(state), system.A[m:]
+    mass, free = rows[id(plant)]
+    feedback = law.feedback(*rows[id(law.model)])
+    matrix = np.zeros((2 * m + law.integrals,) * 2)
+    matrix[:m, m : 2 * m] = np.eye(m)
+    matrix[m : 2 * m, : 2 * m] = free
+    driven = np.zeros((m, feedback.shape[1]))
+    driven[:k] = feedback
+    matrix[m : 2 * m, : feedback.shape[1]] += np.linalg.solve(mass, driven)
+    matrix[2 * m :, : law.integrals] = -np.eye(law.integrals)
+    return matrix
+
+
+def _check_modes(law: ContinuousLaw, plant: NeedleModel) -> None:
+    if law.model.coordinates != plant.coordinates:
+        raise ParameterError(
+            f'the law must have the {plant.modes.count} modes of the plant, got '
+            f'{law.model.modes.count}'
+        )

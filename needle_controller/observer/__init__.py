@@ -1,0 +1,1 @@
+"""The estimate of the deflection from what is measured."""

@@ -1,0 +1,1 @@
+"""References: the motion that a law follows."""

@@ -1,0 +1,1 @@
+"""Everything that is compiled to machine code."""

@@ -1,0 +1,1 @@
+"""A needle, its tissue and its sensors in simulated time."""

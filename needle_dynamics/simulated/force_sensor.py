@@ -1,0 +1,248 @@
+"""The base force-torque sensor (a JR3 in the source): noise, drift, filters, counts, tare."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, field, fields
+from typing import Final
+
+from needle_dynamics.compiled.kernels import FloatArray, sense, straight
+from needle_ros.errors import (
+    JobError,
+    ParameterError,
+    ShapeError,
+)
+from needle_ros.settings import check_constants, constant
+import numpy as np
+from scipy.signal import butter
+
+#: Filters of the sensor; each is fed by the one before.
+MOST_FILTERS: Final = 6
+
+#: Highest sample rate of the sensor [Hz].
+HIGHEST_RATE: Final = 8000.0
+
+#: Time over which readings are averaged to zero the sensor [s].
+TARE_TIME: Final = 0.1
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ForceSensorParameters:
+    """
+    Constants of the sensor; zero switches each imperfection off.
+
+    Those of forces and torques are one number, or three for x y z.
+    """
+
+    rate: float = constant(
+        HIGHEST_RATE, 'Hz', 'samples per second within the sensor', high=HIGHEST_RATE,
+        open_low=True,
+    )  # fmt: skip
+    filter: int = field(
+        default=2,
+        metadata={
+            'description': 'low-pass filter: 0 none, 1 with a cutoff of rate / 16 (500 Hz), '
+            f'each further one a quarter of that, up to {MOST_FILTERS}'
+        },
+    )
+    force_noise: float | tuple[float, ...] = constant(
+        (0.05, 0.05, 0.05), 'N', 'standard deviation of the white noise of each sample'
+    )
+    torque_noise: float | tuple[float, ...] = constant(
+        (1.5e-3, 1.5e-3, 1.5e-3), 'N m', 'standard deviation of the white noise of each sample'
+    )
+    force_bias: float | tuple[float, ...] = constant(
+        (0.0, 0.0, 0.0), 'N', 'offset at the start', low=-1e3
+    )
+    torque_bias: float | tuple[float, ...] = constant(
+        (0.0, 0.0, 0.0), 'N m', 'offset at the start', low=-1e2
+    )
+    force_drift: float | tuple[float, ...] = constant(
+        (0.0, 0.0, 0.0), 'N/s^0.5', 'standard deviation of the random walk of the offset in 1 s'
+    )
+    torque_drift: float | tuple[float, ...] = constant(
+        (0.0, 0.0, 0.0), 'N m/s^0.5', 'standard deviation of the random walk of the offset in 1 s'
+    )
+    force_resolution: float | tuple[float, ...] = constant(
+        (0.0025, 0.0025, 0.0025), 'N', 'force per count'
+    )
+    torque_resolution: float | tuple[float, ...] = constant(
+        (1e-4, 1e-4, 1e-4), 'N m', 'torque per count'
+    )
+    force_range: float | tuple[float, ...] = constant(
+        (100.0, 100.0, 100.0), 'N', 'force at which the sensor saturates', open_low=True
+    )
+    torque_range: float | tuple[float, ...] = constant(
+        (5.0, 5.0, 5.0), 'N m', 'torque at which the sensor saturates', open_low=True
+    )
+
+    def __post_init__(self) -> None:
+        check_constants(self)
+        for item in fields(self):
+            value = getattr(self, item.name)
+            if isinstance(value, tuple) and len(value) != 3:
+                raise ParameterError(
+                    f'{item.name} must be one number or three, x y z, got {list(value)}'
+                )
+        chosen = self.filter
+        if (
+            isinstance(chosen, bool)
+            or not isinstance(chosen, int)
+            or not (0 <= chosen <= MOST_FILTERS)
+        ):
+            raise ParameterError(
+                f'filter must be an integer from 0 (none) to {MOST_FILTERS}, got {chosen!r}'
+            )
+
+    @property
+    def cutoffs(self) -> tuple[float, ...]:
+        """Cutoffs of the filters that are in use, the first fed first [Hz]."""
+        return tuple(self.rate / (16.0 * 4.0**k) for k in range(self.filter))
+
+    def per_axis(self, name: str) -> FloatArray:
+        """Return a constant of the forces x y z and of the torques x y z, shape (6,)."""
+        pair = (getattr(self, f'{kind}_{name}') for kind in ('force', 'torque'))
+        return np.concatenate([np.broadcast_to(value, 3) for value in pair], dtype=np.float64)
+
+
+class ForceSensor:
+    """
+    Turns true wrenches into what the sensor reports.
+
+    The sensor samples faster than it is read. Each sample takes offset and noise, saturates, and
+    passes the filters, second-order Butterworth in a cascade; what is read is zeroed and rounded
+    to counts.
+
+    Parameters
+    ----------
+    parameters : ForceSensorParameters
+        Constants.
+    rate : float
+        Readings per second [Hz].
+    seed : int
+        Seed of the noise: the same seed gives the same noise.
+
+    Attributes
+    ----------
+    samples : int
+        Samples of the sensor between two readings.
+
+    Raises
+    ------
+    ParameterError
+        If the sensor's rate is not a whole multiple of that of the readings.
+
+    """
+
+    #: Random numbers drawn at once.
+    _DRAWN = 16384
+
+    def __init__(self, parameters: ForceSensorParameters, rate: float, seed: int) -> None:
+        p = parameters
+        samples = round(p.rate / rate)
+        if samples < 1 or abs(samples * rate - p.rate) > 1e-9 * p.rate:
+            fits = max(1.0, HIGHEST_RATE // rate) * rate
+            raise ParameterError(
+                f'rate of the force sensor must be a whole multiple of {rate:g} Hz, got '
+                f'{p.rate:g} Hz; {fits:g} Hz would do'
+            )
+        self.samples = samples
+        self._felt = np.empty((samples, 6))
+        self._rng = np.random.default_rng(seed)
+        self._constants = np.array(
+            [
+                p.per_axis('noise'),
+                p.per_axis('drift') / np.sqrt(rate),
+                p.per_axis('range'),
+                p.per_axis('resolution'),
+            ]
+        )
+        self._offset = p.per_axis('bias')
+        self._zero = np.zeros(6)
+        sections = [butter(2, cutoff, fs=p.rate, output='sos')[0] for cutoff in p.cutoffs]
+        self._sections = np.array(sections).reshape(-1, 6)
+        self._memory = np.zeros((p.filter, 2, 6))
+        self._before: FloatArray | None = None
+        # One row more than samples: the step of the random walk.
+        self._block = max(1, self._DRAWN // (6 * (samples + 1))), samples + 1, 6
+        self._drawn = np.empty((0, samples + 1, 6))
+        self._next = 0
+        self._resting: deque[FloatArray] = deque(maxlen=max(1, round(TARE_TIME * rate)))
+
+    def measure(
+        self, wrench: FloatArray, *, start: FloatArray | None = None, moving: bool = False
+    ) -> FloatArray:
+        """
+        Return the next reading.
+
+        Parameters
+        ----------
+        wrench : ndarray, shape (samples, 6) or (6,)
+            True force [N] and torque [N m], x y z each: what each sample feels, its mean over
+            the sample; or only what the last one does, to which the wrench then goes in a
+            straight line.
+        start : ndarray, shape (6,), optional
+            That just after the reading before, if the wrench jumped there; for a straight line.
+        moving : bool
+            Whether what it feels moves; such a reading is not used to zero it.
+
+        Returns
+        -------
+        ndarray, shape (6,)
+            What the sensor reports.
+
+        Raises
+        ------
+        ShapeError
+            If what each sample feels is not given for all of them.
+
+        """
+        felt = np.array(wrench, dtype=np.float64)
+        if felt.ndim == 2 and len(felt) != self.samples:
+            raise ShapeError(
+                f'wrench must have shape (6,) or ({self.samples}, 6), got {felt.shape}'
+            )
+        if self._next == len(self._drawn):
+            self._drawn = self._rng.standard_normal(self._block)
+            self._next = 0
+        if self._before is None:
+            # The filters start in the steady state of the first value.
+            limit = self._constants[2]
+            first = felt if felt.ndim == 1 else felt[0]
+            value = np.clip(first + self._offset, -limit, limit)
+            b, a = self._sections[:, :3], self._sections[:, 3:]
+            self._memory[:, 0] = (1.0 - b[:, :1]) * value
+            self._memory[:, 1] = (b[:, 2:] - a[:, 2:]) * value
+            self._before = first
+        if felt.ndim == 1:
+            straight(self._before if start is None else start, felt, self._felt)
+            self._before, felt = felt, self._felt
+        else:
+            self._before = felt[-1]
+        reading = np.empty(6)
+        sense(
+            felt, self._drawn[self._next], self._constants, self._sections, self._memory,
+            self._offset, self._zero, reading,
+        )  # fmt: skip
+        self._next += 1
+        if moving:
+            self._resting.clear()
+        else:
+            self._resting.append(reading)
+        return reading
+
+    def tare(self) -> None:
+        """
+        Zero the sensor on the mean of the readings of the last tenth of a second.
+
+        Raises
+        ------
+        JobError
+            If there are not as many readings at rest since the last motion or zeroing.
+
+        """
+        found, needed = len(self._resting), self._resting.maxlen
+        if found != needed:
+            raise JobError(f'{found} of {needed} readings at rest so far')
+        self._zero += np.mean(self._resting, axis=0)
+        self._resting.clear()

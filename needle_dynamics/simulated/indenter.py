@@ -1,0 +1,266 @@
+"""The end-effector that presses the tissue in the plane: section 3.2.2.3 as a stand-in."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from itertools import pairwise
+from math import hypot
+
+from needle_dynamics.compiled.kernels import FloatArray
+from needle_dynamics.simulated.force_sensor import ForceSensor
+from needle_dynamics.simulated.plant import AT_REST, check_times, joint_values, on_grid
+from needle_ros.errors import (
+    JobError,
+    ParameterError,
+)
+from needle_ros.settings import check_constants, constant
+import numpy as np
+
+#: Joints of the indenter's trajectories, the axes of the plane.
+JOINTS = ('x', 'z')
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class IndenterParameters:
+    """
+    Tissue under the end-effector and the robot that presses it.
+
+    The stiffness matrix depends on the magnitude of the force: linear between the levels,
+    constant outside. The defaults are the means of Table 2.
+    """
+
+    force_levels: tuple[float, ...] = constant(
+        (1.1, 1.2, 1.3, 1.4, 1.5), 'N', 'magnitudes of force at which the stiffness is given'
+    )
+    stiffness_xx: tuple[float, ...] = constant(
+        (1260.0, 820.0, 1100.0, 1030.0, 960.0), 'N/m',
+        'force along x per motion along x, each level',
+    )  # fmt: skip
+    stiffness_xz: tuple[float, ...] = constant(
+        (40.0, 40.0, 10.0, 1.0, -5.0), 'N/m', 'force along x per motion along z, each level',
+        low=-1e6,
+    )  # fmt: skip
+    stiffness_zx: tuple[float, ...] = constant(
+        (-100.0, -100.0, -110.0, -110.0, -110.0), 'N/m',
+        'force along z per motion along x, each level', low=-1e6,
+    )  # fmt: skip
+    stiffness_zz: tuple[float, ...] = constant(
+        (1010.0, 810.0, 690.0, 600.0, 520.0), 'N/m', 'force along z per motion along z, each level'
+    )
+    off_plane: float = constant(
+        1e-4, 'm/N', 'motion along y per magnitude of the force', low=-1.0, high=1.0
+    )
+    position_noise: float = constant(1e-5, 'm', 'standard deviation of white position noise')
+    encoder_resolution: float = constant(1e-6, 'm', 'length per count of the position')
+    force_rate: float = constant(5.0, 'N/s', 'highest rate of the force', open_low=True)
+
+    def __post_init__(self) -> None:
+        check_constants(self)
+        levels = self.force_levels
+        for item in fields(self):
+            values = getattr(self, item.name)
+            if isinstance(item.default, tuple) and (
+                not isinstance(values, tuple) or len(values) != len(levels)
+            ):
+                raise ParameterError(
+                    f'{item.name} must be a list with one value for each of the force_levels, '
+                    f'got {values!r}'
+                )
+        if not levels or any(high <= low for low, high in pairwise(levels)):
+            raise ParameterError(f'force_levels must increase, got {list(levels)} N')
+        for level, matrix in zip(levels, self.matrices, strict=True):
+            # Then it is so at all forces between, and a press has one answer.
+            if np.linalg.eigvalsh(matrix + matrix.T)[0] <= 0.0:
+                raise ParameterError(
+                    f'stiffness_xx, ..., stiffness_zz must resist a press in every direction, '
+                    f'got {matrix.tolist()} N/m at {level:g} N'
+                )
+
+    @property
+    def matrices(self) -> FloatArray:
+        """Stiffness matrix at each level [N/m], shape (levels, 2, 2), over x and z."""
+        rows = (self.stiffness_xx, self.stiffness_xz, self.stiffness_zx, self.stiffness_zz)
+        return np.array(rows, dtype=np.float64).T.reshape(-1, 2, 2)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Press:
+    """
+    What the indenter shows at the end of one sample interval.
+
+    Attributes
+    ----------
+    position : ndarray, shape (3,)
+        Measured position of the end-effector x y z [m], zero where no force acts.
+    force : ndarray, shape (2,)
+        True force of the end-effector on the tissue along x and z [N].
+    wrench : ndarray, shape (6,)
+        Reading of the sensor: force of the end-effector on the tissue x y z [N], torque [N m].
+
+    """
+
+    position: FloatArray
+    force: FloatArray
+    wrench: FloatArray
+
+
+class Indenter:
+    """
+    Presses the tissue with a commanded force in the plane, one sample at a time.
+
+    Parameters
+    ----------
+    parameters : IndenterParameters
+        Tissue and robot.
+    sensor : ForceSensor
+        Sensor at the end-effector.
+    rate : float
+        Samples per second [Hz].
+    seed : int
+        Seed of the position noise: the same seed gives the same noise.
+    force_limit : float
+        Largest force along each axis [N].
+
+    """
+
+    def __init__(
+        self,
+        parameters: IndenterParameters,
+        sensor: ForceSensor,
+        rate: float,
+        seed: int,
+        force_limit: float = np.inf,
+    ) -> None:
+        self.interval = 1.0 / rate
+        self.time = 0.0
+        self._parameters = parameters
+        self._levels = np.array(parameters.force_levels)
+        self._entries = parameters.matrices.reshape(-1, 4).T
+        self._sensor = sensor
+        # Not the sequence of the sensor's noise.
+        self._rng = np.random.default_rng([seed, 1])
+        self._force_limit = force_limit
+        self._force = np.zeros(2)
+        self._moving = False
+        self._times = np.array([0.0])
+        self._forces = np.zeros((1, 2))
+        self._count = 0
+
+    @property
+    def report(self) -> dict[str, object]:
+        """How it presses, for people."""
+        return {
+            f'force {axis} [N]': f'{f:.3f}' for axis, f in zip(JOINTS, self._force, strict=True)
+        }
+
+    def follow(
+        self,
+        joints: Sequence[str],
+        times: Sequence[float],
+        positions: Sequence[Sequence[float]],
+        efforts: Sequence[Sequence[float]],
+    ) -> None:
+        """
+        Take a new course of forces, straight lines in time from the present force.
+
+        Parameters
+        ----------
+        joints : sequence of str
+            Names of the joints, `x` and `z` among them.
+        times : sequence of float
+            Time of each point from now [s].
+        positions : sequence of sequence of float
+            Must be empty: the indenter is force controlled.
+        efforts : sequence of sequence of float
+            Forces on the tissue [N].
+
+        Raises
+        ------
+        ParameterError
+            If times do not increase, or a point lacks a force or has one beyond the limit.
+
+        """
+        check_times(times)
+        if any(len(point) for point in positions):
+            raise ParameterError('the indenter takes efforts, not positions')
+        forces = [joint_values(joint, joints, efforts) for joint in JOINTS]
+        for values in forces:
+            # Written so that NaN is refused too.
+            if not all(f is not None and abs(f) <= self._force_limit for f in values):
+                raise ParameterError(
+                    f'each point needs efforts of x and z within {self._force_limit:g} N, got '
+                    f'{[list(point) for point in efforts]}'
+                )
+        self._times = self.time + np.append(0.0, times)
+        self._forces = np.vstack([self._force, np.array(forces, dtype=np.float64).T])
+
+    def tare(self) -> None:
+        """
+        Zero the sensor on the mean of its latest readings.
+
+        Raises
+        ------
+        JobError
+            If the force changes, or has not been steady long enough.
+
+        """
+        if self._moving:
+            raise JobError('the end-effector moves; it must rest')
+        self._sensor.tare()
+
+    def displacement(self, force: FloatArray) -> FloatArray:
+        """
+        Return where a force presses the tissue, F = K(|F|) d.
+
+        Parameters
+        ----------
+        force : ndarray, shape (2,)
+            Force on the tissue along x and z [N].
+
+        Returns
+        -------
+        ndarray, shape (3,)
+            Displacement x y z [m]; y is off the plane.
+
+        """
+        x, z = force
+        size = hypot(x, z)
+        xx, xz, zx, zz = (np.interp(size, self._levels, row) for row in self._entries)
+        determinant = xx * zz - xz * zx
+        return np.array(
+            [
+                (zz * x - xz * z) / determinant,
+                self._parameters.off_plane * size,
+                (xx * z - zx * x) / determinant,
+            ]
+        )
+
+    def advance(self, _force: float = 0.0, _torque: float = 0.0) -> Press:
+        """
+        Advance by one sample interval; a commanded wrench does not count.
+
+        Returns
+        -------
+        Press
+            What the sensors report at the end of the interval.
+
+        """
+        p = self._parameters
+        self._count += 1
+        self.time = self._count * self.interval
+        wanted = np.array([np.interp(self.time, self._times, f) for f in self._forces.T])
+        change = wanted - self._force
+        size = hypot(*change)
+        most = p.force_rate * self.interval
+        before = self.displacement(self._force)
+        self._force = self._force + change * (most / size) if size > most else wanted
+        true = self.displacement(self._force)
+        self._moving = bool(abs(true - before).max() > AT_REST * self.interval)
+        noisy = true + p.position_noise * self._rng.standard_normal(3)
+        x, z = self._force
+        return Press(
+            position=np.array([on_grid(value, p.encoder_resolution) for value in noisy]),
+            force=self._force,
+            wrench=self._sensor.measure(np.array([x, 0.0, z, 0.0, 0.0, 0.0]), moving=self._moving),
+        )

@@ -1,0 +1,1 @@
+"""Bags: files of messages, read and written."""

@@ -1,0 +1,177 @@
+"""Friction from streams that run: pairs force and motion by stamp and keeps estimating."""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Mapping
+from itertools import pairwise
+from math import inf, isfinite, nan
+from statistics import median
+from typing import Final
+
+from needle_identification.estimation.estimate import ParameterEstimate
+from needle_identification.friction.recursive import RecursiveFriction
+from needle_identification.friction.terms import FrictionSettings
+
+#: Pairs from which the sample rate is told.
+_FIRST: Final = 50
+
+#: Motion is not interpolated over a longer step [s].
+_LARGEST_STEP: Final = 0.1
+
+#: A stamp that goes back by more is a clock set anew, not a message that overtook another [s].
+_SET_BACK: Final = 1.0
+
+#: Samples that may wait for the other stream.
+_MOST_WAITING: Final = 20_000
+
+
+class LiveFriction:
+    """
+    Estimates friction from messages as they come.
+
+    Motion is interpolated at the stamps of the force. What is not finite, out of order, or
+    within a gap of the motion is dropped and counted; when the clock is set back, estimation
+    starts anew.
+
+    Parameters
+    ----------
+    settings : FrictionSettings
+        How to identify.
+    forgetting : float
+        Time of steady motion after which a sample counts 1/e [s].
+
+    Attributes
+    ----------
+    samples : int
+        Samples of the force that were paired with the motion.
+
+    Raises
+    ------
+    ParameterError
+        If the settings or the time are not such as `RecursiveFriction` takes.
+
+    """
+
+    def __init__(self, settings: FrictionSettings, forgetting: float) -> None:
+        # The rate is not known yet; what is wrong with the rest is said now.
+        RecursiveFriction(settings, 1.0, forgetting)
+        self._settings, self._forgetting = settings, forgetting
+        self._dropped: Counter[str] = Counter()
+        self._restart()
+
+    def _restart(self) -> None:
+        self._start: int | None = None
+        self._motion: deque[tuple[float, float]] = deque(maxlen=_MOST_WAITING)
+        self._force: deque[tuple[float, float]] = deque(maxlen=_MOST_WAITING)
+        self._last = {'force': -inf, 'motion': -inf}
+        self._last_depth: tuple[float, float] | None = None
+        self._first: list[tuple[float, float, float]] = []
+        self._estimator: RecursiveFriction | None = None
+        self.samples = 0
+
+    @property
+    def dropped(self) -> Mapping[str, int]:
+        """Samples dropped, by reason."""
+        return dict(self._dropped)
+
+    def take_motion(self, stamp: int, depth: float, speed: float | None) -> None:
+        """
+        Take a sample of the motion.
+
+        Parameters
+        ----------
+        stamp : int
+            When [ns].
+        depth : float
+            Inserted length [m].
+        speed : float or None
+            Insertion speed [m/s]; the depth is differentiated if there is none.
+
+        """
+        time = self._time('motion', stamp, depth if speed is None else speed)
+        if time is None:
+            return
+        if speed is None:
+            before, self._last_depth = self._last_depth, (time, depth)
+            if before is None:
+                return
+            # The slope between two samples is the speed in their middle.
+            speed = (depth - before[1]) / (time - before[0])
+            time = (time + before[0]) / 2.0
+        self._motion.append((time, speed))
+        self._pair()
+
+    def take_force(self, stamp: int, force: float) -> None:
+        """
+        Take a sample of the force.
+
+        Parameters
+        ----------
+        stamp : int
+            When [ns].
+        force : float
+            Force of the base on the needle [N], positive into the tissue.
+
+        """
+        time = self._time('force', stamp, force)
+        if time is not None:
+            self._force.append((time, force))
+            self._pair()
+
+    def estimate(self) -> tuple[ParameterEstimate, ...]:
+        """Return the friction as it is now; nothing before the sample rate is known."""
+        return () if self._estimator is None else self._estimator.estimate()
+
+    def _time(self, stream: str, stamp: int, value: float) -> float | None:
+        """Return the time from the start [s], or None if the sample is dropped."""
+        if not isfinite(value):
+            self._dropped['not finite'] += 1
+            return None
+        if self._start is None:
+            self._start = stamp
+        time = 1e-9 * (stamp - self._start)
+        if time < self._last[stream] - _SET_BACK:
+            self._restart()
+            self._dropped['clock set back'] += 1
+            return None
+        if time <= self._last[stream]:
+            self._dropped['out of order'] += 1
+            return None
+        self._last[stream] = time
+        return time
+
+    def _pair(self) -> None:
+        """Pass on the samples of the force that the motion has reached."""
+        motion = self._motion
+        while self._force and motion and motion[-1][0] >= self._force[0][0]:
+            time, force = self._force.popleft()
+            while len(motion) > 1 and motion[1][0] <= time:
+                motion.popleft()
+            speed = _interpolated(motion, time)
+            if isfinite(speed):
+                self._pass_on(time, speed, force)
+            else:
+                self._dropped['no motion at their time'] += 1
+
+    def _pass_on(self, time: float, speed: float, force: float) -> None:
+        self.samples += 1
+        if self._estimator is not None:
+            self._estimator.update(time, speed, force)
+            return
+        self._first.append((time, speed, force))
+        if len(self._first) == _FIRST:
+            period = median(after[0] - before[0] for before, after in pairwise(self._first))
+            self._estimator = RecursiveFriction(self._settings, 1.0 / period, self._forgetting)
+            for sample in self._first:
+                self._estimator.update(*sample)
+
+
+def _interpolated(motion: deque[tuple[float, float]], time: float) -> float:
+    before, speed = motion[0]
+    if before == time:
+        return speed
+    if before > time or motion[1][0] - before > _LARGEST_STEP:
+        return nan
+    after, later = motion[1]
+    return speed + (later - speed) * (time - before) / (after - before)

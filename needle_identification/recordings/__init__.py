@@ -1,0 +1,1 @@
+"""Recordings: what a bag says of one experiment, as arrays."""

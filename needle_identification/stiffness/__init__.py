@@ -1,0 +1,1 @@
+"""Identification of the stiffness of the tissue."""

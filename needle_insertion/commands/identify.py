@@ -1,0 +1,421 @@
+"""`needle identify`: parameters from recordings, as tables, JSON, a parameter file and a page."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from dataclasses import dataclass, fields, is_dataclass
+from hashlib import sha256
+import json
+from math import isfinite
+from pathlib import Path
+import sys
+from typing import Any, Final
+
+from needle_dynamics import NeedleError, ParameterError
+from needle_identification import (
+    check_distinct,
+    ESTIMATORS,
+    FrictionSettings,
+    FrictionSummary,
+    identify_friction,
+    identify_stiffness,
+    ParameterEstimate,
+    read_friction_recording,
+    read_indentation_recording,
+    Statistic,
+    StiffnessSettings,
+    StiffnessSummary,
+    summarize,
+    summarize_stiffness,
+    TERMS,
+    write_result,
+)
+from needle_identification.friction.fit import Fit
+from needle_identification.recordings.reading import TIMES
+from needle_identification.result import between, measured
+from needle_identification.stiffness.fit import Presses
+from needle_insertion.report.identify_report import (
+    every_parameter,
+    friction_report,
+    friction_statistics,
+    label_of,
+    MEAN_HEADS,
+    mean_row,
+    Origin,
+    Source,
+    stiffness_report,
+    with_deviation,
+)
+from needle_insertion.report.report import table
+import numpy as np
+from tqdm import tqdm
+
+#: Options that take an axis, which may begin with a minus sign.
+SIGNED: Final = ('--force-axis', '--motion-axis', '--axes')
+
+#: Bytes of a file read at once.
+_PIECE: Final = 1 << 20
+
+#: Arrays as long as the recording, for pictures: no part of what is printed.
+_FOR_PICTURES: Final = (Fit, Presses)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """
+    Declare `needle identify friction` and `needle identify stiffness`.
+
+    Parameters
+    ----------
+    parser : ArgumentParser
+        Parser of the command.
+
+    """
+    what = parser.add_subparsers(required=True, metavar='WHAT')
+    friction = what.add_parser(
+        'friction',
+        help='Coulomb and viscous friction, equation (15)',
+        description='Fit mu_s sgn(v) + mu_v v, equation (15), to force and motion of the needle '
+        'base while the tip is past the tissue.',
+        epilog='example: needle identify friction run_1 run_2.mcap --wrench-topic /ft '
+        '--motion-axis -slide -o result.yaml --report page',
+    )
+    reading, fitting = _add_common(friction, FrictionSettings())
+    reading.add_argument(
+        '--force-axis',
+        default='y',
+        metavar='AXIS',
+        help='x, y or z: where the force on the needle points into the tissue; -x, -y or -z '
+        'turns it around (default y)',
+    )
+    reading.add_argument(
+        '--motion-axis',
+        metavar='AXIS',
+        help='likewise for the motion; of a JointState the name of the joint, or -name '
+        '(default y; the joint insertion or the only one)',
+    )
+    fitting.add_argument(
+        '--terms',
+        type=_words,
+        action='extend',
+        metavar='TERM,...',
+        help=f'terms of the force, of {", ".join(TERMS)} '
+        f'(default {",".join(FrictionSettings().terms)})',
+    )
+    friction.set_defaults(command=_run_friction)
+
+    stiffness = what.add_parser(
+        'stiffness',
+        help='2 x 2 stiffness of the tissue by force, as Table 2',
+        description='Fit the 2 x 2 stiffness of the tissue to force and position of an '
+        'end-effector that presses it in several directions and rests in between.',
+        epilog='example: needle identify stiffness place_1 place_2.mcap --axes x,-z '
+        '-o result.yaml --report page',
+    )
+    reading, fitting = _add_common(stiffness, StiffnessSettings())
+    reading.add_argument(
+        '--axes',
+        type=_words,
+        default=['x', 'z'],
+        metavar='X,Z',
+        help='axes across the needle and along its deflection; -x turns one around (default x,z)',
+    )
+    fitting.add_argument(
+        '--level',
+        type=float,
+        metavar='N',
+        help='force level whose stiffness is the result (default the largest)',
+    )
+    stiffness.set_defaults(command=_run_stiffness)
+
+
+def _words(text: str) -> list[str]:
+    return [word.strip() for word in text.split(',')]
+
+
+def _add_common(
+    parser: argparse.ArgumentParser, defaults: object
+) -> tuple[argparse._ArgumentGroup, argparse._ArgumentGroup]:
+    """Add what both have; return the groups of options of reading and of fitting."""
+    parser.add_argument(
+        'bags',
+        type=Path,
+        nargs='+',
+        metavar='BAG',
+        help='rosbag2 folder, .mcap or .db3 file; one that cannot be used is named, the others '
+        'go on, and the exit status is 2',
+    )
+    writing = parser.add_argument_group('what to write')
+    writing.add_argument(
+        '-o', '--output', type=Path, metavar='FILE', help='ROS parameter file with the result'
+    )
+    writing.add_argument(
+        '--report', type=Path, metavar='DIR', help='folder for a page of HTML with its pictures'
+    )
+    writing.add_argument('--json', action='store_true', help='print JSON instead of tables')
+    reading = parser.add_argument_group('what to read')
+    reading.add_argument(
+        '--wrench-topic',
+        metavar='TOPIC',
+        help='topic of the force, a WrenchStamped (default the only one, or base_wrench)',
+    )
+    reading.add_argument(
+        '--motion-topic',
+        metavar='TOPIC',
+        help='topic of the motion (default the only one of a type that tells it, or joint_states '
+        'or end_effector_pose)',
+    )
+    reading.add_argument(
+        '--time',
+        choices=TIMES,
+        default='header',
+        help='go by the stamps of the messages or by when they were received (default header)',
+    )
+    fitting = parser.add_argument_group('how to identify')
+    fitting.add_argument(
+        '--estimator',
+        choices=ESTIMATORS,
+        default='ordinary',
+        help='least squares: ordinary, weighted by the noise measured, huber against outliers, '
+        'total for noise in the motion too (default ordinary)',
+    )
+    for item in fields(defaults):  # type: ignore[arg-type]
+        if 'unit' in item.metadata:
+            unit = item.metadata['unit']
+            default = f'{item.default:g} {unit}'.removesuffix(' 1')
+            fitting.add_argument(
+                f'--{item.name.replace("_", "-")}',
+                type=float,
+                default=item.default,
+                metavar='X' if unit == '1' else unit,
+                help=f'{item.metadata["description"]} (default {default})',
+            )
+    return reading, fitting
+
+
+def _settings(kind: Callable[..., Any], options: argparse.Namespace) -> Any:
+    """Make settings from the options of the same name; what was not given has its default."""
+    names = [item.name for item in fields(kind)]  # type: ignore[arg-type]
+    given = {name: getattr(options, name, None) for name in names}
+    values = {
+        name: tuple(value) if isinstance(value, list) else value
+        for name, value in given.items()
+        if value is not None
+    }
+    return kind(**values)
+
+
+@dataclass(frozen=True, slots=True)
+class _Found:
+    """What several recordings gave: an estimate and its source each, and those that failed."""
+
+    estimates: list[Any]
+    sources: list[Source]
+    failures: list[tuple[str, str]]
+
+
+def _run_friction(options: argparse.Namespace) -> int:
+    settings = _settings(FrictionSettings, options)
+    reading = {
+        **_reading(options),
+        'force_axis': options.force_axis,
+        'motion_axis': options.motion_axis,
+    }
+    found = _identify(
+        options,
+        lambda bag: read_friction_recording(bag, **reading),
+        lambda recording: identify_friction(recording, settings),
+    )
+    if not found.estimates:
+        return 2
+    summary = summarize(found.estimates)
+    if options.output is not None:
+        write_result(options.output, summary)
+    return _tell(options, found, summary, settings, reading, _friction_tables, friction_report)
+
+
+def _run_stiffness(options: argparse.Namespace) -> int:
+    settings = _settings(StiffnessSettings, options)
+    if len(options.axes) != 2:
+        raise ParameterError(f'--axes must name two axes, got {",".join(options.axes)}')
+    reading = {**_reading(options), 'axes': tuple(options.axes)}
+    found = _identify(
+        options,
+        lambda bag: read_indentation_recording(bag, **reading),
+        lambda recording: identify_stiffness(recording, settings),
+    )
+    if not found.estimates:
+        return 2
+    summary = summarize_stiffness(
+        found.estimates, force=options.level, level_tolerance=settings.level_tolerance
+    )
+    if options.output is not None:
+        write_result(options.output, None, summary)
+    return _tell(options, found, summary, settings, reading, _stiffness_tables, stiffness_report)
+
+
+def _reading(options: argparse.Namespace) -> dict[str, Any]:
+    return {
+        'wrench_topic': options.wrench_topic,
+        'motion_topic': options.motion_topic,
+        'time': options.time,
+    }
+
+
+def _identify(
+    options: argparse.Namespace, read: Callable[[Path], Any], identify: Callable[[Any], Any]
+) -> _Found:
+    """Read and identify each recording; one that fails is named, and the others go on."""
+    check_distinct(options.bags)
+    found = _Found([], [], [])
+    for bag in tqdm(options.bags, desc='bags', disable=None, leave=False):
+        try:
+            recording = read(bag)
+            found.estimates.append(identify(recording))
+        except (NeedleError, OSError) as error:
+            found.failures.append((str(bag), str(error)))
+            continue
+        found.sources.append(
+            Source(
+                name=recording.name,
+                losses=recording.losses,
+                clock_offset=recording.clock_offset,
+                samples=len(recording.time),
+                files=_files(bag) if options.report or options.json else (),
+            )
+        )
+    for bag, reason in found.failures:
+        sys.stderr.write(f'error: {reason if bag in reason else f"{bag}: {reason}"}\n')
+    return found
+
+
+def _files(bag: Path) -> tuple[tuple[str, str], ...]:
+    """Return the files of a recording with their SHA-256."""
+    found = []
+    for path in (
+        sorted(path for path in bag.iterdir() if path.is_file()) if bag.is_dir() else [bag]
+    ):
+        digest = sha256()
+        with path.open('rb') as stream:
+            while piece := stream.read(_PIECE):
+                digest.update(piece)
+        found.append((str(path), digest.hexdigest()))
+    return tuple(found)
+
+
+def _tell(
+    options: argparse.Namespace,
+    found: _Found,
+    summary: Any,
+    settings: Any,
+    reading: dict[str, Any],
+    tables: Callable[[Any], str],
+    report: Callable[..., Path],
+) -> int:
+    """Print, warn, and write the page; return the exit status."""
+    written = [] if options.output is None else [options.output]
+    if options.report is not None:
+        try:
+            options.report.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise ParameterError(
+                f'{options.report} cannot be written: {error.strerror}'
+            ) from error
+        origin = Origin(
+            sources=found.sources,
+            failures=found.failures,
+            settings=settings,
+            reading=reading,
+            result=options.output,
+        )
+        written.append(report(options.report, summary, origin))
+    for estimate, source in zip(found.estimates, found.sources, strict=True):
+        for words in (*source.losses, *estimate.warnings):
+            sys.stderr.write(f'warning: {source.name}: {words}\n')
+    if options.json:
+        result = {
+            **_plain(summary),
+            'settings': _plain(settings),
+            'reading': _plain(reading),
+            'recordings': [_plain(source) for source in found.sources],
+            'failures': [{'name': name, 'reason': reason} for name, reason in found.failures],
+            'files': [str(path) for path in written],
+        }
+        sys.stdout.write(f'{json.dumps(result, indent=2, allow_nan=False)}\n')
+    else:
+        sys.stdout.write(f'{tables(summary)}\n')
+        for path in written:
+            sys.stdout.write(f'wrote {path}\n')
+    return 2 if found.failures else 0
+
+
+def _plain(value: Any) -> Any:
+    """Return a value as JSON can hold it: what is not finite is null."""
+    if is_dataclass(value):
+        named = {item.name: getattr(value, item.name) for item in fields(value)}
+        return {
+            name: _plain(one) for name, one in named.items() if not isinstance(one, _FOR_PICTURES)
+        }
+    if isinstance(value, dict):
+        return {str(key): _plain(one) for key, one in value.items()}
+    if isinstance(value, (list, tuple)):
+        # What has names is found by them.
+        if value and all(isinstance(one, (ParameterEstimate, Statistic)) for one in value):
+            return {one.name: _plain(one) for one in value}
+        return [_plain(one) for one in value]
+    if isinstance(value, np.generic):
+        return _plain(value.item())
+    if isinstance(value, float) and not isfinite(value):
+        return None
+    return value
+
+
+def _friction_tables(summary: FrictionSummary) -> str:
+    means = friction_statistics(summary)
+    whole = table([mean_row(one) for one in means], MEAN_HEADS)
+    found = [(estimate, every_parameter(estimate)) for estimate in summary.estimates]
+    rows = [
+        (
+            estimate.name,
+            *(_cell(given.get(one.name)) for one in means),
+            f'{estimate.samples}',
+            f'{estimate.residual:.4f}',
+        )
+        for estimate, given in found
+    ]
+    symbols = [f'{label_of(one)} ± SE' for one in means]
+    return f'{whole}\n\n{table(rows, ("bag", *symbols, "samples", "residual [N]"))}'
+
+
+def _cell(one: ParameterEstimate | None) -> str:
+    return '' if one is None else measured(one.value, one.error)
+
+
+def _stiffness_tables(summary: StiffnessSummary) -> str:
+    """Return Table 2: a row for each entry, a column for each force; then k_a."""
+    names = [one.name for one in summary.levels[0].statistics]
+    rows = [
+        (
+            label_of(summary.levels[0][name]),
+            *(with_deviation(level[name]) for level in summary.levels),
+        )
+        for name in names
+    ]
+    heads = ['mean ± SE (STD)', *(f'{level.force:.2f} N' for level in summary.levels)]
+    by_force = [
+        (
+            f'{level.force:.2f} N',
+            *(between(level[name].interval) for name in names),
+            f'{level[names[0]].count}',
+        )
+        for level in summary.levels
+    ]
+    symbols = [summary.levels[0][name].symbol for name in names]
+    matrices = table(rows, heads)
+    intervals = table(by_force, ('95 % interval', *symbols, 'bags'))
+    result = summary.tissue_stiffness
+    return (
+        f'{matrices}\n\n{intervals}\n\n'
+        f'{result.symbol} = {measured(result.mean, result.error, result.unit)}, '
+        f'95 % interval {between(result.interval)}'
+    )

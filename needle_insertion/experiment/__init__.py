@@ -1,0 +1,1 @@
+"""The protocols of the paper, run in a graph of nodes."""

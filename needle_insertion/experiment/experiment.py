@@ -1,0 +1,314 @@
+"""`needle experiment`: the protocols on the stand-in, through real nodes, recorded bag by bag."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+import shutil
+import sys
+from typing import Any
+
+from geometry_msgs.msg import WrenchStamped
+from needle_dynamics import JobError, ParameterError
+from needle_identification import message_counts, read_topic, RecordingError
+from needle_insertion.experiment.graph import ACTIVATE, CLEANUP, CONFIGURE, DEACTIVATE, Graph
+from needle_insertion.experiment.protocol import Campaign, FASTEST, Protocol, PROTOCOLS, SPEED
+from needle_ros.base_node import COMMAND, SENSOR
+from needle_ros.timing import seconds
+import numpy as np
+from rclpy.duration import Duration
+from rclpy.parameter import Parameter
+from rclpy.parameter_client import AsyncParameterClient
+from tqdm import tqdm
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+import yaml
+
+#: Part of the samples that a bag may lack: a few in a thousand, which no stroke or press misses,
+#: alone or in a row. A reader that stalls loses far more.
+_LARGEST_LOSS = 0.002
+
+
+class ExperimentError(JobError):
+    """A run could not be recorded whole."""
+
+
+def run(options: argparse.Namespace) -> int:
+    """Record what is missing in the folder; return the exit status."""
+    campaign = Campaign(
+        protocol=PROTOCOLS[options.which],
+        repeats=options.repeats,
+        seed=options.seed,
+        rate=options.rate,
+        fixed=options.fixed,
+    )
+    if not 0.0 < options.speed <= FASTEST:
+        raise ParameterError(f'--speed must be in (0, {FASTEST:g}], got {options.speed}')
+    record(campaign, options.output, options.speed)
+    return 0
+
+
+def record(campaign: Campaign, folder: Path, speed: float = SPEED) -> list[Path]:
+    """
+    Record the runs of a campaign that a folder does not hold yet.
+
+    Parameters
+    ----------
+    campaign : Campaign
+        What to record.
+    folder : Path
+        Holds one bag per run, and whatever else there is: it is left alone.
+    speed : float
+        Times real time.
+
+    Returns
+    -------
+    list of Path
+        All bags of the campaign, in order.
+
+    Raises
+    ------
+    ParameterError
+        If the folder holds something else under the name of a bag; nothing is recorded then.
+    GraphError, ExperimentError
+        If a node fails, or samples are lost at half the speed too. What is finished is kept.
+
+    """
+    runs, protocol = campaign.runs(), campaign.protocol
+    missing = [
+        name
+        for name, parameters in runs.items()
+        if not _is_finished(folder / name, protocol, parameters)
+    ]
+    bar = tqdm(
+        total=len(runs),
+        initial=len(runs) - len(missing),
+        desc=f'{protocol.name} runs',
+        disable=None,
+    )
+    if missing:
+        with bar, rig(folder, protocol) as stand:
+            for name in missing:
+                stand.record(folder / name, runs[name], speed)
+                bar.update()
+    return [folder / name for name in runs]
+
+
+@contextmanager
+def rig(folder: Path, protocol: Protocol) -> Iterator[Rig]:
+    """
+    Start a plant and a recorder for any number of runs of a protocol.
+
+    Parameters
+    ----------
+    folder : Path
+        Where the bags will be; unfinished ones are in a hidden folder beside them.
+    protocol : Protocol
+        What will be done.
+
+    Yields
+    ------
+    Rig
+        Ready to record.
+
+    """
+    drafts = folder / f'.{protocol.name}.unfinished'
+    # What an earlier call left when it was killed.
+    shutil.rmtree(drafts, ignore_errors=True)
+    drafts.mkdir(parents=True)
+    try:
+        with Graph(drafts / 'logs') as graph:
+            yield Rig(graph, drafts / 'run', protocol)
+    finally:
+        shutil.rmtree(drafts, ignore_errors=True)
+
+
+class Rig:
+    """
+    The stand-in and a recorder, which record one run after the other.
+
+    Parameters
+    ----------
+    graph : Graph
+        Where they run.
+    draft : Path
+        Folder of the first bag while it is recorded; the k-th has ``_k`` appended.
+    protocol : Protocol
+        What each run does.
+
+    """
+
+    def __init__(self, graph: Graph, draft: Path, protocol: Protocol) -> None:
+        self._graph, self._draft, self._protocol = graph, draft, protocol
+        self._recordings = 0
+        topics = list(protocol.topics)
+        graph.start('recorder', {'autostart': False, 'path': str(draft), 'topics': topics})
+        graph.start('plant', {'autostart': False})
+        self._node = node = graph.node('experiment')
+        self._trajectory = node.create_publisher(JointTrajectory, 'joint_trajectory', COMMAND)
+        self._wrench = graph.latest(node, WrenchStamped, 'base_wrench', SENSOR)
+        self._plant = AsyncParameterClient(node, 'plant')
+        graph.wait_for(node, 'plant')
+        graph.change(node, 'recorder', CONFIGURE)
+
+    def record(
+        self,
+        bag: Path,
+        parameters: Mapping[str, Any],
+        speed: float,
+        progress: Callable[[float], None] = lambda _fraction: None,
+    ) -> None:
+        """
+        Run the protocol once; the bag appears when it is complete.
+
+        Parameters
+        ----------
+        bag : Path
+            Folder of the bag; must not exist.
+        parameters : mapping
+            Parameters of the plant by name.
+        speed : float
+            Times real time; once more at half of it if samples are lost.
+        progress : callable
+            Called with the fraction done.
+
+        Raises
+        ------
+        GraphError
+            If a node fails.
+        ExperimentError
+            If samples are lost at half the speed too.
+
+        """
+        for factor in (speed, speed / 2.0):
+            draft = self._run({**parameters, 'real_time_factor': factor}, progress)
+            lost = _lost(draft, self._protocol, parameters['rate'])
+            if not lost:
+                _move(draft, bag)
+                return
+            said = f'{bag}: {lost} at {factor:g} times real time'
+            tqdm.write(said, file=sys.stderr)
+        raise ExperimentError(f'{said}; ask for a lower --speed or --rate')
+
+    def _run(self, parameters: Mapping[str, Any], progress: Callable[[float], None]) -> Path:
+        graph, node, protocol = self._graph, self._node, self._protocol
+        if self._recordings:
+            graph.change(node, 'plant', CLEANUP)
+        answer = self._plant.set_parameters(
+            [Parameter(name, value=value) for name, value in parameters.items()]
+        )
+        graph.spin_until(answer.done, 'the answer of plant')
+        for result in answer.result().results:
+            if not result.successful:
+                raise ExperimentError(f'plant refused its parameters: {result.reason}')
+        graph.change(node, 'plant', CONFIGURE)
+        # Only the plant listens: what an earlier recording took has been let go.
+        graph.spin_until(lambda: self._trajectory.get_subscription_count() == 1, 'the plant')
+        graph.change(node, 'recorder', ACTIVATE)
+        self._recordings += 1
+        # The plant begins when the recorder listens and the trajectory is there: the bag holds
+        # every sample of it. This process listens to the wrench, too.
+        graph.spin_until(
+            lambda: (
+                self._trajectory.get_subscription_count() == 2
+                and node.count_subscribers('/base_wrench') == 2
+                and all(node.count_subscribers(topic) for topic in protocol.topics)
+            ),
+            'the recorder',
+        )
+        message = _trajectory(protocol)
+        message.header.stamp = node.get_clock().now().to_msg()
+        self._trajectory.publish(message)
+        self._trajectory.wait_for_all_acked(Duration(seconds=10.0))
+        self._wrench.message = None
+        graph.change(node, 'plant', ACTIVATE)
+        graph.spin_until(lambda: self._wrench.message, 'base_wrench')
+        start = seconds(self._wrench.message.header.stamp)
+
+        def done() -> bool:
+            elapsed = seconds(self._wrench.message.header.stamp) - start
+            progress(min(elapsed / protocol.duration, 1.0))
+            return elapsed > protocol.duration
+
+        # By the stamps, whatever the speed; simulated time may wait for a busy machine.
+        due = protocol.duration / parameters['real_time_factor']
+        graph.spin_until(done, 'the end of the protocol', 4.0 * due + 10.0)
+        graph.change(node, 'plant', DEACTIVATE)
+        graph.change(node, 'recorder', DEACTIVATE)
+        number = self._recordings
+        name = self._draft.name if number == 1 else f'{self._draft.name}_{number}'
+        return self._draft.with_name(name)
+
+
+def _move(draft: Path, bag: Path) -> None:
+    """Give a bag its own name, inside too."""
+    old, new = f'{draft.name}_0.mcap', f'{bag.name}_0.mcap'
+    (draft / old).rename(draft / new)
+    metadata = draft / 'metadata.yaml'
+    metadata.write_text(metadata.read_text(encoding='utf-8').replace(old, new), encoding='utf-8')
+    draft.rename(bag)
+
+
+def _trajectory(protocol: Protocol) -> JointTrajectory:
+    points = [
+        JointTrajectoryPoint(
+            positions=point.positions,
+            effort=point.effort,
+            time_from_start=Duration(seconds=point.time).to_msg(),
+        )
+        for point in protocol.points
+    ]
+    return JointTrajectory(joint_names=protocol.joints, points=points)
+
+
+def _lost(bag: Path, protocol: Protocol, rate: float) -> str:
+    """Say what a recorded run lacks, '' if it is whole."""
+    counts = message_counts(bag)
+    for topic in protocol.topics:
+        if not counts.get(topic):
+            return f'{topic} has no messages'
+    for topic in protocol.sampled:
+        stamps = np.array([seconds(message.header.stamp) for _, message in read_topic(bag, topic)])
+        span = float(stamps.max() - stamps.min())
+        if span < protocol.duration - 1.5 / rate:
+            return f'{topic} lasts {span:.2f} s of {protocol.duration:.2f} s'
+        due = round(span * rate) + 1
+        if abs(len(stamps) - due) > _LARGEST_LOSS * due:
+            return f'{topic} has {len(stamps)} messages of {due}'
+    return ''
+
+
+def _is_finished(bag: Path, protocol: Protocol, parameters: Mapping[str, Any]) -> bool:
+    """Tell whether a run is there; raise `ParameterError` if something else is in its place."""
+    if not bag.exists():
+        return False
+    try:
+        ((_, message),) = read_topic(bag, '/plant/configuration')
+        found = dict(yaml.safe_load(message.data)['/plant']['ros__parameters'])
+        commanded = [_points(message) for _, message in read_topic(bag, '/joint_trajectory')]
+    except (RecordingError, yaml.YAMLError, AttributeError, KeyError, TypeError, ValueError):
+        raise ParameterError(
+            f'{bag} exists and is no run of this experiment; name another folder'
+        ) from None
+    for name, value in parameters.items():
+        if found.get(name) != value:
+            raise ParameterError(
+                f'{bag} was recorded with {name} = {found.get(name)}, asked for is {value}; name '
+                'another folder'
+            )
+    if commanded != [_points(_trajectory(protocol))]:
+        raise ParameterError(f'{bag} was recorded with another trajectory; name another folder')
+    return True
+
+
+def _points(trajectory: Any) -> list[tuple[Any, ...]]:
+    return [
+        (
+            point.time_from_start.sec,
+            point.time_from_start.nanosec,
+            list(point.positions),
+            list(point.effort),
+        )
+        for point in trajectory.points
+    ]

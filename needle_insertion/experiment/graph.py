@@ -1,0 +1,317 @@
+"""A private ROS graph: nodes as processes on a domain of their own, watched from one node."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+import gc
+import os
+from pathlib import Path
+import signal
+import subprocess
+import sys
+import time
+from types import TracebackType
+from typing import Any, Final, IO
+
+from domain_coordinator import domain_id
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState, GetState
+from needle_dynamics import JobError
+from needle_ros.base_node import END_WITH_PARENT
+from rclpy.client import Client
+from rclpy.context import Context
+from rclpy.executors import Executor
+from rclpy.experimental.events_executor import EventsExecutor
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+from rclpy.task import Future
+import yaml
+
+#: Modules of the nodes by name.
+MODULES: Mapping[str, str] = {
+    'plant': 'needle_dynamics.plant_node',
+    'controller': 'needle_controller.controller_node',
+    'identification': 'needle_identification.identification_node',
+    'player': 'needle_identification.player_node',
+    'recorder': 'needle_identification.recorder_node',
+}
+
+CONFIGURE = Transition.TRANSITION_CONFIGURE
+ACTIVATE = Transition.TRANSITION_ACTIVATE
+DEACTIVATE = Transition.TRANSITION_DEACTIVATE
+CLEANUP = Transition.TRANSITION_CLEANUP
+
+
+#: Time that a node may take to start, with all to be compiled on a busy machine [s].
+_START: Final = 180.0
+
+#: Time that the nodes have to end by themselves at the end of a graph [s].
+_PATIENCE: Final = 3.0
+
+
+class GraphError(JobError):
+    """A node did not start, ended early, or what was waited for did not come."""
+
+
+class NodeProcess:
+    """
+    One node of the suite as a process.
+
+    Parameters
+    ----------
+    name : str
+        A key of `MODULES`.
+    parameters : Mapping[str, object]
+        Parameters by name.
+    environment : Mapping[str, str]
+        Environment with the domain.
+    log : file
+        Receives what the node prints.
+
+    """
+
+    def __init__(
+        self,
+        name: str,
+        parameters: Mapping[str, object],
+        environment: Mapping[str, str],
+        log: IO[str],
+    ) -> None:
+        self.name = name
+        self.killed = False
+        self._log = log
+        settings = []
+        for key, value in parameters.items():
+            # One line of YAML, without the end-of-document mark of a bare scalar.
+            text = yaml.safe_dump(value, default_flow_style=True, width=10_000).splitlines()[0]
+            settings += ['-p', f'{key}:={text}']
+        self.process = subprocess.Popen(
+            [sys.executable, '-m', MODULES[name], '--ros-args', *settings],
+            env=dict(environment),
+            stdout=log,
+            stderr=subprocess.STDOUT,
+        )
+
+    def check(self) -> None:
+        """Raise `GraphError` with the node's last words if it has ended."""
+        status = self.process.poll()
+        if status is not None:
+            raise GraphError(
+                f'{self.name} ended early with status {status}: {self.last_words() or "no output"}'
+            )
+
+    def last_words(self) -> str:
+        """Return the last line the node printed."""
+        self._log.flush()
+        lines = Path(self._log.name).read_text(encoding='utf-8', errors='replace').splitlines()
+        return lines[-1] if lines else ''
+
+    def kill(self) -> None:
+        """End the node at once, as a crash does, and wait."""
+        self.killed = True
+        self.process.kill()
+        self.process.wait()
+
+    def interrupt(self, timeout: float = 15.0) -> None:
+        """End the node as Ctrl-C does and wait; raise `GraphError` if it does not end well."""
+        self.process.send_signal(signal.SIGINT)
+        try:
+            status = self.process.wait(timeout)
+        except subprocess.TimeoutExpired as error:
+            raise GraphError(f'{self.name} did not end within {timeout:g} s') from error
+        if status != 0:
+            raise GraphError(f'{self.name} ended with status {status}: {self.last_words()}')
+
+
+class Latest:
+    """The newest message of a topic, None before the first."""
+
+    def __init__(self) -> None:
+        self.message: Any = None
+
+    def take(self, message: Any) -> None:
+        """Take a message."""
+        self.message = message
+
+
+class Graph:
+    """
+    A ROS graph on a free domain, on this machine only; leaving it ends all its processes.
+
+    Parameters
+    ----------
+    logs : Path
+        Folder for what the nodes print.
+    executor : type of executor
+        Spins the nodes in this process, in the caller's thread: an error in a callback is an
+        error of the caller.
+
+    """
+
+    def __init__(self, logs: Path, executor: Callable[..., Executor] = EventsExecutor) -> None:
+        self._logs = logs
+        self._executor_kind = executor
+        self._processes: list[NodeProcess] = []
+        self._files: list[IO[str]] = []
+        self._nodes: list[Node] = []
+        self._life_cycles: dict[str, Client] = {}
+
+    def __enter__(self) -> Graph:
+        self._domain = domain_id()
+        domain = self._domain.__enter__()
+        self.environment = {
+            **os.environ,
+            'ROS_DOMAIN_ID': str(domain),
+            'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
+            END_WITH_PARENT: '1',
+        }
+        # The context of this process reads its discovery range from the environment too.
+        os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
+        self.context = Context()
+        self.context.init(domain_id=domain)
+        self.executor = self._executor_kind(context=self.context)
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        try:
+            # Before the processes: Fast DDS 2.14 may crash where one that shared its memory with
+            # this one has been killed.
+            for node in self._nodes:
+                self.executor.remove_node(node)
+                node.destroy_node()
+            self.executor.shutdown()
+            self.context.try_shutdown()
+            self._nodes.clear()
+            self._life_cycles.clear()
+            del self.executor
+            # rclpy's nodes are in cycles; until these are gone DDS keeps them in the domain, where
+            # the next graph would find them.
+            gc.collect()
+            # Who is killed leaves its shared memory behind.
+            for started in self._processes:
+                if started.process.poll() is None:
+                    started.process.terminate()
+            deadline = time.monotonic() + _PATIENCE
+            for started in self._processes:
+                with suppress(subprocess.TimeoutExpired):
+                    started.process.wait(max(0.0, deadline - time.monotonic()))
+        finally:
+            # All before any: a second interrupt may come while waiting.
+            for started in self._processes:
+                if started.process.poll() is None:
+                    started.process.kill()
+            for started in self._processes:
+                started.process.wait()
+            for file in self._files:
+                file.close()
+            self._domain.__exit__(kind, error, trace)
+
+    def add(self, kind: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
+        """Make a node in this process and spin it along."""
+        node = kind(*arguments, context=self.context, **options)
+        self._nodes.append(node)
+        self.executor.add_node(node)
+        return node
+
+    def node(self, name: str) -> Node:
+        """Make a plain node in this process, to watch and to command."""
+        node: Node = self.add(Node, name)
+        return node
+
+    def latest(self, node: Node, kind: type, topic: str, qos: QoSProfile) -> Latest:
+        """Watch a topic for its newest message."""
+        latest = Latest()
+        node.create_subscription(kind, topic, latest.take, qos)
+        return latest
+
+    def start(self, name: str, parameters: Mapping[str, object] | None = None) -> NodeProcess:
+        """Start a node of the suite as a process."""
+        self._logs.mkdir(parents=True, exist_ok=True)
+        # Closed with the graph: the process writes to it until then.
+        log = (self._logs / f'{name}.log').open('a', encoding='utf-8')
+        self._files.append(log)
+        process = NodeProcess(name, parameters or {}, self.environment, log)
+        self._processes.append(process)
+        return process
+
+    def wait_for(self, node: Node, name: str) -> None:
+        """
+        Wait until a node of the suite answers a node of this process, with all its clients.
+
+        Raises
+        ------
+        GraphError
+            If it does not.
+
+        """
+        if name in self._life_cycles:
+            return
+        self._life_cycles[name] = node.create_client(ChangeState, f'{name}/change_state')
+        probe = node.create_client(GetState, f'{name}/get_state')
+        self.spin_until(probe.service_is_ready, f'the node {name}')
+        # An answer to a client that the other side does not know yet is lost. Clients become
+        # known in the order they were made: once the last has its answer, all will.
+        answers: list[Future] = []
+        start = time.monotonic()
+
+        def answered() -> bool:
+            if time.monotonic() - start >= len(answers):
+                answers.append(probe.call_async(GetState.Request()))
+            return any(answer.done() for answer in answers)
+
+        self.spin_until(answered, f'the answer of {name}', _START)
+        node.destroy_client(probe)
+
+    def change(self, node: Node, name: str, *transitions: int) -> None:
+        """
+        Take a node, started with ``autostart`` off, through transitions of its life cycle.
+
+        Parameters
+        ----------
+        node : Node
+            Node in this process that asks for it.
+        name : str
+            Name of the other node.
+        *transitions : int
+            `CONFIGURE`, `ACTIVATE`, `DEACTIVATE` or `CLEANUP`, in order.
+
+        Raises
+        ------
+        GraphError
+            If it refuses.
+
+        """
+        self.wait_for(node, name)
+        client = self._life_cycles[name]
+        for transition in transitions:
+            answer = client.call_async(ChangeState.Request(transition=Transition(id=transition)))
+            self.spin_until(answer.done, f'the answer of {name}', _START)
+            if not answer.result().success:
+                said = [p.last_words() for p in self._processes if p.name == name]
+                raise GraphError(f'{name} refused to start: {"".join(said[-1:])}')
+
+    def spin_until(self, condition: Callable[[], Any], what: str, timeout: float = 60.0) -> None:
+        """
+        Spin until a condition holds.
+
+        Raises
+        ------
+        GraphError
+            If it does not within the timeout [s], or a process of the graph has ended.
+
+        """
+        deadline = time.monotonic() + timeout
+        while not condition():
+            for started in self._processes:
+                # One that was interrupted on purpose has ended well.
+                if started.process.poll() not in (None, 0) and not started.killed:
+                    started.check()
+            if time.monotonic() > deadline:
+                raise GraphError(f'{what} did not come within {timeout:g} s')
+            self.executor.spin_once(timeout_sec=0.05)

@@ -1,0 +1,1 @@
+"""A recorded run of a plant, computed again."""

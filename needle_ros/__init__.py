@@ -1,0 +1,1 @@
+"""What every node shares: the contract on the wire, settings, time and the common node."""
