@@ -39,8 +39,9 @@ from needle_dynamics import (
     NeedleModel,
     NeedleParameters,
 )
+from needle_dynamics.model_node import ModelNode
 from needle_dynamics.simulated.plant import joint_values
-from needle_ros.base_node import COMMAND, NeedleNode, run, SENSOR
+from needle_ros.base_node import COMMAND, run, SENSOR
 from needle_ros.errors import (
     NeedleError,
     ParameterError,
@@ -77,7 +78,7 @@ _GAINS: dict[str, dict[str, InverseDynamicsGains | PidGains]] = {
 FEEDBACKS = ('observer', 'ground_truth', 'none')
 
 
-class ControllerNode(NeedleNode):
+class ControllerNode(ModelNode):
     """
     Answers each ``joint_states`` with a ``wrench_command`` (force.y [N], torque.x [N m]).
 

@@ -13,12 +13,13 @@ from builtin_interfaces.msg import Time as TimeMessage
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import Point, PointStamped, Pose, PoseArray, PoseStamped, WrenchStamped
 from needle_dynamics.compiled.kernels import FloatArray
+from needle_dynamics.model_node import ModelNode
 from needle_dynamics.simulated.assembly import assemble, MODES
 from needle_dynamics.simulated.faults import Fault, FaultParameters, FAULTS
 from needle_dynamics.simulated.force_sensor import ForceSensorParameters, HIGHEST_RATE
 from needle_dynamics.simulated.indenter import Indenter, IndenterParameters, Press
 from needle_dynamics.simulated.plant import BaseParameters, Plant, Sample, TipParameters
-from needle_ros.base_node import COMMAND, NeedleNode, run, SENSOR
+from needle_ros.base_node import COMMAND, run, SENSOR
 from needle_ros.errors import (
     JobError,
     NeedleError,
@@ -107,7 +108,7 @@ class PlantSettings:
         check_constants(self)
 
 
-class PlantNode(NeedleNode):
+class PlantNode(ModelNode):
     """
     The needle, or the end-effector, with its sensors.
 

@@ -32,7 +32,7 @@ from needle_identification.stiffness.fit import (
     StiffnessSettings,
     summarize_stiffness,
 )
-from needle_ros.base_node import LATCHED, NeedleNode, run, SENSOR
+from needle_ros.base_node import BaseNode, LATCHED, run, SENSOR
 from needle_ros.errors import (
     NeedleError,
     ParameterError,
@@ -77,7 +77,7 @@ class IdentificationSettings:
         check_constants(self)
 
 
-class IdentificationNode(NeedleNode):
+class IdentificationNode(BaseNode):
     """
     Publishes ``friction`` or ``stiffness`` (latched) from the recordings named in ``bags``.
 

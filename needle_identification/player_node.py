@@ -17,7 +17,7 @@ from needle_identification.bags.bag import Bag, Recorded
 from needle_identification.bags.storage import offered_qos, OfferedQos, Topic
 from needle_identification.errors import RecordingError
 from needle_identification.recorder_node import is_hidden, message_class
-from needle_ros.base_node import NeedleNode, run
+from needle_ros.base_node import BaseNode, run
 from needle_ros.errors import (
     NeedleError,
     ParameterError,
@@ -75,7 +75,7 @@ class PlayerSettings:
             )
 
 
-class PlayerNode(NeedleNode):
+class PlayerNode(BaseNode):
     """
     Plays while active, each topic with the quality of service that its publishers offered.
 

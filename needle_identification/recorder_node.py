@@ -13,7 +13,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from needle_identification.bags.bag import BagWriter, COMPRESSIONS
 from needle_identification.bags.storage import OfferedQos
 from needle_identification.errors import RecordingError
-from needle_ros.base_node import NeedleNode, run
+from needle_ros.base_node import BaseNode, run
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.event_handler import SubscriptionEventCallbacks
@@ -40,7 +40,7 @@ class _Taken(NamedTuple):
     latched: bool
 
 
-class RecorderNode(NeedleNode):
+class RecorderNode(BaseNode):
     """
     Records while active, each topic with the quality of service that its publishers offer.
 

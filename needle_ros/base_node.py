@@ -24,7 +24,6 @@ from typing import Any, ClassVar, TypeVar
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import WrenchStamped
-from needle_dynamics.parameters import NeedleParameters, PRESETS
 from needle_ros.errors import (
     NeedleError,
     ParameterError,
@@ -95,7 +94,7 @@ def layout_of(kind: type, reading: Reading) -> Layout:
     return Layout(reading.frame, numbers=counts[0])
 
 
-class NeedleNode(LifecycleNode):
+class BaseNode(LifecycleNode):
     """
     A lifecycle node that reads its parameters into dataclasses and says how it is.
 
@@ -225,30 +224,6 @@ class NeedleNode(LifecycleNode):
             if isinstance(default, tuple):
                 default = list(default)
             self.declare_parameter(f'{prefix}{item.name}', default, descriptor)
-
-    def declare_model(self) -> None:
-        """Declare ``model.preset`` and, with its values as defaults, every model constant."""
-        # Fixed at start: the other defaults follow from it.
-        self.declare_parameter(
-            'model.preset',
-            'phantom',
-            ParameterDescriptor(description=f'one of {", ".join(PRESETS)}', read_only=True),
-        )
-        preset = self.get_parameter('model.preset').value
-        self.declare_settings('model.', PRESETS.get(preset, NeedleParameters()))
-
-    def model_parameters(self, changes: Mapping[str, Any] | None = None) -> NeedleParameters:
-        """
-        Read the model constants, but for the changes.
-
-        Raises
-        ------
-        ParameterError
-            Naming the parameter.
-
-        """
-        self.text('model.preset', tuple(PRESETS))
-        return self.settings('model.', NeedleParameters, changes)
 
     def settings(
         self,
@@ -457,7 +432,7 @@ class NeedleNode(LifecycleNode):
             self.publish_diagnostics()
 
 
-def run(kind: Callable[[], NeedleNode], arguments: list[str] | None = None) -> int:
+def run(kind: Callable[[], BaseNode], arguments: list[str] | None = None) -> int:
     """
     Run one node until SIGINT or SIGTERM, then deactivate it while the graph still lives.
 

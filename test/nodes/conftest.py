@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from needle_insertion.experiment.graph import Graph
-from needle_ros.base_node import NeedleNode
+from needle_ros.base_node import BaseNode
 import pytest
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -27,7 +27,7 @@ class RosGraph(Graph):
         parameters: Mapping[str, object] = options.pop('parameters', {})
         overrides = [Parameter(name, value=value) for name, value in parameters.items()]
         node = super().add(kind, *arguments, parameter_overrides=overrides, **options)
-        if start and isinstance(node, NeedleNode):
+        if start and isinstance(node, BaseNode):
             assert node.start(), node.failure
         return node
 

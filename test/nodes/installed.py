@@ -8,7 +8,7 @@ from importlib import import_module
 import inspect
 from pathlib import Path
 
-from needle_ros.base_node import NeedleNode
+from needle_ros.base_node import BaseNode
 
 ROOT = Path(__file__).parent.parent.parent
 
@@ -25,12 +25,12 @@ def _constant(name: str) -> Mapping[str, str]:
 NODES = _constant('NODES')
 
 
-def node_class(name: str) -> type[NeedleNode]:
+def node_class(name: str) -> type[BaseNode]:
     """Return the class of the node that an executable runs."""
     module = NODES[name]
     (kind,) = (
         item
         for _, item in inspect.getmembers(import_module(module), inspect.isclass)
-        if issubclass(item, NeedleNode) and item.__module__ == module
+        if issubclass(item, BaseNode) and item.__module__ == module
     )
     return kind

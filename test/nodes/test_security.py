@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 from lxml import etree
 from needle_insertion.experiment.protocol import SHIPPED_BAGS
-from needle_ros.base_node import NeedleNode
+from needle_ros.base_node import BaseNode
 from nodes.installed import node_class, NODES, ROOT
 import pytest
 
@@ -63,7 +63,7 @@ def policies() -> dict[str, Profile]:
 POLICY = policies()
 
 
-def used(node: NeedleNode) -> Profile:
+def used(node: BaseNode) -> Profile:
     """Return what a node offers and listens to, as the graph has it."""
     name, namespace = node.get_name(), node.get_namespace()
     return Profile(
@@ -79,7 +79,7 @@ def used(node: NeedleNode) -> Profile:
     )
 
 
-def made(node: NeedleNode) -> Profile:
+def made(node: BaseNode) -> Profile:
     """Return what a node has made itself; the graph comes to know it a moment later."""
     return Profile(
         frozenset(item.topic_name for item in node.publishers),
