@@ -44,6 +44,7 @@ from needle_identification.stiffness.fit import (
     StiffnessSummary,
     summarize_stiffness,
 )
+from needle_identification.stiffness.spring import asymmetry
 
 __all__ = [
     'COMPRESSIONS',
@@ -71,6 +72,7 @@ __all__ = [
     'StiffnessEstimate',
     'StiffnessSettings',
     'StiffnessSummary',
+    'asymmetry',
     'check_distinct',
     'encode',
     'identify_friction',
