@@ -50,16 +50,17 @@ from needle_identification import (
     StiffnessSettings,
 )
 from needle_identification.friction.terms import columns_of, regressors
-from needle_insertion.experiment.draw import draw_friction, draw_stiffness, FORCE_LEVELS
+from needle_insertion.experiment.population import draw_friction, draw_stiffness
 from needle_insertion.experiment.protocol import (
     DIRECTIONS,
     HOLD_TIME,
-    node_name,
+    indenter_name,
     Protocol,
     PROTOCOLS,
     START_DEPTH,
 )
-from needle_insertion.report.report import table
+from needle_insertion.paper.tables import FORCE_LEVELS
+from needle_insertion.report.page import table
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solveh_banded
@@ -480,10 +481,10 @@ def stiffness(seed: int, number: int) -> list[Found]:
     drawn = draw_stiffness(_DRAWN, seed + number // _DRAWN)[number % _DRAWN]
     entropy = int(np.random.default_rng([seed, number]).integers(2**32))
     protocol = PROTOCOLS['stiffness']
-    entries: dict[str, Any] = {node_name(name): values for name, values in drawn.items()}
+    entries: dict[str, Any] = {indenter_name(name): values for name, values in drawn.items()}
     tissue = IndenterParameters(
         force_levels=FORCE_LEVELS,
-        force_rate=float(str(protocol.stand_in['indenter.force_rate'])),
+        force_rate=float(str(protocol.plant['indenter.force_rate'])),
         **entries,
     )
     sensor = ForceSensorParameters()

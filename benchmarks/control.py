@@ -23,7 +23,7 @@ from needle_controller import (
 )
 from needle_dynamics import FloatArray, NeedleModel, NeedleParameters
 from needle_insertion.paper.mismatch import sampled_laws
-from needle_insertion.report.report import table
+from needle_insertion.report.page import table
 import numpy as np
 from scipy.linalg import eigh, expm
 

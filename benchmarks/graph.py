@@ -33,8 +33,14 @@ from benchmarks.bare import PERIOD, RATE, Sender, STREAMS
 from benchmarks.measure import Bar, version
 from geometry_msgs.msg import PointStamped, WrenchStamped
 from needle_identification.bags.bag import Bag
-from needle_insertion.experiment.graph import ACTIVATE, CONFIGURE, DEACTIVATE, Graph, GraphError
-from needle_insertion.report.report import table
+from needle_insertion.experiment.ros_graph import (
+    ACTIVATE,
+    CONFIGURE,
+    DEACTIVATE,
+    Graph,
+    GraphError,
+)
+from needle_insertion.report.page import table
 from needle_ros.base_node import COMMAND, LATCHED, SENSOR
 from needle_ros.timing import nanoseconds
 import numpy as np

@@ -3,14 +3,26 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib import import_module
-from importlib.metadata import version
-from pathlib import Path
 import signal
 import sys
 from types import FrameType
-from typing import NoReturn
+from typing import Any, Final, NoReturn
+
+from needle_ros.errors import JobError, NeedleError
+
+#: Subcommands, each a module of `needle_insertion.commands`, and what the help says of them.
+COMMANDS: Final[Mapping[str, str]] = {
+    'demo': 'insertion, recording, identification and a report',
+    'identify': 'fit parameters to recordings',
+    'experiment': 'record an experiment on the simulated robot',
+    'reproduce': "compute the paper's results and compare them with the paper",
+    'simulate': 'simulate the needle in open loop, without ROS',
+    'analyze': 'controllability and observability',
+    'verify': 'compute recorded runs again and compare',
+    'bench': 'measure speed and accuracy (from a clone)',
+}
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
@@ -31,7 +43,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
-    # Loading takes a second, and leaves nothing to tidy up: a signal just ends it.
+    # Imports take up to a second and leave nothing to clean up: until then a signal just ends it.
     previous = {name: signal.signal(name, signal.SIG_DFL) for name in _SIGNALS}
     try:
         return _run(words)
@@ -41,14 +53,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(words: list[str]) -> int:
-    from needle_dynamics import JobError, NeedleError
-
-    options = _parser().parse_args(_joined(words))
+    chosen = next((word for word in words if not word.startswith('-')), '')
+    command = import_module(f'needle_insertion.commands.{chosen}') if chosen in COMMANDS else None
+    options = _parser(chosen, command).parse_args(_joined(words, getattr(command, 'SIGNED', ())))
     try:
-        # What was started is ended on the way out, whatever ends the command.
+        # From here on a signal must clean up: it ends the nodes that the command has started.
         for name in _SIGNALS:
             signal.signal(name, _interrupt)
-        status: int = options.command(options)
+        status: int = command.run(options)  # type: ignore[union-attr]
     except JobError as error:
         sys.stderr.write(f'error: {error}\n')
         return 1
@@ -62,127 +74,43 @@ def _run(words: list[str]) -> int:
 
 
 def _interrupt(_signal: int, _frame: FrameType | None) -> NoReturn:
-    # Once is enough: another signal must not break off the tidying up.
+    # Another signal must not break off the clean-up.
     for name in _SIGNALS:
         signal.signal(name, signal.SIG_IGN)
     raise KeyboardInterrupt
 
 
-def _joined(words: list[str]) -> list[str]:
-    """Join ``--force-axis -y``, which argparse would take for two options."""
-    from needle_insertion.commands.identify import SIGNED
+def _parser(chosen: str, command: Any) -> argparse.ArgumentParser:
+    """Return a parser that has the options of the chosen command only: others cost imports."""
+    parser = argparse.ArgumentParser(prog='needle', description='Robot-assisted needle insertion.')
+    parser.add_argument('--version', action=_Version, nargs=0, help='show the version and exit')
+    commands = parser.add_subparsers(required=True, metavar='COMMAND')
+    for name, words in COMMANDS.items():
+        subparser = commands.add_parser(name, help=words)
+        if name == chosen:
+            command.add_arguments(subparser)
+    return parser
 
+
+class _Version(argparse.Action):
+    def __call__(self, parser: argparse.ArgumentParser, *_rest: Any) -> None:
+        # Imported here: it takes as long as all other imports of the help.
+        from importlib.metadata import version
+
+        sys.stdout.write(f'{version("needle_insertion")}\n')
+        parser.exit()
+
+
+def _joined(words: list[str], signed: Sequence[str]) -> list[str]:
+    """Join ``--force-axis -y``, which argparse would take for two options."""
     joined: list[str] = []
     for word in words:
-        signed = word.startswith('-') and not word.startswith('--')
-        if joined and joined[-1] in SIGNED and signed:
+        has_sign = word.startswith('-') and not word.startswith('--')
+        if joined and joined[-1] in signed and has_sign:
             joined[-1] += f'={word}'
         else:
             joined.append(word)
     return joined
-
-
-def _parser() -> argparse.ArgumentParser:
-    from needle_insertion.commands import (
-        analyze,
-        identify,
-        reproduce,
-        simulate,
-        verify,
-    )
-    from needle_insertion.experiment import protocol
-
-    parser = argparse.ArgumentParser(prog='needle', description='Robot-assisted needle insertion.')
-    parser.add_argument('--version', action='version', version=version('needle_insertion'))
-    commands = parser.add_subparsers(required=True, metavar='COMMAND')
-
-    demo = commands.add_parser('demo', help='insertion, recording, identification, one report')
-    demo.add_argument('-o', '--output', type=Path, default=Path('demo_output'), help='folder')
-    demo.add_argument(
-        '--bags', type=Path, default=protocol.SHIPPED_BAGS, help='shipped recordings'
-    )
-    demo.set_defaults(command=_demo)
-
-    identify.add_arguments(commands.add_parser('identify', help='fit parameters to recordings'))
-
-    experiment = commands.add_parser('experiment', help='record an experiment on the stand-in')
-    protocol.add_arguments(experiment)
-    experiment.set_defaults(command=_experiment)
-
-    paper = commands.add_parser('reproduce', help="the paper's results anew, beside the paper's")
-    reproduce.add_arguments(paper)
-    paper.set_defaults(command=_reproduce)
-
-    open_loop = commands.add_parser('simulate', help='the open-loop needle, without ROS')
-    simulate.add_arguments(open_loop)
-    open_loop.set_defaults(command=simulate.run)
-
-    analyze.add_arguments(commands.add_parser('analyze', help='controllability and observability'))
-
-    again = commands.add_parser('verify', help='compute recorded runs anew and compare')
-    verify.add_arguments(again)
-    again.set_defaults(command=verify.run)
-
-    bench = commands.add_parser('bench', help='measure speed as ratios, and errors')
-    subjects = bench.add_subparsers(required=True, dest='subject', metavar='SUBJECT')
-    for subject, asked in (
-        ('dynamics', 'the integrator'),
-        ('identification', 'bag to result'),
-        ('control', 'a control step'),
-    ):
-        subjects.add_parser(subject, help=f'speed: {asked}').set_defaults(command=_bench)
-    graph = subjects.add_parser('graph', help='speed: the nodes beside bare ones')
-    length = graph.add_mutually_exclusive_group()
-    length.add_argument('--full', action='store_true', help='record 60 s, watch memory 10 min')
-    length.add_argument('--quick', action='store_true', help='a trial, too short for figures')
-    graph.set_defaults(command=_bench)
-    intervals = subjects.add_parser('calibration', help='do the intervals hold the truth?')
-    intervals.add_argument(
-        '--recordings', type=int, default=1000, metavar='N', help='simulated ones of each kind'
-    )
-    intervals.add_argument('--seed', type=int, default=2014, help='of the truth and of the noise')
-    intervals.add_argument('--json', action='store_true', help='print JSON instead')
-    intervals.set_defaults(command=_bench)
-    return parser
-
-
-def _bench(options: argparse.Namespace) -> int:
-    # The benchmarks are not installed: they are run from a clone, which is not on the path.
-    from needle_ros.errors import ParameterError
-
-    root = Path(__file__).parents[1]
-    if not (root / 'benchmarks').is_dir():
-        raise ParameterError('needle bench needs a clone of the repository: benchmarks/ is there')
-    sys.path.insert(0, str(root))
-    own = options.subject in ('graph', 'calibration')
-    benchmark = import_module(f'benchmarks.{options.subject}' if own else 'benchmarks.run')
-    return int(benchmark.run(options))
-
-
-def _demo(options: argparse.Namespace) -> int:
-    from needle_insertion.commands import demo
-
-    return demo.run(options.output, options.bags)
-
-
-def _experiment(options: argparse.Namespace) -> int:
-    from needle_insertion.experiment import experiment
-
-    return experiment.run(options)
-
-
-def _reproduce(options: argparse.Namespace) -> int:
-    from needle_insertion.commands import reproduce
-
-    recorded = None
-    if options.record is not None:
-        from needle_insertion.experiment import experiment
-
-        recorded = {
-            name: experiment.record(campaign, options.record)
-            for name, campaign in reproduce.campaigns(options.what).items()
-        }
-    return reproduce.run(options, recorded)
 
 
 if __name__ == '__main__':

@@ -31,7 +31,7 @@ from needle_dynamics.analysis import (
     Structure,
 )
 from needle_insertion.commands.options import constants
-from needle_insertion.report.report import Picture, png, table, write_whole
+from needle_insertion.report.page import Picture, png, table, write_whole
 from needle_insertion.report.section import Grid, Section
 import numpy as np
 from tqdm import tqdm
@@ -56,7 +56,7 @@ _PANELS = (
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """
-    Declare the options of `needle analyze`, and `run` as its command.
+    Add the options of `needle analyze`.
 
     Parameters
     ----------
@@ -100,7 +100,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='also map depth and deflection, up to the largest deflection given',
     )
     parser.add_argument('-o', '--output', type=Path, metavar='DIR', help='folder for the map')
-    parser.set_defaults(command=run)
 
 
 def run(options: argparse.Namespace) -> int:

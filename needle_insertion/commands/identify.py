@@ -47,7 +47,7 @@ from needle_insertion.report.identify_report import (
     stiffness_report,
     with_deviation,
 )
-from needle_insertion.report.report import table
+from needle_insertion.report.page import table
 import numpy as np
 from tqdm import tqdm
 
@@ -102,7 +102,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help=f'terms of the force, of {", ".join(TERMS)} '
         f'(default {",".join(FrictionSettings().terms)})',
     )
-    friction.set_defaults(command=_run_friction)
+    friction.set_defaults(identify=_run_friction)
 
     stiffness = what.add_parser(
         'stiffness',
@@ -126,7 +126,31 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar='N',
         help='force level whose stiffness is the result (default the largest)',
     )
-    stiffness.set_defaults(command=_run_stiffness)
+    stiffness.set_defaults(identify=_run_stiffness)
+
+
+def run(options: argparse.Namespace) -> int:
+    """
+    Identify friction or stiffness.
+
+    Parameters
+    ----------
+    options : Namespace
+        As declared by `add_arguments`.
+
+    Returns
+    -------
+    int
+        0, or 2 if a recording cannot be used.
+
+    Raises
+    ------
+    NeedleError
+        If an option is not valid, or a file cannot be written.
+
+    """
+    status: int = options.identify(options)
+    return status
 
 
 def _words(text: str) -> list[str]:

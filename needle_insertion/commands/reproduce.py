@@ -24,11 +24,12 @@ from needle_identification import (
     summarize_stiffness,
 )
 from needle_insertion.commands import analyze
-from needle_insertion.experiment.draw import FORCE_LEVELS, TABLE_1, TABLE_2
-from needle_insertion.experiment.protocol import Campaign, node_name, PROTOCOLS, SHIPPED_BAGS
-from needle_insertion.paper import claims, mismatch, paper_figures
-from needle_insertion.paper.paper_figures import FIGURES
-from needle_insertion.report.report import (
+from needle_insertion.experiment.campaign import Campaign
+from needle_insertion.experiment.protocol import indenter_name, PROTOCOLS, SHIPPED_BAGS
+from needle_insertion.paper import claims, figures, mismatch
+from needle_insertion.paper.figures import FIGURES
+from needle_insertion.paper.tables import FORCE_LEVELS, TABLE_1, TABLE_2
+from needle_insertion.report.page import (
     grid,
     heading,
     headline,
@@ -230,7 +231,7 @@ def friction_truth(truth: Mapping[str, Any] | None, name: str) -> float | None:
 def stiffness_truth(truth: Mapping[str, Any] | None, entry: str, force: float) -> float | None:
     """Return the stand-in's stiffness at its level nearest to a force, None if it is not known."""
     known = truth or {}
-    values = known.get(f'indenter.{node_name(entry)}')
+    values = known.get(f'indenter.{indenter_name(entry)}')
     if values is None:
         return None
     levels = np.array(known['indenter.force_levels'])
@@ -612,7 +613,7 @@ def results(what: str, recorded: Mapping[str, Sequence[Path]] | None = None) -> 
         **{name: lambda name=name: _of_table(tables[name]) for name in TABLES},  # type: ignore[misc]
         'table-3': lambda: _of_section(table_3()),
         **{name: lambda name=name: _figure(name) for name in FIGURES},  # type: ignore[misc]
-        'figures': lambda: _of_section(paper_figures.section()),
+        'figures': lambda: _of_section(figures.section()),
         'controllability': lambda: _of_section(analyze.section()),
         'mismatch': lambda: _of_section(mismatch.section(_study())),
     }
@@ -623,7 +624,7 @@ def results(what: str, recorded: Mapping[str, Sequence[Path]] | None = None) -> 
     return found
 
 
-def run(options: argparse.Namespace, recorded: Mapping[str, Sequence[Path]] | None = None) -> int:
+def run(options: argparse.Namespace) -> int:
     """
     Print a result, and write its page.
 
@@ -631,8 +632,6 @@ def run(options: argparse.Namespace, recorded: Mapping[str, Sequence[Path]] | No
     ----------
     options : Namespace
         As declared by `add_arguments`.
-    recorded : Mapping[str, sequence of Path], optional
-        Recordings by experiment; the shipped ones if not given.
 
     Returns
     -------
@@ -641,6 +640,13 @@ def run(options: argparse.Namespace, recorded: Mapping[str, Sequence[Path]] | No
         finding, not a failure.
 
     """
+    recorded = None
+    if options.record is not None:
+        wanted = campaigns(options.what)
+        # Needs ROS; the shipped recordings are read without it.
+        from needle_insertion.experiment.record import record
+
+        recorded = {name: record(one, options.record) for name, one in wanted.items()}
     folder = options.output or (_OUTPUT if options.what == 'all' else None)
     if folder is not None:
         try:

@@ -21,7 +21,7 @@ from needle_dynamics import (
 from needle_dynamics.simulated.integrators import DEFAULT_TOLERANCE
 from needle_identification import BagWriter, encode, message_type
 from needle_insertion.commands.options import constants
-from needle_insertion.report.report import png, table, write_whole
+from needle_insertion.report.page import png, table, write_whole
 from needle_ros.timing import NANOSECONDS
 import numpy as np
 

@@ -23,9 +23,9 @@ from needle_dynamics.analysis import Analysis, analyze, linearize, operating_poi
 from needle_dynamics.compiled.kernels import decay_means
 from needle_dynamics.modes import mode_shapes
 from needle_identification import asymmetry, StiffnessSettings
-from needle_insertion.paper import mismatch, paper_figures
-from needle_insertion.paper.figures import exact_compliance, exact_frequencies
-from needle_insertion.paper.paper_figures import (
+from needle_insertion.paper import figures, mismatch
+from needle_insertion.paper.convergence import exact_compliance, exact_frequencies
+from needle_insertion.paper.figures import (
     base_alone,
     CASES,
     closed_loop,
@@ -889,7 +889,7 @@ def positive_definite() -> Claim:
     # One period of the textbook form: the pole of d_dot under its held force.
     ends = [
         Outcome.of(closed_loop(law, 'paper_mm', 'complete', hub_stop=True)).final
-        for law in paper_figures.LAWS
+        for law in figures.LAWS
     ]
     x = p.viscous_friction * 1e-3 / p.moving_mass
     textbook = 1.0 - x * decay_means(x)[0] - decay_means(x)[0] * 1e-3 * PID_KV / p.moving_mass
@@ -911,7 +911,7 @@ def same_inputs() -> Claim:
     """Judge the inputs of model and controllers."""
     start = {
         law: closed_loop(law, 'paper_si', 'complete', hub_stop=True).forces[0]
-        for law in paper_figures.LAWS
+        for law in figures.LAWS
     }
     return Claim(
         section='abstract, 3.2.7',
@@ -922,7 +922,7 @@ def same_inputs() -> Claim:
         condition='the laws push on the base alone, unlike those of figures 6 to 8',
         evidence='The gain matrices push on q1 and q2, whose rows of F are zero in (14): with '
         + ' and '.join(
-            f'{force[2]:.2g} and {force[3]:.2g} N m^-1/2 at the start ({paper_figures.LAWS[law]})'
+            f'{force[2]:.2g} and {force[3]:.2g} N m^-1/2 at the start ({figures.LAWS[law]})'
             for law, force in start.items()
         )
         + '. No motor of a needle robot applies that.',
@@ -955,16 +955,16 @@ def smoother() -> Claim:
     """Smoothness of the closed loop."""
     free = open_loop('paper_mm', 'complete')
     rates = {'open loop': _turns(free) / float(free.time[-1])}
-    for law in paper_figures.LAWS:
+    for law in figures.LAWS:
         run = closed_loop(law, 'paper_mm', 'complete', hub_stop=True)
         rates[law] = _turns(run) / float(run.time[-1])
         alone = base_alone(law, 'paper_mm')
         rates[f'{law}, f_y alone'] = _turns(alone) / float(alone.time[-1])
-    controlled = max(rates[law] for law in paper_figures.LAWS)
-    alone_rate = min(rates[f'{law}, f_y alone'] for law in paper_figures.LAWS)
+    controlled = max(rates[law] for law in figures.LAWS)
+    alone_rate = min(rates[f'{law}, f_y alone'] for law in figures.LAWS)
     peaks = {
         law: abs(Outcome.of(closed_loop(law, 'paper_mm', 'complete', hub_stop=True)).peak)
-        for law in paper_figures.LAWS
+        for law in figures.LAWS
     }
     peak = abs(Outcome.of(free).peak)
     return Claim(
@@ -1068,7 +1068,7 @@ def informed(study: mismatch.Mismatch) -> Claim:
     model = needle('paper_mm', 'complete')
     p = model.parameters
     believed = NeedleModel(replace(p, coulomb_friction=0.99 * p.coulomb_friction))
-    law = paper_figures.paper_law('inverse_dynamics', believed)
+    law = figures.paper_law('inverse_dynamics', believed)
     run = run_continuous(
         law, model, model.state_at(DEPTH, DEFLECTION), np.zeros((3, 4)), [0.0, 30.0],
         method='DOP853',
@@ -1076,7 +1076,7 @@ def informed(study: mismatch.Mismatch) -> Claim:
     left = float(run.states[-1, 0])
     printed = {
         law: abs(Outcome.of(closed_loop(law, 'paper_mm', 'complete', hub_stop=True)).error)
-        for law in paper_figures.LAWS
+        for law in figures.LAWS
     }
     finals = {law: np.median(np.abs(b.final)) for law, b in study.batches.items()}
     known = {law: float(b.rms[0]) for law, b in study.nominal.items()}

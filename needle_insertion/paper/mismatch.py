@@ -27,8 +27,8 @@ from needle_controller import (
 from needle_controller.in_loop import LoopBatch, run_batch
 from needle_controller.laws.axis import BREAKAWAY_TIME
 from needle_dynamics import FloatArray, NeedleModel, NeedleParameters
-from needle_insertion.paper.paper_figures import LAW_COLORS, LAWS
-from needle_insertion.report.report import Picture
+from needle_insertion.paper.figures import LAW_COLORS, LAWS
+from needle_insertion.report.page import Picture
 from needle_insertion.report.section import Grid, Section
 import numpy as np
 

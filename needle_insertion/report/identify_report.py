@@ -28,8 +28,8 @@ from needle_identification.stiffness.fit import (
     StiffnessEstimate,
     StiffnessSummary,
 )
-from needle_insertion.experiment.draw import FORCE_LEVELS, TABLE_1, TABLE_2
-from needle_insertion.report.report import (
+from needle_insertion.paper.tables import FORCE_LEVELS, TABLE_1, TABLE_2
+from needle_insertion.report.page import (
     bullets,
     code,
     grid,

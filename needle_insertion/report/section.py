@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from needle_insertion.report.report import Picture
+from needle_insertion.report.page import Picture
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

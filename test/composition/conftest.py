@@ -1,6 +1,6 @@
 """What the tests of this folder share."""
 
-from needle_insertion.paper import paper_figures
+from needle_insertion.paper import figures
 import pytest
 
 
@@ -8,5 +8,5 @@ import pytest
 def brief_inverse_dynamics():
     """Run figures 6 and 7 up to what they show; after that d alone goes on as exp(-0.05 t)."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(paper_figures.CLOSED_LOOP, 'inverse_dynamics', 40.0)
+        patch.setitem(figures.CLOSED_LOOP, 'inverse_dynamics', 40.0)
         yield

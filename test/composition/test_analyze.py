@@ -22,7 +22,7 @@ def run(*words: str) -> int:
     parser = argparse.ArgumentParser()
     add_arguments(parser)
     options = parser.parse_args(words)
-    return int(options.command(options))
+    return command.run(options)
 
 
 def found_by(capsys: pytest.CaptureFixture[str], *words: str) -> dict[str, Any]:

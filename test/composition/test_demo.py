@@ -10,7 +10,7 @@ from needle_identification import (
     read_friction_recording,
     read_indentation_recording,
 )
-from needle_insertion.commands.demo import (
+from needle_insertion.experiment.demo import (
     Comparison,
     COUNTED,
     DemoError,

@@ -22,17 +22,10 @@ from needle_identification import (
     read_topic,
 )
 from needle_insertion.cli import main
-from needle_insertion.experiment import experiment
-from needle_insertion.experiment.draw import (
-    draw_friction,
-    draw_stiffness,
-    FORCE_LEVELS,
-    TABLE_1,
-    TABLE_2,
-)
-from needle_insertion.experiment.experiment import ExperimentError, record, rig
+from needle_insertion.experiment import record as recorder
+from needle_insertion.experiment.campaign import Campaign
+from needle_insertion.experiment.population import draw_friction, draw_stiffness
 from needle_insertion.experiment.protocol import (
-    Campaign,
     DIRECTIONS,
     PROTOCOLS,
     PUSH,
@@ -40,6 +33,8 @@ from needle_insertion.experiment.protocol import (
     SPEEDS,
     START_DEPTH,
 )
+from needle_insertion.experiment.record import ExperimentError, record, rig
+from needle_insertion.paper.tables import FORCE_LEVELS, TABLE_1, TABLE_2
 import numpy as np
 import pytest
 
@@ -189,18 +184,18 @@ def test_what_is_no_run_of_this_experiment_is_left_alone(tmp_path):
     campaign = Campaign(protocol=FRICTION, repeats=1)
     place = tmp_path / 'friction_01'
     place.write_text('notes')
-    with pytest.raises(ParameterError, match='exists and is no run of this experiment'):
+    with pytest.raises(ParameterError, match='exists and is not a run of this experiment'):
         record(campaign, tmp_path)
     place.unlink()
     place.mkdir()
-    with pytest.raises(ParameterError, match='exists and is no run of this experiment'):
+    with pytest.raises(ParameterError, match='exists and is not a run of this experiment'):
         record(campaign, tmp_path)
     place.rmdir()
     pretended(place, seed=7)
     with pytest.raises(ParameterError, match='recorded with seed = 7, asked for is 2014'):
         record(campaign, tmp_path)
     pretended(tmp_path / 'none' / 'friction_01', configuration='none')
-    with pytest.raises(ParameterError, match='exists and is no run of this experiment'):
+    with pytest.raises(ParameterError, match='exists and is not a run of this experiment'):
         record(campaign, tmp_path / 'none')
     pretended(tmp_path / 'other' / 'friction_01')
     with pytest.raises(ParameterError, match='recorded with another trajectory'):
@@ -214,7 +209,7 @@ def test_what_is_no_run_of_this_experiment_is_left_alone(tmp_path):
 @pytest.mark.parametrize(('protocol', 'rate'), [(FRICTION, 100.0), (STIFFNESS, 40.0)])
 def test_the_shipped_bags_are_those_of_the_command_that_makes_them(protocol, rate, monkeypatch):
     """Parameters and trajectory are as today: the command would record nothing."""
-    monkeypatch.delattr(experiment, 'rig')
+    monkeypatch.delattr(recorder, 'rig')
     bags = record(Campaign(protocol=protocol, rate=rate), SHIPPED_BAGS)
     assert bags == sorted(SHIPPED_BAGS.glob(f'{protocol.name}_*'))
 
@@ -305,7 +300,7 @@ def test_a_run_with_losses_is_done_again_at_half_the_speed_and_then_given_up(
         judged.append(bag)
         return next(answers)
 
-    monkeypatch.setattr(experiment, '_lost', lossy)
+    monkeypatch.setattr(recorder, '_lost', lossy)
     with pytest.raises(ExperimentError, match='fewer at 25 times real time; ask for a lower'):
         stand.record(tmp_path / 'a', place, 50.0)
     assert not (tmp_path / 'a').exists()
@@ -341,5 +336,5 @@ def test_losses_are_seen(tmp_path, kept, complaint):
                 at = header(stamp=stamp(sec=k // 100, nanosec=k % 100 * 10**7), frame_id='')
                 message = pointed(header=at, point=point(x=0.0, y=0.0, z=0.0))
                 bag.write(topic, encode(message), k)
-    assert complaint in experiment._lost(tmp_path / 'bag', FRICTION, 100.0)
-    assert bool(complaint) == bool(experiment._lost(tmp_path / 'bag', FRICTION, 100.0))
+    assert complaint in recorder._lost(tmp_path / 'bag', FRICTION, 100.0)
+    assert bool(complaint) == bool(recorder._lost(tmp_path / 'bag', FRICTION, 100.0))

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from matplotlib.figure import Figure
 from needle_dynamics import ParameterError
-from needle_insertion.report.report import (
+from needle_insertion.report.page import (
     bullets,
     Check,
     check_table,

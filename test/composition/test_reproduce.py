@@ -16,9 +16,9 @@ from needle_insertion.commands.reproduce import (
     Line,
     stiffness_truth,
 )
-from needle_insertion.experiment.draw import FORCE_LEVELS, TABLE_1, TABLE_2
 from needle_insertion.experiment.protocol import SHIPPED_BAGS
-from needle_insertion.paper import claims, mismatch, paper_figures
+from needle_insertion.paper import claims, figures, mismatch
+from needle_insertion.paper.tables import FORCE_LEVELS, TABLE_1, TABLE_2
 import numpy as np
 import pytest
 
@@ -196,7 +196,7 @@ def test_a_result_is_a_page_that_a_browser_shows(tmp_path, capsys, what, picture
 @pytest.fixture
 def cheap(monkeypatch, once, coarse):
     """Have all results, but few runs behind them."""
-    figure = paper_figures.FIGURES['figure-4']
+    figure = figures.FIGURES['figure-4']
     study = cache(lambda: mismatch.study(8))
     monkeypatch.setattr(reproduce, '_study', study)
     monkeypatch.setattr(
@@ -207,7 +207,7 @@ def cheap(monkeypatch, once, coarse):
         ],
     )  # fmt: skip
     monkeypatch.setattr(
-        paper_figures, 'section',
+        figures, 'section',
         lambda: reproduce.Section(
             title='Figures 4 to 8', paragraphs=(), pictures=(figure().picture,)
         ),

@@ -23,9 +23,10 @@ from needle_dynamics.simulated.plant import (
 from needle_identification import BagWriter, encode, message_type, RecordingError
 from needle_insertion.cli import main
 from needle_insertion.commands.verify import verify
-from needle_insertion.experiment.experiment import record
-from needle_insertion.experiment.graph import ACTIVATE, CONFIGURE, Graph
-from needle_insertion.experiment.protocol import Campaign, PROTOCOLS, SHIPPED_BAGS
+from needle_insertion.experiment.campaign import Campaign
+from needle_insertion.experiment.protocol import PROTOCOLS, SHIPPED_BAGS
+from needle_insertion.experiment.record import record
+from needle_insertion.experiment.ros_graph import ACTIVATE, CONFIGURE, Graph
 from needle_ros.base_node import COMMAND, SENSOR
 import numpy as np
 import pytest

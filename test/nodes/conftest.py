@@ -7,7 +7,7 @@ import gc
 from pathlib import Path
 from typing import Any
 
-from needle_insertion.experiment.graph import Graph
+from needle_insertion.experiment.ros_graph import Graph
 from needle_ros.base_node import BaseNode
 import pytest
 from rclpy.node import Node

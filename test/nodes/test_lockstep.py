@@ -9,7 +9,7 @@ from needle_controller import closed_loop, ContinuousInverseDynamics
 from needle_dynamics import NeedleModel, NeedleParameters
 from needle_identification.bags.bag import Bag, deserialize, encode
 from needle_identification.recorder_node import is_hidden
-from needle_insertion.experiment.graph import Graph
+from needle_insertion.experiment.ros_graph import Graph
 from needle_ros.base_node import COMMAND, SENSOR
 from needle_ros.timing import seconds
 import numpy as np

@@ -1,8 +1,7 @@
-"""`needle experiment`: the protocols on the stand-in, through real nodes, recorded bag by bag."""
+"""Recording the runs of a campaign through real nodes, one bag each."""
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,8 +12,9 @@ from typing import Any
 from geometry_msgs.msg import WrenchStamped
 from needle_dynamics import JobError, ParameterError
 from needle_identification import message_counts, read_topic, RecordingError
-from needle_insertion.experiment.graph import ACTIVATE, CLEANUP, CONFIGURE, DEACTIVATE, Graph
-from needle_insertion.experiment.protocol import Campaign, FASTEST, Protocol, PROTOCOLS, SPEED
+from needle_insertion.experiment.campaign import Campaign
+from needle_insertion.experiment.protocol import Protocol, SPEED
+from needle_insertion.experiment.ros_graph import ACTIVATE, CLEANUP, CONFIGURE, DEACTIVATE, Graph
 from needle_ros.base_node import COMMAND, SENSOR
 from needle_ros.timing import seconds
 import numpy as np
@@ -25,28 +25,13 @@ from tqdm import tqdm
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 import yaml
 
-#: Part of the samples that a bag may lack: a few in a thousand, which no stroke or press misses,
-#: alone or in a row. A reader that stalls loses far more.
+#: Largest share of samples that a bag may lack: a few in a thousand change no stroke or press,
+#: even in a row. A reader that stalls loses far more.
 _LARGEST_LOSS = 0.002
 
 
 class ExperimentError(JobError):
-    """A run could not be recorded whole."""
-
-
-def run(options: argparse.Namespace) -> int:
-    """Record what is missing in the folder; return the exit status."""
-    campaign = Campaign(
-        protocol=PROTOCOLS[options.which],
-        repeats=options.repeats,
-        seed=options.seed,
-        rate=options.rate,
-        fixed=options.fixed,
-    )
-    if not 0.0 < options.speed <= FASTEST:
-        raise ParameterError(f'--speed must be in (0, {FASTEST:g}], got {options.speed}')
-    record(campaign, options.output, options.speed)
-    return 0
+    """A run could not be recorded completely."""
 
 
 def record(campaign: Campaign, folder: Path, speed: float = SPEED) -> list[Path]:
@@ -58,9 +43,9 @@ def record(campaign: Campaign, folder: Path, speed: float = SPEED) -> list[Path]
     campaign : Campaign
         What to record.
     folder : Path
-        Holds one bag per run, and whatever else there is: it is left alone.
+        Folder of the bags. Other files in it are left alone.
     speed : float
-        Times real time.
+        Multiple of real time.
 
     Returns
     -------
@@ -70,9 +55,9 @@ def record(campaign: Campaign, folder: Path, speed: float = SPEED) -> list[Path]
     Raises
     ------
     ParameterError
-        If the folder holds something else under the name of a bag; nothing is recorded then.
+        If the folder holds something else under the name of a bag. Nothing is recorded then.
     GraphError, ExperimentError
-        If a node fails, or samples are lost at half the speed too. What is finished is kept.
+        If a node fails, or samples are lost at half the speed too. Finished bags are kept.
 
     """
     runs, protocol = campaign.runs(), campaign.protocol
@@ -103,9 +88,9 @@ def rig(folder: Path, protocol: Protocol) -> Iterator[Rig]:
     Parameters
     ----------
     folder : Path
-        Where the bags will be; unfinished ones are in a hidden folder beside them.
+        Folder of the bags; unfinished ones are in a hidden folder beside them.
     protocol : Protocol
-        What will be done.
+        What each run does.
 
     Yields
     ------
@@ -114,7 +99,7 @@ def rig(folder: Path, protocol: Protocol) -> Iterator[Rig]:
 
     """
     drafts = folder / f'.{protocol.name}.unfinished'
-    # What an earlier call left when it was killed.
+    # An earlier call that was killed may have left it.
     shutil.rmtree(drafts, ignore_errors=True)
     drafts.mkdir(parents=True)
     try:
@@ -126,14 +111,14 @@ def rig(folder: Path, protocol: Protocol) -> Iterator[Rig]:
 
 class Rig:
     """
-    The stand-in and a recorder, which record one run after the other.
+    The simulated robot and a recorder, which record one run after the other.
 
     Parameters
     ----------
     graph : Graph
-        Where they run.
+        The graph in which they run.
     draft : Path
-        Folder of the first bag while it is recorded; the k-th has ``_k`` appended.
+        Folder of the first bag during recording; that of bag k ends in ``_k``.
     protocol : Protocol
         What each run does.
 
@@ -169,7 +154,7 @@ class Rig:
         parameters : mapping
             Parameters of the plant by name.
         speed : float
-            Times real time; once more at half of it if samples are lost.
+            Multiple of real time. If samples are lost, the run is repeated at half of it.
         progress : callable
             Called with the fraction done.
 
@@ -203,12 +188,12 @@ class Rig:
             if not result.successful:
                 raise ExperimentError(f'plant refused its parameters: {result.reason}')
         graph.change(node, 'plant', CONFIGURE)
-        # Only the plant listens: what an earlier recording took has been let go.
+        # Only the plant listens: the recorder has ended its earlier subscriptions.
         graph.spin_until(lambda: self._trajectory.get_subscription_count() == 1, 'the plant')
         graph.change(node, 'recorder', ACTIVATE)
         self._recordings += 1
-        # The plant begins when the recorder listens and the trajectory is there: the bag holds
-        # every sample of it. This process listens to the wrench, too.
+        # The plant starts when the recorder listens and the trajectory has arrived: then the bag
+        # holds every sample. This process listens to the wrench, too.
         graph.spin_until(
             lambda: (
                 self._trajectory.get_subscription_count() == 2
@@ -231,7 +216,7 @@ class Rig:
             progress(min(elapsed / protocol.duration, 1.0))
             return elapsed > protocol.duration
 
-        # By the stamps, whatever the speed; simulated time may wait for a busy machine.
+        # The stamps decide, at any speed; simulated time may fall behind on a busy machine.
         due = protocol.duration / parameters['real_time_factor']
         graph.spin_until(done, 'the end of the protocol', 4.0 * due + 10.0)
         graph.change(node, 'plant', DEACTIVATE)
@@ -242,7 +227,7 @@ class Rig:
 
 
 def _move(draft: Path, bag: Path) -> None:
-    """Give a bag its own name, inside too."""
+    """Give a bag its final name, also in its metadata."""
     old, new = f'{draft.name}_0.mcap', f'{bag.name}_0.mcap'
     (draft / old).rename(draft / new)
     metadata = draft / 'metadata.yaml'
@@ -263,7 +248,7 @@ def _trajectory(protocol: Protocol) -> JointTrajectory:
 
 
 def _lost(bag: Path, protocol: Protocol, rate: float) -> str:
-    """Say what a recorded run lacks, '' if it is whole."""
+    """Say which samples a recorded run lacks, '' if none."""
     counts = message_counts(bag)
     for topic in protocol.topics:
         if not counts.get(topic):
@@ -280,7 +265,7 @@ def _lost(bag: Path, protocol: Protocol, rate: float) -> str:
 
 
 def _is_finished(bag: Path, protocol: Protocol, parameters: Mapping[str, Any]) -> bool:
-    """Tell whether a run is there; raise `ParameterError` if something else is in its place."""
+    """Tell whether a run is there; raise `ParameterError` if something else has its name."""
     if not bag.exists():
         return False
     try:
@@ -289,7 +274,7 @@ def _is_finished(bag: Path, protocol: Protocol, parameters: Mapping[str, Any]) -
         commanded = [_points(message) for _, message in read_topic(bag, '/joint_trajectory')]
     except (RecordingError, yaml.YAMLError, AttributeError, KeyError, TypeError, ValueError):
         raise ParameterError(
-            f'{bag} exists and is no run of this experiment; name another folder'
+            f'{bag} exists and is not a run of this experiment; name another folder'
         ) from None
     for name, value in parameters.items():
         if found.get(name) != value:

@@ -1,40 +1,23 @@
 """
-Parameters of the stand-ins, drawn so that few repeats represent the paper's Tables 1 and 2.
+True values of simulated needles and tissues, drawn so that they represent Tables 1 and 2.
 
-The tables give mean and standard deviation over 20 experiments. Each repeat takes its values from
-a Latin hypercube: with n repeats every quantity takes each of the quantiles (k + 1/2)/n once, in
-an order of its own. Quantities that cannot be negative follow a gamma distribution, the others a
-normal one.
+The tables give mean and standard deviation over 20 experiments. The values of the repeats form a
+Latin hypercube: with n repeats every quantity takes each of the quantiles (k + 1/2)/n once, in an
+order of its own. Quantities that cannot be negative follow a gamma distribution, the others a
+normal distribution.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from itertools import count
 from typing import Final
 
 from needle_dynamics import FloatArray
+from needle_insertion.paper.tables import TABLE_1, TABLE_2
 import numpy as np
 from scipy.special import gammaincinv, ndtri
 
-#: Table 1: mean and standard deviation of mu_s [N] and mu_v [N s/m], 0.3 read as N s/mm.
-TABLE_1: Final[Mapping[str, tuple[float, float]]] = {
-    'coulomb_friction': (0.56, 0.0374),
-    'viscous_friction': (300.0, 44.7),
-}
-
-#: Force levels of Table 2 [N].
-FORCE_LEVELS: Final = (1.1, 1.2, 1.3, 1.4, 1.5)
-
-#: Table 2: means and standard deviations by entry, at each force level [N/m].
-TABLE_2: Final[Mapping[str, tuple[tuple[float, ...], tuple[float, ...]]]] = {
-    'k_xx': ((1260.0, 820.0, 1100.0, 1030.0, 960.0), (80.0, 540.0, 110.0, 120.0, 120.0)),
-    'k_xz': ((40.0, 40.0, 10.0, 1.0, -5.0), (80.0, 70.0, 90.0, 80.0, 80.0)),
-    'k_zx': ((-100.0, -100.0, -110.0, -110.0, -110.0), (60.0, 100.0, 90.0, 90.0, 90.0)),
-    'k_zz': ((1010.0, 810.0, 690.0, 600.0, 520.0), (110.0, 150.0, 180.0, 190.0, 180.0)),
-}
-
-#: Entries that cannot be negative.
+#: Entries of the stiffness matrix that cannot be negative.
 _POSITIVE: Final = ('k_xx', 'k_zz')
 
 
@@ -45,14 +28,14 @@ def draw_friction(repeats: int, seed: int) -> list[dict[str, float]]:
     Parameters
     ----------
     repeats : int
-        How many.
+        Number of repeats.
     seed : int
-        The same seed gives the same draws.
+        The same seed gives the same values.
 
     Returns
     -------
     list of dict
-        Values by the keys of `TABLE_1`.
+        Values by the keys of `TABLE_1` [N], [N s/m].
 
     """
     quantiles = _hypercube(len(TABLE_1), repeats, np.random.default_rng(seed))
@@ -69,15 +52,15 @@ def draw_stiffness(repeats: int, seed: int) -> list[dict[str, tuple[float, ...]]
 
     A place has one quantile per entry, used at all force levels: where the tissue is stiff, it is
     stiff under any force. At every level the symmetric part must be positive definite, or the
-    tissue would yield energy when pressed: a hypercube with a place that breaks this is
+    tissue would release energy when it is pressed. A hypercube with a place that violates this is
     replaced by the next of the sequence of generators seeded (seed, 0), (seed, 1), ...
 
     Parameters
     ----------
     repeats : int
-        How many places.
+        Number of places.
     seed : int
-        The same seed gives the same draws.
+        The same seed gives the same values.
 
     Returns
     -------

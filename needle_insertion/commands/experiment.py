@@ -1,0 +1,84 @@
+"""`needle experiment`: the paper's experiments on the simulated robot, recorded to bags."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from needle_insertion.experiment.campaign import Campaign
+from needle_insertion.experiment.protocol import FASTEST, PROTOCOLS, SPEED
+from needle_ros.errors import ParameterError
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """
+    Add the options of `needle experiment`.
+
+    Parameters
+    ----------
+    parser : ArgumentParser
+        Parser of the command.
+
+    """
+    parser.add_argument('which', choices=tuple(PROTOCOLS), help='what to identify from it')
+    parser.add_argument('output', type=Path, metavar='DIR', help='folder for the bags')
+    for name, kind, default, unit, words in (
+        ('repeats', int, 20, 'N', 'number of bags to record'),
+        (
+            'seed',
+            int,
+            2014,
+            'N',
+            'seed of the true values; the sensor noise of run k, from 0, has the seed plus k',
+        ),
+        ('rate', float, 250.0, 'Hz', 'samples per second'),
+        ('speed', float, SPEED, 'X', 'times real time'),
+    ):
+        parser.add_argument(
+            f'--{name}',
+            type=kind,
+            default=default,
+            metavar=unit,
+            help=f'{words} (default {default:g})',
+        )
+    parser.add_argument(
+        '--fixed',
+        action='store_true',
+        help="use the means of the paper's tables instead of values drawn around them",
+    )
+
+
+def run(options: argparse.Namespace) -> int:
+    """
+    Record the bags that the folder does not hold yet.
+
+    Parameters
+    ----------
+    options : Namespace
+        As declared by `add_arguments`.
+
+    Returns
+    -------
+    int
+        0.
+
+    Raises
+    ------
+    NeedleError
+        If an option is not valid, or a run cannot be recorded.
+
+    """
+    campaign = Campaign(
+        protocol=PROTOCOLS[options.which],
+        repeats=options.repeats,
+        seed=options.seed,
+        rate=options.rate,
+        fixed=options.fixed,
+    )
+    if not 0.0 < options.speed <= FASTEST:
+        raise ParameterError(f'--speed must be in (0, {FASTEST:g}], got {options.speed}')
+    # Needs ROS; invalid options are reported without it.
+    from needle_insertion.experiment.record import record
+
+    record(campaign, options.output, options.speed)
+    return 0

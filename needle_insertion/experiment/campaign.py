@@ -1,0 +1,96 @@
+"""Repeats of an experiment: the parameters of the simulated robot in each."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Final
+
+from needle_dynamics.simulated.force_sensor import HIGHEST_RATE
+from needle_insertion.experiment.population import draw_friction, draw_stiffness
+from needle_insertion.experiment.protocol import indenter_name, Protocol
+from needle_insertion.paper.tables import EXPERIMENTS, FORCE_LEVELS, TABLE_1, TABLE_2
+from needle_ros.errors import ParameterError
+
+#: Sample rates at which strokes and presses are resolved [Hz].
+RATES: Final = (40.0, 5000.0)
+
+_MOST_REPEATS: Final = 1000
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Campaign:
+    """
+    Repeats of one experiment.
+
+    Attributes
+    ----------
+    protocol : Protocol
+        What is done in each run.
+    repeats : int
+        Number of runs.
+    seed : int
+        Seed of the true values; run k, counted from zero, has sensor noise of the seed plus k.
+    rate : float
+        Samples per second [Hz].
+    fixed : bool
+        Take the means of the paper's tables in each run instead of values drawn around them.
+
+    Raises
+    ------
+    ParameterError
+        If a number is out of range.
+
+    """
+
+    protocol: Protocol
+    repeats: int = EXPERIMENTS
+    seed: int = 2014
+    rate: float = 250.0
+    fixed: bool = False
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.repeats <= _MOST_REPEATS:
+            raise ParameterError(f'--repeats must be in [1, {_MOST_REPEATS}], got {self.repeats}')
+        if self.seed < 0:
+            raise ParameterError(f'--seed must be >= 0, got {self.seed}')
+        if not RATES[0] <= self.rate <= RATES[1]:
+            raise ParameterError(
+                f'--rate must be in [{RATES[0]:g}, {RATES[1]:g}] Hz, got {self.rate}'
+            )
+
+    def runs(self) -> dict[str, dict[str, object]]:
+        """
+        Return the parameters of each run.
+
+        Returns
+        -------
+        dict
+            Parameters of the plant by name, by the name of the bag.
+
+        """
+        digits = max(2, len(str(self.repeats)))
+        common = {
+            **self.protocol.plant,
+            'rate': self.rate,
+            # The plant wants a whole multiple of its own rate.
+            'sensor.rate': HIGHEST_RATE // self.rate * self.rate,
+        }
+        return {
+            f'{self.protocol.name}_{k + 1:0{digits}d}': {**common, 'seed': self.seed + k, **drawn}
+            for k, drawn in enumerate(self._drawn())
+        }
+
+    def _drawn(self) -> list[dict[str, Any]]:
+        if self.protocol.name == 'friction':
+            friction = draw_friction(self.repeats, self.seed)
+            if self.fixed:
+                friction = [{name: mean for name, (mean, _) in TABLE_1.items()}] * self.repeats
+            return [{f'model.{name}': v for name, v in drawn.items()} for drawn in friction]
+        stiffness = draw_stiffness(self.repeats, self.seed)
+        if self.fixed:
+            stiffness = [{name: means for name, (means, _) in TABLE_2.items()}] * self.repeats
+        levels = {'indenter.force_levels': list(FORCE_LEVELS)}
+        return [
+            {**levels, **{f'indenter.{indenter_name(name)}': list(v) for name, v in drawn.items()}}
+            for drawn in stiffness
+        ]
