@@ -10,10 +10,8 @@ from typing import Final
 from benchmarks.measure import Bar, least_times
 from needle_controller import (
     Axis,
-    DeflectionLaw,
     InverseDynamics,
     InverseDynamicsGains,
-    ModalLoop,
     Observer,
     ObserverSettings,
     Pid,
@@ -21,11 +19,10 @@ from needle_controller import (
     SampledLoop,
     Setpoint,
 )
-from needle_dynamics import FloatArray, NeedleModel, NeedleParameters
+from needle_dynamics import FloatArray, NeedleParameters
 from needle_insertion.paper.mismatch import sampled_laws
 from needle_insertion.report.page import table
 import numpy as np
-from scipy.linalg import eigh, expm
 
 #: Sample period [s], delay in periods, and the bar for a whole law with the observer [s].
 PERIOD: Final = 1e-3
@@ -77,48 +74,6 @@ class NumpyInverseDynamics:
         return self.last
 
 
-def numpy_deflection(
-    model: NeedleModel, gains: InverseDynamicsGains, x: FloatArray, speed: float
-) -> FloatArray:
-    """
-    Return what `DeflectionLaw` with inverse dynamics commands without delay, to no deflection.
-
-    Parameters
-    ----------
-    model : NeedleModel
-        Needle.
-    gains : InverseDynamicsGains
-        Gains of all deflections.
-    x : ndarray, shape (2, n)
-        Deflections q and their rates, at the depth that is measured.
-    speed : float
-        Insertion speed [m/s].
-
-    Returns
-    -------
-    ndarray, shape (n,)
-        Generalized forces.
-
-    """
-    p, n, h = model.parameters, model.modes.count, PERIOD
-    middle = _DEPTH + 0.5 * h * speed
-    at = model.modes.integrals(middle)
-    mass = p.linear_density * at.gram
-    squares, shapes = eigh(model.stiffness_matrix(middle), mass)
-    damping = p.tissue_damping / p.linear_density
-    wanted = -gains.kp * x[0] - gains.kv * x[1]
-    back = shapes.T @ mass
-    eta, rate, change = back @ x[0], back @ x[1], h * (back @ wanted)
-    force = np.empty(n)
-    for i, square in enumerate(squares):
-        system = np.zeros((3, 3))
-        system[0, 1], system[1, 0], system[1, 1], system[1, 2] = 1.0, -square, -damping, 1.0
-        end = expm(h * system)[1]
-        force[i] = (rate[i] + change[i] - end[0] * eta[i] - end[1] * rate[i]) / end[2]
-    held = p.linear_density * speed * float(at.value @ x[1]) * at.value
-    return np.asarray(back.T @ force + held)
-
-
 def jobs() -> dict[str, Callable[[], object]]:
     """
     Return what is measured: each job is one control step, on a needle that moves.
@@ -130,12 +85,7 @@ def jobs() -> dict[str, Callable[[], object]]:
 
     """
     parameters = NeedleParameters.preset('phantom')
-    model = NeedleModel(parameters)
-    state = model.state_at(_DEPTH, 5e-4)
-    state[4] = -_SPEED
-    seen = state.copy()
     goal, still = Setpoint(_DEPTH + _SPEED * PERIOD, _SPEED), Setpoint(0.0)
-    rest = np.zeros((3, parameters.modes))
     observer = Observer(parameters, ObserverSettings(), PERIOD)
     samples = cycle([(0.01, 0.001), (0.012, 0.0012), (0.009, 0.0009)])
     clock = [0.0]
@@ -159,30 +109,12 @@ def jobs() -> dict[str, Callable[[], object]]:
             rotation.command(0.0, 0.0, still)
             return loop.command(_DEPTH, _SPEED, goal, load)
 
-        found[f'{name}, physical'] = physical
-        found[f'{name}, physical, with observer'] = _observed(physical, observe)
-        deflections = modal_loop(model, name, loop)
-
-        def modal(deflections: ModalLoop = deflections) -> FloatArray:
-            return deflections.command(state, goal, still, rest)
-
-        def modal_observed(deflections: ModalLoop = deflections) -> FloatArray:
-            observe()
-            seen[2:4], seen[6:8] = observer.modal
-            return deflections.command(seen, goal, still, rest)
-
-        found[f'{name}, modal'] = modal
-        found[f'{name}, modal, with observer'] = modal_observed
+        found[name] = physical
+        found[f'{name}, with observer'] = _observed(physical, observe)
     found['observer'] = observe
-    gains = InverseDynamicsGains()
-    plain = NumpyInverseDynamics(parameters, gains)
+    plain = NumpyInverseDynamics(parameters, InverseDynamicsGains())
     target = np.array([goal.position, goal.speed, goal.acceleration])
-    found['inverse_dynamics, physical, NumPy'] = lambda: plain.command(_DEPTH, _SPEED, target)
-    x = np.array([state[2:4], state[6:8]])
-    found['inverse_dynamics, modal, NumPy'] = lambda: (
-        plain.command(_DEPTH, _SPEED, target),
-        numpy_deflection(model, gains, x, _SPEED),
-    )
+    found['inverse_dynamics, NumPy'] = lambda: plain.command(_DEPTH, _SPEED, target)
     return found
 
 
@@ -199,24 +131,6 @@ def sampled_loop(axis: Axis, name: str) -> SampledLoop:
         else Pid(axis=axis, gains=PidGains(kp=1e-6, ki=1e-6, kd=1e-8), period=PERIOD)
     )
     return SampledLoop(law, DELAY, inf)
-
-
-def modal_loop(model: NeedleModel, name: str, insertion: SampledLoop) -> ModalLoop:
-    """Return the loop on all coordinates of a law; nothing is driven with it."""
-    gains = (
-        InverseDynamicsGains()
-        if name == 'inverse_dynamics'
-        else PidGains(kp=5.0, ki=20.0, kd=0.02)
-    )
-    law = DeflectionLaw(model=model, gains=gains, period=PERIOD)
-    return ModalLoop(
-        insertion.law,
-        sampled_loop(Axis.rotation(model.parameters), name).law,
-        law,
-        DELAY,
-        force_limit=_LIMIT,
-        torque_limit=0.01,
-    )
 
 
 def compare(tick: Callable[[str], None]) -> tuple[str, list[Bar]]:
@@ -259,13 +173,12 @@ def compare(tick: Callable[[str], None]) -> tuple[str, list[Bar]]:
     heads = ('control step', 'cost [us]', 'of 1 ms', 'NumPy takes')
     bars = [
         Bar(
-            f'{name}, {how}, with observer [us]',
+            f'{name}, with observer [us]',
             f'<= {1e6 * BUDGET:g}',
-            1e6 * times[f'{name}, {how}, with observer'],
+            1e6 * times[f'{name}, with observer'],
             1e6 * BUDGET,
             at_least=False,
         )
         for name in ('inverse_dynamics', 'pid')
-        for how in ('physical', 'modal')
     ]
     return table(rows, heads), bars

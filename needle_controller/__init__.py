@@ -17,7 +17,6 @@ from needle_controller.laws.continuous import (
     ContinuousPid,
 )
 from needle_controller.laws.inverse_dynamics import InverseDynamics, InverseDynamicsGains
-from needle_controller.laws.modal import DeflectionLaw, DeflectionLoop, ModalLoop, NormalModes
 from needle_controller.laws.pid import ANTI_WINDUP, Pid, PidGains
 from needle_controller.observer.observer import Consistency, Observer, ObserverSettings
 from needle_controller.reference.reference import (
@@ -29,7 +28,6 @@ from needle_controller.reference.reference import (
 from needle_controller.safety import Guard, Refusal, Safety, SafetyLimits, Stream
 from needle_controller.stability import (
     check_stability,
-    deflection_matrix,
     Limit,
     MARGIN,
     spectral_radius,
@@ -51,8 +49,6 @@ __all__ = [
     'ContinuousPid',
     'Controller',
     'ControllerSettings',
-    'DeflectionLaw',
-    'DeflectionLoop',
     'Guard',
     'InverseDynamics',
     'InverseDynamicsGains',
@@ -60,8 +56,6 @@ __all__ = [
     'Limit',
     'Measurement',
     'MinimumJerk',
-    'ModalLoop',
-    'NormalModes',
     'Observer',
     'ObserverSettings',
     'Pid',
@@ -78,7 +72,6 @@ __all__ = [
     'check_stability',
     'closed_loop',
     'closed_loop_matrix',
-    'deflection_matrix',
     'no_memory',
     'spectral_radius',
     'stability_limit',

@@ -20,7 +20,6 @@ from needle_controller.controller import (
     Measurement,
 )
 from needle_controller.laws.axis import Setpoint
-from needle_controller.laws.continuous import ACTUATIONS
 from needle_controller.laws.inverse_dynamics import InverseDynamicsGains
 from needle_controller.laws.pid import PidGains
 from needle_controller.observer.observer import Observer, ObserverSettings
@@ -35,7 +34,6 @@ from needle_controller.safety import (
     SENSORS,
 )
 from needle_dynamics import (
-    FloatArray,
     NeedleModel,
     NeedleParameters,
 )
@@ -64,13 +62,12 @@ _WAITING = 'no joint_states yet'
 _RETRACT = 0.01
 
 #: Gains by law and axis. Rotation by PID: a closed loop of 20 rad/s on the rotary inertia of the
-#: source's needle. Deflection by PID: at 1 kHz it is stable from 12 cm on.
+#: source's needle.
 _GAINS: dict[str, dict[str, InverseDynamicsGains | PidGains]] = {
     'inverse_dynamics': {axis: InverseDynamicsGains() for axis in AXES},
     'pid': {
         'insertion': PidGains(),
         'rotation': PidGains(kp=2.1e-7, ki=0.0, kd=2.1e-8),
-        'deflection': PidGains(kp=5.0, ki=20.0, kd=0.02),
     },
 }
 
@@ -81,9 +78,6 @@ FEEDBACKS = ('observer', 'ground_truth', 'none')
 class ControllerNode(ModelNode):
     """
     Answers each ``joint_states`` with a ``wrench_command`` (force.y [N], torque.x [N m]).
-
-    With ``actuation: modal``, which only a simulated needle has, the answer is a
-    ``generalized_command`` (efforts of d, theta and q1..qn) instead.
 
     ``target`` (point.y [m]) is the inserted length to reach, ``joint_trajectory`` (joint
     `insertion`: positions, and speeds or none) a path to follow. Before the first of them, while
@@ -116,11 +110,6 @@ class ControllerNode(ModelNode):
     def __init__(self, **node_options: Any) -> None:
         super().__init__('controller', **node_options)
         self.declare_text('law', LAWS[0], f'one of {", ".join(LAWS)}')
-        self.declare_text(
-            'actuation',
-            ACTUATIONS[0],
-            'physical: force and torque at the base; modal: a force on every coordinate',
-        )
         self.declare_text('reference.kind', 'trapezoid', f'one of {", ".join(REFERENCES)}')
         self.declare_text(
             'deflection_feedback',
@@ -148,15 +137,9 @@ class ControllerNode(ModelNode):
         self._settings = ControllerSettings()
         self._safety = Safety(SafetyLimits(), self._settings, NeedleParameters())
         self._load = 0.0
-        #: Deflections and rates that the ground truth last had, and its stamp.
-        self._truth: tuple[int, tuple[FloatArray, FloatArray]] | None = None
         self._truths: Subscription | None = None
-        #: Measurement that waits for the ground truth of its time, and looks that found one.
-        self._pending: tuple[int, Measurement] | None = None
-        self._waits = 0
         #: Stamp, lateral force and moment of the last wrench that no measurement has taken.
         self._wrench_now: tuple[int, float, float] | None = None
-        self._is_modal = False
         self._fault: str | None = None
         #: Measurements answered, those too late for the delay, and the age of the oldest [s].
         self._answered = self._late = 0
@@ -166,7 +149,6 @@ class ControllerNode(ModelNode):
 
         publisher = self.create_lifecycle_publisher
         self._wrench_command = publisher(WrenchStamped, 'wrench_command', COMMAND)
-        self._generalized_command = publisher(JointState, 'generalized_command', COMMAND)
         self._reference = publisher(JointState, 'reference', SENSOR)
         self._tracking_error = publisher(JointState, 'tracking_error', SENSOR)
         self.listen(JointState, 'joint_states', SENSOR, self._on_joint_states)
@@ -178,7 +160,6 @@ class ControllerNode(ModelNode):
         self.create_service(Trigger, '~/clear_stop', self._on_clear_stop)
         self.create_service(SetBool, '~/pause', self._on_pause)
         self.create_service(Trigger, '~/retract', self._on_retract)
-        self._commands = (self._wrench_command, self._generalized_command)
         #: One that stands still or jumps does not take the watchdog along.
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
 
@@ -191,13 +172,7 @@ class ControllerNode(ModelNode):
 
     def configure(self) -> None:
         """Make the controller from the parameters; refuse gains that cannot be stable."""
-        actuation = self.text('actuation', ACTUATIONS)
         feedback = self.text('deflection_feedback', FEEDBACKS)
-        if actuation == 'modal' and feedback != 'ground_truth':
-            raise ParameterError(
-                'deflection_feedback must be ground_truth with actuation modal, which only a '
-                f'simulated needle has, got {feedback!r}'
-            )
         parameters = self.model_parameters()
         self._settings = self.settings('', ControllerSettings)
         self._controller = Controller(
@@ -208,11 +183,9 @@ class ControllerNode(ModelNode):
             pid=self._gains('pid', PidGains),
             reference=self.text('reference.kind', tuple(REFERENCES)),
             limits=self.settings('reference.', ReferenceLimits),
-            actuation=actuation,
         )
-        self._is_modal = actuation == 'modal'
         self._retract_depth({})
-        self._take_model(parameters)
+        self._model = NeedleModel(parameters)
         noise: dict[str, tuple[float, ...]] = {}
         if feedback == 'ground_truth':
             self._truths = self.listen(JointState, 'ground_truth', SENSOR, self._on_ground_truth)
@@ -238,11 +211,6 @@ class ControllerNode(ModelNode):
         self, law: str, kind: type[Any], changes: Mapping[str, Any] | None = None
     ) -> tuple[Any, ...]:
         return tuple(self.settings(f'{law}.{axis}.', kind, changes) for axis in AXES)
-
-    def _take_model(self, parameters: NeedleParameters) -> None:
-        self._model = NeedleModel(parameters)
-        names = self._model.coordinate_names
-        self._generalized = Layout('', names=names, counts=(0, 0, len(names)))
 
     def _retract_depth(self, changes: Mapping[str, Any]) -> float:
         """Return the depth to retract to, or refuse it."""
@@ -270,11 +238,11 @@ class ControllerNode(ModelNode):
         except ParameterError as error:
             self._refuse(f'parameters: {error}')
             raise
-        self._take_model(parameters)
+        self._model = NeedleModel(parameters)
 
     def cleanup(self) -> None:
         """Forget the controller, the bending and who tells of it."""
-        self._controller = self._observer = self._truth = None
+        self._controller = self._observer = None
         self._load = 0.0
         if self._truths is not None:
             self.destroy_subscription(self._truths)
@@ -296,8 +264,8 @@ class ControllerNode(ModelNode):
     def _begin(self) -> None:
         """Know nothing of what was measured."""
         self._safety.begin(self.now())
-        self._load, self._truth = 0.0, None
-        self._pending = self._wrench_now = None
+        self._load = 0.0
+        self._wrench_now = None
         if self._observer is not None:
             self._observer.reset()
 
@@ -357,14 +325,14 @@ class ControllerNode(ModelNode):
         if self._controller is None or not self._takes('target', message.header):
             return
         try:
-            self._controller.set_target(message.point.y, message.point.z)
+            self._controller.set_target(message.point.y)
         except ParameterError as error:
             self._refuse(f'target refused: {error}')
             return
-        if message.point.z != 0.0 and not self._is_modal:
+        if message.point.z != 0.0:
             self.get_logger().warning(
-                f'wanted deflection {message.point.z:g} m cannot be reached by force and torque '
-                'at the base (physical actuation); the depth is',
+                f'wanted deflection {message.point.z:g} m is ignored: force and torque at the '
+                'base cannot reach it; the depth is taken',
                 once=True,
             )
 
@@ -411,7 +379,7 @@ class ControllerNode(ModelNode):
             self._observer.add_wrench(stamp / NANOSECONDS, lateral, moment)
 
     def _on_ground_truth(self, reading: Reading) -> None:
-        """Take the load of the bent needle, or all of its bending, from the simulation."""
+        """Take the load of the bent needle from the simulation."""
         positions, speeds, _ = reading.values
         state = [*positions, *speeds]
         if not self.is_active or not self._counts('ground_truth', reading, state):
@@ -423,18 +391,10 @@ class ControllerNode(ModelNode):
             if not isfinite(load):
                 raise ParameterError('the forces of such a needle are not finite')
         except NeedleError as error:
-            self._load, self._truth = 0.0, None
+            self._load = 0.0
             self._warn('ground_truth', f'ground_truth: {error}; not taken in')
             return
         self._load = load
-        if not self._is_modal:
-            return
-        stamp, bend = reading.stamp, (np.array(positions[2:]), np.array(speeds[2:]))
-        self._truth = stamp, bend
-        pending, self._pending = self._pending, None
-        self._waits = 0
-        if pending is not None and pending[0] == stamp:
-            self._answer(*pending, bend)
 
     def _observe(self, stamp: int, measured: Measurement) -> None:
         """Renew what the observer says of the bending."""
@@ -476,24 +436,16 @@ class ControllerNode(ModelNode):
         if measured.is_finite():
             self._stop_for(self._safety.guard.encoders(measured.depth, measured.speed), stamp)
             self._observe(stamp, measured)
-        waits = self._is_modal and self._safety.stop is None
-        if waits and (self._truth is None or self._truth[0] != stamp):
-            self._pending = stamp, measured
-        else:
-            self._answer(stamp, measured, self._truth[1] if self._truth else None)
+        self._answer(stamp, measured)
 
     def _repeat(self, stamp: int) -> None:
         """Command the same again, or nothing if that was not the last word."""
-        if self._pending is not None and self._pending[0] == stamp:
-            return
         if self._last[0] == stamp:
-            self._commands[self._is_modal].publish(self._last[2])
+            self._wrench_command.publish(self._last[2])
         else:
             self._publish(0.0, 0.0, stamp=stamp)
 
-    def _answer(
-        self, stamp: int, measured: Measurement, bend: tuple[FloatArray, FloatArray] | None
-    ) -> None:
+    def _answer(self, stamp: int, measured: Measurement) -> None:
         """Command what the controller says."""
         safety = self._safety
         if self._controller is None:
@@ -504,7 +456,7 @@ class ControllerNode(ModelNode):
         if safety.rivals is not None:
             self._let_go(safety.rivals, stamp)
             return
-        command = self._controller.command(measured, self._load, bend)
+        command = self._controller.command(measured, self._load)
         if command.fault is not None:
             self._let_go(command.fault, stamp)
             return
@@ -529,13 +481,13 @@ class ControllerNode(ModelNode):
             stamp,
             abs(command.force) >= limits.force_limit or abs(command.torque) >= limits.torque_limit,
         )
-        self._publish(command.force, command.torque, command.modal, stamp)
+        self._publish(command.force, command.torque, stamp)
         self._show(stamp, measured, command)
 
     def _count_commanders(self) -> None:
         """See who else commands; those that are not active count too."""
-        topics = [publisher.topic_name for publisher in self._commands]
-        self._safety.count_commanders({topic: self.count_publishers(topic) for topic in topics})
+        topic = self._wrench_command.topic_name
+        self._safety.count_commanders({topic: self.count_publishers(topic)})
 
     def _on_watchdog(self) -> None:
         """Look for what does not come, and for who should not be there."""
@@ -546,15 +498,8 @@ class ControllerNode(ModelNode):
             self._let_go(f'joint_states is stale: the last came {silence:.3f} s ago')
         elif safety.rivals is not None:
             self._let_go(safety.rivals)
-        self._waits += self._pending is not None
-        if self._pending is not None and self._waits > 1:
-            # Not one that came a moment ago: two looks in a row found it.
-            self._let_go(
-                'ground_truth of the time of joint_states does not come', self._pending[0]
-            )
-            self._pending = None
         if safety.streams['ground_truth'].silence(now) > self._settings.measurement_timeout:
-            self._load, self._truth = 0.0, None
+            self._load = 0.0
         for line in safety.news(now):
             self._warn(line.partition(' ')[0], f'{line}; the observer goes on without it')
         if safety.limits.sensors_required:
@@ -636,24 +581,12 @@ class ControllerNode(ModelNode):
             self._controller.release()
         self._publish(0.0, 0.0, stamp=stamp)
 
-    def _publish(
-        self,
-        force: float,
-        torque: float,
-        modal: FloatArray | None = None,
-        stamp: int | None = None,
-    ) -> None:
+    def _publish(self, force: float, torque: float, stamp: int | None = None) -> None:
         """Command forces with the stamp of the measurement that they answer, or of now."""
         at = self.now() if stamp is None else stamp
-        if self._is_modal:
-            count = self._model.modes.count
-            rest = [0.0] * count if modal is None else modal.tolist()
-            # Insertion makes d smaller.
-            message = self._generalized.serialize(at, -force, torque, *rest)
-        else:
-            message = self._wrench.serialize(at, 0.0, force, 0.0, torque, 0.0, 0.0)
+        message = self._wrench.serialize(at, 0.0, force, 0.0, torque, 0.0, 0.0)
         self._last = at, torque, message
-        self._commands[self._is_modal].publish(message)
+        self._wrench_command.publish(message)
 
     def _show(self, stamp: int, measured: Measurement, command: Command) -> None:
         aim: Setpoint = command.setpoint
@@ -673,7 +606,7 @@ class ControllerNode(ModelNode):
             name, limit = max(
                 control.limits.items(), key=lambda item: item[1].radius - item[1].bound
             )
-            values['least stable axis'] = ': '.join(filter(None, (name, limit.axis)))
+            values['least stable axis'] = name
             values['spectral radius'] = f'{limit.radius:.9g} (at most {limit.bound:.9g})'
         if self._observer is not None and self._observer.ready:
             observer = self._observer

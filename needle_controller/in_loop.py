@@ -373,8 +373,8 @@ def run_controller(
     step : float
         Longest step of the integrator [s].
     ground_truth : bool
-        Tell the controller the deflections and the load of insertion that they make, as an
-        observer without error would; `modal` actuation needs it.
+        Tell the controller the load that the bent needle puts on insertion, as an observer
+        without error would.
 
     Returns
     -------
@@ -393,7 +393,7 @@ def run_controller(
     time = np.arange(count + 1, dtype=np.float64) * period
     states = np.empty((count + 1, 2 * model.coordinates))
     forces = np.zeros((count + 1, model.coordinates))
-    m, on_the_way = model.coordinates, deque([np.zeros(model.coordinates)] * delay)
+    m, on_the_way = model.coordinates, deque([(0.0, 0.0)] * delay)
     for k in range(count):
         states[k] = x = integrator.state
         measured = Measurement(
@@ -405,18 +405,14 @@ def run_controller(
         )
         if ground_truth:
             load = -float(model.bias_forces(x, measured.time)[0])
-            command = controller.command(measured, load, (x[2:m], x[m + 2 :]))
+            command = controller.command(measured, load)
         else:
             command = controller.command(measured)
-        wanted = np.zeros(m)
-        wanted[:2] = command.force, command.torque
-        if command.modal is not None:
-            wanted[2:] = command.modal
-        on_the_way.append(wanted)
-        forces[k] = applied = on_the_way.popleft()
+        on_the_way.append((command.force, command.torque))
+        applied = on_the_way.popleft()
+        forces[k, :2] = applied
         integrator.time = float(time[k])
-        modal = applied[2:] if command.modal is not None else None
-        integrator.advance(period, float(applied[0]), float(applied[1]), modal)
+        integrator.advance(period, *applied)
     states[count], forces[count] = integrator.state, forces[count - 1]
     return LoopRun(model, time, states, forces)
 

@@ -12,7 +12,6 @@ from typing import Any
 from builtin_interfaces.msg import Time as TimeMessage
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import Point, PointStamped, Pose, PoseArray, PoseStamped, WrenchStamped
-from needle_dynamics.compiled.kernels import FloatArray
 from needle_dynamics.model_node import ModelNode
 from needle_dynamics.simulated.assembly import assemble, MODES
 from needle_dynamics.simulated.faults import Fault, FaultParameters, FAULTS
@@ -75,7 +74,6 @@ class _Command:
     stamp: int
     force: float = 0.0
     torque: float = 0.0
-    modal: FloatArray | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -99,9 +97,6 @@ class PlantSettings:
     )
     force_limit: float = constant(1e3, 'N', 'largest force that a command may ask for')
     torque_limit: float = constant(1.0, 'N m', 'largest torque that a command may ask for')
-    modal_limit: float = constant(
-        1e4, 'N m^-1/2', 'largest generalized force on q1..qn that a command may ask for'
-    )
     backlog: float = constant(0.5, 's', 'delay that is made up after a stall', open_low=True)
 
     def __post_init__(self) -> None:
@@ -113,8 +108,7 @@ class PlantNode(ModelNode):
     The needle, or the end-effector, with its sensors.
 
     Lengths in m, forces in N, torques in N m, positive into the tissue. In mode `simulation`
-    the needle moves under ``wrench_command`` (force.y, torque.x) or ``generalized_command``
-    (efforts of d, theta and q1..qn), whichever came last; in mode `robot` the base
+    the needle moves under ``wrench_command`` (force.y, torque.x); in mode `robot` the base
     follows ``joint_trajectory`` (joint `insertion`: positions, or efforts for a push). Both
     publish ``joint_states``, ``base_wrench``, ``tip_deflection`` and ``ground_truth``, and for
     people ``needle_shape`` and ``needle_poses``. In mode `indenter` the end-effector presses the
@@ -192,7 +186,6 @@ class PlantNode(ModelNode):
         self._needle_poses = publisher(PoseArray, 'needle_poses', SENSOR)
         self._clock_topic: Publisher | None = None
         self.listen(WrenchStamped, 'wrench_command', COMMAND, self._on_command)
-        self.listen(JointState, 'generalized_command', COMMAND, self._on_generalized)
         self.create_subscription(JointTrajectory, 'joint_trajectory', self._on_trajectory, COMMAND)
         self.create_service(Trigger, '~/tare', self._on_tare)
         self.create_service(SetBool, '~/pause', self._on_pause)
@@ -363,33 +356,6 @@ class PlantNode(ModelNode):
                 stamp,
             )
 
-    def _on_generalized(self, reading: Reading) -> None:
-        stamp = self._counts_from(reading.stamp)
-        if stamp is None or not isinstance(self._plant, Plant):
-            return
-        settings, names = self._settings, self._names
-        _, _, efforts = reading.values
-        if sorted(reading.names) != sorted(names) or len(efforts) != len(names):
-            self._refuse(
-                f'generalized_command needs an effort for each of {", ".join(names)}, got '
-                f'{list(efforts)} for {", ".join(reading.names) or "none"}',
-                stamp,
-            )
-            return
-        by_name = dict(zip(reading.names, efforts, strict=True))
-        forces = [by_name[name] for name in names]
-        limits = settings.force_limit, settings.torque_limit, settings.modal_limit
-        bounds = [*limits[:2], *limits[2:] * (len(names) - 2)]
-        if all(abs(force) <= bound for force, bound in zip(forces, bounds, strict=True)):
-            # Insertion makes d smaller.
-            self._take(_Command(stamp, -forces[0], forces[1], np.array(forces[2:])))
-        else:
-            self._refuse(
-                f'generalized_command must be within {limits[0]:g} N, {limits[1]:g} N m and '
-                f'{limits[2]:g} N m^-1/2, got {forces}',
-                stamp,
-            )
-
     def _take(self, command: _Command) -> None:
         """Let a command act from the next sample on."""
         if self._rivals:
@@ -486,7 +452,7 @@ class PlantNode(ModelNode):
 
     def _on_watch(self) -> None:
         """Look who commands, and ask again for an answer that does not come."""
-        commanders = max(map(self.count_publishers, ('wrench_command', 'generalized_command')))
+        commanders = self.count_publishers('wrench_command')
         rivals = max(0, commanders - 1)
         if rivals != self._rivals:
             self._rivals = rivals
@@ -506,11 +472,7 @@ class PlantNode(ModelNode):
         if plant is None or self._halted is not None:
             return
         try:
-            sample = (
-                plant.advance(held.force, held.torque, held.modal)
-                if isinstance(plant, Plant)
-                else plant.advance(held.force, held.torque)
-            )
+            sample = plant.advance(held.force, held.torque)
         except NeedleError as error:
             self._halted = str(error)
             self.get_logger().error(f'{error}; the plant stands still')

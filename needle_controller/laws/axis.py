@@ -14,7 +14,6 @@ from needle_controller.compiled.laws import (
     law_match,
     law_remember,
     law_step,
-    oscillation,
 )
 from needle_dynamics import (
     FloatArray,
@@ -38,12 +37,10 @@ class Response(NamedTuple):
     """
     Linear response of an axis over a time, under a constant force.
 
-    ``end position = pp position + pv speed + pf force`` and likewise for the end speed.
+    ``end position = position + pv speed + pf force`` and ``end speed = vv speed + vf force``.
     """
 
-    pp: float
     pv: float
-    vp: float
     vv: float
     pf: float
     vf: float
@@ -52,37 +49,30 @@ class Response(NamedTuple):
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Axis:
     """
-    Insertion (SI: kg, N, N s/m), rotation (kg m^2, N m, N m s), or one mode of deflection.
+    Insertion (SI: kg, N, N s/m) or rotation (kg m^2, N m, N m s).
 
     Attributes
     ----------
-    inertia, coulomb, viscous, stiffness : float
-        Inertia, Coulomb friction mu_s, viscous friction mu_v and stiffness. An axis with
-        stiffness has no Coulomb friction.
+    inertia, coulomb, viscous : float
+        Inertia, Coulomb friction mu_s and viscous friction mu_v.
 
     Raises
     ------
     ParameterError
-        If a value is not finite or negative, the inertia is zero, or both stiffness and Coulomb
-        friction are given.
+        If a value is not finite or negative, or the inertia is zero.
 
     """
 
     inertia: float
     coulomb: float = 0.0
     viscous: float = 0.0
-    stiffness: float = 0.0
 
     def __post_init__(self) -> None:
-        for name in ('inertia', 'coulomb', 'viscous', 'stiffness'):
+        for name in ('inertia', 'coulomb', 'viscous'):
             value = getattr(self, name)
             if not (isfinite(value) and value >= 0.0) or (name == 'inertia' and value == 0.0):
                 sign = '>' if name == 'inertia' else '>='
                 raise ParameterError(f'{name} must be finite and {sign} 0, got {value!r}')
-        if self.stiffness > 0.0 and self.coulomb > 0.0:
-            raise ParameterError(
-                f'an axis with stiffness must have coulomb = 0, got {self.coulomb!r}'
-            )
 
     @classmethod
     def insertion(cls, parameters: NeedleParameters) -> Axis:
@@ -106,26 +96,15 @@ class Axis:
         self, position: float, speed: float, force: float, t: float
     ) -> tuple[float, float]:
         """Return position and speed after a constant force for a time t [s], exactly."""
-        if self.stiffness > 0.0:
-            r = self.response(t)
-            return (
-                r.pp * position + r.pv * speed + r.pf * force,
-                r.vp * position + r.vv * speed + r.vf * force,
-            )
         end, moved = slide(speed, force, self.inertia, self.coulomb, self.viscous, t)
         return position + moved, end
 
     def response(self, t: float) -> Response:
         """Return the linear response over a time t [s] under a constant force, exactly."""
-        if self.stiffness > 0.0:
-            pp, pv, vp, vv, pf, vf = oscillation(
-                self.viscous / self.inertia, self.stiffness / self.inertia, t
-            )
-            return Response(pp, pv, vp, vv, pf / self.inertia, vf / self.inertia)
         x = self.viscous * t / self.inertia
         mean, ramp = decay_means(x)
         push = t / self.inertia
-        return Response(1.0, mean * t, 0.0, 1.0 - x * mean, ramp * t * push, mean * push)
+        return Response(mean * t, 1.0 - x * mean, ramp * t * push, mean * push)
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,9 +121,9 @@ def _instant(position: float, speed: float, aim: Setpoint) -> kernels.Instant:
     return float(position), float(speed), aim.position, aim.speed, aim.acceleration
 
 
-def no_memory(count: int | None = None) -> FloatArray:
-    """Return what a law remembers at the beginning: of one axis, or of ``count`` deflections."""
-    return np.zeros(kernels.MEMORY if count is None else (kernels.MEMORY, count))
+def no_memory() -> FloatArray:
+    """Return what a law remembers at the beginning."""
+    return np.zeros(kernels.MEMORY)
 
 
 def law_constants(period: float, breakaway_speed: float, **slots: float) -> FloatArray:

@@ -487,9 +487,7 @@ class Plant:
             raise JobError(f'the needle moves at {1e3 * speed:.3g} mm/s; it must rest')
         self._sensor.tare()
 
-    def advance(
-        self, force: float = 0.0, torque: float = 0.0, modal: FloatArray | None = None
-    ) -> Sample:
+    def advance(self, force: float = 0.0, torque: float = 0.0) -> Sample:
         """
         Advance by one sample interval.
 
@@ -499,8 +497,6 @@ class Plant:
             Commanded insertion force [N]; not used when a base moves the needle.
         torque : float
             Commanded torque about x [N m]; likewise.
-        modal : ndarray, shape (n,), optional
-            Commanded generalized forces on q1..qn [N m^-1/2]; likewise.
 
         Returns
         -------
@@ -516,7 +512,7 @@ class Plant:
         needle, base, interval = self.integrator, self.base, self.interval
         resolution = late = 0.0
         if base is None:
-            seen = needle.advance(interval, force, torque, modal, self._sensor.samples)
+            seen = needle.advance(interval, force, torque, parts=self._sensor.samples)
         else:
             resolution = base.limits.encoder_resolution
             push = base.push(self.time, needle.depth, interval / _PUSHES)

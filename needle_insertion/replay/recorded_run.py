@@ -17,7 +17,6 @@ from needle_dynamics import (
     NeedleParameters,
     PRESETS,
 )
-from needle_dynamics.compiled.kernels import FloatArray
 from needle_dynamics.simulated.assembly import assemble
 from needle_dynamics.simulated.indenter import Indenter, IndenterParameters
 from needle_dynamics.simulated.plant import BaseParameters, Plant, TipParameters
@@ -26,7 +25,6 @@ from needle_identification.bags.bag import Bag, deserialize
 from needle_identification.bags.storage import Topic
 from needle_ros.settings import as_number
 from needle_ros.timing import NANOSECONDS, nanoseconds
-import numpy as np
 import yaml
 
 #: The numbers of a message.
@@ -51,7 +49,6 @@ class Command:
     stamp: int
     force: float = 0.0
     torque: float = 0.0
-    modal: FloatArray | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -311,7 +308,7 @@ class RecordedRun:
 
     def _read(self, space: str) -> list[tuple[int, str, Any]]:
         """Read what was measured; return what was asked: receive time [ns], kind, message."""
-        kinds = ('wrench_command', 'generalized_command', 'joint_trajectory')
+        kinds = ('wrench_command', 'joint_trajectory')
         asked = {f'{space}/{kind}': kind for kind in kinds}
         bag = Bag(self.path)
         found: list[tuple[int, str, Any]] = []
@@ -357,7 +354,7 @@ class RecordedRun:
 
     def _commanded(self, asked: Sequence[tuple[int, str, Any]]) -> list[Command]:
         """Return the forces commanded, without those that a newer one had overtaken."""
-        limits = [float(self.values.get(f'{n}_limit', inf)) for n in ('force', 'torque', 'modal')]
+        limits = [float(self.values.get(f'{n}_limit', inf)) for n in ('force', 'torque')]
         commands: list[Command] = []
         for received, kind, message in asked:
             if kind == 'joint_trajectory':
@@ -413,18 +410,9 @@ class RecordedRun:
 
 def _command(stamp: int, message: Any, limits: Sequence[float]) -> Command:
     """Return the forces of a message; none for one that a plant refuses."""
-    if hasattr(message, 'wrench'):
-        force, torque, modal = message.wrench.force.y, message.wrench.torque.x, None
-        values, bounds = [force, torque], [*limits[:2]]
-    else:
-        efforts = message.effort.tolist()
-        values, bounds = efforts, [*limits[:2], *[limits[2]] * (len(efforts) - 2)]
-        if len(efforts) < 2:
-            return Command(stamp)
-        # Insertion makes d smaller.
-        force, torque, modal = -efforts[0], efforts[1], np.array(efforts[2:])
-    if all(abs(value) <= bound for value, bound in zip(values, bounds, strict=True)):
-        return Command(stamp, force, torque, modal)
+    force, torque = message.wrench.force.y, message.wrench.torque.x
+    if abs(force) <= limits[0] and abs(torque) <= limits[1]:
+        return Command(stamp, force, torque)
     return Command(stamp)
 
 

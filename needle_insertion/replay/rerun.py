@@ -422,9 +422,7 @@ class Rerun:
             state.current = max(state.current, take)
             command = self._command(take, k)
             if isinstance(plant, Plant):
-                sample: Sample | Press = plant.advance(
-                    command.force, command.torque, command.modal
-                )
+                sample: Sample | Press = plant.advance(command.force, command.torque)
             else:
                 sample = plant.advance()
         return _Seen(_shown(sample, command.torque), getattr(sample, 'tip', None))

@@ -58,7 +58,6 @@ NODE = {
     'command_timeout': 0.1,
     'force_limit': 100.0,
     'torque_limit': 1.0,
-    'modal_limit': 1e4,
     'real_time_factor': 1.0,
     'model.preset': 'phantom',
 }

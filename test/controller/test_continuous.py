@@ -8,10 +8,8 @@ from needle_controller import (
     closed_loop_matrix,
     ContinuousInverseDynamics,
     ContinuousPid,
-    DeflectionLaw,
     InverseDynamics,
     InverseDynamicsGains,
-    ModalLoop,
     Pid,
     PidGains,
     SampledLoop,
@@ -194,7 +192,7 @@ def test_inverse_dynamics_puts_the_poles_where_its_gains_say(actuation):
 # Convergence.
 
 
-def sampled_end(kind: str, actuation: str, gains, period: float, duration: float) -> np.ndarray:
+def sampled_end(kind: str, gains, period: float, duration: float) -> np.ndarray:
     """Run the sampled loop around the true needle; return its state at the end."""
     p = MODEL.parameters
     law = InverseDynamics if kind == 'inverse_dynamics' else Pid
@@ -205,63 +203,40 @@ def sampled_end(kind: str, actuation: str, gains, period: float, duration: float
     def aim(time: float) -> Setpoint:
         return Setpoint(DEPTH + 1e-3 + SPEED * time, SPEED)
 
-    if actuation == 'physical':
-        needle = Integrator(p, state, 2e-5)
-        loops = SampledLoop(insertion, 0, np.inf), SampledLoop(rotation, 0, np.inf)
-        for i in range(count):
-            x = needle.state
-            load = -float(MODEL.bias_forces(x)[0])
-            force = loops[0].command(needle.depth, needle.speed, aim(i * period), load)
-            torque = loops[1].command(float(x[1]), float(x[5]), Setpoint(0.0))
-            needle.advance(period, force, torque)
-        return needle.state
-    deflection = DeflectionLaw(model=MODEL, gains=gains[2], period=period)
-    loop = ModalLoop(insertion, rotation, deflection, 0, force_limit=np.inf, torque_limit=np.inf)
-    # Runge-Kutta of fourth order with steps of 0.1 rad of the fastest mode.
-    steps = max(1, round(period / 5e-5))
-    h = period / steps
+    needle = Integrator(p, state, 2e-5)
+    loops = SampledLoop(insertion, 0, np.inf), SampledLoop(rotation, 0, np.inf)
     for i in range(count):
-        forces = loop.command(state, aim(i * period), Setpoint(0.0), np.zeros((3, 2)))
-
-        def field(x: np.ndarray, forces: np.ndarray = forces) -> np.ndarray:
-            return np.concatenate([x[4:], acceleration(MODEL, x, forces)])
-
-        for _ in range(steps):
-            k1 = field(state)
-            k2 = field(state + 0.5 * h * k1)
-            k3 = field(state + 0.5 * h * k2)
-            k4 = field(state + h * k3)
-            state = state + h / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
-    return state
+        x = needle.state
+        load = -float(MODEL.bias_forces(x)[0])
+        force = loops[0].command(needle.depth, needle.speed, aim(i * period), load)
+        torque = loops[1].command(float(x[1]), float(x[5]), Setpoint(0.0))
+        needle.advance(period, force, torque)
+    return needle.state
 
 
-ID_GAINS = (InverseDynamicsGains(kp=900.0, kv=60.0),) * 3
+ID_GAINS = (InverseDynamicsGains(kp=900.0, kv=60.0),) * 2
 PID_GAINS = (
     PidGains(kp=50.0, ki=40.0, kd=1.0),
     # 20 rad/s on 5e-10 kg m^2.
     PidGains(kp=2e-7, ki=1e-6, kd=2e-8),
-    PidGains(kp=2.0, ki=9.0, kd=5e-3),
 )
 
 
-@pytest.mark.parametrize('actuation', ['physical', 'modal'])
 @pytest.mark.parametrize('kind', ['inverse_dynamics', 'pid'])
-def test_the_sampled_law_tends_to_the_continuous_one(kind, actuation):
+def test_the_sampled_law_tends_to_the_continuous_one(kind):
     """Half the period, half the difference of the closed loops, in every coordinate together."""
-    size, gains = (2 if actuation == 'physical' else 4), ID_GAINS
+    gains = ID_GAINS
     if kind == 'inverse_dynamics':
         law = ContinuousInverseDynamics(
             model=MODEL,
-            actuation=actuation,
-            kp=np.full(size, 900.0),
-            kv=np.full(size, 60.0),
+            kp=np.full(2, 900.0),
+            kv=np.full(2, 60.0),
             breakaway_speed=1e-4,
         )
     else:
         gains = PID_GAINS
-        columns = [(g.kp, g.kd, g.ki) for g in (*gains, gains[2])[:size]]
-        kp, kd, ki = np.transpose(columns)
-        law = ContinuousPid(model=MODEL, actuation=actuation, kp=kp, kd=kd, ki=ki)
+        kp, kd, ki = np.transpose([(g.kp, g.kd, g.ki) for g in gains])
+        law = ContinuousPid(model=MODEL, kp=kp, kd=kd, ki=ki)
     duration = 0.016
     start = np.concatenate([moving(), np.zeros(law.integrals)])
     exact = solve_ivp(
@@ -273,43 +248,12 @@ def test_the_sampled_law_tends_to_the_continuous_one(kind, actuation):
     scales[0] = 1e-3
     periods = np.array([2e-4, 1e-4, 5e-5])
     errors = [
-        np.linalg.norm((sampled_end(kind, actuation, gains, h, duration) - exact) / scales)
-        for h in periods
+        np.linalg.norm((sampled_end(kind, gains, h, duration) - exact) / scales) for h in periods
     ]
     orders = np.log2(np.array(errors[:-1]) / errors[1:])
     # First order; the second-order part is h omega_2 = 0.35 at the longest period.
     assert_allclose(orders, 1.0, atol=0.2)
     assert errors[-1] < 0.05
-
-
-def test_the_modal_loop_predicts_its_delay():
-    """With a force on its way it commands what it would without delay a period later."""
-    p, now = MODEL.parameters, moving()
-    aim = Setpoint(DEPTH + 1e-3, SPEED), Setpoint(0.0), np.zeros((3, 2))
-    waiting, differences = [0.2, 1e-7, 0.05, -0.02], []
-    for period in (2e-4, 1e-4, 5e-5):
-        loops = [
-            ModalLoop(
-                InverseDynamics(axis=Axis.insertion(p), gains=ID_GAINS[0], period=period),
-                InverseDynamics(axis=Axis.rotation(p), gains=ID_GAINS[1], period=period),
-                DeflectionLaw(model=MODEL, gains=ID_GAINS[2], period=period),
-                delay,
-                force_limit=np.inf,
-                torque_limit=np.inf,
-            )
-            for delay in (0, 1)
-        ]
-        loops[1].insertion.on_the_way[0], loops[1].rotation.on_the_way[0] = waiting[:2]
-        loops[1].deflection.on_the_way[0] = np.array(waiting[2:])
-        later = solve_ivp(
-            lambda _, x: np.concatenate([x[4:], acceleration(MODEL, x, waiting)]),
-            (0.0, period), now, method='DOP853', rtol=1e-12, atol=1e-16,
-        ).y[:, -1]  # fmt: skip
-        known, predicted = loops[0].command(later, *aim), loops[1].command(now, *aim)
-        differences.append(np.abs(predicted - known) / np.abs(known))
-    # Depth and loads are held over a period: small, and of first order at least.
-    assert np.max(differences[-1]) < 1e-4
-    assert np.all(differences[2] < differences[0] / 4.0 + 1e-12)
 
 
 # Bad input.

@@ -315,9 +315,6 @@ def test_a_command_knows_whether_it_is_finite(load):
     assert steering.command(measured).is_finite()
     assert not steering.command(measured, nan).is_finite()
     assert not Command(force=0.0, torque=load, setpoint=Setpoint(0.02)).is_finite()
-    assert not Command(
-        force=0.0, torque=0.0, setpoint=Setpoint(0.02), modal=np.array([0.0, load])
-    ).is_finite()
 
 
 def test_a_range_of_depths_bounds_the_targets():
@@ -328,74 +325,3 @@ def test_a_range_of_depths_bounds_the_targets():
             steering.set_target(depth)
     with pytest.raises(ParameterError, match='lowest_depth and highest_depth must leave some'):
         controller(lowest_depth=0.3)
-
-
-def modal(law: str = 'inverse_dynamics', low: float = 0.184, **changes) -> Controller:
-    """Return a controller with a force on every coordinate."""
-    return Controller(
-        law,
-        NeedleParameters.preset('phantom'),
-        ControllerSettings(lowest_depth=low, **changes),
-        inverse_dynamics=(InverseDynamicsGains(),) * 3,
-        pid=(
-            PidGains(),
-            PidGains(kp=2.1e-7, ki=0.0, kd=2.1e-8),
-            PidGains(kp=5.0, ki=20.0, kd=0.02, feed_forward=True),
-        ),
-        reference='minimum_jerk',
-        limits=ReferenceLimits(),
-        actuation='modal',
-    )
-
-
-def test_modes_that_are_too_fast_for_the_rate_are_refused_by_name():
-    """At 1 kHz and 2 cm the second mode has 22 kHz: samples do not tell it."""
-    with pytest.raises(ParameterError, match=r'deflection mode 2 at 2 cm: 22 kHz') as refusal:
-        modal(low=0.02)
-    assert 'rate of' in str(refusal.value)
-    assert 'inserted lengths from' in str(refusal.value)
-
-
-@pytest.mark.parametrize(('law', 'left'), [('inverse_dynamics', 0.02), ('pid', 0.02)])
-def test_modal_actuation_brings_depth_and_deflection_to_their_targets(law, left):
-    """From a bent needle both laws arrive, PID with its feed-forward: its gains are soft."""
-    truth = NeedleParameters.preset('phantom')
-    steering = modal(law)
-    model = NeedleModel(truth)
-    needle = Integrator(truth, model.state_at(0.185, 1e-3), 2e-5)
-    steering.set_target(0.195, -2e-3)
-    waiting = [np.zeros(4)]
-    for i in range(3000):
-        x = needle.state
-        measured = Measurement(
-            time=i * PERIOD, depth=needle.depth, speed=needle.speed, angle=x[1], angular_speed=x[5]
-        )
-        command = steering.command(measured, bend=(x[2:4], x[6:8]))
-        assert command.fault is None
-        waiting.append(np.array([command.force, command.torque, *command.modal]))
-        force = waiting.pop(0)
-        needle.advance(PERIOD, force[0], force[1], force[2:])
-    assert needle.depth == pytest.approx(0.195, abs=1e-4)
-    assert model.tip_deflection(needle.state) == pytest.approx(-2e-3, abs=left * 3e-3)
-    outside = steering.command(
-        Measurement(time=3.001, depth=0.18299, speed=-12.0), bend=(x[2:4], x[6:8])
-    )
-    assert 'outside' in (outside.fault or '')
-    assert not outside.modal.any()
-
-
-@pytest.mark.parametrize('law', ['inverse_dynamics', 'pid'])
-def test_only_what_the_deflections_feel_has_their_poles_searched_anew(law):
-    """Friction and other gains leave their limit as it is; their gains and tissue do not."""
-    steering = modal(law)
-    before = steering.limits
-    steering.change(NeedleParameters.preset('phantom', coulomb_friction=0.4))
-    assert steering.limits['deflection'] is before['deflection']
-    steering.change(NeedleParameters.preset('phantom', tissue_damping=0.5))
-    damped = steering.limits['deflection']
-    assert damped.radius != before['deflection'].radius
-    soft = tuple(gains.scaled(0.9) for gains in steering._gains[law])
-    steering.change(**{law: (soft[0], *steering._gains[law][1:])})
-    assert steering.limits['deflection'] is damped
-    steering.change(**{law: soft})
-    assert steering.limits['deflection'].radius != damped.radius

@@ -236,25 +236,6 @@ def test_a_batch_is_the_controller_of_the_node(name, delay):
         assert batch.completed[i] == len(run.time) - 1
 
 
-def test_the_controller_drives_the_deflections_too():
-    """`modal`, from 18.5 cm on at 1 kHz: with the ground truth the tip comes to zero."""
-    inverse, gains = InverseDynamicsGains(), PidGains()
-    settings = ControllerSettings(lowest_depth=0.185)
-    controller = Controller(
-        'inverse_dynamics', BELIEVED, settings, inverse_dynamics=(inverse,) * 3,
-        pid=(gains,) * 3, reference='minimum_jerk', limits=ReferenceLimits(), actuation='modal',
-    )  # fmt: skip
-    controller.set_target(0.195)
-    start = NeedleModel(BELIEVED).state_at(0.19, 5e-4)
-    run = run_controller(
-        controller, BELIEVED, start, period=PERIOD, delay=1, duration=1.2, ground_truth=True
-    )
-    assert np.abs(run.forces[:, 2:]).max() > 1e-3
-    # Micrometers: what friction holds of the base, and exp(-20 t) of the deflection.
-    assert abs(run.depth[-1] - 0.195) < 5e-5
-    assert abs(run.tip_deflection[-1]) < 1e-6
-
-
 def test_a_batch_does_not_depend_on_threads_nor_on_its_step():
     law = Pid(axis=Axis.insertion(BELIEVED), gains=PidGains(), period=PERIOD)
     needles = plants(5)

@@ -1,7 +1,6 @@
 """What is accepted is stable, and what is refused is not."""
 
 from contextlib import nullcontext
-from dataclasses import replace
 from math import log
 import re
 
@@ -10,12 +9,8 @@ from hypothesis import strategies as st
 from needle_controller import (
     Axis,
     check_stability,
-    deflection_matrix,
-    DeflectionLaw,
-    DeflectionLoop,
     InverseDynamics,
     InverseDynamicsGains,
-    MARGIN,
     Pid,
     PidGains,
     SampledLoop,
@@ -59,50 +54,6 @@ def test_transition_matrix_is_the_loop(delay, unmodeled, filter_time):
         position, speed = axis.propagate(position, speed, waiting.pop(0), PERIOD)
     # Rounding over fifty steps.
     assert_allclose([position, speed], state[:2], rtol=1e-9, atol=1e-15)
-
-
-DEFLECTION_GAINS = {
-    'inverse_dynamics': InverseDynamicsGains(),
-    'pid': PidGains(kp=5.0, ki=20.0, kd=0.02, filter_time=2e-3),
-}
-
-
-def deflection_law(kind: str, period: float = PERIOD, factor: float = 1.0) -> DeflectionLaw:
-    """Return a law on the deflections of the phantom."""
-    gains = DEFLECTION_GAINS[kind].scaled(factor)
-    return DeflectionLaw(model=MODEL, gains=gains, period=period)
-
-
-def deflect(law: DeflectionLaw, depth: float, late: int, periods: int, delay: int = 1):
-    """Run the loop on the deflections of the true needle at rest; return their norms."""
-    modes, loop = law.at(depth), DeflectionLoop(law, delay)
-    x = np.stack([modes.from_normal([1.0, 1.0]), np.zeros(2)])
-    waiting = [np.zeros(2)] * (delay + late)
-    rest, path = np.zeros((3, 2)), []
-    for _ in range(periods):
-        waiting.append(loop.command(modes, x, rest))
-        x, _ = loop.predict(modes, x, 0.0, waiting.pop(0))
-        path.append(x)
-        if not abs(x[1, 0]) < 1e12:
-            break
-    normal = np.array(path) @ modes.inverse.T
-    sizes = np.sqrt((normal[:, 0] ** 2 + normal[:, 1] ** 2 / modes.squares).sum(axis=1))
-    return sizes, normal.reshape(-1, 4)
-
-
-@pytest.mark.parametrize('kind', DEFLECTION_GAINS)
-@pytest.mark.parametrize('unmodeled', [0, 1])
-def test_deflection_matrix_is_the_loop(kind, unmodeled):
-    """Powers of the matrix are what the running loop does to deflections."""
-    law = deflection_law(kind)
-    matrix = deflection_matrix(law, law.at(0.195), 1, unmodeled)
-    state = np.zeros(len(matrix))
-    state[:2] = 1.0
-    _, ends = deflect(law, 0.195, unmodeled, 30)
-    for end in ends:
-        state = matrix @ state
-        # Rounding over the steps, of rates of 1e3.
-        assert_allclose(state[:4], end, rtol=1e-8, atol=1e-8)
 
 
 def decays(law, unmodeled: int) -> bool:
@@ -285,89 +236,3 @@ def test_missing_gains_are_named(gains, missing):
     """No factor makes up for a gain of zero."""
     with pytest.raises(ParameterError, match=f'{missing} must not be zero'):
         check_stability(law_of(gains, PAPER_SI), 1, 'gains')
-
-
-# The deflection.
-
-
-def test_modal_control_at_2_cm_is_refused_at_1_khz():
-    """The refusal names the 22 kHz mode, and the rate and depth it names are accepted."""
-    law = deflection_law('inverse_dynamics')
-    with pytest.raises(ParameterError) as refusal:
-        check_stability(law, 1, 'deflection gains', depths=(0.02, 0.2))
-    text = str(refusal.value)
-    words = (
-        r'deflection gains cannot be stable at 1000 Hz with a delay of 2 periods: deflection '
-        r'mode 2 at 2 cm: 22 kHz, not below half the rate, spectral radius .* a rate of (\d+) Hz '
-        r'or inserted lengths from ([\d.]+) cm on would do'
-    )
-    rate, centimeters = (float(found) for found in re.fullmatch(words, text).groups())
-    fast, deep = replace(law, period=1.0 / rate), 1e-2 * centimeters
-    check_stability(fast, 1, 'gains', depths=(0.02, 0.2))
-    check_stability(law, 1, 'gains', depths=(deep, 0.2))
-    # Not for little: six times the frequency, and nearly the whole needle.
-    assert 100e3 < rate < 150e3
-    assert 0.17 < deep < 0.19
-    # Nearest: a step of the search less would not do.
-    assert not stability_limit(replace(law, period=1.2 / rate), 1, (0.02, 0.2)).stable
-    assert not stability_limit(law, 1, (deep - 1e-3, 0.2)).stable
-
-
-def test_gains_on_deflections_are_cut_to_what_would_do():
-    """Where the rate is fit for the modes, a factor on the gains is named, and accepted."""
-    law = deflection_law('pid', factor=1e4)
-    words = r'deflection mode \d at .* cm: [\d.]+ Hz, spectral .* times ([\d.e-]+) would be'
-    with pytest.raises(ParameterError, match=words) as refusal:
-        check_stability(law, 1, 'gains', depths=(0.19, 0.2))
-    factor = float(re.search(words, str(refusal.value))[1])
-    assert check_stability(law.scaled(factor), 1, 'gains', depths=(0.19, 0.2)).stable
-
-
-def test_gains_that_no_rate_saves_are_named():
-    """The source's gains of PID on the deflections are refused with their delay at any rate."""
-    gains = PidGains(kp=1e3, ki=0.0, kd=1e4)
-    law = DeflectionLaw(model=MODEL, gains=gains, period=PERIOD)
-    with pytest.raises(ParameterError, match=r'22 kHz.* no rate up to 1000000 Hz would do'):
-        check_stability(law, 1, 'gains', depths=(0.02, 0.2))
-
-
-@settings(PROPERTY, max_examples=25)
-@given(
-    st.sampled_from(list(DEFLECTION_GAINS)),
-    power_of_ten(-1.0, 1.5),
-    st.floats(0.12, 0.2),
-    power_of_ten(-3.7, -3.0),
-    st.integers(0, 1),
-)
-def test_deflections_obey_the_verdict_at_every_depth(kind, factor, depth, period, unmodeled):
-    """Accepted over a range, they settle at each of its depths; outside the circle they grow."""
-    law = deflection_law(kind, period, factor)
-    accepted = stability_limit(law, 1, (0.12, 0.2)).stable
-    matrix = deflection_matrix(law, law.at(depth), 1, unmodeled)
-    radius = float(np.abs(np.linalg.eigvals(matrix)).max())
-    if accepted:
-        assert radius < 1.0
-    assume(abs(log(radius)) > 3e-3)
-    # Six time constants beyond a thousand for what the other poles hide.
-    sizes, _ = deflect(law, depth, unmodeled, round(13.0 / abs(log(radius))))
-    if radius < 1.0:
-        assert sizes[-1] < 0.1 * sizes.max()
-    else:
-        assert sizes[-1] > 10.0
-
-
-def test_depths_out_of_range_are_refused():
-    """A range must increase and lie on the needle."""
-    law = deflection_law('inverse_dynamics')
-    for depths in ((0.1, 0.05), (0.0, 0.1), (0.1, 0.3)):
-        with pytest.raises(ParameterError, match=r'depths must be increasing in \(0, 0\.2\] m'):
-            stability_limit(law, 1, depths)
-
-
-def test_an_axis_too_fast_for_the_rate_is_refused():
-    """A spring beyond half the rate is refused even where its aliased poles are inside."""
-    axis = Axis(inertia=1.0, viscous=100.0, stiffness=(7.0 / PERIOD) ** 2)
-    law = InverseDynamics(axis=axis, gains=InverseDynamicsGains(), period=PERIOD)
-    assert spectral_radius(law, 0) < 1.0 - MARGIN
-    with pytest.raises(ParameterError, match='not below half the rate'):
-        check_stability(law, 0, 'gains')

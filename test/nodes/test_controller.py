@@ -485,47 +485,6 @@ def test_the_observer_tells_what_it_sees(ros_graph):
     assert min(b - a for a, b in pairwise(stamps)) == pytest.approx(0.02, abs=1e-6)
 
 
-def test_modal_actuation_drives_the_deflection_where_it_is_stable(ros_graph):
-    """With a force on every coordinate the plant's tip goes where it shall, at 500 Hz."""
-    rate = {'rate': 1000.0}
-    probe = ros_graph.node('probe')
-    tips = ros_graph.listen(probe, PointStamped, 'tip_deflection', SENSOR)
-    forces = ros_graph.listen(probe, JointState, 'generalized_command', COMMAND)
-    targets = probe.create_publisher(PointStamped, 'target', COMMAND)
-    modal = {
-        **rate, 'actuation': 'modal', 'deflection_feedback': 'ground_truth', 'lowest_depth': 0.184,
-        'measurement_timeout': 1.0,
-        # On a machine that is held up the answers are late and the tip swings: not looked at here.
-        'safety.tip_deflection': 1.0, 'safety.lateral_load': 1e3, 'safety.moment_load': 1e2,
-        'safety.speed': 10.0, 'safety.tracking_error': 1.0,
-    }  # fmt: skip
-    ros_graph.start('plant', {**rate, 'depth': 0.19, 'command_timeout': 1.0})
-    ros_graph.start('controller', modal)
-    ros_graph.spin_until(lambda: forces and targets.get_subscription_count(), 'the loop', 60.0)
-    assert forces[-1].name == ['d', 'theta', 'q1', 'q2']
-    message = PointStamped()
-    message.point.y, message.point.z = 0.19, 1e-3
-    targets.publish(message)
-    ros_graph.spin_until(lambda: tips and abs(tips[-1].point.z - 1e-3) < 1e-4, 'the deflection')
-
-
-@pytest.mark.parametrize(
-    ('parameters', 'reason'),
-    [
-        ({'deflection_feedback': 'ground_truth'}, 'deflection mode 2 at 0.1 cm'),
-        ({'deflection_feedback': 'ground_truth', 'lowest_depth': 0.02}, 'mode 2 at 2 cm: 22 kHz'),
-        ({}, 'deflection_feedback must be ground_truth'),
-    ],
-)
-def test_modal_actuation_is_refused_where_it_cannot_work(ros_graph, parameters, reason):
-    """Modes that the rate cannot tell, or deflections that nothing tells."""
-    node = ros_graph.add(
-        ControllerNode, start=False, parameters={'actuation': 'modal', **parameters}
-    )
-    assert not node.start()
-    assert reason in node.failure
-
-
 def test_the_integral_is_frozen_while_it_is_stopped(ros_graph):
     """What PID has learned of the friction is there again after the stop."""
     bench = Bench(ros_graph, law='pid')
@@ -901,25 +860,6 @@ def test_no_ground_truth_raises(ros_graph, message):
     ros_graph.spin_until(lambda: bench.value('input ground_truth'), 'the truth')
     assert bench.controller._load == 0.0
     assert bench.push() > 0.5
-
-
-def test_a_truth_that_does_not_come_is_answered_with_no_force(ros_graph):
-    """With a force on every coordinate it waits for the bending, but not for ever."""
-    bench = Bench(
-        ros_graph, actuation='modal', deflection_feedback='ground_truth', lowest_depth=0.184,
-        rate=1000.0,
-    )  # fmt: skip
-    forces = ros_graph.listen(bench.node, JointState, 'generalized_command', COMMAND)
-    ros_graph.spin_until(lambda: bench.node.count_publishers('generalized_command'), 'discovery')
-    message = JointState(name=['insertion'], position=[0.19], velocity=[0.0])
-
-    def answered():
-        message.header.stamp = bench.now()
-        bench.states.publish(message)
-        return forces and 'ground_truth' in bench.said()
-
-    ros_graph.spin_until(answered, 'zero force')
-    assert not any(forces[-1].effort)
 
 
 def test_diagnostics_tell_rates_and_saturation(ros_graph):

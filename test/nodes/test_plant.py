@@ -707,9 +707,9 @@ def test_the_controller_takes_friction_live_if_its_gains_can_bear_it(ros_graph):
         ),
         (
             ControllerNode,
-            'actuation',
-            'modal',
-            'actuation: cannot change while configured; clean up the node first',
+            'deflection_feedback',
+            'none',
+            'deflection_feedback: cannot change while configured; clean up the node first',
         ),
         (
             ControllerNode,
@@ -726,31 +726,3 @@ def test_what_cannot_change_live_is_refused(ros_graph, kind, name, value, reason
     answer = node.set_parameters([Parameter(name, value=value)])[0]
     assert (answer.successful, answer.reason) == (False, reason)
     assert node.get_parameter(name).value == before
-
-
-def test_generalized_forces_bend_the_needle_and_bad_ones_do_not(ros_graph):
-    """Efforts on q1..qn act; what is not finite, not complete or too large is no force."""
-    bench = Bench(ros_graph, depth=0.19)
-    forces = bench.probe.create_publisher(JointState, 'generalized_command', COMMAND)
-    ros_graph.spin_until(forces.get_subscription_count, 'discovery')
-    names = ['d', 'theta', 'q1', 'q2']
-    plant = bench.plant
-    for count, (name, effort) in enumerate(
-        [
-            (names, [0.0, 0.0, float('nan'), 0.0]),
-            (names[:3], [0.0, 0.0, 1.0]),
-            (names, [0.0, 0.0, 1e9, 0.0]),
-        ],
-        1,
-    ):
-        forces.publish(JointState(name=name, effort=effort))
-        ros_graph.spin_until(
-            lambda count=count: plant.diagnose()[2]['commands refused'] == count, 'the refusal'
-        )
-    truth = ros_graph.listen(bench.probe, JointState, 'ground_truth', SENSOR)
-
-    def bent() -> bool:
-        forces.publish(JointState(name=names, effort=[0.0, 0.0, 0.1, 0.0]))
-        return bool(truth) and abs(truth[-1].position[2]) > 1e-5
-
-    ros_graph.spin_until(bent, 'the bending')
