@@ -67,7 +67,13 @@ setup(
         ],
         # The name by which colcon test knows pytest.
         'test': TEST,
-        'dev': [*TEST, 'colcon-common-extensions>=0.3', 'mypy>=1.14', 'ruff>=0.9'],
+        'dev': [
+            *TEST,
+            'colcon-common-extensions>=0.3',
+            'mypy>=1.14',
+            'pytest-xdist>=3.5',
+            'ruff>=0.9',
+        ],
         # What `needle bench` is measured beside.
         'bench': ['mcap-ros2-support>=0.5.6', 'mujoco>=3.2', 'pyelastica>=0.3.3'],
     },

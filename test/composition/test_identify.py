@@ -5,12 +5,12 @@ from pathlib import Path
 import re
 import shutil
 
-from composition.pages import look_at
-from composition.presses import STIFFNESS, write_presses
 from needle_identification import TERMS
 from needle_insertion.cli import main
 from needle_insertion.experiment.protocol import SHIPPED_BAGS
 import pytest
+from support.pages import look_at
+from support.presses import STIFFNESS, write_presses
 import yaml
 
 BAGS = [str(path) for path in sorted(SHIPPED_BAGS.glob('friction_*'))][:4]

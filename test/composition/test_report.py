@@ -2,7 +2,6 @@
 
 from html.parser import HTMLParser
 
-from composition.pages import look_at
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from matplotlib.figure import Figure
@@ -23,6 +22,7 @@ from needle_insertion.report.page import (
     write_page,
 )
 import pytest
+from support.pages import look_at
 
 cells = st.text(st.characters(categories=('L', 'N', 'P', 'S')), min_size=1, max_size=12)
 #: Whatever text there is, but for carriage returns, which HTML does not keep.

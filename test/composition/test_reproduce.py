@@ -4,7 +4,6 @@ from argparse import ArgumentParser
 from functools import cache
 import json
 
-from composition.pages import look_at
 from needle_identification import ParameterEstimate, Statistic
 from needle_insertion.cli import main
 from needle_insertion.commands import analyze, reproduce
@@ -21,6 +20,7 @@ from needle_insertion.paper import claims, figures, mismatch
 from needle_insertion.paper.tables import FORCE_LEVELS, TABLE_1, TABLE_2
 import numpy as np
 import pytest
+from support.pages import look_at
 
 
 @pytest.fixture(scope='module')

@@ -7,18 +7,6 @@ import shutil
 import sqlite3
 
 from hypothesis import given, HealthCheck, settings, strategies
-from identification.samples import (
-    EPOCH,
-    joint_states,
-    MOTION,
-    simulated,
-    STORE,
-    TEXT,
-    text,
-    WRENCH,
-    wrench,
-    write_bag,
-)
 import lz4.frame
 from mcap.reader import make_reader
 from mcap.writer import Writer as McapWriter
@@ -37,6 +25,18 @@ import pytest
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import get_types_from_msg, get_typestore, Stores
+from support.samples import (
+    EPOCH,
+    joint_states,
+    MOTION,
+    simulated,
+    STORE,
+    TEXT,
+    text,
+    WRENCH,
+    wrench,
+    write_bag,
+)
 import yaml
 import zstandard
 

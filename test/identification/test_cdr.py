@@ -3,11 +3,11 @@
 import struct
 
 from hypothesis import given, settings, strategies
-from identification.samples import header, MOTION, STORE, WRENCH, wrench
 from needle_ros import cdr
 import numpy as np
 from numpy.testing import assert_array_equal
 import pytest
+from support.samples import header, MOTION, STORE, WRENCH, wrench
 
 FLOATS = strategies.lists(strategies.floats(), max_size=3)
 MESSAGES = strategies.lists(

@@ -7,15 +7,15 @@ import shutil
 import sqlite3
 import struct
 
-from composition.presses import presses, STIFFNESS
-from identification.samples import EPOCH, header, STORE, TEXT, text, WRENCH, wrench
-from identification.strokes import COULOMB, strokes, VISCOUS
 from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
 from needle_insertion.cli import main
 import numpy as np
 import pytest
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+from support.presses import presses, STIFFNESS
+from support.samples import EPOCH, header, STORE, TEXT, text, WRENCH, wrench
+from support.strokes import COULOMB, strokes, VISCOUS
 
 JOINTS = 'sensor_msgs/msg/JointState'
 POSE = 'geometry_msgs/msg/PoseStamped'

@@ -3,7 +3,6 @@
 from dataclasses import replace
 from functools import cache
 
-from identification.strokes import COULOMB, SPEEDS, strokes, VISCOUS
 from needle_dynamics import ParameterError
 from needle_identification import (
     ESTIMATORS,
@@ -16,6 +15,7 @@ from needle_identification import (
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 import pytest
+from support.strokes import COULOMB, SPEEDS, strokes, VISCOUS
 
 TRUTH = {'coulomb_friction': COULOMB, 'viscous_friction': VISCOUS}
 

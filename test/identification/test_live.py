@@ -2,12 +2,12 @@
 
 from math import inf, nan
 
-from identification.samples import IDEAL, simulated, TRUTH
 from needle_dynamics import ParameterError
 from needle_identification.friction.live import LiveFriction
 from needle_identification.friction.terms import FrictionSettings
 import numpy as np
 import pytest
+from support.samples import IDEAL, simulated, TRUTH
 
 #: There and back at two speeds, slow enough for the filter to settle.
 LEGS = tuple(

@@ -2,7 +2,6 @@
 
 from itertools import pairwise
 
-from identification.samples import EPOCH, STORE, TEXT, text
 from needle_identification import BagWriter, OfferedQos
 from needle_identification.bags import bag as bag_io
 from needle_identification.bags.bag import Bag
@@ -17,6 +16,7 @@ from rosbags.interfaces import (
     QosTime,
 )
 from rosbags.rosbag2 import StoragePlugin, Writer
+from support.samples import EPOCH, STORE, TEXT, text
 import yaml
 
 OLD = """

@@ -4,17 +4,6 @@ from contextlib import suppress
 import struct
 
 from hypothesis import given, settings, strategies
-from identification.samples import (
-    EPOCH,
-    header,
-    joint_states,
-    MOTION,
-    STORE,
-    TEXT,
-    text,
-    WRENCH,
-    wrench,
-)
 from mcap.reader import make_reader
 from mcap.writer import Writer as McapWriter
 from needle_identification import (
@@ -27,6 +16,17 @@ from needle_identification import (
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 import pytest
+from support.samples import (
+    EPOCH,
+    header,
+    joint_states,
+    MOTION,
+    STORE,
+    TEXT,
+    text,
+    WRENCH,
+    wrench,
+)
 
 MILLISECOND = 1_000_000
 POSE = 'geometry_msgs/msg/PoseStamped'

@@ -2,12 +2,12 @@
 
 from dataclasses import replace
 
-from identification.strokes import COULOMB, strokes, VISCOUS
 from needle_dynamics import ParameterError
 from needle_identification import FrictionSettings, identify_friction, RecursiveFriction
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest
+from support.strokes import COULOMB, strokes, VISCOUS
 
 RATE = 250.0
 

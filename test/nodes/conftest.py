@@ -2,40 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 import gc
 from pathlib import Path
-from typing import Any
 
-from needle_insertion.experiment.ros_graph import Graph
-from needle_ros.base_node import BaseNode
 import pytest
-from rclpy.node import Node
-from rclpy.parameter import Parameter
-
-
-class RosGraph(Graph):
-    """The graph of one test: nodes in its own thread, and processes."""
-
-    def add(self, kind: type, *arguments: Any, **options: Any) -> Any:
-        """
-        Make a node; a node of the suite is started unless ``start`` is False.
-
-        ``parameters`` are its parameters by name.
-        """
-        start = options.pop('start', True)
-        parameters: Mapping[str, object] = options.pop('parameters', {})
-        overrides = [Parameter(name, value=value) for name, value in parameters.items()]
-        node = super().add(kind, *arguments, parameter_overrides=overrides, **options)
-        if start and isinstance(node, BaseNode):
-            assert node.start(), node.failure
-        return node
-
-    def listen(self, node: Node, kind: type, topic: str, qos: Any) -> list[Any]:
-        """Return a list that fills with the messages of a topic."""
-        received: list[Any] = []
-        node.create_subscription(kind, topic, received.append, qos)
-        return received
+from support.ros_graph import RosGraph
 
 
 @pytest.fixture(scope='session', autouse=True)

@@ -3,10 +3,8 @@
 import math
 import time
 
-from composition.presses import write_presses
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import WrenchStamped
-from identification.samples import NOISY, simulated, TRUTH, write_bag
 from needle_dynamics.plant_node import PlantNode
 from needle_identification.identification_node import IdentificationNode
 from needle_ros.base_node import COMMAND, LATCHED, SENSOR
@@ -16,6 +14,8 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
+from support.presses import write_presses
+from support.samples import NOISY, simulated, TRUTH, write_bag
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 COEFFICIENTS = (('coulomb_friction', 'N'), ('viscous_friction', 'N s/m'))

@@ -7,8 +7,8 @@ import shutil
 import subprocess
 from typing import Any
 
-from nodes.installed import node_class, ROOT
 import pytest
+from support.installed import node_class, ROOT
 
 PATH = ROOT / 'launch/insertion.launch.py'
 TREE = ast.parse(PATH.read_text())

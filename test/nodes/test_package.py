@@ -16,12 +16,14 @@ import xml.etree.ElementTree as ET
 from catkin_pkg.package import InvalidPackage, parse_package_string
 from lxml import etree
 from needle_insertion.experiment.protocol import SHIPPED_BAGS
-from nodes.installed import NODES, ROOT
 import pytest
+from support.installed import NODES, ROOT
 import yaml
 
 DATA = ROOT / 'test/data'
 PATH = f'{Path(sys.executable).parent}:{os.environ["PATH"]}'
+#: Without PYTHONPATH: what is installed must not be hidden by this tree.
+ENVIRONMENT = {**os.environ, 'PATH': PATH, 'PYTHONPATH': ''}
 MANIFEST = ET.parse(ROOT / 'package.xml').getroot()  # noqa: S314
 
 #: rosdep keys by imported module, where they are not the module itself.
@@ -39,13 +41,13 @@ KEYS = {
     'yaml': 'python3-yaml',
 }
 
-OWN = {'needle_controller', 'needle_dynamics', 'needle_identification', 'needle_insertion'}
+OWN = {path.parent.name for path in ROOT.glob('needle_*/__init__.py')}
 
 
 def imported() -> set[str]:
     """Return the top-level modules that the shipped code imports from elsewhere."""
     modules = set()
-    sources = [*ROOT.glob('needle_*/*.py'), *ROOT.glob('launch/*.py')]
+    sources = [*ROOT.glob('needle_*/**/*.py'), *ROOT.glob('launch/*.py')]
     for node in (n for path in sources for n in ast.walk(ast.parse(path.read_text()))):
         if isinstance(node, ast.Import):
             modules |= {alias.name for alias in node.names}
@@ -151,7 +153,7 @@ def shell(folder: Path, *words: object) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
         [str(word) for word in words],
         cwd=folder,
-        env={**os.environ, 'PATH': PATH},
+        env=ENVIRONMENT,
         capture_output=True,
         text=True,
         check=False,

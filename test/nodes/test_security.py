@@ -11,8 +11,8 @@ from typing import NamedTuple
 from lxml import etree
 from needle_insertion.experiment.protocol import SHIPPED_BAGS
 from needle_ros.base_node import BaseNode
-from nodes.installed import node_class, NODES, ROOT
 import pytest
+from support.installed import node_class, NODES, ROOT
 
 POLICIES = ROOT / 'config/security/policies.xml'
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from identification.samples import EPOCH, header, STORE, WRENCH
 from needle_identification import BagWriter
 import numpy as np
+from support.samples import EPOCH, header, STORE, WRENCH
 
 POSE = 'geometry_msgs/msg/PoseStamped'
 

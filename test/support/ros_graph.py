@@ -1,0 +1,39 @@
+"""A ROS graph for one test: nodes in the thread of the test, and processes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from needle_insertion.experiment.ros_graph import Graph
+from needle_ros.base_node import BaseNode
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+
+class RosGraph(Graph):
+    """The graph of one test: nodes in its own thread, and processes."""
+
+    def __enter__(self) -> RosGraph:
+        super().__enter__()
+        return self
+
+    def add(self, kind: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
+        """
+        Make a node; a node of the suite is started unless ``start`` is False.
+
+        ``parameters`` are its parameters by name.
+        """
+        start = options.pop('start', True)
+        parameters: Mapping[str, object] = options.pop('parameters', {})
+        overrides = [Parameter(name, value=value) for name, value in parameters.items()]
+        node = super().add(kind, *arguments, parameter_overrides=overrides, **options)
+        if start and isinstance(node, BaseNode):
+            assert node.start(), node.failure
+        return node
+
+    def listen(self, node: Node, kind: type, topic: str, qos: Any) -> list[Any]:
+        """Return a list that fills with the messages of a topic."""
+        received: list[Any] = []
+        node.create_subscription(kind, topic, received.append, qos)
+        return received
