@@ -37,6 +37,7 @@ from needle_dynamics import (
     NeedleModel,
     NeedleParameters,
 )
+from needle_dynamics.compiled.cache import announce_compilation
 from needle_dynamics.model_node import ModelNode
 from needle_dynamics.simulated.plant import joint_values
 from needle_ros.base_node import COMMAND, run, SENSOR
@@ -639,6 +640,7 @@ class ControllerNode(ModelNode):
 
 def main() -> int:
     """Run the node; return its exit status."""
+    announce_compilation()
     return run(ControllerNode)
 
 

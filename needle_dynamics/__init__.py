@@ -4,14 +4,15 @@ Mathematics of a flexible needle in soft tissue, and the plant node around it.
 Units are SI throughout; signs and frames are those of docs/architecture.md.
 """
 
-from needle_dynamics.compiled.kernels import FloatArray
+from needle_dynamics.arrays import FloatArray
+from needle_dynamics.compiled.integrals import ModeIntegrals
 from needle_dynamics.errors import (
     InsertedLengthError,
     ToleranceError,
 )
 from needle_dynamics.friction import Friction, FRICTION_LAWS
 from needle_dynamics.model import NeedleModel
-from needle_dynamics.modes import mode_shapes, ModeIntegrals, ModeShapes
+from needle_dynamics.modes import mode_shapes, ModeShapes
 from needle_dynamics.parameters import FORMULATIONS, NeedleParameters, PRESETS
 from needle_dynamics.simulated.force_sensor import ForceSensor, ForceSensorParameters
 from needle_dynamics.simulated.indenter import Indenter, IndenterParameters

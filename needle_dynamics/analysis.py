@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 from math import exp, inf, isfinite, tanh
 from typing import Final
 
-from needle_dynamics.compiled.kernels import FloatArray
+from needle_dynamics.arrays import FloatArray
 from needle_dynamics.friction import Friction
 from needle_dynamics.model import NeedleModel
 from needle_dynamics.parameters import NeedleParameters

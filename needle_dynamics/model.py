@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from math import isfinite
 from typing import Final
 
-from needle_dynamics.compiled.kernels import FloatArray
+from needle_dynamics.arrays import FloatArray
 from needle_dynamics.errors import (
     InsertedLengthError,
 )

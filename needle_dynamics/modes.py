@@ -11,22 +11,24 @@ small enough at any s: one Horner pass gives all of them.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache, cached_property, lru_cache
+from functools import cached_property, lru_cache
 from math import cos, cosh, factorial, pi
 from typing import Final
 
-from needle_dynamics.compiled.kernels import (
-    evaluate,
-    evaluate_many,
-    FloatArray,
+from needle_dynamics.arrays import FloatArray
+from needle_dynamics.compiled.integrals import (
+    mode_integrals,
+    ModeIntegrals,
+    ModeTables,
     SERIES_END,
     TERMS_PER_LENGTH,
 )
+from needle_dynamics.compiled.kernels import evaluate, evaluate_many
 from needle_ros.errors import (
     ParameterError,
 )
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.optimize import brentq
 
 #: The first term that a series leaves out is below this part of the sum.
@@ -263,9 +265,7 @@ class ModeShapes:
             If ``depth`` is outside that range.
 
         """
-        high = self.reach * self.length
-        if not 0.0 <= depth <= high:
-            raise ParameterError(f'inserted length must be in [0, {high:g}] m, got {depth!r}')
+        self._check(depth)
         n = self.count
         out = np.empty(n * (n + 1) + 4 * n)
         work = np.empty(self.series.shape[1] + 4 * n)
@@ -303,46 +303,22 @@ class ModeShapes:
             If ``depth`` is outside that range.
 
         """
-        packed, n = self.packed(depth), self.count
-        pairs = n * (n + 1) // 2
-        upper = _upper(n)
-        gram, curvature_gram = np.empty((n, n)), np.empty((n, n))
-        for matrix, start in ((gram, 0), (curvature_gram, pairs)):
-            matrix[upper] = packed[start : start + pairs]
-            matrix.T[upper] = matrix[upper]
-        value, curvature, area, moment = packed[2 * pairs :].reshape(4, n)
-        return ModeIntegrals(gram, curvature_gram, value, curvature, area, moment)
+        n, tables = self.count, self.tables
+        self._check(depth)
+        grams, rows = np.empty((2, n, n)), np.empty((4, n))
+        at = ModeIntegrals(grams[0], grams[1], rows[0], rows[1], rows[2], rows[3])
+        mode_integrals(tables, float(depth), np.empty(self.series.shape[1] + 4 * n), at)
+        return at
 
+    @cached_property
+    def tables(self) -> ModeTables:
+        """What the compiled evaluation of the modes takes."""
+        return ModeTables(self.length, self.series, self.terms, self.constants)
 
-@cache
-def _upper(n: int) -> tuple[NDArray[np.intp], ...]:
-    return np.triu_indices(n)
-
-
-@dataclass(frozen=True, slots=True)
-class ModeIntegrals:
-    """
-    The modes at the tip and their integrals over the inserted part 0 <= y <= s.
-
-    Attributes
-    ----------
-    gram : ndarray, shape (n, n)
-        G(s), the integral of phi phi^T [1].
-    curvature_gram : ndarray, shape (n, n)
-        H(s), the integral of phi'' phi''^T [m^-4].
-    value, curvature : ndarray, shape (n,)
-        phi(s) [m^-1/2] and phi''(s) [m^-5/2].
-    area, moment : ndarray, shape (n,)
-        Integrals of phi [m^1/2] and of y phi [m^3/2].
-
-    """
-
-    gram: FloatArray
-    curvature_gram: FloatArray
-    value: FloatArray
-    curvature: FloatArray
-    area: FloatArray
-    moment: FloatArray
+    def _check(self, depth: float) -> None:
+        high = self.reach * self.length
+        if not 0.0 <= depth <= high:
+            raise ParameterError(f'inserted length must be in [0, {high:g}] m, got {depth!r}')
 
 
 @lru_cache(maxsize=32)

@@ -12,6 +12,7 @@ from typing import Any
 from builtin_interfaces.msg import Time as TimeMessage
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import Point, PointStamped, Pose, PoseArray, PoseStamped, WrenchStamped
+from needle_dynamics.compiled.cache import announce_compilation
 from needle_dynamics.model_node import ModelNode
 from needle_dynamics.simulated.assembly import assemble, MODES
 from needle_dynamics.simulated.faults import Fault, FaultParameters, FAULTS
@@ -609,6 +610,7 @@ class PlantNode(ModelNode):
 
 def main() -> int:
     """Run the node; return its exit status."""
+    announce_compilation()
     return run(PlantNode)
 
 

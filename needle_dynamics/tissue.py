@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from itertools import pairwise
 from math import expm1, inf
 
-from needle_dynamics.compiled.kernels import FloatArray
+from needle_dynamics.arrays import FloatArray
+from needle_dynamics.compiled.tissue import Layers
 from needle_dynamics.modes import ModeShapes
 from needle_ros.errors import (
     ParameterError,
@@ -111,6 +112,31 @@ class Tissue:
             step = self.stiffnesses[m - 1] - self.stiffnesses[m]
             offsets[m] = offsets[m - 1] + step * above
         return offsets
+
+    def layers(self, modes: ModeShapes) -> Layers:
+        """
+        Return the layers with what those above each of them add, for compiled functions.
+
+        Parameters
+        ----------
+        modes : ModeShapes
+            Shape modes.
+
+        Returns
+        -------
+        Layers
+            Arrays of the layers.
+
+        """
+        n, m = modes.count, len(self.starts)
+        gram, area, moment = np.zeros((m, n, n)), np.zeros((m, n)), np.zeros((m, n))
+        for i in range(1, m):
+            at = modes.integrals(min(self.starts[i], modes.reach * modes.length))
+            step = self.stiffnesses[i - 1] - self.stiffnesses[i]
+            gram[i] = gram[i - 1] + step * at.gram
+            area[i] = area[i - 1] + step * at.area
+            moment[i] = moment[i - 1] + step * at.moment
+        return Layers(np.array(self.starts), np.array(self.stiffnesses), gram, area, moment)
 
     def matrix(self, modes: ModeShapes, depth: float, time: float = 0.0) -> FloatArray:
         """

@@ -11,6 +11,7 @@ from typing import Any, ClassVar, Final
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import WrenchStamped
+from needle_dynamics.compiled.cache import announce_compilation
 from needle_identification.bags.bag import check_distinct
 from needle_identification.estimation.estimate import Statistic, statistic
 from needle_identification.friction.fit import (
@@ -484,6 +485,7 @@ def _sentence(found: Sequence[Statistic]) -> str:
 
 def main() -> int:
     """Run the node."""
+    announce_compilation()
     return run(IdentificationNode)
 
 

@@ -56,6 +56,10 @@ def _run(words: list[str]) -> int:
     chosen = next((word for word in words if not word.startswith('-')), '')
     command = import_module(f'needle_insertion.commands.{chosen}') if chosen in COMMANDS else None
     options = _parser(chosen, command).parse_args(_joined(words, getattr(command, 'SIGNED', ())))
+    if command is not None:
+        from needle_dynamics.compiled.cache import announce_compilation
+
+        announce_compilation()
     try:
         # From here on a signal must clean up: it ends the nodes that the command has started.
         for name in _SIGNALS:

@@ -16,7 +16,8 @@ from __future__ import annotations
 
 from math import cos, exp, pi, sin, sqrt
 
-from needle_dynamics.compiled.kernels import compiled, FloatArray
+from needle_dynamics.arrays import FloatArray
+from needle_dynamics.compiled.cache import compiled
 
 # Slots of `fixed`.
 DENSITY, BENDING, DAMPING, PRINTED, LENGTH = 0, 1, 2, 3, 4

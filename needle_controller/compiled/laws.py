@@ -7,11 +7,10 @@ place: the same functions serve the node and compiled loops over thousands of ru
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import cast, Final, TypeAlias, TypeVar
+from typing import Final, TypeAlias
 
-from needle_dynamics import FloatArray
-import numba
+from needle_dynamics.arrays import FloatArray
+from needle_dynamics.compiled.cache import compiled
 import numpy as np
 
 #: Laws by number.
@@ -52,14 +51,6 @@ MEMORY: Final = 3
 
 #: Position and speed, and those wanted with the acceleration.
 Instant: TypeAlias = tuple[float, float, float, float, float]
-
-_Function = TypeVar('_Function', bound=Callable[..., object])
-
-
-def compiled(function: _Function) -> _Function:
-    """Compile a function to machine code at its first call and keep it on disk."""
-    # error_model: divide as C does. nogil: batches run in threads.
-    return cast(_Function, numba.njit(cache=True, error_model='numpy', nogil=True)(function))
 
 
 @compiled

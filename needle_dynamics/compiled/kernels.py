@@ -7,15 +7,12 @@ changes, but not when that of a function which it calls does.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from math import ceil, cos, exp, expm1, inf, log1p, nan, sin, sqrt, tanh
-from typing import cast, Final, NamedTuple, TypeAlias, TypeVar
+from typing import Final, NamedTuple
 
-import numba
+from needle_dynamics.arrays import FloatArray
+from needle_dynamics.compiled.cache import compiled
 import numpy as np
-from numpy.typing import NDArray
-
-FloatArray: TypeAlias = NDArray[np.float64]
 
 #: Friction laws by number: set-valued Coulomb, set-valued Stribeck, smooth tanh.
 COULOMB: Final = 0
@@ -47,15 +44,6 @@ SUM_CONTACT: Final = 8
 #: Integral of the curvature at the tip.
 SUM_BEND: Final = 9
 SUMS: Final = 10
-
-_Function = TypeVar('_Function', bound=Callable[..., object])
-
-
-def compiled(function: _Function) -> _Function:
-    """Compile a function to machine code at its first call and keep it on disk."""
-    # error_model: divide as C does; every divisor below is positive by construction.
-    # nogil: batches run in threads.
-    return cast(_Function, numba.njit(cache=True, error_model='numpy', nogil=True)(function))
 
 
 class Constants(NamedTuple):

@@ -6,7 +6,8 @@ from collections import deque
 from dataclasses import dataclass, field, fields
 from typing import Final
 
-from needle_dynamics.compiled.kernels import FloatArray, sense, straight
+from needle_dynamics.arrays import FloatArray
+from needle_dynamics.compiled.kernels import sense, straight
 from needle_ros.errors import (
     JobError,
     ParameterError,

@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields
 from itertools import pairwise
 from math import hypot
 
-from needle_dynamics.compiled.kernels import FloatArray
+from needle_dynamics.arrays import FloatArray
 from needle_dynamics.simulated.force_sensor import ForceSensor
 from needle_dynamics.simulated.plant import AT_REST, check_times, joint_values, on_grid
 from needle_ros.errors import (

@@ -28,10 +28,10 @@ from math import copysign, inf, isfinite, isnan, sqrt
 import os
 from typing import Final
 
+from needle_dynamics.arrays import FloatArray
 from needle_dynamics.compiled.kernels import (
     advance,
     Constants,
-    FloatArray,
     run,
     SUM_CONTACT,
     SUM_DAMPING_WORK,

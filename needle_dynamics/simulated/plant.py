@@ -10,7 +10,7 @@ from math import ceil, copysign, inf, sqrt
 from statistics import fmean
 from typing import Final, NamedTuple
 
-from needle_dynamics.compiled.kernels import FloatArray
+from needle_dynamics.arrays import FloatArray
 from needle_dynamics.friction import Friction
 from needle_dynamics.simulated.force_sensor import ForceSensor
 from needle_dynamics.simulated.integrators import Integrator, Interval

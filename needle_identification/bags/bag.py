@@ -27,7 +27,7 @@ from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Channel, Schema, Statistics
 from mcap.writer import CompressionType, Writer
-from needle_dynamics.compiled.kernels import compiled
+from needle_dynamics.compiled.cache import compiled
 from needle_identification.bags.sqlite import sqlite_batches
 from needle_identification.bags.storage import (
     Batch,

@@ -17,7 +17,7 @@ from math import ceil, inf, isfinite
 from typing import Any, Final, NamedTuple
 
 from needle_dynamics import ForceSensor, NeedleError, NeedleModel, ParameterError
-from needle_dynamics.compiled.kernels import FloatArray
+from needle_dynamics.arrays import FloatArray
 from needle_dynamics.simulated.indenter import Indenter, Press
 from needle_dynamics.simulated.plant import Plant, Sample, TipReading
 from needle_insertion.replay.recorded_run import (

@@ -1,0 +1,169 @@
+"""
+Normal modes of the inserted part at a frozen depth.
+
+In their coordinates a, with q = N a, the modal mass is the identity and the stiffness is diagonal:
+N^T rho A G N = 1 and N^T (E I_y H + k_a G) N = omega^2.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from needle_dynamics.arrays import FloatArray
+from needle_dynamics.compiled.cache import compiled
+from needle_dynamics.compiled.integrals import ModeIntegrals
+from needle_dynamics.compiled.matrices import backward, cholesky, diagonalize, forward
+from needle_dynamics.compiled.tissue import Layers
+import numpy as np
+
+
+class NormalModes(NamedTuple):
+    """
+    Normal modes of the inserted part.
+
+    Attributes
+    ----------
+    shapes : ndarray, shape (n, n)
+        N, one mode per column [kg^-1/2 m^1/2]: q = N a. Generalized forces and
+        values at the tip go the other way: N^T Q and N^T phi belong to a.
+    inverse : ndarray, shape (n, n)
+        N^-1: a = N^-1 q. Momenta are p = N^-T a_dot.
+    squares : ndarray, shape (n,)
+        Squares of the natural frequencies [1/s^2], ascending.
+    factor : ndarray, shape (n, n)
+        Lower Cholesky factor of the modal mass rho A G.
+
+    """
+
+    shapes: FloatArray
+    inverse: FloatArray
+    squares: FloatArray
+    factor: FloatArray
+
+
+@compiled
+def empty_normal_modes(n: int) -> NormalModes:
+    """
+    Return arrays for the normal modes of a needle with n modes.
+
+    Parameters
+    ----------
+    n : int
+        Number of modes.
+
+    Returns
+    -------
+    NormalModes
+        Arrays of zeros.
+
+    """
+    return NormalModes(np.zeros((n, n)), np.zeros((n, n)), np.zeros(n), np.zeros((n, n)))
+
+
+@compiled
+def modal_stiffness(
+    bending: float,
+    at: ModeIntegrals,
+    stiffness: float,
+    growth: float,
+    layers: Layers,
+    layer: int,
+    out: FloatArray,
+) -> None:
+    """
+    Write the modal stiffness of needle and tissue, E I_y H plus the integral of k phi phi^T.
+
+    Parameters
+    ----------
+    bending : float
+        Bending stiffness E I_y [N m^2].
+    at : ModeIntegrals
+        Modes and their integrals at the inserted length.
+    stiffness : float
+        Stiffness of the tissue at the tip, grown by swelling [N/m^2].
+    growth : float
+        Factor by which the tissue has grown stiffer by swelling.
+    layers : Layers
+        Layers of tissue.
+    layer : int
+        Layer that holds the tip.
+    out : ndarray, shape (n, n)
+        Overwritten [N/m for modal coordinates in m^3/2].
+
+    """
+    n = out.shape[0]
+    for i in range(n):
+        for j in range(n):
+            tissue = stiffness * at.gram[i, j] + growth * layers.gram[layer, i, j]
+            out[i, j] = bending * at.curvature_gram[i, j] + tissue
+
+
+@compiled
+def normal_modes(
+    density: float, at: ModeIntegrals, stiffness: FloatArray, modes: NormalModes
+) -> None:
+    """
+    Find the normal modes of the pair (stiffness, rho A G).
+
+    Parameters
+    ----------
+    density : float
+        Mass per length rho A [kg/m].
+    at : ModeIntegrals
+        Modes and their integrals at the inserted length.
+    stiffness : ndarray, shape (n, n)
+        Modal stiffness, as from `modal_stiffness`; destroyed.
+    modes : NormalModes
+        Overwritten.
+
+    """
+    n = stiffness.shape[0]
+    factor, mass = modes.factor, modes.inverse
+    for i in range(n):
+        for j in range(n):
+            mass[i, j] = density * at.gram[i, j]
+    cholesky(mass, factor)
+    # L^-1 K L^-T, by columns and then by rows.
+    for i in range(n):
+        forward(factor, stiffness[:, i])
+    for i in range(n):
+        forward(factor, stiffness[i])
+    for i in range(n):
+        for j in range(i):
+            stiffness[i, j] = stiffness[j, i] = 0.5 * (stiffness[i, j] + stiffness[j, i])
+    diagonalize(stiffness, modes.shapes)
+    for k in range(n):
+        modes.squares[k] = stiffness[k, k]
+        for i in range(n):
+            value = 0.0
+            for j in range(i + 1):
+                value += modes.shapes[j, k] * factor[i, j]
+            modes.inverse[k, i] = value
+    for k in range(n):
+        backward(factor, modes.shapes[:, k])
+
+
+@compiled
+def coupling(
+    density: float, bending: float, stiffness: float, bend: float, tip: float, rate: float
+) -> float:
+    """
+    Return the force of the bent needle against insertion, the row of d of N in (13) with its sign.
+
+    Parameters
+    ----------
+    density, bending : float
+        Mass per length rho A [kg/m] and bending stiffness E I_y [N m^2].
+    stiffness : float
+        Stiffness of the tissue at the tip [N/m^2].
+    bend, tip, rate : float
+        Curvature at the tip phi''(s) q [1/m], deflection of the tip phi(s) q [m] and
+        phi(s) q_dot [m/s].
+
+    Returns
+    -------
+    float
+        -N_d [N]: half of E I_y w''^2 + k w^2 - rho A (phi q_dot)^2.
+
+    """
+    return 0.5 * (bending * bend * bend + stiffness * tip * tip - density * rate * rate)

@@ -1,0 +1,98 @@
+"""The damped oscillator, and the first-order lag under a constant force; both exact."""
+
+from __future__ import annotations
+
+from math import cos, exp, expm1, sin, sqrt
+
+from needle_dynamics.compiled.cache import compiled
+
+
+@compiled
+def swing(damping: float, square: float, t: float) -> tuple[float, float, float, float]:
+    """
+    Solve x_ddot + damping x_dot + square x = 0 for a time t, exactly.
+
+    Parameters
+    ----------
+    damping : float
+        Damping [1/s], not negative.
+    square : float
+        Square of the undamped natural frequency [1/s^2], positive.
+    t : float
+        Time [s].
+
+    Returns
+    -------
+    pp, pv, vp, vv : float
+        Response to the position x and velocity v before: the position after t is pp x + pv v and
+        the velocity vp x + vv v; pp and vv [1], pv [s], vp [1/s].
+
+    """
+    half = 0.5 * damping
+    apart = square - half * half
+    if apart >= 0.0:
+        w = sqrt(apart)
+        fall = exp(-half * t)
+        pv = fall * (sin(w * t) / w if w > 0.0 else t)
+        pp = fall * cos(w * t) + half * pv
+        return pp, pv, -square * pv, pp - damping * pv
+    # Two real poles, the slow one in a form that does not cancel.
+    r = sqrt(-apart)
+    fast = -(half + r)
+    slow = square / fast
+    pv = exp(slow * t) * -expm1(-2.0 * r * t) / (2.0 * r)
+    return exp(slow * t) - slow * pv, pv, -square * pv, exp(slow * t) + fast * pv
+
+
+@compiled
+def decay_means(x: float) -> tuple[float, float]:
+    """
+    Return the means of an exponential decay, without cancellation at small x.
+
+    Parameters
+    ----------
+    x : float
+        Exponent of the decay over the whole time, not negative.
+
+    Returns
+    -------
+    mean : float
+        Mean of exp(-x r) over r in [0, 1], (1 - exp(-x)) / x.
+    ramp : float
+        Integral over r in [0, 1] of that mean over [0, r] times r, (x - 1 + exp(-x)) / x^2.
+
+    """
+    if x < 1e-4:
+        # Taylor: the next terms are below 1e-13.
+        return 1.0 - x * (0.5 - x / 6.0), 0.5 - x * (1.0 / 6.0 - x / 24.0)
+    mean = -expm1(-x) / x
+    return mean, (1.0 - mean) / x
+
+
+@compiled
+def glide(u: float, a: float, b: float, t: float) -> tuple[float, float]:
+    """
+    Solve u_dot = a - b u for a time t, exactly.
+
+    Parameters
+    ----------
+    u : float
+        Velocity [m/s].
+    a : float
+        Constant acceleration [m/s^2].
+    b : float
+        Damping [1/s], not negative.
+    t : float
+        Time [s].
+
+    Returns
+    -------
+    velocity : float
+        Velocity after t [m/s].
+    displacement : float
+        Distance moved [m].
+
+    """
+    x = b * t
+    mean, ramp = decay_means(x)
+    return u * (1.0 - x * mean) + a * t * mean, t * (u * mean + a * t * ramp)

@@ -1,0 +1,94 @@
+"""Layers of tissue along the needle."""
+
+from __future__ import annotations
+
+from math import inf
+from typing import NamedTuple
+
+from needle_dynamics.arrays import FloatArray
+from needle_dynamics.compiled.cache import compiled
+
+
+class Layers(NamedTuple):
+    """
+    Layers of tissue, and what those above a layer add to the integrals of the modes.
+
+    The tissue holds the needle by k(y) w per length. With the tip in layer m the integrals of
+    k phi phi^T, k phi and k y phi over the inserted part are the stiffness of that layer times
+    the integrals without k, plus row m of ``gram``, ``area`` and ``moment``. All of it grows with
+    the swelling of the tissue.
+
+    Attributes
+    ----------
+    starts : ndarray, shape (m,)
+        Depths at which the layers begin [m], the first 0.
+    stiffnesses : ndarray, shape (m,)
+        Stiffness of each layer per length [N/m^2].
+    gram : ndarray, shape (m, n, n)
+        Addition to the integral of k phi phi^T [N/m^2].
+    area, moment : ndarray, shape (m, n)
+        Additions to the integrals of k phi [N m^-3/2] and k y phi [N m^-1/2].
+
+    """
+
+    starts: FloatArray
+    stiffnesses: FloatArray
+    gram: FloatArray
+    area: FloatArray
+    moment: FloatArray
+
+
+@compiled
+def layer_at(starts: FloatArray, depth: float, layer: int = 0) -> int:
+    """
+    Return the layer that holds a depth.
+
+    Parameters
+    ----------
+    starts : ndarray, shape (m,)
+        As in `Layers`.
+    depth : float
+        Distance from the entry point [m].
+    layer : int
+        Layer from which to search.
+
+    Returns
+    -------
+    int
+        Number of the layer. At a border it is the lower layer.
+
+    """
+    while layer + 1 < starts.shape[0] and depth >= starts[layer + 1]:
+        layer += 1
+    while layer > 0 and depth < starts[layer]:
+        layer -= 1
+    return layer
+
+
+@compiled
+def time_to_layer(layers: Layers, depth: float, velocity: float) -> float:
+    """
+    Return the time until the tip reaches the next border between unlike layers.
+
+    Parameters
+    ----------
+    layers : Layers
+        Layers.
+    depth : float
+        Inserted length [m].
+    velocity : float
+        Insertion velocity [m/s].
+
+    Returns
+    -------
+    float
+        Time at that velocity [s]; infinite if there is no border ahead.
+
+    """
+    starts, stiffnesses = layers.starts, layers.stiffnesses
+    soonest = inf
+    for i in range(1, starts.shape[0]):
+        ahead = (starts[i] - depth) / velocity if velocity != 0.0 else inf
+        if 0.0 < ahead < soonest and stiffnesses[i] != stiffnesses[i - 1]:
+            soonest = ahead
+    return soonest
