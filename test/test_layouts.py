@@ -117,7 +117,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Recording:
     return Recording(folder / 'bag')
 
 
-def test_rviz_shows_topics_by_displays_that_take_them(recording):
+def test_rviz_shows_topics_by_displays_that_take_them(recording: Recording) -> None:
     """Each display names a topic of its type, received as it is offered, in a frame of ours."""
     layout = yaml.safe_load((CONFIG / 'insertion.rviz').read_text())['Visualization Manager']
     shown = {}
@@ -144,7 +144,7 @@ def panels(node: Any) -> set[str]:
     return panels(node['first']) | panels(node['second'])
 
 
-def test_foxglove_plots_fields_of_the_recording(recording):
+def test_foxglove_plots_fields_of_the_recording(recording: Recording) -> None:
     """Each path is a number of a recorded topic, and every panel has its place."""
     layout = json.loads((CONFIG / 'insertion.foxglove.json').read_text())
     configuration: Mapping[str, Any] = layout['configById']
@@ -166,7 +166,7 @@ def test_foxglove_plots_fields_of_the_recording(recording):
     assert set(STREAMS) - {'/ground_truth'} <= plotted
 
 
-def test_plotjuggler_finds_every_curve(recording):
+def test_plotjuggler_finds_every_curve(recording: Recording) -> None:
     """Each curve is a number that PlotJuggler makes of the recording, under its name."""
     root = ET.parse(CONFIG / 'insertion.plotjuggler.xml').getroot()  # noqa: S314
     names = [curve.get('name') for curve in root.iter('curve')]
@@ -180,7 +180,7 @@ def test_plotjuggler_finds_every_curve(recording):
 @pytest.mark.parametrize(
     'name', ['/joint_states/insertion/force', '/joint_states/elbow/position', '/tip/point/z']
 )
-def test_a_curve_that_does_not_exist_is_found_out(recording, name):
+def test_a_curve_that_does_not_exist_is_found_out(recording: Recording, name: str) -> None:
     """The check can fail: wrong field, joint or topic."""
     with pytest.raises((AttributeError, KeyError, ValueError)):
         recording.curve(name)

@@ -1,11 +1,13 @@
 """What the tests of this folder share."""
 
+from collections.abc import Iterator
+
 from needle_insertion.paper import figures
 import pytest
 
 
 @pytest.fixture(scope='session', autouse=True)
-def brief_inverse_dynamics():
+def brief_inverse_dynamics() -> Iterator[None]:
     """Run figures 6 and 7 up to what they show; after that d alone goes on as exp(-0.05 t)."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(figures.CLOSED_LOOP, 'inverse_dynamics', 40.0)

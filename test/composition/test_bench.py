@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from math import log1p, sin, sqrt
 from pathlib import Path
+from typing import Any
 
 from benchmarks import (
     batches as bench_batches,
@@ -22,7 +24,8 @@ from benchmarks import (
     step as bench_step,
 )
 from benchmarks.measure import Bar
-from needle_dynamics import NeedleModel, NeedleParameters
+from benchmarks.solvers import OpenLoop
+from needle_dynamics import FloatArray, NeedleModel, NeedleParameters
 from needle_insertion.cli import main
 import numba
 import numpy as np
@@ -34,11 +37,11 @@ FORCE = 3.0
 
 
 @pytest.fixture(scope='module')
-def open_loop():
+def open_loop() -> OpenLoop:
     return bench_solvers.OpenLoop()
 
 
-def states():
+def states() -> Iterator[FloatArray]:
     """States from shallow to deep: under way, withdrawing, at rest under a push that moves it."""
     random = np.random.default_rng(3)
     for depth, speed in ((0.02, 1.0), (0.1, 8.0), (0.199, -0.5), (0.07, 0.0)):
@@ -50,7 +53,9 @@ def states():
 @pytest.mark.parametrize('state', list(states()))
 @pytest.mark.parametrize('preset', ['paper_si', 'phantom'])
 @pytest.mark.parametrize('how', ['compiled', 'gauss', 'quad'])
-def test_every_solver_is_given_the_equations_of_the_model(state, preset, how):
+def test_every_solver_is_given_the_equations_of_the_model(
+    state: FloatArray, preset: str, how: str
+) -> None:
     model = NeedleModel(NeedleParameters.preset(preset))
     if how == 'compiled':
         right_hand_side = bench_solvers.compiled_right_hand_side(model, FORCE)
@@ -65,7 +70,7 @@ def test_every_solver_is_given_the_equations_of_the_model(state, preset, how):
         assert_allclose(right_hand_side(0.0, state), exact, rtol=1e-9, atol=1e-12)
 
 
-def test_a_push_that_friction_holds_does_not_move_any_of_them():
+def test_a_push_that_friction_holds_does_not_move_any_of_them() -> None:
     model = NeedleModel(NeedleParameters.preset('paper_si'))
     state = model.state_at(0.1, 0.0)
     for right_hand_side in (
@@ -75,7 +80,7 @@ def test_a_push_that_friction_holds_does_not_move_any_of_them():
         assert_allclose(right_hand_side(0.0, state), np.zeros(8), atol=1e-15)
 
 
-def test_the_error_of_a_run_is_that_of_its_tip(open_loop):
+def test_the_error_of_a_run_is_that_of_its_tip(open_loop: OpenLoop) -> None:
     run = open_loop.solve('DOP853', 1e-8, 1e-12, open_loop.right_hand_side)
     assert open_loop.error(run.t, run.y) < 1e-6
     wrong = run.y.copy()
@@ -85,14 +90,16 @@ def test_the_error_of_a_run_is_that_of_its_tip(open_loop):
     assert open_loop.error(run.t[:-1], run.y[:, :-1]) == np.inf
 
 
-def test_a_trial_outside_the_range_is_survived(open_loop):
+def test_a_trial_outside_the_range_is_survived(open_loop: OpenLoop) -> None:
     beyond = open_loop.start.copy()
     for remaining in (-1.0, 0.3, np.nan):
         beyond[0] = remaining
         assert open_loop.right_hand_side(0.0, beyond).shape == (8,)
 
 
-def test_our_integrator_meets_the_error_it_is_timed_at(open_loop, monkeypatch):
+def test_our_integrator_meets_the_error_it_is_timed_at(
+    open_loop: OpenLoop, monkeypatch: pytest.MonkeyPatch
+) -> None:
     # A run to each time of the grid: fewer of them tell the same.
     monkeypatch.setattr(bench_solvers, '_GRID', 8.0 * bench_solvers._GRID)
     ours = open_loop.ours(graded=True)
@@ -100,11 +107,11 @@ def test_our_integrator_meets_the_error_it_is_timed_at(open_loop, monkeypatch):
     assert 0 < ours.evaluations < open_loop.steps(2e-5, graded=False)
 
 
-def test_steps_are_counted(open_loop):
+def test_steps_are_counted(open_loop: OpenLoop) -> None:
     assert open_loop.steps(bench_solvers.DURATION / 300, graded=False) == 300
 
 
-def test_batches_do_not_depend_on_the_threads_and_keep_only_what_is_asked_for():
+def test_batches_do_not_depend_on_the_threads_and_keep_only_what_is_asked_for() -> None:
     batches = bench_batches.Batches(40)
     ends = [batches.run(workers).states for workers in (1, 2)]
     assert np.array_equal(*ends)
@@ -115,15 +122,15 @@ def test_batches_do_not_depend_on_the_threads_and_keep_only_what_is_asked_for():
     assert long < 1.5 * short < kept
 
 
-def test_exact_frequency_solves_the_equation_of_the_beam():
+def test_exact_frequency_solves_the_equation_of_the_beam() -> None:
     stiffness, density, foundation, length = 0.0256, 0.01016, 520.0, 0.15
 
-    def beam(y, w, unknown):
+    def beam(y: FloatArray, w: FloatArray, unknown: FloatArray) -> FloatArray:
         # E I w'''' = (rho A omega^2 - k) w, in y / l.
         load = (density * unknown[0] - foundation) * length**4 / stiffness
         return np.vstack([w[1], w[2], w[3], load * w[0]])
 
-    def ends(left, right, _unknown):
+    def ends(left: FloatArray, right: FloatArray, _unknown: FloatArray) -> FloatArray:
         return np.array([left[0], left[1], right[2], right[3], right[0] - 1.0])
 
     y = np.linspace(0.0, 1.0, 41)
@@ -134,13 +141,13 @@ def test_exact_frequency_solves_the_equation_of_the_beam():
     assert (2.0 * np.pi * found) ** 2 == pytest.approx(solution.p[0], rel=1e-6)
 
 
-def test_without_tissue_it_is_the_frequency_of_the_textbooks():
+def test_without_tissue_it_is_the_frequency_of_the_textbooks() -> None:
     # 1.875104... is the first root of cos x cosh x = -1.
     found = bench_rods.beam_frequency(0.2, 2.0, 0.5)
     assert found == pytest.approx(1.8751040687**2 / 0.04 * 2.0 / (2.0 * np.pi), rel=1e-9)
 
 
-def test_frequency_of_a_sinusoid_is_found_beside_a_higher_one():
+def test_frequency_of_a_sinusoid_is_found_beside_a_higher_one() -> None:
     time = np.linspace(0.0, 0.1, 301)
     values = np.cos(250.0 * time + 0.4) + 0.05 * np.sin(1600.0 * time) + 3.0
     found = bench_rods.measured_frequency(time, values, 38.0)
@@ -148,7 +155,7 @@ def test_frequency_of_a_sinusoid_is_found_beside_a_higher_one():
 
 
 @pytest.mark.parametrize('step', [1e-3, 1e-5])
-def test_two_modes_are_within_a_percent_of_the_beam_at_15_cm(step):
+def test_two_modes_are_within_a_percent_of_the_beam_at_15_cm(step: float) -> None:
     assert abs(bench_rods.needle(step).error) < bench_rods.FREQUENCY_ERROR
     error = bench_rods.mode_error(NeedleModel(NeedleParameters.preset('paper_si')))
     # From above, as Rayleigh has it.
@@ -156,17 +163,17 @@ def test_two_modes_are_within_a_percent_of_the_beam_at_15_cm(step):
 
 
 @numba.njit
-def _helper(x):
+def _helper(x: Any) -> Any:
     return log1p(x) * x
 
 
 @numba.njit
-def evaluate(x):
+def evaluate(x: Any) -> Any:
     return x * x + 1.0
 
 
 @numba.njit
-def _arithmetic(x, values, n):
+def _arithmetic(x: Any, values: Any, n: Any) -> Any:
     total = 0.0
     for i in range(n):
         total += values[i] * x
@@ -179,7 +186,7 @@ def _arithmetic(x, values, n):
     return _helper(sin(total)) - 2.0 * x
 
 
-def test_operations_are_counted_as_they_are_done():
+def test_operations_are_counted_as_they_are_done() -> None:
     values = np.array([1.0, 2.0, 3.0])
     counts = bench_step.count_operations(_arithmetic, (2.0, values, 3))
     assert dict(counts) == {
@@ -195,7 +202,7 @@ def test_operations_are_counted_as_they_are_done():
     assert_allclose(values, [1.0, 2.0, 3.0])
 
 
-def test_operations_are_grouped_as_they_are_timed():
+def test_operations_are_grouped_as_they_are_timed() -> None:
     counts = bench_step.operations_of_a_step(20)
     groups = bench_step.grouped(counts)
     # Two modes turn: a sine and a cosine each; the axis glides: one exponential.
@@ -206,14 +213,14 @@ def test_operations_are_grouped_as_they_are_timed():
     assert groups['division'] == counts['divide']
 
 
-def test_a_bar_says_by_what_it_is_missed():
+def test_a_bar_says_by_what_it_is_missed() -> None:
     assert Bar('speed', '>= 100', 150.0, 100.0).verdict == 'met'
     assert Bar('speed', '>= 100', 50.0, 100.0).verdict == 'missed by a factor 2.00'
     assert Bar('cost', '<= 4', 5.0, 4.0, at_least=False).verdict == 'missed by a factor 1.25'
     assert Bar('cost', '<= 4', 3.0, 4.0, at_least=False).verdict == 'met'
 
 
-def test_what_is_not_installed_is_said_and_the_rest_runs(monkeypatch):
+def test_what_is_not_installed_is_said_and_the_rest_runs(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(bench_rods, 'optional', lambda _name: None)
     text, bars = bench_rods.compare(lambda _what: None)
     assert text.count('not installed: pip install needle-insertion[bench]') == 2
@@ -223,12 +230,12 @@ def test_what_is_not_installed_is_said_and_the_rest_runs(monkeypatch):
     assert bench_measure.optional('no_such_tool') is None
 
 
-def test_settings_are_tried_from_loose_to_tight():
+def test_settings_are_tried_from_loose_to_tight() -> None:
     assert_allclose(bench_measure.geometric(1.0, 8.0, 2.0), [1.0, 2.0, 4.0, 8.0])
     assert_allclose(bench_measure.geometric(1.0, 0.1, 0.5), [1.0, 0.5, 0.25, 0.125])
 
 
-def test_jobs_take_turns():
+def test_jobs_take_turns() -> None:
     calls = []
     jobs = {name: (lambda name=name: calls.append(name)) for name in 'ab'}
     times = bench_measure.least_times(jobs, 2)
@@ -239,7 +246,9 @@ def test_jobs_take_turns():
     assert turns == ['a', 'b', 'a', 'b']
 
 
-def test_the_whole_is_one_table_per_question_and_one_of_bars(monkeypatch, capsys):
+def test_the_whole_is_one_table_per_question_and_one_of_bars(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     bars = [Bar('a', '>= 1', 2.0, 1.0), Bar('b', '>= 1', None, 1.0)]
     questions = {'dynamics': (lambda tick: (tick('x') or 'a table', bars),)}
     monkeypatch.setattr(bench, 'QUESTIONS', questions)
@@ -252,7 +261,7 @@ def test_the_whole_is_one_table_per_question_and_one_of_bars(monkeypatch, capsys
     assert bench_measure.NOT_INSTALLED in printed.out
 
 
-def test_a_cable_of_mujoco_converges_to_its_beam():
+def test_a_cable_of_mujoco_converges_to_its_beam() -> None:
     mujoco = pytest.importorskip('mujoco')
     libraries = list((Path(mujoco.__file__).parent / 'plugin').glob('*elasticity*'))
     for library in libraries:
@@ -269,7 +278,7 @@ def test_a_cable_of_mujoco_converges_to_its_beam():
     assert errors[1] < 0.6 * errors[0] < 0.012
 
 
-def test_a_rod_of_pyelastica_is_near_its_beam():
+def test_a_rod_of_pyelastica_is_near_its_beam() -> None:
     elastica = pytest.importorskip('elastica')
     _, _, _, exact = bench_rods._section()
     rod = bench_rods._Rod(elastica, 'PositionVerlet', 5, 1.9e-7)

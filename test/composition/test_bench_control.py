@@ -14,11 +14,12 @@ from needle_insertion.cli import main
 from needle_insertion.paper.mismatch import sampled_laws
 import numpy as np
 from numpy.testing import assert_allclose
+import pytest
 
 PHANTOM = NeedleParameters.preset('phantom')
 
 
-def test_the_plain_law_is_ours():
+def test_the_plain_law_is_ours() -> None:
     plain = NumpyInverseDynamics(PHANTOM, InverseDynamicsGains())
     law = sampled_laws(PHANTOM, PERIOD)['inverse_dynamics']
     ours = SampledLoop(law, bench_control.DELAY, 15.0)
@@ -33,7 +34,9 @@ def test_the_plain_law_is_ours():
         assert_allclose(found, expected, rtol=1e-9)
 
 
-def test_every_job_runs_and_has_a_verdict(capsys, monkeypatch):
+def test_every_job_runs_and_has_a_verdict(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(bench_control, '_CALLS', 1)
     monkeypatch.setattr(bench_control, '_ROUNDS', 1)
     assert main(['bench', 'control']) == 0

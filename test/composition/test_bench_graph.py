@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from benchmarks import graph as bench_graph
 from benchmarks.bare import PERIOD, STREAMS
 from benchmarks.graph import Plan
@@ -13,7 +15,9 @@ import pytest
 
 
 @pytest.fixture(scope='module')
-def found(tmp_path_factory):
+def found(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> tuple[Plan, list[str], dict[str, list[dict[str, float]]]]:
     plan = Plan(rounds=1, turn=0.2, recording=1.0, memory=1.0)
     told = []
     folder = tmp_path_factory.mktemp('graph')
@@ -21,7 +25,9 @@ def found(tmp_path_factory):
     return plan, told, camps
 
 
-def test_every_camp_has_every_figure(found):
+def test_every_camp_has_every_figure(
+    found: tuple[Plan, list[str], dict[str, list[dict[str, float]]]],
+) -> None:
     plan, told, camps = found
     assert tuple(camps) == bench_graph.CAMPS
     names = list(camps['needle'][0])
@@ -37,7 +43,7 @@ def test_every_camp_has_every_figure(found):
     assert all(bar.found > 0.0 and not bar.at_least for bar in bars)
 
 
-def test_the_recorder_is_given_what_is_counted(tmp_path):
+def test_the_recorder_is_given_what_is_counted(tmp_path: Path) -> None:
     text, [bar] = bench_graph.record(tmp_path, 1.0)
     assert 'lost' in text
     # What is lost depends on the machine; most of it is there.
@@ -48,14 +54,14 @@ def test_the_recorder_is_given_what_is_counted(tmp_path):
         assert 0 < found.min() < found.max()
 
 
-def test_memory_is_watched_over_time(tmp_path):
+def test_memory_is_watched_over_time(tmp_path: Path) -> None:
     text, [bar] = bench_graph.watch_memory(tmp_path, 1.0, lambda _what: None)
     for name in ('plant', 'controller', 'recorder'):
         assert name in text
     assert bar.what.startswith('growth in 1 s')
 
 
-def write_bag(path, numbers):
+def write_bag(path: Path, numbers: list[int]) -> None:
     """Write one message of a kind, and those of another with given numbers in their stamps."""
     time_of, header = (
         message_type(n) for n in ('builtin_interfaces/msg/Time', 'std_msgs/msg/Header')
@@ -72,7 +78,7 @@ def write_bag(path, numbers):
             bag.write('/tip_deflection', encode(message), 1)
 
 
-def test_numbers_in_a_bag_are_those_of_the_stamps(tmp_path):
+def test_numbers_in_a_bag_are_those_of_the_stamps(tmp_path: Path) -> None:
     expected = [1, 2, 2, 5, 1234]
     write_bag(tmp_path / 'bag', expected)
     numbers = bench_graph.sample_numbers(tmp_path / 'bag')
@@ -80,19 +86,23 @@ def test_numbers_in_a_bag_are_those_of_the_stamps(tmp_path):
     assert all(len(others) == 0 for others in numbers.values())
 
 
-def test_losses_are_what_is_missing_after_the_first_second():
+def test_losses_are_what_is_missing_after_the_first_second() -> None:
     numbers = {'a': np.array([900, 1001, 1002, 1002, 1004, 1005]), 'b': np.arange(1000, 1006)}
     assert bench_graph.losses(numbers, 1005) == {'a': 1, 'b': 0}
 
 
-def test_a_ratio_is_the_median_of_those_within_rounds():
+def test_a_ratio_is_the_median_of_those_within_rounds() -> None:
     ours = [{'x': 2.0}, {'x': 30.0}, {'x': 3.0}]
     theirs = [{'x': 1.0}, {'x': 10.0}, {'x': 0.0}]
     assert bench_graph.ratio(ours, theirs, 'x') == 2.5
     assert np.isnan(bench_graph.ratio(ours[2:], theirs[2:], 'x'))
 
 
-def test_the_command_prints_tables_and_verdicts(found, monkeypatch, capsys):
+def test_the_command_prints_tables_and_verdicts(
+    found: tuple[Plan, list[str], dict[str, list[dict[str, float]]]],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     camps = found[2]
     lost = Bar('messages lost', 'none', 0.0, 0.0, at_least=False)
     grown = Bar('growth', '<= 2', 3.0, 2.0, at_least=False)
@@ -109,7 +119,7 @@ def test_the_command_prints_tables_and_verdicts(found, monkeypatch, capsys):
         assert line.split('  ')[-1] == verdict
 
 
-def test_nothing_lost_is_met_and_anything_is_not():
+def test_nothing_lost_is_met_and_anything_is_not() -> None:
     verdicts = [Bar('lost', 'none', n, 0.0, at_least=False).verdict for n in (0.0, 1.0)]
     assert verdicts[0] == 'met'
     assert verdicts[1].startswith('missed')

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from math import nan, pi
+from pathlib import Path
 
 from benchmarks import calibration as bench_calibration
 from benchmarks import identification as bench_identification
@@ -19,30 +20,39 @@ from scipy.linalg import toeplitz
 
 
 @pytest.fixture(scope='module')
-def friction():
+def friction() -> list[list[Found]]:
     return [bench_calibration.friction(1, number) for number in range(2)]
 
 
 @pytest.fixture(scope='module')
-def stiffness():
+def stiffness() -> list[Found]:
     return bench_calibration.stiffness(1, 0)
 
 
 @pytest.fixture(scope='module')
-def bag(tmp_path_factory):
+def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp('bag') / 'strokes'
     bench_identification.write_bag(path, 5000)
     return path
 
 
-def found(value, low, high, *, truth=1.0, bound=1.0, unit='N', case='a'):
+def found(
+    value: float,
+    low: float,
+    high: float,
+    *,
+    truth: float = 1.0,
+    bound: float = 1.0,
+    unit: str = 'N',
+    case: str = 'a',
+) -> Found:
     return Found(case, 'x', unit, truth, bound, value, 0.5, low, high)
 
 
 # The bag and its readers.
 
 
-def test_the_bag_holds_the_friction_it_was_made_with(bag):
+def test_the_bag_holds_the_friction_it_was_made_with(bag: Path) -> None:
     recording = read_friction_recording(bag)
     assert recording.losses == ()
     assert_allclose(np.diff(recording.time), 1.0 / 250.0, rtol=1e-6)
@@ -55,13 +65,13 @@ def test_the_bag_holds_the_friction_it_was_made_with(bag):
         assert abs(estimate[name].value - true) < 5.0 * estimate[name].error
 
 
-def test_bags_of_any_length_have_as_many_messages_as_asked_for(tmp_path):
+def test_bags_of_any_length_have_as_many_messages_as_asked_for(tmp_path: Path) -> None:
     # More than one block of messages is made of.
     bench_identification.write_bag(tmp_path / 'bag', 2**16 + 3)
     assert set(message_counts(tmp_path / 'bag').values()) == {2**16 + 3}
 
 
-def test_rosbags_takes_the_numbers_that_we_do(bag, monkeypatch):
+def test_rosbags_takes_the_numbers_that_we_do(bag: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     taken = {}
     monkeypatch.setattr(bench_identification, '_arrays', taken.update)
     bench_identification.any_reader(bag)
@@ -72,7 +82,9 @@ def test_rosbags_takes_the_numbers_that_we_do(bag, monkeypatch):
     assert_allclose(motion[:, 1:].T, [recording.depth, recording.speed], rtol=1e-12)
 
 
-def test_mcap_ros2_support_takes_the_numbers_that_we_do(bag, monkeypatch):
+def test_mcap_ros2_support_takes_the_numbers_that_we_do(
+    bag: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     pytest.importorskip('mcap_ros2.reader')
     taken = {}
     monkeypatch.setattr(bench_identification, '_arrays', taken.update)
@@ -80,19 +92,21 @@ def test_mcap_ros2_support_takes_the_numbers_that_we_do(bag, monkeypatch):
     assert_allclose(np.array(taken['/base_wrench'])[:, 1], read_friction_recording(bag).force)
 
 
-def test_a_process_of_its_own_tells_its_time_and_memory(bag):
+def test_a_process_of_its_own_tells_its_time_and_memory(bag: Path) -> None:
     figures = bench_identification.measured('needle_identification', bag, bag, 1)
     assert figures['seconds'] > 0.0
     # NumPy alone takes 10 MB.
     assert 1e7 < figures['before'] <= figures['memory'] < 1e10
 
 
-def test_what_is_not_installed_is_said_and_the_rest_is_compared(monkeypatch):
+def test_what_is_not_installed_is_said_and_the_rest_is_compared(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(bench_identification, 'optional', lambda _name: None)
     monkeypatch.setattr(bench_identification, 'LONGER', (1, 2))
     asked = []
 
-    def measured(reader, warm, path, repeats):
+    def measured(reader: str, warm: Path, path: Path, repeats: int) -> dict[str, float]:
         asked.append((reader, path.name))
         speed = 1.0 if reader == 'needle_identification' else 4.0
         return {'seconds': speed, 'memory': 2e8, 'before': 1e8}
@@ -113,7 +127,7 @@ def test_what_is_not_installed_is_said_and_the_rest_is_compared(monkeypatch):
 # Coverage and bounds.
 
 
-def test_the_noise_of_readings_is_that_of_the_sensor():
+def test_the_noise_of_readings_is_that_of_the_sensor() -> None:
     parameters = ForceSensorParameters(force_noise=(0.01, 0.05, 0.02))
     wrenches = np.zeros((20_000, 6))
     sensor = bench_calibration.ForceSensor(parameters, bench_calibration.RATE, 3)
@@ -124,7 +138,7 @@ def test_the_noise_of_readings_is_that_of_the_sensor():
     assert_allclose(measured, expected[:5], atol=4.0 / np.sqrt(20_000) * expected[0])
 
 
-def test_information_is_that_of_the_samples_that_are_used():
+def test_information_is_that_of_the_samples_that_are_used() -> None:
     rng = np.random.default_rng(2)
     x, noise = rng.standard_normal((40, 2)), np.array([2.0, 0.7, 0.2])
     used = rng.random(40) < 0.7
@@ -133,7 +147,7 @@ def test_information_is_that_of_the_samples_that_are_used():
     assert_allclose(bench_calibration.information(x, noise, used), expected, rtol=1e-12)
 
 
-def test_no_filter_delays_nothing_and_two_delay_by_their_cutoffs():
+def test_no_filter_delays_nothing_and_two_delay_by_their_cutoffs() -> None:
     assert bench_calibration.sensor_lag(ForceSensorParameters(filter=0)) == 0.0
     # A Butterworth filter of second order delays by sqrt(2) / (2 pi f).
     expected = np.sqrt(2.0) / (2.0 * pi) * (1.0 / 500.0 + 1.0 / 125.0)
@@ -141,7 +155,7 @@ def test_no_filter_delays_nothing_and_two_delay_by_their_cutoffs():
     assert bench_calibration.sensor_lag(ForceSensorParameters()) == pytest.approx(expected, 0.02)
 
 
-def test_the_bound_of_friction_is_the_textbook_one_for_white_noise():
+def test_the_bound_of_friction_is_the_textbook_one_for_white_noise() -> None:
     needle = NeedleParameters.preset('phantom')
     sensor = ForceSensorParameters(filter=0, force_resolution=0.0)
     motion = bench_calibration.insertion(needle)
@@ -154,7 +168,7 @@ def test_the_bound_of_friction_is_the_textbook_one_for_white_noise():
     assert_allclose([truth[name][1] for name in names], expected, rtol=1e-9)
 
 
-def test_the_bound_of_a_matrix_turns_with_it():
+def test_the_bound_of_a_matrix_turns_with_it() -> None:
     tissue, sensor = IndenterParameters(), ForceSensorParameters()
     one = bench_calibration.stiffness_truth(
         np.array([[900.0, 20.0], [-40.0, 600.0]]), 1.3, sensor, tissue
@@ -170,13 +184,13 @@ def test_the_bound_of_a_matrix_turns_with_it():
         assert one[name][1] == pytest.approx(other[name][1], rel=1e-5)
 
 
-def test_the_same_seed_gives_the_same_study(friction):
+def test_the_same_seed_gives_the_same_study(friction: list[list[Found]]) -> None:
     again = np.array([one[3:] for one in bench_calibration.friction(1, 0)])
     assert np.array_equal(again, np.array([one[3:] for one in friction[0]]), equal_nan=True)
     assert friction[0][0].truth != friction[1][0].truth
 
 
-def test_every_case_reports_what_it_is_about(friction):
+def test_every_case_reports_what_it_is_about(friction: list[list[Found]]) -> None:
     by_case = {}
     for one in friction[0]:
         by_case.setdefault(one.case, set()).add(one.name)
@@ -200,20 +214,20 @@ def test_every_case_reports_what_it_is_about(friction):
     assert {one.case for one in friction[1]} == {'(15)'}
 
 
-def test_estimates_are_near_the_truth(friction, stiffness):
+def test_estimates_are_near_the_truth(friction: list[list[Found]], stiffness: list[Found]) -> None:
     for one in (*friction[0], *friction[1], *stiffness):
         # Of a few hundred none is off by four times what 95 % of them are.
         if one.name != 'principal_angle' and np.isfinite(one.value):
             assert abs(one.value - one.truth) < 2.0 * (one.high - one.low), one
 
 
-def test_stiffness_is_reported_by_estimator_and_level(stiffness):
+def test_stiffness_is_reported_by_estimator_and_level(stiffness: list[Found]) -> None:
     cases = {one.case for one in stiffness}
     assert cases == {'K, ordinary', 'K, weighted', 'K, huber', 'K, total'}
     assert sum(one.name == 'k_zz' for one in stiffness) == 4 * 5
 
 
-def test_a_row_counts_what_holds_the_truth_and_what_was_not_determined():
+def test_a_row_counts_what_holds_the_truth_and_what_was_not_determined() -> None:
     [row] = bench_calibration.summarized(
         [
             found(1.5, 0.5, 2.5),
@@ -233,7 +247,7 @@ def test_a_row_counts_what_holds_the_truth_and_what_was_not_determined():
     assert not row.holds
 
 
-def test_directions_half_a_turn_apart_are_the_same():
+def test_directions_half_a_turn_apart_are_the_same() -> None:
     [row] = bench_calibration.summarized(
         [found(-1.5, -1.6, -1.4, truth=1.6, bound=0.01, unit='rad')]
     )
@@ -242,14 +256,16 @@ def test_directions_half_a_turn_apart_are_the_same():
     assert row.bias == pytest.approx(pi - 3.1)
 
 
-def test_processes_give_what_one_gives(friction):
+def test_processes_give_what_one_gives(friction: list[list[Found]]) -> None:
     pairs = list(bench_calibration.studied(bench_calibration.friction, 2, 1, 1))
     assert pairs[1][0] == friction[1][0]
     # Any function of seed and number will do, if other processes can import it.
     assert list(bench_calibration.studied(max, 8, 5, 2)) == [5, 5, 5, 5, 5, 5, 6, 7]
 
 
-def test_the_command_prints_a_table_or_json(monkeypatch, capsys):
+def test_the_command_prints_a_table_or_json(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.setattr(bench_calibration.os, 'cpu_count', lambda: 1)
     studies = {'friction': lambda seed, number: [found(1.5, 0.5, 2.5 + seed + number)]}
     monkeypatch.setattr(bench_calibration, '_STUDIES', studies)
@@ -266,6 +282,8 @@ def test_the_command_prints_a_table_or_json(monkeypatch, capsys):
 
 
 @pytest.mark.parametrize('words', [['--recordings', '1'], ['--seed', '-1']])
-def test_numbers_out_of_range_end_with_2(words, capsys):
+def test_numbers_out_of_range_end_with_2(
+    words: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main(['bench', 'calibration', *words]) == 2
     assert 'must be' in capsys.readouterr().err

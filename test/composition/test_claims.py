@@ -3,17 +3,17 @@
 from dataclasses import replace
 
 from needle_insertion.paper import claims, mismatch
-from needle_insertion.paper.claims import FAILS, HOLDS, ONLY_IF, Tables
+from needle_insertion.paper.claims import Claim, FAILS, HOLDS, ONLY_IF, Tables
 import pytest
 
 
 @pytest.fixture(scope='module')
-def found():
+def found() -> list[Claim]:
     # Its verdicts are those of a thousand needles: what they rest on differs by factors.
     return claims.claims(study=mismatch.study(8))
 
 
-def test_each_claim_has_a_verdict_with_evidence(found):
+def test_each_claim_has_a_verdict_with_evidence(found: list[Claim]) -> None:
     assert len(found) >= 40
     assert len({one.claim for one in found}) == len(found)
     for one in found:
@@ -42,19 +42,19 @@ KNOWN = {
 
 
 @pytest.mark.parametrize('words', KNOWN)
-def test_verdicts_are_those_that_the_equations_give(found, words):
+def test_verdicts_are_those_that_the_equations_give(found: list[Claim], words: str) -> None:
     matching = [one for one in found if words in one.claim]
     assert [one.verdict for one in matching] == [KNOWN[words]]
 
 
-def test_the_section_lists_all(found):
+def test_the_section_lists_all(found: list[Claim]) -> None:
     page = claims.section(found)
     assert len(page.tables[0].rows) == len(found)
     total = sum(int(word) for word in page.paragraphs[0].split() if word.isdigit())
     assert total == 2 * len(found)
 
 
-def test_verdicts_on_tables_follow_what_is_identified():
+def test_verdicts_on_tables_follow_what_is_identified() -> None:
     """A tissue that is a linear spring with little scatter makes the claims of Table 2 hold."""
     even = ((1.0,) * 5, (0.05,) * 5)
     none = ((0.0,) * 5, (0.05,) * 5)

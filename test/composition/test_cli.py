@@ -18,7 +18,7 @@ import yaml
 BAGS = [str(path) for path in sorted(SHIPPED_BAGS.glob('friction_*'))]
 
 
-def test_shipped_bags_give_the_friction_they_were_made_with():
+def test_shipped_bags_give_the_friction_they_were_made_with() -> None:
     """Each recording holds its truth; the errors of all are as large as they claim to be."""
     scores = []
     for bag in BAGS:
@@ -34,7 +34,7 @@ def test_shipped_bags_give_the_friction_they_were_made_with():
     assert max(map(abs, scores)) < 4.5
 
 
-def test_the_result_runs_the_plant(tmp_path):
+def test_the_result_runs_the_plant(tmp_path: Path) -> None:
     """The plant takes the file with --params-file and holds the identified values."""
     file = tmp_path / 'friction.yaml'
     assert main(['identify', 'friction', *BAGS[:2], '-o', str(file)]) == 0
@@ -61,7 +61,13 @@ def test_the_result_runs_the_plant(tmp_path):
     ],
     ids=['missing', 'corrupt', 'empty'],
 )
-def test_bad_bags_end_in_one_line(tmp_path, capsys, what, content, complaint):
+def test_bad_bags_end_in_one_line(
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    what: str,
+    content: bytes | None,
+    complaint: str,
+) -> None:
     """A bag that cannot be read is named in one line, exit status 2, and nothing is written."""
     bag, file = tmp_path / 'bag.mcap', tmp_path / 'result.yaml'
     if content is not None:
@@ -88,7 +94,7 @@ def test_bad_bags_end_in_one_line(tmp_path, capsys, what, content, complaint):
         ['experiment', 'luck'],
     ],
 )
-def test_bad_usage_ends_with_2(words, capsys):
+def test_bad_usage_ends_with_2(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     """Unknown commands and options are refused with the usage."""
     with pytest.raises(SystemExit) as refused:
         main(words)
@@ -96,7 +102,7 @@ def test_bad_usage_ends_with_2(words, capsys):
     assert 'usage: needle' in capsys.readouterr().err
 
 
-def test_the_checksums_of_the_shipped_bags_hold():
+def test_the_checksums_of_the_shipped_bags_hold() -> None:
     """Each file of the shipped recordings is the one that SHA256SUMS names."""
     listed = dict(
         reversed(line.split()) for line in (SHIPPED_BAGS / 'SHA256SUMS').read_text().splitlines()
@@ -120,8 +126,12 @@ def test_the_checksums_of_the_shipped_bags_hold():
     ],
 )
 def test_an_experiment_is_refused_before_anything_is_written(
-    tmp_path, capsys, which, words, complaint
-):
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    which: str,
+    words: list[str],
+    complaint: str,
+) -> None:
     """Bad numbers are named, with exit status 2, and leave no folder behind."""
     assert main(['experiment', which, str(tmp_path / 'out'), *words]) == 2
     assert complaint in capsys.readouterr().err
@@ -129,25 +139,29 @@ def test_an_experiment_is_refused_before_anything_is_written(
 
 
 @pytest.mark.parametrize('output', ['.', '/', ''])
-def test_a_result_needs_the_name_of_a_file(output, capsys):
+def test_a_result_needs_the_name_of_a_file(
+    output: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     """A folder as output is refused in one line."""
     assert main(['identify', 'friction', BAGS[0], '-o', output]) == 2
     assert 'it is not the name of a file' in capsys.readouterr().err
 
 
-def test_a_bag_counts_once(capsys):
+def test_a_bag_counts_once(capsys: pytest.CaptureFixture[str]) -> None:
     """The same recording twice would feign a smaller error: it is refused."""
     assert main(['identify', 'friction', BAGS[0], BAGS[0] + '/']) == 2
     assert 'is given twice' in capsys.readouterr().err
 
 
-def test_a_place_that_cannot_be_written_ends_in_one_line(capsys):
+def test_a_place_that_cannot_be_written_ends_in_one_line(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     """An error of the operating system is told in one line."""
     assert main(['demo', '-o', '/dev/null/demo']) == 2
     assert capsys.readouterr().err.count('\n') == 1
 
 
-def test_a_signal_while_the_command_loads_ends_it_without_a_traceback():
+def test_a_signal_while_the_command_loads_ends_it_without_a_traceback() -> None:
     """Loading takes long enough for who changes their mind."""
     code = """
 import os, signal, sys

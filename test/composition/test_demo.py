@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from math import inf, nan
+from pathlib import Path
 
 from needle_identification import (
     identify_friction,
@@ -30,7 +31,9 @@ import numpy as np
 import pytest
 
 
-def insertion(end=TARGET_DEPTH, peak=TARGET_DEPTH, lag=0.0, complete=1.0) -> Insertion:
+def insertion(
+    end: float = TARGET_DEPTH, peak: float = TARGET_DEPTH, lag: float = 0.0, complete: float = 1.0
+) -> Insertion:
     """Return a made-up insertion."""
     time = np.linspace(0.0, 10.0, 1001)
     aim = np.linspace(0.02, TARGET_DEPTH, 1001)
@@ -57,7 +60,9 @@ def insertion(end=TARGET_DEPTH, peak=TARGET_DEPTH, lag=0.0, complete=1.0) -> Ins
         ({'complete': 1.01}, [True, True, True, False]),
     ],
 )
-def test_an_insertion_is_judged_by_end_overshoot_tracking_and_messages(changes, verdicts):
+def test_an_insertion_is_judged_by_end_overshoot_tracking_and_messages(
+    changes: dict[str, float], verdicts: list[bool]
+) -> None:
     """Each check fails for its own reason and for no other."""
     assert [check.passed for check in insertion_checks(insertion(**changes))] == verdicts
 
@@ -72,7 +77,9 @@ def comparison(value: float, symbol: str = 'k_zz', **changes: object) -> Compari
 
 
 @pytest.mark.parametrize(('missed', 'passed'), [(0, True), (4, True), (5, False), (20, False)])
-def test_shipped_bags_are_judged_by_how_many_intervals_hold_their_truth(missed, passed):
+def test_shipped_bags_are_judged_by_how_many_intervals_hold_their_truth(
+    missed: int, passed: bool
+) -> None:
     """Of 20 at least 16 must, for each parameter on its own."""
     bags = [
         [comparison(111.0 if k < missed else 109.0), comparison(100.0, symbol='k_xx')]
@@ -85,7 +92,7 @@ def test_shipped_bags_are_judged_by_how_many_intervals_hold_their_truth(missed, 
 
 
 @pytest.mark.parametrize(('value', 'passed'), [(119.0, True), (81.0, True), (121.0, False)])
-def test_a_fresh_recording_is_judged_at_its_worst_force(value, passed):
+def test_a_fresh_recording_is_judged_at_its_worst_force(value: float, passed: bool) -> None:
     """Twice the interval decides; what is not determined fails."""
     (check,) = fresh_checks([comparison(100.0), comparison(value), comparison(101.0)])
     assert check.passed == passed
@@ -94,7 +101,7 @@ def test_a_fresh_recording_is_judged_at_its_worst_force(value, passed):
     assert not check.passed
 
 
-def test_estimates_are_compared_with_the_stand_in_of_their_own_bag():
+def test_estimates_are_compared_with_the_stand_in_of_their_own_bag() -> None:
     """Of the first shipped bags every parameter, at every level, is within a few intervals."""
     friction = read_friction_recording(SHIPPED_BAGS / 'friction_01')
     found = friction_comparisons(friction, identify_friction(friction))
@@ -114,7 +121,7 @@ def test_estimates_are_compared_with_the_stand_in_of_their_own_bag():
     assert len(stiffness_figure(press, estimate).axes) == 2
 
 
-def test_a_recording_without_truth_cannot_be_judged():
+def test_a_recording_without_truth_cannot_be_judged() -> None:
     """A bag that does not say what its plant was is no base for a verdict."""
     recording = read_friction_recording(SHIPPED_BAGS / 'friction_01')
     estimate = identify_friction(recording)
@@ -122,7 +129,7 @@ def test_a_recording_without_truth_cannot_be_judged():
         friction_comparisons(replace(recording, configuration=''), estimate)
 
 
-def test_the_demo_removes_nothing_that_is_not_its_own(tmp_path):
+def test_the_demo_removes_nothing_that_is_not_its_own(tmp_path: Path) -> None:
     """A folder that no demo made is left alone."""
     bags, output = tmp_path / 'bags', tmp_path / 'thesis'
     (bags / 'friction_1').mkdir(parents=True)

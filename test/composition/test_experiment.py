@@ -1,5 +1,6 @@
 """The experiments: what they command, what they record, and how they go on after a break."""
 
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from hashlib import sha256
 from pathlib import Path
@@ -7,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from typing import Any
 
 from needle_dynamics import ParameterError
 from needle_dynamics.simulated.indenter import IndenterParameters
@@ -27,13 +29,14 @@ from needle_insertion.experiment.campaign import Campaign
 from needle_insertion.experiment.population import draw_friction, draw_stiffness
 from needle_insertion.experiment.protocol import (
     DIRECTIONS,
+    Protocol,
     PROTOCOLS,
     PUSH,
     SHIPPED_BAGS,
     SPEEDS,
     START_DEPTH,
 )
-from needle_insertion.experiment.record import ExperimentError, record, rig
+from needle_insertion.experiment.record import ExperimentError, record, Rig, rig
 from needle_insertion.paper.tables import FORCE_LEVELS, TABLE_1, TABLE_2
 import numpy as np
 import pytest
@@ -48,12 +51,12 @@ RATE, SPEED = 100.0, 10.0
 
 
 @pytest.mark.parametrize('protocol', PROTOCOLS.values(), ids=PROTOCOLS)
-def test_times_increase(protocol):
+def test_times_increase(protocol: Protocol) -> None:
     """No point is before or at the one before it."""
     assert (np.diff([0.0, *(point.time for point in protocol.points)]) > 0.0).all()
 
 
-def test_strokes_go_both_ways_at_each_speed_and_the_base_can_follow():
+def test_strokes_go_both_ways_at_each_speed_and_the_base_can_follow() -> None:
     """The speed of each stroke is held for most of its time, in and out, and ends at the start."""
     moved = [point for point in FRICTION.points if point.positions]
     times = np.array([point.time for point in moved])
@@ -72,7 +75,7 @@ def test_strokes_go_both_ways_at_each_speed_and_the_base_can_follow():
     assert np.abs(speeds).max() < base.speed_limit
 
 
-def test_the_push_moves_any_needle_that_is_drawn():
+def test_the_push_moves_any_needle_that_is_drawn() -> None:
     """Its force rises from zero to a third more than the largest mu_s of a thousand draws."""
     first, last = (point.effort for point in FRICTION.points if point.effort)
     assert first == (0.0,)
@@ -80,7 +83,7 @@ def test_the_push_moves_any_needle_that_is_drawn():
     assert max(drawn['coulomb_friction'] for drawn in draw_friction(1000, 1)) < 0.75 * PUSH
 
 
-def test_each_level_is_pressed_in_eight_directions_from_rest():
+def test_each_level_is_pressed_in_eight_directions_from_rest() -> None:
     """Forces held have the five magnitudes, evenly around; before and after is no force."""
     forces = np.array([point.effort for point in STIFFNESS.points])
     held = np.flatnonzero((forces[1:] == forces[:-1]).all(axis=1) & forces[1:].any(axis=1))
@@ -94,7 +97,7 @@ def test_each_level_is_pressed_in_eight_directions_from_rest():
     assert np.diff(np.unwrap(angles)) == pytest.approx(2.0 * np.pi / DIRECTIONS, abs=1e-12)
 
 
-def test_a_campaign_draws_around_the_tables_or_takes_their_means():
+def test_a_campaign_draws_around_the_tables_or_takes_their_means() -> None:
     """Runs have the drawn values and a seed each; ``fixed`` gives every run the means."""
     runs = Campaign(protocol=FRICTION, repeats=3, seed=5).runs()
     assert list(runs) == ['friction_01', 'friction_02', 'friction_03']
@@ -113,7 +116,7 @@ def test_a_campaign_draws_around_the_tables_or_takes_their_means():
 
 
 @pytest.mark.parametrize('seed', [0, 2014])
-def test_the_indenter_takes_every_place_that_is_drawn(seed):
+def test_the_indenter_takes_every_place_that_is_drawn(seed: int) -> None:
     """No draw is refused by the stand-in."""
     for run in Campaign(protocol=STIFFNESS, repeats=40, seed=seed).runs().values():
         IndenterParameters(
@@ -126,7 +129,7 @@ def test_the_indenter_takes_every_place_that_is_drawn(seed):
 
 
 @pytest.mark.parametrize('rate', [40.0, 100.0, 333.0, 5000.0])
-def test_the_sensor_suits_any_rate(rate):
+def test_the_sensor_suits_any_rate(rate: float) -> None:
     """The sensor's own rate is a whole multiple of that of the samples."""
     (run,) = Campaign(protocol=FRICTION, repeats=1, rate=rate).runs().values()
     assert run['sensor.rate'] % rate == 0.0
@@ -147,7 +150,9 @@ def test_the_sensor_suits_any_rate(rate):
         (['--speed', 'nan'], '--speed must be in'),
     ],
 )
-def test_bad_numbers_are_refused_before_anything_is_written(tmp_path, capsys, words, complaint):
+def test_bad_numbers_are_refused_before_anything_is_written(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], complaint: str
+) -> None:
     """They are named, with exit status 2, and leave no folder behind."""
     assert main(['experiment', 'friction', str(tmp_path / 'out'), *words]) == 2
     assert complaint in capsys.readouterr().err
@@ -179,7 +184,7 @@ def pretended(folder: Path, configuration: str = '', **changes: object) -> None:
         bag.write('/joint_trajectory', encode(empty), 2)
 
 
-def test_what_is_no_run_of_this_experiment_is_left_alone(tmp_path):
+def test_what_is_no_run_of_this_experiment_is_left_alone(tmp_path: Path) -> None:
     """A file, a folder, other parameters, another trajectory: named, and nothing is recorded."""
     campaign = Campaign(protocol=FRICTION, repeats=1)
     place = tmp_path / 'friction_01'
@@ -207,7 +212,9 @@ def test_what_is_no_run_of_this_experiment_is_left_alone(tmp_path):
 
 
 @pytest.mark.parametrize(('protocol', 'rate'), [(FRICTION, 100.0), (STIFFNESS, 40.0)])
-def test_the_shipped_bags_are_those_of_the_command_that_makes_them(protocol, rate, monkeypatch):
+def test_the_shipped_bags_are_those_of_the_command_that_makes_them(
+    protocol: Protocol, rate: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Parameters and trajectory are as today: the command would record nothing."""
     monkeypatch.delattr(recorder, 'rig')
     bags = record(Campaign(protocol=protocol, rate=rate), SHIPPED_BAGS)
@@ -219,7 +226,7 @@ def digests(folder: Path) -> dict[str, str]:
     return {path.name: sha256(path.read_bytes()).hexdigest() for path in folder.iterdir()}
 
 
-def test_an_interrupted_experiment_goes_on_where_it_was(tmp_path):
+def test_an_interrupted_experiment_goes_on_where_it_was(tmp_path: Path) -> None:
     """Ctrl-C leaves whole bags only; the same call keeps them and records the others."""
     words = ['experiment', 'friction', str(tmp_path), '--repeats', '3']
     words += ['--rate', f'{RATE:g}', '--speed', f'{SPEED:g}']
@@ -264,21 +271,23 @@ def test_an_interrupted_experiment_goes_on_where_it_was(tmp_path):
 
 
 @pytest.fixture(scope='module')
-def stand(tmp_path_factory):
+def stand(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Rig]:
     """Return a rig for presses."""
     with rig(tmp_path_factory.mktemp('rig'), STIFFNESS) as running:
         yield running
 
 
 @pytest.fixture
-def place():
+def place() -> dict[str, float | list[float] | str]:
     """Return the only place of a campaign of presses."""
     campaign = Campaign(protocol=STIFFNESS, repeats=1, rate=RATE)
     (parameters,) = campaign.runs().values()
     return parameters
 
 
-def test_stiffness_is_recorded_press_by_press(tmp_path, stand, place):
+def test_stiffness_is_recorded_press_by_press(
+    tmp_path: Path, stand: Rig, place: dict[str, float | list[float] | str]
+) -> None:
     """The bag of a place gives the matrix that was drawn, at each level."""
     stand.record(tmp_path / 'bag', place, 2.0 * SPEED)
     (drawn,) = draw_stiffness(1, place['seed'])
@@ -291,8 +300,12 @@ def test_stiffness_is_recorded_press_by_press(tmp_path, stand, place):
 
 
 def test_a_run_with_losses_is_done_again_at_half_the_speed_and_then_given_up(
-    tmp_path, monkeypatch, capfd, stand, place
-):
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+    stand: Rig,
+    place: dict[str, float | list[float] | str],
+) -> None:
     """What lacks samples never becomes a bag; the second attempt may."""
     judged, answers = [], iter(['few messages', 'fewer', 'few messages', ''])
 
@@ -321,7 +334,7 @@ def test_a_run_with_losses_is_done_again_at_half_the_speed_and_then_given_up(
     ],
     ids=['whole', 'gaps', 'cut', 'none'],
 )
-def test_losses_are_seen(tmp_path, kept, complaint):
+def test_losses_are_seen(tmp_path: Path, kept: Callable[..., Any], complaint: str) -> None:
     """A bag is whole if the stamps of the sampled topics leave no gaps and reach to the end."""
     header, stamp = (
         message_type('std_msgs/msg/Header'),

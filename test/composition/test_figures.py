@@ -30,14 +30,14 @@ BOUND = NeedleParameters().coulomb_friction / figures.PID_KP
 
 
 @pytest.mark.parametrize('case', CASES)
-def test_all_runs_begin_where_the_paper_says(case):
+def test_all_runs_begin_where_the_paper_says(case: tuple[str, ...]) -> None:
     for run in (open_loop(*case), closed_loop('pid', *case, hub_stop=True)):
         assert_allclose(run.depth[0], DEPTH)
         assert_allclose(run.tip_deflection[0], DEFLECTION)
         assert (run.states[0, 4:] == 0.0).all()
 
 
-def test_the_open_loop_tells_the_readings_and_the_formulations_apart():
+def test_the_open_loop_tells_the_readings_and_the_formulations_apart() -> None:
     # 2 %: the way to the terminal speed and the force of the deflection.
     assert_allclose(hub_time(open_loop('paper_mm', 'complete')), 0.18 * 300.0 / 2.44, rtol=0.02)
     assert 0.028 < hub_time(open_loop('paper_si', 'complete')) < 0.029
@@ -49,7 +49,7 @@ def test_the_open_loop_tells_the_readings_and_the_formulations_apart():
         assert printed > 50.0 * complete
 
 
-def test_the_open_loop_has_converged():
+def test_the_open_loop_has_converged() -> None:
     """The slow runs turn many thousand times; their peaks must not be those of the step."""
     for formulation in ('complete', 'as_printed'):
         run = open_loop('paper_mm', formulation)
@@ -64,7 +64,7 @@ def test_the_open_loop_has_converged():
 
 
 @pytest.mark.parametrize('hub_stop', [False, True])
-def test_inverse_dynamics_leaves_nothing_of_reading_and_formulation(hub_stop):
+def test_inverse_dynamics_leaves_nothing_of_reading_and_formulation(hub_stop: bool) -> None:
     # Of a peak of 100 mm and 30 mm; where the hub is touched differs by the solver's tolerance.
     assert figures.spread('inverse_dynamics', hub_stop=hub_stop) < 1e-4
     for case in CASES:
@@ -76,7 +76,7 @@ def test_inverse_dynamics_leaves_nothing_of_reading_and_formulation(hub_stop):
 
 
 @pytest.mark.parametrize('case', CASES)
-def test_pid_leaves_coulomb_friction_over_its_gain(case):
+def test_pid_leaves_coulomb_friction_over_its_gain(case: tuple[str, ...]) -> None:
     run = closed_loop('pid', *case, hub_stop=True)
     found = Outcome.of(run)
     assert found.final < 1e-8
@@ -86,7 +86,7 @@ def test_pid_leaves_coulomb_friction_over_its_gain(case):
     assert found.deepest < 0.2
 
 
-def test_another_solver_agrees_on_the_pid_run():
+def test_another_solver_agrees_on_the_pid_run() -> None:
     """BDF on the smooth right-hand side: before the end the friction never changes its sign."""
     model = needle('paper_mm', 'complete')
     law = figures.paper_law('pid', model)
@@ -103,7 +103,7 @@ def test_another_solver_agrees_on_the_pid_run():
 
 
 @pytest.mark.parametrize('law', figures.LAWS)
-def test_with_f_y_alone_the_tip_rings_on(law):
+def test_with_f_y_alone_the_tip_rings_on(law: str) -> None:
     for reading in READINGS:
         run = base_alone(law, reading)
         found = Outcome.of(run)
@@ -113,7 +113,7 @@ def test_with_f_y_alone_the_tip_rings_on(law):
         assert_allclose(found.error, modal.error, atol=5e-6)
 
 
-def test_the_moved_base_follows_the_error_equation():
+def test_the_moved_base_follows_the_error_equation() -> None:
     run = base_alone('inverse_dynamics', 'paper_si')
     before = run.time < 1.6
     w = sqrt(1.0 - 0.05**2)
@@ -123,7 +123,7 @@ def test_the_moved_base_follows_the_error_equation():
     assert_allclose(run.states[before, 0], exact, atol=1e-5)
 
 
-def test_every_figure_is_drawn_and_says_what_is_seen():
+def test_every_figure_is_drawn_and_says_what_is_seen() -> None:
     for name, draw in FIGURES.items():
         found = draw()
         assert isinstance(found.picture.figure, Figure)
@@ -132,7 +132,7 @@ def test_every_figure_is_drawn_and_says_what_is_seen():
     assert png(FIGURES['figure-8']().picture.figure) == png(FIGURES['figure-8']().picture.figure)
 
 
-def test_the_section_compares_the_controllers():
+def test_the_section_compares_the_controllers() -> None:
     found = section()
     assert len(found.pictures) == 5
     rows = found.tables[0].rows

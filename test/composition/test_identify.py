@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 import re
 import shutil
+from typing import Any
 
 from needle_identification import TERMS
 from needle_insertion.cli import main
@@ -17,7 +18,7 @@ BAGS = [str(path) for path in sorted(SHIPPED_BAGS.glob('friction_*'))][:4]
 
 
 @pytest.fixture(scope='module')
-def places(tmp_path_factory):
+def places(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
     """Return recordings of presses at two places."""
     folder = tmp_path_factory.mktemp('places')
     for seed in (1, 2):
@@ -25,17 +26,17 @@ def places(tmp_path_factory):
     return [str(folder / f'place_{seed}') for seed in (1, 2)]
 
 
-def identify(capsys, *words, status=0):
+def identify(capsys: pytest.CaptureFixture[str], *words: str, status: int = 0) -> tuple[str, ...]:
     """Run the command; return what it printed and what it warned of."""
     assert main(['identify', *words]) == status
     said = capsys.readouterr()
     return said.out, said.err
 
 
-def as_json(capsys, *words, status=0):
+def as_json(capsys: pytest.CaptureFixture[str], *words: str, status: int = 0) -> dict[str, Any]:
     """Run the command for machines; nothing in its answer is other than standard JSON."""
 
-    def refuse(word):
+    def refuse(word: Any) -> None:
         raise AssertionError(f'{word} is no JSON')
 
     out, _ = identify(capsys, *words, '--json', status=status)
@@ -45,7 +46,9 @@ def as_json(capsys, *words, status=0):
 # Friction.
 
 
-def test_the_tables_hold_every_parameter_with_error_and_interval(capsys):
+def test_the_tables_hold_every_parameter_with_error_and_interval(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     """Over the bags with 95 % interval and STD, and bag by bag; break-away stands beside mu_s."""
     out, _ = identify(capsys, 'friction', *BAGS)
     whole, each = out.split('\n\n')
@@ -64,7 +67,7 @@ def test_the_tables_hold_every_parameter_with_error_and_interval(capsys):
     assert all(bag in each for bag in BAGS)
 
 
-def test_json_names_everything_and_has_no_nan(capsys):
+def test_json_names_everything_and_has_no_nan(capsys: pytest.CaptureFixture[str]) -> None:
     """Statistics and parameters by name, with settings, files and checksums."""
     found = as_json(capsys, 'friction', *BAGS, '--terms', 'coulomb,viscous,offset')
     assert {'coulomb_friction', 'viscous_friction', 'offset'} <= set(found['statistics'])
@@ -82,7 +85,7 @@ def test_json_names_everything_and_has_no_nan(capsys):
     assert found['failures'] == []
 
 
-def test_terms_are_a_list_or_repeated(capsys):
+def test_terms_are_a_list_or_repeated(capsys: pytest.CaptureFixture[str]) -> None:
     """Both ways of writing them mean the same."""
     one = as_json(capsys, 'friction', BAGS[0], '--terms', 'coulomb,viscous,offset')
     two = as_json(capsys, 'friction', BAGS[0], '--terms', 'coulomb', '--terms', 'viscous, offset')
@@ -99,7 +102,9 @@ def test_terms_are_a_list_or_repeated(capsys):
         (['--motion-axis', '-slide'], 'slide'),
     ],
 )
-def test_what_is_not_valid_is_named_in_one_line(capsys, words, complaint):
+def test_what_is_not_valid_is_named_in_one_line(
+    capsys: pytest.CaptureFixture[str], words: list[str], complaint: str
+) -> None:
     """Exit status 2; the line says what was found and what would be valid."""
     out, err = identify(capsys, 'friction', BAGS[0], *words, status=2)
     assert out == ''
@@ -114,7 +119,9 @@ def test_what_is_not_valid_is_named_in_one_line(capsys, words, complaint):
         ['--force-axis=-y', '--motion-axis=-insertion'],
     ],
 )
-def test_signed_axes_are_taken_as_they_are_written(capsys, words):
+def test_signed_axes_are_taken_as_they_are_written(
+    capsys: pytest.CaptureFixture[str], words: list[str]
+) -> None:
     """Force and motion both turned around leave friction what it is."""
     turned = as_json(capsys, 'friction', BAGS[0], *words)['statistics']
     straight = as_json(capsys, 'friction', BAGS[0])['statistics']
@@ -124,13 +131,15 @@ def test_signed_axes_are_taken_as_they_are_written(capsys, words):
         assert turned[name]['mean'] == pytest.approx(straight[name]['mean'], abs=tolerance)
 
 
-def test_a_force_turned_around_is_refused(capsys):
+def test_a_force_turned_around_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
     """Friction that drives is none."""
     _, err = identify(capsys, 'friction', BAGS[0], '--force-axis', '-y', status=2)
     assert 'must not be negative' in err
 
 
-def test_a_bad_bag_among_good_ones_is_named_and_the_others_go_on(capsys, tmp_path):
+def test_a_bad_bag_among_good_ones_is_named_and_the_others_go_on(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
     """The result is that of the others; exit status 2 tells a script that it is not of all."""
     bad, file = str(tmp_path / 'bad.mcap'), tmp_path / 'result.yaml'
     Path(bad).write_bytes(b'not a bag')
@@ -144,7 +153,9 @@ def test_a_bad_bag_among_good_ones_is_named_and_the_others_go_on(capsys, tmp_pat
     assert [bad in line for line in err.splitlines() if line.startswith('error: ')] == [True]
 
 
-def test_nothing_is_written_if_no_bag_can_be_used(capsys, tmp_path):
+def test_nothing_is_written_if_no_bag_can_be_used(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
     """Neither file nor folder, and nothing is printed but the reasons."""
     bad = [str(tmp_path / name) for name in ('one', 'two')]
     file, page = tmp_path / 'result.yaml', tmp_path / 'report'
@@ -154,7 +165,9 @@ def test_nothing_is_written_if_no_bag_can_be_used(capsys, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_what_the_data_do_not_determine_is_said(capsys, tmp_path):
+def test_what_the_data_do_not_determine_is_said(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
     """A single term too many for one speed is no tight number, and not in the file."""
     file = tmp_path / 'result.yaml'
     words = ('friction', BAGS[0], '-o', str(file), '--terms', 'coulomb,viscous,stribeck')
@@ -166,7 +179,9 @@ def test_what_the_data_do_not_determine_is_said(capsys, tmp_path):
     assert all(one['interval'] == [None, None] and one['error'] is None for one in unknown)
 
 
-def test_the_friction_page_shows_what_was_found(capsys, tmp_path):
+def test_the_friction_page_shows_what_was_found(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
     """A person sees figures, pictures and what was read; the page loads nothing from outside."""
     file, folder = tmp_path / 'result.yaml', tmp_path / 'new' / 'report'
     bags = [*BAGS, str(tmp_path / 'missing')]
@@ -192,7 +207,9 @@ def test_the_friction_page_shows_what_was_found(capsys, tmp_path):
     assert pictures == {'friction_data', 'friction_residuals', 'friction_spread'}
 
 
-def test_the_same_recordings_give_the_same_page(capsys, tmp_path):
+def test_the_same_recordings_give_the_same_page(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
     """Byte by byte: pages can be compared, and kept under version control."""
     pages = []
     for _ in range(2):
@@ -202,7 +219,7 @@ def test_the_same_recordings_give_the_same_page(capsys, tmp_path):
     assert pages[0] == pages[1]
 
 
-def test_a_folder_that_cannot_be_made_ends_in_one_line(capsys):
+def test_a_folder_that_cannot_be_made_ends_in_one_line(capsys: pytest.CaptureFixture[str]) -> None:
     """The reason of the operating system, exit status 2."""
     _, err = identify(capsys, 'friction', BAGS[0], '--report', '/dev/null/report', status=2)
     assert '/dev/null/report cannot be written' in err.splitlines()[-1]
@@ -211,7 +228,9 @@ def test_a_folder_that_cannot_be_made_ends_in_one_line(capsys):
 # Stiffness.
 
 
-def test_stiffness_is_told_by_force_as_table_2(capsys, places):
+def test_stiffness_is_told_by_force_as_table_2(
+    capsys: pytest.CaptureFixture[str], places: list[str]
+) -> None:
     """Each entry of the matrix at each force, and k_a at the largest."""
     out, _ = identify(capsys, 'stiffness', *places)
     matrices, intervals, result = out.strip().split('\n\n')
@@ -226,7 +245,9 @@ def test_stiffness_is_told_by_force_as_table_2(capsys, places):
     assert result.startswith('k_a = 5')
 
 
-def test_the_level_of_the_result_can_be_chosen(capsys, places, tmp_path):
+def test_the_level_of_the_result_can_be_chosen(
+    capsys: pytest.CaptureFixture[str], places: list[str], tmp_path: Path
+) -> None:
     """The parameter file holds k_a at that force, over the contact length."""
     file = tmp_path / 'result.yaml'
     words = ('--level', '1.1', '--contact-length', '2', '-o', str(file))
@@ -242,7 +263,9 @@ def test_the_level_of_the_result_can_be_chosen(capsys, places, tmp_path):
     assert 'no level at 3 N' in err
 
 
-def test_the_plane_of_the_presses_can_be_named(capsys, places):
+def test_the_plane_of_the_presses_can_be_named(
+    capsys: pytest.CaptureFixture[str], places: list[str]
+) -> None:
     """Axes in the other order and with a sign turn the matrix accordingly."""
     found = as_json(capsys, 'stiffness', *places, '--axes', '-z,x')['levels'][0]['statistics']
     k = STIFFNESS[1.1]
@@ -252,7 +275,9 @@ def test_the_plane_of_the_presses_can_be_named(capsys, places):
     assert '--axes must name two axes' in err
 
 
-def test_the_stiffness_page_shows_what_was_found(capsys, places, tmp_path):
+def test_the_stiffness_page_shows_what_was_found(
+    capsys: pytest.CaptureFixture[str], places: list[str], tmp_path: Path
+) -> None:
     """A person sees the matrices beside Table 2, whether it is a spring, and the pictures."""
     folder = tmp_path / 'report'
     identify(capsys, 'stiffness', *places, '--report', str(folder))

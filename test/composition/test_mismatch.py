@@ -1,17 +1,18 @@
 """The mismatch study: drawn as stated, converged, and the same each time."""
 
 from needle_insertion.paper import mismatch
+from needle_insertion.paper.mismatch import Mismatch
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest
 
 
 @pytest.fixture(scope='module')
-def found():
+def found() -> Mismatch:
     return mismatch.study(80)
 
 
-def test_needles_are_drawn_independently_within_30_percent(found):
+def test_needles_are_drawn_independently_within_30_percent(found: Mismatch) -> None:
     assert found.factors.min() >= 0.7
     assert found.factors.max() <= 1.3
     # Means of 80 uniform numbers: 3 standard errors of 0.6 / sqrt(12 * 80).
@@ -19,7 +20,7 @@ def test_needles_are_drawn_independently_within_30_percent(found):
     assert np.abs(np.corrcoef(found.factors.T)[np.triu_indices(3, 1)]).max() < 0.4
 
 
-def test_every_run_arrives(found):
+def test_every_run_arrives(found: Mismatch) -> None:
     for batch in found.batches.values():
         assert (batch.completed == batch.completed[0]).all()
         # A tenth of a millimeter: what dry friction can hold against either law.
@@ -27,26 +28,26 @@ def test_every_run_arrives(found):
         assert (batch.rms <= batch.largest).all()
 
 
-def test_the_step_is_fine_enough(found):
+def test_the_step_is_fine_enough(found: Mismatch) -> None:
     fine = mismatch.study(3, step=5e-5)
     for law, batch in fine.batches.items():
         assert_allclose(found.batches[law].largest[:3], batch.largest, atol=1e-9)
 
 
-def test_the_same_seed_gives_the_same_numbers_and_another_one_others(found):
+def test_the_same_seed_gives_the_same_numbers_and_another_one_others(found: Mismatch) -> None:
     again, other = mismatch.study(5), mismatch.study(5, seed=1)
     for law in found.batches:
         assert (again.batches[law].final == found.batches[law].final[:5]).all()
         assert (again.batches[law].final != other.batches[law].final).any()
 
 
-def test_an_exact_model_is_what_the_errors_are_held_against(found):
+def test_an_exact_model_is_what_the_errors_are_held_against(found: Mismatch) -> None:
     for law, nominal in found.nominal.items():
         assert nominal.rms[0] < np.median(found.batches[law].rms) * 1.1
     assert found.nominal['inverse_dynamics'].rms < found.nominal['pid'].rms
 
 
-def test_the_section_has_a_row_for_each_error_of_each_law(found):
+def test_the_section_has_a_row_for_each_error_of_each_law(found: Mismatch) -> None:
     section = mismatch.section(found)
     assert len(section.tables[0].rows) == 6
     assert len(section.pictures) == 1

@@ -11,7 +11,7 @@ SEEDS = st.integers(0, 2**32)
 
 
 @pytest.mark.parametrize('seed', [0, 1, 2014])
-def test_twenty_draws_have_the_mean_and_std_of_the_tables(seed):
+def test_twenty_draws_have_the_mean_and_std_of_the_tables(seed: int) -> None:
     """
     The midpoints of 20 strata stand for the whole distribution.
 
@@ -30,7 +30,7 @@ def test_twenty_draws_have_the_mean_and_std_of_the_tables(seed):
 
 @settings(max_examples=30, deadline=None)
 @given(repeats=st.integers(1, 60), seed=SEEDS)
-def test_every_draw_is_a_tissue_that_can_be(repeats, seed):
+def test_every_draw_is_a_tissue_that_can_be(repeats: int, seed: int) -> None:
     """Friction is positive, and pressing the tissue costs energy at every level, anywhere."""
     assert all(value > 0.0 for drawn in draw_friction(repeats, seed) for value in drawn.values())
     places = draw_stiffness(repeats, seed)
@@ -43,7 +43,7 @@ def test_every_draw_is_a_tissue_that_can_be(repeats, seed):
 
 @settings(max_examples=20, deadline=None)
 @given(seed=SEEDS)
-def test_a_place_has_one_quantile_per_entry(seed):
+def test_a_place_has_one_quantile_per_entry(seed: int) -> None:
     """The order of the places by an entry is the same at every force level."""
     places = draw_stiffness(20, seed)
     for entry in TABLE_2:
@@ -53,14 +53,14 @@ def test_a_place_has_one_quantile_per_entry(seed):
         assert (orders == orders[:, :1]).all()
 
 
-def test_a_seed_gives_one_draw():
+def test_a_seed_gives_one_draw() -> None:
     """The same seed gives the same draw, another seed another."""
     for draw in (draw_friction, draw_stiffness):
         assert draw(20, 7) == draw(20, 7)
         assert draw(20, 7) != draw(20, 8)
 
 
-def test_a_single_repeat_is_typical():
+def test_a_single_repeat_is_typical() -> None:
     """One repeat takes the medians, which the tables' means are close to."""
     (friction,) = draw_friction(1, 3)
     # A gamma distribution's median is below its mean by a third of variance over mean.

@@ -1,6 +1,7 @@
 """What a person sees: tables that line up, a page that is whole and self-contained."""
 
 from html.parser import HTMLParser
+from pathlib import Path
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -31,7 +32,7 @@ texts = st.text(st.characters(exclude_categories=('Cs', 'Cc')), max_size=30)
 
 @settings(deadline=None)
 @given(st.lists(st.tuples(cells, cells, cells), max_size=6))
-def test_columns_of_a_table_line_up(rows):
+def test_columns_of_a_table_line_up(rows: list[tuple[str, str, str]]) -> None:
     """Every cell of a column starts at the same place, and every cell is there whole."""
     lines = table(rows, ('a', 'b', 'c')).splitlines()
     widths = [len(dashes) for dashes in lines[1].split('  ')]
@@ -43,7 +44,7 @@ def test_columns_of_a_table_line_up(rows):
             start += width + 2
 
 
-def test_a_failure_is_told_in_capitals():
+def test_a_failure_is_told_in_capitals() -> None:
     """The verdict follows the check."""
     text = check_table([Check('x', '1', '2', passed=False), Check('y', '1', '1', passed=True)])
     assert text.splitlines()[2].endswith('FAIL')
@@ -61,21 +62,21 @@ class Reader(HTMLParser):
         self.feed(piece)
         self.close()
 
-    def handle_starttag(self, tag, attrs):
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str]]) -> None:
         self.tags.append((tag, dict(attrs)))
         if tag not in ('meta', 'img'):
             self.open.append(tag)
 
-    def handle_endtag(self, tag):
+    def handle_endtag(self, tag: str) -> None:
         assert self.open.pop() == tag
 
-    def handle_data(self, data):
+    def handle_data(self, data: str) -> None:
         self.texts.append(data)
 
 
 @settings(deadline=None)
 @given(texts)
-def test_no_text_can_be_taken_for_a_tag(text):
+def test_no_text_can_be_taken_for_a_tag(text: str) -> None:
     """Each block holds what it was given, letter by letter, and only tags of its own."""
     for block in (
         heading(text),
@@ -111,7 +112,7 @@ def test_no_text_can_be_taken_for_a_tag(text):
             assert text in ''.join(reader.texts)
 
 
-def test_symbols_are_written_as_in_print():
+def test_symbols_are_written_as_in_print() -> None:
     """The name of a coefficient becomes a letter with a subscript, within words too."""
     assert '<i>μ</i><sub>s</sub> = 1' in paragraph('mu_s = 1')
     assert '<i>k</i><sub>zz</sub>' in paragraph('k_zz')
@@ -122,12 +123,12 @@ def test_symbols_are_written_as_in_print():
     assert 'm² M<sup>T</sup> m<sup>-1/2</sup>' in paragraph('m^2 M^T m^-1/2')
 
 
-def test_a_notice_of_nothing_is_nothing():
+def test_a_notice_of_nothing_is_nothing() -> None:
     """No empty frame is drawn."""
     assert notice('Warnings', []) == ''
 
 
-def test_a_table_says_what_its_cells_are():
+def test_a_table_says_what_its_cells_are() -> None:
     """Heads of columns and of rows are marked as such, and the table has a caption."""
     reader = Reader(grid([('mu_s', '0.56')], ('parameter', 'value'), 'Friction'))
     scopes = [given['scope'] for tag, given in reader.tags if tag == 'th']
@@ -142,7 +143,7 @@ def picture() -> Picture:
     return Picture('plot', 'caption "x"', figure, 'a line that "rises"')
 
 
-def test_the_page_needs_nothing_beside_it(tmp_path):
+def test_the_page_needs_nothing_beside_it(tmp_path: Path) -> None:
     """Pictures are inside, texts are escaped, and no draft is left."""
     path = tmp_path / 'report.html'
     checks = [Check('a < b', '<script>', '1 & 2', passed=True)]
@@ -157,7 +158,7 @@ def test_the_page_needs_nothing_beside_it(tmp_path):
     assert {item.name for item in tmp_path.iterdir()} == {'report.html', 'plot.png'}
 
 
-def test_the_same_content_gives_the_same_bytes(tmp_path):
+def test_the_same_content_gives_the_same_bytes(tmp_path: Path) -> None:
     """No date and no name of the folder gets into the page or its pictures."""
     pages = []
     for name in ('one', 'two'):
@@ -168,7 +169,7 @@ def test_the_same_content_gives_the_same_bytes(tmp_path):
     assert pages[0] == pages[1]
 
 
-def test_a_page_is_shown_whole_even_on_a_telephone(tmp_path):
+def test_a_page_is_shown_whole_even_on_a_telephone(tmp_path: Path) -> None:
     """Pictures have loaded with their texts, nothing outside is asked for, nothing sticks out."""
     path = tmp_path / 'page.html'
     blocks = [
@@ -187,7 +188,7 @@ def test_a_page_is_shown_whole_even_on_a_telephone(tmp_path):
     assert seen.overflow == 0
 
 
-def test_what_a_page_would_load_from_outside_is_noticed(tmp_path):
+def test_what_a_page_would_load_from_outside_is_noticed(tmp_path: Path) -> None:
     """The look at a page can fail: an image from elsewhere is seen as missing and as asked for."""
     path = tmp_path / 'page.html'
     write_document(path, 'A page', '', ['<img src="http://127.0.0.1:9/outside.png">'])
@@ -196,7 +197,7 @@ def test_what_a_page_would_load_from_outside_is_noticed(tmp_path):
     assert seen.requests == ['http://127.0.0.1:9/outside.png']
 
 
-def test_names_the_page_that_cannot_be_written(tmp_path):
+def test_names_the_page_that_cannot_be_written(tmp_path: Path) -> None:
     """A folder that is not there ends in one line, and nothing is left."""
     with pytest.raises(ParameterError, match=r'no/page.html cannot be written: No such file'):
         write_document(tmp_path / 'no' / 'page.html', 'title', '', [])

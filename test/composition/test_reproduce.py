@@ -3,6 +3,8 @@
 from argparse import ArgumentParser
 from functools import cache
 import json
+from pathlib import Path
+from typing import Any
 
 from needle_identification import ParameterEstimate, Statistic
 from needle_insertion.cli import main
@@ -12,6 +14,7 @@ from needle_insertion.commands.reproduce import (
     count_held,
     deviation_interval,
     fewest,
+    Identified,
     Line,
     stiffness_truth,
 )
@@ -24,26 +27,26 @@ from support.pages import look_at
 
 
 @pytest.fixture(scope='module')
-def identified():
+def identified() -> dict[str, Identified]:
     """Return what the shipped bags give."""
     return {name: reproduce.identify(name) for name in reproduce.TABLES}
 
 
 @pytest.fixture
-def once(monkeypatch, identified):
+def once(monkeypatch: pytest.MonkeyPatch, identified: dict[str, Identified]) -> None:
     """Have the shipped bags identified once for all tests."""
     monkeypatch.setattr(reproduce, 'identify', lambda name, _recorded: identified[name])
 
 
 @pytest.fixture
-def coarse(monkeypatch):
+def coarse(monkeypatch: pytest.MonkeyPatch) -> None:
     """Have the map of controllability with fewer points."""
     monkeypatch.setattr(analyze, 'DEPTHS', 9)
     monkeypatch.setattr(analyze, 'DEFLECTIONS', 7)
 
 
 @pytest.mark.usefixtures('once')
-def test_table_1_comes_out_of_the_shipped_bags(capsys):
+def test_table_1_comes_out_of_the_shipped_bags(capsys: pytest.CaptureFixture[str]) -> None:
     """Both means and both STDs of the paper are in their intervals, from 20 recordings."""
     assert main(['reproduce', 'table-1', '--json']) == 0
     found = json.loads(capsys.readouterr().out)
@@ -57,7 +60,7 @@ def test_table_1_comes_out_of_the_shipped_bags(capsys):
 
 
 @pytest.mark.usefixtures('once')
-def test_table_2_comes_out_of_the_shipped_bags(capsys):
+def test_table_2_comes_out_of_the_shipped_bags(capsys: pytest.CaptureFixture[str]) -> None:
     """Every entry at every level is in its intervals, and k_a, from 20 places."""
     assert main(['reproduce', 'table-2']) == 0
     text = capsys.readouterr().out
@@ -92,14 +95,16 @@ def line(mean: float, deviation: float | None, count: int = 20) -> Line:
         (10.0, None, True),
     ],
 )
-def test_a_line_holds_if_mean_and_std_are_in_their_intervals(mean, deviation, holds):
+def test_a_line_holds_if_mean_and_std_are_in_their_intervals(
+    mean: float, deviation: float | None, holds: bool
+) -> None:
     """Each of the two can break it; of a single recording the STD is not known."""
     judged = line(mean, deviation)
     assert judged.holds == holds
     assert ('DOES NOT HOLD' in as_table([judged])) == (not holds)
 
 
-def test_the_interval_of_the_std_is_that_of_chi_squared():
+def test_the_interval_of_the_std_is_that_of_chi_squared() -> None:
     """It holds the STD of the population in 95 of 100 samples of it."""
     rng = np.random.default_rng(0)
     samples = rng.normal(size=(4000, 20)).std(axis=1, ddof=1)
@@ -113,7 +118,7 @@ def test_the_interval_of_the_std_is_that_of_chi_squared():
 
 
 @pytest.mark.parametrize('trials', [1, 20, 40, 400])
-def test_fewer_intervals_than_the_least_are_improbable(trials):
+def test_fewer_intervals_than_the_least_are_improbable(trials: int) -> None:
     """If each holds its truth in 95 %, fewer than `fewest` do so once in a hundred at most."""
     held = np.random.default_rng(trials).binomial(trials, 0.95, size=20000)
     # Three standard errors of a share of 0.01 in 20000.
@@ -121,7 +126,7 @@ def test_fewer_intervals_than_the_least_are_improbable(trials):
     assert np.mean(held <= fewest(trials)) >= 0.01 - 3.0 * np.sqrt(0.01 / 20000)
 
 
-def test_an_interval_counts_where_the_truth_is_known():
+def test_an_interval_counts_where_the_truth_is_known() -> None:
     """Held, missed, not determined, not known."""
     sure = {'name': 'a', 'symbol': 'a', 'unit': 'N', 'value': 1.0, 'error': 0.5}
     held = ParameterEstimate(**sure, interval=(0.0, 2.0), determined=True)
@@ -129,7 +134,7 @@ def test_an_interval_counts_where_the_truth_is_known():
     assert count_held([held, held, unknown, held], [1.5, 2.5, 1.0, None]) == (1, 3)
 
 
-def test_the_truth_of_a_place_is_that_of_the_level():
+def test_the_truth_of_a_place_is_that_of_the_level() -> None:
     """The nearest level counts, not what lies between; without a configuration it is unknown."""
     truth = {'indenter.force_levels': [1.1, 1.2], 'indenter.stiffness_zz': [900.0, 700.0]}
     assert stiffness_truth(truth, 'k_zz', 1.198) == 700.0
@@ -137,7 +142,9 @@ def test_the_truth_of_a_place_is_that_of_the_level():
     assert stiffness_truth(None, 'k_zz', 1.1) is None
 
 
-def test_without_recordings_there_is_one_line(tmp_path, monkeypatch, capsys):
+def test_without_recordings_there_is_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     """What is missing, and where to get it, with exit status 2."""
     monkeypatch.setattr(reproduce, 'SHIPPED_BAGS', tmp_path)
     assert main(['reproduce', 'table-2']) == 2
@@ -146,7 +153,9 @@ def test_without_recordings_there_is_one_line(tmp_path, monkeypatch, capsys):
     assert 'holds no stiffness_*' in said
 
 
-def test_a_table_that_does_not_hold_ends_in_status_1(tmp_path, monkeypatch, capsys):
+def test_a_table_that_does_not_hold_ends_in_status_1(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Three recordings of one kind are not the population of the paper."""
     for k, bag in enumerate(sorted(SHIPPED_BAGS.glob('friction_*'))[:2]):
         (tmp_path / f'friction_{k}').symlink_to(bag)
@@ -164,7 +173,7 @@ def test_a_table_that_does_not_hold_ends_in_status_1(tmp_path, monkeypatch, caps
         *('controllability', 'claims', 'mismatch', 'all'),
     ],
 )
-def test_every_result_can_be_asked_for(what):
+def test_every_result_can_be_asked_for(what: str) -> None:
     """Figures, tables, analysis, claims, mismatch, or all of them."""
     parser = ArgumentParser()
     reproduce.add_arguments(parser)
@@ -181,7 +190,9 @@ def test_every_result_can_be_asked_for(what):
     ],
 )
 @pytest.mark.usefixtures('once', 'coarse')
-def test_a_result_is_a_page_that_a_browser_shows(tmp_path, capsys, what, pictures, words):
+def test_a_result_is_a_page_that_a_browser_shows(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], what: str, pictures: int, words: list[str]
+) -> None:
     """It is whole, fits a telephone, asks for nothing outside, and says what the terminal says."""
     assert main(['reproduce', what, '-o', str(tmp_path)]) == 0
     assert f'wrote {tmp_path}/reproduce.html' in capsys.readouterr().out
@@ -194,7 +205,7 @@ def test_a_result_is_a_page_that_a_browser_shows(tmp_path, capsys, what, picture
 
 
 @pytest.fixture
-def cheap(monkeypatch, once, coarse):
+def cheap(monkeypatch: pytest.MonkeyPatch, once: Any, coarse: Any) -> None:
     """Have all results, but few runs behind them."""
     figure = figures.FIGURES['figure-4']
     study = cache(lambda: mismatch.study(8))
@@ -215,7 +226,9 @@ def cheap(monkeypatch, once, coarse):
 
 
 @pytest.mark.usefixtures('cheap')
-def test_all_is_one_page_with_every_part(tmp_path, capsys):
+def test_all_is_one_page_with_every_part(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Parts in order, claims judged by what the bags gave, and the same bytes each time."""
     first, second = tmp_path / 'first', tmp_path / 'second'
     assert main(['reproduce', 'all', '-o', str(first)]) == 0
@@ -247,13 +260,17 @@ def test_all_is_one_page_with_every_part(tmp_path, capsys):
 
 
 @pytest.mark.usefixtures('cheap')
-def test_a_claim_that_does_not_hold_is_a_finding(tmp_path, capsys):
+def test_a_claim_that_does_not_hold_is_a_finding(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Only a table that does not come out is a failure."""
     assert main(['reproduce', 'claims', '-o', str(tmp_path)]) == 0
     assert 'does not hold' in capsys.readouterr().out
 
 
-def test_what_is_computed_is_not_recorded(tmp_path, capsys):
+def test_what_is_computed_is_not_recorded(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """A recording for a figure is refused in one line."""
     assert main(['reproduce', 'figure-6', '--record', str(tmp_path / 'bags')]) == 2
     assert 'nothing to --record' in capsys.readouterr().err

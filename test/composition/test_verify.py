@@ -1,11 +1,15 @@
 """A recorded run computed anew is the run; what is not, is named: where, what, and why."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 import json
 from math import sin
+from pathlib import Path
+from typing import Any
 
 from geometry_msgs.msg import WrenchStamped
 from needle_dynamics import (
+    FloatArray,
     ForceSensor,
     ForceSensorParameters,
     Integrator,
@@ -17,12 +21,13 @@ from needle_dynamics.simulated.plant import (
     BaseMotion,
     BaseParameters,
     Plant,
+    Sample,
     TipParameters,
     TipSensor,
 )
 from needle_identification import BagWriter, encode, message_type, RecordingError
 from needle_insertion.cli import main
-from needle_insertion.commands.verify import verify
+from needle_insertion.commands.verify import Result, verify
 from needle_insertion.experiment.campaign import Campaign
 from needle_insertion.experiment.protocol import PROTOCOLS, SHIPPED_BAGS
 from needle_insertion.experiment.record import record
@@ -100,21 +105,27 @@ def stamp(k: int) -> int:
     return BEGIN + k * PERIOD
 
 
-def header(at: int):
+def header(at: int) -> Any:
     time = message_type('builtin_interfaces/msg/Time')(*divmod(at, 10**9))
     return message_type('std_msgs/msg/Header')(time, '')
 
 
-def vector(values):
+def vector(values: FloatArray | list[float]) -> Any:
     return message_type('geometry_msgs/msg/Vector3')(*map(float, values))
 
 
-def wrench(at: int, numbers) -> bytes:
+def wrench(at: int, numbers: FloatArray | list[float]) -> bytes:
     pair = message_type('geometry_msgs/msg/Wrench')(vector(numbers[:3]), vector(numbers[3:]))
     return encode(message_type(KINDS['/base_wrench'])(header(at), pair))
 
 
-def joints(at: int, names, position, velocity, effort=()) -> bytes:
+def joints(
+    at: int,
+    names: list[str],
+    position: FloatArray | list[float],
+    velocity: FloatArray | list[float],
+    effort: list[float] | tuple[()] = (),
+) -> bytes:
     arrays = (np.array(values, dtype=float) for values in (position, velocity, effort))
     return encode(message_type(KINDS['/joint_states'])(header(at), list(names), *arrays))
 
@@ -124,12 +135,14 @@ def tip(at: int, depth: float, deflection: float) -> bytes:
     return encode(message_type(KINDS['/tip_deflection'])(header(at), point))
 
 
-def text(values) -> bytes:
+def text(values: dict[str, float | str]) -> bytes:
     document = yaml.safe_dump({'/plant': {'ros__parameters': values}})
     return encode(message_type(KINDS['/plant/configuration'])(document))
 
 
-def trajectory(points) -> bytes:
+def trajectory(
+    points: tuple[tuple[float, float], tuple[float, float], tuple[float, float]],
+) -> bytes:
     duration = message_type('builtin_interfaces/msg/Duration')
     numbers = [np.zeros(0)] * 3
     made = [
@@ -152,7 +165,7 @@ class Message:
     data: bytes
 
 
-def measured(sample, k: int, torque: float) -> list[Message]:
+def measured(sample: Sample, k: int, torque: float) -> list[Message]:
     """Return what the node publishes of a sample."""
     state, at = sample.state, stamp(k)
     m = len(state) // 2
@@ -177,7 +190,11 @@ def force(k: int) -> float:
     return 2.0 + 1.5 * sin(0.3 * k)
 
 
-def simulated(late=(), lost=(), before=None) -> list[Message]:
+def simulated(
+    late: tuple[int, ...] = (),
+    lost: tuple[int, ...] = (),
+    before: Callable[..., Any] | None = None,
+) -> list[Message]:
     """
     Run under commands, each an answer to a sample, which act one period later.
 
@@ -209,7 +226,13 @@ def simulated(late=(), lost=(), before=None) -> list[Message]:
 
 
 def carried(
-    comes: int, recorded: int, points=((0.1, 0.032), (0.2, 0.031), (0.25, 0.031))
+    comes: int,
+    recorded: int,
+    points: tuple[tuple[float, float], tuple[float, float], tuple[float, float]] = (
+        (0.1, 0.032),
+        (0.2, 0.031),
+        (0.25, 0.031),
+    ),
 ) -> list[Message]:
     """Run with a base that takes a trajectory before a sample; it is recorded near another."""
     plant = needle('robot')
@@ -226,7 +249,7 @@ def carried(
     return messages
 
 
-def written(path, messages) -> object:
+def written(path: Path, messages: filter | list[Message]) -> object:
     """Write messages into a bag, in the order in which they were received."""
     with BagWriter(path) as bag:
         for topic, kind in KINDS.items():
@@ -236,12 +259,12 @@ def written(path, messages) -> object:
     return path
 
 
-def only(path):
+def only(path: Path) -> Result:
     (result,) = verify(path)
     return result
 
 
-def exact(result) -> None:
+def exact(result: Result) -> None:
     """Every number of every topic is the same to the last bit."""
     assert result.verdict == 'identical', result
     assert {tally.verdict for tally in result.topics.values()} == {'identical'}
@@ -251,7 +274,7 @@ def exact(result) -> None:
 # What is the same.
 
 
-def test_a_run_under_commands_is_the_same(tmp_path):
+def test_a_run_under_commands_is_the_same(tmp_path: Path) -> None:
     """All numbers are identical, and each command acted one period after its sample."""
     result = only(written(tmp_path / 'bag', simulated()))
     exact(result)
@@ -266,7 +289,7 @@ def test_a_run_under_commands_is_the_same(tmp_path):
     assert result.notes == ()
 
 
-def test_commands_that_came_late_or_are_not_in_the_bag_are_found(tmp_path):
+def test_commands_that_came_late_or_are_not_in_the_bag_are_found(tmp_path: Path) -> None:
     """The run is the same all the same, and what happened is said."""
     result = only(written(tmp_path / 'bag', simulated(late=(20, 21, 60), lost=(40,))))
     # The force that is not in the bag is known from joint_states, where it is a mean.
@@ -278,14 +301,14 @@ def test_commands_that_came_late_or_are_not_in_the_bag_are_found(tmp_path):
 
 
 @pytest.mark.parametrize('shift', [-4, 0, 3])
-def test_a_trajectory_begins_where_it_makes_the_run(tmp_path, shift):
+def test_a_trajectory_begins_where_it_makes_the_run(tmp_path: Path, shift: int) -> None:
     """The sample at which the base took it is found, whatever the recorder saw."""
     result = only(written(tmp_path / 'bag', carried(40, 40 + shift)))
     exact(result)
     assert result.notes == ('joint_trajectory from sample 40 on',)
 
 
-def test_a_recording_that_begins_late_is_placed_by_the_noise(tmp_path):
+def test_a_recording_that_begins_late_is_placed_by_the_noise(tmp_path: Path) -> None:
     """The first samples are not there: which one is the first is known by its noise."""
     messages = [m for m in carried(40, 40) if m.stamp == 0 or m.stamp >= stamp(8)]
     result = only(written(tmp_path / 'bag', messages))
@@ -294,7 +317,7 @@ def test_a_recording_that_begins_late_is_placed_by_the_noise(tmp_path):
     assert result.notes == ('joint_trajectory from sample 40 on',)
 
 
-def test_samples_lost_on_the_way_are_made_up(tmp_path):
+def test_samples_lost_on_the_way_are_made_up(tmp_path: Path) -> None:
     """A best-effort reader loses some: what lies between is computed."""
     gone = {stamp(k) for k in (30, 31, 32, 77)}
     measures = {'/joint_states', '/base_wrench', '/ground_truth'}
@@ -304,7 +327,7 @@ def test_samples_lost_on_the_way_are_made_up(tmp_path):
     assert result.samples == SAMPLES - 4
 
 
-def test_time_that_stood_still_is_told_from_samples_lost(tmp_path):
+def test_time_that_stood_still_is_told_from_samples_lost(tmp_path: Path) -> None:
     """After a stall the plant goes on where it was, though stamps have gone on."""
     shifted = []
     for message in carried(40, 40):
@@ -324,7 +347,7 @@ def test_time_that_stood_still_is_told_from_samples_lost(tmp_path):
     assert 'no samples were taken for 50 periods before sample 80' in result.notes
 
 
-def test_tare_and_reset_are_found(tmp_path):
+def test_tare_and_reset_are_found(tmp_path: Path) -> None:
     """Services leave no message: they show in what follows."""
     plant = needle('robot')
     messages = [Message('/plant/configuration', BEGIN, 0, text(configuration(mode='robot')))]
@@ -342,7 +365,7 @@ def test_tare_and_reset_are_found(tmp_path):
     )
 
 
-def test_friction_that_changed_in_the_run_is_followed(tmp_path):
+def test_friction_that_changed_in_the_run_is_followed(tmp_path: Path) -> None:
     """The new configuration is in the bag; where it took effect is found."""
     other = replace(MODEL, coulomb_friction=0.8)
 
@@ -369,7 +392,9 @@ def test_friction_that_changed_in_the_run_is_followed(tmp_path):
         ('/ground_truth', 76, 'theta'),
     ],
 )
-def test_a_single_changed_sample_is_named(tmp_path, topic, offset, quantity):
+def test_a_single_changed_sample_is_named(
+    tmp_path: Path, topic: str, offset: int, quantity: str
+) -> None:
     """Stamp, topic and number are those of the message that was altered, and nothing else is."""
     messages = simulated()
     message = next(m for m in messages if m.topic == topic and m.stamp == stamp(70))
@@ -403,7 +428,9 @@ def test_a_single_changed_sample_is_named(tmp_path, topic, offset, quantity):
     ],
     ids=['friction', 'seed', 'version', 'fault'],
 )
-def test_another_plant_diverges_and_the_reason_is_told(tmp_path, changes, reason):
+def test_another_plant_diverges_and_the_reason_is_told(
+    tmp_path: Path, changes: dict[str, Any], reason: str
+) -> None:
     """Parameters that are not those of the run do not give its samples."""
     changes = {'model.viscous_friction': 250.0, **changes}
     messages = simulated()
@@ -415,7 +442,7 @@ def test_another_plant_diverges_and_the_reason_is_told(tmp_path, changes, reason
     assert result.first['sample'] <= 5
 
 
-def test_a_bag_without_commands_says_what_to_record(tmp_path):
+def test_a_bag_without_commands_says_what_to_record(tmp_path: Path) -> None:
     """The motion has no cause in the bag."""
     silent = [m for m in simulated() if m.topic not in ('/wrench_command', '/joint_states')]
     result = only(written(tmp_path / 'bag', silent))
@@ -428,7 +455,7 @@ def test_a_bag_without_commands_says_what_to_record(tmp_path):
     assert result.first['sample'] == 40
 
 
-def test_differences_within_the_tolerance_are_no_divergence(tmp_path):
+def test_differences_within_the_tolerance_are_no_divergence(tmp_path: Path) -> None:
     """A tolerance takes what is smaller, and says how large it was."""
     messages = simulated()
     values = configuration(**{'model.viscous_friction': MODEL.viscous_friction * (1.0 + 1e-9)})
@@ -460,7 +487,13 @@ def test_differences_within_the_tolerance_are_no_divergence(tmp_path):
     ],
     ids=['parameters', 'measurements', 'value', 'mode'],
 )
-def test_bad_input_is_named(tmp_path, capsys, kept, changes, complaint):
+def test_bad_input_is_named(
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    kept: Callable[..., Any] | type,
+    changes: dict[str, Any],
+    complaint: str,
+) -> None:
     """One line names the bag and what it lacks; the exit status is 2."""
     messages = simulated()
     messages[0].data = text(configuration(**changes))
@@ -474,7 +507,7 @@ def test_bad_input_is_named(tmp_path, capsys, kept, changes, complaint):
     assert said.count('\n') == 1
 
 
-def test_a_parameter_that_is_missing_is_named(tmp_path):
+def test_a_parameter_that_is_missing_is_named(tmp_path: Path) -> None:
     """Without the rate there is no time."""
     messages = simulated()
     values = configuration()
@@ -484,7 +517,9 @@ def test_a_parameter_that_is_missing_is_named(tmp_path):
         verify(written(tmp_path / 'bag', messages))
 
 
-def test_the_command_line_tells_people_and_machines(tmp_path, capsys):
+def test_the_command_line_tells_people_and_machines(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Exit status 0 for what is the same, 1 for what is not; JSON has the first divergence."""
     same = written(tmp_path / 'same', simulated())
     messages = simulated()
@@ -512,7 +547,7 @@ def test_the_command_line_tells_people_and_machines(tmp_path, capsys):
 
 
 @pytest.mark.parametrize('name', ['friction', 'stiffness'])
-def test_the_shipped_bags_are_what_the_plant_computes(name):
+def test_the_shipped_bags_are_what_the_plant_computes(name: str) -> None:
     """All of them, but for how another machine may round."""
     for path in sorted(SHIPPED_BAGS.glob(f'{name}_*')):
         (result,) = verify(path)
@@ -523,7 +558,9 @@ def test_the_shipped_bags_are_what_the_plant_computes(name):
 @pytest.mark.parametrize(
     ('name', 'rate', 'speed'), [('friction', 100.0, 20.0), ('stiffness', 40.0, 40.0)]
 )
-def test_an_experiment_over_dds_is_computed_anew(tmp_path, name, rate, speed):
+def test_an_experiment_over_dds_is_computed_anew(
+    tmp_path: Path, name: str, rate: float, speed: float
+) -> None:
     """What nodes have recorded a moment ago on this machine is the same to the last bit."""
     campaign = Campaign(protocol=PROTOCOLS[name], repeats=1, rate=rate)
     (path,) = record(campaign, tmp_path, speed)
@@ -532,7 +569,7 @@ def test_an_experiment_over_dds_is_computed_anew(tmp_path, name, rate, speed):
     assert 'joint_trajectory from sample 1 on' in result.notes
 
 
-def test_a_run_under_commands_over_dds_is_computed_anew(tmp_path):
+def test_a_run_under_commands_over_dds_is_computed_anew(tmp_path: Path) -> None:
     """Whenever a command arrived at the plant, on however busy a machine: the run is the same."""
     path = tmp_path / 'bag'
     with Graph(tmp_path / 'logs') as graph:

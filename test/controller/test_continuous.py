@@ -1,6 +1,7 @@
 """The laws of the source in continuous time, and how the sampled ones tend to them."""
 
 from dataclasses import replace
+from typing import Any
 
 from needle_controller import (
     Axis,
@@ -53,7 +54,7 @@ def goal(time: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize('skew', [0.0, 20.0])
-def test_inverse_dynamics_makes_the_error_linear(skew):
+def test_inverse_dynamics_makes_the_error_linear(skew: float) -> None:
     """With its own model as the plant, e_ddot + k_v e_dot + k_p e = 0 on all coordinates."""
     kp, kv = matrix([900.0, 400.0, 1600.0, 2500.0], skew), matrix([60.0, 40.0, 30.0, 20.0], skew)
     law = ContinuousInverseDynamics(model=MODEL, actuation='modal', kp=kp, kv=kv)
@@ -68,7 +69,7 @@ def test_inverse_dynamics_makes_the_error_linear(skew):
     assert_allclose(end, linear, rtol=1e-7, atol=1e-7 * np.abs(linear).max())
 
 
-def test_physical_actuation_forces_the_base_alone():
+def test_physical_actuation_forces_the_base_alone() -> None:
     """Both laws leave q1..qn alone; the base follows the error equation of its own gains."""
     law = ContinuousInverseDynamics(model=MODEL, kp=[900.0, 100.0], kv=[60.0, 20.0])
     forces = law.forces(moving(), goal(0.0))
@@ -84,7 +85,7 @@ def test_physical_actuation_forces_the_base_alone():
     assert_allclose(found, [-(50.0 * error + 0.7), -2.0 * 0.4, 0.0, 0.0], rtol=1e-12)
 
 
-def test_inverse_dynamics_breaks_away():
+def test_inverse_dynamics_breaks_away() -> None:
     """At rest friction counts in the direction of the wanted acceleration."""
     rest = MODEL.state_at(DEPTH)
     kp, kv = [900.0, 100.0], [60.0, 20.0]
@@ -101,7 +102,7 @@ def test_inverse_dynamics_breaks_away():
     'friction', ['coulomb', 'stribeck', 'tanh'], ids=['coulomb', 'stribeck', 'tanh']
 )
 @pytest.mark.parametrize('speed', [-0.02, 0.02])
-def test_full_compensation_is_the_friction_of_the_model(friction, speed):
+def test_full_compensation_is_the_friction_of_the_model(friction: str, speed: float) -> None:
     """Beyond the breakaway speed the smooth compensation is friction itself, in either way."""
     model = NeedleModel(replace(MODEL.parameters, friction_law=friction, withdrawal_friction=1.5))
     state = moving()
@@ -116,7 +117,7 @@ def test_full_compensation_is_the_friction_of_the_model(friction, speed):
     assert_allclose(smooth, exact, rtol=1e-12)
 
 
-def test_the_law_may_believe_in_another_needle():
+def test_the_law_may_believe_in_another_needle() -> None:
     """The forces are those of the law's own model, whatever the plant is."""
     other = NeedleModel(
         replace(MODEL.parameters, viscous_friction=0.7, tissue_stiffness=700.0, area=1e-6)
@@ -153,7 +154,9 @@ LAWS = {
 @pytest.mark.parametrize('kind', LAWS)
 @pytest.mark.parametrize(('actuation', 'size'), [('physical', 2), ('modal', 4)])
 @pytest.mark.parametrize('speed', [0.0, 0.01])
-def test_the_closed_loop_matrix_is_the_derivative(kind, actuation, size, speed):
+def test_the_closed_loop_matrix_is_the_derivative(
+    kind: str, actuation: str, size: int, speed: float
+) -> None:
     """Differences of the closed loop around a straight needle, the law believing in another."""
     other = NeedleModel(replace(MODEL.parameters, viscous_friction=0.3, tissue_stiffness=400.0))
     plant = NeedleModel(replace(MODEL.parameters, coulomb_friction=0.0))
@@ -176,7 +179,7 @@ def test_the_closed_loop_matrix_is_the_derivative(kind, actuation, size, speed):
 
 
 @pytest.mark.parametrize('actuation', ['physical', 'modal'])
-def test_inverse_dynamics_puts_the_poles_where_its_gains_say(actuation):
+def test_inverse_dynamics_puts_the_poles_where_its_gains_say(actuation: str) -> None:
     """Poles of s^2 + k_v s + k_p for each driven coordinate, with the law's own model."""
     size = 2 if actuation == 'physical' else 4
     law = ContinuousInverseDynamics(
@@ -192,7 +195,13 @@ def test_inverse_dynamics_puts_the_poles_where_its_gains_say(actuation):
 # Convergence.
 
 
-def sampled_end(kind: str, gains, period: float, duration: float) -> np.ndarray:
+def sampled_end(
+    kind: str,
+    gains: tuple[InverseDynamicsGains, InverseDynamicsGains, InverseDynamicsGains]
+    | tuple[PidGains, PidGains, PidGains],
+    period: float,
+    duration: float,
+) -> np.ndarray:
     """Run the sampled loop around the true needle; return its state at the end."""
     p = MODEL.parameters
     law = InverseDynamics if kind == 'inverse_dynamics' else Pid
@@ -223,7 +232,7 @@ PID_GAINS = (
 
 
 @pytest.mark.parametrize('kind', ['inverse_dynamics', 'pid'])
-def test_the_sampled_law_tends_to_the_continuous_one(kind):
+def test_the_sampled_law_tends_to_the_continuous_one(kind: str) -> None:
     """Half the period, half the difference of the closed loops, in every coordinate together."""
     gains = ID_GAINS
     if kind == 'inverse_dynamics':
@@ -273,14 +282,16 @@ def test_the_sampled_law_tends_to_the_continuous_one(kind):
         ({'breakaway_speed': -1.0}, ParameterError, 'breakaway_speed must be finite and >= 0'),
     ],
 )
-def test_bad_gains_are_named(changes, error, words):
+def test_bad_gains_are_named(
+    changes: dict[str, Any], error: type[ParameterError] | type[ShapeError], words: str
+) -> None:
     """Sizes, numbers, definiteness and names, each in one line."""
     valid = {'kp': [900.0, 100.0], 'kv': [60.0, 20.0]}
     with pytest.raises(error, match=words):
         ContinuousInverseDynamics(model=MODEL, **{**valid, **changes})
 
 
-def test_bad_arguments_are_named():
+def test_bad_arguments_are_named() -> None:
     """An integral gain may vanish but not be negative; goals and integrals have their sizes."""
     with pytest.raises(ParameterError, match='ki must be positive semidefinite'):
         ContinuousPid(model=MODEL, kp=[1.0, 1.0], kd=[1.0, 1.0], ki=[1.0, -1.0])

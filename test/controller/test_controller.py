@@ -13,14 +13,16 @@ from needle_controller import (
     Setpoint,
 )
 from needle_controller.compiled.laws import INTEGRAL
-from needle_dynamics import Integrator, NeedleModel, NeedleParameters, ParameterError
+from needle_dynamics import FloatArray, Integrator, NeedleModel, NeedleParameters, ParameterError
 import numpy as np
 import pytest
 
 PERIOD = 1e-3
 
 
-def controller(law='inverse_dynamics', preset='phantom', **changes) -> Controller:
+def controller(
+    law: str = 'inverse_dynamics', preset: str = 'phantom', **changes: float
+) -> Controller:
     """Return a controller with default gains."""
     return Controller(
         law,
@@ -33,7 +35,9 @@ def controller(law='inverse_dynamics', preset='phantom', **changes) -> Controlle
     )
 
 
-def insert(steering: Controller, truth: NeedleParameters, duration: float, late: int = 1):
+def insert(
+    steering: Controller, truth: NeedleParameters, duration: float, late: int = 1
+) -> tuple[FloatArray, ...]:
     """Run the loop around the true needle; return depths and references [m]."""
     state = NeedleModel(truth).state_at(0.02, 5e-4)
     needle = Integrator(truth, state, 2e-5)
@@ -49,7 +53,7 @@ def insert(steering: Controller, truth: NeedleParameters, duration: float, late:
     return np.array(depths), np.array(aims)
 
 
-def test_inverse_dynamics_tracks_the_insertion():
+def test_inverse_dynamics_tracks_the_insertion() -> None:
     """With the model it believes in, the depth follows within 20 um from start to end."""
     steering = controller()
     steering.set_target(0.05)
@@ -62,7 +66,7 @@ def test_inverse_dynamics_tracks_the_insertion():
 
 @pytest.mark.parametrize('law', ['inverse_dynamics', 'pid'])
 @pytest.mark.parametrize('scale', [0.7, 1.3])
-def test_both_laws_arrive_in_spite_of_a_wrong_model(law, scale):
+def test_both_laws_arrive_in_spite_of_a_wrong_model(law: str, scale: float) -> None:
     """Friction 30 % off: the target is still reached, with less than 1 mm of overshoot."""
     truth = NeedleParameters.preset(
         'phantom', coulomb_friction=0.56 * scale, viscous_friction=300.0 * scale
@@ -75,7 +79,7 @@ def test_both_laws_arrive_in_spite_of_a_wrong_model(law, scale):
     assert depths.max() < 0.051
 
 
-def test_an_unknown_delay_of_one_period_is_survived():
+def test_an_unknown_delay_of_one_period_is_survived() -> None:
     """One period more than stated still ends at the target: the margin that was checked."""
     steering = controller()
     steering.set_target(0.03)
@@ -83,7 +87,7 @@ def test_an_unknown_delay_of_one_period_is_survived():
     assert abs(depths[-1] - 0.03) < 2e-5
 
 
-def test_no_force_before_a_target_nor_for_what_is_not_finite():
+def test_no_force_before_a_target_nor_for_what_is_not_finite() -> None:
     """Zero force until there is a target, and zero force for a measurement of NaN."""
     steering = controller()
     good = Measurement(time=0.0, depth=0.02, speed=0.0)
@@ -98,7 +102,7 @@ def test_no_force_before_a_target_nor_for_what_is_not_finite():
     assert again.setpoint.position == 0.021
 
 
-def test_a_new_target_in_motion_does_not_make_the_reference_jump():
+def test_a_new_target_in_motion_does_not_make_the_reference_jump() -> None:
     """Position and speed of the reference are continuous when the target changes."""
     steering = controller()
     steering.set_target(0.05)
@@ -114,7 +118,7 @@ def test_a_new_target_in_motion_does_not_make_the_reference_jump():
     assert speeds.min() < -0.009
 
 
-def test_it_goes_on_with_other_constants():
+def test_it_goes_on_with_other_constants() -> None:
     """Told the right friction in mid-motion, it keeps its target and reference and arrives."""
     truth = NeedleParameters.preset('phantom', coulomb_friction=1.0, viscous_friction=500.0)
     steering, told = controller(), controller()
@@ -134,7 +138,7 @@ def test_it_goes_on_with_other_constants():
     assert np.abs(believed - aims[:2000]).max() > 5e-4
 
 
-def test_constants_that_its_gains_cannot_bear_are_refused():
+def test_constants_that_its_gains_cannot_bear_are_refused() -> None:
     """Less friction than the gains need is refused with what would do; the law stays."""
     steering, other = controller('pid'), controller('pid')
     thin = NeedleParameters.preset('phantom', viscous_friction=0.3)
@@ -147,7 +151,7 @@ def test_constants_that_its_gains_cannot_bear_are_refused():
     assert steering.command(measured) == other.command(measured)
 
 
-def test_forces_stay_within_their_limit():
+def test_forces_stay_within_their_limit() -> None:
     """No command exceeds the force limit, whatever the error."""
     steering = controller(force_limit=2.0)
     steering.set_target(0.2)
@@ -158,26 +162,26 @@ def test_forces_stay_within_their_limit():
 
 
 @pytest.mark.parametrize('depth', [nan, -0.01, 0.0, 0.21, np.inf])
-def test_targets_out_of_reach_are_refused(depth):
+def test_targets_out_of_reach_are_refused(depth: float) -> None:
     """Before the skin, beyond the hub and not a number: refused with the valid range."""
     with pytest.raises(ParameterError, match=r'target depth must be in \[0.001, 0.2\] m'):
         controller().set_target(depth)
 
 
-def test_unknown_names_are_listed():
+def test_unknown_names_are_listed() -> None:
     """An unknown law is answered with the known ones."""
     with pytest.raises(ParameterError, match='inverse_dynamics, pid'):
         controller('sliding_mode')
 
 
-def test_fractional_delay_is_refused():
+def test_fractional_delay_is_refused() -> None:
     """A delay is a whole number of periods."""
     with pytest.raises(ParameterError, match='whole number'):
         ControllerSettings(delay=1.5)
 
 
 @pytest.mark.parametrize('switch', ['law', 'gains'])
-def test_a_switch_in_motion_goes_on_with_the_last_force(switch):
+def test_a_switch_in_motion_goes_on_with_the_last_force(switch: str) -> None:
     """Another law, or other gains, begin with the force before; then it does not jump either."""
     truth = NeedleParameters.preset('phantom')
     steering = controller()
@@ -206,7 +210,7 @@ def test_a_switch_in_motion_goes_on_with_the_last_force(switch):
     assert steering.law == ('pid' if switch == 'law' else 'inverse_dynamics')
 
 
-def test_a_switch_to_gains_that_cannot_be_stable_is_refused():
+def test_a_switch_to_gains_that_cannot_be_stable_is_refused() -> None:
     """The reason names them, and the old law goes on."""
     steering = controller()
     with pytest.raises(ParameterError, match=r'inverse_dynamics.insertion gains cannot be stable'):
@@ -216,7 +220,7 @@ def test_a_switch_to_gains_that_cannot_be_stable_is_refused():
     assert steering.law == 'inverse_dynamics'
 
 
-def test_what_limits_the_stability_is_told():
+def test_what_limits_the_stability_is_told() -> None:
     """A radius for each axis; a margin that the gains do not have is refused."""
     steering = controller()
     assert set(steering.limits) == {'insertion', 'rotation'}
@@ -229,7 +233,7 @@ def test_what_limits_the_stability_is_told():
     ('depth', 'speed', 'fault'),
     [(0.025, 0.0, 'moved by 0.005 m'), (0.02, 9e3, 'moved by 0 m'), (nan, 0.0, 'must be finite')],
 )
-def test_a_measurement_that_jumps_is_not_answered(depth, speed, fault):
+def test_a_measurement_that_jumps_is_not_answered(depth: float, speed: float, fault: str) -> None:
     """More than its speed explains, or a speed that the depth denies: no force, and why."""
     steering = controller()
     steering.set_target(0.05)
@@ -247,7 +251,7 @@ def test_a_measurement_that_jumps_is_not_answered(depth, speed, fault):
     assert steering.target == 0.05
 
 
-def test_a_needle_that_is_elsewhere_for_good_is_not_driven_to_the_old_target():
+def test_a_needle_that_is_elsewhere_for_good_is_not_driven_to_the_old_target() -> None:
     """It says so once, and waits for a target."""
     steering = controller()
     steering.set_target(0.05)
@@ -262,7 +266,7 @@ def test_a_needle_that_is_elsewhere_for_good_is_not_driven_to_the_old_target():
     assert not any(c.force for c in commands[51:])
 
 
-def test_the_integral_is_frozen_while_nothing_is_commanded():
+def test_the_integral_is_frozen_while_nothing_is_commanded() -> None:
     """After a fault PID goes on with the friction that it had learned."""
     truth = NeedleParameters.preset('phantom')
     steering = controller('pid')
@@ -281,7 +285,7 @@ def test_the_integral_is_frozen_while_nothing_is_commanded():
 
 
 @pytest.mark.parametrize('step', [7.0, -7.0], ids=['forward', 'back'])
-def test_a_gap_or_a_step_back_in_time_starts_the_motion_anew(step):
+def test_a_gap_or_a_step_back_in_time_starts_the_motion_anew(step: float) -> None:
     """No fault, no jump of the reference: on to the same target from where the needle is."""
     steering = controller()
     steering.set_target(0.05)
@@ -307,7 +311,7 @@ def test_a_gap_or_a_step_back_in_time_starts_the_motion_anew(step):
 
 
 @pytest.mark.parametrize('load', [nan, inf])
-def test_a_command_knows_whether_it_is_finite(load):
+def test_a_command_knows_whether_it_is_finite(load: float) -> None:
     """A load that is none makes a command that must not go out."""
     steering = controller()
     steering.set_target(0.05)
@@ -317,7 +321,7 @@ def test_a_command_knows_whether_it_is_finite(load):
     assert not Command(force=0.0, torque=load, setpoint=Setpoint(0.02)).is_finite()
 
 
-def test_a_range_of_depths_bounds_the_targets():
+def test_a_range_of_depths_bounds_the_targets() -> None:
     """Targets outside it are refused, and one that leaves nothing of the needle too."""
     steering = controller(lowest_depth=0.02, highest_depth=0.1)
     for depth in (0.01, 0.11):

@@ -16,7 +16,13 @@ from needle_controller import (
     SampledLoop,
     Setpoint,
 )
-from needle_controller.in_loop import run_batch, run_continuous, run_controller, tip_deflections
+from needle_controller.in_loop import (
+    LoopBatch,
+    run_batch,
+    run_continuous,
+    run_controller,
+    tip_deflections,
+)
 from needle_controller.laws.axis import Axis
 from needle_dynamics import (
     InsertedLengthError,
@@ -52,7 +58,7 @@ def pid(kp: float, kd: float) -> ContinuousPid:
     return ContinuousPid(model=MODEL, kp=[kp, 1e-6], kd=[kd, 1e-8])
 
 
-def test_a_piece_of_sliding_is_the_linear_flow_with_constant_dry_friction():
+def test_a_piece_of_sliding_is_the_linear_flow_with_constant_dry_friction() -> None:
     """Until it first comes to rest: M x_ddot = - kp x - (kd + mu_v) x_dot - mu_s, for x = e."""
     law, p = pid(2.0, 0.01), MODEL.parameters
     run = run_continuous(law, MODEL, STRAIGHT, goal(0.19), np.linspace(0.0, 0.4, 81))
@@ -66,7 +72,7 @@ def test_a_piece_of_sliding_is_the_linear_flow_with_constant_dry_friction():
         assert_allclose(depth, expected, atol=4e-8 * 10.0)
 
 
-def test_it_sticks_inside_the_bound_and_says_when():
+def test_it_sticks_inside_the_bound_and_says_when() -> None:
     """An underdamped PID swings, comes to rest, and stays where |kp e| <= mu_s, exactly."""
     model = NeedleModel(replace(MODEL.parameters, viscous_friction=0.01))
     law = ContinuousPid(model=model, kp=[5.0, 1e-6], kd=[0.005, 1e-8])
@@ -80,7 +86,7 @@ def test_it_sticks_inside_the_bound_and_says_when():
     assert 5.0 * abs(0.17 - run.depth[-1]) <= model.parameters.coulomb_friction
 
 
-def test_a_growing_push_breaks_away_when_it_reaches_the_bound():
+def test_a_growing_push_breaks_away_when_it_reaches_the_bound() -> None:
     """A PID with its goal moving off at 1 cm/s reaches mu_s = kp v t, and slides from then on."""
 
     def moving(time: float) -> np.ndarray:
@@ -98,7 +104,7 @@ def test_a_growing_push_breaks_away_when_it_reaches_the_bound():
     assert run.depth[-1] > 0.15 + 1e-4
 
 
-def test_inverse_dynamics_goes_through_reversals_as_if_there_were_no_friction():
+def test_inverse_dynamics_goes_through_reversals_as_if_there_were_no_friction() -> None:
     """With its own model as the plant d obeys its error equation, at rest for an instant only."""
     kp, kv = [400.0, 100.0], [4.0, 20.0]
     law = ContinuousInverseDynamics(model=MODEL, kp=kp, kv=kv)
@@ -112,7 +118,7 @@ def test_inverse_dynamics_goes_through_reversals_as_if_there_were_no_friction():
     assert_allclose(run.depth, expected, atol=2e-7)
 
 
-def test_the_hub_stops_the_needle_and_lets_it_go_again():
+def test_the_hub_stops_the_needle_and_lets_it_go_again() -> None:
     """On the hub d = 0 and d_dot = 0; a goal that comes out again takes the needle along."""
 
     def swinging(time: float) -> np.ndarray:
@@ -131,7 +137,7 @@ def test_the_hub_stops_the_needle_and_lets_it_go_again():
     assert run.depth[-1] < 0.15
 
 
-def test_agrees_with_the_sampled_law_inside_the_integrator():
+def test_agrees_with_the_sampled_law_inside_the_integrator() -> None:
     """The implicit PID at a short period, without delay, tends to the continuous one."""
     law, p = pid(5.0, 0.2), MODEL.parameters
     state = MODEL.state_at(0.15, 5e-4)
@@ -155,7 +161,7 @@ def test_agrees_with_the_sampled_law_inside_the_integrator():
     assert errors[-1] < 1e-5
 
 
-def test_refuses_what_it_cannot_run():
+def test_refuses_what_it_cannot_run() -> None:
     law = pid(2.0, 0.01)
     with pytest.raises(ShapeError, match='times must be at least two that ascend'):
         run_continuous(law, MODEL, STRAIGHT, goal(0.16), [0.0])
@@ -167,7 +173,7 @@ def test_refuses_what_it_cannot_run():
     assert issubclass(InsertedLengthError, NeedleError)
 
 
-def test_tips_of_many_states_are_those_of_each():
+def test_tips_of_many_states_are_those_of_each() -> None:
     states = np.array([MODEL.state_at(depth, 1e-3 * depth) for depth in (0.02, 0.1, 0.2)])
     found = [MODEL.tip_deflection(x) for x in states]
     # Closed form here, series there: rounding of cosh and sinh at small depth.
@@ -197,7 +203,7 @@ def plants(count: int) -> list[NeedleParameters]:
 
 @pytest.mark.parametrize('name', ['inverse_dynamics', 'pid'])
 @pytest.mark.parametrize('delay', [0, 1, 3])
-def test_a_batch_is_the_controller_of_the_node(name, delay):
+def test_a_batch_is_the_controller_of_the_node(name: str, delay: int) -> None:
     """Every run of a batch is, to the bit, that of the controller object."""
     axis = Axis.insertion(BELIEVED)
     inverse, gains = InverseDynamicsGains(kp=400.0, kv=40.0), PidGains(kp=1000.0, ki=3000.0)
@@ -236,11 +242,11 @@ def test_a_batch_is_the_controller_of_the_node(name, delay):
         assert batch.completed[i] == len(run.time) - 1
 
 
-def test_a_batch_does_not_depend_on_threads_nor_on_its_step():
+def test_a_batch_does_not_depend_on_threads_nor_on_its_step() -> None:
     law = Pid(axis=Axis.insertion(BELIEVED), gains=PidGains(), period=PERIOD)
     needles = plants(5)
 
-    def run(**how):
+    def run(**how: float) -> LoopBatch:
         return run_batch(law, needles, START, REFERENCE, delay=1, limit=15.0, duration=0.8, **how)
 
     one, two, fine = run(workers=1, step=PERIOD), run(workers=2, step=PERIOD), run(step=1e-5)
@@ -250,7 +256,7 @@ def test_a_batch_does_not_depend_on_threads_nor_on_its_step():
     assert_allclose(one.largest, fine.largest, atol=1e-9)
 
 
-def test_a_needle_that_leaves_its_range_is_told_apart():
+def test_a_needle_that_leaves_its_range_is_told_apart() -> None:
     shallow = NeedleModel(BELIEVED).state_at(0.0012)
     out = MinimumJerk(Setpoint(0.0012), 0.0, ReferenceLimits())
     law = Pid(axis=Axis.insertion(BELIEVED), gains=PidGains(), period=PERIOD)
@@ -258,7 +264,7 @@ def test_a_needle_that_leaves_its_range_is_told_apart():
     assert 0 < batch.completed[0] < 1000
 
 
-def test_a_batch_refuses_what_does_not_agree():
+def test_a_batch_refuses_what_does_not_agree() -> None:
     law = Pid(axis=Axis.insertion(BELIEVED), gains=PidGains(), period=PERIOD)
     options = {'delay': 1, 'limit': 15.0, 'duration': 0.1}
     with pytest.raises(ShapeError, match='one number of runs'):

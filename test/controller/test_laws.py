@@ -1,6 +1,7 @@
 """What the sampled laws do to the axes they believe in."""
 
 from math import isfinite
+from typing import Any
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -34,7 +35,9 @@ viscosities = st.floats(0.0, 500.0)
 
 @settings(deadline=None, derandomize=True)
 @given(numbers, numbers, numbers, inertias, viscosities)
-def test_inverse_dynamics_gives_the_speed_it_aims_at(position, speed, load, inertia, viscous):
+def test_inverse_dynamics_gives_the_speed_it_aims_at(
+    position: float, speed: float, load: float, inertia: float, viscous: float
+) -> None:
     """Held over the period, the force brings about u + h a exactly, on every axis."""
     axis = Axis(inertia=inertia, viscous=viscous)
     law = InverseDynamics(axis=axis, gains=InverseDynamicsGains(), period=PERIOD)
@@ -47,7 +50,7 @@ def test_inverse_dynamics_gives_the_speed_it_aims_at(position, speed, load, iner
     assert abs(reached - (speed + PERIOD * acceleration)) < 1e-11 * scale
 
 
-def test_inverse_dynamics_tends_to_the_continuous_law():
+def test_inverse_dynamics_tends_to_the_continuous_law() -> None:
     """As h -> 0 the force is M a + mu_v u + mu_s sgn(u) + N, with an error of order one."""
     axis = PAPER_SI
     aim, gains = Setpoint(0.1, 0.02, 0.3), InverseDynamicsGains(kp=9.0, kv=6.0)
@@ -68,8 +71,14 @@ def test_inverse_dynamics_tends_to_the_continuous_law():
 @settings(deadline=None, derandomize=True)
 @given(numbers, numbers, numbers, inertias, viscosities, st.floats(0.0, 0.1), numbers)
 def test_pid_is_evaluated_at_the_end_of_the_period(
-    position, speed, integral, inertia, viscous, filter_time, filtered
-):
+    position: float,
+    speed: float,
+    integral: float,
+    inertia: float,
+    viscous: float,
+    filter_time: float,
+    filtered: float,
+) -> None:
     """The force equals kp e + ki int e + kd e_dot at the state that it itself brings about."""
     axis = Axis(inertia=inertia, viscous=viscous)
     gains = PidGains(kp=50.0, ki=20.0, kd=3.0, filter_time=filter_time)
@@ -92,7 +101,7 @@ def test_pid_is_evaluated_at_the_end_of_the_period(
 
 @settings(deadline=None, derandomize=True, max_examples=200)
 @given(st.floats(-3.0, 6.0), st.sampled_from([1e-6, 1e-3]))
-def test_response_is_exact(damping, t):
+def test_response_is_exact(damping: float, t: float) -> None:
     """Every entry agrees with the matrix exponential in 40 digits, damped a little or a lot."""
     gamma = 10.0**damping
     response = Axis(inertia=1.0, viscous=gamma).response(t)
@@ -105,7 +114,7 @@ def test_response_is_exact(damping, t):
     assert_allclose(vv, exact[1], rtol=1e-14, atol=1e-15)
 
 
-def test_response_joins_its_limits():
+def test_response_joins_its_limits() -> None:
     """Hardly any friction is like none, to first order."""
     free = Axis(inertia=2e-3).response(PERIOD)
     # x = mu_v h / M = 5e-6 is the relative size of what changes.
@@ -119,7 +128,7 @@ def test_response_joins_its_limits():
         ({'inertia': 1.0, 'viscous': -1.0}, 'viscous must be finite and >= 0'),
     ],
 )
-def test_axes_that_are_none_are_refused(changes, words):
+def test_axes_that_are_none_are_refused(changes: dict[str, float], words: str) -> None:
     """No mass, and negative damping."""
     with pytest.raises(ParameterError, match=words):
         Axis(**changes)
@@ -127,7 +136,7 @@ def test_axes_that_are_none_are_refused(changes, words):
 
 @settings(deadline=None, derandomize=True, max_examples=30)
 @given(st.integers(0, 5), st.lists(numbers, min_size=8, max_size=8))
-def test_the_loop_predicts_its_delay_away(delay, kicks):
+def test_the_loop_predicts_its_delay_away(delay: int, kicks: list[float]) -> None:
     """With the axis it believes in, delay only delays: the depths are those without it, later."""
 
     def run(late: int) -> list[float]:
@@ -148,7 +157,7 @@ def test_the_loop_predicts_its_delay_away(delay, kicks):
 
 
 @pytest.mark.parametrize('period', [1e-5, 1e-4, 1e-3])
-def test_breakaway_overcomes_coulomb_friction_at_rest(period):
+def test_breakaway_overcomes_coulomb_friction_at_rest(period: float) -> None:
     """At rest with an error the inverse dynamics breaks away, at the sign of the error."""
     law = InverseDynamics(axis=PHANTOM, gains=InverseDynamicsGains(), period=period)
     for sign in (-1.0, 1.0):
@@ -163,7 +172,7 @@ def test_breakaway_overcomes_coulomb_friction_at_rest(period):
 # Anti-windup, feed-forward, memory.
 
 
-def test_the_integral_neither_winds_up_nor_hunts():
+def test_the_integral_neither_winds_up_nor_hunts() -> None:
     """In a limit the integral stands still, and within the tolerance at rest it is frozen."""
     loop = SampledLoop(Pid(axis=PHANTOM, gains=PidGains(), period=PERIOD), 0, 1.0)
     for _ in range(100):
@@ -176,7 +185,7 @@ def test_the_integral_neither_winds_up_nor_hunts():
     assert loop.memory[INTEGRAL] == pytest.approx(PERIOD * 1e-3, rel=1e-12)
 
 
-def test_back_calculation_unwinds_in_its_tracking_time():
+def test_back_calculation_unwinds_in_its_tracking_time() -> None:
     """Without an error what exceeds the limit fades as exp(-t / tracking_time)."""
     gains = PidGains(anti_windup='back_calculation', tracking_time=0.05, tolerance=0.0)
     law = Pid(axis=PHANTOM, gains=gains, period=1e-5)
@@ -191,7 +200,7 @@ def test_back_calculation_unwinds_in_its_tracking_time():
 
 
 @pytest.mark.parametrize('anti_windup', ['conditional', 'back_calculation'])
-def test_a_limit_does_not_make_the_integral_overshoot(anti_windup):
+def test_a_limit_does_not_make_the_integral_overshoot(anti_windup: str) -> None:
     """After a long time in the limit the axis arrives without more overshoot than unlimited."""
     gains = PidGains(anti_windup=anti_windup, tracking_time=0.02)
     loop = SampledLoop(Pid(axis=PHANTOM, gains=gains, period=PERIOD), 1, 4.0)
@@ -206,7 +215,7 @@ def test_a_limit_does_not_make_the_integral_overshoot(anti_windup):
 
 
 @pytest.mark.parametrize('axis', [PHANTOM, PAPER_SI], ids=['phantom', 'si'])
-def test_feed_forward_follows_the_reference_by_itself(axis):
+def test_feed_forward_follows_the_reference_by_itself(axis: Axis) -> None:
     """With the axis it believes in, almost nothing is left to the feedback; without it a lot."""
     reference = MinimumJerk(Setpoint(0.0), 0.01, ReferenceLimits(speed=0.02, acceleration=0.2))
     worst = {}
@@ -239,7 +248,9 @@ def test_feed_forward_follows_the_reference_by_itself(axis):
         ]
     ),
 )
-def test_a_switch_has_no_bump(position, speed, last, axis, gains):
+def test_a_switch_has_no_bump(
+    position: float, speed: float, last: float, axis: Axis, gains: InverseDynamicsGains | PidGains
+) -> None:
     """Whatever law follows, its first force is the last one of the law before."""
     law = InverseDynamics if isinstance(gains, InverseDynamicsGains) else Pid
     loop = SampledLoop(Pid(axis=axis, gains=PidGains(), period=PERIOD), 1, 20.0)
@@ -251,7 +262,7 @@ def test_a_switch_has_no_bump(position, speed, last, axis, gains):
     assert isfinite(loop.command(position, speed, Setpoint(0.1, 0.01, 0.2)))
 
 
-def test_what_bridges_a_switch_fades():
+def test_what_bridges_a_switch_fades() -> None:
     """The force that inverse dynamics took over is gone after ten times its 0.1 s."""
     loop = SampledLoop(Pid(axis=PHANTOM, gains=PidGains(), period=PERIOD), 0, 20.0)
     loop.last = 3.0
@@ -264,7 +275,7 @@ def test_what_bridges_a_switch_fades():
     assert loop.memory[OFFSET] < 2e-4
 
 
-def test_a_stopped_loop_keeps_what_it_knows():
+def test_a_stopped_loop_keeps_what_it_knows() -> None:
     """A stop takes the commands off the way; the integral waits, and a reset forgets it."""
     loop = SampledLoop(Pid(axis=PHANTOM, gains=PidGains(), period=PERIOD), 2, 20.0)
     for _ in range(10):
@@ -277,7 +288,7 @@ def test_a_stopped_loop_keeps_what_it_knows():
     assert not loop.memory.any()
 
 
-def test_a_switch_keeps_the_period():
+def test_a_switch_keeps_the_period() -> None:
     """A law of another period belongs into another loop."""
     law = Pid(axis=PHANTOM, gains=PidGains(), period=PERIOD)
     with pytest.raises(ParameterError, match=r'period must stay 0\.001 s'):
@@ -293,7 +304,7 @@ def test_a_switch_keeps_the_period():
         ({'tracking_time': 0.0}, 'tracking_time must be finite, > 0 s'),
     ],
 )
-def test_gains_that_are_none_are_refused(changes, words):
+def test_gains_that_are_none_are_refused(changes: dict[str, Any], words: str) -> None:
     """Unknown names and numbers out of range, with what would be valid."""
     with pytest.raises(ParameterError, match=words):
         PidGains(**changes)

@@ -1,10 +1,13 @@
 """References keep their limits, join what was before, and arrive."""
 
+from collections.abc import Callable
+from typing import Any
+
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from needle_controller import MinimumJerk, ReferenceLimits, Setpoint, Trapezoid
 from needle_controller.reference.reference import Guide, Joined, Path, Quintic
-from needle_dynamics import ParameterError
+from needle_dynamics import FloatArray, ParameterError
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest
@@ -19,7 +22,9 @@ speeds = st.floats(-0.02, 0.02)
 @BOTH
 @settings(deadline=None)
 @given(depths, speeds, depths)
-def test_starts_where_it_was_and_ends_at_the_target_at_rest(kind, start, speed, target):
+def test_starts_where_it_was_and_ends_at_the_target_at_rest(
+    kind: type[MinimumJerk] | type[Trapezoid], start: float, speed: float, target: float
+) -> None:
     """The ends are exact, before and after it rests there."""
     motion = kind(Setpoint(start, speed), target, LIMITS)
     assume(motion.duration > 0.0)
@@ -34,7 +39,9 @@ def test_starts_where_it_was_and_ends_at_the_target_at_rest(kind, start, speed, 
 @BOTH
 @settings(deadline=None)
 @given(depths, speeds, depths)
-def test_position_speed_and_acceleration_belong_together(kind, start, speed, target):
+def test_position_speed_and_acceleration_belong_together(
+    kind: type[MinimumJerk] | type[Trapezoid], start: float, speed: float, target: float
+) -> None:
     """The speed is the derivative of the position and stays within what limits and start allow."""
     motion = kind(Setpoint(start, speed), target, LIMITS)
     assume(motion.duration > 1e-2)
@@ -56,7 +63,7 @@ ends = st.builds(Setpoint, depths, speeds, st.one_of(st.just(0.0), st.floats(-0.
 
 @settings(deadline=None)
 @given(ends, ends, st.floats(-3.0, 2.0))
-def test_extremes_of_a_quintic_are_found(start, end, exponent):
+def test_extremes_of_a_quintic_are_found(start: Setpoint, end: Setpoint, exponent: float) -> None:
     """No sample of position, speed or acceleration is beyond them, and some are near them."""
     motion = Quintic(start, end, 10.0**exponent)
     points = [motion.at(x * motion.duration) for x in np.linspace(0.0, 1.0, 1001)]
@@ -77,7 +84,7 @@ def test_extremes_of_a_quintic_are_found(start, end, exponent):
 
 @settings(deadline=None)
 @given(depths, depths)
-def test_trapezoid_is_the_fastest_motion(start, target):
+def test_trapezoid_is_the_fastest_motion(start: float, target: float) -> None:
     """Its duration is the least that speed and acceleration allow from rest to rest."""
     distance = abs(target - start)
     motion = Trapezoid(Setpoint(start), target, LIMITS)
@@ -86,7 +93,7 @@ def test_trapezoid_is_the_fastest_motion(start, target):
     assert motion.duration == pytest.approx(least, rel=1e-9, abs=1e-12)
 
 
-def test_minimum_jerk_meets_its_limit():
+def test_minimum_jerk_meets_its_limit() -> None:
     """From rest to rest the peak speed is the limit, reached half-way."""
     motion = MinimumJerk(Setpoint(0.02), 0.12, LIMITS)
     # Peak of the quintic at half time: 15/8 of the mean speed.
@@ -94,14 +101,16 @@ def test_minimum_jerk_meets_its_limit():
     assert motion.duration == pytest.approx(18.75, rel=1e-12)
 
 
-def samples(motion, end: float, count: int = 801):
+def samples(motion: Callable[..., Any], end: float, count: int = 801) -> tuple[FloatArray, ...]:
     """Return times, positions, speeds and accelerations of a motion."""
     times = np.linspace(0.0, end, count)
     points = [motion(t) for t in times]
     return times, *np.array([(p.position, p.speed, p.acceleration) for p in points]).T
 
 
-def check_smooth(motion, end: float, extra_speed: float = 0.0, extra_ramp: float = 0.0):
+def check_smooth(
+    motion: Callable[..., Any], end: float, extra_speed: float = 0.0, extra_ramp: float = 0.0
+) -> None:
     """Check that position and speed do not jump and keep the limits, and what a start exceeds."""
     times, position, speed, _ = samples(motion, end)
     step = times[1]
@@ -119,7 +128,7 @@ REACH = (0.001, 0.2)
 legs = st.lists(st.tuples(st.floats(0.3, 3.0), st.floats(-1.0, 1.0)), min_size=1, max_size=6)
 
 
-def lines(legs, start: float = 0.1):
+def lines(legs: list[tuple[float, float]], start: float = 0.1) -> tuple[list[float], list[float]]:
     """Return times and positions of lines within limits and reach."""
     times, positions = [0.0], [start]
     for time, part in legs:
@@ -132,8 +141,8 @@ def lines(legs, start: float = 0.1):
 @settings(deadline=None, max_examples=60)
 @given(legs, st.floats(0.05, 0.15), speeds, st.booleans())
 def test_a_path_is_joined_from_anywhere_without_a_jump_and_followed_to_its_end(
-    legs, start, speed, cubic
-):
+    legs: list[tuple[float, float]], start: float, speed: float, cubic: bool
+) -> None:
     """Lines, or cubics at rest in their points: joined within the limits, ended exactly."""
     times, positions = lines(legs)
     if cubic:
@@ -147,7 +156,7 @@ def test_a_path_is_joined_from_anywhere_without_a_jump_and_followed_to_its_end(
     assert motion.at(motion.duration) == Setpoint(positions[-1])
 
 
-def test_lines_are_followed_to_the_bit_between_their_corners():
+def test_lines_are_followed_to_the_bit_between_their_corners() -> None:
     """In the middle of each line the path is the line; a corner is cut by dv^2 / 8a at most."""
     times, positions = [0.0, 2.0, 4.0], [0.1, 0.118, 0.11]
     path = Path(times, positions, None, LIMITS, REACH)
@@ -176,7 +185,9 @@ def test_lines_are_followed_to_the_bit_between_their_corners():
         ([0.0, 4.0], [0.1995, 0.1995], [0.009, 0.0], r'must stay in \[0.001, 0.2\] m'),
     ],
 )
-def test_a_path_that_cannot_be_followed_is_refused(times, positions, rates, reason):
+def test_a_path_that_cannot_be_followed_is_refused(
+    times: list[float], positions: list[float], rates: list[float] | None, reason: str
+) -> None:
     """In one line, with what was found and what would be valid."""
     with pytest.raises(ParameterError, match=reason):
         Path(times, positions, rates, LIMITS, REACH)
@@ -208,7 +219,9 @@ events = st.lists(
 @KINDS
 @settings(deadline=None, max_examples=25)
 @given(st.data(), events)
-def test_no_change_makes_the_reference_jump(kind, data, events):
+def test_no_change_makes_the_reference_jump(
+    kind: str, data: Any, events: list[tuple[str, float]]
+) -> None:
     """Targets, paths, pauses and resumptions in any order: position and speed are continuous."""
     walk = Walk(kind)
     walk.guide.aim(0.12)
@@ -232,7 +245,7 @@ def test_no_change_makes_the_reference_jump(kind, data, events):
 
 
 @KINDS
-def test_a_pause_brakes_to_rest_holds_and_is_resumed(kind):
+def test_a_pause_brakes_to_rest_holds_and_is_resumed(kind: str) -> None:
     """In motion it stops within v^2 / 2a (2.9 times as far with little jerk), then goes on."""
     walk = Walk(kind)
     walk.guide.aim(0.1)
@@ -250,7 +263,7 @@ def test_a_pause_brakes_to_rest_holds_and_is_resumed(kind):
 
 
 @KINDS
-def test_a_paused_path_is_resumed_where_it_was_left(kind):
+def test_a_paused_path_is_resumed_where_it_was_left(kind: str) -> None:
     """It goes on behind where it stopped, to the end of the path, as late as the pause took."""
     times, positions = [0.0, 4.0, 8.0], [0.05, 0.08, 0.06]
     walk = Walk(kind)
@@ -275,7 +288,7 @@ inside = st.one_of(st.sampled_from(NARROW), st.floats(*NARROW))
 
 
 @st.composite
-def narrow_paths(draw):
+def narrow_paths(draw: Callable[..., Any]) -> tuple[list[float], list[float]]:
     """Return times and positions of lines from end to end of the narrow reach."""
     times, positions = [draw(st.sampled_from([0.0, 0.05, 1.0]))], [draw(inside)]
     for _ in range(draw(st.integers(0, 4))):
@@ -300,7 +313,7 @@ narrow_events = st.lists(
 @KINDS
 @settings(deadline=None, max_examples=40)
 @given(start=inside, events=narrow_events)
-def test_the_reference_never_leaves_the_reach(kind, start, events):
+def test_the_reference_never_leaves_the_reach(kind: str, start: float, events: list[Any]) -> None:
     """Targets, paths and pauses at its ends, at any speed: it turns before them, and no jump."""
     guide, time, points = Guide(kind, LIMITS, NARROW), 0.0, []
     guide.aim(NARROW[1])

@@ -1,6 +1,7 @@
 """What counts as a message, what violates a limit, and what latches."""
 
 from math import inf, nan
+from typing import Any
 
 from needle_controller import (
     ControllerSettings,
@@ -19,12 +20,12 @@ SECOND = 1_000_000_000
 MILLISECOND = SECOND // 1000
 
 
-def stream(**options) -> Stream:
+def stream(**options: list[float] | tuple[str, ...]) -> Stream:
     """Return the stream of a force sensor at 1 kHz."""
     return Stream('base_wrench', 0.5, **options)
 
 
-def safety(expected=(), **limits) -> Safety:
+def safety(expected: tuple[str, ...] = (), **limits: bool | float) -> Safety:
     """Return the safety of a needle of the phantom that has begun at 10 s."""
     whole = Safety(
         SafetyLimits(**limits), ControllerSettings(), NeedleParameters(), expected=expected
@@ -43,7 +44,7 @@ def safety(expected=(), **limits) -> Safety:
         (0, 'not stamped', 'base_wrench is stale: it is not stamped'),
     ],
 )
-def test_a_stamp_must_be_of_now(stamp, kind, words):
+def test_a_stamp_must_be_of_now(stamp: int, kind: str | None, words: str) -> None:
     """Old, from the future or missing: refused, and each counted by its kind."""
     wrench = stream()
     refusal = wrench.check(stamp, 10 * SECOND)
@@ -52,7 +53,7 @@ def test_a_stamp_must_be_of_now(stamp, kind, words):
     assert wrench.counts[kind or 'taken'] == 1
 
 
-def test_a_time_that_starts_at_zero_has_stamps_of_zero():
+def test_a_time_that_starts_at_zero_has_stamps_of_zero() -> None:
     """The first sample of a simulation is one, not a message without a stamp."""
     wrench = stream()
     assert wrench.check(0, 0) is None
@@ -60,7 +61,7 @@ def test_a_time_that_starts_at_zero_has_stamps_of_zero():
     assert wrench.check(MILLISECOND, MILLISECOND) is None
 
 
-def test_a_wish_without_a_stamp_is_of_now():
+def test_a_wish_without_a_stamp_is_of_now() -> None:
     """`ros2 topic pub` sends no stamp; a wish with one must be of now all the same."""
     target = Stream('target', 1.0, frames=('', 'needle_entry'), stamped=False)
     assert [target.check(0, 10 * SECOND, frame) for frame in ('', 'needle_entry', '')] == [
@@ -69,7 +70,7 @@ def test_a_wish_without_a_stamp_is_of_now():
     assert target.check(SECOND, 10 * SECOND).kind == 'stale'
 
 
-def test_order_is_kept():
+def test_order_is_kept() -> None:
     """One that comes twice, or after a later one, does not count and is no fault."""
     wrench = stream()
     stamps = [1, 2, 2, 4, 3, 5]
@@ -81,7 +82,7 @@ def test_order_is_kept():
     assert '5 taken, 1 repeated, 1 dropped; refused: none' in wrench.describe(5 * SECOND)
 
 
-def test_frame_and_numbers_are_checked():
+def test_frame_and_numbers_are_checked() -> None:
     """Another frame and what is not finite are refused with what came."""
     wrench = stream(frames=('needle_base',))
     now = 10 * SECOND
@@ -93,7 +94,7 @@ def test_frame_and_numbers_are_checked():
     assert wrench.describe(now).endswith('refused: 1 frame, 3 not finite')
 
 
-def feed(watched: Stream, readings) -> list[str]:
+def feed(watched: Stream, readings: list[Any]) -> list[str]:
     """Return what becomes of readings at 1 kHz from 10 s on, '' for those that count."""
     kinds = []
     for i, value in enumerate(readings):
@@ -103,14 +104,14 @@ def feed(watched: Stream, readings) -> list[str]:
     return kinds
 
 
-def test_a_jump_is_not_believed_at_once():
+def test_a_jump_is_not_believed_at_once() -> None:
     """A spike counts neither up nor down; a step counts from its second reading on."""
     assert feed(stream(jumps=[1.0]), [0, 0, 9, 0, 0]) == ['', '', 'jump', 'jump', '']
     assert feed(stream(jumps=[1.0]), [0, 9, 9, 9]) == ['', 'jump', '', '']
     assert feed(stream(jumps=[1.0]), [0, 0.9, 1.8]) == [''] * 3
 
 
-def test_a_noisy_reading_that_stands_still_is_frozen():
+def test_a_noisy_reading_that_stands_still_is_frozen() -> None:
     """After the timeout of 0.5 s it does not count until it changes."""
     rng = np.random.default_rng(1)
     noisy = [*rng.normal(0.0, 0.01, 100)]
@@ -129,7 +130,7 @@ def test_a_noisy_reading_that_stands_still_is_frozen():
     [[0.0] * 2000, [0.1 * 0.9**i if i < 300 else 0.0 for i in range(2000)]],
     ids=['still from the start', 'comes to rest'],
 )
-def test_a_reading_without_noise_may_stand_still(readings):
+def test_a_reading_without_noise_may_stand_still(readings: list[float]) -> None:
     """A perfect sensor at rest is not frozen."""
     assert set(feed(stream(noise=[0.01]), readings)) == {''}
 
@@ -149,7 +150,9 @@ GUARD = [
 
 
 @pytest.mark.parametrize(('name', 'values', 'words'), GUARD)
-def test_two_readings_beyond_a_limit_violate_it(name, values, words):
+def test_two_readings_beyond_a_limit_violate_it(
+    name: str, values: tuple[float, ...], words: str
+) -> None:
     """Quantity, value, limit and unit in one line; one reading alone does not count."""
     guard = Guard(SafetyLimits(), (0.001, 0.1))
     good = {'encoders': (0.05, 0.0), 'wrench': (0.0, 0.0, 0.0)}.get(name, (0.0,))
@@ -163,7 +166,7 @@ def test_two_readings_beyond_a_limit_violate_it(name, values, words):
     assert guard.violated is None
 
 
-def test_readings_at_a_limit_are_within_it():
+def test_readings_at_a_limit_are_within_it() -> None:
     """Limits are the largest values that may be."""
     guard, limits = Guard(SafetyLimits(), (0.001, 0.1)), SafetyLimits()
     for _ in range(3):
@@ -173,7 +176,7 @@ def test_readings_at_a_limit_are_within_it():
         assert guard.tracking(-limits.tracking_error) is None
 
 
-def test_a_stop_holds_until_it_may_be_cleared():
+def test_a_stop_holds_until_it_may_be_cleared() -> None:
     """The first reason stays; clearing is refused with what is still beyond its limit."""
     whole = safety()
     now = 10 * SECOND
@@ -190,7 +193,7 @@ def test_a_stop_holds_until_it_may_be_cleared():
     assert (whole.stop, whole.stops) == (None, 1)
 
 
-def test_a_sensor_that_fell_silent_does_not_keep_the_stop():
+def test_a_sensor_that_fell_silent_does_not_keep_the_stop() -> None:
     """What it said before says nothing of now."""
     whole = safety()
     now = 10 * SECOND
@@ -201,7 +204,7 @@ def test_a_sensor_that_fell_silent_does_not_keep_the_stop():
     assert whole.clear(now + 2 * SECOND) is None
 
 
-def test_the_error_of_a_reference_that_was_let_go_does_not_keep_the_stop():
+def test_the_error_of_a_reference_that_was_let_go_does_not_keep_the_stop() -> None:
     """The motion starts anew from where the needle is."""
     whole = safety()
     whole.guard.tracking(0.02)
@@ -209,7 +212,7 @@ def test_the_error_of_a_reference_that_was_let_go_does_not_keep_the_stop():
     assert whole.clear(10 * SECOND) is None
 
 
-def test_sensors_are_missed_while_the_encoders_speak():
+def test_sensors_are_missed_while_the_encoders_speak() -> None:
     """Said once when they stop, shown as long as they are silent, and not before a plant is up."""
     whole = safety(expected=('base_wrench',), sensor_timeout=0.5)
     joints, wrench = (whole.streams[name] for name in ('joint_states', 'base_wrench'))
@@ -232,7 +235,7 @@ def test_sensors_are_missed_while_the_encoders_speak():
     assert whole.news(now + 9 * SECOND) == []
 
 
-def test_a_stop_for_want_of_sensors_is_kept_while_they_are_missing():
+def test_a_stop_for_want_of_sensors_is_kept_while_they_are_missing() -> None:
     """With `sensors_required` clearing is refused until they are back."""
     whole = safety(expected=('base_wrench',), sensor_timeout=0.5, sensors_required=True)
     joints, wrench = (whole.streams[name] for name in ('joint_states', 'base_wrench'))
@@ -247,14 +250,14 @@ def test_a_stop_for_want_of_sensors_is_kept_while_they_are_missing():
     assert whole.clear(later) is None
 
 
-def test_a_clock_set_back_is_told_from_one_that_stands():
+def test_a_clock_set_back_is_told_from_one_that_stands() -> None:
     """By more than the timeout of 0.1 s; forward and still are no matter."""
     whole = safety()
     steps = [10.0, 10.0, 10.5, 99.0, 98.95, 50.0, 50.0]
     assert [whole.clock_went_back(round(t * SECOND)) for t in steps] == [0, 0, 0, 0, 0, 48.95, 0]
 
 
-def test_who_else_commands_is_named():
+def test_who_else_commands_is_named() -> None:
     """Each topic with more than one publisher, until it is alone again."""
     whole = safety()
     whole.count_commanders({'/wrench_command': 2})
@@ -263,7 +266,7 @@ def test_who_else_commands_is_named():
     assert whole.rivals is None
 
 
-def test_nothing_is_said_twice_in_a_second():
+def test_nothing_is_said_twice_in_a_second() -> None:
     """Each kind of complaint has its own second."""
     whole = safety()
     times = [0.0, 0.5, 1.0, 1.9, 2.1]
@@ -280,13 +283,13 @@ def test_nothing_is_said_twice_in_a_second():
         ({'sensors_required': 1}, 'sensors_required must be true or false, got 1'),
     ],
 )
-def test_limits_must_be_finite(change, reason):
+def test_limits_must_be_finite(change: dict[str, Any], reason: str) -> None:
     """There is no way to switch a limit off."""
     with pytest.raises(ParameterError, match=reason):
         SafetyLimits(**change)
 
 
-def test_encoders_are_read_by_name():
+def test_encoders_are_read_by_name() -> None:
     """In any order, with or without the rotation."""
     both = read_encoders(1.0, ['rotation', 'insertion'], [0.1, 0.02], [0.2, 0.01])
     assert both == Measurement(time=1.0, depth=0.02, speed=0.01, angle=0.1, angular_speed=0.2)
@@ -303,7 +306,9 @@ def test_encoders_are_read_by_name():
         (['elbow'], [0.02], [0.0]),
     ],
 )
-def test_encoders_that_are_not_complete_are_refused(names, positions, speeds):
+def test_encoders_that_are_not_complete_are_refused(
+    names: list[str], positions: list[float], speeds: list[float]
+) -> None:
     """In one line that says what came."""
     with pytest.raises(ParameterError, match=r"needs position and velocity of 'insertion', got"):
         read_encoders(1.0, names, positions, speeds)

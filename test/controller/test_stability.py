@@ -37,7 +37,7 @@ PROPERTY = settings(
 @pytest.mark.parametrize('delay', [0, 1, 3])
 @pytest.mark.parametrize('unmodeled', [0, 1, 2])
 @pytest.mark.parametrize('filter_time', [0.0, 5e-3])
-def test_transition_matrix_is_the_loop(delay, unmodeled, filter_time):
+def test_transition_matrix_is_the_loop(delay: int, unmodeled: int, filter_time: float) -> None:
     """Powers of the matrix are what the running loop does to an initial error."""
     axis = PHANTOM.without_coulomb()
     gains = PidGains(tolerance=0.0, filter_time=filter_time)
@@ -56,7 +56,7 @@ def test_transition_matrix_is_the_loop(delay, unmodeled, filter_time):
     assert_allclose([position, speed], state[:2], rtol=1e-9, atol=1e-15)
 
 
-def decays(law, unmodeled: int) -> bool:
+def decays(law: InverseDynamics | Pid, unmodeled: int) -> bool:
     """Return whether an error of the loop without Coulomb friction is smaller at the end."""
     loop = SampledLoop(law.linear(), 1, np.inf)
     axis = law.axis.without_coulomb()
@@ -75,7 +75,9 @@ def decays(law, unmodeled: int) -> bool:
 @pytest.mark.parametrize('axis', [PHANTOM, PAPER_SI], ids=['phantom', 'paper_si'])
 @pytest.mark.parametrize('scale', [0.1, 1.0, 10.0, 100.0, 1000.0])
 @pytest.mark.parametrize('law', [InverseDynamics, Pid])
-def test_what_is_accepted_is_stable_and_what_is_refused_is_not(axis, law, scale):
+def test_what_is_accepted_is_stable_and_what_is_refused_is_not(
+    axis: Axis, law: type[InverseDynamics] | type[Pid], scale: float
+) -> None:
     """Acceptance and the growth of the error in the running loop agree."""
     if law is Pid:
         gains = PidGains(kp=20.0 * scale, ki=0.0, kd=1.0 * scale, tolerance=0.0)
@@ -121,8 +123,13 @@ def law_of(gains: InverseDynamicsGains | PidGains, axis: Axis) -> InverseDynamic
     st.integers(0, 1),
 )
 def test_whatever_is_accepted_is_stable_at_every_depth(
-    gains, preset, coulomb, depth, delay, unmodeled
-):
+    gains: InverseDynamicsGains | PidGains,
+    preset: str,
+    coulomb: float,
+    depth: float,
+    delay: int,
+    unmodeled: int,
+) -> None:
     """Around the true, bent needle the error stays bounded and ends within what friction holds."""
     truth = NeedleParameters.preset(preset, coulomb_friction=coulomb)
     law = law_of(gains, Axis.insertion(truth))
@@ -162,7 +169,9 @@ def test_whatever_is_accepted_is_stable_at_every_depth(
 
 @settings(PROPERTY, max_examples=60)
 @given(gains_of_a_law, st.sampled_from([PHANTOM, PAPER_SI]), st.integers(0, 3), st.integers(0, 1))
-def test_what_has_a_pole_outside_diverges(gains, axis, delay, unmodeled):
+def test_what_has_a_pole_outside_diverges(
+    gains: InverseDynamicsGains | PidGains, axis: Axis, delay: int, unmodeled: int
+) -> None:
     """In the running loop without friction an error grows as the spectral radius says."""
     law = law_of(gains, axis)
     radius = spectral_radius(law, delay, unmodeled)
@@ -178,7 +187,7 @@ def test_what_has_a_pole_outside_diverges(gains, axis, delay, unmodeled):
     assert abs(position) > 1.0
 
 
-def test_the_gains_of_the_source_hold_in_the_implicit_form():
+def test_the_gains_of_the_source_hold_in_the_implicit_form() -> None:
     """On 2 g at 1 kHz kp = 1e3, kv = 1e4 are stable here; the textbook form explodes."""
     law = Pid(axis=PAPER_SI, gains=PidGains(kp=1e3, ki=0.0, kd=1e4), period=PERIOD)
     assert spectral_radius(law, 0) < 1.0
@@ -188,7 +197,7 @@ def test_the_gains_of_the_source_hold_in_the_implicit_form():
 
 
 @pytest.mark.parametrize('rate', [100.0, 1e3, 1e4])
-def test_the_slow_gains_of_the_source_are_within_the_margin(rate):
+def test_the_slow_gains_of_the_source_are_within_the_margin(rate: float) -> None:
     """k_p = 1, k_v = 0.1 take a minute to settle; the default margin does not forbid that."""
     law = InverseDynamics(
         axis=PAPER_SI, gains=InverseDynamicsGains(kp=1.0, kv=0.1), period=1.0 / rate
@@ -198,7 +207,7 @@ def test_the_slow_gains_of_the_source_are_within_the_margin(rate):
     assert_allclose(1.0 - spectral_radius(law, 1), 0.05 / rate, rtol=0.05)
 
 
-def test_the_margin_is_kept():
+def test_the_margin_is_kept() -> None:
     """A margin beyond what the loop has is refused, and named; less is accepted."""
     law = Pid(axis=PHANTOM, gains=PidGains(ki=0.0), period=PERIOD)
     # The slow pole is at -kp / (mu_v + kd) = -15 1/s.
@@ -213,7 +222,7 @@ def test_the_margin_is_kept():
         check_stability(law, 1, 'gains', margin=1.0)
 
 
-def test_gains_that_cannot_be_stable_are_named():
+def test_gains_that_cannot_be_stable_are_named() -> None:
     """The refusal names the gains, the rate, what was found and what would do."""
     law = InverseDynamics(axis=PHANTOM, gains=InverseDynamicsGains(kv=3000.0), period=PERIOD)
     words = (
@@ -232,7 +241,7 @@ def test_gains_that_cannot_be_stable_are_named():
     ('gains', 'missing'),
     [(InverseDynamicsGains(kp=0.0), 'kp'), (PidGains(kp=0.0, ki=0.0, kd=0.0), 'kp and kd')],
 )
-def test_missing_gains_are_named(gains, missing):
+def test_missing_gains_are_named(gains: InverseDynamicsGains | PidGains, missing: str) -> None:
     """No factor makes up for a gain of zero."""
     with pytest.raises(ParameterError, match=f'{missing} must not be zero'):
         check_stability(law_of(gains, PAPER_SI), 1, 'gains')

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from needle_dynamics import FloatArray, mode_shapes, ModeIntegrals, ModeShapes, ParameterError
@@ -30,7 +33,7 @@ def derivative(order: int, y: float) -> FloatArray:
     return np.asarray(MODES.scales * k**order * bracket)
 
 
-def gauss(integrand, depth: float) -> FloatArray:
+def gauss(integrand: Callable[..., Any], depth: float) -> FloatArray:
     """Integrate a vector-valued function of y (points last) from 0 to the depth."""
     return np.asarray(fixed_quad(integrand, 0.0, depth, n=POINTS)[0])
 

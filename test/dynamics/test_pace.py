@@ -15,14 +15,20 @@ import pytest
 BEGIN = 1_700_000_000 * NANOSECONDS
 
 
-def make(rate=1000.0, factor=1.0, backlog=0.5, own=False, lockstep=False):
+def make(
+    rate: float = 1000.0,
+    factor: float = 1.0,
+    backlog: float = 0.5,
+    own: bool = False,
+    lockstep: bool = False,
+) -> Pace:
     """Return a pace that has begun."""
     pace = Pace(rate, factor, backlog, own=own, lockstep=lockstep)
     pace.begin(BEGIN)
     return pace
 
 
-def take(pace, now):
+def take(pace: Pace, now: int) -> list[int]:
     """Take what is due; return the stamps."""
     return [pace.take() for _ in range(pace.due(now))]
 
@@ -32,7 +38,9 @@ ticks = st.lists(st.integers(0, 300_000_000), min_size=1, max_size=60)
 
 @given(ticks, st.sampled_from([30.0, 100.0, 1000.0]), st.sampled_from([0.5, 1.0, 7.0]))
 @settings(max_examples=60)
-def test_samples_are_at_multiples_of_the_period_and_never_early(steps, rate, factor):
+def test_samples_are_at_multiples_of_the_period_and_never_early(
+    steps: list[int], rate: float, factor: float
+) -> None:
     """However late the looks are, no sample is missing, twice, or of the future."""
     pace = make(rate, factor, own=True)
     now, stamps = BEGIN, []
@@ -46,7 +54,7 @@ def test_samples_are_at_multiples_of_the_period_and_never_early(steps, rate, fac
 
 @given(ticks)
 @settings(max_examples=60)
-def test_the_clocks_time_skips_what_is_beyond_the_backlog(steps):
+def test_the_clocks_time_skips_what_is_beyond_the_backlog(steps: list[int]) -> None:
     """The newest stamp is within a period of the clock's now; every sample is taken or lost."""
     pace = make(100.0, backlog=0.1)
     now, taken = BEGIN, 0
@@ -62,7 +70,7 @@ def test_the_clocks_time_skips_what_is_beyond_the_backlog(steps):
     assert taken + pace.lost == pytest.approx((now - BEGIN) / 1e7, abs=1.0)
 
 
-def test_a_time_of_its_own_waits_for_a_machine_that_stalls():
+def test_a_time_of_its_own_waits_for_a_machine_that_stalls() -> None:
     """After a stall of a second half of it is made up in bursts; the rest has been waited."""
     pace = make(own=True)
     stamps = []
@@ -73,7 +81,7 @@ def test_a_time_of_its_own_waits_for_a_machine_that_stalls():
     assert {b - a for a, b in pairwise(stamps)} == {1_000_000}
 
 
-def test_as_fast_as_possible_is_not_bound_to_the_clock():
+def test_as_fast_as_possible_is_not_bound_to_the_clock() -> None:
     """Without a pace samples are due at once, and as many as readers can bear."""
     pace = make(factor=0.0)
     stamps = [stamp for _ in range(10) for stamp in take(pace, BEGIN)]
@@ -82,7 +90,7 @@ def test_as_fast_as_possible_is_not_bound_to_the_clock():
 
 
 @pytest.mark.parametrize('factor', [0.0, 1.0])
-def test_in_lockstep_each_sample_waits_for_its_answer(factor):
+def test_in_lockstep_each_sample_waits_for_its_answer(factor: float) -> None:
     """Time begins at zero and goes on by a sample for every answer, if it is the right one."""
     pace = make(factor=factor, lockstep=True)
     now = BEGIN
@@ -97,7 +105,7 @@ def test_in_lockstep_each_sample_waits_for_its_answer(factor):
     assert pace.lost == 0
 
 
-def test_in_lockstep_it_is_no_faster_than_its_pace():
+def test_in_lockstep_it_is_no_faster_than_its_pace() -> None:
     """An answer that comes at once does not make time run faster."""
     pace = make(lockstep=True)
     for k in range(1, 3001):
@@ -108,7 +116,7 @@ def test_in_lockstep_it_is_no_faster_than_its_pace():
 
 
 @pytest.mark.parametrize('own', [False, True])
-def test_a_pause_ends_with_the_run(own):
+def test_a_pause_ends_with_the_run(own: bool) -> None:
     """Who begins again is not held by a pause of before."""
     pace = make(own=own)
     pace.pause()
@@ -119,7 +127,7 @@ def test_a_pause_ends_with_the_run(own):
 
 
 @pytest.mark.parametrize('own', [False, True])
-def test_in_a_pause_time_stands_still(own):
+def test_in_a_pause_time_stands_still(own: bool) -> None:
     """Afterwards a time of its own goes on where it stood, the clock's at the clock's now."""
     pace = make(own=own)
     before = take(pace, BEGIN + 10_000_000)[-1]
@@ -134,7 +142,7 @@ def test_in_a_pause_time_stands_still(own):
 
 
 @pytest.mark.parametrize('own', [False, True])
-def test_a_step_is_one_sample(own):
+def test_a_step_is_one_sample(own: bool) -> None:
     """Each step is a period on in a time of its own, and the clock's now where that is time."""
     pace = make(own=own)
     with pytest.raises(JobError, match='time goes on; pause first'):
@@ -146,7 +154,7 @@ def test_a_step_is_one_sample(own):
     assert pace.due(BEGIN + 4 * NANOSECONDS) == 0
 
 
-def test_a_step_in_lockstep_waits_for_the_answer_too():
+def test_a_step_in_lockstep_waits_for_the_answer_too() -> None:
     """A second step is refused until the first sample has been answered."""
     pace = make(lockstep=True)
     pace.pause()
@@ -158,7 +166,7 @@ def test_a_step_in_lockstep_waits_for_the_answer_too():
 
 
 @pytest.mark.parametrize('own', [False, True])
-def test_a_clock_that_is_set_back_does_not_stop_it(own):
+def test_a_clock_that_is_set_back_does_not_stop_it(own: bool) -> None:
     """The clock's time follows; a time of its own goes on where it was."""
     pace = make(own=own)
     newest = take(pace, BEGIN + 100_000_000)[-1] if not own else BEGIN

@@ -11,7 +11,7 @@ MILLISECOND = NANOSECONDS // 1000
 
 
 @given(st.integers(0, 2**31 - 1), st.integers(0, NANOSECONDS - 1))
-def test_times_are_those_of_the_message(sec, nanosec):
+def test_times_are_those_of_the_message(sec: int, nanosec: int) -> None:
     """Nanoseconds to the last digit; seconds but for two roundings."""
     time = Time(sec=sec, nanosec=nanosec)
     assert divmod(nanoseconds(time), NANOSECONDS) == (sec, nanosec)
@@ -20,7 +20,7 @@ def test_times_are_those_of_the_message(sec, nanosec):
     assert abs(Fraction(seconds(time)) - exact) <= exact / 2**52
 
 
-def test_rates_and_shares_are_those_of_the_last_second():
+def test_rates_and_shares_are_those_of_the_last_second() -> None:
     """In any second that is full; of a time that went back nothing is left."""
     window = Window()
     for i in range(2001):

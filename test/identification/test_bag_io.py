@@ -5,6 +5,7 @@ import re
 import resource
 import shutil
 import sqlite3
+from typing import Any
 
 from hypothesis import given, HealthCheck, settings, strategies
 import lz4.frame
@@ -16,6 +17,7 @@ from needle_identification import (
     OfferedQos,
     read_friction_recording,
     read_topic,
+    Recording,
     RecordingError,
 )
 from needle_identification.bags.bag import Bag
@@ -44,12 +46,12 @@ MILLISECOND = 1_000_000
 
 
 @pytest.fixture(scope='module')
-def recording():
+def recording() -> Recording:
     return simulated()
 
 
 @pytest.fixture(scope='module')
-def bag(tmp_path_factory, recording):
+def bag(tmp_path_factory: pytest.TempPathFactory, recording: Recording) -> Path:
     """Return a bag with all that our plant publishes; tests must not change it."""
     path = tmp_path_factory.mktemp('bags') / 'run'
     truth = {'/plant': {'ros__parameters': {'model.coulomb_friction': 0.56}}}
@@ -57,7 +59,12 @@ def bag(tmp_path_factory, recording):
     return path
 
 
-def small_bag(path, wrenches=(), motions=(), joint_names=('insertion',)):
+def small_bag(
+    path: Path,
+    wrenches: list[tuple[int, float]] | tuple[()] = (),
+    motions: list[tuple[int, float, float]] | tuple[()] = (),
+    joint_names: tuple[str, ...] = ('insertion',),
+) -> Path:
     """Write (stamp, value) wrenches and (stamp, depth, speed) motions, in ms after the epoch."""
     with BagWriter(path) as writer:
         writer.add_topic('/ft', WRENCH)
@@ -71,7 +78,9 @@ def small_bag(path, wrenches=(), motions=(), joint_names=('insertion',)):
     return path
 
 
-def grid(count=11, step=10):
+def grid(
+    count: int = 11, step: int = 10
+) -> tuple[list[tuple[int, float]], list[tuple[int, float, float]]]:
     return [(i * step, float(i)) for i in range(count)], [
         (i * step, 0.1 + 0.001 * i, 0.1) for i in range(count)
     ]
@@ -80,7 +89,7 @@ def grid(count=11, step=10):
 # Round trip.
 
 
-def test_gives_back_every_byte_and_nanosecond(tmp_path):
+def test_gives_back_every_byte_and_nanosecond(tmp_path: Path) -> None:
     written = [(EPOCH + 7 * i, wrench(EPOCH + i, i / 3.0)) for i in range(1000)]
     with BagWriter(tmp_path / 'bag') as writer:
         writer.add_topic('/a', WRENCH)
@@ -96,7 +105,9 @@ def test_gives_back_every_byte_and_nanosecond(tmp_path):
 
 
 @pytest.mark.parametrize('compression', ['zstd', 'lz4', 'none'])
-def test_opens_in_rosbags_with_its_own_definitions_and_hashes(tmp_path, compression):
+def test_opens_in_rosbags_with_its_own_definitions_and_hashes(
+    tmp_path: Path, compression: str
+) -> None:
     offered = [OfferedQos('best_effort', 'volatile', 'keep_last', 5)]
     with BagWriter(tmp_path / 'bag', compression) as writer:
         writer.add_topic('/a', WRENCH, offered)
@@ -119,7 +130,7 @@ def test_opens_in_rosbags_with_its_own_definitions_and_hashes(tmp_path, compress
     assert forces == [1.5, 2.5]
 
 
-def test_stores_what_rosbag2_and_foxglove_look_for(bag):
+def test_stores_what_rosbag2_and_foxglove_look_for(bag: Path) -> None:
     with next(bag.glob('*.mcap')).open('rb') as stream:
         reader = make_reader(stream)
         assert reader.get_header().profile == 'ros2'
@@ -141,7 +152,7 @@ def test_stores_what_rosbag2_and_foxglove_look_for(bag):
     assert '&id' not in (bag / 'metadata.yaml').read_text()
 
 
-def test_arrays_of_a_recording_survive_the_bag(bag, recording):
+def test_arrays_of_a_recording_survive_the_bag(bag: Path, recording: Recording) -> None:
     read = read_friction_recording(bag)
     # 2e-9: a stamp is a whole nanosecond, and so is the first one.
     assert_allclose(read.time, recording.time, rtol=0.0, atol=2e-9)
@@ -153,7 +164,7 @@ def test_arrays_of_a_recording_survive_the_bag(bag, recording):
     assert read.truth == {'model.coulomb_friction': 0.56}
 
 
-def test_counts_messages_by_topic(bag, recording):
+def test_counts_messages_by_topic(bag: Path, recording: Recording) -> None:
     count = len(recording.time)
     assert message_counts(bag) == {
         '/base_wrench': count,
@@ -167,7 +178,7 @@ def test_counts_messages_by_topic(bag, recording):
 # Writing.
 
 
-def test_metadata_appears_only_with_close(tmp_path):
+def test_metadata_appears_only_with_close(tmp_path: Path) -> None:
     writer = BagWriter(tmp_path / 'bag')
     writer.add_topic('/a', TEXT)
     writer.write('/a', text('x'), EPOCH)
@@ -182,8 +193,8 @@ def test_metadata_appears_only_with_close(tmp_path):
     ]
 
 
-def test_an_error_leaves_the_folder_unfinished_and_readable(tmp_path):
-    def fail():
+def test_an_error_leaves_the_folder_unfinished_and_readable(tmp_path: Path) -> None:
+    def fail() -> None:
         with BagWriter(tmp_path / 'bag') as writer:
             writer.add_topic('/a', TEXT)
             writer.write('/a', text('x'), EPOCH)
@@ -196,18 +207,18 @@ def test_an_error_leaves_the_folder_unfinished_and_readable(tmp_path):
     assert message_counts(tmp_path / 'bag') == {'/a': 1}
 
 
-def test_refuses_a_folder_that_exists(tmp_path):
+def test_refuses_a_folder_that_exists(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match='exists; a recording must go to a new folder'):
         BagWriter(tmp_path)
 
 
-def test_refuses_a_place_that_cannot_be_written(tmp_path):
+def test_refuses_a_place_that_cannot_be_written(tmp_path: Path) -> None:
     (tmp_path / 'file').touch()
     with pytest.raises(RecordingError, match=r'cannot record to .*/file/bag: Not a directory'):
         BagWriter(tmp_path / 'file' / 'bag')
 
 
-def test_refuses_a_type_it_cannot_describe(tmp_path):
+def test_refuses_a_type_it_cannot_describe(tmp_path: Path) -> None:
     with (
         BagWriter(tmp_path / 'bag') as writer,
         pytest.raises(RecordingError, match='no definition of lab_msgs/msg/Thing'),
@@ -215,13 +226,13 @@ def test_refuses_a_type_it_cannot_describe(tmp_path):
         writer.add_topic('/a', 'lab_msgs/msg/Thing')
 
 
-def test_a_full_disk_is_an_error_of_the_system_and_loses_nothing_flushed(tmp_path):
+def test_a_full_disk_is_an_error_of_the_system_and_loses_nothing_flushed(tmp_path: Path) -> None:
     noise = np.random.default_rng(0)
     writer = BagWriter(tmp_path / 'bag')
     writer.add_topic('/a', TEXT)
     flushed = 0
 
-    def fill():
+    def fill() -> None:
         nonlocal flushed
         for _ in range(1000):
             writer.write('/a', text(noise.bytes(500).hex()), EPOCH)
@@ -244,7 +255,7 @@ def test_a_full_disk_is_an_error_of_the_system_and_loses_nothing_flushed(tmp_pat
 
 
 @pytest.fixture(scope='module')
-def cut(tmp_path_factory):
+def cut(tmp_path_factory: pytest.TempPathFactory) -> tuple[bytes, Path]:
     """Return a file in several chunks, its messages, and a place for cut-off copies."""
     folder = tmp_path_factory.mktemp('cut')
     with BagWriter(folder / 'bag') as writer:
@@ -258,7 +269,9 @@ def cut(tmp_path_factory):
 
 @settings(max_examples=300, deadline=None)
 @given(data=strategies.data())
-def test_a_bag_cut_off_at_any_byte_gives_its_first_messages(cut, data):
+def test_a_bag_cut_off_at_any_byte_gives_its_first_messages(
+    cut: tuple[bytes, Path], data: Any
+) -> None:
     whole, part = cut
     part.write_bytes(whole[: data.draw(strategies.integers(0, len(whole)))])
     try:
@@ -270,7 +283,7 @@ def test_a_bag_cut_off_at_any_byte_gives_its_first_messages(cut, data):
 
 @settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(data=strategies.data())
-def test_a_bag_with_a_wrong_byte_is_read_or_refused(cut, data):
+def test_a_bag_with_a_wrong_byte_is_read_or_refused(cut: tuple[bytes, Path], data: Any) -> None:
     whole, part = cut
     at = data.draw(strategies.integers(0, len(whole) - 1))
     wrong = bytearray(whole)
@@ -286,7 +299,7 @@ def test_a_bag_with_a_wrong_byte_is_read_or_refused(cut, data):
 
 
 @pytest.fixture(scope='module')
-def unchecked(tmp_path_factory):
+def unchecked(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, bytes], Path]:
     """Return a small friction recording in forms that carry no checksums."""
     folder = tmp_path_factory.mktemp('unchecked')
     loose = folder / 'loose.mcap'
@@ -315,7 +328,9 @@ def unchecked(tmp_path_factory):
 @pytest.mark.parametrize('form', ['.mcap', '.db3'])
 @settings(max_examples=200, deadline=None)
 @given(data=strategies.data())
-def test_a_recording_with_wrong_bytes_is_read_or_refused(unchecked, form, data):
+def test_a_recording_with_wrong_bytes_is_read_or_refused(
+    unchecked: tuple[dict[str, bytes], Path], form: str, data: Any
+) -> None:
     wholes, part = unchecked
     wrong = bytearray(wholes[form])
     # Pages of a database are mostly empty.
@@ -337,7 +352,7 @@ def test_a_recording_with_wrong_bytes_is_read_or_refused(unchecked, form, data):
     assert not any('\n' in line for line in lines)
 
 
-def test_a_chunk_lost_in_the_middle_is_noticed(tmp_path):
+def test_a_chunk_lost_in_the_middle_is_noticed(tmp_path: Path) -> None:
     with BagWriter(tmp_path / 'bag') as writer:
         writer.add_topic('/ft', WRENCH)
         writer.add_topic('/joints', MOTION)
@@ -362,7 +377,7 @@ def test_a_chunk_lost_in_the_middle_is_noticed(tmp_path):
 
 @settings(max_examples=100, deadline=None)
 @given(strategies.binary(max_size=200))
-def test_any_bytes_are_refused_in_one_line(cut, data):
+def test_any_bytes_are_refused_in_one_line(cut: tuple[bytes, Path], data: bytes) -> None:
     _, part = cut
     part.write_bytes(data)
     with pytest.raises(RecordingError, match=r'is not an MCAP file|holds no messages') as caught:
@@ -370,7 +385,7 @@ def test_any_bytes_are_refused_in_one_line(cut, data):
     assert '\n' not in str(caught.value)
 
 
-def test_says_what_a_cut_off_recording_lost(tmp_path, bag):
+def test_says_what_a_cut_off_recording_lost(tmp_path: Path, bag: Path) -> None:
     part = tmp_path / 'run_0.mcap'
     whole = next(bag.glob('*.mcap')).read_bytes()
     part.write_bytes(whole[: len(whole) // 2])
@@ -380,13 +395,13 @@ def test_says_what_a_cut_off_recording_lost(tmp_path, bag):
     assert 0.4 < count / sum(message_counts(bag).values()) < 0.9
 
 
-def test_reads_a_folder_without_metadata_and_says_so(tmp_path, bag):
+def test_reads_a_folder_without_metadata_and_says_so(tmp_path: Path, bag: Path) -> None:
     shutil.copy(next(bag.glob('*.mcap')), tmp_path)
     [loss] = read_friction_recording(tmp_path).losses
     assert loss == 'no readable metadata.yaml: the recording was not closed'
 
 
-def test_reads_the_parts_of_a_split_bag_in_order_and_misses_one_by_name(tmp_path):
+def test_reads_the_parts_of_a_split_bag_in_order_and_misses_one_by_name(tmp_path: Path) -> None:
     names = [f'bag_{i}.mcap' for i in range(12)]
     for i, name in enumerate(names):
         with BagWriter(tmp_path / 'one') as writer:
@@ -413,7 +428,9 @@ def test_reads_the_parts_of_a_split_bag_in_order_and_misses_one_by_name(tmp_path
         (StoragePlugin.MCAP, CompressionMode.MESSAGE),
     ],
 )
-def test_reads_bags_of_another_writer(tmp_path, plugin, mode):
+def test_reads_bags_of_another_writer(
+    tmp_path: Path, plugin: StoragePlugin, mode: CompressionMode
+) -> None:
     writer = Writer(tmp_path / 'bag', version=9, storage_plugin=plugin)
     writer.set_compression(mode, CompressionFormat.ZSTD)
     with writer:
@@ -431,7 +448,9 @@ def test_reads_bags_of_another_writer(tmp_path, plugin, mode):
 
 @pytest.mark.parametrize('form', ['.mcap', '.db3'])
 @pytest.mark.parametrize('compression', ['', '.zstd', '.zst', '.lz4'])
-def test_reads_bare_and_compressed_files_and_what_is_left_of_them(tmp_path, form, compression):
+def test_reads_bare_and_compressed_files_and_what_is_left_of_them(
+    tmp_path: Path, form: str, compression: str
+) -> None:
     plugin = {'.mcap': StoragePlugin.MCAP, '.db3': StoragePlugin.SQLITE3}[form]
     noise = np.random.default_rng(0).normal(size=3000)
     with Writer(tmp_path / 'bag', version=9, storage_plugin=plugin) as writer:
@@ -451,7 +470,7 @@ def test_reads_bare_and_compressed_files_and_what_is_left_of_them(tmp_path, form
     assert read == list(noise[: len(read)])
 
 
-def test_reads_messages_compressed_with_lz4(tmp_path):
+def test_reads_messages_compressed_with_lz4(tmp_path: Path) -> None:
     with BagWriter(tmp_path / 'bag') as writer:
         writer.add_topic('/a', TEXT)
         for i in range(3):
@@ -459,7 +478,7 @@ def test_reads_messages_compressed_with_lz4(tmp_path):
     assert [m.data for _, m in read_topic(tmp_path / 'bag', '/a')] == ['0', '1', '2']
 
 
-def test_reads_what_a_database_has_only_in_its_journal(tmp_path):
+def test_reads_what_a_database_has_only_in_its_journal(tmp_path: Path) -> None:
     with Writer(tmp_path / 'bag', version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
         force = writer.add_connection('/a', TEXT, typestore=STORE)
         writer.write(force, EPOCH, text('in the file'))
@@ -474,7 +493,7 @@ def test_reads_what_a_database_has_only_in_its_journal(tmp_path):
         recorder.close()
 
 
-def test_reads_messages_outside_of_chunks(tmp_path):
+def test_reads_messages_outside_of_chunks(tmp_path: Path) -> None:
     path = tmp_path / 'loose.mcap'
     with path.open('wb') as stream:
         writer = McapWriter(stream, use_chunking=False)
@@ -491,7 +510,7 @@ def test_reads_messages_outside_of_chunks(tmp_path):
     assert 400 < len(read_topic(path, '/a')) < 600
 
 
-def test_a_broken_chunk_costs_its_own_messages_only(tmp_path):
+def test_a_broken_chunk_costs_its_own_messages_only(tmp_path: Path) -> None:
     with BagWriter(tmp_path / 'bag', 'none') as writer:
         writer.add_topic('/a', TEXT)
         for i in range(30):
@@ -510,14 +529,14 @@ def test_a_broken_chunk_costs_its_own_messages_only(tmp_path):
     ]
 
 
-def test_what_metadata_does_not_list_is_not_part_of_the_bag(tmp_path, bag):
+def test_what_metadata_does_not_list_is_not_part_of_the_bag(tmp_path: Path, bag: Path) -> None:
     shutil.copytree(bag, tmp_path / 'run')
     shutil.copy(tmp_path / 'run' / 'run_0.mcap', tmp_path / 'run' / 'copy.mcap')
     read = read_friction_recording(tmp_path / 'run')
     assert read.losses == ('copy.mcap is not part of the recording by metadata.yaml, left out',)
 
 
-def test_a_channel_of_another_encoding_is_none_of_ours(tmp_path):
+def test_a_channel_of_another_encoding_is_none_of_ours(tmp_path: Path) -> None:
     path = tmp_path / 'ros1.mcap'
     with path.open('wb') as stream:
         writer = McapWriter(stream)
@@ -530,7 +549,7 @@ def test_a_channel_of_another_encoding_is_none_of_ours(tmp_path):
         read_friction_recording(path)
 
 
-def test_decodes_a_type_of_the_lab_by_the_definition_in_the_bag(tmp_path):
+def test_decodes_a_type_of_the_lab_by_the_definition_in_the_bag(tmp_path: Path) -> None:
     store = get_typestore(Stores.ROS2_JAZZY)
     store.register(get_types_from_msg('std_msgs/Header header\nint32 x', 'lab_msgs/msg/Thing'))
     with Writer(tmp_path / 'bag', version=9, storage_plugin=StoragePlugin.MCAP) as writer:
@@ -576,13 +595,13 @@ def damaged(tmp_path: Path, case: str) -> Path:
         ('silent', 'silent holds no messages'),
     ],
 )
-def test_says_what_is_not_a_recording(tmp_path, case, complaint):
+def test_says_what_is_not_a_recording(tmp_path: Path, case: str, complaint: str) -> None:
     with pytest.raises(RecordingError, match=complaint) as caught:
         message_counts(damaged(tmp_path, case))
     assert '\n' not in str(caught.value)
 
 
-def test_a_message_that_is_not_of_its_type_is_named(tmp_path):
+def test_a_message_that_is_not_of_its_type_is_named(tmp_path: Path) -> None:
     with BagWriter(tmp_path / 'bag') as writer:
         writer.add_topic('/a', WRENCH)
         writer.write('/a', wrench(EPOCH, 1.0), EPOCH)

@@ -1,9 +1,12 @@
 """Numbers taken from whole batches are those that a deserializer finds message by message."""
 
+from collections.abc import Callable
 import struct
+from typing import Any
 
 from hypothesis import given, settings, strategies
 from needle_ros import cdr
+from needle_ros.cdr import Decoded, Layout
 import numpy as np
 from numpy.testing import assert_array_equal
 import pytest
@@ -23,20 +26,22 @@ MESSAGES = strategies.lists(
 )
 
 
-def decode(messages, type_name, choice, columns):
+def decode(
+    messages: list[bytes], type_name: str, choice: Callable[..., Any], columns: int
+) -> Decoded:
     ends = np.cumsum([len(message) for message in messages])
     begins = ends - [len(message) for message in messages]
     data = np.frombuffer(b''.join(messages), dtype=np.uint8)
     return cdr.decode(data, begins, ends, type_name, choice, columns)
 
 
-def first_two(layout):
+def first_two(layout: Layout) -> list[int]:
     return [begin if length else -1 for begin, length in layout.arrays[:2]]
 
 
 @settings(max_examples=150, deadline=None)
 @given(MESSAGES)
-def test_finds_what_rosbags_finds_in_either_byte_order(drawn):
+def test_finds_what_rosbags_finds_in_either_byte_order(drawn: list[Any]) -> None:
     serialized, expected = [], []
     for stamp, names, position, velocity, little in drawn:
         message = STORE.types[MOTION](
@@ -53,7 +58,7 @@ def test_finds_what_rosbags_finds_in_either_byte_order(drawn):
         assert stamp == there.sec * 10**9 + there.nanosec
 
 
-def test_reads_xcdr2_which_aligns_to_four_bytes():
+def test_reads_xcdr2_which_aligns_to_four_bytes() -> None:
     body = struct.pack('<iII', 1, 2, 4) + b'abc\0' + struct.pack('<6d', *range(6))
     read = decode([b'\x00\x07\x00\x00' + body], WRENCH, lambda plan: [plan.arrays[0][0] + 8], 1)
     assert read.broken == 0
@@ -62,7 +67,7 @@ def test_reads_xcdr2_which_aligns_to_four_bytes():
 
 @settings(max_examples=200, deadline=None)
 @given(strategies.binary(max_size=120), strategies.sampled_from([*cdr.TYPES]))
-def test_any_bytes_are_broken_or_have_numbers(data, type_name):
+def test_any_bytes_are_broken_or_have_numbers(data: bytes, type_name: str) -> None:
     for message in (data, b'\x00\x01\x00\x00' + data):
         read = decode([message], type_name, first_two, 2)
         assert read.broken + len(read.used) == 1
@@ -70,13 +75,13 @@ def test_any_bytes_are_broken_or_have_numbers(data, type_name):
 
 
 @pytest.mark.parametrize('size', range(76))
-def test_a_message_cut_anywhere_is_broken(size):
+def test_a_message_cut_anywhere_is_broken(size: int) -> None:
     whole = wrench(10**18, 1.0)
     read = decode([whole[:size], whole], WRENCH, lambda plan: [plan.arrays[0][0] + 8], 1)
     assert (read.broken, *read.used, *read.values) == (1, 1, 1.0)
 
 
-def test_many_kinds_of_message_are_taken_one_by_one():
+def test_many_kinds_of_message_are_taken_one_by_one() -> None:
     messages = [
         bytes(
             STORE.serialize_cdr(

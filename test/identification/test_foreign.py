@@ -1,16 +1,21 @@
 """Recordings as other labs make them: the right result with what was lost, or one line, exit 2."""
 
+from collections.abc import Callable
 from functools import lru_cache
 import json
+from pathlib import Path
 import re
 import shutil
 import sqlite3
 import struct
+from typing import Any
 
 from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
+from needle_dynamics import FloatArray
 from needle_insertion.cli import main
 import numpy as np
+from numpy.typing import NDArray
 import pytest
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from support.presses import presses, STIFFNESS
@@ -29,22 +34,24 @@ LATENCY, JITTER = 2_000_000, 300_000
 
 
 @lru_cache(maxsize=1)
-def samples():
+def samples() -> tuple[NDArray[np.int64], FloatArray, FloatArray, FloatArray]:
     """Return stamps [ns], depth, speed and force of strokes, at 125 Hz."""
     made = strokes(seed=7, speeds=(2e-3, 10e-3, 20e-3), push=0.0)
     stamps = EPOCH + np.rint(made.time * 1e9).astype(np.int64)
     return tuple(column[::2] for column in (stamps, made.depth, made.speed, made.force))
 
 
-def serialized(type_name, stamp, *parts):
+def serialized(type_name: str, stamp: int, *parts: Any) -> bytes:
     return bytes(STORE.serialize_cdr(STORE.types[type_name](header(stamp), *parts), type_name))
 
 
-def triple(kind, **given):
+def triple(kind: str, **given: float) -> Any | Any:
     return STORE.types[f'geometry_msgs/msg/{kind}'](*(given.get(axis, 0.0) for axis in 'xyz'))
 
 
-def joints(stamp, position, speed, names=('slide',)):
+def joints(
+    stamp: int, position: float | None, speed: float | None, names: tuple[str, ...] = ('slide',)
+) -> bytes:
     """Serialize a JointState of joints that all do the same; None leaves an array empty."""
     arrays = [
         np.array([] if value is None else [value] * len(names))
@@ -53,7 +60,7 @@ def joints(stamp, position, speed, names=('slide',)):
     return serialized(JOINTS, stamp, list(names), *arrays)
 
 
-def motion(type_name, stamp, speed, **place):
+def motion(type_name: str, stamp: int, speed: float, **place: float) -> bytes:
     """Serialize a motion in any type; the speed is along the axes of the place."""
     kinds = STORE.types
     where = triple('Point', **place)
@@ -76,7 +83,13 @@ def motion(type_name, stamp, speed, **place):
     return serialized(type_name, stamp, *parts[type_name])
 
 
-def recorded(type_name=JOINTS, make=joints, ahead=0.0, sign=1.0, topics=(FORCE, MOTION)):
+def recorded(
+    type_name: str = JOINTS,
+    make: Callable[..., Any] = joints,
+    ahead: float = 0.0,
+    sign: float = 1.0,
+    topics: tuple[str, ...] = (FORCE, MOTION),
+) -> list[tuple[str, str, int, bytes]]:
     """
     Return messages in the order of reception: topic, type, receive time [ns], bytes.
 
@@ -96,7 +109,12 @@ def recorded(type_name=JOINTS, make=joints, ahead=0.0, sign=1.0, topics=(FORCE, 
     )  # fmt: skip
 
 
-def write_folder(path, rows, plugin='mcap', mode=None):
+def write_folder(
+    path: Path,
+    rows: list[tuple[str, str, int, bytes]],
+    plugin: str = 'mcap',
+    mode: CompressionMode | None = None,
+) -> Path:
     """Write a rosbag2 folder as rosbags does; return its one file of data."""
     writer = Writer(path, version=9, storage_plugin=StoragePlugin[plugin.upper()])
     if mode is not None:
@@ -111,7 +129,9 @@ def write_folder(path, rows, plugin='mcap', mode=None):
     return file
 
 
-def write_mcap(path, rows, **options):
+def write_mcap(
+    path: Path, rows: list[tuple[str, str, int, bytes]], **options: bool | int | CompressionType
+) -> Path:
     """Write an MCAP file alone; a type that ROS does not have goes without a definition."""
     with path.open('wb') as stream:
         writer = McapWriter(stream, **options)
@@ -130,10 +150,10 @@ def write_mcap(path, rows, **options):
 
 
 @pytest.fixture
-def identified(capsys):
+def identified(capsys: pytest.CaptureFixture[str]) -> Callable[..., Any]:
     """Return a function that runs the command, expects the truth, and returns the warnings."""
 
-    def run(path, *words):
+    def run(path: Path, *words: str) -> str:
         assert main(['identify', 'friction', str(path), '--json', *words]) == 0
         said = capsys.readouterr()
         found = json.loads(said.out)['statistics']
@@ -148,10 +168,10 @@ def identified(capsys):
 
 
 @pytest.fixture
-def refused(capsys):
+def refused(capsys: pytest.CaptureFixture[str]) -> Callable[..., Any]:
     """Return a function that runs the command, expects one line, and returns it."""
 
-    def run(path, *words, what='friction'):
+    def run(path: Path, *words: str, what: str = 'friction') -> str:
         assert main(['identify', what, str(path), *words]) == 2
         said = capsys.readouterr()
         assert said.out == ''
@@ -168,8 +188,8 @@ def refused(capsys):
 @pytest.mark.parametrize('plugin', ['mcap', 'sqlite3'])
 @pytest.mark.parametrize('mode', [None, CompressionMode.FILE, CompressionMode.MESSAGE])
 def test_containers_are_read_whole_without_metadata_bare_and_cut_off(
-    tmp_path, identified, plugin, mode
-):
+    tmp_path: Path, identified: Callable[..., Any], plugin: str, mode: CompressionMode | None
+) -> None:
     file = write_folder(tmp_path / 'bag', recorded(), plugin, mode)
     assert identified(tmp_path / 'bag') == ''
     bare = tmp_path / file.name
@@ -184,7 +204,9 @@ def test_containers_are_read_whole_without_metadata_bare_and_cut_off(
 
 @pytest.mark.parametrize('plugin', ['mcap', 'sqlite3'])
 @pytest.mark.parametrize('share', [0.0, 0.002, 0.03])
-def test_what_is_left_of_a_file_is_too_little(tmp_path, refused, plugin, share):
+def test_what_is_left_of_a_file_is_too_little(
+    tmp_path: Path, refused: Callable[..., Any], plugin: str, share: float
+) -> None:
     file = write_folder(tmp_path / 'bag', recorded(), plugin)
     file.write_bytes(file.read_bytes()[: int(share * file.stat().st_size)])
     assert str(tmp_path / 'bag') in refused(tmp_path / 'bag')
@@ -198,11 +220,15 @@ def test_what_is_left_of_a_file_is_too_little(tmp_path, refused, plugin, share):
         {'use_chunking': False},
     ],
 )
-def test_bare_files_of_other_writers(tmp_path, identified, options):
+def test_bare_files_of_other_writers(
+    tmp_path: Path, identified: Callable[..., Any], options: dict[str, Any]
+) -> None:
     assert identified(write_mcap(tmp_path / 'run.mcap', recorded(), **options)) == ''
 
 
-def test_a_split_recording_with_a_part_missing(tmp_path, identified):
+def test_a_split_recording_with_a_part_missing(
+    tmp_path: Path, identified: Callable[..., Any]
+) -> None:
     rows, folder = recorded(), tmp_path / 'split'
     folder.mkdir()
     for k in range(12):
@@ -222,23 +248,23 @@ def test_a_split_recording_with_a_part_missing(tmp_path, identified):
 # Messages.
 
 
-def without_speed(stamp, depth, _speed):
+def without_speed(stamp: int, depth: float, _speed: float) -> bytes:
     return joints(stamp, depth, None)
 
 
-def at_speed_zero(stamp, depth, _speed):
+def at_speed_zero(stamp: int, depth: float, _speed: float) -> bytes:
     return joints(stamp, depth, 0.0)
 
 
-def at_speed_nan(stamp, depth, _speed):
+def at_speed_nan(stamp: int, depth: float, _speed: float) -> bytes:
     return joints(stamp, depth, np.nan)
 
 
-def without_position(stamp, _depth, speed):
+def without_position(stamp: int, _depth: float, speed: float) -> bytes:
     return joints(stamp, None, speed)
 
 
-def at_position_zero(stamp, _depth, speed):
+def at_position_zero(stamp: int, _depth: float, speed: float) -> bytes:
     return joints(stamp, 0.0, speed)
 
 
@@ -252,7 +278,9 @@ def at_position_zero(stamp, _depth, speed):
         (at_position_zero, 'has no position'),
     ],
 )
-def test_joints_of_which_half_is_missing(tmp_path, identified, make, said):
+def test_joints_of_which_half_is_missing(
+    tmp_path: Path, identified: Callable[..., Any], make: Callable[..., Any], said: str
+) -> None:
     assert f'{MOTION} {said}' in identified(write_mcap(tmp_path / 'run.mcap', recorded(make=make)))
 
 
@@ -264,12 +292,16 @@ def test_joints_of_which_half_is_missing(tmp_path, identified, make, said):
         (('roll', 'slide'), "no joint 'insertion'; motion_axis must name one of roll, slide"),
     ],
 )
-def test_joints_that_tell_nothing(tmp_path, refused, names, said):
+def test_joints_that_tell_nothing(
+    tmp_path: Path, refused: Callable[..., Any], names: tuple[str, ...], said: str
+) -> None:
     rows = recorded(make=lambda stamp, *_: joints(stamp, None, None, names))
     assert said in refused(write_mcap(tmp_path / 'run.mcap', rows))
 
 
-def test_a_joint_among_others_that_points_out_of_the_tissue(tmp_path, identified):
+def test_a_joint_among_others_that_points_out_of_the_tissue(
+    tmp_path: Path, identified: Callable[..., Any]
+) -> None:
     rows = recorded(make=lambda t, d, v: joints(t, -d, -v, ('rail', 'slide')), sign=-1.0)
     path = write_mcap(tmp_path / 'run.mcap', rows)
     assert identified(path, '--motion-axis', '-slide', '--force-axis', '-y') == ''
@@ -285,15 +317,24 @@ def test_a_joint_among_others_that_points_out_of_the_tissue(tmp_path, identified
     ],
 )
 @pytest.mark.parametrize(('axis', 'sign'), [('y', 1.0), ('-z', -1.0)])
-def test_every_type_of_motion_along_any_axis(tmp_path, identified, type_name, said, axis, sign):
-    def make(stamp, depth, speed):
+def test_every_type_of_motion_along_any_axis(
+    tmp_path: Path,
+    identified: Callable[..., Any],
+    type_name: str,
+    said: str,
+    axis: str,
+    sign: float,
+) -> None:
+    def make(stamp: int, depth: float, speed: float) -> bytes:
         return motion(type_name, stamp, sign * speed, **{axis[-1]: sign * depth})
 
     path = write_mcap(tmp_path / 'run.mcap', recorded(type_name, make))
     assert said in identified(path, '--motion-axis', axis)
 
 
-def test_topics_of_one_type_are_listed_and_named(tmp_path, identified, refused):
+def test_topics_of_one_type_are_listed_and_named(
+    tmp_path: Path, identified: Callable[..., Any], refused: Callable[..., Any]
+) -> None:
     rows = [*recorded(topics=('/l/ft', '/l/arm')), *recorded(topics=('/r/ft', '/r/arm'))]
     path = write_mcap(tmp_path / 'run.mcap', sorted(rows, key=lambda row: row[2]))
     assert 'wrench_topic must name one of /l/ft, /r/ft' in refused(path)
@@ -302,7 +343,9 @@ def test_topics_of_one_type_are_listed_and_named(tmp_path, identified, refused):
     assert identified(path, *one, '--motion-topic', '/l/arm') == ''
 
 
-def test_what_is_recorded_beside_does_no_harm(tmp_path, identified):
+def test_what_is_recorded_beside_does_no_harm(
+    tmp_path: Path, identified: Callable[..., Any]
+) -> None:
     rows = recorded()
     for k, (_, _, received, _) in enumerate(rows[::20]):
         rows += [
@@ -326,12 +369,14 @@ def test_what_is_recorded_beside_does_no_harm(tmp_path, identified):
 
 
 @pytest.mark.parametrize('ahead', [5.0, -5.0, 3 * 3600.0])
-def test_clocks_that_differ(tmp_path, identified, ahead):
+def test_clocks_that_differ(tmp_path: Path, identified: Callable[..., Any], ahead: float) -> None:
     path = write_mcap(tmp_path / 'run.mcap', recorded(ahead=ahead))
     assert f'is stamped {ahead:.3f} s after {MOTION}: clocks differ, corrected' in identified(path)
 
 
-def test_a_tenth_of_a_second_may_be_latency_and_is_said(tmp_path, identified, capsys):
+def test_a_tenth_of_a_second_may_be_latency_and_is_said(
+    tmp_path: Path, identified: Callable[..., Any], capsys: pytest.CaptureFixture[str]
+) -> None:
     path = write_mcap(tmp_path / 'run.mcap', recorded(ahead=0.1))
     assert 'may be latency' not in identified(path, '--time', 'receive')
     assert main(['identify', 'friction', str(path)]) == 0
@@ -340,7 +385,7 @@ def test_a_tenth_of_a_second_may_be_latency_and_is_said(tmp_path, identified, ca
     )
 
 
-def damaged(kind):
+def damaged(kind: str) -> tuple[list[tuple[str, str, int, bytes]], str]:
     """Return the messages of a recording that has a fault, and what must be said of it."""
     rows = recorded()
     rng = np.random.default_rng(1)
@@ -368,7 +413,9 @@ def damaged(kind):
 
 
 @pytest.mark.parametrize('kind', ['gap', 'lost', 'twice', 'order', 'short', 'nan', 'inf', '1e300'])
-def test_faults_are_told_and_do_no_harm(tmp_path, identified, kind):
+def test_faults_are_told_and_do_no_harm(
+    tmp_path: Path, identified: Callable[..., Any], kind: str
+) -> None:
     rows, said = damaged(kind)
     assert said in identified(write_mcap(tmp_path / 'run.mcap', rows))
 
@@ -384,12 +431,16 @@ def test_faults_are_told_and_do_no_harm(tmp_path, identified, kind):
         ([], 'holds no messages'),
     ],
 )
-def test_what_is_missing_is_named(tmp_path, refused, kept, said):
+def test_what_is_missing_is_named(
+    tmp_path: Path, refused: Callable[..., Any], kept: list[str], said: str
+) -> None:
     rows = [row for row in recorded() if row[0] in kept]
     assert said in refused(write_mcap(tmp_path / 'run.mcap', rows))
 
 
-def test_what_is_not_one_recording_is_told_what_to_do(tmp_path, refused):
+def test_what_is_not_one_recording_is_told_what_to_do(
+    tmp_path: Path, refused: Callable[..., Any]
+) -> None:
     old = tmp_path / 'old.bag'
     old.write_bytes(b'#ROSBAG V2.0\n')
     assert f'rosbags-convert --src {old} --dst {tmp_path / "old"}' in refused(old)
@@ -405,7 +456,9 @@ def test_what_is_not_one_recording_is_told_what_to_do(tmp_path, refused):
 
 
 @pytest.mark.parametrize('type_name', [POSE, POINT, ODOMETRY, JOINTS])
-def test_stiffness_from_every_type_of_motion(tmp_path, capsys, type_name):
+def test_stiffness_from_every_type_of_motion(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], type_name: str
+) -> None:
     rows = []
     for time, (x, z), (f_x, f_z) in zip(*presses(1), strict=True):
         stamp = EPOCH + round(time * 1e9)

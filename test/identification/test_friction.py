@@ -1,14 +1,18 @@
 """Friction comes out as it went in, with an error bar that means what it says."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
+from typing import Any
 
-from needle_dynamics import ParameterError
+from needle_dynamics import FloatArray, ParameterError
 from needle_identification import (
     ESTIMATORS,
+    FrictionEstimate,
     FrictionSettings,
     IdentificationError,
     identify_friction,
+    ParameterEstimate,
     Recording,
     summarize,
 )
@@ -20,7 +24,13 @@ from support.strokes import COULOMB, SPEEDS, strokes, VISCOUS
 TRUTH = {'coulomb_friction': COULOMB, 'viscous_friction': VISCOUS}
 
 
-def law(pace, *, both_ways=True, duration=8.0, offset=0.0):
+def law(
+    pace: Callable[..., Any] | Any,
+    *,
+    both_ways: bool = True,
+    duration: float = 8.0,
+    offset: float = 0.0,
+) -> Recording:
     """Make a recording of equation (15) itself at a given pace |s_dot| [m/s] over time [s]."""
     time = np.arange(round(duration * 250)) / 250.0
     way = np.where(time < duration / 2.0, 1.0, -1.0) if both_ways else np.ones_like(time)
@@ -31,25 +41,25 @@ def law(pace, *, both_ways=True, duration=8.0, offset=0.0):
     )
 
 
-def varied(time):
+def varied(time: FloatArray) -> FloatArray:
     return 5e-3 + 2e-3 * np.sin(2.0 * np.pi * 0.3 * time)
 
 
-def settings(*terms, **changes):
+def settings(*terms: str, **changes: float) -> FrictionSettings:
     return FrictionSettings(terms=('coulomb', 'viscous', *terms), **changes)
 
 
 @cache
-def identified(chosen=None, **recorded):
+def identified(chosen: FrictionSettings | None = None, **recorded: float) -> FrictionEstimate:
     return identify_friction(strokes(**recorded), chosen)
 
 
-def within(parameter, truth, errors=4.0):
+def within(parameter: ParameterEstimate, truth: float, errors: float = 4.0) -> bool:
     return parameter.determined and abs(parameter.value - truth) < errors * parameter.error
 
 
 @pytest.mark.parametrize('estimator', ESTIMATORS)
-def test_recovers_what_was_recorded(estimator):
+def test_recovers_what_was_recorded(estimator: str) -> None:
     found = identified(FrictionSettings(estimator=estimator))
     for name, truth in TRUTH.items():
         # 1e-6: the filter has finite length, and what it reaches of a change is left out.
@@ -61,19 +71,19 @@ def test_recovers_what_was_recorded(estimator):
 
 
 @pytest.mark.parametrize('estimator', ESTIMATORS)
-def test_recovers_the_truth_within_its_errors(estimator):
+def test_recovers_the_truth_within_its_errors(estimator: str) -> None:
     found = identified(FrictionSettings(estimator=estimator), seed=1)
     assert all(within(found[name], truth) for name, truth in TRUTH.items())
     assert within(found.breakaway, COULOMB)
 
 
-def test_one_direction_is_enough():
+def test_one_direction_is_enough() -> None:
     found = identify_friction(law(varied, both_ways=False))
     assert_allclose(found['coulomb_friction'].value, COULOMB, rtol=1e-6)
 
 
 @pytest.mark.parametrize('recorded', [{'cutoff': 40.0}, {}], ids=['40 Hz', '125 Hz'])
-def test_error_bars_hold_the_truth_as_often_as_they_say(recorded):
+def test_error_bars_hold_the_truth_as_often_as_they_say(recorded: dict[str, float]) -> None:
     runs = [identified(seed=seed, **recorded) for seed in range(100)]
     truths = {**TRUTH, 'breakaway_force': COULOMB}
     for name, truth in truths.items():
@@ -86,7 +96,7 @@ def test_error_bars_hold_the_truth_as_often_as_they_say(recorded):
         assert_allclose(np.sqrt(np.mean(errors**2)), values.std(), rtol=0.21)
 
 
-def test_friction_scales_with_the_force():
+def test_friction_scales_with_the_force() -> None:
     recording = strokes(seed=2)
     one = identify_friction(recording)
     three = identify_friction(replace(recording, force=3.0 * recording.force))
@@ -98,7 +108,7 @@ def test_friction_scales_with_the_force():
     assert_allclose(three.residual, 3.0 * one.residual, rtol=1e-6)
 
 
-def test_friction_is_the_same_seen_from_the_other_side():
+def test_friction_is_the_same_seen_from_the_other_side() -> None:
     recording = strokes(seed=2, offset=0.1)
     mirrored = replace(
         recording, force=-recording.force, speed=-recording.speed, depth=-recording.depth
@@ -112,7 +122,7 @@ def test_friction_is_the_same_seen_from_the_other_side():
     assert_allclose(other.breakaway.value, one.breakaway.value, rtol=1e-6)
 
 
-def test_the_paper_has_no_offset_and_one_that_is_there_is_named():
+def test_the_paper_has_no_offset_and_one_that_is_there_is_named() -> None:
     plain = identified(seed=3)
     assert [parameter.name for parameter in plain.parameters] == list(TRUTH)
     assert plain.warnings == ()
@@ -143,7 +153,9 @@ def test_the_paper_has_no_offset_and_one_that_is_there_is_named():
         ),
     ],
 )
-def test_a_term_that_is_there_is_found(term, recorded, truths):
+def test_a_term_that_is_there_is_found(
+    term: str, recorded: dict[str, float], truths: dict[str, float]
+) -> None:
     without = identified(seed=4, **recorded)
     assert [c.terms[-1] for c in without.comparison if c.supported].count(term) == 1
     assert any(f'add the term {term}' in words for words in without.warnings)
@@ -153,7 +165,7 @@ def test_a_term_that_is_there_is_found(term, recorded, truths):
     assert not any('add the term' in words for words in found.warnings)
 
 
-def test_only_tests_whose_words_speak_against_the_model_are_warnings():
+def test_only_tests_whose_words_speak_against_the_model_are_warnings() -> None:
     fine = ('show no drift', 'as good as', 'do not depend', 'the same at', 'forget as fast')
     for found in [identified(seed=seed) for seed in range(40)]:
         assert all(t.failed != any(words in t.words for words in fine) for t in found.tests)
@@ -162,7 +174,7 @@ def test_only_tests_whose_words_speak_against_the_model_are_warnings():
             assert [words for words in found.warnings if 'residuals' in words] == failed
 
 
-def test_terms_that_are_not_there_are_not_found():
+def test_terms_that_are_not_there_are_not_found() -> None:
     found = [identified(seed=seed) for seed in range(40)]
     false = [any(c.supported for c in one.comparison) for one in found]
     # At most 5 % of 40 recordings, and three standard deviations of that.
@@ -176,7 +188,7 @@ def test_terms_that_are_not_there_are_not_found():
     assert not any(c.supported for c in needless if 'coulomb' not in c.terms)
 
 
-def test_an_inertia_is_found_as_well_as_the_stamps_agree():
+def test_an_inertia_is_found_as_well_as_the_stamps_agree() -> None:
     time = np.arange(5000) / 250.0
     speed = 8e-3 * np.sin(2.0 * np.pi * 0.5 * time) + 6e-3 * np.sin(2.0 * np.pi * 0.31 * time)
     force = COULOMB * np.sign(speed) + 20.0 * np.gradient(speed, time) + 5.0 * speed
@@ -191,7 +203,7 @@ def test_an_inertia_is_found_as_well_as_the_stamps_agree():
 
 
 @pytest.mark.parametrize('lag', [0.008, -0.05, 0.1])
-def test_a_lag_is_found_and_corrected(lag):
+def test_a_lag_is_found_and_corrected(lag: float) -> None:
     time = np.arange(4000) / 250.0
     speed = 8e-3 * np.sin(2.0 * np.pi * 0.3 * time) + 5e-3 * np.sin(2.0 * np.pi * 0.47 * time)
     shown = np.interp(time - lag, time, speed)
@@ -206,7 +218,7 @@ def test_a_lag_is_found_and_corrected(lag):
     assert any(' the motion: ' in words for words in found.warnings) == (abs(lag) > 0.01)
 
 
-def steps(rate, lag):
+def steps(rate: float, lag: float) -> Recording:
     """Make strokes of constant speed, without any acceleration, with a late force."""
     legs = [leg for v in SPEEDS for leg in ((v, 1.0), (0.0, 0.2), (-v, 1.0), (0.0, 0.2))]
     speed = np.repeat([v for v, _ in legs], [round(rate * duration) for _, duration in legs])
@@ -223,7 +235,7 @@ def steps(rate, lag):
 
 @pytest.mark.parametrize('rate', [50.0, 250.0, 1000.0])
 @pytest.mark.parametrize('lag', [0.02, 0.1, -0.1])
-def test_a_lag_that_steady_strokes_show_roughly_is_corrected(rate, lag):
+def test_a_lag_that_steady_strokes_show_roughly_is_corrected(rate: float, lag: float) -> None:
     found = identify_friction(steps(rate, lag))
     assert all(within(found[name], truth) for name, truth in TRUTH.items())
     # A thousand samples with noise of 0.01 N.
@@ -233,7 +245,7 @@ def test_a_lag_that_steady_strokes_show_roughly_is_corrected(rate, lag):
     assert ('behind' in words) == (lag > 0.0)
 
 
-def eased(rate, lag, seed):
+def eased(rate: float, lag: float, seed: int) -> Recording:
     """Make strokes that gain and lose their speed in 0.05 s, sampled anywhere in between."""
     corners = [(0.0, 0.0)]
     for speed in (way * v for v in SPEEDS for way in (1.0, -1.0)):
@@ -252,7 +264,7 @@ def eased(rate, lag, seed):
 
 
 @pytest.mark.parametrize(('rate', 'surest'), [(250.0, 0.0), (100.0, 5e-4)])
-def test_the_error_of_a_lag_knows_of_the_sample_period(rate, surest):
+def test_the_error_of_a_lag_knows_of_the_sample_period(rate: float, surest: float) -> None:
     found = [identify_friction(eased(rate, 2.24e-3, seed)).lag for seed in range(60)]
     held = [lag.interval[0] <= 2.24e-3 <= lag.interval[1] for lag in found]
     # Three standard deviations of a binomial of 60 trials at 95 % are 8.4 %.
@@ -260,13 +272,13 @@ def test_the_error_of_a_lag_knows_of_the_sample_period(rate, surest):
     assert all(surest < lag.error < 2e-3 for lag in found)
 
 
-def test_jumps_of_the_speed_tell_no_lag():
+def test_jumps_of_the_speed_tell_no_lag() -> None:
     # What the spline rings after a jump is no acceleration.
     lags = [identify_friction(steps(250.0, 0.0)).lag, identified(seed=14, push=0.0).lag]
     assert not any(lag.determined for lag in lags)
 
 
-def test_a_lag_is_not_told_from_positions():
+def test_a_lag_is_not_told_from_positions() -> None:
     recording = strokes(seed=14, lag=0.02)
     found = identify_friction(replace(recording, speed=None))
     assert found.lag is None
@@ -275,7 +287,7 @@ def test_a_lag_is_not_told_from_positions():
     assert any(' behind the motion' in words for words in found.warnings)
 
 
-def test_a_force_that_does_not_change_with_the_speed_shows_no_lag():
+def test_a_force_that_does_not_change_with_the_speed_shows_no_lag() -> None:
     recording = strokes(seed=14, speeds=SPEEDS[:3], push=0.0)
     dry = replace(recording, force=recording.force - (VISCOUS - 0.3) * recording.speed)
     found = identify_friction(dry)
@@ -284,7 +296,7 @@ def test_a_force_that_does_not_change_with_the_speed_shows_no_lag():
     assert within(found['coulomb_friction'], COULOMB)
 
 
-def test_positions_alone_give_the_same_within_the_errors():
+def test_positions_alone_give_the_same_within_the_errors() -> None:
     recording = strokes(seed=5)
     both = identify_friction(recording)
     counted = 1e-6 * np.round(recording.depth / 1e-6)
@@ -295,7 +307,7 @@ def test_positions_alone_give_the_same_within_the_errors():
         assert alone[name].error < 1.3 * both[name].error
 
 
-def test_noise_of_the_speed_is_named_and_total_takes_it():
+def test_noise_of_the_speed_is_named_and_total_takes_it() -> None:
     """Speeds that differ little: noise then is much of what they differ by."""
     rng = np.random.default_rng(1)
     recording = law(lambda time: 3e-3 + varied(time), duration=80.0)
@@ -312,7 +324,7 @@ def test_noise_of_the_speed_is_named_and_total_takes_it():
     assert not any('choose' in words for words in total.warnings)
 
 
-def test_outliers_move_huber_little():
+def test_outliers_move_huber_little() -> None:
     recording = strokes(seed=6)
     rng = np.random.default_rng(6)
     struck = rng.random(len(recording.time)) < 0.01
@@ -326,7 +338,7 @@ def test_outliers_move_huber_little():
 
 @pytest.mark.parametrize('both_ways', [True, False])
 @pytest.mark.parametrize('seed', [None, 0])
-def test_one_speed_does_not_determine_two_coefficients(both_ways, seed):
+def test_one_speed_does_not_determine_two_coefficients(both_ways: bool, seed: int | None) -> None:
     recording = law(lambda time: np.full_like(time, 5e-3), both_ways=both_ways, offset=0.01)
     if seed is not None:
         noise = np.random.default_rng(seed).normal(scale=0.01, size=2000)
@@ -340,7 +352,7 @@ def test_one_speed_does_not_determine_two_coefficients(both_ways, seed):
     assert any('do not determine coulomb_friction' in words for words in found.warnings)
 
 
-def test_offset_and_direction_cannot_be_told_apart_but_the_rest_can():
+def test_offset_and_direction_cannot_be_told_apart_but_the_rest_can() -> None:
     found = identified(settings('offset', 'direction'), seed=7)
     known = {parameter.name: parameter.determined for parameter in found.parameters}
     assert known == {
@@ -354,13 +366,13 @@ def test_offset_and_direction_cannot_be_told_apart_but_the_rest_can():
     assert within(found['viscous_friction'], VISCOUS)
 
 
-def test_an_offset_is_not_told_from_friction_in_one_direction():
+def test_an_offset_is_not_told_from_friction_in_one_direction() -> None:
     found = identify_friction(law(varied, both_ways=False), settings('offset'))
     known = {parameter.name: parameter.determined for parameter in found.parameters}
     assert known == {'coulomb_friction': False, 'viscous_friction': True, 'offset': False}
 
 
-def test_only_a_rest_with_a_rising_force_shows_the_break_away():
+def test_only_a_rest_with_a_rising_force_shows_the_break_away() -> None:
     assert identified(seed=8).breakaway is not None
     assert identified(seed=8, push=0.0).breakaway is None
     sticky = identified(settings('stribeck'), seed=8, breakaway=1.3)
@@ -368,7 +380,7 @@ def test_only_a_rest_with_a_rising_force_shows_the_break_away():
     assert sticky.breakaway is None or sticky.breakaway.error < 0.02
 
 
-def test_time_may_begin_anywhere_and_samples_may_be_lost():
+def test_time_may_begin_anywhere_and_samples_may_be_lost() -> None:
     recording = strokes(seed=9)
     whole = identify_friction(recording)
     rng = np.random.default_rng(3)
@@ -391,7 +403,7 @@ def test_time_may_begin_anywhere_and_samples_may_be_lost():
 
 @pytest.mark.filterwarnings('error')
 @pytest.mark.parametrize('rate', [50.0, 1000.0])
-def test_the_rate_of_the_recording_may_be_any(rate):
+def test_the_rate_of_the_recording_may_be_any(rate: float) -> None:
     recording = strokes(seed=10)
     time = np.arange(recording.time[0], recording.time[-1], 1.0 / rate)
     changed = Recording(
@@ -408,7 +420,7 @@ def test_the_rate_of_the_recording_may_be_any(rate):
     assert len(found.fit.time) <= 250 * 15
 
 
-def test_the_fit_is_what_the_pictures_show():
+def test_the_fit_is_what_the_pictures_show() -> None:
     found = identified(seed=11)
     fit = found.fit
     assert_array_equal(np.isfinite(fit.model), fit.used)
@@ -417,7 +429,7 @@ def test_the_fit_is_what_the_pictures_show():
     assert np.count_nonzero(fit.used) == found.samples
 
 
-def jump(recording):
+def jump(recording: Recording) -> Recording:
     """Let the clock jump in the middle, as one with simulated and real stamps does."""
     return replace(recording, time=recording.time + np.where(recording.time < 4.0, 0.0, 1e9))
 
@@ -441,12 +453,12 @@ def jump(recording):
     ],
     ids=['rest', 'little motion', 'short', 'one sample', 'no force', 'noise', 'stamps'],
 )
-def test_says_what_a_recording_lacks(recording, complaint):
+def test_says_what_a_recording_lacks(recording: Recording, complaint: str) -> None:
     with pytest.raises(IdentificationError, match=f'^law: .*{complaint}'):
         identify_friction(recording)
 
 
-def test_refuses_friction_that_drives():
+def test_refuses_friction_that_drives() -> None:
     recording = law(varied)
     with pytest.raises(IdentificationError, match=r'negative, got mu_s = -0\.56 N.*wrong sign'):
         identify_friction(replace(recording, force=-recording.force))
@@ -456,7 +468,7 @@ def test_refuses_friction_that_drives():
     'name', ['cutoff', 'moving_speed', 'largest_acceleration', 'stribeck_speed']
 )
 @pytest.mark.parametrize('value', [0.0, -1.0, float('nan')])
-def test_refuses_settings_out_of_range(name, value):
+def test_refuses_settings_out_of_range(name: str, value: float) -> None:
     with pytest.raises(ParameterError, match=f'{name} must be'):
         FrictionSettings(**{name: value})
 
@@ -472,17 +484,19 @@ def test_refuses_settings_out_of_range(name, value):
         ({'estimator': 'total', 'terms': ('coulomb',)}, 'total needs the term viscous'),
     ],
 )
-def test_refuses_terms_and_estimators_that_do_not_go(changes, complaint):
+def test_refuses_terms_and_estimators_that_do_not_go(
+    changes: dict[str, Any], complaint: str
+) -> None:
     with pytest.raises(ParameterError, match=complaint):
         FrictionSettings(**changes)
 
 
-def test_a_parameter_that_was_not_fitted_is_named_with_those_that_were():
+def test_a_parameter_that_was_not_fitted_is_named_with_those_that_were() -> None:
     with pytest.raises(KeyError, match='offset; there are coulomb_friction, viscous_friction'):
         identified()['offset']
 
 
-def test_summary_holds_every_parameter_of_every_recording():
+def test_summary_holds_every_parameter_of_every_recording() -> None:
     one = identified(settings('offset'), seed=12, offset=0.1)
     other = identified(seed=13)
     summary = summarize([one, other])
@@ -498,6 +512,6 @@ def test_summary_holds_every_parameter_of_every_recording():
         summary['moving_mass']
 
 
-def test_nothing_cannot_be_summarized():
+def test_nothing_cannot_be_summarized() -> None:
     with pytest.raises(IdentificationError, match='no recordings'):
         summarize([])

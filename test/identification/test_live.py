@@ -3,6 +3,7 @@
 from math import inf, nan
 
 from needle_dynamics import ParameterError
+from needle_identification import ParameterEstimate
 from needle_identification.friction.live import LiveFriction
 from needle_identification.friction.terms import FrictionSettings
 import numpy as np
@@ -20,24 +21,29 @@ SAMPLES = list(
 )
 
 
-def feed(live, samples=SAMPLES, shift=0, speeds=True):
+def feed(
+    live: LiveFriction,
+    samples: list[tuple[int, float, float, float]] = SAMPLES,
+    shift: int = 0,
+    speeds: bool = True,
+) -> None:
     """Feed the recording as two streams, the motion a little later on the way."""
     for stamp, depth, speed, force in samples:
         live.take_force(stamp, force)
         live.take_motion(stamp + shift, depth, speed if speeds else None)
 
 
-def make():
+def make() -> LiveFriction:
     """Return a live identification that forgets nothing within the recording."""
     return LiveFriction(FrictionSettings(), 1e6)
 
 
-def values(live):
+def values(live: LiveFriction) -> dict[str, ParameterEstimate]:
     """Return the estimates by name."""
     return {one.name: one for one in live.estimate()}
 
 
-def check(live, tolerance):
+def check(live: LiveFriction, tolerance: float) -> None:
     """Compare with what was simulated."""
     found = values(live)
     for name in ('coulomb_friction', 'viscous_friction'):
@@ -45,7 +51,7 @@ def check(live, tolerance):
         assert found[name].value == pytest.approx(getattr(TRUTH, name), rel=tolerance)
 
 
-def test_finds_the_friction_that_was_simulated():
+def test_finds_the_friction_that_was_simulated() -> None:
     """Stamps that agree are paired one by one."""
     live = make()
     assert live.estimate() == ()
@@ -56,7 +62,7 @@ def test_finds_the_friction_that_was_simulated():
     check(live, 0.01)
 
 
-def test_motion_between_the_stamps_of_the_force_is_interpolated():
+def test_motion_between_the_stamps_of_the_force_is_interpolated() -> None:
     """A motion sampled 1.3 ms beside the force gives the same friction."""
     live = make()
     feed(live, shift=-1_300_000)
@@ -65,7 +71,7 @@ def test_motion_between_the_stamps_of_the_force_is_interpolated():
     check(live, 0.02)
 
 
-def test_positions_alone_are_differentiated():
+def test_positions_alone_are_differentiated() -> None:
     """Without speeds the slope between two positions is the speed in their middle."""
     live = make()
     feed(live, speeds=False)
@@ -73,7 +79,7 @@ def test_positions_alone_are_differentiated():
 
 
 @pytest.mark.parametrize('value', [nan, inf])
-def test_what_is_not_finite_is_dropped_and_counted(value):
+def test_what_is_not_finite_is_dropped_and_counted(value: float) -> None:
     """A sensor that fails for a while does not spoil the estimate."""
     live = make()
     for k, (stamp, depth, speed, force) in enumerate(SAMPLES):
@@ -83,7 +89,7 @@ def test_what_is_not_finite_is_dropped_and_counted(value):
     check(live, 0.02)
 
 
-def test_stamps_that_go_back_a_little_are_dropped():
+def test_stamps_that_go_back_a_little_are_dropped() -> None:
     """Duplicates and messages overtaken on the way count once, or not at all."""
     live = make()
     for k, (stamp, depth, speed, force) in enumerate(SAMPLES):
@@ -96,7 +102,7 @@ def test_stamps_that_go_back_a_little_are_dropped():
     check(live, 0.01)
 
 
-def test_a_clock_that_is_set_back_starts_anew():
+def test_a_clock_that_is_set_back_starts_anew() -> None:
     """Estimation goes on with the new stamps as if it had begun with them."""
     live, fresh = make(), make()
     feed(live)
@@ -108,7 +114,7 @@ def test_a_clock_that_is_set_back_starts_anew():
     check(live, 0.01)
 
 
-def test_force_within_a_gap_of_the_motion_is_not_paired():
+def test_force_within_a_gap_of_the_motion_is_not_paired() -> None:
     """Nobody knows how the needle moved while the encoder was silent."""
     live = make()
     gap = range(400, 500)
@@ -120,7 +126,7 @@ def test_force_within_a_gap_of_the_motion_is_not_paired():
     check(live, 0.02)
 
 
-def test_one_stream_alone_takes_no_more_memory_than_its_share():
+def test_one_stream_alone_takes_no_more_memory_than_its_share() -> None:
     """Force without motion waits, but not for ever."""
     live = make()
     for k in range(30_000):
@@ -137,7 +143,9 @@ def test_one_stream_alone_takes_no_more_memory_than_its_share():
         (FrictionSettings(estimator='huber'), 60.0, 'estimator ordinary'),
     ],
 )
-def test_what_cannot_be_done_is_refused_before_a_sample_comes(settings, forgetting, complaint):
+def test_what_cannot_be_done_is_refused_before_a_sample_comes(
+    settings: FrictionSettings, forgetting: float, complaint: str
+) -> None:
     """The settings are checked at once."""
     with pytest.raises(ParameterError, match=complaint):
         LiveFriction(settings, forgetting)

@@ -1,11 +1,12 @@
 """What a player needs of a bag: its messages in the order of time, and how they were offered."""
 
 from itertools import pairwise
+from pathlib import Path
 
 from needle_identification import BagWriter, OfferedQos
 from needle_identification.bags import bag as bag_io
 from needle_identification.bags.bag import Bag
-from needle_identification.bags.storage import offered_qos
+from needle_identification.bags.storage import offered_qos, Topic
 import pytest
 from rosbags.interfaces import (
     Qos,
@@ -28,11 +29,11 @@ OLD = """
 """
 
 
-def everything(_topic) -> bool:
+def everything(_topic: Topic) -> bool:
     return True
 
 
-def test_messages_come_in_the_order_of_time_across_topics(tmp_path):
+def test_messages_come_in_the_order_of_time_across_topics(tmp_path: Path) -> None:
     """Batches come topic by topic; messages do not."""
     with BagWriter(tmp_path / 'bag') as writer:
         for name in ('/a', '/b'):
@@ -45,7 +46,7 @@ def test_messages_come_in_the_order_of_time_across_topics(tmp_path):
     ]
 
 
-def test_equal_times_keep_the_order_of_the_file(tmp_path):
+def test_equal_times_keep_the_order_of_the_file(tmp_path: Path) -> None:
     """Of messages received at once the one written first comes first."""
     with BagWriter(tmp_path / 'bag') as writer:
         writer.add_topic('/a', TEXT)
@@ -55,7 +56,9 @@ def test_equal_times_keep_the_order_of_the_file(tmp_path):
     assert found == [text(str(k)) for k in range(100)]
 
 
-def test_a_long_recording_is_put_in_order_piece_by_piece(tmp_path, monkeypatch):
+def test_a_long_recording_is_put_in_order_piece_by_piece(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """No more waits than the window and the piece that is read; only the wanted topics do."""
     monkeypatch.setattr(bag_io, '_WINDOW', 1000)
     with BagWriter(tmp_path / 'bag') as writer:
@@ -76,7 +79,9 @@ def test_a_long_recording_is_put_in_order_piece_by_piece(tmp_path, monkeypatch):
     assert times == [EPOCH + k for k in range(1000)]
 
 
-def test_a_message_behind_the_window_comes_when_it_is_met(tmp_path, monkeypatch):
+def test_a_message_behind_the_window_comes_when_it_is_met(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Nothing is lost, whatever the order."""
     monkeypatch.setattr(bag_io, '_WINDOW', 0)
     with BagWriter(tmp_path / 'bag') as writer:
@@ -89,7 +94,7 @@ def test_a_message_behind_the_window_comes_when_it_is_met(tmp_path, monkeypatch)
     assert any(late < early for early, late in pairwise(times))
 
 
-def test_what_was_offered_comes_back(tmp_path):
+def test_what_was_offered_comes_back(tmp_path: Path) -> None:
     """Profiles are those that the recorder stored, in either form of storage."""
     weak = OfferedQos('best_effort', 'volatile', 'keep_last', 5)
     latched = OfferedQos('reliable', 'transient_local', 'keep_all', 1)
@@ -125,6 +130,8 @@ def test_what_was_offered_comes_back(tmp_path):
         ('- [1]', ()),
     ],
 )
-def test_reads_what_any_version_of_rosbag2_stored(stored, found):
+def test_reads_what_any_version_of_rosbag2_stored(
+    stored: str, found: tuple[OfferedQos, ...]
+) -> None:
     """Numbers stand for the words in older recordings; what is not readable says nothing."""
     assert offered_qos(stored) == found

@@ -1,7 +1,9 @@
 """Recordings of any lab give force and motion as they were, or one line that says why not."""
 
 from contextlib import suppress
+from pathlib import Path
 import struct
+from typing import Any
 
 from hypothesis import given, settings, strategies
 from mcap.reader import make_reader
@@ -35,7 +37,7 @@ TWIST = 'geometry_msgs/msg/TwistStamped'
 ODOMETRY = 'nav_msgs/msg/Odometry'
 
 
-def pose(position, turn=0.0):
+def pose(position: tuple[float, ...], turn: float = 0.0) -> Any:
     """Return a pose turned about z [rad]."""
     orientation = (0.0, 0.0, np.sin(turn / 2.0), np.cos(turn / 2.0))
     return message_type('geometry_msgs/msg/Pose')(
@@ -44,12 +46,14 @@ def pose(position, turn=0.0):
     )
 
 
-def twist(velocity):
+def twist(velocity: tuple[float, ...]) -> Any:
     vector = message_type('geometry_msgs/msg/Vector3')
     return message_type('geometry_msgs/msg/Twist')(vector(*velocity), vector(0.0, 0.0, 0.0))
 
 
-def odometry(stamp, position, velocity, turn=0.0):
+def odometry(
+    stamp: int, position: tuple[float, ...], velocity: tuple[float, ...], turn: float = 0.0
+) -> bytes:
     """Serialize an Odometry whose body is turned about z; the velocity is in the body."""
     zero = np.zeros(36)
     return serialized(
@@ -61,11 +65,11 @@ def odometry(stamp, position, velocity, turn=0.0):
     )
 
 
-def serialized(type_name, stamp, *parts):
+def serialized(type_name: str, stamp: int, *parts: Any) -> bytes:
     return bytes(STORE.serialize_cdr(message_type(type_name)(header(stamp), *parts), type_name))
 
 
-def moving(type_name, stamp, depth, speed):
+def moving(type_name: str, stamp: int, depth: float, speed: float) -> bytes:
     """Serialize what a motion along y is in each type of message."""
     if type_name == MOTION:
         return joint_states(stamp, depth, speed)
@@ -78,7 +82,7 @@ def moving(type_name, stamp, depth, speed):
     return serialized(POINT, stamp, message_type('geometry_msgs/msg/Point')(0.0, depth, 0.0))
 
 
-def write(path, topics):
+def write(path: Path, topics: dict[str, tuple[str, list[tuple[Any, Any]]]]) -> Path:
     """Write topics, each a type and (stamp [ms after the epoch], bytes)."""
     with BagWriter(path) as writer:
         for topic, (type_name, messages) in topics.items():
@@ -88,11 +92,16 @@ def write(path, topics):
     return path
 
 
-def at(stamp):
+def at(stamp: int) -> int:
     return EPOCH + stamp * MILLISECOND
 
 
-def small_bag(path, wrenches=(), motions=(), joint_names=('insertion',)):
+def small_bag(
+    path: Path,
+    wrenches: list[tuple[int, float]] = (),
+    motions: list[Any] = (),
+    joint_names: tuple[str, ...] = ('insertion',),
+) -> Path:
     """Write (stamp, value) wrenches and (stamp, depth, speed) motions, in ms after the epoch."""
     return write(
         path,
@@ -106,11 +115,13 @@ def small_bag(path, wrenches=(), motions=(), joint_names=('insertion',)):
     )
 
 
-def forces(count=11, step=10):
+def forces(count: int = 11, step: int = 10) -> tuple[str, list[tuple[int, bytes]]]:
     return WRENCH, [(i * step, wrench(at(i * step), float(i))) for i in range(count)]
 
 
-def grid(count=11, step=10):
+def grid(
+    count: int = 11, step: int = 10
+) -> tuple[list[tuple[int, float]], list[tuple[int, float, float]]]:
     return [(i * step, float(i)) for i in range(count)], [
         (i * step, 0.1 + 0.001 * i, 0.1) for i in range(count)
     ]
@@ -120,7 +131,7 @@ def grid(count=11, step=10):
 
 
 @pytest.mark.parametrize(('axis', 'sign'), [('y', 1.0), ('-y', -1.0), ('x', 0.0)])
-def test_takes_the_axis_asked_for(tmp_path, axis, sign):
+def test_takes_the_axis_asked_for(tmp_path: Path, axis: str, sign: float) -> None:
     path = small_bag(tmp_path / 'bag', *grid())
     assert_array_equal(
         read_friction_recording(path, force_axis=axis).force, sign * np.arange(11.0)
@@ -128,12 +139,12 @@ def test_takes_the_axis_asked_for(tmp_path, axis, sign):
 
 
 @pytest.mark.parametrize('axis', ['', '-', 'w', '--x', 'xy'])
-def test_refuses_an_axis_that_is_none(tmp_path, axis):
+def test_refuses_an_axis_that_is_none(tmp_path: Path, axis: str) -> None:
     with pytest.raises(RecordingError, match='force axis must be'):
         read_friction_recording(tmp_path, force_axis=axis)
 
 
-def test_takes_the_joint_asked_for_and_lists_what_there_is(tmp_path):
+def test_takes_the_joint_asked_for_and_lists_what_there_is(tmp_path: Path) -> None:
     path = small_bag(tmp_path / 'bag', *grid(), joint_names=('slide', 'roll'))
     with pytest.raises(RecordingError, match=r"no joint 'insertion'; .* one of roll, slide"):
         read_friction_recording(path)
@@ -144,14 +155,14 @@ def test_takes_the_joint_asked_for_and_lists_what_there_is(tmp_path):
     assert_array_equal(read_friction_recording(alone).depth, one.depth)
 
 
-def test_motion_is_interpolated_to_the_stamps_of_the_force(tmp_path):
+def test_motion_is_interpolated_to_the_stamps_of_the_force(tmp_path: Path) -> None:
     wrenches = [(i * 10 + 5, float(i)) for i in range(10)]
     path = small_bag(tmp_path / 'bag', wrenches, grid()[1])
     read = read_friction_recording(path)
     assert_allclose(read.depth, 0.1005 + 0.001 * np.arange(10), rtol=1e-12)
 
 
-def test_speed_that_is_not_there_is_none_and_said(tmp_path):
+def test_speed_that_is_not_there_is_none_and_said(tmp_path: Path) -> None:
     wrenches, motions = grid()
     for name, value in (('empty', None), ('nan', float('nan'))):
         path = small_bag(tmp_path / name, wrenches, [(t, d, value) for t, d, _ in motions])
@@ -164,7 +175,7 @@ def test_speed_that_is_not_there_is_none_and_said(tmp_path):
     assert read.losses == ('/joints moves at the velocity 0, which is left out',)
 
 
-def test_a_speed_that_is_there_mostly_is_taken_where_it_is(tmp_path):
+def test_a_speed_that_is_there_mostly_is_taken_where_it_is(tmp_path: Path) -> None:
     wrenches, motions = grid()
     motions[4] = (40, 0.104, None)
     read = read_friction_recording(small_bag(tmp_path / 'bag', wrenches, motions))
@@ -172,7 +183,7 @@ def test_a_speed_that_is_there_mostly_is_taken_where_it_is(tmp_path):
     assert read.losses == ('1 of /joints without velocity, left out',)
 
 
-def test_samples_that_say_nothing_are_left_out_and_counted(tmp_path):
+def test_samples_that_say_nothing_are_left_out_and_counted(tmp_path: Path) -> None:
     wrenches, motions = grid()
     wrenches[3] = (30, float('nan'))
     wrenches[5], wrenches[6] = wrenches[6], wrenches[5]
@@ -188,7 +199,7 @@ def test_samples_that_say_nothing_are_left_out_and_counted(tmp_path):
     )
 
 
-def test_force_without_motion_is_left_out_and_counted(tmp_path):
+def test_force_without_motion_is_left_out_and_counted(tmp_path: Path) -> None:
     wrenches, motions = grid(count=101)
     path = small_bag(tmp_path / 'bag', wrenches, motions[10:40] + motions[70:])
     read = read_friction_recording(path)
@@ -202,7 +213,7 @@ def test_force_without_motion_is_left_out_and_counted(tmp_path):
         read_friction_recording(later)
 
 
-def test_without_header_stamps_the_time_of_reception_counts(tmp_path):
+def test_without_header_stamps_the_time_of_reception_counts(tmp_path: Path) -> None:
     with BagWriter(tmp_path / 'bag') as writer:
         writer.add_topic('/ft', WRENCH)
         writer.add_topic('/joints', MOTION)
@@ -217,7 +228,7 @@ def test_without_header_stamps_the_time_of_reception_counts(tmp_path):
     )
 
 
-def test_one_sample_is_not_a_recording(tmp_path):
+def test_one_sample_is_not_a_recording(tmp_path: Path) -> None:
     path = small_bag(tmp_path / 'bag', [(0, 1.0)], grid()[1])
     with pytest.raises(
         RecordingError, match='/ft must have >= 2 samples at different times, has 1'
@@ -229,7 +240,7 @@ def test_one_sample_is_not_a_recording(tmp_path):
 
 
 @pytest.mark.parametrize('type_name', [MOTION, POSE, POINT, TWIST, ODOMETRY])
-def test_motion_is_the_same_in_every_type_of_message(tmp_path, type_name):
+def test_motion_is_the_same_in_every_type_of_message(tmp_path: Path, type_name: str) -> None:
     motions = [(t, moving(type_name, at(t), d, v)) for t, d, v in grid()[1]]
     path = write(tmp_path / 'bag', {'/ft': forces(), '/robot': (type_name, motions)})
     axis = '-insertion' if type_name == MOTION else '-y'
@@ -250,7 +261,7 @@ def test_motion_is_the_same_in_every_type_of_message(tmp_path, type_name):
     assert read.losses == said.get(type_name, ())
 
 
-def test_the_velocity_of_an_odometry_is_turned_from_the_body(tmp_path):
+def test_the_velocity_of_an_odometry_is_turned_from_the_body(tmp_path: Path) -> None:
     # Turned by 90 degrees about z, the body moves along its x where the frame has y.
     motions = [
         (t, odometry(at(t), (0.0, d, 0.0), (v, 0.0, 0.0), np.pi / 2.0)) for t, d, v in grid()[1]
@@ -260,7 +271,7 @@ def test_the_velocity_of_an_odometry_is_turned_from_the_body(tmp_path):
     assert_allclose(read_friction_recording(path).speed, 0.1, rtol=1e-12)
 
 
-def test_joints_may_change_places_and_come_from_several_publishers(tmp_path):
+def test_joints_may_change_places_and_come_from_several_publishers(tmp_path: Path) -> None:
     messages = []
     for i in range(11):
         names = ('insertion', 'rotation') if i % 2 else ('rotation', 'insertion')
@@ -275,7 +286,9 @@ def test_joints_may_change_places_and_come_from_several_publishers(tmp_path):
         read_friction_recording(path)
 
 
-def joints(stamp, names, position, velocity):
+def joints(
+    stamp: int, names: tuple[str, ...], position: tuple[float, ...], velocity: tuple[float, ...]
+) -> bytes:
     return serialized(
         MOTION,
         stamp,
@@ -286,7 +299,7 @@ def joints(stamp, names, position, velocity):
     )
 
 
-def test_arrays_shorter_than_the_names_are_samples_that_are_missing(tmp_path):
+def test_arrays_shorter_than_the_names_are_samples_that_are_missing(tmp_path: Path) -> None:
     messages = [
         (10 * i, joints(at(10 * i), ('a', 'insertion'), (0.0, 0.1)[: 1 + (i != 4)], (0.0, 0.1)))
         for i in range(11)
@@ -295,7 +308,7 @@ def test_arrays_shorter_than_the_names_are_samples_that_are_missing(tmp_path):
     assert read_friction_recording(path).losses == ('1 of /joints not finite, left out',)
 
 
-def test_messages_that_are_none_are_left_out_and_counted(tmp_path):
+def test_messages_that_are_none_are_left_out_and_counted(tmp_path: Path) -> None:
     kind, wrenches = forces()
     wrenches[3] = (30, wrenches[3][1][:-5])
     wrenches[5] = (50, b'')
@@ -311,7 +324,7 @@ def test_messages_that_are_none_are_left_out_and_counted(tmp_path):
     assert read.losses == ('3 of /ft not readable, left out: the first one ends after 71 bytes',)
 
 
-def test_what_lies_beside_the_topics_does_no_harm(tmp_path):
+def test_what_lies_beside_the_topics_does_no_harm(tmp_path: Path) -> None:
     path = small_bag(tmp_path / 'bag', *grid())
     file = path / 'bag_0.mcap'
     with file.open('rb') as stream:
@@ -338,7 +351,7 @@ def test_what_lies_beside_the_topics_does_no_harm(tmp_path):
     assert read.losses == ()
 
 
-def test_prefers_the_usual_names_and_lists_candidates_otherwise(tmp_path):
+def test_prefers_the_usual_names_and_lists_candidates_otherwise(tmp_path: Path) -> None:
     motions = (MOTION, [(t, joint_states(at(t), d, v)) for t, d, v in grid()[1]])
     usual = write(
         tmp_path / 'usual',
@@ -360,7 +373,7 @@ def test_prefers_the_usual_names_and_lists_candidates_otherwise(tmp_path):
         read_friction_recording(two, wrench_topic='/left/ft')
 
 
-def test_the_last_configuration_of_the_plant_comes_along(tmp_path):
+def test_the_last_configuration_of_the_plant_comes_along(tmp_path: Path) -> None:
     wrenches, motions = grid()
     with BagWriter(tmp_path / 'bag') as writer:
         for topic, kind in (('/ft', WRENCH), ('/joints', MOTION), ('/plant/configuration', TEXT)):
@@ -376,7 +389,9 @@ def test_the_last_configuration_of_the_plant_comes_along(tmp_path):
 # Clocks.
 
 
-def two_clocks(path, ahead, latency=(0.002, 0.002), count=500):
+def two_clocks(
+    path: Path, ahead: float, latency: tuple[float, ...] = (0.002, 0.002), count: int = 500
+) -> Path:
     """Write force and motion 4 ms apart, the force stamped by a clock that is ahead [s]."""
     rng = np.random.default_rng(0)
     with BagWriter(path) as writer:
@@ -392,7 +407,7 @@ def two_clocks(path, ahead, latency=(0.002, 0.002), count=500):
 
 
 @pytest.mark.parametrize('ahead', [-3600.0, 0.5, 1e6])
-def test_clocks_that_differ_are_set_to_each_other(tmp_path, ahead):
+def test_clocks_that_differ_are_set_to_each_other(tmp_path: Path, ahead: float) -> None:
     read = read_friction_recording(two_clocks(tmp_path / 'bag', ahead))
     # 2e-3: the 5 % quantiles of 500 latencies scatter by 5e-5 s, and the clock of 1e6 s is told
     # to the nanosecond; this leaves room for what other generators draw.
@@ -405,14 +420,16 @@ def test_clocks_that_differ_are_set_to_each_other(tmp_path, ahead):
 
 
 @pytest.mark.parametrize(('latency', 'said'), [((0.002, 0.002), 0), ((0.002, 0.2), 1)])
-def test_latency_is_not_taken_for_a_clock(tmp_path, latency, said):
+def test_latency_is_not_taken_for_a_clock(
+    tmp_path: Path, latency: tuple[float, ...], said: int
+) -> None:
     read = read_friction_recording(two_clocks(tmp_path / 'bag', 0.0, latency))
     assert read.clock_offset == 0.0
     assert_array_equal(read.depth, 1e-3 * read.force)
     assert len([loss for loss in read.losses if 'may be latency' in loss]) == said
 
 
-def test_receive_times_that_mean_nothing_move_no_stamps(tmp_path):
+def test_receive_times_that_mean_nothing_move_no_stamps(tmp_path: Path) -> None:
     wrenches, motions = grid()
     with BagWriter(tmp_path / 'bag') as writer:
         writer.add_topic('/ft', WRENCH)
@@ -423,7 +440,7 @@ def test_receive_times_that_mean_nothing_move_no_stamps(tmp_path):
     assert read_friction_recording(tmp_path / 'bag').clock_offset == 0.0
 
 
-def test_refuses_a_time_that_is_none(tmp_path):
+def test_refuses_a_time_that_is_none(tmp_path: Path) -> None:
     path = small_bag(tmp_path / 'bag', *grid())
     with pytest.raises(RecordingError, match="time must be one of header, receive, got 'now'"):
         read_friction_recording(path, time='now')
@@ -440,7 +457,12 @@ SECONDS = strategies.integers(-(2**31), 2**31 - 1)
     received=strategies.lists(strategies.integers(0, 2**64 - 1), min_size=8, max_size=8),
     value=strategies.floats(),
 )
-def test_any_stamps_and_values_are_read_or_refused(tmp_path_factory, stamps, received, value):
+def test_any_stamps_and_values_are_read_or_refused(
+    tmp_path_factory: pytest.TempPathFactory,
+    stamps: list[tuple[int, int]],
+    received: list[int],
+    value: float,
+) -> None:
     path = tmp_path_factory.mktemp('stamps') / 'bag'
     with BagWriter(path) as writer:
         writer.add_topic('/ft', WRENCH)
@@ -459,7 +481,7 @@ def test_any_stamps_and_values_are_read_or_refused(tmp_path_factory, stamps, rec
 # Dense recordings.
 
 
-def test_dense_samples_are_averaged_without_delay(tmp_path):
+def test_dense_samples_are_averaged_without_delay(tmp_path: Path) -> None:
     rate, frequency = 4000, 5.0
     with BagWriter(tmp_path / 'bag') as writer:
         writer.add_topic('/ft', WRENCH)
@@ -481,7 +503,7 @@ def test_dense_samples_are_averaged_without_delay(tmp_path):
 # Indentation.
 
 
-def pressed(path, type_name):
+def pressed(path: Path, type_name: str) -> Path:
     """Write an indentation along x, z and a little y; force 100 and 200 N/m."""
     messages = []
     for i in range(11):
@@ -507,7 +529,7 @@ def pressed(path, type_name):
 
 
 @pytest.mark.parametrize('type_name', [POSE, POINT, ODOMETRY, MOTION])
-def test_reads_an_indentation_from_every_type_of_message(tmp_path, type_name):
+def test_reads_an_indentation_from_every_type_of_message(tmp_path: Path, type_name: str) -> None:
     path = pressed(tmp_path / 'bag', type_name)
     read = read_indentation_recording(path)
     i = np.arange(11)
@@ -520,7 +542,7 @@ def test_reads_an_indentation_from_every_type_of_message(tmp_path, type_name):
     assert_array_equal(turned.force, read.force[:, ::-1] * [-1.0, 1.0])
 
 
-def test_joints_of_an_indentation_may_lack_the_one_across(tmp_path):
+def test_joints_of_an_indentation_may_lack_the_one_across(tmp_path: Path) -> None:
     messages = [(10 * i, joints(at(10 * i), ('z', 'x'), (i, -i), ())) for i in range(11)]
     path = write(tmp_path / 'bag', {'/ft': forces(), '/joint_states': (MOTION, messages)})
     read = read_indentation_recording(path)
@@ -534,6 +556,6 @@ def test_joints_of_an_indentation_may_lack_the_one_across(tmp_path):
 
 
 @pytest.mark.parametrize('axes', [('x', 'x'), ('x', '-x'), ('x', 'w')])
-def test_refuses_a_plane_that_is_none(tmp_path, axes):
+def test_refuses_a_plane_that_is_none(tmp_path: Path, axes: tuple[str, ...]) -> None:
     with pytest.raises(RecordingError, match=r'axes must be two different|axis of the plane must'):
         read_indentation_recording(tmp_path, axes=axes)

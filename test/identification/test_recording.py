@@ -1,12 +1,12 @@
 """The value that identification works on is what it claims to be."""
 
-from needle_dynamics import ShapeError
+from needle_dynamics import FloatArray, ShapeError
 from needle_identification import IndentationRecording, Recording
 import numpy as np
 import pytest
 
 
-def recording(**changes):
+def recording(**changes: FloatArray | str | None) -> Recording:
     fields = {name: np.array([0.0, 1.0, 2.0]) for name in ('time', 'depth', 'speed', 'force')}
     return Recording(name='it', **{**fields, **changes})
 
@@ -20,12 +20,12 @@ def recording(**changes):
         ({'time': np.array([0.0, 1.0, 1.0])}, 'time must increase strictly'),
     ],
 )
-def test_refuses_what_is_not_a_recording(changes, complaint):
+def test_refuses_what_is_not_a_recording(changes: dict[str, FloatArray], complaint: str) -> None:
     with pytest.raises(ShapeError, match=complaint):
         recording(**changes)
 
 
-def test_holds_a_copy_that_cannot_change():
+def test_holds_a_copy_that_cannot_change() -> None:
     force = np.zeros(3)
     made = recording(force=force)
     force[0] = 1.0
@@ -35,22 +35,22 @@ def test_holds_a_copy_that_cannot_change():
 
 
 @pytest.mark.parametrize('text', ['', 'a: [', 'just words', '{"/plant": 3}', '[1, 2]'])
-def test_knows_no_truth_without_a_parameter_file(text):
+def test_knows_no_truth_without_a_parameter_file(text: str) -> None:
     assert recording(configuration=text).truth is None
 
 
-def test_reads_the_truth_from_the_configuration_of_the_plant():
+def test_reads_the_truth_from_the_configuration_of_the_plant() -> None:
     text = '/lab/plant:\n  ros__parameters:\n    model.coulomb_friction: 0.56\n'
     assert recording(configuration=text).truth == {'model.coulomb_friction': 0.56}
 
 
-def test_only_speed_may_be_missing():
+def test_only_speed_may_be_missing() -> None:
     assert recording(speed=None).speed is None
     with pytest.raises(ShapeError, match='force must have the shape'):
         recording(force=None)
 
 
-def test_an_indentation_has_two_components_and_one_across():
+def test_an_indentation_has_two_components_and_one_across() -> None:
     fields = {
         'time': np.arange(3.0),
         'position': np.zeros((3, 2)),

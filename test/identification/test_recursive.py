@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 from needle_dynamics import ParameterError
-from needle_identification import FrictionSettings, identify_friction, RecursiveFriction
+from needle_identification import FrictionSettings, identify_friction, Recording, RecursiveFriction
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest
@@ -12,14 +12,16 @@ from support.strokes import COULOMB, strokes, VISCOUS
 RATE = 250.0
 
 
-def fed(recording, forgetting=8.0, settings=None):
+def fed(
+    recording: Recording, forgetting: float = 8.0, settings: FrictionSettings | None = None
+) -> RecursiveFriction:
     running = RecursiveFriction(settings or FrictionSettings(), RATE, forgetting)
     for row in zip(recording.time, recording.speed, recording.force, strict=True):
         running.update(*row)
     return running
 
 
-def joined(*recordings):
+def joined(*recordings: Recording) -> Recording:
     """Play recordings one after the other."""
     time = np.arange(sum(len(r.time) for r in recordings)) / RATE
     return replace(
@@ -35,16 +37,16 @@ def joined(*recordings):
 class Weighed(RecursiveFriction):
     """Keep what was learned, to solve it all at once."""
 
-    def __init__(self, *args):
+    def __init__(self, *args: float | FrictionSettings) -> None:
         super().__init__(*args)
         self.rows = []
 
-    def _learn(self, speed, acceleration, force):
+    def _learn(self, speed: float, acceleration: float, force: float) -> None:
         self.rows.append((np.sign(speed), speed, acceleration, force))
         super()._learn(speed, acceleration, force)
 
 
-def test_equals_weighted_least_squares_of_all_samples_at_once():
+def test_equals_weighted_least_squares_of_all_samples_at_once() -> None:
     recording = strokes(seed=1)
     running = Weighed(FrictionSettings(), RATE, 3.0)
     for row in zip(recording.time, recording.speed, recording.force, strict=True):
@@ -59,14 +61,14 @@ def test_equals_weighted_least_squares_of_all_samples_at_once():
 
 
 @pytest.mark.parametrize('lag', [0.0, 0.004])
-def test_recovers_the_truth_without_noise(lag):
+def test_recovers_the_truth_without_noise(lag: float) -> None:
     coulomb, viscous = fed(strokes(lag=lag)).estimate()
     # 1e-4 of the force at the largest speed: the lag is taken up to first order.
     assert_allclose(coulomb.value, COULOMB, rtol=1e-3)
     assert_allclose(viscous.value, VISCOUS, rtol=1e-4)
 
 
-def test_follows_a_step_within_the_forgetting_time():
+def test_follows_a_step_within_the_forgetting_time() -> None:
     slippery = strokes(seed=2, push=0.0)
     rough = strokes(seed=3, push=0.0)
     rough = replace(rough, force=rough.force + 0.2 * np.sign(rough.speed))
@@ -80,7 +82,7 @@ def test_follows_a_step_within_the_forgetting_time():
     assert COULOMB + 0.05 < slow.value < COULOMB + 0.15
 
 
-def test_intervals_hold_the_truth_as_often_as_they_say():
+def test_intervals_hold_the_truth_as_often_as_they_say() -> None:
     estimates = [fed(strokes(seed=seed)).estimate() for seed in range(40)]
     for k, truth in enumerate((COULOMB, VISCOUS)):
         values, errors = np.array([(e[k].value, e[k].error) for e in estimates]).T
@@ -91,7 +93,7 @@ def test_intervals_hold_the_truth_as_often_as_they_say():
         assert_allclose(np.sqrt(np.mean(errors**2)), values.std(), rtol=0.34)
 
 
-def test_nothing_is_determined_until_the_motion_determines_it():
+def test_nothing_is_determined_until_the_motion_determines_it() -> None:
     recording = strokes(seed=1, push=0.0)
     running = RecursiveFriction(FrictionSettings(), RATE, 8.0)
     assert not any(p.determined for p in running.estimate())
@@ -109,7 +111,7 @@ def test_nothing_is_determined_until_the_motion_determines_it():
     assert all(p.interval == (-np.inf, np.inf) for p in one_speed)
 
 
-def test_rest_forgets_nothing():
+def test_rest_forgets_nothing() -> None:
     recording = strokes(seed=4)
     rest = replace(
         recording, speed=np.zeros_like(recording.speed), force=np.zeros_like(recording.force)
@@ -118,7 +120,7 @@ def test_rest_forgets_nothing():
     assert_allclose([p.value for p in other], [p.value for p in one], rtol=1e-9)
 
 
-def test_gaps_and_what_is_not_finite_do_no_harm():
+def test_gaps_and_what_is_not_finite_do_no_harm() -> None:
     recording = strokes(seed=5)
     kept = np.ones(len(recording.time), dtype=bool)
     kept[1500:1700] = False
@@ -130,7 +132,7 @@ def test_gaps_and_what_is_not_finite_do_no_harm():
         assert abs(found.value - truth) < 4.0 * found.error
 
 
-def test_takes_the_terms_that_were_chosen():
+def test_takes_the_terms_that_were_chosen() -> None:
     settings = FrictionSettings(terms=('coulomb', 'viscous', 'offset', 'direction'))
     found = fed(strokes(seed=6), settings=settings).estimate()
     known = {p.name: p.determined for p in found}
@@ -150,6 +152,8 @@ def test_takes_the_terms_that_were_chosen():
         ((FrictionSettings(estimator='huber'), RATE, 8.0), "ordinary, got 'huber'"),
     ],
 )
-def test_refuses_what_it_cannot_run_with(arguments, complaint):
+def test_refuses_what_it_cannot_run_with(
+    arguments: tuple[FrictionSettings, float, float], complaint: str
+) -> None:
     with pytest.raises(ParameterError, match=complaint):
         RecursiveFriction(*arguments)

@@ -1,8 +1,10 @@
 """Regression finds what is there, says how well, and says what it cannot tell."""
 
+from typing import Any
+
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from needle_dynamics import ParameterError, ShapeError
+from needle_dynamics import FloatArray, ParameterError, ShapeError
 from needle_identification import (
     ESTIMATORS,
     IdentificationError,
@@ -12,6 +14,7 @@ from needle_identification import (
 )
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
+from numpy.typing import NDArray
 import pytest
 from scipy.signal import lfilter
 from scipy.signal.windows import triang
@@ -21,13 +24,17 @@ VALUES = np.array([0.56, 300.0, -2.0])
 SIZES = np.array([1.0, 1e-2, 0.1])
 
 
-def problem(seed=0, n=600, noise=0.0):
+def problem(
+    seed: int = 0, n: int = 600, noise: float = 0.0
+) -> tuple[FloatArray, FloatArray, np.random.Generator]:
     rng = np.random.default_rng(seed)
     x = SIZES * rng.normal(loc=[0.2, 0.5, 0.0], size=(n, 3))
     return x, x @ VALUES + noise * rng.normal(size=n), rng
 
 
-def extras(n, noise=(0.0, 0.0, 0.0)):
+def extras(
+    n: int, noise: tuple[float, ...] = (0.0, 0.0, 0.0)
+) -> dict[str, FloatArray | NDArray[np.bool_] | NDArray[np.int64]]:
     return {
         'groups': np.arange(n) % 4,
         'noisy': np.array(noise) > 0.0,
@@ -36,7 +43,7 @@ def extras(n, noise=(0.0, 0.0, 0.0)):
 
 
 @pytest.mark.parametrize('estimator', ESTIMATORS)
-def test_recovers_exactly_without_noise(estimator):
+def test_recovers_exactly_without_noise(estimator: str) -> None:
     x, y, _ = problem()
     found = regress(x, y, estimator=estimator, **extras(len(y)))
     # 1e-10: rounding times the condition number of the columns.
@@ -49,7 +56,7 @@ def test_recovers_exactly_without_noise(estimator):
 @pytest.mark.parametrize('estimator', ESTIMATORS)
 @given(scale=st.floats(1e-3, 1e3), column=st.floats(1e-3, 1e3), sign=st.sampled_from([-1.0, 1.0]))
 @settings(max_examples=10, deadline=None)
-def test_units_do_not_matter(estimator, scale, column, sign):
+def test_units_do_not_matter(estimator: str, scale: float, column: float, sign: float) -> None:
     x, y, _ = problem(noise=0.1)
     one = regress(x, y, estimator=estimator, **extras(len(y), (0.0, 1e-3, 0.0)))
     units = np.array([1.0, sign * column, 1.0])
@@ -61,7 +68,7 @@ def test_units_do_not_matter(estimator, scale, column, sign):
     assert_allclose(other.condition, one.condition, rtol=1e-9)
 
 
-def test_ordinary_is_least_squares_with_its_textbook_errors():
+def test_ordinary_is_least_squares_with_its_textbook_errors() -> None:
     x, y, _ = problem(noise=0.1, n=20_000)
     found = regress(x, y)
     assert_allclose(found.values, np.linalg.lstsq(x, y, rcond=None)[0], rtol=1e-9)
@@ -70,7 +77,7 @@ def test_ordinary_is_least_squares_with_its_textbook_errors():
     assert_allclose(found.errors, textbook, rtol=0.05)
 
 
-def test_gross_outliers_move_huber_little():
+def test_gross_outliers_move_huber_little() -> None:
     x, y, rng = problem(noise=0.1)
     struck = rng.random(len(y)) < 0.1
     y = y + np.where(struck, 50.0, 0.0)
@@ -80,7 +87,7 @@ def test_gross_outliers_move_huber_little():
     assert (huber.errors < 0.1 * ordinary.errors).all()
 
 
-def test_total_is_not_attenuated_where_ordinary_is():
+def test_total_is_not_attenuated_where_ordinary_is() -> None:
     noise = 0.3 * SIZES[1]
     total, ordinary = [], []
     for seed in range(50):
@@ -98,13 +105,13 @@ def test_total_is_not_attenuated_where_ordinary_is():
     assert_allclose(np.std([f.values[1] for f in total]), np.sqrt(np.mean(errors**2)), rtol=0.3)
 
 
-def test_total_refuses_columns_of_noise():
+def test_total_refuses_columns_of_noise() -> None:
     x, y, _ = problem()
     with pytest.raises(IdentificationError, match='noise of the regressors exceeds'):
         regress(x, y, estimator='total', **extras(len(y), (0.0, 1.0, 0.0)))
 
 
-def test_weights_of_the_noise_of_each_group_make_errors_smaller():
+def test_weights_of_the_noise_of_each_group_make_errors_smaller() -> None:
     values = {'ordinary': [], 'weighted': []}
     for seed in range(100):
         x, y, rng = problem(seed)
@@ -120,7 +127,7 @@ def test_weights_of_the_noise_of_each_group_make_errors_smaller():
 
 
 @pytest.mark.parametrize('estimator', ESTIMATORS)
-def test_intervals_cover_under_correlated_noise(estimator):
+def test_intervals_cover_under_correlated_noise(estimator: str) -> None:
     """Noise of a first-order filter with a memory of 10 samples, regressors that are smooth."""
     rng = np.random.default_rng(7)
     n, runs = 1500, 200
@@ -140,7 +147,7 @@ def test_intervals_cover_under_correlated_noise(estimator):
     assert (independent.errors < 0.5 * found.errors).all()
 
 
-def test_samples_that_are_not_used_do_not_matter_but_for_their_place():
+def test_samples_that_are_not_used_do_not_matter_but_for_their_place() -> None:
     x, y, rng = problem(noise=0.1)
     used = rng.random(len(y)) < 0.7
     spoiled = np.where(used, y, 1e6)
@@ -153,7 +160,7 @@ def test_samples_that_are_not_used_do_not_matter_but_for_their_place():
 
 
 @pytest.mark.parametrize('estimator', ESTIMATORS)
-def test_what_stands_for_one_another_is_not_determined_and_the_rest_is(estimator):
+def test_what_stands_for_one_another_is_not_determined_and_the_rest_is(estimator: str) -> None:
     x, y, _ = problem(noise=0.1)
     x = np.column_stack([x, x[:, 0] - 3.0 * x[:, 2]])
     extra = extras(len(y)) | {'noisy': np.zeros(4, bool), 'regressor_noise': np.zeros(4)}
@@ -169,7 +176,7 @@ def test_what_stands_for_one_another_is_not_determined_and_the_rest_is(estimator
 
 
 @pytest.mark.parametrize(('spread', 'determined'), [(0.05, False), (0.3, True)])
-def test_what_hardly_differs_is_not_determined(spread, determined):
+def test_what_hardly_differs_is_not_determined(spread: float, determined: bool) -> None:
     rng = np.random.default_rng(0)
     speed = 5e-3 * (1.0 + spread * rng.normal(size=1000))
     x = np.column_stack([np.ones(1000), speed])
@@ -177,13 +184,13 @@ def test_what_hardly_differs_is_not_determined(spread, determined):
     assert (found.determined == determined).all()
 
 
-def test_a_column_of_zeros_is_not_determined():
+def test_a_column_of_zeros_is_not_determined() -> None:
     x, y, _ = problem(noise=0.1)
     found = regress(np.column_stack([x, np.zeros(len(y))]), y)
     assert_array_equal(found.determined, [True, True, True, False])
 
 
-def test_wald_test_of_what_is_not_there_is_as_rare_as_it_says():
+def test_wald_test_of_what_is_not_there_is_as_rare_as_it_says() -> None:
     chances = []
     for seed in range(400):
         x, y, rng = problem(seed, n=60, noise=0.1)
@@ -205,13 +212,17 @@ def test_wald_test_of_what_is_not_there_is_as_rare_as_it_says():
         ({'window': triang(1000)}, IdentificationError, 'independent samples, got 0.8'),
     ],
 )
-def test_refuses_what_it_cannot_solve(changes, error, complaint):
+def test_refuses_what_it_cannot_solve(
+    changes: dict[str, Any],
+    error: type[IdentificationError] | type[ParameterError] | type[ShapeError],
+    complaint: str,
+) -> None:
     x, y, _ = problem()
     with pytest.raises(error, match=complaint):
         regress(x, y, **changes)
 
 
-def test_refuses_what_is_not_finite():
+def test_refuses_what_is_not_finite() -> None:
     x, y, _ = problem()
     y[7] = np.nan
     with pytest.raises(ShapeError, match='must be finite'):
@@ -219,7 +230,7 @@ def test_refuses_what_is_not_finite():
     assert regress(x, y, used=np.isfinite(y)).samples == 599
 
 
-def estimates(values, error):
+def estimates(values: list[float], error: float) -> list[ParameterEstimate]:
     return [
         ParameterEstimate(
             name='coulomb_friction',
@@ -234,7 +245,7 @@ def estimates(values, error):
     ]
 
 
-def test_statistic_is_the_mean_and_scatter_of_table_1():
+def test_statistic_is_the_mean_and_scatter_of_table_1() -> None:
     found = statistic(estimates([0.5, 0.6, 0.7, 0.6], 0.01))
     assert_allclose(found.mean, 0.6, rtol=1e-12)
     assert_allclose(found.deviation, np.sqrt(0.02 / 3.0), rtol=1e-12)
@@ -244,13 +255,13 @@ def test_statistic_is_the_mean_and_scatter_of_table_1():
     assert (found.name, found.unit, found.count) == ('coulomb_friction', 'N', 4)
 
 
-def test_statistic_is_no_surer_than_its_recordings_allow():
+def test_statistic_is_no_surer_than_its_recordings_allow() -> None:
     found = statistic(estimates([0.6, 0.6], 0.02))
     assert_allclose(found.error, 0.02 / np.sqrt(2.0), rtol=1e-12)
     assert_allclose(found.interval, [0.6 - 2.0 * found.error, 0.6 + 2.0 * found.error])
 
 
-def test_statistic_leaves_out_what_was_not_determined():
+def test_statistic_leaves_out_what_was_not_determined() -> None:
     unknown = ParameterEstimate(name='coulomb_friction', symbol='mu_s', unit='N')
     one = statistic([unknown, *estimates([0.6], 0.02)])
     assert (one.mean, one.deviation, one.error, one.count) == (0.6, None, 0.02, 1)
@@ -259,6 +270,6 @@ def test_statistic_leaves_out_what_was_not_determined():
     assert np.isnan(none.mean)
 
 
-def test_nothing_has_no_statistic():
+def test_nothing_has_no_statistic() -> None:
     with pytest.raises(IdentificationError, match='no recordings'):
         statistic([])

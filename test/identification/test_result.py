@@ -1,6 +1,7 @@
 """The result is a parameter file, whole or not there, and numbers are told to their errors."""
 
 from math import inf, nan
+from pathlib import Path
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -40,7 +41,7 @@ STIFFNESS = StiffnessSummary(
 FRICTION = friction(found('coulomb_friction', 0.5604), found('viscous_friction', 300.014, 0.04))
 
 
-def test_holds_what_was_identified_for_plant_and_controller():
+def test_holds_what_was_identified_for_plant_and_controller() -> None:
     """Both sections hold the means under the names of the nodes' parameters."""
     document = yaml.safe_load(result_yaml(FRICTION, STIFFNESS))
     expected = {
@@ -60,12 +61,14 @@ def test_holds_what_was_identified_for_plant_and_controller():
         ((None, STIFFNESS), {'model.tissue_stiffness'}),
     ],
 )
-def test_holds_only_what_was_looked_for(given_, names):
+def test_holds_only_what_was_looked_for(
+    given_: tuple[None, StiffnessSummary] | tuple[FrictionSummary, None], names: set[str]
+) -> None:
     """Friction alone leaves the stiffness as it is, and the other way around."""
     assert set(yaml.safe_load(result_yaml(*given_))['/**/plant']['ros__parameters']) == names
 
 
-def test_what_the_data_do_not_determine_is_not_set():
+def test_what_the_data_do_not_determine_is_not_set() -> None:
     """It is said in a comment, and the node keeps its value."""
     text = result_yaml(friction(found('coulomb_friction', 0.5), found('viscous_friction', nan)))
     assert list(yaml.safe_load(text)['/**/plant']['ros__parameters']) == ['model.coulomb_friction']
@@ -74,7 +77,7 @@ def test_what_the_data_do_not_determine_is_not_set():
         result_yaml(friction(found('viscous_friction', nan)))
 
 
-def test_a_mean_outside_the_range_is_moved_to_its_end():
+def test_a_mean_outside_the_range_is_moved_to_its_end() -> None:
     """Negative friction, and a break-away below Coulomb friction, are refused by the model."""
     values = model_parameters(
         [
@@ -95,7 +98,7 @@ def test_a_mean_outside_the_range_is_moved_to_its_end():
 
 @settings(deadline=None)
 @given(st.floats(1e-12, 1e12))
-def test_a_value_survives_the_file(value):
+def test_a_value_survives_the_file(value: float) -> None:
     """To seven digits, and as a number: YAML reads 5e-05 as a text."""
     text = result_yaml(friction(found('viscous_friction', value)))
     read = yaml.safe_load(text)['/**/plant']['ros__parameters']['model.viscous_friction']
@@ -104,7 +107,7 @@ def test_a_value_survives_the_file(value):
     assert abs(read - value) <= 5e-7 * value
 
 
-def test_replaces_the_file_at_once(tmp_path):
+def test_replaces_the_file_at_once(tmp_path: Path) -> None:
     """The new text is there whole, and no draft is left."""
     path = tmp_path / 'result.yaml'
     path.write_text('old')
@@ -121,7 +124,7 @@ def test_replaces_the_file_at_once(tmp_path):
         ('', 'it is not the name of a file'),
     ],
 )
-def test_names_the_file_that_cannot_be_written(tmp_path, name, complaint):
+def test_names_the_file_that_cannot_be_written(tmp_path: Path, name: str, complaint: str) -> None:
     """One line that names it; nothing is left behind."""
     with pytest.raises(ParameterError, match=complaint):
         write_result(tmp_path / name, FRICTION)
@@ -130,7 +133,7 @@ def test_names_the_file_that_cannot_be_written(tmp_path, name, complaint):
 
 @settings(deadline=None)
 @given(st.floats(-1e6, 1e6), st.floats(1e-6, 1e6))
-def test_a_number_is_told_to_two_digits_of_its_error(value, error):
+def test_a_number_is_told_to_two_digits_of_its_error(value: float, error: float) -> None:
     """What is not told of the value is within a twentieth of its error."""
     told, reach = measured(value, error).split(' ± ')
     # Half of the second digit of the error, which is 1.0 at least, and rounding of the sum.
@@ -152,12 +155,12 @@ def test_a_number_is_told_to_two_digits_of_its_error(value, error):
         (nan, inf, UNKNOWN),
     ],
 )
-def test_a_number_is_told_with_its_unit(value, error, text):
+def test_a_number_is_told_with_its_unit(value: float, error: float, text: str) -> None:
     """An error of zero is said, one that is not known is not, and a nan is told in words."""
     assert measured(value, error, 'N') == text
 
 
-def test_a_pure_number_has_no_unit():
+def test_a_pure_number_has_no_unit() -> None:
     """The unit 1 is not written."""
     assert measured(0.1, 0.01, '1') == '0.100 ± 0.010'
     assert between((-inf, inf)) == UNKNOWN

@@ -1,14 +1,18 @@
 """Samples keep their values and their means, in bounded memory."""
 
+from typing import Any
+
 from hypothesis import given, settings, strategies
+from needle_dynamics import FloatArray
 from needle_identification.recordings import series
 from needle_identification.recordings.series import FINEST, Series
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
+from numpy.typing import NDArray
 import pytest
 
 
-def gathered(stamps, values, batch=7):
+def gathered(stamps: NDArray[np.int64], values: FloatArray, batch: int = 7) -> Series:
     made = Series(values.shape[1])
     for k in range(0, len(stamps), batch):
         made.add(stamps[k : k + batch], values[k : k + batch])
@@ -18,7 +22,7 @@ def gathered(stamps, values, batch=7):
 
 @settings(max_examples=100, deadline=None)
 @given(strategies.lists(strategies.integers(-(10**9), 10**9), min_size=1, max_size=50))
-def test_sparse_samples_are_kept_bit_for_bit_in_order_of_time(numbers):
+def test_sparse_samples_are_kept_bit_for_bit_in_order_of_time(numbers: list[int]) -> None:
     stamps = np.array(numbers) * FINEST
     values = np.random.default_rng(0).normal(size=(len(stamps), 2))
     made = gathered(stamps, values)
@@ -30,7 +34,7 @@ def test_sparse_samples_are_kept_bit_for_bit_in_order_of_time(numbers):
     assert made.late == np.count_nonzero(np.diff(stamps) < 0)
 
 
-def test_dense_samples_become_means_of_stamps_and_of_values():
+def test_dense_samples_become_means_of_stamps_and_of_values() -> None:
     step = 125_000
     stamps = np.arange(100_000) * step
     made = gathered(stamps, stamps[:, None] * 1e-9, batch=1000)
@@ -41,12 +45,12 @@ def test_dense_samples_become_means_of_stamps_and_of_values():
 
 
 @pytest.fixture
-def small(monkeypatch):
+def small(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(series, 'LARGEST', 64)
     monkeypatch.setattr(series, '_GATHERED', 100)
 
 
-def test_a_long_series_trades_resolution_for_length_and_keeps_the_mean(small):
+def test_a_long_series_trades_resolution_for_length_and_keeps_the_mean(small: Any) -> None:
     rng = np.random.default_rng(0)
     stamps = np.arange(5000) * 4_000_000
     values = rng.normal(size=(5000, 1))
@@ -61,7 +65,7 @@ def test_a_long_series_trades_resolution_for_length_and_keeps_the_mean(small):
     assert abs(full.mean() - values.mean()) < 0.02
 
 
-def test_stamps_from_anywhere_take_no_more_memory(small):
+def test_stamps_from_anywhere_take_no_more_memory(small: Any) -> None:
     rng = np.random.default_rng(0)
     made = Series(1)
     for _ in range(50):

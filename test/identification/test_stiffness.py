@@ -1,12 +1,14 @@
 """The stiffness matrix comes out as it went in, and its errors mean what they say."""
 
+from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 from hypothesis import given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
-from needle_dynamics import ParameterError
-from needle_identification import IdentificationError
+from needle_dynamics import FloatArray, ParameterError
+from needle_identification import IdentificationError, StiffnessEstimate
 from needle_identification.recordings.recording import IndentationRecording
 from needle_identification.stiffness.fit import (
     identify_stiffness,
@@ -31,32 +33,32 @@ COUNT, RESOLUTION = 2.5e-3, 1e-6
 HOLD, RATE = 0.3, 250.0
 
 
-def grid(forces=(1.1, 1.3, 1.5), angles=EIGHT):
+def grid(forces: tuple[float, ...] = (1.1, 1.3, 1.5), angles: FloatArray = EIGHT) -> FloatArray:
     """Return force vectors, level by level, shape (m, 2)."""
     return np.array([[f * np.cos(a), f * np.sin(a)] for f in forces for a in angles])
 
 
-def ofs(table):
+def ofs(table: dict[float, FloatArray]) -> Callable[..., Any]:
     """Return the stiffness at a force as that of the nearest level."""
     return lambda force: table[min(table, key=lambda level: abs(level - force))]
 
 
 def pressed(
-    stiffness,
-    forces,
+    stiffness: Callable[..., Any] | FloatArray,
+    forces: FloatArray | list[Any],
     *,
-    hold=HOLD,
-    rest=0.3,
-    ramp=0.2,
-    rate=RATE,
-    noise=0.0,
-    seed=0,
-    bias=(0.3, -0.2),
-    drift=(0.0, 0.0),
-    creep=(0.0, 0.0),
-    off_plane=0.0,
-    rests=True,
-):
+    hold: float = HOLD,
+    rest: float = 0.3,
+    ramp: float = 0.2,
+    rate: float = RATE,
+    noise: float = 0.0,
+    seed: int = 0,
+    bias: tuple[float, ...] = (0.3, -0.2),
+    drift: tuple[float, ...] = (0.0, 0.0),
+    creep: tuple[float, ...] = (0.0, 0.0),
+    off_plane: float = 0.0,
+    rests: bool = True,
+) -> IndentationRecording:
     """Press with force vectors in turn; stiffness is a matrix or gives one for a force."""
     matrix = stiffness if callable(stiffness) else lambda _force: stiffness
     legs = [(rest, (0.0, 0.0), 1.0)]
@@ -87,7 +89,7 @@ def pressed(
     )
 
 
-def limited(rng, count, rate):
+def limited(rng: np.random.Generator, count: int, rate: float) -> FloatArray:
     """Noise of unit power below 125 Hz, as the sensor's second filter leaves it."""
     every = round(2000.0 / rate)
     white = rng.normal(size=((count + 10) * every, 2))
@@ -96,7 +98,7 @@ def limited(rng, count, rate):
     return noise[10 * every :: every] / np.sqrt(1.11 * 125.0 / 1000.0)
 
 
-def expected(matrix):
+def expected(matrix: FloatArray) -> dict[str, float]:
     """Return every parameter of a matrix, by name."""
     stiffness, directions = np.linalg.eigh((matrix + matrix.T) / 2.0)
     angle = np.arctan2(*directions[::-1, 1])
@@ -111,7 +113,9 @@ def expected(matrix):
     }
 
 
-def turned(recording, angle):
+def turned(
+    recording: IndentationRecording, angle: float
+) -> tuple[IndentationRecording, FloatArray]:
     """Return the same presses seen from axes turned by an angle, and the turn."""
     c, s = np.cos(angle), np.sin(angle)
     turn = np.array([[c, -s], [s, c]])
@@ -122,7 +126,7 @@ def turned(recording, angle):
 
 
 @st.composite
-def matrices(draw):
+def matrices(draw: Callable[..., Any]) -> FloatArray:
     """Return tissues: principal stiffnesses 300 to 3000 N/m, in any direction, with a curl."""
     first, second = (draw(st.floats(300.0, 3000.0)) for _ in range(2))
     angle, curl = draw(st.floats(0.0, np.pi)), draw(st.floats(-200.0, 200.0))
@@ -133,7 +137,7 @@ def matrices(draw):
 
 @given(matrices())
 @hypothesis_settings(max_examples=20, deadline=None)
-def test_recovers_any_matrix_from_exact_presses(matrix):
+def test_recovers_any_matrix_from_exact_presses(matrix: FloatArray) -> None:
     (level,) = identify_stiffness(pressed(matrix, grid((1.2,)))).levels
     # 1e-8: noise below this part of a reading is taken as rounding.
     assert_allclose(level.matrix, matrix, atol=1e-8 * np.linalg.norm(matrix))
@@ -146,7 +150,7 @@ def test_recovers_any_matrix_from_exact_presses(matrix):
 
 @given(matrices(), st.floats(0.0, 2.0 * np.pi))
 @hypothesis_settings(max_examples=10, deadline=None)
-def test_turning_the_axes_turns_the_matrix(matrix, angle):
+def test_turning_the_axes_turns_the_matrix(matrix: FloatArray, angle: float) -> None:
     recording = pressed(matrix, grid((1.2,)))
     (level,) = identify_stiffness(recording).levels
     other, turn = turned(recording, angle)
@@ -158,7 +162,7 @@ def test_turning_the_axes_turns_the_matrix(matrix, angle):
     assert_allclose(seen.spring.value, level.spring.value, atol=1e-7)
 
 
-def test_a_quarter_turn_changes_no_error():
+def test_a_quarter_turn_changes_no_error() -> None:
     recording = pressed(TABLE[1.3], grid((1.3,)), noise=1.0)
     (level,) = identify_stiffness(recording).levels
     (seen,) = identify_stiffness(turned(recording, np.pi / 2.0)[0]).levels
@@ -174,7 +178,7 @@ def test_a_quarter_turn_changes_no_error():
         assert_allclose(seen[name].interval, level[other].interval, rtol=1e-6)
 
 
-def test_force_over_length_scales_the_matrix_and_its_errors():
+def test_force_over_length_scales_the_matrix_and_its_errors() -> None:
     recording = pressed(TABLE[1.3], grid((1.3,)), noise=1.0)
     (level,) = identify_stiffness(recording).levels
     larger = replace(recording, force=4.0 * recording.force, position=recording.position / 2.0)
@@ -187,7 +191,7 @@ def test_force_over_length_scales_the_matrix_and_its_errors():
     assert_allclose(other.angle.interval, level.angle.interval, rtol=1e-9)
 
 
-def test_tissue_stiffness_is_per_length_of_contact():
+def test_tissue_stiffness_is_per_length_of_contact() -> None:
     recording = pressed(TABLE[1.5], grid((1.5,)), noise=1.0)
     (level,) = identify_stiffness(recording, StiffnessSettings(contact_length=0.02)).levels
     assert_allclose(level.tissue_stiffness.value, level['k_zz'].value / 0.02)
@@ -204,7 +208,9 @@ ROUND = {force: 800.0 * np.eye(2) for force in (1.1, 1.3, 1.5)}
     params=[(TABLE, 48), (NEARLY, 24), (ROUND, 24)],
     ids=['table 2', 'nearly round', 'round'],
 )
-def repeats(request):
+def repeats(
+    request: pytest.FixtureRequest,
+) -> tuple[dict[float, FloatArray], list[StiffnessEstimate]]:
     """Identify the same place many times."""
     table, count = request.param
     return table, [
@@ -213,7 +219,9 @@ def repeats(request):
     ]
 
 
-def test_intervals_hold_the_truth_as_often_as_they_say(repeats):
+def test_intervals_hold_the_truth_as_often_as_they_say(
+    repeats: tuple[dict[float, FloatArray], list[StiffnessEstimate]],
+) -> None:
     table, estimates = repeats
     for name in expected(TABLE[1.1]):
         inside = [
@@ -228,7 +236,9 @@ def test_intervals_hold_the_truth_as_often_as_they_say(repeats):
             assert sum(inside) <= binom.ppf(1.0 - 2e-4, len(inside), 0.95), name
 
 
-def test_variance_is_near_the_least_possible(repeats):
+def test_variance_is_near_the_least_possible(
+    repeats: tuple[dict[float, FloatArray], list[StiffnessEstimate]],
+) -> None:
     """The Cramer-Rao bound of whole holds whose zero is known, without drift."""
     table, estimates = repeats
     samples = HOLD * RATE
@@ -247,7 +257,9 @@ def test_variance_is_near_the_least_possible(repeats):
     assert np.mean(ratios) < 1.3
 
 
-def test_zero_is_in_the_interval_of_the_figure_where_it_is_in_that_of_the_curl(repeats):
+def test_zero_is_in_the_interval_of_the_figure_where_it_is_in_that_of_the_curl(
+    repeats: tuple[dict[float, FloatArray], list[StiffnessEstimate]],
+) -> None:
     for estimate in repeats[1]:
         for level in estimate.levels:
             low, high = level.curl.interval
@@ -255,7 +267,9 @@ def test_zero_is_in_the_interval_of_the_figure_where_it_is_in_that_of_the_curl(r
             assert level.spring.interval[0] <= level.spring.value <= level.spring.interval[1]
 
 
-def test_a_round_tissue_has_no_principal_direction(repeats):
+def test_a_round_tissue_has_no_principal_direction(
+    repeats: tuple[dict[float, FloatArray], list[StiffnessEstimate]],
+) -> None:
     table, estimates = repeats
     determined = sum(level.angle.determined for e in estimates for level in e.levels)
     if table is TABLE:
@@ -265,7 +279,7 @@ def test_a_round_tissue_has_no_principal_direction(repeats):
         assert determined <= binom.ppf(1.0 - 1e-4, len(estimates) * len(TABLE), 0.01)
 
 
-def test_errors_of_presses_are_those_of_their_scatter():
+def test_errors_of_presses_are_those_of_their_scatter() -> None:
     """Also where a slow sensor leaves few independent samples in a hold."""
     forces = grid((1.3,))
     off, error = [], []
@@ -280,7 +294,7 @@ def test_errors_of_presses_are_those_of_their_scatter():
     assert_allclose(np.sqrt(np.mean(np.square(error))), np.std(off), rtol=0.15)
 
 
-def test_linear_drift_leaves_no_trace():
+def test_linear_drift_leaves_no_trace() -> None:
     forces = grid()
     still = identify_stiffness(pressed(ofs(TABLE), forces))
     moving = identify_stiffness(
@@ -295,7 +309,7 @@ def test_linear_drift_leaves_no_trace():
     assert 'drift' not in ' '.join(still.warnings)
 
 
-def test_the_order_of_presses_does_not_matter():
+def test_the_order_of_presses_does_not_matter() -> None:
     forces = grid()
     order = np.random.default_rng(3).permutation(len(forces))
     straight = identify_stiffness(pressed(ofs(TABLE), forces))
@@ -321,7 +335,9 @@ STAIRS = np.array([[f * np.cos(a), f * np.sin(a)] for a in EIGHT for f in (0.5, 
     ],
     ids=['slow', 'fast', 'scattered', 'short rests and bias', 'stairs'],
 )
-def test_finds_the_presses_of_other_protocols(forces, options, levels):
+def test_finds_the_presses_of_other_protocols(
+    forces: FloatArray, options: dict[str, Any], levels: int
+) -> None:
     matrix = TABLE[1.3]
     estimate = identify_stiffness(pressed(matrix, forces, noise=1.0, **options))
     assert len(estimate.levels) == levels
@@ -333,7 +349,7 @@ def test_finds_the_presses_of_other_protocols(forces, options, levels):
         assert level.determination > 0.999
 
 
-def test_uneven_stamps_and_gaps_do_no_harm():
+def test_uneven_stamps_and_gaps_do_no_harm() -> None:
     recording = pressed(TABLE[1.3], grid((1.3,)), noise=1.0)
     rng = np.random.default_rng(5)
     kept = (rng.random(len(recording.time)) < 0.8) & (np.abs(recording.time - 3.35) > 0.2)
@@ -350,7 +366,7 @@ def test_uneven_stamps_and_gaps_do_no_harm():
     assert_allclose(level.matrix, TABLE[1.3], atol=5.0)
 
 
-def test_begins_and_ends_anywhere():
+def test_begins_and_ends_anywhere() -> None:
     recording = pressed(TABLE[1.3], grid((1.3,)), noise=1.0)
     kept = (recording.time > 0.6) & (recording.time < 7.9)
     cut = IndentationRecording(
@@ -365,7 +381,7 @@ def test_begins_and_ends_anywhere():
     assert_allclose(level.matrix, TABLE[1.3], atol=5.0)
 
 
-def test_a_press_without_a_hold_is_left_out_and_said():
+def test_a_press_without_a_hold_is_left_out_and_said() -> None:
     forces = grid((1.3,))
     exact = pressed(TABLE[1.3], forces)
     force, position = exact.force.copy(), exact.position.copy()
@@ -392,7 +408,7 @@ UNKNOWN_FROM_X = (
 
 
 @pytest.mark.parametrize('noise', [0.0, 1.0])
-def test_motion_along_x_tells_only_what_it_can(noise):
+def test_motion_along_x_tells_only_what_it_can(noise: float) -> None:
     along = TABLE[1.3] @ (1e-3, 0.0)
     estimate = identify_stiffness(pressed(TABLE[1.3], [along, -along] * 4, noise=noise))
     (level,) = estimate.levels
@@ -416,7 +432,9 @@ def test_motion_along_x_tells_only_what_it_can(noise):
     ids=['one oblique direction', 'a narrow fan', 'two presses'],
 )
 @pytest.mark.parametrize('noise', [0.0, 1.0])
-def test_too_few_directions_tell_nothing(forces, noise):
+def test_too_few_directions_tell_nothing(
+    forces: FloatArray | list[tuple[float, float]], noise: float
+) -> None:
     (level,) = identify_stiffness(pressed(TABLE[1.3], forces, noise=noise)).levels
     for parameter in level.parameters:
         assert not parameter.determined
@@ -425,7 +443,7 @@ def test_too_few_directions_tell_nothing(forces, noise):
 
 
 @pytest.mark.parametrize('estimator', ['ordinary', 'weighted', 'huber', 'total'])
-def test_every_estimator_finds_the_matrix(estimator):
+def test_every_estimator_finds_the_matrix(estimator: str) -> None:
     recording = pressed(ofs(TABLE), grid(), noise=1.0)
     settings = StiffnessSettings(estimator=estimator)
     for level, matrix in zip(
@@ -437,7 +455,7 @@ def test_every_estimator_finds_the_matrix(estimator):
         assert errors.max() < 2.0
 
 
-def test_huber_is_not_led_astray_by_one_press():
+def test_huber_is_not_led_astray_by_one_press() -> None:
     exact = pressed(TABLE[1.3], grid((1.3,)), noise=1.0)
     position = exact.position.copy()
     position[np.abs(exact.time - 1.65) < 0.24] += (1e-4, 1e-4)
@@ -452,7 +470,7 @@ def test_huber_is_not_led_astray_by_one_press():
     assert off['huber'] < off['ordinary'] / 2.0
 
 
-def test_weighted_looks_less_at_noisy_presses():
+def test_weighted_looks_less_at_noisy_presses() -> None:
     forces = grid((1.3,), np.tile(EIGHT, 2))
     off = {'ordinary': [], 'weighted': []}
     for seed in range(12):
@@ -469,7 +487,7 @@ def test_weighted_looks_less_at_noisy_presses():
     assert np.var(off['weighted']) < np.var(off['ordinary']) / 5.0
 
 
-def test_a_spring_is_told_from_what_is_none():
+def test_a_spring_is_told_from_what_is_none() -> None:
     skewed = TABLE[1.5] + np.array([[0.0, -150.0], [150.0, 0.0]])
     spring, other = (
         identify_stiffness(pressed(matrix, grid((1.5,)), noise=1.0)).levels[0]
@@ -486,7 +504,7 @@ def test_a_spring_is_told_from_what_is_none():
     assert loud.words.startswith('cannot be told')
 
 
-def test_warns_of_what_makes_the_numbers_doubtful():
+def test_warns_of_what_makes_the_numbers_doubtful() -> None:
     falling = {1.1: 500.0 * np.eye(2), 1.3: 900.0 * np.eye(2)}
     recording = pressed(ofs(falling), grid((1.1, 1.3), np.arange(3) * 2.0), off_plane=0.3)
     text = '\n'.join(identify_stiffness(recording).warnings)
@@ -500,7 +518,7 @@ def test_warns_of_what_makes_the_numbers_doubtful():
     assert identify_stiffness(pressed(ROUND[1.1], grid((1.1,)), noise=1.0)).warnings == ()
 
 
-def test_says_where_presses_do_not_follow_one_matrix():
+def test_says_where_presses_do_not_follow_one_matrix() -> None:
     forces = grid((1.1,))
     stiffer = {1.08: 900.0 * np.eye(2), 1.12: 800.0 * np.eye(2)}
     forces[:4] *= 1.08 / 1.1
@@ -509,7 +527,7 @@ def test_says_where_presses_do_not_follow_one_matrix():
     assert 'scatter more than their noise' in text
 
 
-def test_tells_what_is_missing():
+def test_tells_what_is_missing() -> None:
     flat = pressed(TABLE[1.1], [(0.05, 0.0)])
     with pytest.raises(IdentificationError, match=r'place: no hold: .* the largest is 0\.05 N'):
         identify_stiffness(flat)
@@ -529,7 +547,7 @@ def test_tells_what_is_missing():
         StiffnessSettings(estimator='best')
 
 
-def test_summary_is_a_column_of_table_2_per_level():
+def test_summary_is_a_column_of_table_2_per_level() -> None:
     rng = np.random.default_rng(8)
     places = [
         {force: matrix + 50.0 * rng.normal(size=(2, 2)) for force, matrix in TABLE.items()}
@@ -556,7 +574,7 @@ def test_summary_is_a_column_of_table_2_per_level():
         summarize_stiffness([])
 
 
-def test_what_was_found_is_read_by_name():
+def test_what_was_found_is_read_by_name() -> None:
     (level,) = identify_stiffness(pressed(TABLE[1.1], grid((1.1,)))).levels
     assert level['principal_angle'] is level.angle
     assert level['curl'] is level.curl

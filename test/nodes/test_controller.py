@@ -1,8 +1,10 @@
 """The controller as the graph sees it, alone and around the plant."""
 
+from collections.abc import Callable
 from itertools import pairwise
 from math import inf, nan
 from time import monotonic
+from typing import Any
 
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
@@ -15,9 +17,13 @@ import pytest
 from rclpy.duration import Duration
 from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.parameter import Parameter
+from rclpy.task import Future
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool, Trigger
+from std_srvs.srv._set_bool import SetBool_Request, SetBool_Response
+from std_srvs.srv._trigger import Trigger_Request, Trigger_Response
+from support.ros_graph import RosGraph
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 #: Both nodes in the test's own thread.
@@ -27,7 +33,9 @@ SLOW = {'rate': 200.0}
 class Bench:
     """A controller with a probe that plays the plant."""
 
-    def __init__(self, graph, start=True, **parameters):
+    def __init__(
+        self, graph: RosGraph, start: bool = True, **parameters: bool | float | str
+    ) -> None:
         self.graph = graph
         self.node = graph.node('probe')
         self.states = self.node.create_publisher(JointState, 'joint_states', SENSOR)
@@ -49,7 +57,7 @@ class Bench:
             'discovery',
         )
 
-    def now(self):
+    def now(self) -> Time:
         """Return the time to stamp with."""
         return self.node.get_clock().now().to_msg()
 
@@ -58,11 +66,11 @@ class Bench:
         message = JointState(name=['insertion'], position=[depth], velocity=[speed])
         return self.ask(message, fresh=True)
 
-    def ask(self, message, fresh=False) -> float:
+    def ask(self, message: JointState, fresh: bool = False) -> float:
         """Publish a joint state and return the force that answers it."""
         count, asked = len(self.commands), []
 
-        def answers():
+        def answers() -> list[WrenchStamped]:
             # On a machine that is held up a measurement may be stale before it is read.
             if not asked or (fresh and monotonic() - asked[-1][0] > 1.0):
                 if fresh:
@@ -75,13 +83,15 @@ class Bench:
         self.graph.spin_until(answers, 'an answer')
         return answers()[-1].wrench.force.y
 
-    def call(self, name: str, kind=Trigger, **request):
+    def call(
+        self, name: str, kind: type[SetBool] | type[Trigger] = Trigger, **request: bool
+    ) -> SetBool_Response | Trigger_Response:
         """Return the answer of a service."""
         client = self.node.create_client(kind, f'controller/{name}')
         self.graph.spin_until(client.service_is_ready, name)
         answers = []
 
-        def answered():
+        def answered() -> list[Future]:
             # One to a client that the node does not know yet is lost; none of them adds up.
             if not answers or monotonic() - answers[-1][0] > 1.0:
                 answers.append((monotonic(), client.call_async(kind.Request(**request))))
@@ -98,7 +108,14 @@ class Bench:
         """Return one value of its diagnostics."""
         return str(self.controller.diagnose()[2].get(key, ''))
 
-    def wrench(self, axial=0.0, lateral=0.0, moment=0.0, frame='needle_base', stamp=True):
+    def wrench(
+        self,
+        axial: float = 0.0,
+        lateral: float = 0.0,
+        moment: float = 0.0,
+        frame: str = 'needle_base',
+        stamp: bool = True,
+    ) -> None:
         """Publish a reading of the force sensor."""
         message = WrenchStamped()
         message.header.frame_id = frame
@@ -108,7 +125,7 @@ class Bench:
         message.wrench.torque.x = moment
         self.wrenches.publish(message)
 
-    def tip(self, deflection, frame='needle_entry', stamp=True):
+    def tip(self, deflection: float, frame: str = 'needle_entry', stamp: bool = True) -> None:
         """Publish a sample of the tip."""
         message = PointStamped()
         message.header.frame_id = frame
@@ -132,7 +149,7 @@ class Bench:
 
 @pytest.mark.parametrize('law', ['inverse_dynamics', 'pid'])
 @pytest.mark.parametrize('reference', ['trapezoid', 'minimum_jerk'])
-def test_reaches_the_target(ros_graph, law, reference):
+def test_reaches_the_target(ros_graph: RosGraph, law: str, reference: str) -> None:
     """Around the plant over DDS each law brings the needle to the target with each reference."""
     probe = ros_graph.node('probe')
     states = ros_graph.listen(probe, JointState, 'joint_states', SENSOR)
@@ -151,12 +168,12 @@ def test_reaches_the_target(ros_graph, law, reference):
     assert max(m.position[0] for m in states) < 0.026
 
 
-def test_no_force_before_a_target(ros_graph):
+def test_no_force_before_a_target(ros_graph: RosGraph) -> None:
     """Measurements alone are answered with zero."""
     assert Bench(ros_graph).measure(0.02) == 0.0
 
 
-def test_lets_go_when_measurements_stop(ros_graph):
+def test_lets_go_when_measurements_stop(ros_graph: RosGraph) -> None:
     """A force is withdrawn when the last measurement is older than the timeout."""
     bench = Bench(ros_graph, measurement_timeout=0.2)
     bench.aim(0.1)
@@ -174,7 +191,7 @@ def test_lets_go_when_measurements_stop(ros_graph):
     ],
     ids=['not finite', 'no velocity', 'other joint'],
 )
-def test_lets_go_of_a_measurement_it_cannot_use(ros_graph, message):
+def test_lets_go_of_a_measurement_it_cannot_use(ros_graph: RosGraph, message: JointState) -> None:
     """What is not finite, not complete or not the insertion joint is answered with zero force."""
     bench = Bench(ros_graph)
     bench.aim(0.1)
@@ -185,7 +202,7 @@ def test_lets_go_of_a_measurement_it_cannot_use(ros_graph, message):
     assert 'joint_states' in bench.controller.diagnose()[1]
 
 
-def test_an_emergency_stop_latches(ros_graph):
+def test_an_emergency_stop_latches(ros_graph: RosGraph) -> None:
     """After a stop every answer is zero until it is cleared; then the motion starts anew."""
     bench = Bench(ros_graph)
     bench.aim(0.1)
@@ -197,7 +214,7 @@ def test_an_emergency_stop_latches(ros_graph):
     assert bench.push() > 0.5
 
 
-def test_a_target_out_of_reach_is_refused(ros_graph):
+def test_a_target_out_of_reach_is_refused(ros_graph: RosGraph) -> None:
     """A target beyond the hub leaves the old one in force."""
     bench = Bench(ros_graph)
     bench.aim(0.1)
@@ -211,7 +228,7 @@ def test_a_target_out_of_reach_is_refused(ros_graph):
     )
 
 
-def test_unstable_gains_refuse_the_transition(ros_graph):
+def test_unstable_gains_refuse_the_transition(ros_graph: RosGraph) -> None:
     """Gains that cannot be stable leave the node unconfigured with the reason."""
     controller = ros_graph.add(
         ControllerNode, start=False, parameters={'inverse_dynamics.insertion.kv': 3000.0}
@@ -221,14 +238,14 @@ def test_unstable_gains_refuse_the_transition(ros_graph):
     assert not controller.is_active
 
 
-def test_unstable_gains_end_the_process(ros_graph):
+def test_unstable_gains_end_the_process(ros_graph: RosGraph) -> None:
     """Run on its own it says so in one line and exits with 2."""
     controller = ros_graph.start('controller', {'inverse_dynamics.insertion.kv': 3000.0})
     assert controller.process.wait(30) == 2
     assert 'cannot be stable' in controller.last_words()
 
 
-def test_parameters_cannot_change_while_configured(ros_graph):
+def test_parameters_cannot_change_while_configured(ros_graph: RosGraph) -> None:
     """A change that would not take effect is refused, with the way to make it."""
     controller = ros_graph.add(ControllerNode, parameters=SLOW)
     parameter = controller.get_parameter('reference.kind')
@@ -238,7 +255,7 @@ def test_parameters_cannot_change_while_configured(ros_graph):
 
 
 @pytest.mark.parametrize('offset', [-10.0, 3600.0, None], ids=['old', 'ahead', 'not stamped'])
-def test_lets_go_of_stamps_that_are_not_now(ros_graph, offset):
+def test_lets_go_of_stamps_that_are_not_now(ros_graph: RosGraph, offset: float | None) -> None:
     """A measurement stamped long ago, in the future or not at all is answered with zero force."""
     bench = Bench(ros_graph)
     bench.aim(0.1)
@@ -254,7 +271,9 @@ def test_lets_go_of_stamps_that_are_not_now(ros_graph, offset):
     assert bench.push() > 0.5
 
 
-def test_forgets_the_target_when_the_needle_is_elsewhere_after_a_fault(ros_graph):
+def test_forgets_the_target_when_the_needle_is_elsewhere_after_a_fault(
+    ros_graph: RosGraph,
+) -> None:
     """A needle that comes back at another depth is not pushed towards the old target."""
     bench = Bench(ros_graph, measurement_timeout=0.2)
     bench.aim(0.1)
@@ -264,7 +283,7 @@ def test_forgets_the_target_when_the_needle_is_elsewhere_after_a_fault(ros_graph
     assert bench.controller.diagnose()[2]['target [m]'] is None
 
 
-def test_configuring_again_doubles_nothing(ros_graph):
+def test_configuring_again_doubles_nothing(ros_graph: RosGraph) -> None:
     """Clean up and configure as often as one likes: one subscription to the ground truth."""
     controller = ros_graph.add(
         ControllerNode, parameters={**SLOW, 'deflection_feedback': 'ground_truth'}
@@ -278,7 +297,7 @@ def test_configuring_again_doubles_nothing(ros_graph):
     assert topics.count('/joint_states') == 1
 
 
-def test_a_refused_configuration_leaves_nothing_behind(ros_graph):
+def test_a_refused_configuration_leaves_nothing_behind(ros_graph: RosGraph) -> None:
     """What was made before the parameter that is not valid is undone."""
     wrong = {'deflection_feedback': 'ground_truth', 'safety.sensor_timeout': 0.0}
     controller = ros_graph.add(ControllerNode, start=False, parameters={**SLOW, **wrong})
@@ -298,7 +317,9 @@ def test_a_refused_configuration_leaves_nothing_behind(ros_graph):
 class Loop:
     """Controller and simulated plant in one thread, with a probe."""
 
-    def __init__(self, graph, *, rate=200.0, depth=0.02, **parameters):
+    def __init__(
+        self, graph: RosGraph, *, rate: float = 200.0, depth: float = 0.02, **parameters: float
+    ) -> None:
         self.graph = graph
         self.probe = graph.node('probe')
         self.states = graph.listen(self.probe, JointState, 'joint_states', SENSOR)
@@ -323,30 +344,35 @@ class Loop:
         self.until(lambda: self.aims and self.targets.get_subscription_count(), 'discovery')
         self.until(lambda: self.paths.get_subscription_count() == 2, 'discovery')
 
-    def until(self, condition, what):
+    def until(self, condition: Callable[..., Any], what: str) -> None:
         self.graph.spin_until(condition, what)
 
-    def aim(self, depth):
+    def aim(self, depth: float) -> None:
         message = PointStamped()
         message.point.y = depth
         self.targets.publish(message)
         self.until(lambda: self.said('target [m]') == depth, 'the target')
 
-    def call(self, kind, name, request):
+    def call(
+        self,
+        kind: type[SetBool] | type[Trigger],
+        name: str,
+        request: SetBool_Request | Trigger_Request,
+    ) -> SetBool_Response | Trigger_Response:
         client = self.probe.create_client(kind, f'controller/{name}')
         self.until(client.service_is_ready, name)
         answer = client.call_async(request)
         self.until(answer.done, name)
         return answer.result()
 
-    def said(self, key):
+    def said(self, key: str) -> Any:
         return self.node.diagnose()[2][key]
 
-    def speed(self):
+    def speed(self) -> float:
         return self.aims[-1].velocity[0]
 
 
-def path(*points, joint='insertion'):
+def path(*points: tuple[float, float, None], joint: str = 'insertion') -> JointTrajectory:
     """Return a trajectory of points: time, position, speed or None."""
     message = JointTrajectory(joint_names=[joint])
     for time, position, speed in points:
@@ -358,7 +384,7 @@ def path(*points, joint='insertion'):
     return message
 
 
-def test_pauses_goes_on_and_retracts(ros_graph):
+def test_pauses_goes_on_and_retracts(ros_graph: RosGraph) -> None:
     """The reference brakes, holds, goes on to its target, and back out again."""
     loop = Loop(ros_graph, retract_depth=0.019)
     loop.aim(0.1)
@@ -384,7 +410,7 @@ def test_pauses_goes_on_and_retracts(ros_graph):
     assert not refused.success
 
 
-def test_follows_a_trajectory(ros_graph):
+def test_follows_a_trajectory(ros_graph: RosGraph) -> None:
     """Lines by positions alone are followed to their end; the plant leaves them to it."""
     loop = Loop(ros_graph)
     loop.paths.publish(path((0.5, 0.024, None), (1.0, 0.022, None)))
@@ -406,7 +432,9 @@ def test_follows_a_trajectory(ros_graph):
     ],
     ids=['reach', 'finite', 'times', 'joint', 'speed'],
 )
-def test_a_trajectory_that_it_cannot_follow_is_refused(ros_graph, message, reason):
+def test_a_trajectory_that_it_cannot_follow_is_refused(
+    ros_graph: RosGraph, message: JointTrajectory, reason: str
+) -> None:
     """In one line, which diagnostics have too; nothing moves."""
     bench = Bench(ros_graph)
     paths = bench.node.create_publisher(JointTrajectory, 'joint_trajectory', COMMAND)
@@ -418,7 +446,7 @@ def test_a_trajectory_that_it_cannot_follow_is_refused(ros_graph, message, reaso
     assert bench.measure(0.02) == 0.0
 
 
-def test_switches_law_and_gains_in_motion_without_a_bump(ros_graph):
+def test_switches_law_and_gains_in_motion_without_a_bump(ros_graph: RosGraph) -> None:
     """By parameter, over DDS: the commanded force goes on where it was."""
     loop = Loop(ros_graph)
     loop.aim(0.1)
@@ -443,7 +471,9 @@ def test_switches_law_and_gains_in_motion_without_a_bump(ros_graph):
         ('retract_depth', 0.5, 'retract_depth must be in [0.001, 0.2] m'),
     ],
 )
-def test_gains_that_will_not_do_are_refused_while_running(ros_graph, name, value, reason):
+def test_gains_that_will_not_do_are_refused_while_running(
+    ros_graph: RosGraph, name: str, value: float | list[float] | str, reason: str
+) -> None:
     """The reason is the answer and on /diagnostics; the old value stays."""
     node = ros_graph.add(ControllerNode, parameters=SLOW)
     before = node.get_parameter(name).value
@@ -454,7 +484,7 @@ def test_gains_that_will_not_do_are_refused_while_running(ros_graph, name, value
     assert reason in node.diagnose()[2]['last complaint']
 
 
-def test_a_measurement_that_jumps_is_answered_with_no_force(ros_graph):
+def test_a_measurement_that_jumps_is_answered_with_no_force(ros_graph: RosGraph) -> None:
     """A needle that is 5 mm on within a period is no needle."""
     bench = Bench(ros_graph)
     bench.aim(0.1)
@@ -464,7 +494,7 @@ def test_a_measurement_that_jumps_is_answered_with_no_force(ros_graph):
     assert bench.controller.get_parameter('jump').value < 5e-3
 
 
-def test_the_observer_tells_what_it_sees(ros_graph):
+def test_the_observer_tells_what_it_sees(ros_graph: RosGraph) -> None:
     """By default it follows the tip of a bent needle from the plant's sensors."""
     probe = ros_graph.node('probe')
     tips = ros_graph.listen(probe, PointStamped, 'tip_deflection', SENSOR)
@@ -485,7 +515,7 @@ def test_the_observer_tells_what_it_sees(ros_graph):
     assert min(b - a for a, b in pairwise(stamps)) == pytest.approx(0.02, abs=1e-6)
 
 
-def test_the_integral_is_frozen_while_it_is_stopped(ros_graph):
+def test_the_integral_is_frozen_while_it_is_stopped(ros_graph: RosGraph) -> None:
     """What PID has learned of the friction is there again after the stop."""
     bench = Bench(ros_graph, law='pid')
     bench.aim(0.1)
@@ -513,7 +543,7 @@ BEYOND = {
 
 
 @pytest.mark.parametrize('limit', BEYOND)
-def test_beyond_a_limit_it_stops_until_it_is_cleared(ros_graph, limit):
+def test_beyond_a_limit_it_stops_until_it_is_cleared(ros_graph: RosGraph, limit: str) -> None:
     """Zero force, the reason on /diagnostics, and no way back while it is still beyond."""
     exceed, reason = BEYOND[limit]
     bench = Bench(ros_graph)
@@ -521,7 +551,7 @@ def test_beyond_a_limit_it_stops_until_it_is_cleared(ros_graph, limit):
     bench.aim(0.1)
     assert bench.push() > 0.5
 
-    def stopped():
+    def stopped() -> str:
         exceed(bench)
         return bench.value('stop')
 
@@ -557,7 +587,7 @@ def test_beyond_a_limit_it_stops_until_it_is_cleared(ros_graph, limit):
     assert bench.push() > 0.5
 
 
-def test_a_needle_that_does_not_follow_is_not_pushed_for_ever(ros_graph):
+def test_a_needle_that_does_not_follow_is_not_pushed_for_ever(ros_graph: RosGraph) -> None:
     """Encoders that stand still while the reference goes on are a fault, not a reason to push."""
     bench = Bench(ros_graph)
     bench.aim(0.1)
@@ -567,7 +597,7 @@ def test_a_needle_that_does_not_follow_is_not_pushed_for_ever(ros_graph):
     assert bench.push() > 0.5
 
 
-def test_one_reading_alone_stops_nothing(ros_graph):
+def test_one_reading_alone_stops_nothing(ros_graph: RosGraph) -> None:
     """A spike is not taken in, and the needle is pushed on."""
     bench = Bench(ros_graph)
     bench.aim(0.1)
@@ -592,7 +622,9 @@ def test_one_reading_alone_stops_nothing(ros_graph):
         (lambda b: b.tip(nan), 'tip_deflection', 'not finite'),
     ],
 )
-def test_a_reading_that_does_not_count_is_not_taken_in(ros_graph, send, topic, kind):
+def test_a_reading_that_does_not_count_is_not_taken_in(
+    ros_graph: RosGraph, send: Callable[..., Any], topic: str, kind: str
+) -> None:
     """It is counted by its kind; the observer hears nothing of it and the motion goes on."""
     bench = Bench(ros_graph)
     bench.aim(0.1)
@@ -604,13 +636,13 @@ def test_a_reading_that_does_not_count_is_not_taken_in(ros_graph, send, topic, k
     assert bench.push() > 0.5
 
 
-def test_it_goes_on_without_sensors_that_fall_silent(ros_graph):
+def test_it_goes_on_without_sensors_that_fall_silent(ros_graph: RosGraph) -> None:
     """Diagnostics warn for as long as they are; the force stays."""
     bench = Bench(ros_graph, **{'safety.sensor_timeout': 0.3, 'safety.tracking_error': 1.0})
     bench.aim(0.1)
     depth = 0.02
 
-    def stale():
+    def stale() -> bool:
         bench.measure(depth)
         return 'base_wrench is stale' in bench.said() and 'tip_deflection' in bench.said()
 
@@ -618,7 +650,7 @@ def test_it_goes_on_without_sensors_that_fall_silent(ros_graph):
     assert bench.controller.diagnose()[0] == DiagnosticStatus.WARN
     assert bench.measure(depth) > 0.5
 
-    def well():
+    def well() -> bool:
         bench.wrench()
         bench.tip(0.0)
         bench.measure(depth)
@@ -628,7 +660,7 @@ def test_it_goes_on_without_sensors_that_fall_silent(ros_graph):
     assert bench.measure(depth) > 0.5
 
 
-def test_it_stops_for_want_of_sensors_if_they_are_required(ros_graph):
+def test_it_stops_for_want_of_sensors_if_they_are_required(ros_graph: RosGraph) -> None:
     """A parameter makes of the warning a stop."""
     bench = Bench(
         ros_graph,
@@ -645,7 +677,7 @@ def test_it_stops_for_want_of_sensors_if_they_are_required(ros_graph):
     assert 'is stale' in bench.call('clear_stop').message
 
 
-def test_two_that_command_both_let_go(ros_graph):
+def test_two_that_command_both_let_go(ros_graph: RosGraph) -> None:
     """While another node publishes the same topic the answer is zero; alone again it goes on."""
     bench = Bench(ros_graph, **{'safety.tracking_error': 1.0})
     bench.aim(0.1)
@@ -658,7 +690,7 @@ def test_two_that_command_both_let_go(ros_graph):
     assert bench.push() > 0.5
 
 
-def test_commands_carry_the_stamp_of_what_they_answer(ros_graph):
+def test_commands_carry_the_stamp_of_what_they_answer(ros_graph: RosGraph) -> None:
     """A measurement that comes again is answered as before; what answers nothing is of now."""
     bench = Bench(ros_graph, measurement_timeout=1.0)
     bench.aim(0.1)
@@ -673,7 +705,9 @@ def test_commands_carry_the_stamp_of_what_they_answer(ros_graph):
     assert (last.sec, last.nanosec) > (stamp.sec, stamp.nanosec)
 
 
-def test_a_measurement_that_comes_again_after_a_stop_is_answered_with_none(ros_graph):
+def test_a_measurement_that_comes_again_after_a_stop_is_answered_with_none(
+    ros_graph: RosGraph,
+) -> None:
     """The stop was the last word, not the force before it."""
     bench = Bench(ros_graph, measurement_timeout=5.0)
     bench.aim(0.1)
@@ -688,28 +722,28 @@ def test_a_measurement_that_comes_again_after_a_stop_is_answered_with_none(ros_g
 class SimulatedTime(Bench):
     """A bench whose clock is what the test makes it."""
 
-    def __init__(self, graph, **parameters):
+    def __init__(self, graph: RosGraph, **parameters: float) -> None:
         super().__init__(graph, use_sim_time=True, **parameters)
         self.clock = self.node.create_publisher(Clock, '/clock', 10)
         graph.spin_until(self.clock.get_subscription_count, 'the clock')
         self.set(0.0)
 
-    def set(self, seconds):
+    def set(self, seconds: float) -> None:
         """Set the clock and wait until the controller has it."""
         self.time = round(seconds * 1e9)
         self.clock.publish(Clock(clock=self.now()))
         clock = self.controller.get_clock()
         self.graph.spin_until(lambda: clock.now().nanoseconds == self.time, 'the clock')
 
-    def now(self):
+    def now(self) -> Time:
         return Time(sec=self.time // 10**9, nanosec=self.time % 10**9)
 
-    def measure(self, depth, speed=0.0):
+    def measure(self, depth: float, speed: float = 0.0) -> float:
         self.set((self.time + 5_000_000) / 1e9)
         return super().measure(depth, speed)
 
 
-def test_a_simulation_that_starts_at_zero_is_answered(ros_graph):
+def test_a_simulation_that_starts_at_zero_is_answered(ros_graph: RosGraph) -> None:
     """Its first sample has a stamp of zero, and is one."""
     bench = SimulatedTime(ros_graph)
     message = JointState(name=['insertion'], position=[0.02], velocity=[0.0])
@@ -719,7 +753,7 @@ def test_a_simulation_that_starts_at_zero_is_answered(ros_graph):
     assert bench.push() > 0.5
 
 
-def test_a_clock_that_is_set_back_starts_the_motion_anew(ros_graph):
+def test_a_clock_that_is_set_back_starts_the_motion_anew(ros_graph: RosGraph) -> None:
     """It lets go, and the next sample is answered again, though older than those before."""
     bench = SimulatedTime(ros_graph)
     bench.set(100.0)
@@ -733,7 +767,7 @@ def test_a_clock_that_is_set_back_starts_the_motion_anew(ros_graph):
     assert 'clock' not in bench.said()
 
 
-def test_a_clock_that_jumps_ahead_is_a_gap(ros_graph):
+def test_a_clock_that_jumps_ahead_is_a_gap(ros_graph: RosGraph) -> None:
     """The motion starts anew from where the needle is; nothing is faulty."""
     bench = SimulatedTime(ros_graph)
     bench.set(100.0)
@@ -742,7 +776,7 @@ def test_a_clock_that_jumps_ahead_is_a_gap(ros_graph):
     aims = ros_graph.listen(bench.node, JointState, 'reference', SENSOR)
     bench.set(200.0)
 
-    def aimed():
+    def aimed() -> list[JointState]:
         bench.measure(0.0201)
         return aims
 
@@ -755,7 +789,7 @@ def test_a_clock_that_jumps_ahead_is_a_gap(ros_graph):
     assert bench.push() > 0.5
 
 
-def test_a_clock_that_stands_is_no_fault(ros_graph):
+def test_a_clock_that_stands_is_no_fault(ros_graph: RosGraph) -> None:
     """Paused, nothing is stale; the same sample again is answered with the same force."""
     bench = SimulatedTime(ros_graph)
     bench.set(100.0)
@@ -765,7 +799,7 @@ def test_a_clock_that_stands_is_no_fault(ros_graph):
     message.header.stamp = bench.now()
     start = monotonic()
 
-    def repeated():
+    def repeated() -> bool:
         forces.add(bench.ask(message))
         # Three times the timeout, by the clock on the wall.
         return monotonic() - start > 0.3
@@ -783,7 +817,9 @@ def test_a_clock_that_stands_is_no_fault(ros_graph):
         ('', Time(sec=5), 'target is stale: its stamp is'),
     ],
 )
-def test_a_target_of_another_frame_or_time_is_refused(ros_graph, frame, stamp, reason):
+def test_a_target_of_another_frame_or_time_is_refused(
+    ros_graph: RosGraph, frame: str, stamp: Time, reason: str
+) -> None:
     """In one line; without frame and stamp it is meant as it is, and now."""
     bench = Bench(ros_graph)
     message = PointStamped()
@@ -795,7 +831,7 @@ def test_a_target_of_another_frame_or_time_is_refused(ros_graph, frame, stamp, r
     assert bench.value('target [m]') == 'None'
 
 
-def test_before_it_is_active_it_answers_and_waits(ros_graph):
+def test_before_it_is_active_it_answers_and_waits(ros_graph: RosGraph) -> None:
     """Services say so, a target is refused, and a stop is kept for when it is active."""
     bench = Bench(ros_graph, start=False)
     assert bench.call('emergency_stop').success
@@ -828,7 +864,7 @@ def test_before_it_is_active_it_answers_and_waits(ros_graph):
         JointState(name=['insertion', 'rotation'], position=[0.02, nan], velocity=[0.0, 0.0]),
     ],
 )
-def test_no_joint_state_raises(ros_graph, message):
+def test_no_joint_state_raises(ros_graph: RosGraph, message: JointState) -> None:
     """Whatever its fields are: zero force with its stamp, and the next good one is answered."""
     bench = Bench(ros_graph, measurement_timeout=5.0)
     bench.aim(0.1)
@@ -849,7 +885,7 @@ def test_no_joint_state_raises(ros_graph, message):
         JointState(position=[0.18, 0.0, 1e308, 0.0], velocity=[0.0] * 4),
     ],
 )
-def test_no_ground_truth_raises(ros_graph, message):
+def test_no_ground_truth_raises(ros_graph: RosGraph, message: JointState) -> None:
     """A truth of a wrong length, not finite or of a needle that is none is not taken in."""
     bench = Bench(ros_graph, deflection_feedback='ground_truth')
     truths = bench.node.create_publisher(JointState, 'ground_truth', SENSOR)
@@ -862,12 +898,12 @@ def test_no_ground_truth_raises(ros_graph, message):
     assert bench.push() > 0.5
 
 
-def test_diagnostics_tell_rates_and_saturation(ros_graph):
+def test_diagnostics_tell_rates_and_saturation(ros_graph: RosGraph) -> None:
     """Of each input in the last second, and how long the force was all there is."""
     bench = SimulatedTime(ros_graph, force_limit=0.7, **{'safety.tracking_error': 0.1})
     bench.aim(0.1)
 
-    def saturated():
+    def saturated() -> bool | float:
         bench.measure(0.02)
         seen = float(bench.value('input joint_states').split()[0])
         return seen and bench.value('share of commands at their limit') == '1.000'

@@ -1,6 +1,9 @@
 """What goes wrong in a graph, and what must then happen: never silence, never force."""
 
+from collections.abc import Callable
+from pathlib import Path
 import resource
+from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PointStamped, WrenchStamped
@@ -16,6 +19,8 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
+from std_srvs.srv._trigger import Trigger_Response
+from support.ros_graph import RosGraph
 
 RATE, START, TARGET = 200.0, 0.02, 0.025
 
@@ -30,7 +35,12 @@ class Loop:
     Time is the plant's: a machine that stalls makes it wait, and is no fault of its own.
     """
 
-    def __init__(self, graph, plant=None, controller=None):
+    def __init__(
+        self,
+        graph: RosGraph,
+        plant: dict[str, float] | None = None,
+        controller: dict[str, float] | None = None,
+    ) -> None:
         self.graph = graph
         self.probe = graph.node('probe')
         self.truth = graph.latest(self.probe, JointState, 'ground_truth', SENSOR)
@@ -46,41 +56,41 @@ class Loop:
             lambda: self.said('measurements answered') > 5 and self.truth.message, 'discovery'
         )
 
-    def until(self, condition, what):
+    def until(self, condition: Callable[..., Any], what: str) -> None:
         """Spin until a condition holds."""
         self.graph.spin_until(condition, what)
 
-    def said(self, key):
+    def said(self, key: str) -> float | None:
         """Return a figure of the controller's diagnostics."""
         return self.controller.diagnose()[2][key]
 
     @property
-    def depth(self):
+    def depth(self) -> Any:
         """True inserted length [m]."""
         return 0.2 - self.truth.message.position[0]
 
     @property
-    def speed(self):
+    def speed(self) -> float:
         """True insertion speed [m/s]."""
         return -self.truth.message.velocity[0]
 
     @property
-    def time(self):
+    def time(self) -> Any:
         """Time of the newest sample [s]."""
         return seconds(self.truth.message.header.stamp)
 
-    def aim(self, depth=TARGET):
+    def aim(self, depth: float = TARGET) -> None:
         """Send a target until it is taken."""
         message = PointStamped()
         message.point.y = depth
 
-        def taken():
+        def taken() -> bool:
             self.targets.publish(message)
             return self.said('target [m]') == depth
 
         self.until(taken, 'the target')
 
-    def break_down(self, kind, topic, **values):
+    def break_down(self, kind: str, topic: str, **values: float) -> None:
         """Let a stream of the plant suffer from a fault."""
         parameters = {'fault.kind': kind, 'fault.topic': topic}
         parameters |= {f'fault.{name}': value for name, value in values.items()}
@@ -89,24 +99,24 @@ class Loop:
         )
         assert changed.successful, changed.reason
 
-    def mend(self):
+    def mend(self) -> None:
         """End the fault."""
         self.plant.set_parameters([Parameter('fault.kind', value='none')])
 
-    def passes(self, seconds):
+    def passes(self, seconds: float) -> None:
         """Spin for a time of the needle."""
         end = self.time + seconds
         self.until(lambda: self.time >= end, f'{seconds} s')
 
-    def moves(self):
+    def moves(self) -> None:
         """Spin until the needle is on its way."""
         self.until(lambda: self.speed > 0.005, 'motion')
 
-    def arrives(self, depth=TARGET):
+    def arrives(self, depth: float = TARGET) -> None:
         """Spin until the needle rests at its target."""
         self.until(lambda: abs(self.depth - depth) < NEAR and self.speed == 0.0, 'the arrival')
 
-    def rests_without_force(self, why):
+    def rests_without_force(self, why: str) -> None:
         """Spin until nothing is commanded and the reason told; the needle rests."""
         self.until(lambda: why in self.controller.diagnose()[1], why)
         self.until(lambda: self.speed == 0.0, 'rest')
@@ -118,7 +128,7 @@ class Loop:
         # Where no measurement comes the plant has let go by itself.
         assert force == 0.0 or self.plant.diagnose()[2]['commands per second [Hz]'] == '0.0'
 
-    def clears(self):
+    def clears(self) -> Trigger_Response:
         """Release the latched stop."""
         client = self.probe.create_client(Trigger, 'controller/clear_stop')
         self.until(client.service_is_ready, 'the service')
@@ -137,7 +147,9 @@ class Loop:
     ],
 )
 @pytest.mark.parametrize('topic', ['joint_states', 'base_wrench', 'tip_deflection'])
-def test_a_network_that_loses_or_muddles_measurements_is_borne(ros_graph, kind, values, topic):
+def test_a_network_that_loses_or_muddles_measurements_is_borne(
+    ros_graph: RosGraph, kind: str, values: dict[str, float], topic: str
+) -> None:
     """The needle gets where it shall, and no stop latches."""
     loop = Loop(ros_graph)
     loop.break_down(kind, topic, **values)
@@ -151,7 +163,9 @@ def test_a_network_that_loses_or_muddles_measurements_is_borne(ros_graph, kind, 
     ('kind', 'values'),
     [('drop', {}), ('freeze', {}), ('nan', {}), ('delay', {'delay': 5.0})],
 )
-def test_without_its_sensors_of_bending_it_goes_on(ros_graph, kind, values, topic):
+def test_without_its_sensors_of_bending_it_goes_on(
+    ros_graph: RosGraph, kind: str, values: dict[str, float], topic: str
+) -> None:
     """The observer does without what does not come or is of no use; the diagnostics tell."""
     loop = Loop(ros_graph, plant={'tip.noise': 1e-4})
     loop.aim()
@@ -165,7 +179,9 @@ def test_without_its_sensors_of_bending_it_goes_on(ros_graph, kind, values, topi
 @pytest.mark.parametrize(
     ('kind', 'values'), [('drop', {}), ('nan', {}), ('delay', {'delay': 0.5})]
 )
-def test_without_encoders_it_lets_go_and_goes_on_when_they_are_back(ros_graph, kind, values):
+def test_without_encoders_it_lets_go_and_goes_on_when_they_are_back(
+    ros_graph: RosGraph, kind: str, values: dict[str, float]
+) -> None:
     """Zero force while they are gone; then to the target, if the needle has not gone far."""
     loop = Loop(ros_graph, controller={'jump': 0.01})
     loop.aim(0.04)
@@ -184,7 +200,9 @@ def test_without_encoders_it_lets_go_and_goes_on_when_they_are_back(ros_graph, k
         ('bias', {'size': 0.01}, 'insertion moved by'),
     ],
 )
-def test_encoders_that_lie_end_the_motion(ros_graph, kind, values, why):
+def test_encoders_that_lie_end_the_motion(
+    ros_graph: RosGraph, kind: str, values: dict[str, float], why: str
+) -> None:
     """What the encoders say does not fit the motion: no force, and the reason."""
     loop = Loop(ros_graph)
     loop.aim(0.1)
@@ -198,7 +216,9 @@ def test_encoders_that_lie_end_the_motion(ros_graph, kind, values, why):
     ('topic', 'size', 'why'),
     [('base_wrench', 50.0, 'load'), ('tip_deflection', 0.06, 'tip_deflection')],
 )
-def test_a_load_beyond_the_limits_latches_a_stop(ros_graph, topic, size, why):
+def test_a_load_beyond_the_limits_latches_a_stop(
+    ros_graph: RosGraph, topic: str, size: float, why: str
+) -> None:
     """Until the reading is within them again and the stop is cleared."""
     loop = Loop(ros_graph)
     loop.aim(0.04)
@@ -215,7 +235,7 @@ def test_a_load_beyond_the_limits_latches_a_stop(ros_graph, topic, size, why):
     loop.arrives(0.04)
 
 
-def test_a_killed_controller_leaves_the_needle_at_rest(ros_graph):
+def test_a_killed_controller_leaves_the_needle_at_rest(ros_graph: RosGraph) -> None:
     """The plant lets go after command_timeout; a new controller takes over after the lease."""
     probe = ros_graph.node('probe')
     truth = ros_graph.latest(probe, JointState, 'ground_truth', SENSOR)
@@ -225,7 +245,7 @@ def test_a_killed_controller_leaves_the_needle_at_rest(ros_graph):
     message = PointStamped()
     message.point.y = 0.1
 
-    def moves():
+    def moves() -> bool:
         targets.publish(message)
         return truth.message is not None and truth.message.velocity[0] < 0.0
 
@@ -244,7 +264,7 @@ def test_a_killed_controller_leaves_the_needle_at_rest(ros_graph):
     ros_graph.spin_until(moves, 'motion')
 
 
-def test_a_killed_plant_is_waited_for(ros_graph):
+def test_a_killed_plant_is_waited_for(ros_graph: RosGraph) -> None:
     """The controller commands nothing, says why, and goes on with a plant that takes its place."""
     probe = ros_graph.node('probe')
     states = ros_graph.latest(probe, JointState, 'joint_states', SENSOR)
@@ -254,7 +274,7 @@ def test_a_killed_plant_is_waited_for(ros_graph):
     message = PointStamped()
     message.point.y = 0.1
 
-    def moves():
+    def moves() -> bool:
         targets.publish(message)
         return states.message is not None and states.message.velocity[0] > 0.0
 
@@ -267,7 +287,9 @@ def test_a_killed_plant_is_waited_for(ros_graph):
     ros_graph.spin_until(moves, 'motion', timeout=60.0)
 
 
-def test_a_recorder_without_disk_says_so_and_keeps_what_it_has(ros_graph, tmp_path):
+def test_a_recorder_without_disk_says_so_and_keeps_what_it_has(
+    ros_graph: RosGraph, tmp_path: Path
+) -> None:
     """When no more can be written the recording ends, the node does not, and the bag is read."""
     loop = Loop(ros_graph)
     bag = tmp_path / 'bag'
@@ -295,7 +317,7 @@ def test_a_recorder_without_disk_says_so_and_keeps_what_it_has(ros_graph, tmp_pa
     assert count > size / 2 / 200
 
 
-def test_a_clock_that_jumps_moves_nothing(ros_graph):
+def test_a_clock_that_jumps_moves_nothing(ros_graph: RosGraph) -> None:
     """Under a foreign clock that jumps both ways the loop goes on, without a force in between."""
     clocks = ros_graph.node('clock')
     ticks = clocks.create_publisher(Clock, '/clock', SENSOR)
@@ -309,7 +331,7 @@ def test_a_clock_that_jumps_moves_nothing(ros_graph):
     # A clock that goes on before all have taken notice would make every message late.
     seen, waited = [None], [0]
 
-    def goes_on(step=0):
+    def goes_on(step: int = 0) -> None:
         waited[0] += 1
         if step == 0 and truth.message is seen[0] and waited[0] < 20:
             return
@@ -319,11 +341,11 @@ def test_a_clock_that_jumps_moves_nothing(ros_graph):
         message.clock.sec, message.clock.nanosec = divmod(now[0], 10**9)
         ticks.publish(message)
 
-    def aimed(depth):
+    def aimed(depth: float) -> None:
         message = PointStamped()
         message.point.y = depth
 
-        def taken():
+        def taken() -> bool:
             goes_on()
             if waited[0] == 0:
                 targets.publish(message)
@@ -331,11 +353,11 @@ def test_a_clock_that_jumps_moves_nothing(ros_graph):
 
         ros_graph.spin_until(taken, 'the target')
 
-    def reached(depth):
+    def reached(depth: float) -> bool:
         goes_on()
         return abs(0.2 - truth.message.position[0] - depth) < NEAR
 
-    def sampled():
+    def sampled() -> bool:
         goes_on()
         return truth.message is not None
 
@@ -353,7 +375,7 @@ def test_a_clock_that_jumps_moves_nothing(ros_graph):
     ros_graph.spin_until(lambda: reached(0.024), 'the needle')
 
 
-def test_a_flood_of_commands_does_not_stop_the_samples(ros_graph):
+def test_a_flood_of_commands_does_not_stop_the_samples(ros_graph: RosGraph) -> None:
     """Commands as fast as a process can publish them: the plant samples on and warns."""
     probe = ros_graph.node('probe')
     stamps, said = [], []
@@ -376,18 +398,18 @@ def test_a_flood_of_commands_does_not_stop_the_samples(ros_graph):
     # Below mu_s.
     message.wrench.force.y = 0.3
 
-    def flood():
+    def flood() -> None:
         for _ in range(100):
             commands.publish(message)
 
-    def warned():
+    def warned() -> bool:
         flood()
         return any('commands come per second' in line for line in said)
 
     ros_graph.spin_until(warned, 'the warning')
     first = len(stamps)
 
-    def further():
+    def further() -> bool:
         flood()
         return len(stamps) > first + 60
 

@@ -22,7 +22,7 @@ def use(graph: Graph) -> None:
     graph.spin_until(answer.done, 'the answer')
 
 
-def test_nothing_of_a_graph_outlives_it(tmp_path):
+def test_nothing_of_a_graph_outlives_it(tmp_path: Path) -> None:
     """A node that DDS still knows would be a second one of its name in the next graph."""
     counts = []
     for _ in range(3):

@@ -1,7 +1,9 @@
 """From bags and from running topics to results, parameter files and running nodes."""
 
 import math
+from pathlib import Path
 import time
+from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import WrenchStamped
@@ -15,6 +17,7 @@ from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 from support.presses import write_presses
+from support.ros_graph import RosGraph
 from support.samples import NOISY, simulated, TRUTH, write_bag
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
@@ -22,7 +25,7 @@ COEFFICIENTS = (('coulomb_friction', 'N'), ('viscous_friction', 'N s/m'))
 
 
 @pytest.fixture(scope='module')
-def bags(tmp_path_factory):
+def bags(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
     """Return three recordings of the simulated needle."""
     folder = tmp_path_factory.mktemp('bags')
     paths = [folder / f'run_{seed}' for seed in range(3)]
@@ -32,21 +35,21 @@ def bags(tmp_path_factory):
 
 
 @pytest.fixture(scope='module')
-def place(tmp_path_factory):
+def place(tmp_path_factory: pytest.TempPathFactory) -> str:
     """Return a recording of presses."""
     path = tmp_path_factory.mktemp('places') / 'place'
     write_presses(path)
     return str(path)
 
 
-def call(ros_graph, service):
+def call(ros_graph: RosGraph, service: str) -> tuple[bool, str]:
     """Call a service of the node; return success and message."""
     client = ros_graph.node('caller').create_client(Trigger, f'identification/{service}')
     ros_graph.spin_until(client.service_is_ready, 'the service')
     asked = []
     start = time.monotonic()
 
-    def answered():
+    def answered() -> bool:
         # An answer to a client that the other side does not know yet is lost: ask again.
         if time.monotonic() - start >= 6.0 * len(asked):
             asked.append(client.call_async(Trigger.Request()))
@@ -57,11 +60,11 @@ def call(ros_graph, service):
     return response.success, response.message
 
 
-def apply(ros_graph, target):
+def apply(ros_graph: RosGraph, target: str) -> tuple[bool, str]:
     """Call ``~/apply`` until the node has found the other node."""
     answers = [(False, f'{target}: no such node')]
 
-    def answered():
+    def answered() -> bool:
         if f'{target}: no such node' in answers[-1][1]:
             answers.append(call(ros_graph, 'apply'))
             return False
@@ -71,12 +74,14 @@ def apply(ros_graph, target):
     return answers[-1]
 
 
-def statuses(message):
+def statuses(message: DiagnosticArray) -> dict[str, dict[str, str]]:
     """Return the values of each status by name."""
     return {s.name: {v.key: v.value for v in s.values} for s in message.status}
 
 
-def test_identifies_when_activated_and_tells_who_comes_late(ros_graph, bags):
+def test_identifies_when_activated_and_tells_who_comes_late(
+    ros_graph: RosGraph, bags: list[str]
+) -> None:
     """The latched result holds estimate, interval, unit, sample count and quality."""
     ros_graph.add(IdentificationNode, parameters={'bags': bags})
     late = ros_graph.listen(ros_graph.node('late'), DiagnosticArray, 'friction', LATCHED)
@@ -94,7 +99,7 @@ def test_identifies_when_activated_and_tells_who_comes_late(ros_graph, bags):
     assert float(status[bags[0]]['determination']) > 0.99
 
 
-def test_publishes_stiffness_by_force(ros_graph, place):
+def test_publishes_stiffness_by_force(ros_graph: RosGraph, place: str) -> None:
     """The result at the force asked for, and each entry of the matrix at each, latched."""
     parameters = {'bags': [place], 'what': 'stiffness', 'level': 1.5}
     ros_graph.add(IdentificationNode, parameters=parameters)
@@ -106,7 +111,9 @@ def test_publishes_stiffness_by_force(ros_graph, place):
     assert status[place]['presses'] == '16'
 
 
-def test_its_result_is_a_parameter_file_for_nodes_in_any_namespace(ros_graph, bags, tmp_path):
+def test_its_result_is_a_parameter_file_for_nodes_in_any_namespace(
+    ros_graph: RosGraph, bags: list[str], tmp_path: Path
+) -> None:
     """Rclpy applies the file to plant and controller wherever they are, and to no other node."""
     output = tmp_path / 'friction.yaml'
     ros_graph.add(IdentificationNode, parameters={'bags': bags, 'output': str(output)})
@@ -129,14 +136,16 @@ def test_its_result_is_a_parameter_file_for_nodes_in_any_namespace(ros_graph, ba
             assert value == pytest.approx(TRUTH.viscous_friction, rel=0.01)
 
 
-def test_the_service_identifies_and_gives_the_reason_when_it_cannot(ros_graph):
+def test_the_service_identifies_and_gives_the_reason_when_it_cannot(ros_graph: RosGraph) -> None:
     """Failure is an answer of one line, and the node lives on."""
     node = ros_graph.add(IdentificationNode)
     assert call(ros_graph, 'identify') == (False, 'no recordings to identify from')
     assert node.is_active
 
 
-def test_the_service_takes_the_bags_that_are_named_now(ros_graph, bags):
+def test_the_service_takes_the_bags_that_are_named_now(
+    ros_graph: RosGraph, bags: list[str]
+) -> None:
     """A node that runs identifies from other recordings without a new start."""
     node = ros_graph.add(IdentificationNode, parameters={'bags': bags[:1]})
     assert node.set_parameters([Parameter('bags', value=bags)])[0].successful
@@ -162,7 +171,9 @@ def test_the_service_takes_the_bags_that_are_named_now(ros_graph, bags):
         ({'forgetting': 0.0}, 'forgetting must be finite, > 0'),
     ],
 )
-def test_refuses_to_start_and_says_why(ros_graph, parameters, complaint):
+def test_refuses_to_start_and_says_why(
+    ros_graph: RosGraph, parameters: dict[str, Any], complaint: str
+) -> None:
     """A node that cannot do what it was asked to does not become active."""
     node = ros_graph.add(IdentificationNode, start=False, parameters=parameters)
     assert not node.start()
@@ -172,7 +183,7 @@ def test_refuses_to_start_and_says_why(ros_graph, parameters, complaint):
 # Running topics.
 
 
-def test_finds_the_friction_of_a_plant_that_runs(ros_graph):
+def test_finds_the_friction_of_a_plant_that_runs(ros_graph: RosGraph) -> None:
     """Against a stand-in that moves, the intervals close around its friction."""
     truth = {'coulomb_friction': 0.8, 'viscous_friction': 200.0}
     parameters = {f'model.{name}': value for name, value in truth.items()}
@@ -191,7 +202,7 @@ def test_finds_the_friction_of_a_plant_that_runs(ros_graph):
         message.points.append(point)
     trajectory.publish(message)
 
-    def told():
+    def told() -> bool:
         if not found:
             return False
         status = statuses(found[-1])
@@ -219,7 +230,7 @@ def test_finds_the_friction_of_a_plant_that_runs(ros_graph):
     )
 
 
-def test_lives_on_with_messages_that_make_no_sense(ros_graph):
+def test_lives_on_with_messages_that_make_no_sense(ros_graph: RosGraph) -> None:
     """NaN, stamps that go back, joints that are missing: counted, and the node is active."""
     node = ros_graph.add(IdentificationNode, parameters={'live': True})
     probe = ros_graph.node('probe')
@@ -247,7 +258,7 @@ def test_lives_on_with_messages_that_make_no_sense(ros_graph):
 # Into running nodes.
 
 
-def test_applies_what_it_found_to_a_plant_that_runs(ros_graph, bags):
+def test_applies_what_it_found_to_a_plant_that_runs(ros_graph: RosGraph, bags: list[str]) -> None:
     """The plant goes on with the identified friction, and the answer names it."""
     plant = ros_graph.add(
         PlantNode, parameters={'rate': 200.0, 'model.coulomb_friction': 2.0, 'mode': 'robot'}
@@ -262,7 +273,7 @@ def test_applies_what_it_found_to_a_plant_that_runs(ros_graph, bags):
         assert value == pytest.approx(getattr(TRUTH, name), rel=0.01)
 
 
-def test_applies_it_from_process_to_process(ros_graph, bags):
+def test_applies_it_from_process_to_process(ros_graph: RosGraph, bags: list[str]) -> None:
     """A call that fails, then one that succeeds, with the executor that the nodes have."""
     ros_graph.start('identification', {'bags': bags, 'apply_to': ['plant']})
     assert call(ros_graph, 'apply') == (False, 'plant: no such node')
@@ -278,7 +289,7 @@ def test_applies_it_from_process_to_process(ros_graph, bags):
     assert value == pytest.approx(TRUTH.coulomb_friction, rel=0.01)
 
 
-def test_says_what_a_node_does_not_take(ros_graph, place):
+def test_says_what_a_node_does_not_take(ros_graph: RosGraph, place: str) -> None:
     """A plant that runs keeps its tissue: the answer gives the reason."""
     ros_graph.add(PlantNode, parameters={'rate': 200.0})
     ros_graph.add(IdentificationNode, parameters={'bags': [place], 'what': 'stiffness'})
@@ -288,7 +299,7 @@ def test_says_what_a_node_does_not_take(ros_graph, place):
     assert 'cannot change while configured' in message
 
 
-def test_has_nothing_to_apply_before_it_found_something(ros_graph):
+def test_has_nothing_to_apply_before_it_found_something(ros_graph: RosGraph) -> None:
     """The answer says so."""
     ros_graph.add(IdentificationNode)
     success, message = call(ros_graph, 'apply')
@@ -296,7 +307,9 @@ def test_has_nothing_to_apply_before_it_found_something(ros_graph):
     assert message.startswith('nothing identified yet')
 
 
-def test_a_node_that_does_not_answer_does_not_keep_it_waiting(ros_graph, bags, monkeypatch):
+def test_a_node_that_does_not_answer_does_not_keep_it_waiting(
+    ros_graph: RosGraph, bags: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The call ends with the reason, and meanwhile the node is at work."""
     monkeypatch.setattr('needle_identification.identification_node._ANSWER_TIME', 0.3)
     ros_graph.add(IdentificationNode, parameters={'bags': bags, 'apply_to': ['deaf']})

@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 from support.installed import node_class, ROOT
+from support.ros_graph import RosGraph
 
 PATH = ROOT / 'launch/insertion.launch.py'
 TREE = ast.parse(PATH.read_text())
@@ -26,7 +27,7 @@ def constant(name: str) -> Any:
 ARGUMENTS, PARAMETERS = constant('ARGUMENTS'), constant('PARAMETERS')
 
 
-def test_every_argument_has_a_meaning_and_a_use():
+def test_every_argument_has_a_meaning_and_a_use() -> None:
     """An argument sets a parameter, or the file asks for it by name."""
     used = {argument for table in PARAMETERS.values() for argument in table}
     assert used <= ARGUMENTS.keys()
@@ -48,13 +49,13 @@ def test_every_argument_has_a_meaning_and_a_use():
 
 
 @pytest.mark.parametrize('name', PARAMETERS)
-def test_arguments_set_parameters_that_the_nodes_have(ros_graph, name):
+def test_arguments_set_parameters_that_the_nodes_have(ros_graph: RosGraph, name: str) -> None:
     """Each parameter is one of the node that setup.py installs under this name."""
     node = ros_graph.add(node_class(name), start=False)
     assert {key for key in PARAMETERS[name].values() if not node.has_parameter(key)} == set()
 
 
-def test_where_ros2_launch_is_installed_it_takes_the_file():
+def test_where_ros2_launch_is_installed_it_takes_the_file() -> None:
     """`ros2 launch` loads the file and shows every argument; elsewhere it is at least Python."""
     compile(TREE, PATH, 'exec')
     if ros2 := shutil.which('ros2'):

@@ -1,6 +1,7 @@
 """Messages read and written as bytes are those of rmw."""
 
 from itertools import pairwise
+from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PointStamped, WrenchStamped
@@ -15,6 +16,7 @@ from needle_ros.packed import Layout, Reading
 import pytest
 from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import JointState
+from support.ros_graph import RosGraph
 
 numbers = st.lists(st.floats(allow_nan=False), min_size=9, max_size=9)
 stamps = st.integers(0, 2**31 * 10**9 - 1)
@@ -22,7 +24,11 @@ words = st.text('ab_é→', max_size=9)
 lengths = st.tuples(*[st.integers(0, 3)] * 3)
 
 
-def is_one(kind, layout, reading):
+def is_one(
+    kind: type[PointStamped] | type[WrenchStamped] | type[JointState],
+    layout: Layout,
+    reading: Reading,
+) -> PointStamped | WrenchStamped | JointState:
     """Hold against rmw, and against a reader that knows the length to the byte, both ways."""
     data = layout.serialize(reading.stamp, *sum(reading.values, ()))
     package, _, _ = kind.__module__.partition('.')
@@ -35,7 +41,9 @@ def is_one(kind, layout, reading):
 
 
 @given(stamps, words, st.lists(words, max_size=3), lengths, numbers)
-def test_joint_states_are_those_of_rmw(stamp, frame, names, counts, values):
+def test_joint_states_are_those_of_rmw(
+    stamp: int, frame: str, names: list[str], counts: tuple[int, ...], values: list[float]
+) -> None:
     """Whatever the lengths, which decide where fields are aligned."""
     ends = [sum(counts[:k]) for k in range(4)]
     blocks = tuple(tuple(values[ends[k] : ends[k + 1]]) for k in range(3))
@@ -48,7 +56,7 @@ def test_joint_states_are_those_of_rmw(stamp, frame, names, counts, values):
 
 
 @given(stamps, words, numbers)
-def test_wrenches_and_points_are_those_of_rmw(stamp, frame, values):
+def test_wrenches_and_points_are_those_of_rmw(stamp: int, frame: str, values: list[float]) -> None:
     """Single numbers follow the header."""
     reading = Reading(stamp, frame, (), (tuple(values[:6]),))
     message = is_one(WrenchStamped, Layout(frame, numbers=6), reading)
@@ -64,7 +72,13 @@ layouts = st.tuples(words, st.lists(words, max_size=3), lengths)
 
 
 @given(layouts, layouts, stamps, numbers)
-def test_a_layout_does_not_read_another(one, other, stamp, values):
+def test_a_layout_does_not_read_another(
+    one: tuple[str, list[Any], tuple[int, int, int]] | tuple[str, list[str], tuple[int, int, int]],
+    other: tuple[str, list[Any], tuple[int, int, int]]
+    | tuple[str, list[str], tuple[int, int, int]],
+    stamp: int,
+    values: list[float],
+) -> None:
     """Nothing is taken for what it is not."""
     frame, names, counts = other
     layout = Layout(frame, names=names, counts=counts)
@@ -74,7 +88,7 @@ def test_a_layout_does_not_read_another(one, other, stamp, values):
 
 
 @pytest.mark.parametrize('length', [0, 3, 12, 75])
-def test_a_message_cut_short_is_none(length):
+def test_a_message_cut_short_is_none(length: int) -> None:
     """Fewer bytes than the layout has; more do not matter, nor do options of the encoding."""
     layout = Layout('needle_base', numbers=6)
     data = layout.serialize(1, *[0.5] * 6)
@@ -87,7 +101,7 @@ def test_a_message_cut_short_is_none(length):
 
 
 @pytest.mark.parametrize('count', [0, 5, 7])
-def test_values_that_are_not_as_many_are_refused(count):
+def test_values_that_are_not_as_many_are_refused(count: int) -> None:
     """And do no harm to those that follow."""
     layout = Layout('needle_base', numbers=6)
     with pytest.raises(ShapeError, match=f'has 6 values, got {count}'):
@@ -106,11 +120,15 @@ JUNK = [b'', b'\0\1\0\0', b'\0\1\0\0' + b'\xff' * 40]
 
 
 @pytest.mark.parametrize('messages', [JOINTS, WRENCHES, POINTS], ids=['joints', 'wrench', 'point'])
-def test_a_node_takes_any_layout(ros_graph, monkeypatch, messages):
+def test_a_node_takes_any_layout(
+    ros_graph: RosGraph, monkeypatch: pytest.MonkeyPatch, messages: list[Any]
+) -> None:
     """As rclpy writes them; it reads the first of each layout. Junk is counted, and said."""
     asked = []
 
-    def deserialized(data, kind):
+    def deserialized(
+        data: bytes, kind: type[PointStamped] | type[WrenchStamped] | type[JointState]
+    ) -> PointStamped | WrenchStamped | JointState:
         asked.append(data)
         return deserialize_message(data, kind)
 

@@ -2,11 +2,13 @@
 
 from collections import defaultdict
 from itertools import groupby
+from pathlib import Path
+from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PointStamped
 from needle_controller import closed_loop, ContinuousInverseDynamics
-from needle_dynamics import NeedleModel, NeedleParameters
+from needle_dynamics import FloatArray, NeedleModel, NeedleParameters
 from needle_identification.bags.bag import Bag, deserialize, encode
 from needle_identification.recorder_node import is_hidden
 from needle_insertion.experiment.ros_graph import Graph
@@ -14,6 +16,7 @@ from needle_ros.base_node import COMMAND, SENSOR
 from needle_ros.timing import seconds
 import numpy as np
 import pytest
+from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 from scipy.integrate import solve_ivp
@@ -39,7 +42,14 @@ DATA = {
 }  # fmt: skip
 
 
-def drive(logs, target, plant, controller, until, bag=None):
+def drive(
+    logs: Path,
+    target: float,
+    plant: dict[str, Any],
+    controller: dict[str, Any],
+    until: float,
+    bag: Path | None = None,
+) -> list[JointState]:
     """
     Drive the needle to a target in lock-step; return what `tracking_error` said.
 
@@ -52,7 +62,7 @@ def drive(logs, target, plant, controller, until, bag=None):
         probe = graph.node('probe')
         health = {}
 
-        def take(message):
+        def take(message: DiagnosticArray) -> None:
             for status in message.status:
                 health[status.name] = {pair.key: pair.value for pair in status.values}
 
@@ -76,7 +86,7 @@ def drive(logs, target, plant, controller, until, bag=None):
         message = PointStamped()
         message.point.y = target
 
-        def aims():
+        def aims() -> bool:
             aim.publish(message)
             return health.get('/controller', {}).get('target [m]') == str(target)
 
@@ -94,7 +104,7 @@ def drive(logs, target, plant, controller, until, bag=None):
     return errors
 
 
-def records_all(probe):
+def records_all(probe: Node) -> bool:
     """
     Tell whether the recorder has subscribed to all that is published.
 
@@ -111,7 +121,7 @@ def records_all(probe):
     )
 
 
-def contents(bag, until):
+def contents(bag: Path, until: float) -> dict[str, list[bytes]]:
     """
     Return the messages of each topic of a bag up to a stamp [s].
 
@@ -128,13 +138,13 @@ def contents(bag, until):
     return {name: [data for data, _ in groupby(all_)] for name, all_ in found.items()}
 
 
-def exact(times):
+def exact(times: FloatArray) -> FloatArray:
     """Return e_ddot + kv e_dot + kp e = 0 from rest: the law's own closed loop."""
     return (TARGET - START) * (1.0 + times) * np.exp(-times)
 
 
 @pytest.mark.parametrize('preset', ['paper_si', 'paper_mm'])
-def test_the_continuous_loop_is_that_of_its_error_equation(preset):
+def test_the_continuous_loop_is_that_of_its_error_equation(preset: str) -> None:
     """The source's law, solved as an ODE on the whole needle, has the error that it promises."""
     model = NeedleModel(NeedleParameters.preset(preset))
     law = ContinuousInverseDynamics(
@@ -158,7 +168,7 @@ def test_the_continuous_loop_is_that_of_its_error_equation(preset):
 
 
 @pytest.mark.parametrize('preset', ['paper_si', 'paper_mm'])
-def test_tracks_at_1_khz_as_the_continuous_loop_does(tmp_path, preset):
+def test_tracks_at_1_khz_as_the_continuous_loop_does(tmp_path: Path, preset: str) -> None:
     """
     From a step of 10 cm the depth error is within 10 % of the continuous one at every instant.
 
@@ -200,7 +210,7 @@ def test_tracks_at_1_khz_as_the_continuous_loop_does(tmp_path, preset):
     assert deviation.max() < 0.1, f'at {time[deviation.argmax()]:.3f} s'
 
 
-def test_two_runs_with_one_seed_are_the_same(tmp_path):
+def test_two_runs_with_one_seed_are_the_same(tmp_path: Path) -> None:
     """Every message of the plant and of the controller has the same content in both bags."""
     bags = [tmp_path / name for name in ('one', 'two')]
     for bag in bags:

@@ -18,6 +18,7 @@ from lxml import etree
 from needle_insertion.experiment.protocol import SHIPPED_BAGS
 import pytest
 from support.installed import NODES, ROOT
+from support.ros_graph import RosGraph
 import yaml
 
 DATA = ROOT / 'test/data'
@@ -56,12 +57,12 @@ def imported() -> set[str]:
     return {module.partition('.')[0] for module in modules} - OWN - sys.stdlib_module_names
 
 
-def test_every_import_is_declared_and_every_declaration_imported():
+def test_every_import_is_declared_and_every_declaration_imported() -> None:
     """The dependencies in package.xml are what the code imports, no more and no less."""
     assert {KEYS.get(module, module) for module in imported()} == declared('exec_depend')
 
 
-def test_pip_and_ros_install_the_same_libraries():
+def test_pip_and_ros_install_the_same_libraries() -> None:
     """What pip installs without ROS is what package.xml asks rosdep for outside ROS."""
     text = (ROOT / 'setup.py').read_text()
     call = next(
@@ -93,7 +94,7 @@ def complaints(text: str) -> list[str]:
     return found
 
 
-def test_the_manifest_is_valid():
+def test_the_manifest_is_valid() -> None:
     """package.xml is what format 3 allows, without a warning."""
     assert complaints((ROOT / 'package.xml').read_text()) == []
 
@@ -110,7 +111,7 @@ def test_the_manifest_is_valid():
         ('<package format="3">', '<package format="2">'),
     ],
 )
-def test_a_manifest_that_is_not_valid_is_found_out(part, other):
+def test_a_manifest_that_is_not_valid_is_found_out(part: str, other: str) -> None:
     """The check can fail: each slip is reported."""
     text = (ROOT / 'package.xml').read_text()
     changed = text.replace(part, other)
@@ -118,7 +119,7 @@ def test_a_manifest_that_is_not_valid_is_found_out(part, other):
     assert complaints(changed)
 
 
-def test_rosdep_knows_every_name():
+def test_rosdep_knows_every_name() -> None:
     """Each dependency is a package of the distribution or a key of rosdep."""
     tables = yaml.safe_load((DATA / 'rosdep.yaml').read_text())
     packages = {name for names in tables['jazzy/distribution.yaml'].values() for name in names}
@@ -129,7 +130,7 @@ def test_rosdep_knows_every_name():
 
 
 @pytest.fixture(scope='module')
-def source(tmp_path_factory) -> Path:
+def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a copy of the tracked files of this tree, in a colcon workspace."""
     folder = tmp_path_factory.mktemp('workspace') / 'src/needle_insertion'
     for pattern in ('needle_*', 'config', 'launch', 'resource', 'scripts', 'test'):
@@ -161,7 +162,7 @@ def shell(folder: Path, *words: object) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.fixture(scope='module')
-def workspace(source) -> Path:
+def workspace(source: Path) -> Path:
     """Return the colcon workspace, built."""
     folder = source.parent.parent
     built = shell(folder, 'colcon', 'build')
@@ -169,7 +170,7 @@ def workspace(source) -> Path:
     return folder
 
 
-def test_ros2_run_finds_every_node(workspace):
+def test_ros2_run_finds_every_node(workspace: Path) -> None:
     """The index of the sourced workspace leads to a folder with the nodes as executables."""
     look = "import ament_index_python as a; print(a.get_package_prefix('needle_insertion'))"
     command = f'source install/setup.bash && exec {sys.executable} -c "{look}"'
@@ -179,7 +180,9 @@ def test_ros2_run_finds_every_node(workspace):
 
 
 @pytest.mark.parametrize('name', NODES)
-def test_colcon_builds_what_ros2_run_finds(workspace, ros_graph, name):
+def test_colcon_builds_what_ros2_run_finds(
+    workspace: Path, ros_graph: RosGraph, name: str
+) -> None:
     """Each node is an executable where ros2 run looks for it, comes up, and ends well."""
     executable = workspace / 'install/needle_insertion/lib/needle_insertion' / name
     probe = ros_graph.node('probe')
@@ -205,7 +208,7 @@ def test_colcon_builds_what_ros2_run_finds(workspace, ros_graph, name):
         node.wait()
 
 
-def test_colcon_test_runs_tests_and_tells_when_one_fails(workspace, source):
+def test_colcon_test_runs_tests_and_tells_when_one_fails(workspace: Path, source: Path) -> None:
     """`colcon test` runs the tests that colcon.pkg names; a failing one fails `test-result`."""
     selection = json.loads((ROOT / 'colcon.pkg').read_text())['pytest-args']
     shell(workspace, 'colcon', 'test')
@@ -234,14 +237,14 @@ SHARED = [
 ]
 
 
-def test_the_install_carries_what_a_ros_package_carries(workspace):
+def test_the_install_carries_what_a_ros_package_carries(workspace: Path) -> None:
     """Manifest, index entry, configuration, layouts, policies and launch files are installed."""
     share = workspace / 'install/needle_insertion/share'
     assert [name for name in SHARED if not (share / name).is_file()] == []
 
 
 @pytest.fixture(scope='module')
-def environment(source, tmp_path_factory) -> Path:
+def environment(source: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a fresh virtual environment with what an sdist brings and our dependencies."""
     folder = tmp_path_factory.mktemp('fresh')
     build = f'from setuptools import build_meta; build_meta.build_sdist({str(folder)!r})'
@@ -260,7 +263,9 @@ def environment(source, tmp_path_factory) -> Path:
     return folder / 'venv'
 
 
-def test_an_sdist_installs_and_runs(environment, ros_graph, tmp_path):
+def test_an_sdist_installs_and_runs(
+    environment: Path, ros_graph: RosGraph, tmp_path: Path
+) -> None:
     """From the archive alone: all files in place, the command simulates, a node comes up."""
     share = environment / 'share'
     assert [name for name in SHARED if not (share / name).is_file()] == []

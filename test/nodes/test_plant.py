@@ -1,15 +1,18 @@
 """The plant as the graph sees it."""
 
+from collections.abc import Callable
 from pathlib import Path
 import signal
+from signal import Signals
 import subprocess
 import sys
 import time
+from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PointStamped, PoseStamped, WrenchStamped
 from needle_controller.controller_node import ControllerNode
-from needle_dynamics import ForceSensorParameters, IndenterParameters
+from needle_dynamics import FloatArray, ForceSensorParameters, IndenterParameters
 from needle_dynamics.plant_node import PlantNode
 from needle_insertion.experiment.ros_graph import GraphError
 from needle_ros.base_node import COMMAND, LATCHED, SENSOR
@@ -22,6 +25,8 @@ from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
+from std_srvs.srv._trigger import Trigger_Response
+from support.ros_graph import RosGraph
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 import yaml
 
@@ -31,7 +36,7 @@ RATE = {'rate': 200.0}
 NOISE = ForceSensorParameters().force_noise
 
 
-def stamp_ns(message) -> int:
+def stamp_ns(message: Any) -> int:
     """Return the stamp of a message in nanoseconds."""
     return message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec
 
@@ -59,7 +64,7 @@ def trajectory(
 class Bench:
     """A plant in this process with a probe that listens to it and commands it."""
 
-    def __init__(self, ros_graph, **parameters):
+    def __init__(self, ros_graph: RosGraph, **parameters: Any) -> None:
         self.graph = ros_graph
         self.probe = ros_graph.node('probe')
         self.states = ros_graph.listen(self.probe, JointState, 'joint_states', SENSOR)
@@ -80,27 +85,27 @@ class Bench:
             'discovery',
         )
 
-    def until(self, condition, what):
+    def until(self, condition: Callable[..., Any], what: str) -> None:
         self.graph.spin_until(condition, what)
 
-    def further(self, count):
+    def further(self, count: int) -> list[WrenchStamped]:
         """Spin until there are so many more readings of the force; return them."""
         seen = len(self.wrenches)
         self.until(lambda: len(self.wrenches) >= seen + count, 'readings')
         return self.wrenches[seen:]
 
-    def zero(self):
+    def zero(self) -> Trigger_Response:
         """Ask for the tare; return the answer."""
         answer = self.tare.call_async(Trigger.Request())
         self.until(answer.done, 'the answer')
         return answer.result()
 
-    def refused(self, count):
+    def refused(self, count: int) -> None:
         """Spin until so many commands have been refused."""
         self.until(lambda: self.plant.diagnose()[2]['commands refused'] == count, 'the refusal')
 
 
-def test_publishes_its_four_topics_in_step(ros_graph):
+def test_publishes_its_four_topics_in_step(ros_graph: RosGraph) -> None:
     """Each sample appears on all four topics with one stamp, exactly one period after the last."""
     probe = ros_graph.node('probe')
     topics = {
@@ -127,7 +132,7 @@ def test_publishes_its_four_topics_in_step(ros_graph):
     assert topics['base_wrench'][-1].header.frame_id == 'needle_base'
 
 
-def test_moves_under_a_command_and_stops_without_it(ros_graph):
+def test_moves_under_a_command_and_stops_without_it(ros_graph: RosGraph) -> None:
     """A push drives the needle at (f - mu_s) / mu_v, until the command is too old."""
     probe = ros_graph.node('probe')
     states = ros_graph.listen(probe, JointState, 'joint_states', SENSOR)
@@ -147,7 +152,7 @@ def test_moves_under_a_command_and_stops_without_it(ros_graph):
 
 
 @pytest.mark.parametrize('force', [float('nan'), float('inf'), -1e300])
-def test_a_command_that_no_robot_could_mean_is_no_force(ros_graph, force):
+def test_a_command_that_no_robot_could_mean_is_no_force(ros_graph: RosGraph, force: float) -> None:
     """NaN, infinity and absurd forces are refused, counted, and leave the needle where it is."""
     probe = ros_graph.node('probe')
     states = ros_graph.listen(probe, JointState, 'joint_states', SENSOR)
@@ -161,7 +166,7 @@ def test_a_command_that_no_robot_could_mean_is_no_force(ros_graph, force):
     assert states[-1].position[0] == states[0].position[0]
 
 
-def test_the_base_follows_a_trajectory_and_feels_friction(ros_graph):
+def test_the_base_follows_a_trajectory_and_feels_friction(ros_graph: RosGraph) -> None:
     """In mode robot the base is where the trajectory says, and the wrench is mu_s + mu_v u."""
     probe = ros_graph.node('probe')
     states = ros_graph.listen(probe, JointState, 'joint_states', SENSOR)
@@ -183,7 +188,7 @@ def test_the_base_follows_a_trajectory_and_feels_friction(ros_graph):
     assert np.mean(steady) == pytest.approx(3.56, abs=5 * 0.2 * max(NOISE) / np.sqrt(50))
 
 
-def test_a_needle_pulled_out_stands_still_and_is_reported(ros_graph):
+def test_a_needle_pulled_out_stands_still_and_is_reported(ros_graph: RosGraph) -> None:
     """Below the least inserted length the plant stops, and /diagnostics says why."""
     probe = ros_graph.node('probe')
     reports = ros_graph.listen(probe, DiagnosticArray, '/diagnostics', 10)
@@ -198,7 +203,7 @@ def test_a_needle_pulled_out_stands_still_and_is_reported(ros_graph):
     ros_graph.spin_until(reported, 'the report')
 
 
-def test_its_configuration_is_a_parameter_file(ros_graph):
+def test_its_configuration_is_a_parameter_file(ros_graph: RosGraph) -> None:
     """The latched configuration reaches who comes late and holds every parameter."""
     ros_graph.add(PlantNode, parameters={**RATE, 'model.coulomb_friction': 1, 'depth': 0.03})
     late = ros_graph.listen(ros_graph.node('probe'), String, 'plant/configuration', LATCHED)
@@ -210,7 +215,9 @@ def test_its_configuration_is_a_parameter_file(ros_graph):
 
 
 @pytest.mark.parametrize('kind', [PlantNode, ControllerNode])
-def test_its_configuration_makes_it_anew(ros_graph, tmp_path, kind):
+def test_its_configuration_makes_it_anew(
+    ros_graph: RosGraph, tmp_path: Path, kind: type[ControllerNode] | type[PlantNode]
+) -> None:
     """A node started from the configuration of another has the same configuration."""
     layers = {'model.layer_depths': [0.03, 0.06], 'model.layer_stiffnesses': [900.0, 200.0]}
     for parameters in ({}, layers):
@@ -223,7 +230,9 @@ def test_its_configuration_makes_it_anew(ros_graph, tmp_path, kind):
 
 
 @pytest.mark.parametrize('kind', [PlantNode, ControllerNode])
-def test_the_shipped_parameter_file_is_accepted(ros_graph, kind):
+def test_the_shipped_parameter_file_is_accepted(
+    ros_graph: RosGraph, kind: type[ControllerNode] | type[PlantNode]
+) -> None:
     """Every name in config/insertion.yaml is known and every value valid."""
     file = Path(__file__).parents[2] / 'config' / 'insertion.yaml'
     node = ros_graph.add(kind, cli_args=['--ros-args', '--params-file', str(file)])
@@ -245,7 +254,9 @@ def test_the_shipped_parameter_file_is_accepted(ros_graph, kind):
         ({'step': 1e-13}, 'step out of range'),
     ],
 )
-def test_bad_parameters_end_the_process_with_one_line(ros_graph, parameters, complaint):
+def test_bad_parameters_end_the_process_with_one_line(
+    ros_graph: RosGraph, parameters: dict[str, Any], complaint: str
+) -> None:
     """A process that cannot be configured says why in its last line and exits with 2."""
     plant = ros_graph.start('plant', parameters)
     assert plant.process.wait(30) == 2
@@ -299,7 +310,9 @@ def test_bad_parameters_end_the_process_with_one_line(ros_graph, parameters, com
         ),
     ],
 )
-def test_it_refuses_to_be_configured_and_says_why(ros_graph, parameters, complaint):
+def test_it_refuses_to_be_configured_and_says_why(
+    ros_graph: RosGraph, parameters: dict[str, Any], complaint: str
+) -> None:
     """The reason is one line that names the parameter; nothing is left half made."""
     node = ros_graph.add(PlantNode, parameters=parameters, start=False)
     assert not node.start()
@@ -308,7 +321,7 @@ def test_it_refuses_to_be_configured_and_says_why(ros_graph, parameters, complai
 
 
 @pytest.mark.parametrize('name', [signal.SIGINT, signal.SIGTERM])
-def test_signals_end_it_well(ros_graph, name):
+def test_signals_end_it_well(ros_graph: RosGraph, name: Signals) -> None:
     """SIGINT and SIGTERM end the process with 0 and without a traceback."""
     probe = ros_graph.node('probe')
     states = ros_graph.listen(probe, JointState, 'joint_states', SENSOR)
@@ -324,7 +337,9 @@ def test_signals_end_it_well(ros_graph, name):
     [['--params-file', 'missing.yaml'], ['-p', 'depth']],
     ids=['no such file', 'no value'],
 )
-def test_arguments_that_ros_cannot_read_end_in_one_line(tmp_path, arguments):
+def test_arguments_that_ros_cannot_read_end_in_one_line(
+    tmp_path: Path, arguments: list[str]
+) -> None:
     """An unreadable command line is told in one line, with exit status 2."""
     ended = subprocess.run(
         [sys.executable, '-m', 'needle_dynamics.plant_node', '--ros-args', *arguments],
@@ -338,7 +353,7 @@ def test_arguments_that_ros_cannot_read_end_in_one_line(tmp_path, arguments):
     assert 'Traceback' not in ended.stderr
 
 
-def test_beyond_its_range_without_hub_stop_it_stands_still(ros_graph):
+def test_beyond_its_range_without_hub_stop_it_stands_still(ros_graph: RosGraph) -> None:
     """Pushed through by more than its length the plant stops and reports; it does not die."""
     probe = ros_graph.node('probe')
     reports = ros_graph.listen(probe, DiagnosticArray, '/diagnostics', 10)
@@ -354,7 +369,7 @@ def test_beyond_its_range_without_hub_stop_it_stands_still(ros_graph):
     ros_graph.spin_until(reported, 'the report')
 
 
-def test_the_preset_is_fixed_at_start(ros_graph):
+def test_the_preset_is_fixed_at_start(ros_graph: RosGraph) -> None:
     """The defaults follow from the preset, so it cannot change afterwards."""
     plant = ros_graph.add(PlantNode, start=False)
     changed = plant.set_parameters([Parameter('model.preset', value='paper_si')])[0]
@@ -363,7 +378,9 @@ def test_the_preset_is_fixed_at_start(ros_graph):
 
 @pytest.mark.parametrize('kind', [PlantNode, ControllerNode])
 @pytest.mark.parametrize('configured', [False, True])
-def test_it_can_be_shut_down_before_it_was_active(ros_graph, kind, configured):
+def test_it_can_be_shut_down_before_it_was_active(
+    ros_graph: RosGraph, kind: type[ControllerNode] | type[PlantNode], configured: bool
+) -> None:
     """Shutdown is granted from unconfigured and from inactive."""
     node = ros_graph.add(kind, start=False)
     if configured:
@@ -371,7 +388,7 @@ def test_it_can_be_shut_down_before_it_was_active(ros_graph, kind, configured):
     assert node.trigger_shutdown() == TransitionCallbackReturn.SUCCESS
 
 
-def test_a_trajectory_out_of_reach_is_refused(ros_graph):
+def test_a_trajectory_out_of_reach_is_refused(ros_graph: RosGraph) -> None:
     """The base stays where it is when a point lies before the skin or beyond the hub."""
     probe = ros_graph.node('probe')
     states = ros_graph.listen(probe, JointState, 'joint_states', SENSOR)
@@ -387,7 +404,7 @@ def test_a_trajectory_out_of_reach_is_refused(ros_graph):
     assert {message.position[0] for message in states[seen:]} == {0.1}
 
 
-def test_a_push_breaks_the_needle_away_and_a_motion_follows(ros_graph):
+def test_a_push_breaks_the_needle_away_and_a_motion_follows(ros_graph: RosGraph) -> None:
     """An effort ramp moves the base from mu_s on; then positions count from where it is."""
     quiet = {'sensor.force_noise': 0.0, 'sensor.force_resolution': 0.0, 'sensor.filter': 0}
     bench = Bench(ros_graph, mode='robot', depth=0.1, **quiet)
@@ -415,7 +432,7 @@ def test_a_push_breaks_the_needle_away_and_a_motion_follows(ros_graph):
     assert states[-1].position[0] == pytest.approx(0.1, abs=1.5e-6)
 
 
-def test_a_trajectory_sent_before_the_activation_begins_with_it(ros_graph):
+def test_a_trajectory_sent_before_the_activation_begins_with_it(ros_graph: RosGraph) -> None:
     """With the same seed two runs are then the same, sample by sample."""
     runs = []
     for name in ('one', 'two'):
@@ -448,7 +465,7 @@ def test_a_trajectory_sent_before_the_activation_begins_with_it(ros_graph):
     assert runs[0] == runs[1]
 
 
-def test_the_encoder_counts_whole_micrometers(ros_graph):
+def test_the_encoder_counts_whole_micrometers(ros_graph: RosGraph) -> None:
     """In mode robot the joint position is rounded to the encoder's resolution."""
     bench = Bench(ros_graph, mode='robot', depth=0.1, **{'base.encoder_resolution': 1e-4})
     bench.course.publish(trajectory(['insertion'], (0.5, [0.102], [])))
@@ -459,7 +476,7 @@ def test_the_encoder_counts_whole_micrometers(ros_graph):
     assert len(set(np.round(counts))) == 21
 
 
-def test_the_end_effector_presses_the_tissue(ros_graph):
+def test_the_end_effector_presses_the_tissue(ros_graph: RosGraph) -> None:
     """In mode indenter the pose is where K(|F|) d = F, and the wrench is F; nothing else comes."""
     bench = Bench(ros_graph, mode='indenter')
     force = np.array([0.6, -1.2])
@@ -523,7 +540,13 @@ def test_the_end_effector_presses_the_tissue(ros_graph):
         ),
     ],
 )
-def test_trajectories_are_refused_with_their_reason(ros_graph, capfd, mode, message, reason):
+def test_trajectories_are_refused_with_their_reason(
+    ros_graph: RosGraph,
+    capfd: pytest.CaptureFixture[str],
+    mode: str,
+    message: JointTrajectory,
+    reason: str,
+) -> None:
     """What a mode cannot follow is refused in one line, counted, and changes nothing."""
     bench = Bench(ros_graph, mode=mode, depth=0.1)
     bench.course.publish(message)
@@ -533,12 +556,12 @@ def test_trajectories_are_refused_with_their_reason(ros_graph, capfd, mode, mess
         assert bench.states[-1].position[0] == 0.1
 
 
-def test_tare_zeroes_the_readings_at_rest(ros_graph):
+def test_tare_zeroes_the_readings_at_rest(ros_graph: RosGraph) -> None:
     """After the tare the readings are about zero, and stay so after a deactivation."""
     biased = {'sensor.force_bias': [1.0, -2.0, 3.0], 'sensor.torque_bias': 0.1}
     bench = Bench(ros_graph, **biased)
 
-    def mean(messages):
+    def mean(messages: list[WrenchStamped]) -> FloatArray:
         parts = [(m.wrench.force, m.wrench.torque) for m in messages]
         return np.mean([[f.x, f.y, f.z, t.x, t.y, t.z] for f, t in parts], axis=0)
 
@@ -562,7 +585,7 @@ def test_tare_zeroes_the_readings_at_rest(ros_graph):
     assert np.all(np.abs(mean(bench.further(110)[10:]) - offset) < bound)
 
 
-def test_tare_is_refused_while_the_needle_moves(ros_graph):
+def test_tare_is_refused_while_the_needle_moves(ros_graph: RosGraph) -> None:
     """A moving needle cannot be zeroed, nor one that has just come to rest."""
     bench = Bench(ros_graph)
 
@@ -584,7 +607,7 @@ def test_tare_is_refused_while_the_needle_moves(ros_graph):
     assert bench.zero().success
 
 
-def test_simulated_time_runs_faster(ros_graph):
+def test_simulated_time_runs_faster(ros_graph: RosGraph) -> None:
     """At ten times the pace 10 s of stamps pass in about 1 s; not one sample is missing."""
     bench = Bench(ros_graph, rate=100.0, real_time_factor=10.0)
     begin, first = time.monotonic(), len(bench.states)
@@ -598,7 +621,9 @@ def test_simulated_time_runs_faster(ros_graph):
 
 
 @pytest.mark.parametrize('factor', [1.0, 2.0])
-def test_after_a_stall_samples_are_given_up_or_simulated_time_waits(ros_graph, factor):
+def test_after_a_stall_samples_are_given_up_or_simulated_time_waits(
+    ros_graph: RosGraph, factor: float
+) -> None:
     """Stamps that are the node's clock skip what is beyond the backlog; others never skip."""
     bench = Bench(ros_graph, rate=100.0, real_time_factor=factor, backlog=0.05)
     bench.further(20)
@@ -617,7 +642,7 @@ def test_after_a_stall_samples_are_given_up_or_simulated_time_waits(ros_graph, f
         assert set(stamps) <= {9_999_999, 10_000_000, 10_000_001}
 
 
-def test_its_clock_drives_a_node_with_simulated_time(ros_graph):
+def test_its_clock_drives_a_node_with_simulated_time(ros_graph: RosGraph) -> None:
     """A node with use_sim_time is never ahead of the newest sample, and goes with it."""
     follower = ros_graph.add(Node, 'follower', parameters={'use_sim_time': True})
     bench = Bench(ros_graph, rate=100.0, real_time_factor=10.0, publish_clock=True)
@@ -633,7 +658,7 @@ def test_its_clock_drives_a_node_with_simulated_time(ros_graph):
     assert now in {stamp_ns(message) for message in bench.states}
 
 
-def test_a_command_ages_in_simulated_time(ros_graph):
+def test_a_command_ages_in_simulated_time(ros_graph: RosGraph) -> None:
     """At five times the pace a command of 0.1 s counts for 0.02 s of the node's clock."""
     bench = Bench(ros_graph, rate=1000.0, real_time_factor=5.0)
     bench.commands.publish(wrench(3.56))
@@ -644,7 +669,7 @@ def test_a_command_ages_in_simulated_time(ros_graph):
     assert 0.08e9 < moving[-1] - moving[0] < 0.3e9
 
 
-def test_friction_may_change_while_it_moves(ros_graph):
+def test_friction_may_change_while_it_moves(ros_graph: RosGraph) -> None:
     """A live change of friction alters the speed at once, and not the depth."""
     bench = Bench(ros_graph)
     configurations = bench.graph.listen(bench.probe, String, 'plant/configuration', LATCHED)
@@ -673,7 +698,7 @@ def test_friction_may_change_while_it_moves(ros_graph):
     bench.until(lambda: 'model.coulomb_friction: 2.06' in configurations[-1].data, 'configuration')
 
 
-def test_the_controller_takes_friction_live_if_its_gains_can_bear_it(ros_graph):
+def test_the_controller_takes_friction_live_if_its_gains_can_bear_it(ros_graph: RosGraph) -> None:
     """Friction is checked as at the start; what is refused leaves the value, and says why."""
     node = ros_graph.add(ControllerNode, parameters={**RATE, 'law': 'pid'})
     friction = [Parameter('model.viscous_friction', value=value) for value in (200.0, 0.3)]
@@ -719,7 +744,13 @@ def test_the_controller_takes_friction_live_if_its_gains_can_bear_it(ros_graph):
         ),
     ],
 )
-def test_what_cannot_change_live_is_refused(ros_graph, kind, name, value, reason):
+def test_what_cannot_change_live_is_refused(
+    ros_graph: RosGraph,
+    kind: type[ControllerNode] | type[PlantNode],
+    name: str,
+    value: bool | float | str,
+    reason: str,
+) -> None:
     """A refused change says why and leaves the value."""
     node = ros_graph.add(kind, parameters=RATE)
     before = node.get_parameter(name).value

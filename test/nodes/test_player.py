@@ -1,5 +1,6 @@
 """What is in a bag goes into the graph: every byte, in order, at the pace that was asked for."""
 
+from collections.abc import Callable
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
@@ -7,7 +8,9 @@ import signal
 import subprocess
 import sys
 import time
+from typing import Any
 
+from builtin_interfaces.msg._time import Time
 from diagnostic_msgs.msg import DiagnosticStatus
 from mcap.writer import Writer as McapWriter
 from needle_identification import BagWriter, OfferedQos, read_topic
@@ -26,6 +29,9 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
+from std_srvs.srv._set_bool import SetBool_Request
+from std_srvs.srv._trigger import Trigger_Request
+from support.ros_graph import RosGraph
 
 MILLISECOND = 1_000_000
 #: Start of the recordings [ns].
@@ -84,7 +90,7 @@ def bytes_of(bag: Path, topic: str) -> list[bytes]:
 class Listener:
     """Hears topics as bytes, in order, with the time at which each came."""
 
-    def __init__(self, ros_graph, **topics) -> None:
+    def __init__(self, ros_graph: RosGraph, **topics: tuple[Any, ...]) -> None:
         self._graph = ros_graph
         self._node = ros_graph.node('listener')
         self.heard: list[tuple[str, bytes, float]] = []
@@ -93,7 +99,7 @@ class Listener:
             for name, (kind, qos) in topics.items()
         ]
 
-    def _taker(self, name: str):
+    def _taker(self, name: str) -> Callable[..., Any]:
         return lambda data: self.heard.append((name, data, time.monotonic()))
 
     def of(self, name: str) -> list[bytes]:
@@ -106,7 +112,12 @@ class Listener:
         )
 
 
-def call(ros_graph, kind, service, request):
+def call(
+    ros_graph: RosGraph,
+    kind: type[SetBool] | type[Trigger],
+    service: str,
+    request: SetBool_Request | Trigger_Request,
+) -> tuple[bool, str]:
     client = ros_graph.node('caller').create_client(kind, f'player/{service}')
     ros_graph.spin_until(client.service_is_ready, service)
     # An answer to a client that the other side does not know yet is lost: a harmless question
@@ -125,12 +136,12 @@ def call(ros_graph, kind, service, request):
     return answer.result().success, answer.result().message
 
 
-def go(ros_graph) -> None:
+def go(ros_graph: RosGraph) -> None:
     """Let a player that began paused play."""
     assert call(ros_graph, SetBool, 'pause', SetBool.Request(data=False))[0]
 
 
-def play(ros_graph, bag: Path, **parameters) -> PlayerNode:
+def play(ros_graph: RosGraph, bag: Path, **parameters: bool | float | list[str]) -> PlayerNode:
     return ros_graph.add(PlayerNode, parameters={'path': str(bag), **HELD, **parameters})
 
 
@@ -138,7 +149,7 @@ BOTH = {'text': (String, EVERYTHING), 'joints': (JointState, WEAK)}
 
 
 @pytest.mark.parametrize('rate', [0.0, 1.0, 20.0])
-def test_plays_every_byte_in_order(ros_graph, tmp_path, rate):
+def test_plays_every_byte_in_order(ros_graph: RosGraph, tmp_path: Path, rate: float) -> None:
     """What is heard is what was written, per topic and across topics, at any rate."""
     bag = small_bag(tmp_path / 'bag')
     player = play(ros_graph, bag, rate=rate)
@@ -151,7 +162,9 @@ def test_plays_every_byte_in_order(ros_graph, tmp_path, rate):
     assert player.diagnose()[2]['messages'] == 42
 
 
-def test_what_is_recorded_of_a_replay_is_the_recording(ros_graph, tmp_path):
+def test_what_is_recorded_of_a_replay_is_the_recording(
+    ros_graph: RosGraph, tmp_path: Path
+) -> None:
     """Recorder, player, recorder: the second bag holds the bytes of the first."""
     bag = small_bag(tmp_path / 'bag')
     play(ros_graph, bag, rate=2.0)
@@ -178,7 +191,7 @@ def test_what_is_recorded_of_a_replay_is_the_recording(ros_graph, tmp_path):
 
 
 @pytest.mark.parametrize('rate', [0.5, 10.0])
-def test_keeps_the_pace_of_the_recording(ros_graph, tmp_path, rate):
+def test_keeps_the_pace_of_the_recording(ros_graph: RosGraph, tmp_path: Path, rate: float) -> None:
     """No message is early; the machine may make it late, which the player says."""
     step = 20 if rate < 1.0 else 200
     bag = small_bag(tmp_path / 'bag', step=step)
@@ -198,7 +211,7 @@ def test_keeps_the_pace_of_the_recording(ros_graph, tmp_path, rate):
     )
 
 
-def test_a_latched_message_reaches_who_comes_late(ros_graph, tmp_path):
+def test_a_latched_message_reaches_who_comes_late(ros_graph: RosGraph, tmp_path: Path) -> None:
     """Readers that come after the end get the last latched message, as of the plant itself."""
     bag = small_bag(tmp_path / 'bag')
     player = ros_graph.add(PlayerNode, parameters={'path': str(bag), 'rate': 0.0, 'delay': 0.0})
@@ -210,12 +223,12 @@ def test_a_latched_message_reaches_who_comes_late(ros_graph, tmp_path):
     assert player.diagnose()[1] == f'at the end of {bag}'
 
 
-def test_offers_what_was_offered(ros_graph, tmp_path):
+def test_offers_what_was_offered(ros_graph: RosGraph, tmp_path: Path) -> None:
     """Best effort, reliable and latched topics are offered as such."""
     play(ros_graph, small_bag(tmp_path / 'bag'))
     probe = ros_graph.node('probe')
 
-    def offered(topic):
+    def offered(topic: str) -> list[QoSProfile]:
         return [each.qos_profile for each in probe.get_publishers_info_by_topic(topic)]
 
     ros_graph.spin_until(
@@ -228,7 +241,7 @@ def test_offers_what_was_offered(ros_graph, tmp_path):
     assert latched.durability == DurabilityPolicy.TRANSIENT_LOCAL
 
 
-def test_begins_and_ends_where_it_is_told(ros_graph, tmp_path):
+def test_begins_and_ends_where_it_is_told(ros_graph: RosGraph, tmp_path: Path) -> None:
     """Only what lies between is played, but for what was latched before: it comes first."""
     play(ros_graph, small_bag(tmp_path / 'bag'), rate=0.0, start=0.05, end=0.1)
     listener = Listener(ros_graph, latched=(String, EVERYTHING), text=(String, EVERYTHING))
@@ -240,7 +253,7 @@ def test_begins_and_ends_where_it_is_told(ros_graph, tmp_path):
     assert listener.of('latched') == [text('new')]
 
 
-def test_begins_again_at_the_end(ros_graph, tmp_path):
+def test_begins_again_at_the_end(ros_graph: RosGraph, tmp_path: Path) -> None:
     """With ``loop`` the messages come over and over, whole and in order."""
     player = play(ros_graph, small_bag(tmp_path / 'bag', step=1), rate=10.0, loop=True)
     listener = Listener(ros_graph, text=(String, EVERYTHING))
@@ -251,7 +264,7 @@ def test_begins_again_at_the_end(ros_graph, tmp_path):
     assert player.diagnose()[2]['loops'] >= 3
 
 
-def test_pauses_steps_and_goes_on(ros_graph, tmp_path):
+def test_pauses_steps_and_goes_on(ros_graph: RosGraph, tmp_path: Path) -> None:
     """A step plays one message and names it; nothing else comes while paused."""
     bag = small_bag(tmp_path / 'bag')
     play(ros_graph, bag, rate=0.0, publish_clock=True, topics=['/text', '/joints'])
@@ -286,14 +299,16 @@ def test_pauses_steps_and_goes_on(ros_graph, tmp_path):
     assert listener.of('joints') == bytes_of(bag, '/joints')
 
 
-def _time(since: int):
+def _time(since: int) -> Time:
     seconds, rest = divmod(EPOCH + since, 10**9)
     clock = Clock()
     clock.clock.sec, clock.clock.nanosec = seconds, rest
     return clock.clock
 
 
-def test_the_recorded_time_is_the_clock_of_who_wants_it(ros_graph, tmp_path):
+def test_the_recorded_time_is_the_clock_of_who_wants_it(
+    ros_graph: RosGraph, tmp_path: Path
+) -> None:
     """With ``publish_clock`` a node with `use_sim_time` lives in the recording, not now."""
     bag = small_bag(tmp_path / 'bag', extra='/clock')
     play(ros_graph, bag, rate=0.1, publish_clock=True)
@@ -316,7 +331,7 @@ def test_the_recorded_time_is_the_clock_of_who_wants_it(ros_graph, tmp_path):
     assert len(stamps) > 100
 
 
-def test_the_pace_changes_while_playing(ros_graph, tmp_path):
+def test_the_pace_changes_while_playing(ros_graph: RosGraph, tmp_path: Path) -> None:
     """``rate`` is live, and refused when it is none."""
     player = play(ros_graph, small_bag(tmp_path / 'bag', step=60_000), rate=1.0)
     listener = Listener(ros_graph, text=(String, EVERYTHING))
@@ -333,7 +348,9 @@ def test_the_pace_changes_while_playing(ros_graph, tmp_path):
     ros_graph.spin_until(lambda: len(listener.heard) == 20, 'the rest')
 
 
-def test_a_recording_that_is_cut_off_is_played_as_far_as_it_goes(ros_graph, tmp_path):
+def test_a_recording_that_is_cut_off_is_played_as_far_as_it_goes(
+    ros_graph: RosGraph, tmp_path: Path
+) -> None:
     """What can be read is played; what is missing is said in the end."""
     bag = small_bag(tmp_path / 'bag', count=600, step=1)
     file = bag / 'bag_0.mcap'
@@ -354,7 +371,7 @@ def test_a_recording_that_is_cut_off_is_played_as_far_as_it_goes(ros_graph, tmp_
     assert 'the recording was not closed' in said
 
 
-def test_plays_sqlite_and_bare_files(ros_graph, tmp_path):
+def test_plays_sqlite_and_bare_files(ros_graph: RosGraph, tmp_path: Path) -> None:
     """Recordings of other tools are played, with what they know of the quality of service."""
     store = get_typestore(Stores.ROS2_JAZZY)
     with Writer(tmp_path / 'bag', version=8, storage_plugin=StoragePlugin.SQLITE3) as writer:
@@ -370,7 +387,9 @@ def test_plays_sqlite_and_bare_files(ros_graph, tmp_path):
     assert listener.of('text') == [text('000'), text('001'), text('002')]
 
 
-def test_a_type_that_is_not_installed_is_left_out_and_said(ros_graph, tmp_path):
+def test_a_type_that_is_not_installed_is_left_out_and_said(
+    ros_graph: RosGraph, tmp_path: Path
+) -> None:
     """The rest is played."""
     path = tmp_path / 'bag'
     path.mkdir()
@@ -394,7 +413,7 @@ def foreign_bag(file: Path) -> None:
         writer.finish()
 
 
-def test_another_publisher_of_a_topic_is_said(ros_graph, tmp_path):
+def test_another_publisher_of_a_topic_is_said(ros_graph: RosGraph, tmp_path: Path) -> None:
     """Readers would get both: /diagnostics warns, and it is played all the same."""
     probe = ros_graph.node('probe')
     probe.create_publisher(JointState, 'joints', SENSOR)
@@ -421,7 +440,13 @@ def test_another_publisher_of_a_topic_is_said(ros_graph, tmp_path):
         ({'publish_clock': True, 'use_sim_time': True}, 'cannot both be true'),
     ],
 )
-def test_refuses_to_start_and_says_why(ros_graph, tmp_path, monkeypatch, parameters, complaint):
+def test_refuses_to_start_and_says_why(
+    ros_graph: RosGraph,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    parameters: dict[str, Any],
+    complaint: str,
+) -> None:
     """Bad input is named in one line, and nothing is played."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / 'empty').mkdir()
@@ -432,7 +457,7 @@ def test_refuses_to_start_and_says_why(ros_graph, tmp_path, monkeypatch, paramet
     assert '\n' not in node.failure
 
 
-def test_a_recording_of_unknown_types_only_is_refused(ros_graph, tmp_path):
+def test_a_recording_of_unknown_types_only_is_refused(ros_graph: RosGraph, tmp_path: Path) -> None:
     """There is nothing to play, and the reason is given."""
     foreign_bag(tmp_path / 'bag.mcap')
     parameters = {'path': str(tmp_path / 'bag.mcap'), 'topics': ['/foreign']}
@@ -441,7 +466,7 @@ def test_a_recording_of_unknown_types_only_is_refused(ros_graph, tmp_path):
     assert 'has nothing to play; /foreign: lab_msgs/msg/Force is not installed' in node.failure
 
 
-def process(ros_graph, bag: Path, *settings: str) -> subprocess.Popen:
+def process(ros_graph: RosGraph, bag: Path, *settings: str) -> subprocess.Popen:
     """Start the player as ``ros2 run`` does."""
     words = [f'path:={bag}', *settings]
     options = [word for setting in words for word in ('-p', setting)]
@@ -453,7 +478,9 @@ def process(ros_graph, bag: Path, *settings: str) -> subprocess.Popen:
     )
 
 
-def test_the_process_ends_well_when_all_is_played_and_delivered(ros_graph, tmp_path):
+def test_the_process_ends_well_when_all_is_played_and_delivered(
+    ros_graph: RosGraph, tmp_path: Path
+) -> None:
     """As `ros2 bag play`: exit status 0 at the end, and the reader has every message."""
     bag = small_bag(tmp_path / 'bag')
     listener = Listener(ros_graph, text=(String, EVERYTHING))
@@ -468,7 +495,9 @@ def test_the_process_ends_well_when_all_is_played_and_delivered(ros_graph, tmp_p
     assert listener.of('text') == bytes_of(bag, '/text')
 
 
-def test_the_process_stays_if_it_shall_and_ends_with_ctrl_c(ros_graph, tmp_path):
+def test_the_process_stays_if_it_shall_and_ends_with_ctrl_c(
+    ros_graph: RosGraph, tmp_path: Path
+) -> None:
     """Without ``exit_at_end`` latched messages stay to be had; SIGINT ends it with status 0."""
     bag = small_bag(tmp_path / 'bag')
     probe = ros_graph.node('probe')
@@ -482,7 +511,7 @@ def test_the_process_stays_if_it_shall_and_ends_with_ctrl_c(ros_graph, tmp_path)
     assert player.returncode == 0, said
 
 
-def test_the_process_says_why_it_does_not_start(ros_graph, tmp_path):
+def test_the_process_says_why_it_does_not_start(ros_graph: RosGraph, tmp_path: Path) -> None:
     """Exit status 2 and one line."""
     with process(ros_graph, tmp_path / 'none') as player:
         _, said = player.communicate(timeout=60.0)

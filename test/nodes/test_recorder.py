@@ -1,7 +1,10 @@
 """What is on the wire is in the bag, whatever ends the recorder."""
 
+from collections.abc import Callable, Iterator
 import errno
+from pathlib import Path
 import time
+from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from nav_msgs.msg import Goals
@@ -15,15 +18,16 @@ from rclpy.serialization import serialize_message
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
+from support.ros_graph import RosGraph
 import yaml
 
 
 @pytest.fixture
-def record(ros_graph):
+def record(ros_graph: RosGraph) -> Iterator[Callable[..., Any]]:
     """Return a function that makes an active recorder; its bag is closed in the end."""
     nodes = []
 
-    def make(path, **parameters):
+    def make(path: Path, **parameters: list[str]) -> RecorderNode:
         nodes.append(ros_graph.add(RecorderNode, parameters={'path': str(path), **parameters}))
         return nodes[-1]
 
@@ -32,7 +36,7 @@ def record(ros_graph):
         node.stop()
 
 
-def call(ros_graph, service):
+def call(ros_graph: RosGraph, service: str) -> tuple[bool, str]:
     client = ros_graph.node('caller').create_client(Trigger, service)
     ros_graph.spin_until(client.service_is_ready, service)
     answer = client.call_async(Trigger.Request())
@@ -40,7 +44,9 @@ def call(ros_graph, service):
     return answer.result().success, answer.result().message
 
 
-def test_records_each_topic_as_it_is_offered(ros_graph, record, tmp_path):
+def test_records_each_topic_as_it_is_offered(
+    ros_graph: RosGraph, record: Callable[..., Any], tmp_path: Path
+) -> None:
     """Best effort, reliable and latched topics are all complete, to the byte."""
     probe = ros_graph.node('probe')
     publishers = {
@@ -88,7 +94,12 @@ def test_records_each_topic_as_it_is_offered(ros_graph, record, tmp_path):
     assert offered['/latched']['durability'] == 'transient_local'
 
 
-def test_stores_the_bytes_of_the_wire(ros_graph, record, tmp_path, monkeypatch):
+def test_stores_the_bytes_of_the_wire(
+    ros_graph: RosGraph,
+    record: Callable[..., Any],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """Nothing is decoded on the way to the bag."""
     written = []
     monkeypatch.setattr(BagWriter, 'write', lambda _bag, *what: written.append(what))
@@ -100,7 +111,9 @@ def test_stores_the_bytes_of_the_wire(ros_graph, record, tmp_path, monkeypatch):
     assert written[0][:2] == ('/text', serialize_message(String(data='as it is')))
 
 
-def test_a_publisher_that_offers_less_is_recorded_too(ros_graph, record, tmp_path):
+def test_a_publisher_that_offers_less_is_recorded_too(
+    ros_graph: RosGraph, record: Callable[..., Any], tmp_path: Path
+) -> None:
     """A best-effort publisher that joins a reliable topic makes the recorder ask for less."""
     probe = ros_graph.node('probe')
     reliable = probe.create_publisher(String, 'text', COMMAND)
@@ -123,8 +136,8 @@ def test_a_publisher_that_offers_less_is_recorded_too(ros_graph, record, tmp_pat
 
 
 def test_a_topic_of_a_type_it_cannot_describe_is_left_out_and_named_once(
-    ros_graph, record, tmp_path
-):
+    ros_graph: RosGraph, record: Callable[..., Any], tmp_path: Path
+) -> None:
     """What cannot be recorded is said once, and the rest is recorded."""
     probe = ros_graph.node('probe')
     logs = ros_graph.listen(probe, Log, '/rosout', 100)
@@ -141,7 +154,9 @@ def test_a_topic_of_a_type_it_cannot_describe_is_left_out_and_named_once(
     assert said.startswith('/goals left out: no definition of nav_msgs/msg/Goals')
 
 
-def test_stops_and_starts_again_in_a_new_folder(ros_graph, record, tmp_path):
+def test_stops_and_starts_again_in_a_new_folder(
+    ros_graph: RosGraph, record: Callable[..., Any], tmp_path: Path
+) -> None:
     """Services end one recording, complete, and begin the next."""
     record(tmp_path / 'bag')
     assert call(ros_graph, 'recorder/start') == (False, 'recording already')
@@ -167,7 +182,13 @@ def test_stops_and_starts_again_in_a_new_folder(ros_graph, record, tmp_path):
         ),
     ],
 )
-def test_refuses_to_start_and_says_why(ros_graph, tmp_path, monkeypatch, parameters, complaint):
+def test_refuses_to_start_and_says_why(
+    ros_graph: RosGraph,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    parameters: dict[str, str],
+    complaint: str,
+) -> None:
     """A recorder that cannot record does not become active."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / 'here').mkdir()
@@ -177,8 +198,11 @@ def test_refuses_to_start_and_says_why(ros_graph, tmp_path, monkeypatch, paramet
 
 
 def test_an_error_of_the_disk_ends_the_recording_and_is_reported(
-    ros_graph, record, tmp_path, monkeypatch
-):
+    ros_graph: RosGraph,
+    record: Callable[..., Any],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """A full disk stops the recording, not the node, and /diagnostics says so."""
     probe = ros_graph.node('probe')
     publisher = probe.create_publisher(String, 'text', COMMAND)
@@ -186,7 +210,7 @@ def test_an_error_of_the_disk_ends_the_recording_and_is_reported(
     node = record(tmp_path / 'bag', topics=['text'])
     ros_graph.spin_until(publisher.get_subscription_count, 'subscription')
 
-    def full(*_arguments):
+    def full(*_arguments: Any) -> None:
         raise OSError(errno.ENOSPC, 'No space left on device')
 
     monkeypatch.setattr(BagWriter, 'write', full)
@@ -200,7 +224,7 @@ def test_an_error_of_the_disk_ends_the_recording_and_is_reported(
     assert not (tmp_path / 'bag' / 'metadata.yaml').exists()
 
 
-def publish(ros_graph, node: Node, count: int) -> None:
+def publish(ros_graph: RosGraph, node: Node, count: int) -> None:
     """Publish numbers on /text at 100 Hz, once the recorder listens."""
     publisher = node.create_publisher(String, 'text', COMMAND)
     ros_graph.spin_until(publisher.get_subscription_count, 'the recorder')
@@ -209,7 +233,7 @@ def publish(ros_graph, node: Node, count: int) -> None:
         time.sleep(0.01)
 
 
-def test_what_was_recorded_survives_kill_9(ros_graph, tmp_path):
+def test_what_was_recorded_survives_kill_9(ros_graph: RosGraph, tmp_path: Path) -> None:
     """After SIGKILL all is there but the last half second, and the folder is not complete."""
     process = ros_graph.start('recorder', {'path': str(tmp_path / 'bag')}).process
     publish(ros_graph, ros_graph.node('probe'), 200)
@@ -222,7 +246,7 @@ def test_what_was_recorded_survives_kill_9(ros_graph, tmp_path):
     assert len(data) >= 100
 
 
-def test_ctrl_c_completes_the_bag(ros_graph, tmp_path):
+def test_ctrl_c_completes_the_bag(ros_graph: RosGraph, tmp_path: Path) -> None:
     """SIGINT ends the recorder with every message and the metadata in place."""
     process = ros_graph.start('recorder', {'path': str(tmp_path / 'bag')})
     probe = ros_graph.node('probe')

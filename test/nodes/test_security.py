@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 from collections.abc import Mapping
+from pathlib import Path
 import subprocess
 import sys
 from typing import NamedTuple
@@ -13,6 +14,7 @@ from needle_insertion.experiment.protocol import SHIPPED_BAGS
 from needle_ros.base_node import BaseNode
 import pytest
 from support.installed import node_class, NODES, ROOT
+from support.ros_graph import RosGraph
 
 POLICIES = ROOT / 'config/security/policies.xml'
 
@@ -90,7 +92,9 @@ def made(node: BaseNode) -> Profile:
 
 
 @pytest.mark.parametrize('name', NODES)
-def test_each_node_may_do_what_it_does_and_no_more(ros_graph, tmp_path, name):
+def test_each_node_may_do_what_it_does_and_no_more(
+    ros_graph: RosGraph, tmp_path: Path, name: str
+) -> None:
     """The policy names every topic and service that the node has, and none that it never has."""
     uses = []
     for settings in SETTINGS[name]:
@@ -115,7 +119,7 @@ def test_each_node_may_do_what_it_does_and_no_more(ros_graph, tmp_path, name):
             assert there == allowed, rule
 
 
-def test_all_that_nodes_say_can_be_recorded_and_played():
+def test_all_that_nodes_say_can_be_recorded_and_played() -> None:
     """Recorder and player know every topic of the others; each request has a node to answer."""
     said = frozenset().union(*(profile.publish for profile in POLICY.values())) - NOT_RECORDED
     assert POLICY['recorder'].subscribe == said
@@ -129,7 +133,9 @@ def test_all_that_nodes_say_can_be_recorded_and_played():
     assert commanding == {'controller', 'player'}
 
 
-def test_no_node_starts_without_credentials_where_they_are_enforced(ros_graph, tmp_path):
+def test_no_node_starts_without_credentials_where_they_are_enforced(
+    ros_graph: RosGraph, tmp_path: Path
+) -> None:
     """A node that has none, or whose middleware cannot check them, ends before it runs bare."""
     probe = ros_graph.node('probe')
     (tmp_path / 'enclaves').mkdir()
@@ -151,7 +157,7 @@ def test_no_node_starts_without_credentials_where_they_are_enforced(ros_graph, t
     assert probe.count_publishers('joint_states') == 0
 
 
-def test_what_we_start_stays_on_this_machine(ros_graph):
+def test_what_we_start_stays_on_this_machine(ros_graph: RosGraph) -> None:
     """Our processes and the launch file look for others on this machine only, unless asked."""
     assert ros_graph.environment['ROS_AUTOMATIC_DISCOVERY_RANGE'] == 'LOCALHOST'
     launch = ast.parse((ROOT / 'launch/insertion.launch.py').read_text())

@@ -1,5 +1,9 @@
 """Manners of the simulated plant: pause, step, reset, lock-step, stamps of commands, faults."""
 
+from collections.abc import Callable
+from typing import Any
+
+from builtin_interfaces.msg._time import Time
 from geometry_msgs.msg import PointStamped, PoseArray, WrenchStamped
 from needle_dynamics import NeedleModel, NeedleParameters
 from needle_dynamics.plant_node import PlantNode
@@ -10,13 +14,14 @@ from rclpy.parameter import Parameter
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool, Trigger
+from support.ros_graph import RosGraph
 from visualization_msgs.msg import Marker
 
 RATE = {'rate': 200.0}
 PERIOD = 5_000_000
 
 
-def stamp_ns(message):
+def stamp_ns(message: PoseArray | JointState | Marker) -> int:
     """Return the stamp of a message in nanoseconds."""
     return message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec
 
@@ -24,7 +29,7 @@ def stamp_ns(message):
 class Bench:
     """A plant in this process, with a probe that listens, commands and calls its services."""
 
-    def __init__(self, ros_graph, **parameters):
+    def __init__(self, ros_graph: RosGraph, **parameters: bool | float | str) -> None:
         self.graph = ros_graph
         self.probe = ros_graph.node('probe')
         #: Force with which each sample is answered; None: not at all.
@@ -47,13 +52,13 @@ class Bench:
             'discovery',
         )
 
-    def on_state(self, message):
+    def on_state(self, message: JointState) -> None:
         """Keep a sample, and answer it."""
         self.states.append(message)
         if self.force is not None:
             self.command(self.force, stamp=message.header.stamp)
 
-    def command(self, force, stamp=None, frame=''):
+    def command(self, force: float, stamp: Time | None = None, frame: str = '') -> None:
         """Publish a command."""
         message = WrenchStamped()
         message.header.frame_id = frame
@@ -62,24 +67,24 @@ class Bench:
         message.wrench.force.y = force
         self.commands.publish(message)
 
-    def until(self, condition, what):
+    def until(self, condition: Callable[..., Any], what: str) -> None:
         """Spin until a condition holds."""
         self.graph.spin_until(condition, what)
 
-    def further(self, count):
+    def further(self, count: int) -> list[JointState]:
         """Spin until there are so many more samples; return them."""
         seen = len(self.states)
         self.until(lambda: len(self.states) >= seen + count, 'samples')
         return self.states[seen:]
 
-    def call(self, name, data=None):
+    def call(self, name: str, data: bool | None = None) -> tuple[bool, str]:
         """Call a service; return whether it was granted and what it said."""
         request = Trigger.Request() if data is None else SetBool.Request(data=data)
         answer = self.services[name].call_async(request)
         self.until(answer.done, 'the answer')
         return answer.result().success, answer.result().message
 
-    def set(self, **values):
+    def set(self, **values: float | str) -> None:
         """Change parameters."""
         parameters = [
             Parameter(name.replace('__', '.'), value=value) for name, value in values.items()
@@ -87,11 +92,11 @@ class Bench:
         changed = self.plant.set_parameters_atomically(parameters)
         assert changed.successful, changed.reason
 
-    def counts(self, name):
+    def counts(self, name: str) -> int:
         """Return a figure of the diagnostics."""
         return self.plant.diagnose()[2][name]
 
-    def quiet(self):
+    def quiet(self) -> None:
         """Spin until nothing has come for ten periods."""
         for _ in range(100):
             seen = len(self.states)
@@ -102,12 +107,12 @@ class Bench:
         pytest.fail('samples come all the time')
 
 
-def test_a_command_acts_from_the_sample_after_it(ros_graph):
+def test_a_command_acts_from_the_sample_after_it(ros_graph: RosGraph) -> None:
     """The answer to sample k moves the needle from k + 1 to k + 2: one period of delay."""
     bench = Bench(ros_graph, lockstep=True, **{'model.preset': 'paper_mm'})
     forces = {}
 
-    def answer(message):
+    def answer(message: JointState) -> None:
         # Friction is settled within microseconds: the speed tells the force.
         k = round(stamp_ns(message) / PERIOD)
         forces[k] = 0.56 + 3.0 * (1 + k % 5)
@@ -121,7 +126,7 @@ def test_a_command_acts_from_the_sample_after_it(ros_graph):
         assert message.velocity[0] == pytest.approx((forces[k - 2] - 0.56) / 300.0, rel=1e-9)
 
 
-def test_in_a_pause_time_stands_and_steps_are_single_samples(ros_graph):
+def test_in_a_pause_time_stands_and_steps_are_single_samples(ros_graph: RosGraph) -> None:
     """Nothing comes in a pause but what is asked for; time goes on where it stood."""
     bench = Bench(ros_graph, publish_clock=True)
     clocks = ros_graph.listen(bench.probe, Clock, '/clock', SENSOR)
@@ -146,7 +151,7 @@ def test_in_a_pause_time_stands_and_steps_are_single_samples(ros_graph):
     bench.until(lambda: any(message.clock == last for message in clocks), 'its time')
 
 
-def test_it_may_begin_paused(ros_graph):
+def test_it_may_begin_paused(ros_graph: RosGraph) -> None:
     """With `paused` nothing comes before time is let go on."""
     bench = Bench(ros_graph, paused=True)
     bench.quiet()
@@ -155,7 +160,7 @@ def test_it_may_begin_paused(ros_graph):
     bench.further(10)
 
 
-def test_reset_puts_the_needle_back_while_time_goes_on(ros_graph):
+def test_reset_puts_the_needle_back_while_time_goes_on(ros_graph: RosGraph) -> None:
     """Depth, speed and noise are those of the start, stamps never go back, and it is not held."""
     bench = Bench(ros_graph, lockstep=True, paused=True, tip_deflection=5e-4)
     bench.force = 3.56
@@ -175,7 +180,7 @@ def test_reset_puts_the_needle_back_while_time_goes_on(ros_graph):
     assert again == first
 
 
-def test_reset_revives_a_plant_that_stands_still(ros_graph):
+def test_reset_revives_a_plant_that_stands_still(ros_graph: RosGraph) -> None:
     """A needle that left the tissue is back in it."""
     bench = Bench(ros_graph, depth=0.002)
     bench.force = -3.0
@@ -187,7 +192,7 @@ def test_reset_revives_a_plant_that_stands_still(ros_graph):
     assert bench.further(5)[-1].position[0] == pytest.approx(0.002, abs=1e-15)
 
 
-def test_services_of_a_plant_that_is_not_active_are_refused(ros_graph):
+def test_services_of_a_plant_that_is_not_active_are_refused(ros_graph: RosGraph) -> None:
     """Each says why."""
     bench = Bench(ros_graph)
     bench.plant.trigger_deactivate()
@@ -195,7 +200,7 @@ def test_services_of_a_plant_that_is_not_active_are_refused(ros_graph):
         assert bench.call(name, data) == (False, f'{name} refused: the plant is not active')
 
 
-def test_in_lockstep_the_plant_waits_and_says_for_what(ros_graph):
+def test_in_lockstep_the_plant_waits_and_says_for_what(ros_graph: RosGraph) -> None:
     """Without an answer time stands, the sample is repeated, and the diagnostics tell."""
     bench = Bench(ros_graph, lockstep=True)
     bench.until(lambda: len(bench.states) >= 2, 'the repeated sample')
@@ -209,7 +214,7 @@ def test_in_lockstep_the_plant_waits_and_says_for_what(ros_graph):
     assert stamp_ns(bench.states[-1]) > 15 * PERIOD
 
 
-def test_as_fast_as_possible_is_faster_than_real_time(ros_graph):
+def test_as_fast_as_possible_is_faster_than_real_time(ros_graph: RosGraph) -> None:
     """With a factor of 0 thirty seconds pass in fewer, by the plant's own account."""
     probe = ros_graph.node('probe')
     clock = ros_graph.latest(probe, Clock, '/clock', SENSOR)
@@ -220,7 +225,7 @@ def test_as_fast_as_possible_is_faster_than_real_time(ros_graph):
     assert (probe.get_clock().now() - begin).nanoseconds < 15e9
 
 
-def test_a_command_that_was_overtaken_is_not_taken(ros_graph):
+def test_a_command_that_was_overtaken_is_not_taken(ros_graph: RosGraph) -> None:
     """What is older than a newer command came too late."""
     bench = Bench(ros_graph, command_timeout=60.0)
     *_, earlier, newest = bench.further(10)
@@ -232,7 +237,7 @@ def test_a_command_that_was_overtaken_is_not_taken(ros_graph):
     assert not any(message.velocity[0] for message in bench.further(20))
 
 
-def test_stale_and_foreign_commands_do_not_move_it(ros_graph):
+def test_stale_and_foreign_commands_do_not_move_it(ros_graph: RosGraph) -> None:
     """What is older than the timeout or in another frame is no force."""
     bench = Bench(ros_graph)
     bench.further(5)
@@ -248,7 +253,7 @@ def test_stale_and_foreign_commands_do_not_move_it(ros_graph):
     bench.until(lambda: bench.states[-1].position[0] > 0.0201, 'motion')
 
 
-def test_two_commanders_are_none(ros_graph):
+def test_two_commanders_are_none(ros_graph: RosGraph) -> None:
     """While another node commands too no force is applied, and the diagnostics say so."""
     bench = Bench(ros_graph)
     bench.force = 3.56
@@ -261,7 +266,7 @@ def test_two_commanders_are_none(ros_graph):
     bench.until(lambda: bench.states[-1].velocity[0] > 0.0, 'motion')
 
 
-def test_its_shape_is_that_of_the_model(ros_graph):
+def test_its_shape_is_that_of_the_model(ros_graph: RosGraph) -> None:
     """The line runs from the base through the entry point to the tip; the poses lie along it."""
     bench = Bench(ros_graph, depth=0.1, tip_deflection=0.005, **{'model.tissue_damping': 0.0})
     shapes = ros_graph.listen(bench.probe, Marker, 'needle_shape', SENSOR)
@@ -287,7 +292,7 @@ def test_its_shape_is_that_of_the_model(ros_graph):
     assert (shape.header.frame_id, line.header.frame_id) == ('needle_entry', 'needle_entry')
 
 
-def test_faults_may_come_and_go_while_it_runs(ros_graph):
+def test_faults_may_come_and_go_while_it_runs(ros_graph: RosGraph) -> None:
     """A fault hits its stream alone, is told, and ends when it is taken back."""
     bench = Bench(ros_graph)
     bench.further(5)
