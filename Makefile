@@ -2,9 +2,9 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-SOURCES := needle_ros needle_dynamics needle_controller needle_identification needle_insertion benchmarks test launch setup.py
+SOURCES := needle_ros needle_dynamics needle_controller needle_identification needle_insertion benchmarks test launch docs setup.py
 
-.PHONY: demo test check format setup lock bags clean
+.PHONY: demo test check docs format setup lock bags clean
 
 demo: setup
 	$(BIN)/needle demo
@@ -16,6 +16,11 @@ check: setup
 	$(BIN)/ruff format --check $(SOURCES)
 	$(BIN)/ruff check $(SOURCES)
 	$(BIN)/mypy
+
+# The site, without the network; what Sphinx warns of is an error.
+docs: $(VENV)/.docs
+	$(BIN)/python -m sphinx -q -W --keep-going -b html docs docs/_build/html
+	@echo 'docs/_build/html/index.html'
 
 format: setup
 	$(BIN)/ruff check --fix $(SOURCES)
@@ -30,10 +35,16 @@ $(VENV)/.complete: requirements.lock setup.py package.xml
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
 	touch $@
 
+$(VENV)/.docs: requirements-docs.lock $(VENV)/.complete
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements-docs.lock
+	touch $@
+
 # Pins for every supported Python at once; run after a change of dependencies in setup.py.
 lock:
 	uv pip compile --quiet --universal --python-version 3.10 --no-annotate --no-header \
 		--extra ros --extra dev setup.py requirements-build.in -o requirements.lock
+	uv pip compile --quiet --universal --python-version 3.10 --no-annotate --no-header \
+		--extra docs --constraints requirements.lock setup.py -o requirements-docs.lock
 
 # The shipped recordings, made anew through real nodes.
 bags: setup
@@ -43,4 +54,4 @@ bags: setup
 	cd bags && sha256sum friction_*/* stiffness_*/* > SHA256SUMS
 
 clean:
-	rm -rf $(VENV) build install log demo_output
+	rm -rf $(VENV) build install log demo_output docs/_build docs/api docs/repository

@@ -517,7 +517,7 @@ class Analysis:
         Whether the tip deflection can be steered. With one output the matrix
         [CB, CAB, ..., D] needs rank 1: the number of outputs, not of inputs.
     output_gain : float
-        Tip deflection per base travel, the slope |w'(s)| of the needle at its tip: what a move
+        Tip deflection per base travel, the slope ``|w'(s)|`` of the needle at its tip: what a move
         of the base does to the output before the bending answers.
 
     """

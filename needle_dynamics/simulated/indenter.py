@@ -211,7 +211,7 @@ class Indenter:
 
     def displacement(self, force: FloatArray) -> FloatArray:
         """
-        Return where a force presses the tissue, F = K(|F|) d.
+        Return where a force presses the tissue, ``F = K(|F|) d``.
 
         Parameters
         ----------

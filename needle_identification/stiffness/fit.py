@@ -1,5 +1,5 @@
 r"""
-Stiffness of the tissue in the plane of deflection, from presses: section 3.2.2.3.
+Stiffness of the tissue in the plane of deflection: section 3.2.2.3 of [Boroomand2014]_.
 
 The end-effector presses the tissue with force F and moves it by d; the tissue answers with -F.
 Per force level the stiffness matrix K is the least-squares solution over the presses of

@@ -1,0 +1,81 @@
+"""One page for each public module of the packages, written into docs/api before Sphinx reads."""
+
+from importlib import import_module
+from pathlib import Path
+from pkgutil import iter_modules
+import sys
+from typing import Any
+
+from sphinx.application import Sphinx
+
+PACKAGES = (
+    'needle_ros',
+    'needle_dynamics',
+    'needle_controller',
+    'needle_identification',
+    'needle_insertion',
+)
+SOURCE = Path(__file__).parents[2]
+
+
+def _title(text: str, line: str = '=') -> str:
+    return f'{text}\n{line * len(text)}\n\n'
+
+
+def _children(name: str) -> list[str]:
+    """List the public modules of a package, which has its own name as a path."""
+    path = SOURCE / name.replace('.', '/')
+    return [f'{name}.{found.name}' for found in iter_modules([str(path)]) if found.name[0] != '_']
+
+
+def _home(package: str, name: str) -> str:
+    """Return the module that defines a name which the root of a package offers."""
+    value = getattr(sys.modules[package], name)
+    inside = [key for key in sys.modules if key.startswith(f'{package}.')]
+    defining = (key for key in inside if name in vars(sys.modules[key]).get('__annotations__', ()))
+    return getattr(value, '__module__', None) or next(defining, package)
+
+
+def _public_names(name: str) -> str:
+    """Tell where the names are that a package offers at its root."""
+    rows = ''
+    for public in getattr(import_module(name), '__all__', ()):
+        home = _home(name, public)
+        rows += f'   * - :py:obj:`~{home}.{public}`\n     - :py:mod:`{home}`\n'
+    if not rows:
+        return ''
+    return _title('Public names', '-') + f'.. list-table::\n   :align: left\n\n{rows}\n'
+
+
+def _page(name: str, folder: Path) -> None:
+    """Write the page of a module and the pages of what is in it."""
+    children = _children(name)
+    text = _title(name) + f'.. automodule:: {name}\n'
+    if children:
+        text += '\n' + _public_names(name)
+        text += '.. toctree::\n   :maxdepth: 1\n\n'
+        text += ''.join(f'   {child.rpartition(".")[2]} <{child}>\n' for child in children)
+    else:
+        text += '   :members:\n'
+    (folder / f'{name}.rst').write_text(text, encoding='utf-8')
+    for child in children:
+        _page(child, folder)
+
+
+def write_pages(app: Sphinx) -> None:
+    """Write all pages, and none of a module that is no more."""
+    folder = Path(app.srcdir) / 'api'
+    folder.mkdir(exist_ok=True)
+    for old in folder.glob('*.rst'):
+        old.unlink()
+    for package in PACKAGES:
+        _page(package, folder)
+    text = _title('Modules') + '.. toctree::\n   :maxdepth: 3\n\n'
+    text += ''.join(f'   {package}\n' for package in PACKAGES)
+    (folder / 'index.rst').write_text(text, encoding='utf-8')
+
+
+def setup(app: Sphinx) -> dict[str, Any]:
+    """Write the pages before Sphinx looks for them."""
+    app.connect('builder-inited', write_pages)
+    return {'parallel_read_safe': True, 'parallel_write_safe': True}
