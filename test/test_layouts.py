@@ -54,7 +54,7 @@ class Recording:
         with AnyReader([path]) as reader:
             self.types |= {item.topic: item.msgtype for item in reader.connections}
             for connection, _, raw in reader.messages():
-                message = reader.deserialize(raw, connection.msgtype)
+                message: Any = reader.deserialize(raw, connection.msgtype)
                 self.last[connection.topic] = message
                 if connection.topic == '/diagnostics':
                     for status in message.status:
@@ -76,8 +76,9 @@ class Recording:
         topic = f'/{topic}'
         if topic == '/diagnostics':
             # An empty hardware id leaves the name of the node, which begins with a slash.
-            node, key = re.fullmatch(r'(/\w+)/(.+)', path).groups()
-            return float(self.diagnostics[node][key])
+            found = re.fullmatch(r'(/\w+)/(.+)', path)
+            assert found
+            return float(self.diagnostics[found[1]][found[2]])
         if self.types[topic] == 'sensor_msgs/msg/JointState':
             joint, field = path.split('/')
             message = self.last[topic]
@@ -169,12 +170,13 @@ def test_foxglove_plots_fields_of_the_recording(recording: Recording) -> None:
 def test_plotjuggler_finds_every_curve(recording: Recording) -> None:
     """Each curve is a number that PlotJuggler makes of the recording, under its name."""
     root = ET.parse(CONFIG / 'insertion.plotjuggler.xml').getroot()  # noqa: S314
-    names = [curve.get('name') for curve in root.iter('curve')]
+    names = [curve.attrib['name'] for curve in root.iter('curve')]
     for name in names:
         recording.curve(name)
     assert len(names) == len(set(names)) > 10
     for splitter in root.iter('DockSplitter'):
-        assert int(splitter.get('count')) == len(splitter) == len(splitter.get('sizes').split(';'))
+        sizes = splitter.attrib['sizes'].split(';')
+        assert int(splitter.attrib['count']) == len(splitter) == len(sizes)
 
 
 @pytest.mark.parametrize(

@@ -81,10 +81,14 @@ def test_a_batch_is_its_runs_one_by_one(n: int) -> None:
     found = batch(constants, states, forces)
     for i in range(RUNS):
         course = forces[i]
+
+        def force(time: float, course: FloatArray = course) -> float:
+            return float(course[round(time / INTERVAL)])
+
         alone = simulate(
             constants[i],
             states[i],
-            lambda t, course=course: course[round(t / INTERVAL)],
+            force,
             duration=COUNT * INTERVAL,
             interval=INTERVAL,
         )

@@ -100,7 +100,7 @@ def test_compiled_files_depend_on_compiled_files_only() -> None:
         for node in ast.parse(path.read_text()).body:
             if not isinstance(node, (ast.Import, ast.ImportFrom)) or path.name == 'cache.py':
                 continue
-            for name in [node.module] if isinstance(node, ast.ImportFrom) else node.names:
-                module = name if isinstance(name, str) else name.name
+            from_one = [str(node.module)] if isinstance(node, ast.ImportFrom) else []
+            for module in from_one or [name.name for name in node.names]:
                 inside = module.rpartition('.')[0] in (shared, own)
                 assert inside or module in FREE or module.split('.')[0] in FREE, (path, module)

@@ -21,7 +21,7 @@ from scipy.signal import butter, group_delay, sosfilt
 from scipy.stats import chi2
 
 RATE = 1000.0
-PERFECT = {
+PERFECT: dict[str, Any] = {
     'force_noise': 0.0,
     'torque_noise': 0.0,
     'force_resolution': 0.0,

@@ -115,7 +115,7 @@ def test_a_straight_needle_moves_alike() -> None:
         it = Integrator(model.parameters, model.state_at(0.02))
         it.advance(0.02, 3.0, 1e-9)
         ends.append(it.state)
-    assert np.array_equal(*ends)
+    assert np.array_equal(ends[0], ends[1])
 
 
 def test_energy_rate_of_the_printed_form_is_what_it_leaves_out() -> None:

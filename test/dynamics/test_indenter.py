@@ -145,8 +145,8 @@ def test_positions_are_whole_counts() -> None:
 
 def test_a_stiffness_of_one_level_is_constant() -> None:
     """With one level the tissue is linear."""
-    one = dict.fromkeys(('stiffness_xx', 'stiffness_zz'), (1000.0,))
-    none = dict.fromkeys(('stiffness_xz', 'stiffness_zx'), (0.0,))
+    one: Any = dict.fromkeys(('stiffness_xx', 'stiffness_zz'), (1000.0,))
+    none: Any = dict.fromkeys(('stiffness_xz', 'stiffness_zx'), (0.0,))
     of = indenter(force_levels=(1.0,), **one, **none)
     assert_allclose(of.displacement(np.array([3.0, -0.1]))[[0, 2]], [3e-3, -1e-4], rtol=1e-12)
 

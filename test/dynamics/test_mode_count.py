@@ -177,8 +177,10 @@ def test_two_modes_rotate_the_same_by_the_general_path(depth: float, formulation
         z = model.mass_matrix(state)[2:, 2:] @ z
     seen, others = np.zeros(SUMS), np.zeros(SUMS)
     p, printed = parameters, formulation == 'as_printed'
-    constants = (p.linear_density, p.bending_stiffness, p.tissue_damping, printed)
-    special = _rotate_two(*constants, *where, *q, *z, 1e-5, 0.99, seen)
+    special = _rotate_two(
+        p.linear_density, p.bending_stiffness, p.tissue_damping, printed,
+        *where, q[0], q[1], z[0], z[1], 1e-5, 0.99, seen,
+    )  # fmt: skip
     impulse = _rotate_many(kernel_constants(model), *where, q, z, 1e-5, 0.99, others)
     # Rounding times sqrt(cond G) = 3e3 at 2 mm, for each of a dozen sums: 1e-10.
     for one, other in (

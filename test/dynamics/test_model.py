@@ -230,11 +230,13 @@ def test_state_at_gives_the_least_energy_shape_for_a_tip_deflection(
     assert x[1] == 0.0
     value = of.modes.integrals(depth).value
     across = np.array([-value[1], value[0]]) / np.linalg.norm(value)
-    size = max(np.linalg.norm(x[2:4]), 1e-6)
+    size = max(float(np.linalg.norm(x[2:4])), 1e-6)
     for other in (-1.0, -1e-2, 1e-2, 1.0):
         y = x.copy()
         y[2:4] += other * size * across
-        assert_allclose(value @ y[2:4], tip, rtol=1e-9, atol=1e-9 * np.linalg.norm(value) * size)
+        assert_allclose(
+            value @ y[2:4], tip, rtol=1e-9, atol=1e-9 * float(np.linalg.norm(value)) * size
+        )
         assert of.potential_energy(y) > of.potential_energy(x)
 
 

@@ -111,6 +111,6 @@ def test_coupling_is_the_row_of_d() -> None:
     q, rate = state[2:4], state[6:]
     force = coupling(
         p.linear_density, p.bending_stiffness, p.tissue_stiffness,
-        at.curvature @ q, at.value @ q, at.value @ rate,
+        float(at.curvature @ q), float(at.value @ q), float(at.value @ rate),
     )  # fmt: skip
     assert_allclose(force, -model.bias_forces(state)[0], rtol=1e-12)

@@ -92,6 +92,11 @@ def test_every_number_declares_unit_meaning_and_range() -> None:
     assert {*NUMBERS, *others} == {item.name for item in fields(NeedleParameters)}
 
 
+def with_constant(name: str, value: Any) -> NeedleParameters:
+    """Make parameters with one constant other than its default."""
+    return NeedleParameters(**{name: value})
+
+
 @pytest.mark.parametrize('name', NUMBERS)
 @pytest.mark.parametrize('value', [np.nan, np.inf, -np.inf, -1.0, -1e-300])
 def test_number_out_of_range_is_refused_with_name_value_and_range(name: str, value: float) -> None:
@@ -101,7 +106,7 @@ def test_number_out_of_range_is_refused_with_name_value_and_range(name: str, val
     if meta['low'] < value < 0.0:
         value = 1.5 * meta['low']
     with pytest.raises(ParameterError) as caught:
-        NeedleParameters(**{name: value})
+        with_constant(name, value)
     unit = '' if meta['unit'] == '1' else f' {meta["unit"]}'
     message = f'{name} must be finite, {bound} {meta["low"]:g}{unit}, got {value!r}'
     assert str(caught.value) == message
@@ -114,10 +119,10 @@ def test_zero_is_valid_only_where_the_model_stays_regular(name: str) -> None:
     """Friction, tissue and carriage may be switched off; geometry and inertia may not."""
     meta = NeedleParameters.__dataclass_fields__[name].metadata
     if name in MAY_BE_ZERO or meta['low'] < 0.0:
-        assert getattr(NeedleParameters(**{name: 0.0}), name) == 0.0
+        assert getattr(with_constant(name, 0.0), name) == 0.0
     else:
         with pytest.raises(ParameterError, match=rf'^{name} must be finite, >.*got 0\.0$'):
-            NeedleParameters(**{name: 0.0})
+            with_constant(name, 0.0)
 
 
 def test_what_may_be_zero() -> None:

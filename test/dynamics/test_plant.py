@@ -310,7 +310,7 @@ def test_the_sensor_feels_the_needle_as_it_rings_within_a_sample() -> None:
     parameters = PRESETS['paper_mm']
     # Modes of 0.36 and 3.4 kHz.
     state = NeedleModel(parameters).state_at(0.05, 5e-4)
-    inputs = 3.0, 1e-6, np.array([1e-3, 2e-3])
+    inputs = 3.0, 1e-6
     sensor = ForceSensor(replace(PERFECT, filter=2), 1000.0, 0)
     plant = Plant(Integrator(parameters, state, 2e-5), sensor, 1000.0)
     samples = [plant.advance(*inputs) for _ in range(40)]

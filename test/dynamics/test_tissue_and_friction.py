@@ -55,7 +55,7 @@ def by_layers(
 ) -> FloatArray:
     """Integrate k(y) times a function (points first) over the inserted part, layer by layer."""
     edges = [y for y in tissue.starts if y < depth] + [depth]
-    total = 0.0
+    total: FloatArray | float = 0.0
     for low, high in pairwise(edges):
         half = 0.5 * (high - low)
         y = low + half * (NODES + 1.0)
@@ -249,7 +249,7 @@ def test_swollen_tissue_is_stiffer_tissue(swelling: float) -> None:
         it.advance(0.01, 3.0)
         ends.append(it.state)
     assert LENGTH - ends[0][0] > 0.07
-    assert np.array_equal(*ends)
+    assert np.array_equal(ends[0], ends[1])
 
 
 @pytest.mark.parametrize('swelling', [-0.9, 2.0])
@@ -261,14 +261,14 @@ def test_work_of_swelling_closes_the_energy_balance(swelling: float) -> None:
     start[4] = -1.0
     for step in (8e-6, 4e-6, 2e-6):
         it = Integrator(p, start, step)
-        work = 0.0
+        work: float = 0.0
         for k in range(round(8e-3 / step)):
             before = it.state
             it.advance(step)
             # Trapezoid: q and the factor before and after, by one part in 1e6 of each other.
             change = model.tissue.growth((k + 1) * step) - model.tissue.growth(k * step)
             held = [
-                2e4 * x[2:4] @ model.modes.integrals(LENGTH - x[0]).gram @ x[2:4]
+                float(2e4 * x[2:4] @ model.modes.integrals(LENGTH - x[0]).gram @ x[2:4])
                 for x in (before, it.state)
             ]
             work += 0.25 * change * sum(held)

@@ -120,14 +120,14 @@ def test_opens_in_rosbags_with_its_own_definitions_and_hashes(
             '/a': 2,
             '/nothing': 0,
         }
-        connection = reader.topics['/a'].connections[0]
+        connection: Any = reader.topics['/a'].connections[0]
         assert connection.digest == STORE.hash_rihs01(WRENCH)
         assert connection.ext.offered_qos_profiles[0].reliability.name == 'BEST_EFFORT'
-        forces = [
-            reader.deserialize(data, connection.msgtype).wrench.force.y
+        messages: list[Any] = [
+            reader.deserialize(data, connection.msgtype)
             for connection, _, data in reader.messages()
         ]
-    assert forces == [1.5, 2.5]
+    assert [message.wrench.force.y for message in messages] == [1.5, 2.5]
 
 
 def test_stores_what_rosbag2_and_foxglove_look_for(bag: Path) -> None:
@@ -342,7 +342,7 @@ def test_a_recording_with_wrong_bytes_is_read_or_refused(
         del wrong[data.draw(strategies.integers(0, len(wrong))) :]
     path = part.with_suffix(form)
     path.write_bytes(wrong)
-    lines = []
+    lines: list[str] = []
     try:
         read = read_friction_recording(path)
         lines += read.losses

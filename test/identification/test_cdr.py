@@ -53,8 +53,8 @@ def test_finds_what_rosbags_finds_in_either_byte_order(drawn: list[Any]) -> None
     assert read.broken == 0
     assert_array_equal(read.used, np.arange(len(drawn)))
     assert_array_equal(read.values, expected)
-    for stamp, message in zip(read.stamps, serialized, strict=True):
-        there = STORE.deserialize_cdr(message, MOTION).header.stamp
+    for stamp, data in zip(read.stamps, serialized, strict=True):
+        there = STORE.deserialize_cdr(data, MOTION).header.stamp  # type: ignore[attr-defined]
         assert stamp == there.sec * 10**9 + there.nanosec
 
 

@@ -38,7 +38,7 @@ def samples() -> tuple[NDArray[np.int64], FloatArray, FloatArray, FloatArray]:
     """Return stamps [ns], depth, speed and force of strokes, at 125 Hz."""
     made = strokes(seed=7, speeds=(2e-3, 10e-3, 20e-3), push=0.0)
     stamps = EPOCH + np.rint(made.time * 1e9).astype(np.int64)
-    return tuple(column[::2] for column in (stamps, made.depth, made.speed, made.force))
+    return stamps[::2], made.depth[::2], made.speed[::2], made.force[::2]
 
 
 def serialized(type_name: str, stamp: int, *parts: Any) -> bytes:
@@ -129,9 +129,7 @@ def write_folder(
     return file
 
 
-def write_mcap(
-    path: Path, rows: list[tuple[str, str, int, bytes]], **options: bool | int | CompressionType
-) -> Path:
+def write_mcap(path: Path, rows: list[tuple[str, str, int, bytes]], **options: Any) -> Path:
     """Write an MCAP file alone; a type that ROS does not have goes without a definition."""
     with path.open('wb') as stream:
         writer = McapWriter(stream, **options)

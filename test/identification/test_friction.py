@@ -45,12 +45,12 @@ def varied(time: FloatArray) -> FloatArray:
     return 5e-3 + 2e-3 * np.sin(2.0 * np.pi * 0.3 * time)
 
 
-def settings(*terms: str, **changes: float) -> FrictionSettings:
+def settings(*terms: str, **changes: Any) -> FrictionSettings:
     return FrictionSettings(terms=('coulomb', 'viscous', *terms), **changes)
 
 
 @cache
-def identified(chosen: FrictionSettings | None = None, **recorded: float) -> FrictionEstimate:
+def identified(chosen: FrictionSettings | None = None, **recorded: Any) -> FrictionEstimate:
     return identify_friction(strokes(**recorded), chosen)
 
 
@@ -468,7 +468,7 @@ def test_refuses_friction_that_drives() -> None:
     'name', ['cutoff', 'moving_speed', 'largest_acceleration', 'stribeck_speed']
 )
 @pytest.mark.parametrize('value', [0.0, -1.0, float('nan')])
-def test_refuses_settings_out_of_range(name: str, value: float) -> None:
+def test_refuses_settings_out_of_range(name: str, value: Any) -> None:
     with pytest.raises(ParameterError, match=f'{name} must be'):
         FrictionSettings(**{name: value})
 

@@ -1,5 +1,6 @@
 """Recordings of any lab give force and motion as they were, or one line that says why not."""
 
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 import struct
@@ -98,8 +99,8 @@ def at(stamp: int) -> int:
 
 def small_bag(
     path: Path,
-    wrenches: list[tuple[int, float]] = (),
-    motions: list[Any] = (),
+    wrenches: Sequence[tuple[int, float]] = (),
+    motions: Sequence[tuple[int, float, float]] = (),
     joint_names: tuple[str, ...] = ('insertion',),
 ) -> Path:
     """Write (stamp, value) wrenches and (stamp, depth, speed) motions, in ms after the epoch."""
@@ -556,6 +557,6 @@ def test_joints_of_an_indentation_may_lack_the_one_across(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize('axes', [('x', 'x'), ('x', '-x'), ('x', 'w')])
-def test_refuses_a_plane_that_is_none(tmp_path: Path, axes: tuple[str, ...]) -> None:
+def test_refuses_a_plane_that_is_none(tmp_path: Path, axes: tuple[str, str]) -> None:
     with pytest.raises(RecordingError, match=r'axes must be two different|axis of the plane must'):
         read_indentation_recording(tmp_path, axes=axes)

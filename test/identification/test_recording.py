@@ -1,13 +1,16 @@
 """The value that identification works on is what it claims to be."""
 
+from typing import Any
+
 from needle_dynamics import FloatArray, ShapeError
 from needle_identification import IndentationRecording, Recording
 import numpy as np
 import pytest
 
 
-def recording(**changes: FloatArray | str | None) -> Recording:
-    fields = {name: np.array([0.0, 1.0, 2.0]) for name in ('time', 'depth', 'speed', 'force')}
+def recording(**changes: Any) -> Recording:
+    names = ('time', 'depth', 'speed', 'force')
+    fields: dict[str, Any] = {name: np.array([0.0, 1.0, 2.0]) for name in names}
     return Recording(name='it', **{**fields, **changes})
 
 
@@ -51,7 +54,7 @@ def test_only_speed_may_be_missing() -> None:
 
 
 def test_an_indentation_has_two_components_and_one_across() -> None:
-    fields = {
+    fields: dict[str, Any] = {
         'time': np.arange(3.0),
         'position': np.zeros((3, 2)),
         'off_plane': np.zeros(3),

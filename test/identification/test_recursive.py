@@ -1,6 +1,7 @@
 """Friction sample by sample: the same as all at once, and it follows what changes."""
 
 from dataclasses import replace
+from typing import Any
 
 from needle_dynamics import ParameterError
 from needle_identification import FrictionSettings, identify_friction, Recording, RecursiveFriction
@@ -24,22 +25,19 @@ def fed(
 def joined(*recordings: Recording) -> Recording:
     """Play recordings one after the other."""
     time = np.arange(sum(len(r.time) for r in recordings)) / RATE
-    return replace(
-        recordings[0],
-        time=time,
-        **{
-            name: np.concatenate([getattr(r, name) for r in recordings])
-            for name in ('depth', 'speed', 'force')
-        },
-    )
+    columns: dict[str, Any] = {
+        name: np.concatenate([getattr(r, name) for r in recordings])
+        for name in ('depth', 'speed', 'force')
+    }
+    return replace(recordings[0], time=time, **columns)
 
 
 class Weighed(RecursiveFriction):
     """Keep what was learned, to solve it all at once."""
 
-    def __init__(self, *args: float | FrictionSettings) -> None:
+    def __init__(self, *args: Any) -> None:
         super().__init__(*args)
-        self.rows = []
+        self.rows: list[tuple[float, float, float, float]] = []
 
     def _learn(self, speed: float, acceleration: float, force: float) -> None:
         self.rows.append((np.sign(speed), speed, acceleration, force))

@@ -12,9 +12,9 @@ from needle_identification import (
     regress,
     statistic,
 )
+from needle_identification.estimation.regression import Regression
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
-from numpy.typing import NDArray
 import pytest
 from scipy.signal import lfilter
 from scipy.signal.windows import triang
@@ -32,9 +32,7 @@ def problem(
     return x, x @ VALUES + noise * rng.normal(size=n), rng
 
 
-def extras(
-    n: int, noise: tuple[float, ...] = (0.0, 0.0, 0.0)
-) -> dict[str, FloatArray | NDArray[np.bool_] | NDArray[np.int64]]:
+def extras(n: int, noise: tuple[float, ...] = (0.0, 0.0, 0.0)) -> dict[str, Any]:
     return {
         'groups': np.arange(n) % 4,
         'noisy': np.array(noise) > 0.0,
@@ -112,7 +110,7 @@ def test_total_refuses_columns_of_noise() -> None:
 
 
 def test_weights_of_the_noise_of_each_group_make_errors_smaller() -> None:
-    values = {'ordinary': [], 'weighted': []}
+    values: dict[str, list[Regression]] = {'ordinary': [], 'weighted': []}
     for seed in range(100):
         x, y, rng = problem(seed)
         groups = np.arange(len(y)) // 150

@@ -37,7 +37,7 @@ def test_sparse_samples_are_kept_bit_for_bit_in_order_of_time(numbers: list[int]
 def test_dense_samples_become_means_of_stamps_and_of_values() -> None:
     step = 125_000
     stamps = np.arange(100_000) * step
-    made = gathered(stamps, stamps[:, None] * 1e-9, batch=1000)
+    made = gathered(stamps, np.asarray(stamps[:, None] * 1e-9, float), batch=1000)
     assert made.width == FINEST
     assert len(made.stamps) == 100_000 * step // FINEST
     # The mean of a line lies on it, but for the rounding of a stamp to 1 ns.

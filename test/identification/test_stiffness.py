@@ -17,6 +17,7 @@ from needle_identification.stiffness.fit import (
 )
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
+from numpy.typing import ArrayLike
 import pytest
 from scipy.signal import butter, lfilter, sosfilt
 from scipy.stats import binom
@@ -33,9 +34,9 @@ COUNT, RESOLUTION = 2.5e-3, 1e-6
 HOLD, RATE = 0.3, 250.0
 
 
-def grid(forces: tuple[float, ...] = (1.1, 1.3, 1.5), angles: FloatArray = EIGHT) -> FloatArray:
+def grid(forces: tuple[float, ...] = (1.1, 1.3, 1.5), angles: ArrayLike = EIGHT) -> FloatArray:
     """Return force vectors, level by level, shape (m, 2)."""
-    return np.array([[f * np.cos(a), f * np.sin(a)] for f in forces for a in angles])
+    return np.array([[f * np.cos(a), f * np.sin(a)] for f in forces for a in np.asarray(angles)])
 
 
 def ofs(table: dict[float, FloatArray]) -> Callable[..., Any]:
@@ -140,7 +141,7 @@ def matrices(draw: Callable[..., Any]) -> FloatArray:
 def test_recovers_any_matrix_from_exact_presses(matrix: FloatArray) -> None:
     (level,) = identify_stiffness(pressed(matrix, grid((1.2,)))).levels
     # 1e-8: noise below this part of a reading is taken as rounding.
-    assert_allclose(level.matrix, matrix, atol=1e-8 * np.linalg.norm(matrix))
+    assert_allclose(level.matrix, matrix, atol=float(1e-8 * np.linalg.norm(matrix)))
     assert_allclose(level.symmetric + level.antisymmetric, matrix, atol=1e-5)
     truth = expected(matrix)
     for name in ('curl', 'spring', 'principal_stiffness_1', 'tissue_stiffness'):
@@ -156,7 +157,7 @@ def test_turning_the_axes_turns_the_matrix(matrix: FloatArray, angle: float) -> 
     other, turn = turned(recording, angle)
     (seen,) = identify_stiffness(other).levels
     # 1e-7: ten times the rounding of a reading, since some matrices amplify it.
-    size = np.linalg.norm(matrix)
+    size = float(np.linalg.norm(matrix))
     assert_allclose(seen.matrix, turn @ level.matrix @ turn.T, atol=1e-7 * size)
     assert_allclose(seen.curl.value, level.curl.value, atol=1e-7 * size)
     assert_allclose(seen.spring.value, level.spring.value, atol=1e-7)
@@ -302,7 +303,7 @@ def test_linear_drift_leaves_no_trace() -> None:
     )
     for a, b in zip(still.levels, moving.levels, strict=True):
         # 1e-7: ten times the rounding of a reading.
-        assert_allclose(b.matrix, a.matrix, atol=1e-7 * np.linalg.norm(a.matrix))
+        assert_allclose(b.matrix, a.matrix, atol=float(1e-7 * np.linalg.norm(a.matrix)))
     text = ' '.join(moving.warnings)
     assert 'force at rest drifted' in text
     assert 'position at rest drifted' in text
@@ -317,7 +318,7 @@ def test_the_order_of_presses_does_not_matter() -> None:
     assert_array_equal(mixed.presses.level, straight.presses.level[order])
     for a, b in zip(straight.levels, mixed.levels, strict=True):
         # 1e-7: ten times the rounding of a reading.
-        assert_allclose(b.matrix, a.matrix, atol=1e-7 * np.linalg.norm(a.matrix))
+        assert_allclose(b.matrix, a.matrix, atol=float(1e-7 * np.linalg.norm(a.matrix)))
 
 
 FEW_ANGLES = np.array([0.0, 2.0, 4.0])
@@ -472,7 +473,7 @@ def test_huber_is_not_led_astray_by_one_press() -> None:
 
 def test_weighted_looks_less_at_noisy_presses() -> None:
     forces = grid((1.3,), np.tile(EIGHT, 2))
-    off = {'ordinary': [], 'weighted': []}
+    off: dict[str, list[float]] = {'ordinary': [], 'weighted': []}
     for seed in range(12):
         exact = pressed(TABLE[1.3], forces)
         rng = np.random.default_rng(seed)

@@ -104,7 +104,7 @@ def _in_browser(page: Path, browser: str) -> Seen:
     assert found, ended.stdout + ended.stderr
     texts: list[str] = []
     reader = HTMLParser()
-    reader.handle_data = texts.append
+    setattr(reader, 'handle_data', texts.append)  # noqa: B010
     reader.feed(found[1])
     seen = json.loads(''.join(texts))
     outside = [name for name in seen['requests'] if not name.startswith('data:')]

@@ -99,6 +99,7 @@ def simulated(
 
 def write_bag(path: Path, recording: Recording, configuration: str = '') -> None:
     """Write a recording as the plant's topics would have been recorded."""
+    assert recording.speed is not None
     with BagWriter(path) as bag:
         bag.add_topic('/base_wrench', WRENCH)
         bag.add_topic('/wrench_command', WRENCH)

@@ -53,7 +53,7 @@ def strokes(
 ) -> Recording:
     """Record strokes; with a seed through a noisy sensor of second order, else as they are."""
     speed, rise = motion(speeds, push)
-    time = STEP * np.arange(1, len(speed) + 1)
+    time = np.asarray(STEP * np.arange(1, len(speed) + 1), float)
     more = 1.0 + (breakaway - 1.0) * np.exp(-((speed / 1e-3) ** 2))
     force = COULOMB * more * np.sign(speed) + VISCOUS * speed
     force = np.where(speed < 0.0, withdrawal, 1.0) * force + mass * np.gradient(speed, STEP)
