@@ -10,7 +10,7 @@ import re
 import struct
 from typing import Any, Final, NamedTuple
 
-import lz4.frame  # type: ignore[import-untyped]
+import lz4.frame
 import numpy as np
 from numpy.typing import NDArray
 import yaml
