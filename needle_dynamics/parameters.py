@@ -14,7 +14,7 @@ from needle_dynamics.tissue import Tissue
 from needle_ros.errors import (
     ParameterError,
 )
-from needle_ros.settings import as_number, check_constants, constant, unknown_name
+from needle_ros.settings import check_constants, constant, from_values
 
 #: Formulations by name: every term of Euler-Lagrange, or the source's final form.
 FORMULATIONS: Final = ('complete', 'as_printed')
@@ -215,39 +215,7 @@ class NeedleParameters:
         """
         if name not in PRESETS:
             raise ParameterError(f'unknown preset {name!r}; valid: {", ".join(PRESETS)}')
-        return cls.from_mapping({**asdict(PRESETS[name]), **changes})
-
-    @classmethod
-    def from_mapping(cls, values: Mapping[str, Any]) -> NeedleParameters:
-        """
-        Make the constants from a mapping; what it leaves out takes its default.
-
-        Parameters
-        ----------
-        values : Mapping[str, Any]
-            Field names and values; integers are taken where a float is meant.
-
-        Returns
-        -------
-        NeedleParameters
-            The constants.
-
-        Raises
-        ------
-        ParameterError
-            If a name is unknown or a value is not valid.
-
-        """
-        known = {item.name: item for item in fields(cls)}
-        for name in values:
-            if name not in known:
-                raise ParameterError(unknown_name(name, list(known)))
-        return cls(
-            **{
-                name: as_number(value) if 'unit' in known[name].metadata else value
-                for name, value in values.items()
-            }
-        )
+        return from_values(cls, {**asdict(PRESETS[name]), **changes})
 
 
 _PAPER_SI = NeedleParameters()

@@ -29,7 +29,7 @@ from needle_ros.errors import (
     ParameterError,
 )
 from needle_ros.packed import Layout, Reading
-from needle_ros.settings import as_number, unknown_name
+from needle_ros.settings import from_values, unknown_name
 from needle_ros.timing import nanoseconds
 from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor, SetParametersResult
 import rclpy
@@ -249,17 +249,14 @@ class BaseNode(LifecycleNode):
             Naming the parameter with its prefix.
 
         """
-        values: dict[str, Any] = {}
-        for item in fields(kind):  # type: ignore[arg-type]
-            name = f'{prefix}{item.name}'
-            value = (changes or {}).get(name, self.get_parameter(name).value)
-            if isinstance(value, (list, array)):
-                value = tuple(value)
-            values[item.name] = as_number(value) if 'unit' in item.metadata else value
-        try:
-            return kind(**values)
-        except ParameterError as error:
-            raise ParameterError(f'{prefix}{error}') from error
+        values = {
+            item.name: (changes or {}).get(f'{prefix}{item.name}', self._value(prefix + item.name))
+            for item in fields(kind)  # type: ignore[arg-type]
+        }
+        return from_values(kind, values, prefix)
+
+    def _value(self, name: str) -> Any:
+        return self.get_parameter(name).value
 
     def text(
         self,

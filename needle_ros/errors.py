@@ -13,5 +13,9 @@ class ParameterError(NeedleError, ValueError):
     """A parameter is unknown, missing, or outside its valid range."""
 
 
+class MessageError(NeedleError, ValueError):
+    """Bytes are not a message of the type that they should be."""
+
+
 class ShapeError(NeedleError, ValueError):
     """An array does not have the shape that is needed."""

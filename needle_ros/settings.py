@@ -1,16 +1,19 @@
-"""Settings: fields of frozen dataclasses with unit, meaning and range, checked when made."""
+"""Settings: frozen dataclasses whose fields have a unit, a meaning and a range."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from array import array
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import field, fields
 from difflib import get_close_matches
 from math import inf, isfinite
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 from needle_ros.errors import ParameterError
 
-#: Integers beyond it are no floats.
+_Settings = TypeVar('_Settings')
+
+#: Larger integers cannot be converted to float.
 _LARGEST_INTEGER: Final = 10**300
 
 
@@ -96,16 +99,61 @@ def _check_number(name: str, value: object, meta: Mapping[str, Any]) -> None:
         )
 
 
+def from_values(
+    kind: Callable[..., _Settings], values: Mapping[str, Any], prefix: str = ''
+) -> _Settings:
+    """
+    Make settings from values by name.
+
+    Parameters
+    ----------
+    kind : type
+        The dataclass.
+    values : Mapping[str, Any]
+        Values by field name; integers are accepted where a float is meant, lists and arrays where
+        a tuple is meant. A field that is not there, or is None, as an empty list in a parameter
+        file is, has its default.
+    prefix : str
+        Namespace of the names in messages, such as ``model.``.
+
+    Returns
+    -------
+    object
+        The dataclass instance.
+
+    Raises
+    ------
+    ParameterError
+        If a name is unknown or a value is not valid; the message names the field.
+
+    """
+    known = {item.name: item for item in fields(kind)}  # type: ignore[arg-type]
+    given = {}
+    for name, value in values.items():
+        if name not in known:
+            raise ParameterError(
+                unknown_name(f'{prefix}{name}', (f'{prefix}{item}' for item in known))
+            )
+        if value is not None:
+            value = tuple(value) if isinstance(value, (list, array)) else value
+            given[name] = as_number(value) if 'unit' in known[name].metadata else value
+    try:
+        return kind(**given)
+    except ParameterError as error:
+        raise ParameterError(f'{prefix}{error}') from error
+
+
 def as_number(value: Any) -> Any:
-    """Take an integer where a float is meant, in a tuple too; leave all else as it is."""
+    """Convert an integer, also in a tuple, to float; return any other value as it is."""
     if isinstance(value, tuple):
         return tuple(as_number(number) for number in value)
     is_integer = isinstance(value, int) and not isinstance(value, bool)
     return float(value) if is_integer and abs(value) <= _LARGEST_INTEGER else value
 
 
-def unknown_name(name: str, valid: list[str]) -> str:
-    """Say that a name is unknown, with the nearest valid one or all of them."""
-    close = get_close_matches(name, valid, n=1)
-    hint = f'did you mean {close[0]!r}?' if close else f'valid: {", ".join(sorted(valid))}'
+def unknown_name(name: str, valid: Iterable[str]) -> str:
+    """Return the message for an unknown name, with the nearest valid one or all of them."""
+    names = sorted(valid)
+    close = get_close_matches(name, names, n=1)
+    hint = f'did you mean {close[0]!r}?' if close else f'valid: {", ".join(names)}'
     return f'unknown parameter {name!r}; {hint}'

@@ -26,7 +26,7 @@ from needle_identification.bags.storage import Batch, Topic
 from needle_identification.errors import RecordingError
 from needle_identification.recordings.recording import IndentationRecording, Recording
 from needle_identification.recordings.series import FINEST, Series
-from needle_ros import cdr
+from needle_ros import wire
 import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import cumulative_trapezoid
@@ -67,15 +67,15 @@ class _Wanted(NamedTuple):
     usual: tuple[str, ...]
 
 
-_WRENCH: Final = _Wanted('wrench_topic', (cdr.WRENCH,), ('base_wrench',))
+_WRENCH: Final = _Wanted('wrench_topic', (wire.WRENCH,), ('base_wrench',))
 _FRICTION_MOTION: Final = _Wanted(
     'motion_topic',
-    (cdr.JOINT_STATE, cdr.POSE, cdr.POINT, cdr.TWIST, cdr.ODOMETRY),
+    (wire.JOINT_STATE, wire.POSE, wire.POINT, wire.TWIST, wire.ODOMETRY),
     ('joint_states', 'end_effector_pose'),
 )
 _INDENTATION_MOTION: Final = _Wanted(
     'motion_topic',
-    (cdr.POSE, cdr.POINT, cdr.ODOMETRY, cdr.JOINT_STATE),
+    (wire.POSE, wire.POINT, wire.ODOMETRY, wire.JOINT_STATE),
     ('end_effector_pose', 'joint_states'),
 )
 
@@ -130,9 +130,9 @@ def read_friction_recording(
     streams, configuration = _read(bag, {wrench: _Numbers(axis), motion: source}, time)
     force = streams[wrench].samples(bag)
     moved = streams[motion].samples(bag)
-    if motion.type_name == cdr.TWIST:
+    if motion.type_name == wire.TWIST:
         moved = _integrated(moved, bag)
-    elif motion.type_name in (cdr.JOINT_STATE, cdr.ODOMETRY):
+    elif motion.type_name in (wire.JOINT_STATE, wire.ODOMETRY):
         moved = _with_speed(moved, bag)
     else:
         bag.losses.append(f'{motion.name} has no velocity')
@@ -196,7 +196,7 @@ def read_indentation_recording(
     wrench = _chosen(bag, topics, _WRENCH, wrench_topic)
     motion = _chosen(bag, topics, _INDENTATION_MOTION, motion_topic)
     source: _Source = _Numbers(*plane, across)
-    if motion.type_name == cdr.JOINT_STATE:
+    if motion.type_name == wire.JOINT_STATE:
         source = _Joints(*plane, across)
     streams, configuration = _read(bag, {wrench: _Numbers(*plane), motion: source}, time)
     merged = _merged(bag, streams[wrench].samples(bag), streams[motion].samples(bag))
@@ -255,8 +255,8 @@ class _Source(ABC):
     width: int
 
     @abstractmethod
-    def __call__(self, layout: cdr.Layout) -> Sequence[int] | None:
-        """Choose the offsets of the numbers, as `cdr.decode` wants them."""
+    def __call__(self, template: wire.Template) -> Sequence[int] | None:
+        """Choose the positions of the numbers, as `wire.decode` wants them."""
 
     def measured(self, numbers: FloatArray) -> FloatArray:
         """Return the values from the numbers, which may be nan."""
@@ -274,8 +274,8 @@ class _Numbers(_Source):
         self.columns = self.width = len(axes)
         self._offsets = [8 * _AXES.index(axis) for axis in axes]
 
-    def __call__(self, layout: cdr.Layout) -> list[int]:
-        begin, _ = layout.arrays[0]
+    def __call__(self, template: wire.Template) -> list[int]:
+        begin, _ = template.arrays[0]
         return [begin + offset for offset in self._offsets]
 
 
@@ -287,8 +287,8 @@ class _Odometry(_Source):
     def __init__(self, axis: str) -> None:
         self._axis = _AXES.index(axis)
 
-    def __call__(self, layout: cdr.Layout) -> list[int]:
-        begin, _ = layout.arrays[0]
+    def __call__(self, template: wire.Template) -> list[int]:
+        begin, _ = template.arrays[0]
         # Position and orientation, their covariance, twist.
         return [begin + 8 * k for k in (*range(7), *range(43, 46))]
 
@@ -310,17 +310,17 @@ class _Joint(_Source):
         self._used: set[str] = set()
         self._has_position = self._has_speed = False
 
-    def __call__(self, layout: cdr.Layout) -> list[int] | None:
+    def __call__(self, template: wire.Template) -> list[int] | None:
         if len(self._seen) < _NAMES:
-            self._seen.update(layout.names)
+            self._seen.update(template.names)
         joint = self._joint or 'insertion'
-        if self._joint is None and joint not in layout.names and len(layout.names) == 1:
-            [joint] = layout.names
-        if joint not in layout.names:
+        if self._joint is None and joint not in template.names and len(template.names) == 1:
+            [joint] = template.names
+        if joint not in template.names:
             return None
         self._used.add(joint)
-        index = layout.names.index(joint)
-        position, speed = (_element(array, index) for array in layout.arrays[:2])
+        index = template.names.index(joint)
+        position, speed = (_element(array, index) for array in template.arrays[:2])
         self._has_position |= position >= 0
         self._has_speed |= speed >= 0
         return [position, speed]
@@ -350,15 +350,17 @@ class _Joints(_Source):
         self._used = False
         self.flat = False
 
-    def __call__(self, layout: cdr.Layout) -> list[int] | None:
+    def __call__(self, template: wire.Template) -> list[int] | None:
         if len(self._seen) < _NAMES:
-            self._seen.update(layout.names)
-        if not set(self._joints[:2]) <= set(layout.names):
+            self._seen.update(template.names)
+        if not set(self._joints[:2]) <= set(template.names):
             return None
         self._used = True
-        self.flat |= self._joints[2] not in layout.names
+        self.flat |= self._joints[2] not in template.names
         return [
-            _element(layout.arrays[0], layout.names.index(joint)) if joint in layout.names else -1
+            _element(template.arrays[0], template.names.index(joint))
+            if joint in template.names
+            else -1
             for joint in self._joints
         ]
 
@@ -391,11 +393,11 @@ def _position_and_speed(position: FloatArray, speed: FloatArray) -> FloatArray:
 
 def _motion(type_name: str, axis: str | None) -> tuple[_Source, float]:
     """Return what to take for a motion along an axis or joint, and its sign."""
-    if type_name == cdr.JOINT_STATE:
+    if type_name == wire.JOINT_STATE:
         backward = axis is not None and axis.startswith('-')
         return _Joint(axis[1:] if axis and backward else axis), -1.0 if backward else 1.0
     sign, name = _signed('y' if axis is None else axis, 'motion axis')
-    return (_Odometry if type_name == cdr.ODOMETRY else _Numbers)(name), sign
+    return (_Odometry if type_name == wire.ODOMETRY else _Numbers)(name), sign
 
 
 class _Samples(NamedTuple):
@@ -421,7 +423,7 @@ class _Stream:
 
     def add(self, batch: Batch) -> None:
         """Take in the messages of a batch."""
-        decoded = cdr.decode(
+        decoded = wire.decode(
             batch.data,
             batch.begin,
             batch.end,
@@ -429,7 +431,7 @@ class _Stream:
             self._source,
             self._source.columns,
         )
-        self._broken += decoded.broken
+        self._broken += decoded.invalid
         self._fault = self._fault or decoded.fault
         stamps = received = batch.received[decoded.used]
         if self._by_header:

@@ -8,6 +8,7 @@ from typing import Any
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from needle_dynamics import NeedleError, NeedleParameters, ParameterError, PRESETS
+from needle_ros.settings import from_values
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest
@@ -143,7 +144,7 @@ def test_what_is_not_a_number_is_refused_by_name(name: str, value: Any) -> None:
     """Booleans, strings, None and the like are not numbers, whatever float() makes of them."""
     for make in (
         lambda: NeedleParameters(**{name: value}),
-        lambda: NeedleParameters.from_mapping({name: value}),
+        lambda: from_values(NeedleParameters, {name: value}),
     ):
         with pytest.raises(ParameterError) as caught:
             make()
@@ -167,7 +168,7 @@ def test_minimum_depth_must_be_less_than_the_length(value: float) -> None:
 
 def test_integers_are_taken_where_a_float_is_meant() -> None:
     """A configuration file may say 8000 for 8000.0; the result is a float."""
-    made = NeedleParameters.from_mapping({'density': 8000, 'viscous_friction': 0})
+    made = from_values(NeedleParameters, {'density': 8000, 'viscous_friction': 0})
     assert made == replace(NeedleParameters(), viscous_friction=0.0)
     assert type(made.density) is type(made.viscous_friction) is float
     assert type(NeedleParameters.preset('phantom', density=7850).density) is float
@@ -187,15 +188,15 @@ def test_integers_are_taken_where_a_float_is_meant() -> None:
 @settings(deadline=None, derandomize=True)
 def test_mapping_round_trip(values: dict[str, Any]) -> None:
     """from_mapping takes what it is given, defaults for the rest, and asdict gives it back."""
-    made = NeedleParameters.from_mapping(values)
+    made = from_values(NeedleParameters, values)
     assert asdict(made) == asdict(NeedleParameters()) | values
-    assert NeedleParameters.from_mapping(asdict(made)) == made
+    assert from_values(NeedleParameters, asdict(made)) == made
 
 
 def test_unknown_key_is_named_with_the_nearest_valid_one() -> None:
     """A misspelled constant is not ignored: the message names it and what was meant."""
     with pytest.raises(ParameterError) as caught:
-        NeedleParameters.from_mapping({'viscous_fricton': 0.3})
+        from_values(NeedleParameters, {'viscous_fricton': 0.3})
     assert str(caught.value) == (
         "unknown parameter 'viscous_fricton'; did you mean 'viscous_friction'?"
     )
@@ -206,7 +207,7 @@ def test_unknown_key_is_named_with_the_nearest_valid_one() -> None:
 def test_unknown_key_like_no_other_lists_the_valid_ones() -> None:
     """If nothing is near, all valid names are listed."""
     with pytest.raises(ParameterError, match='xyzzy') as caught:
-        NeedleParameters.from_mapping({'xyzzy': 1.0})
+        from_values(NeedleParameters, {'xyzzy': 1.0})
     for item in fields(NeedleParameters):
         assert item.name in str(caught.value)
 

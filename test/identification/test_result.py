@@ -15,6 +15,7 @@ from needle_identification import (
 )
 from needle_identification.result import between, measured, model_parameters, rounded, UNKNOWN
 from needle_identification.stiffness.fit import StiffnessSummary
+from needle_ros.settings import from_values
 import pytest
 import yaml
 
@@ -93,7 +94,7 @@ def test_a_mean_outside_the_range_is_moved_to_its_end() -> None:
         'model.friction_law': 'stribeck',
     }
     constants = {name.removeprefix('model.'): value for name, value in values.items()}
-    assert NeedleParameters.from_mapping(constants).friction_law == 'stribeck'
+    assert from_values(NeedleParameters, constants).friction_law == 'stribeck'
 
 
 @settings(deadline=None)

@@ -1,0 +1,450 @@
+"""
+Messages as bytes (CDR): the stamp and the numbers of one message, or of a whole batch.
+
+The messages of a topic differ in their stamp and their numbers only. So one of them is a template
+for the others: where it has its stamp and its numbers, all those have theirs whose other bytes
+are the same. This takes a tenth of the time that rclpy takes to convert a message.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import cached_property
+from itertools import count
+import struct
+from typing import Any, Final, NamedTuple
+
+from needle_ros.errors import MessageError, ShapeError
+from needle_ros.timing import NANOSECONDS
+import numpy as np
+from numpy.typing import NDArray
+
+JOINT_STATE: Final = 'sensor_msgs/msg/JointState'
+WRENCH: Final = 'geometry_msgs/msg/WrenchStamped'
+POSE: Final = 'geometry_msgs/msg/PoseStamped'
+POINT: Final = 'geometry_msgs/msg/PointStamped'
+TWIST: Final = 'geometry_msgs/msg/TwistStamped'
+ODOMETRY: Final = 'nav_msgs/msg/Odometry'
+
+
+class _Fields(NamedTuple):
+    """What follows the header of a message type, in this order, each a count of fields."""
+
+    names: bool = False
+    strings: int = 0
+    sequences: int = 0
+    numbers: int = 0
+
+
+_FIELDS: Final = {
+    JOINT_STATE: _Fields(names=True, sequences=3),
+    WRENCH: _Fields(numbers=6),
+    POSE: _Fields(numbers=7),
+    POINT: _Fields(numbers=3),
+    TWIST: _Fields(numbers=6),
+    ODOMETRY: _Fields(strings=1, numbers=7 + 36 + 6 + 36),
+}
+
+#: The message types that can be read and written here.
+TYPES: Final = tuple(_FIELDS)
+
+#: Alignment of 8-byte numbers by encapsulation: plain CDR and plain XCDR2, big and little endian.
+_WIDEST: Final = {0: 8, 1: 8, 6: 4, 7: 4}
+
+#: Encapsulation that is written: plain CDR, little endian, no options.
+_HEAD: Final = b'\0\1\0\0'
+
+#: Where the stamp is: seconds and nanoseconds behind the encapsulation.
+_STAMP: Final = 4
+
+#: Some middlewares fill up the last word [bytes].
+_PADDING: Final = 3
+
+#: After so many templates in one batch the remaining messages are read one by one.
+_TEMPLATES: Final = 32
+
+
+class Reading(NamedTuple):
+    """
+    Content of a message.
+
+    Attributes
+    ----------
+    stamp : int
+        Time of the header [ns].
+    frame : str
+        Frame of the header.
+    names : tuple of str
+        Joints; empty if the type has no such field.
+    values : tuple of tuple of float
+        Positions, velocities and efforts of a JointState; else one tuple of all numbers, in the
+        order of the fields.
+
+    """
+
+    stamp: int
+    frame: str
+    names: tuple[str, ...]
+    values: tuple[tuple[float, ...], ...]
+
+
+class _Cursor:
+    """
+    Goes through the fields of a message, which it reads, or writes if it is given their values.
+
+    Numbers are written as zero.
+    """
+
+    def __init__(self, message: bytes, given: Iterable[str | int] | None = None) -> None:
+        kind = int.from_bytes(message[:2], 'big')
+        if len(message) < 4 or kind not in _WIDEST:
+            raise MessageError(
+                f'begins with {message[:4].hex(" ") or "nothing"}, which is not CDR'
+            )
+        self.message = bytearray(message)
+        self.order = '<' if kind % 2 else '>'
+        #: Bytes other than the stamp and the numbers: where they begin and end.
+        self.fixed = [(0, 2)]
+        self._widest = _WIDEST[kind]
+        self._end = 4
+        self._given: Iterator[Any] | None = None if given is None else iter(given)
+
+    def take(self, size: int, number: int = 1) -> int:
+        """Pass over numbers of a size [bytes]; return where they begin."""
+        if number:
+            self._end += -(self._end - 4) % min(size, self._widest)
+        begin = self._end
+        self._end += size * number
+        if self._given is not None:
+            self.message.extend(bytes(self._end - len(self.message)))
+        if self._end > len(self.message):
+            raise MessageError(f'ends after {len(self.message)} bytes')
+        return begin
+
+    def count(self, given: int | None = None) -> int:
+        begin = self.take(4)
+        if self._given is not None:
+            value = next(self._given) if given is None else given
+            struct.pack_into(f'{self.order}I', self.message, begin, value)
+        self.fixed.append((begin, begin + 4))
+        return int(struct.unpack_from(f'{self.order}I', self.message, begin)[0])
+
+    def string(self) -> str:
+        text = b'' if self._given is None else next(self._given).encode() + b'\0'
+        length = self.count(len(text))
+        begin = self.take(1, length)
+        if text:
+            self.message[begin : begin + length] = text
+        self.fixed.append((begin, begin + length))
+        return self.message[begin : begin + length].rstrip(b'\0').decode(errors='replace')
+
+    def numbers(self, number: int) -> tuple[int, int]:
+        return self.take(8, number), number
+
+    def close(self) -> None:
+        if len(self.message) - self._end > _PADDING:
+            raise MessageError(f"has {len(self.message)} bytes, {self._end} are its type's")
+
+
+class Template:
+    """
+    A message with a header, of which the stamp and the numbers may change.
+
+    It writes and reads single messages, and `decode` reads many at once by it. Gaps before
+    aligned fields are written as zeros, where rmw leaves what was in memory, and are not compared
+    when a message is read.
+
+    Parameters
+    ----------
+    type_name : str
+        One of `TYPES`.
+    frame : str
+        Frame of the header.
+    names : sequence of str
+        Joints of a JointState.
+    counts : sequence of int
+        Number of positions, velocities and efforts of a JointState.
+
+    Attributes
+    ----------
+    frame : str
+        Frame of the header.
+    names : tuple of str
+        Joints; empty if the type has no such field.
+    arrays : tuple of (int, int)
+        Position in the message [bytes] and length of each array of numbers: positions,
+        velocities and efforts of a JointState, else all numbers as one.
+    order : str
+        Byte order, ``<`` or ``>``.
+
+    """
+
+    def __init__(
+        self,
+        type_name: str,
+        frame: str = '',
+        *,
+        names: Sequence[str] = (),
+        counts: Sequence[int] = (0, 0, 0),
+    ) -> None:
+        self._walk(type_name, _Cursor(_HEAD, [frame, len(names), *names, *counts]))
+
+    @classmethod
+    def of(cls, message: bytes, type_name: str) -> Template:
+        """
+        Take a message as the template of others.
+
+        Parameters
+        ----------
+        message : bytes
+            The serialized message.
+        type_name : str
+            One of `TYPES`.
+
+        Returns
+        -------
+        Template
+            One that reads this message.
+
+        Raises
+        ------
+        MessageError
+            If the bytes are not a message of this type.
+
+        """
+        template = cls.__new__(cls)
+        template._walk(type_name, _Cursor(message))
+        return template
+
+    def _walk(self, type_name: str, cursor: _Cursor) -> None:
+        """Find the fields of a message."""
+        fields = _FIELDS[type_name]
+        cursor.take(4, 2)
+        self.frame = cursor.string()
+        names = range(cursor.count() if fields.names else 0)
+        self.names = tuple([cursor.string() for _ in names])
+        for _ in range(fields.strings):
+            cursor.string()
+        arrays = [cursor.numbers(cursor.count()) for _ in range(fields.sequences)]
+        if fields.numbers:
+            arrays.append(cursor.numbers(fields.numbers))
+        cursor.close()
+        self.arrays, self.order = tuple(arrays), cursor.order
+        self._fixed, self._message = cursor.fixed, bytes(cursor.message)
+        #: Made when it is first needed: a batch does without.
+        self._format: _Format | None = None
+
+    @cached_property
+    def fixed(self) -> NDArray[np.intp]:
+        """Positions of the bytes that a message of this template shares with it."""
+        return np.concatenate([np.arange(begin, end) for begin, end in self._fixed])
+
+    def _made(self) -> _Format:
+        self._format = _Format(self._message, self.order, self._fixed, self.arrays)
+        return self._format
+
+    def serialize(self, stamp: int, *values: float) -> bytes:
+        """
+        Write a message.
+
+        Parameters
+        ----------
+        stamp : int
+            Time of the header [ns].
+        *values : float
+            All numbers, in the order of the fields.
+
+        Returns
+        -------
+        bytes
+            The serialized message.
+
+        Raises
+        ------
+        ShapeError
+            If there are more or fewer values than the message has.
+
+        """
+        form = self._format or self._made()
+        if len(values) != form.count:
+            raise ShapeError(f'the message has {form.count} values, got {len(values)}')
+        parts = form.parts
+        parts[1], parts[2] = divmod(stamp, NANOSECONDS)
+        for place, own in form.places:
+            parts[place] = values[own]
+        return form.pack(*parts)
+
+    def read(self, message: bytes) -> Reading | None:
+        """
+        Read a message.
+
+        Parameters
+        ----------
+        message : bytes
+            The serialized message.
+
+        Returns
+        -------
+        Reading or None
+            Its content; None if its fixed bytes are not those of the template.
+
+        """
+        form = self._format or self._made()
+        # One that begins alike and is longer has other counts, but for padding.
+        if len(message) < form.size or form.unpack_fixed(message) != form.fixed:
+            return None
+        found = form.unpack_numbers(message)
+        return Reading(
+            found[0] * NANOSECONDS + found[1],
+            self.frame,
+            self.names,
+            tuple([found[block] for block in form.blocks]),
+        )
+
+
+class _Format:
+    """The structs of a template: of the whole message, of what stays, and of what changes."""
+
+    def __init__(
+        self,
+        message: bytes,
+        order: str,
+        fixed: Sequence[tuple[int, int]],
+        arrays: Sequence[tuple[int, int]],
+    ) -> None:
+        #: Values of the whole, and where the numbers go in it.
+        self.parts: list[Any] = [message[:2], 0, 0]
+        self.places: list[tuple[slice, slice]] = []
+        blocks: list[slice] = []
+        whole, stays, changes = '2s2xiI', '2s10x', '4xiI'
+        end, self.count = _STAMP + 8, 0
+        # In the order of the message; an empty array lies wherever it is.
+        pieces = [(begin, end, False) for begin, end in fixed[1:]]
+        pieces += [(begin, begin + 8 * number, True) for begin, number in arrays]
+        for begin, after, changing in sorted(pieces):
+            gap, size = f'{begin - end}x', after - begin
+            if begin < end:
+                gap = ''
+            whole += gap + (f'{size // 8}d' if changing else f'{size}s')
+            stays += gap + (f'{size}x' if changing else f'{size}s')
+            changes += gap + (f'{size // 8}d' if changing else f'{size}x')
+            if changing:
+                first, number = len(self.parts), size // 8
+                self.places.append(
+                    (slice(first, first + number), slice(self.count, self.count + number))
+                )
+                # Behind the two numbers of the stamp.
+                blocks.append(slice(2 + self.count, 2 + self.count + number))
+                self.parts += [0.0] * number
+                self.count += number
+            else:
+                self.parts.append(message[begin:after])
+            end = max(end, after)
+        writer = struct.Struct(order + whole)
+        self.pack, self.size = writer.pack, writer.size
+        self.unpack_fixed = struct.Struct(order + stays).unpack_from
+        self.unpack_numbers = struct.Struct(order + changes).unpack_from
+        self.blocks, self.fixed = blocks, self.unpack_fixed(message)
+
+
+#: Chooses the numbers wanted from the messages of a template: the position of each [bytes], -1
+#: for one that they do not have; None if the messages are not wanted.
+Choice = Callable[[Template], Sequence[int] | None]
+
+
+class Decoded(NamedTuple):
+    """
+    What a batch of messages holds.
+
+    Attributes
+    ----------
+    stamps : ndarray, shape (n,)
+        Stamps of the headers [ns].
+    values : ndarray, shape (n, k)
+        The numbers wanted, nan where a message does not have one.
+    used : ndarray, shape (n,)
+        Which messages these are.
+    invalid : int
+        Number of invalid messages.
+    fault : str
+        What is wrong with the first of them.
+
+    """
+
+    stamps: NDArray[np.int64]
+    values: NDArray[np.float64]
+    used: NDArray[np.intp]
+    invalid: int
+    fault: str
+
+
+def decode(
+    data: NDArray[np.uint8],
+    begin: NDArray[np.int64],
+    end: NDArray[np.int64],
+    type_name: str,
+    choice: Choice,
+    columns: int,
+) -> Decoded:
+    """
+    Read stamps and numbers of many messages.
+
+    Parameters
+    ----------
+    data : ndarray, shape (bytes,)
+        Bytes that hold the messages.
+    begin, end : ndarray, shape (m,)
+        Where each message begins and ends [bytes].
+    type_name : str
+        One of `TYPES`.
+    choice : callable
+        Which numbers are wanted.
+    columns : int
+        How many numbers are wanted.
+
+    Returns
+    -------
+    Decoded
+        In the order of the messages, without those that are invalid or not wanted.
+
+    """
+    stamps = np.zeros(len(begin), dtype=np.int64)
+    values = np.full((len(begin), columns), np.nan)
+    used = np.zeros(len(begin), dtype=np.bool_)
+    pending = np.arange(len(begin))
+    invalid, fault = 0, ''
+    for number in count():
+        if len(pending) == 0:
+            break
+        first = pending[0]
+        message = data[begin[first] : end[first]]
+        try:
+            template = Template.of(message.tobytes(), type_name)
+        except MessageError as error:
+            invalid, fault = invalid + 1, fault or str(error)
+            pending = pending[1:]
+            continue
+        alike = pending[:1]
+        if number < _TEMPLATES:
+            alike = pending[(end - begin)[pending] == len(message)]
+        rows = np.lib.stride_tricks.sliding_window_view(data, len(message))[begin[alike]]
+        same = (rows[:, template.fixed] == message[template.fixed]).all(axis=1)
+        if not same.all():
+            alike, rows = alike[same], rows[same]
+        wanted = choice(template)
+        if wanted is not None:
+            used[alike] = True
+            order = template.order
+            seconds = _column(rows, _STAMP, f'{order}i4').astype(np.int64)
+            stamps[alike] = seconds * NANOSECONDS + _column(rows, _STAMP + 4, f'{order}u4')
+            for k, position in enumerate(wanted):
+                if position >= 0:
+                    values[alike, k] = _column(rows, position, f'{order}f8')
+        pending = np.setdiff1d(pending, alike, assume_unique=True)
+    read = np.flatnonzero(used)
+    return Decoded(stamps[read], values[read], read, invalid, fault)
+
+
+def _column(rows: NDArray[np.uint8], position: int, kind: str) -> NDArray[Any]:
+    size = np.dtype(kind).itemsize
+    return np.ascontiguousarray(rows[:, position : position + size]).view(kind)[:, 0]

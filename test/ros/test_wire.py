@@ -1,0 +1,196 @@
+"""Numbers read from bytes are those that a general deserializer finds, message by message."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+import struct
+
+from hypothesis import given, settings, strategies
+from identification.samples import header, MOTION, STORE, WRENCH, wrench
+from needle_ros import wire
+from needle_ros.errors import MessageError, ShapeError
+from needle_ros.wire import Template
+import numpy as np
+from numpy.testing import assert_array_equal
+import pytest
+
+STAMPS = strategies.integers(-(2**31) * 10**9, 2**31 * 10**9 - 1)
+TEXTS = strategies.text(max_size=5).filter(lambda text: '\0' not in text)
+FLOATS = strategies.lists(strategies.floats(), max_size=3)
+MESSAGES = strategies.lists(
+    strategies.tuples(
+        STAMPS, strategies.lists(TEXTS, max_size=3), FLOATS, FLOATS, strategies.booleans()
+    ),
+    min_size=1,
+    max_size=40,
+)
+
+
+def joint_state(
+    stamp: int,
+    names: Sequence[str],
+    position: Sequence[float] = (),
+    velocity: Sequence[float] = (),
+    *,
+    little_endian: bool = True,
+) -> bytes:
+    """Serialize a JointState without efforts by rosbags."""
+    arrays = (np.array(values, dtype=float) for values in (position, velocity, ()))
+    message = STORE.types[MOTION](header(stamp), list(names), *arrays)
+    return bytes(STORE.serialize_cdr(message, MOTION, little_endian=little_endian))
+
+
+def decode(
+    messages: Sequence[bytes], type_name: str, choice: wire.Choice, columns: int
+) -> wire.Decoded:
+    ends = np.cumsum([len(message) for message in messages])
+    begins = ends - [len(message) for message in messages]
+    data = np.frombuffer(b''.join(messages), dtype=np.uint8)
+    return wire.decode(data, begins, ends, type_name, choice, columns)
+
+
+def first_two(template: Template) -> list[int]:
+    """Choose the first number of the first two arrays."""
+    return [begin if length else -1 for begin, length in template.arrays[:2]]
+
+
+def second(template: Template) -> list[int]:
+    """Choose the second number of the first array."""
+    return [template.arrays[0][0] + 8]
+
+
+@settings(max_examples=150, deadline=None)
+@given(MESSAGES)
+def test_a_batch_has_the_numbers_that_rosbags_finds(
+    drawn: list[tuple[int, list[str], list[float], list[float], bool]],
+) -> None:
+    """In either byte order, whatever the names and lengths."""
+    serialized, expected = [], []
+    for stamp, names, position, velocity, little in drawn:
+        serialized.append(joint_state(stamp, names, position, velocity, little_endian=little))
+        expected.append([(*part, np.nan)[0] for part in (position, velocity)])
+    read = decode(serialized, MOTION, first_two, 2)
+    assert read.invalid == 0
+    assert_array_equal(read.used, np.arange(len(drawn)))
+    assert_array_equal(read.values, expected)
+    for stamp, message in zip(read.stamps, serialized, strict=True):
+        there = STORE.deserialize_cdr(message, MOTION).header.stamp
+        assert stamp == there.sec * 10**9 + there.nanosec
+
+
+@settings(max_examples=150, deadline=None)
+@given(STAMPS, strategies.lists(TEXTS, max_size=3), FLOATS, FLOATS, strategies.booleans())
+def test_a_template_writes_and_reads_what_rosbags_does(
+    stamp: int, names: list[str], position: list[float], velocity: list[float], little: bool
+) -> None:
+    """A message is its own template, and one made from its description writes the same bytes."""
+    message = joint_state(stamp, names, position, velocity, little_endian=little)
+    template = Template.of(message, MOTION)
+    reading = template.read(message)
+    assert reading is not None
+    assert reading[:3] == (stamp, 'needle_base', tuple(names))
+    assert_array_equal(np.concatenate(reading.values), [*position, *velocity])
+    assert template.serialize(stamp, *position, *velocity) == message
+    if little:
+        counts = len(position), len(velocity), 0
+        made = Template(MOTION, 'needle_base', names=names, counts=counts)
+        assert made.serialize(stamp, *position, *velocity) == message
+
+
+DESCRIPTIONS = strategies.tuples(
+    TEXTS,
+    strategies.lists(TEXTS, max_size=3),
+    strategies.tuples(*[strategies.integers(0, 3)] * 3),
+)
+
+
+@given(DESCRIPTIONS, DESCRIPTIONS, STAMPS)
+def test_a_template_reads_its_own_messages_only(
+    one: tuple[str, list[str], tuple[int, int, int]],
+    other: tuple[str, list[str], tuple[int, int, int]],
+    stamp: int,
+) -> None:
+    """Another frame, joint or length is another template."""
+    frame, names, counts = other
+    data = Template(MOTION, frame, names=names, counts=counts).serialize(
+        stamp, *[0.5] * sum(counts)
+    )
+    reading = Template(MOTION, one[0], names=one[1], counts=one[2]).read(data)
+    assert (reading is not None) == (one == other)
+
+
+@pytest.mark.parametrize('length', [0, 3, 12, 75])
+def test_a_template_does_not_read_a_message_cut_short(length: int) -> None:
+    """More bytes do not matter, nor do the options of the encapsulation."""
+    template = Template(WRENCH, 'needle_base')
+    data = template.serialize(1, *[0.5] * 6)
+    reading = template.read(data)
+    assert len(data) == 76
+    assert reading is not None
+    assert reading.values == ((0.5,) * 6,)
+    assert template.read(data[:length]) is None
+    assert template.read(data + b'\0') == reading
+    assert template.read(data[:2] + b'\0\3' + data[4:]) == reading
+
+
+@pytest.mark.parametrize('count', [0, 5, 7])
+def test_a_wrong_number_of_values_is_refused(count: int) -> None:
+    """And does no harm to the messages that follow."""
+    template = Template(WRENCH, 'needle_base')
+    with pytest.raises(ShapeError, match=f'has 6 values, got {count}'):
+        template.serialize(1, *[0.5] * count)
+    reading = template.read(template.serialize(1, *[0.5] * 6))
+    assert reading is not None
+    assert reading.values == ((0.5,) * 6,)
+
+
+def test_xcdr2_aligns_to_four_bytes() -> None:
+    """A batch and a single message are read alike."""
+    body = struct.pack('<iII', 1, 2, 4) + b'abc\0' + struct.pack('<6d', *range(6))
+    message = b'\x00\x07\x00\x00' + body
+    read = decode([message], WRENCH, second, 1)
+    assert read.invalid == 0
+    assert read.values == [[1.0]]
+    reading = Template.of(message, WRENCH).read(message)
+    assert reading == (1_000_000_002, 'abc', (), (tuple(map(float, range(6))),))
+
+
+@settings(max_examples=200, deadline=None)
+@given(strategies.binary(max_size=120), strategies.sampled_from([*wire.TYPES]))
+def test_any_bytes_are_invalid_or_have_numbers(data: bytes, type_name: str) -> None:
+    """Nothing else is raised, and an invalid message has a reason."""
+    for message in (data, b'\x00\x01\x00\x00' + data):
+        read = decode([message], type_name, first_two, 2)
+        assert read.invalid + len(read.used) == 1
+        assert bool(read.invalid) == bool(read.fault)
+
+
+@pytest.mark.parametrize('size', range(76))
+def test_a_message_cut_anywhere_is_invalid(size: int) -> None:
+    """The message after it is read."""
+    whole = wrench(10**18, 1.0)
+    read = decode([whole[:size], whole], WRENCH, second, 1)
+    assert (read.invalid, *read.used, *read.values) == (1, 1, 1.0)
+    with pytest.raises(MessageError, match=r'not CDR|ends after'):
+        Template.of(whole[:size], WRENCH)
+
+
+def test_bytes_beyond_the_type_are_invalid() -> None:
+    """Up to three bytes are padding."""
+    whole = wrench(10**18, 1.0)
+    assert Template.of(whole + bytes(3), WRENCH).read(whole + bytes(3)) is not None
+    with pytest.raises(MessageError, match="has 80 bytes, 76 are its type's"):
+        Template.of(whole + bytes(4), WRENCH)
+
+
+def test_many_kinds_of_message_are_read_one_by_one() -> None:
+    """Each has another joint."""
+    messages = [joint_state(i, [f'joint {i}'], [float(i)]) for i in range(200)]
+    read = decode(messages, MOTION, first_two, 2)
+    assert_array_equal(read.values[:, 0], np.arange(200.0))
+
+
+def test_messages_that_are_not_wanted_are_left_out() -> None:
+    """They are neither used nor invalid."""
+    read = decode([wrench(1, 1.0)], WRENCH, lambda _template: None, 2)
+    assert (len(read.used), read.invalid) == (0, 0)
