@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 import signal
 import sys
@@ -22,7 +22,7 @@ from needle_ros.errors import (
     NeedleError,
     ParameterError,
 )
-from needle_ros.settings import as_number, check_constants, constant
+from needle_ros.settings import check_constants, constant
 from needle_ros.timing import NANOSECONDS
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
@@ -193,7 +193,7 @@ class PlayerNode(BaseNode):
 
     def change(self, changes: Mapping[str, Any]) -> None:
         """Go on at another pace."""
-        settings = replace(self._settings, rate=as_number(changes['rate']))
+        settings = self.settings('', PlayerSettings, changes)
         if self.is_active:
             self._anchor(self._position())
         self._settings = settings

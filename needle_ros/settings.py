@@ -111,8 +111,8 @@ def from_values(
         The dataclass.
     values : Mapping[str, Any]
         Values by field name; integers are accepted where a float is meant, lists and arrays where
-        a tuple is meant. A field that is not there, or is None, as an empty list in a parameter
-        file is, has its default.
+        a tuple is meant. A field without a value has its default, and so has a tuple given as
+        None: so an empty list in a parameter file arrives.
     prefix : str
         Namespace of the names in messages, such as ``model.``.
 
@@ -134,9 +134,11 @@ def from_values(
             raise ParameterError(
                 unknown_name(f'{prefix}{name}', (f'{prefix}{item}' for item in known))
             )
-        if value is not None:
-            value = tuple(value) if isinstance(value, (list, array)) else value
-            given[name] = as_number(value) if 'unit' in known[name].metadata else value
+        several = isinstance(known[name].default, tuple)
+        if several and value is None:
+            continue
+        taken = tuple(value) if several and isinstance(value, (list, array)) else value
+        given[name] = as_number(taken) if 'unit' in known[name].metadata else taken
     try:
         return kind(**given)
     except ParameterError as error:

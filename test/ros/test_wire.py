@@ -6,13 +6,13 @@ from collections.abc import Sequence
 import struct
 
 from hypothesis import given, settings, strategies
-from identification.samples import header, MOTION, STORE, WRENCH, wrench
 from needle_ros import wire
 from needle_ros.errors import MessageError, ShapeError
 from needle_ros.wire import Template
 import numpy as np
 from numpy.testing import assert_array_equal
 import pytest
+from support.samples import header, MOTION, STORE, WRENCH, wrench
 
 STAMPS = strategies.integers(-(2**31) * 10**9, 2**31 * 10**9 - 1)
 TEXTS = strategies.text(max_size=5).filter(lambda text: '\0' not in text)
