@@ -16,35 +16,31 @@ from needle_identification.bags.bag import (
 from needle_identification.bags.storage import OfferedQos
 from needle_identification.errors import IdentificationError, RecordingError
 from needle_identification.estimation.estimate import ParameterEstimate, Statistic, statistic
-from needle_identification.estimation.goodness import ResidualTest
-from needle_identification.estimation.regression import ESTIMATORS, regress, Regression
-from needle_identification.friction.fit import (
-    Comparison,
-    Fit,
-    FrictionEstimate,
-    FrictionSummary,
-    identify_friction,
-    summarize,
-)
+from needle_identification.estimation.estimators import ESTIMATORS
+from needle_identification.estimation.regression import regress, Regression
+from needle_identification.estimation.residual_tests import ResidualTest
+from needle_identification.friction.comparison import Comparison
+from needle_identification.friction.estimate import Fit, FrictionEstimate
+from needle_identification.friction.identify import identify_friction
 from needle_identification.friction.recursive import RecursiveFriction
-from needle_identification.friction.terms import FrictionSettings, TERMS
+from needle_identification.friction.settings import FrictionSettings, TERMS
+from needle_identification.friction.summary import FrictionSummary, summarize
 from needle_identification.recordings.reading import (
     read_friction_recording,
     read_indentation_recording,
 )
 from needle_identification.recordings.recording import IndentationRecording, Recording
 from needle_identification.result import result_yaml, write_result
-from needle_identification.stiffness.fit import (
-    identify_stiffness,
-    LevelEstimate,
+from needle_identification.stiffness.estimate import LevelEstimate, StiffnessEstimate
+from needle_identification.stiffness.identify import identify_stiffness
+from needle_identification.stiffness.presses import Presses
+from needle_identification.stiffness.settings import StiffnessSettings
+from needle_identification.stiffness.spring import asymmetry
+from needle_identification.stiffness.summary import (
     LevelSummary,
-    Presses,
-    StiffnessEstimate,
-    StiffnessSettings,
     StiffnessSummary,
     summarize_stiffness,
 )
-from needle_identification.stiffness.spring import asymmetry
 
 __all__ = [
     'COMPRESSIONS',

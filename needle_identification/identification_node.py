@@ -14,25 +14,22 @@ from geometry_msgs.msg import WrenchStamped
 from needle_dynamics.compiled.cache import announce_compilation
 from needle_identification.bags.bag import check_distinct
 from needle_identification.estimation.estimate import Statistic, statistic
-from needle_identification.friction.fit import (
-    FrictionEstimate,
-    identify_friction,
-    summarize,
-)
+from needle_identification.estimation.formatting import measured
+from needle_identification.friction.estimate import FrictionEstimate
+from needle_identification.friction.identify import identify_friction
 from needle_identification.friction.live import LiveFriction
-from needle_identification.friction.terms import FrictionSettings
+from needle_identification.friction.settings import FrictionSettings
+from needle_identification.friction.summary import summarize
 from needle_identification.recordings.reading import (
     read_friction_recording,
     read_indentation_recording,
     TIMES,
 )
-from needle_identification.result import measured, model_parameters, NODES, write_result
-from needle_identification.stiffness.fit import (
-    identify_stiffness,
-    StiffnessEstimate,
-    StiffnessSettings,
-    summarize_stiffness,
-)
+from needle_identification.result import model_parameters, NODES, write_result
+from needle_identification.stiffness.estimate import StiffnessEstimate
+from needle_identification.stiffness.identify import identify_stiffness
+from needle_identification.stiffness.settings import StiffnessSettings
+from needle_identification.stiffness.summary import summarize_stiffness
 from needle_ros.base_node import BaseNode, LATCHED, run, SENSOR
 from needle_ros.errors import (
     NeedleError,

@@ -5,33 +5,24 @@ from __future__ import annotations
 from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import fields
-from math import floor, inf, isfinite, log10
+from math import isfinite
 import os
 from pathlib import Path
 from typing import Final
 
-from needle_dynamics import (
-    NeedleParameters,
-)
+from needle_dynamics import NeedleParameters
 from needle_identification.errors import IdentificationError
 from needle_identification.estimation.estimate import Statistic
-from needle_identification.friction.fit import FrictionSummary
-from needle_identification.stiffness.fit import StiffnessSummary
-from needle_ros.errors import (
-    ParameterError,
-)
+from needle_identification.estimation.formatting import UNKNOWN
+from needle_identification.friction.summary import FrictionSummary
+from needle_identification.stiffness.summary import StiffnessSummary
+from needle_ros.errors import ParameterError
 import yaml
 
-#: What is said of a parameter that the data do not determine.
-UNKNOWN: Final = 'not determined by the data'
-
-#: Smaller errors are not written out in digits.
-_LEAST_ERROR: Final = 1e-9
-
-#: Nodes that take the result.
+#: Nodes that use the result.
 NODES: Final = ('plant', 'controller')
 
-#: Constants of the model that are numbers, by name.
+#: Numeric constants of the model, by name.
 _CONSTANTS: Final = {
     item.name: item for item in fields(NeedleParameters) if 'unit' in item.metadata
 }
@@ -39,20 +30,20 @@ _CONSTANTS: Final = {
 
 def model_parameters(statistics: Iterable[Statistic]) -> dict[str, float | str]:
     """
-    Return what was identified as parameters of the nodes plant and controller.
+    Return identified parameters as parameters of the nodes plant and controller.
 
-    A mean outside the range of its parameter, which can only be within its error of the range's
-    end, is moved to that end. What the data do not determine is left out.
+    A mean outside the range of its parameter, which can only be within its error of the limit,
+    is moved to the limit. Parameters that the data do not determine are left out.
 
     Parameters
     ----------
     statistics : iterable of Statistic
-        What was identified; what is no constant of the model is left out.
+        Identified parameters; those that are no constants of the model are left out.
 
     Returns
     -------
     dict
-        Values [SI] by name, such as ``model.coulomb_friction``.
+        Values in SI units by name, such as ``model.coulomb_friction``.
 
     """
     values: dict[str, float | str] = {}
@@ -71,7 +62,7 @@ def result_yaml(
     friction: FrictionSummary | None, stiffness: StiffnessSummary | None = None
 ) -> str:
     """
-    Return a ROS parameter file with what was identified.
+    Return a ROS parameter file with the identified parameters.
 
     It applies to nodes named plant and controller in any namespace.
 
@@ -90,7 +81,7 @@ def result_yaml(
     Raises
     ------
     IdentificationError
-        If the data determine nothing.
+        If the data determine no parameter.
 
     """
     found = [
@@ -120,13 +111,24 @@ def _described(statistic: Statistic) -> str:
 
 
 def write_result(
-    path: Path, friction: FrictionSummary | None, stiffness: StiffnessSummary | None = None
+    path: Path | str, friction: FrictionSummary | None, stiffness: StiffnessSummary | None = None
 ) -> None:
     """
     Write the parameter file of `result_yaml`.
 
+    Parameters
+    ----------
+    path : Path or str
+        File to write.
+    friction : FrictionSummary or None
+        Friction over all recordings.
+    stiffness : StiffnessSummary or None
+        Stiffness over all recordings.
+
     Raises
     ------
+    IdentificationError
+        If the data determine no parameter.
     ParameterError
         If the file cannot be written.
 
@@ -134,23 +136,24 @@ def write_result(
     write_whole(path, result_yaml(friction, stiffness).encode())
 
 
-def write_whole(path: Path, content: bytes) -> None:
+def write_whole(path: Path | str, content: bytes) -> None:
     """
-    Write a file so that whoever reads it sees the old content or the new, never a part.
+    Write a file so that a reader sees the old content or the new, never a part.
 
     Parameters
     ----------
-    path : Path
+    path : Path or str
         File to write.
     content : bytes
-        All of it.
+        All of its content.
 
     Raises
     ------
     ParameterError
-        If it cannot be written.
+        If the file cannot be written.
 
     """
+    path = Path(path)
     if not path.name or path.is_dir():
         raise ParameterError(f'{path} cannot be written: it is not the name of a file')
     draft = path.with_name(f'{path.name}.{os.getpid()}.tmp')
@@ -161,57 +164,3 @@ def write_whole(path: Path, content: bytes) -> None:
         with suppress(OSError):
             draft.unlink()
         raise ParameterError(f'{path} cannot be written: {error.strerror}') from error
-
-
-def measured(value: float, error: float, unit: str = '') -> str:
-    """
-    Return a value with its error, to the digits that the error leaves it.
-
-    Parameters
-    ----------
-    value, error : float
-        Estimate and standard error, or half of an interval.
-    unit : str
-        Unit of both.
-
-    Returns
-    -------
-    str
-        Such as ``0.5604 ± 0.0005 N``.
-
-    """
-    if not isfinite(value):
-        return UNKNOWN
-    form = _form(error)
-    reach = f' ± {error:{form if form.endswith("f") else ".2g"}}' if isfinite(error) else ''
-    return f'{value:{form}}{reach}{_after(unit)}'
-
-
-def rounded(value: float, error: float, unit: str = '') -> str:
-    """Return a value to the digits that its error leaves it."""
-    return f'{value:{_form(error)}}{_after(unit)}' if isfinite(value) else UNKNOWN
-
-
-def spread(deviation: float, unit: str = '') -> str:
-    """Return a standard deviation to three digits."""
-    return rounded(deviation, 0.1 * deviation, unit)
-
-
-def between(interval: tuple[float, float]) -> str:
-    """Return an interval, to the digits that its width leaves it."""
-    low, high = interval
-    if not (isfinite(low) and isfinite(high)):
-        return UNKNOWN
-    form = _form((high - low) / 4.0)
-    return f'{low:{form}} to {high:{form}}'
-
-
-def _form(error: float) -> str:
-    """Return the format that leaves two digits of the error."""
-    if not _LEAST_ERROR < error < inf:
-        return '.6g'
-    return f'.{max(1 - floor(log10(error)), 0)}f'
-
-
-def _after(unit: str) -> str:
-    return '' if unit in ('', '1') else f' {unit}'

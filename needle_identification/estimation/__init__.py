@@ -1,1 +1,1 @@
-"""From arrays to estimates with their intervals."""
+"""Linear regression with standard errors, tests of its residuals, and estimates of parameters."""

@@ -1,33 +1,71 @@
-"""What identification says of a parameter: from one recording, and over several."""
+"""Estimates of a parameter: from one recording, and the mean over several."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import inf, nan, sqrt
+from typing import Protocol, TypeVar
 
 from needle_identification.errors import IdentificationError
+from needle_identification.estimation.formatting import measured
 import numpy as np
 from scipy.special import stdtrit
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+class _HasName(Protocol):
+    @property
+    def name(self) -> str: ...
+
+
+_Named = TypeVar('_Named', bound=_HasName)
+
+
+def find_by_name(items: Sequence[_Named], name: str) -> _Named:
+    """
+    Find the item of a name.
+
+    Parameters
+    ----------
+    items : sequence
+        Items that have a ``name``.
+    name : str
+        Name to look for.
+
+    Returns
+    -------
+    item
+        The first item of that name.
+
+    Raises
+    ------
+    KeyError
+        If there is none; the message lists the names.
+
+    """
+    for item in items:
+        if item.name == name:
+            return item
+    raise KeyError(f'{name!r}; valid: {", ".join(item.name for item in items)}')
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class ParameterEstimate:
     """
-    One parameter from one recording.
+    Estimate of one parameter from one recording.
 
     Attributes
     ----------
     name : str
-        Name, that of the field of `NeedleParameters` where there is one.
+        Name; that of the field of `NeedleParameters` if there is one.
     symbol, unit : str
-        How people write it, and its unit.
+        Symbol in text, such as ``mu_s``, and unit; ``1`` for a pure number.
     value, error : float
-        Estimate and its standard error; nan and inf if the data do not determine it.
+        Estimate and its standard error; nan and inf if the data do not determine the parameter.
     interval : (float, float)
         95 % confidence interval.
     determined : bool
-        False if the data cannot tell it from the others.
+        Whether the data determine the parameter.
 
     """
 
@@ -39,8 +77,29 @@ class ParameterEstimate:
     interval: tuple[float, float] = (-inf, inf)
     determined: bool = False
 
+    def with_value(self, value: float, error: float, half_width: float) -> ParameterEstimate:
+        """
+        Return a copy that is determined, with an interval symmetric about the value.
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+        Parameters
+        ----------
+        value, error, half_width : float
+            Estimate, standard error and half the width of the 95 % interval, in its unit.
+
+        Returns
+        -------
+        ParameterEstimate
+            The copy.
+
+        """
+        interval = (value - half_width, value + half_width)
+        return replace(self, value=value, error=error, interval=interval, determined=True)
+
+    def __repr__(self) -> str:
+        return f'<{self.name}: {measured(self.value, self.error, self.unit)}>'
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Statistic:
     """
     One parameter over several recordings.
@@ -50,15 +109,15 @@ class Statistic:
     name, symbol, unit : str
         As in `ParameterEstimate`.
     mean : float
-        Mean over the recordings that determine it; nan if none does.
+        Mean over the recordings that determine the parameter; nan if none does.
     deviation : float or None
-        Standard deviation over the recordings, as in Table 1; None for fewer than two.
+        Standard deviation over the recordings, as in Tables 1 and 2; None for fewer than two.
     error : float
         Standard error of the mean.
     interval : (float, float)
         95 % confidence interval of the mean.
     count : int
-        Recordings that determine it.
+        Number of recordings that determine the parameter.
 
     """
 
@@ -71,21 +130,24 @@ class Statistic:
     interval: tuple[float, float] = (-inf, inf)
     count: int = 0
 
+    def __repr__(self) -> str:
+        return f'<{self.name}: {measured(self.mean, self.error, self.unit)}, n = {self.count}>'
+
 
 def statistic(parameters: Sequence[ParameterEstimate]) -> Statistic:
     """
-    Put one parameter from several recordings together, as in Tables 1 and 2.
+    Take the mean of one parameter over several recordings, as in Tables 1 and 2.
 
-    The standard error of the mean is the scatter over the recordings divided by the root of
-    their number, which holds whatever makes them differ; but it is never taken as smaller than
-    the errors within the recordings alone allow, which few recordings could undercut by chance.
-    The interval is wider than two standard errors where few recordings differ by more than
-    their own errors: a scatter known from few is itself uncertain (Student's t).
+    The standard error of the mean is the standard deviation over the recordings divided by the
+    square root of their number. It is never smaller than the errors within the recordings allow,
+    because a few recordings may agree by chance. Where the recordings differ by more than their
+    own errors, the interval is that of Student's t, since a standard deviation from few
+    recordings is itself uncertain. Otherwise it is the mean plus and minus two standard errors.
 
     Parameters
     ----------
     parameters : sequence of ParameterEstimate
-        The parameter, one per recording; those that do not determine it are left out.
+        The parameter, one estimate per recording. Those that are not determined are left out.
 
     Returns
     -------
@@ -108,9 +170,9 @@ def statistic(parameters: Sequence[ParameterEstimate]) -> Statistic:
     values = np.array([parameter.value for parameter in known])
     deviation = float(values.std(ddof=1)) if count > 1 else None
     within = float(np.mean([parameter.error**2 for parameter in known]))
-    scatter = (deviation or 0.0) ** 2
-    error = sqrt(max(within, scatter) / count)
-    reach = error * (float(stdtrit(count - 1, 0.975)) if scatter > within else 2.0)
+    between = (deviation or 0.0) ** 2
+    error = sqrt(max(within, between) / count)
+    half_width = error * (float(stdtrit(count - 1, 0.975)) if between > within else 2.0)
     mean = float(values.mean())
     return Statistic(
         name=first.name,
@@ -119,6 +181,6 @@ def statistic(parameters: Sequence[ParameterEstimate]) -> Statistic:
         mean=mean,
         deviation=deviation,
         error=error,
-        interval=(mean - reach, mean + reach),
+        interval=(mean - half_width, mean + half_width),
         count=count,
     )

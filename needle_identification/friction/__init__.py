@@ -1,1 +1,1 @@
-"""Identification of friction."""
+"""Friction of a needle from the force and the motion of its base."""

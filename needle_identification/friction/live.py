@@ -1,4 +1,4 @@
-"""Friction from streams that run: pairs force and motion by stamp and keeps estimating."""
+"""Friction from running topics: pairs force and motion by stamp and keeps estimating."""
 
 from __future__ import annotations
 
@@ -11,50 +11,51 @@ from typing import Final
 
 from needle_identification.estimation.estimate import ParameterEstimate
 from needle_identification.friction.recursive import RecursiveFriction
-from needle_identification.friction.terms import FrictionSettings
+from needle_identification.friction.settings import FrictionSettings
 
-#: Pairs from which the sample rate is told.
+#: Pairs from which the sampling rate is determined.
 _FIRST: Final = 50
 
 #: Motion is not interpolated over a longer step [s].
 _LARGEST_STEP: Final = 0.1
 
-#: A stamp that goes back by more is a clock set anew, not a message that overtook another [s].
+#: A stamp that goes back by more means that the clock was set back; by less, that a message
+#: arrived late [s].
 _SET_BACK: Final = 1.0
 
-#: Samples that may wait for the other stream.
-_MOST_WAITING: Final = 20_000
+#: Samples that may wait for the other topic.
+_MAX_WAITING: Final = 20_000
 
 
 class LiveFriction:
     """
-    Estimates friction from messages as they come.
+    Estimates friction from messages as they arrive.
 
-    Motion is interpolated at the stamps of the force. What is not finite, out of order, or
-    within a gap of the motion is dropped and counted; when the clock is set back, estimation
-    starts anew.
+    Motion is interpolated to the stamps of the force. A sample that is not finite, out of order,
+    or within a gap of the motion is dropped and counted. When the clock is set back, estimation
+    starts again.
 
     Parameters
     ----------
     settings : FrictionSettings
-        How to identify.
+        Terms and filter.
     forgetting : float
-        Time of steady motion after which a sample counts 1/e [s].
+        Time of steady motion in which the weight of a sample falls to 1 / e [s].
 
     Attributes
     ----------
     samples : int
-        Samples of the force that were paired with the motion.
+        Number of samples of the force that were paired with the motion.
 
     Raises
     ------
     ParameterError
-        If the settings or the time are not such as `RecursiveFriction` takes.
+        If `RecursiveFriction` rejects the settings or the time.
 
     """
 
     def __init__(self, settings: FrictionSettings, forgetting: float) -> None:
-        # The rate is not known yet; what is wrong with the rest is said now.
+        # The rate is not known yet; the other arguments are checked now.
         RecursiveFriction(settings, 1.0, forgetting)
         self._settings, self._forgetting = settings, forgetting
         self._dropped: Counter[str] = Counter()
@@ -62,8 +63,8 @@ class LiveFriction:
 
     def _restart(self) -> None:
         self._start: int | None = None
-        self._motion: deque[tuple[float, float]] = deque(maxlen=_MOST_WAITING)
-        self._force: deque[tuple[float, float]] = deque(maxlen=_MOST_WAITING)
+        self._motion: deque[tuple[float, float]] = deque(maxlen=_MAX_WAITING)
+        self._force: deque[tuple[float, float]] = deque(maxlen=_MAX_WAITING)
         self._last = {'force': -inf, 'motion': -inf}
         self._last_depth: tuple[float, float] | None = None
         self._first: list[tuple[float, float, float]] = []
@@ -72,21 +73,21 @@ class LiveFriction:
 
     @property
     def dropped(self) -> Mapping[str, int]:
-        """Samples dropped, by reason."""
+        """Number of dropped samples by reason."""
         return dict(self._dropped)
 
     def take_motion(self, stamp: int, depth: float, speed: float | None) -> None:
         """
-        Take a sample of the motion.
+        Add a sample of the motion.
 
         Parameters
         ----------
         stamp : int
-            When [ns].
+            Time [ns].
         depth : float
             Inserted length [m].
         speed : float or None
-            Insertion speed [m/s]; the depth is differentiated if there is none.
+            Insertion speed [m/s]; None to differentiate the depth.
 
         """
         time = self._time('motion', stamp, depth if speed is None else speed)
@@ -104,12 +105,12 @@ class LiveFriction:
 
     def take_force(self, stamp: int, force: float) -> None:
         """
-        Take a sample of the force.
+        Add a sample of the force.
 
         Parameters
         ----------
         stamp : int
-            When [ns].
+            Time [ns].
         force : float
             Force of the base on the needle [N], positive into the tissue.
 
@@ -120,10 +121,18 @@ class LiveFriction:
             self._pair()
 
     def estimate(self) -> tuple[ParameterEstimate, ...]:
-        """Return the friction as it is now; nothing before the sample rate is known."""
+        """
+        Return the present friction.
+
+        Returns
+        -------
+        tuple of ParameterEstimate
+            As `RecursiveFriction.estimate`; empty before the sampling rate is known.
+
+        """
         return () if self._estimator is None else self._estimator.estimate()
 
-    def _time(self, stream: str, stamp: int, value: float) -> float | None:
+    def _time(self, topic: str, stamp: int, value: float) -> float | None:
         """Return the time from the start [s], or None if the sample is dropped."""
         if not isfinite(value):
             self._dropped['not finite'] += 1
@@ -131,14 +140,14 @@ class LiveFriction:
         if self._start is None:
             self._start = stamp
         time = 1e-9 * (stamp - self._start)
-        if time < self._last[stream] - _SET_BACK:
+        if time < self._last[topic] - _SET_BACK:
             self._restart()
             self._dropped['clock set back'] += 1
             return None
-        if time <= self._last[stream]:
+        if time <= self._last[topic]:
             self._dropped['out of order'] += 1
             return None
-        self._last[stream] = time
+        self._last[topic] = time
         return time
 
     def _pair(self) -> None:

@@ -2,10 +2,10 @@ r"""
 Friction while the needle moves: recursive least squares with exponential forgetting.
 
 The information :math:`A = \sum \lambda^{age} x x^T`, :math:`b = \sum \lambda^{age} x f` of the
-samples in steady motion is kept, so that the estimate is at any time that of weighted least
-squares over all of them. Force and speed pass the filter of `identify_friction`, half its length
-late, and samples it mixes are left out likewise; the acceleration is one more regressor, which
-takes up a lag of the force.
+samples in steady motion is kept. The estimate is at any time that of weighted least squares over
+all of them. Force and speed pass the filter of `identify_friction`, half its length late, and the
+same samples are left out. The acceleration is one more regressor, which takes up a lag of the
+force.
 """
 
 from __future__ import annotations
@@ -14,36 +14,26 @@ from collections import deque
 from math import ceil, exp, inf, nan
 from typing import Final
 
-from needle_dynamics import (
-    FloatArray,
-)
+from needle_dynamics import FloatArray
 from needle_identification.estimation.estimate import ParameterEstimate
 from needle_identification.estimation.regression import determinable, Regression
-from needle_identification.friction.fit import filter_taps, WINDOW
-from needle_identification.friction.terms import (
-    columns_of,
-    FrictionSettings,
-    parameter_estimates,
-    regressors,
-)
-from needle_ros.errors import (
-    ParameterError,
-)
+from needle_identification.friction.filtering import CORRELATION_LENGTH, filter_taps, GAP
+from needle_identification.friction.intervals import parameter_estimates
+from needle_identification.friction.settings import FrictionSettings
+from needle_identification.friction.terms import columns_of, regressors
+from needle_ros.errors import ParameterError
 import numpy as np
 
-#: Independent parts of the remembered motion that an error needs to mean something.
+#: Independent parts of the remembered motion that a meaningful standard error needs.
 _FEWEST_PARTS: Final = 10.0
 
-#: Length of these parts [windows of the correlation of filtered noise].
-_PART: Final = 2.0
+#: Length of these parts [correlation windows of filtered noise].
+_PART_LENGTH: Final = 2.0
 
-#: Forgetting times after which a part is dropped: its weight is below 4e-4.
+#: Time after which a part is dropped [forgetting times]; its weight is then below 4e-4.
 _REMEMBERED: Final = 8.0
 
-#: A longer step between samples is a gap [sample periods].
-_GAP: Final = 3.5
-
-#: Size of singular values of the information that are rounding.
+#: Singular values of the information below this part of the largest are rounding.
 _ROUNDING: Final = 1e-7
 
 
@@ -56,10 +46,10 @@ class RecursiveFriction:
     settings : FrictionSettings
         Terms, filter and what counts as steady motion; the estimator is ordinary.
     rate : float
-        Samples per second [Hz]; they come evenly.
+        Sampling rate [Hz]; the samples are even.
     forgetting : float
-        Time of steady motion in which the weight of a sample falls to 1 / e [s]. A needle at rest
-        teaches nothing and makes nothing forgotten.
+        Time of steady motion in which the weight of a sample falls to 1 / e [s]. At rest nothing
+        is learned and nothing is forgotten.
 
     Raises
     ------
@@ -74,40 +64,39 @@ class RecursiveFriction:
                 raise ParameterError(f'{name} must be finite and > 0, got {value!r}')
         if settings.estimator != 'ordinary':
             raise ParameterError(
-                f'recursive estimation takes the estimator ordinary, got {settings.estimator!r}'
+                f'recursive estimation needs the estimator ordinary, got {settings.estimator!r}'
             )
         self._settings = settings
         self._period = 1.0 / rate
         self._taps = filter_taps(settings.cutoff, self._period)
-        self._reach = len(self._taps) // 2
         # The filtered acceleration needs a neighbor on either side, the lag one more.
-        self._margin = self._reach + 2
-        self._forget = exp(-self._period / forgetting)
-        self._length = ceil(_PART * WINDOW / settings.cutoff * rate)
+        self._margin = len(self._taps) // 2 + 2
+        self._decay = exp(-self._period / forgetting)
+        self._length = ceil(_PART_LENGTH * CORRELATION_LENGTH / settings.cutoff * rate)
         self._parts: deque[tuple[FloatArray, int]] = deque(
             maxlen=ceil(_REMEMBERED * forgetting * rate / self._length)
         )
         self._raw: deque[tuple[float, float]] = deque(maxlen=len(self._taps))
         self._smooth: deque[tuple[float, float]] = deque(maxlen=3)
         self._pending: deque[tuple[float, float, float]] = deque()
-        self._nuisance = 'inertia' not in settings.terms
-        k = len(columns_of(settings.terms)) + self._nuisance
-        #: Information A and, in the last column, b: of all samples, and since the last part.
+        self._estimates_lag = 'inertia' not in settings.terms
+        k = len(columns_of(settings.terms)) + self._estimates_lag
+        #: Information A and, in the last column, b: of all samples, and of the part in progress.
         self._known, self._part = np.zeros((k, k + 1)), np.zeros((k, k + 1))
         self._count = 0
-        self._pace = self._weight = 0.0
+        self._speed_sum = self._weight = 0.0
         self._time = -inf
         self._regime = 0.0
-        self._since = 0
+        self._since_change = 0
 
     def update(self, time: float, speed: float, force: float) -> None:
         """
-        Take one sample.
+        Add one sample.
 
         Parameters
         ----------
         time : float
-            Time [s]; after a gap, or a step back, the filter starts anew.
+            Time [s]. After a gap, or a step back, the filter starts again.
         speed, force : float
             Insertion speed [m/s] and force of the base on the needle [N], positive into the
             tissue. A sample that is not finite is a gap.
@@ -116,10 +105,10 @@ class RecursiveFriction:
         if not abs(speed) + abs(force) < inf:
             self._time = -inf
             return
-        if not 0.0 < time - self._time < _GAP * self._period:
+        if not 0.0 < time - self._time < GAP * self._period:
             self._raw.clear()
             self._smooth.clear()
-            self._change()
+            self._drop_pending()
         self._time = time
         self._raw.append((speed, force))
         if len(self._raw) < len(self._taps):
@@ -128,23 +117,24 @@ class RecursiveFriction:
         self._smooth.append((float(smooth[0]), float(smooth[1])))
         if len(self._smooth) == 3:
             (before, _), (now, filtered), (after, _) = self._smooth
-            self._filtered(now, 0.5 * (after - before) / self._period, filtered)
+            self._select(now, 0.5 * (after - before) / self._period, filtered)
 
-    def _change(self) -> None:
-        """Drop the samples that the change of regime reaches, before and after."""
+    def _drop_pending(self) -> None:
+        """Drop the samples that a change of regime affects, before and after it."""
         self._pending.clear()
-        self._since = 0
+        self._since_change = 0
 
-    def _filtered(self, speed: float, acceleration: float, force: float) -> None:
+    def _select(self, speed: float, acceleration: float, force: float) -> None:
+        """Pass on samples in steady motion, once the motion has stayed steady after them."""
         settings = self._settings
         regime = float(np.sign(speed)) if abs(speed) > settings.moving_speed else 0.0
-        if self._nuisance and abs(acceleration) > settings.largest_acceleration:
+        if self._estimates_lag and abs(acceleration) > settings.largest_acceleration:
             regime = nan
         if regime != self._regime:
-            self._change()
+            self._drop_pending()
             self._regime = regime
-        self._since += 1
-        if self._since <= self._margin or abs(regime) != 1.0:
+        self._since_change += 1
+        if self._since_change <= self._margin or abs(regime) != 1.0:
             return
         self._pending.append((speed, acceleration, force))
         if len(self._pending) > self._margin:
@@ -154,13 +144,13 @@ class RecursiveFriction:
         row = regressors(
             np.array([speed]), np.array([acceleration]), self._settings.terms, self._settings
         )[0]
-        if self._nuisance:
+        if self._estimates_lag:
             row = np.append(row, acceleration)
         products = np.outer(row, np.append(row, force))
-        self._known = self._forget * self._known + products
-        self._part = self._forget * self._part + products
-        self._pace = self._forget * self._pace + abs(speed)
-        self._weight = self._forget * self._weight + 1.0
+        self._known = self._decay * self._known + products
+        self._part = self._decay * self._part + products
+        self._speed_sum = self._decay * self._speed_sum + abs(speed)
+        self._weight = self._decay * self._weight + 1.0
         self._count += 1
         if self._count % self._length == 0:
             self._parts.append((self._part, self._count))
@@ -168,20 +158,20 @@ class RecursiveFriction:
 
     def estimate(self) -> tuple[ParameterEstimate, ...]:
         """
-        Return the parameters of the terms now.
+        Return the present parameters of the terms.
 
         Returns
         -------
         tuple of ParameterEstimate
-            As `identify_friction` names them; not determined until the motion determines them.
+            With the names of `identify_friction`; not determined until the motion determines
+            them.
 
         """
-        fit = self._regression()
-        pace = self._pace / max(self._weight, 1.0)
-        return parameter_estimates(fit, self._settings, pace, self._period)
+        mean_speed = self._speed_sum / max(self._weight, 1.0)
+        return parameter_estimates(self._regression(), self._settings, mean_speed, self._period)
 
     def _regression(self) -> Regression:
-        """Solve; errors from the scores of the parts, which hold longer than noise remembers."""
+        """Solve; errors come from the scores of parts longer than the correlation of the noise."""
         known, moment = self._known[:, :-1], self._known[:, -1]
         k = len(moment)
         norms = np.sqrt(np.diag(known))
@@ -191,12 +181,12 @@ class RecursiveFriction:
         singular[singular < _ROUNDING * singular[0]] = 0.0
         basis, unknown = determinable(singular, directions[:, ::-1].T)
         basis = basis / norms[:, np.newaxis]
-        bread = basis @ np.linalg.inv(basis.T @ known @ basis) @ basis.T
-        values = bread @ moment
-        meat, behind, effective = self._scores(values, bread)
+        inverse = basis @ np.linalg.inv(basis.T @ known @ basis) @ basis.T
+        values = inverse @ moment
+        middle, behind, effective = self._scores(values, inverse)
         if effective < max(_FEWEST_PARTS, k + 1.0):
             unknown[:] = True
-        covariance = bread @ meat @ bread * effective / max(effective - k, 1.0)
+        covariance = inverse @ middle @ inverse * effective / max(effective - k, 1.0)
         values[unknown] = nan
         covariance[unknown] = covariance[:, unknown] = nan
         covariance[unknown, unknown] = inf
@@ -210,21 +200,21 @@ class RecursiveFriction:
             determination=nan,
             samples=self._count,
             effective_samples=effective,
-            freedom=np.maximum(behind * (1.0 - k / max(effective, k + 1.0)), 1.0),
+            degrees_of_freedom=np.maximum(behind * (1.0 - k / max(effective, k + 1.0)), 1.0),
         )
 
     def _scores(
-        self, values: FloatArray, bread: FloatArray
+        self, values: FloatArray, inverse: FloatArray
     ) -> tuple[FloatArray, FloatArray, float]:
-        """Return the covariance of the summed scores and the parts behind each value, and all."""
+        """Return the covariance of the summed scores, and the parts behind each value and all."""
         now = self._count
         parts = [*self._parts, (self._part, now)]
-        ages = np.array([self._forget ** (now - count) for _, count in parts])
+        ages = np.array([self._decay ** (now - count) for _, count in parts])
         weighed = ages[:, np.newaxis, np.newaxis] * np.array([part for part, _ in parts])
         information = weighed[:, :, :-1]
         scores = weighed[:, :, -1] - information @ values
-        # Variance that even noise would give each part, parameter by parameter.
-        even = ages * np.einsum('ki,pij,jk->kp', bread, information, bread)
+        # Share of each part in the variance of each parameter, for even noise.
+        even = ages * np.einsum('ki,pij,jk->kp', inverse, information, inverse)
         total = even.sum(axis=1)
         behind = np.divide(
             total**2, (even**2).sum(axis=1), out=np.ones(len(total)), where=total > 0

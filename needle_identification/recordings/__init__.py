@@ -1,1 +1,1 @@
-"""Recordings: what a bag says of one experiment, as arrays."""
+"""Recordings: force and motion of one experiment, as arrays on one time base."""

@@ -1,4 +1,4 @@
-"""What identification works on: one recording as arrays on one time base."""
+"""Recordings: what identification works on, as arrays on one time base."""
 
 from __future__ import annotations
 
@@ -6,145 +6,166 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from needle_dynamics import (
-    FloatArray,
-)
-from needle_ros.errors import (
-    ShapeError,
-)
+from needle_dynamics import FloatArray
+from needle_ros.errors import ShapeError
 import numpy as np
 import yaml
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Recording:
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
+class _AnyRecording:
+    """What recordings of all experiments have in common."""
+
+    name: str = 'recording'
+    time: FloatArray
+    losses: tuple[str, ...] = ()
+    configuration: str = ''
+    clock_offset: float = 0.0
+
+    @property
+    def truth(self) -> Mapping[str, Any] | None:
+        """Parameters of the recorded plant by name; None if there is no configuration."""
+        try:
+            document = yaml.safe_load(self.configuration)
+        except (yaml.YAMLError, ValueError, RecursionError):
+            return None
+        if not isinstance(document, dict):
+            return None
+        for section in document.values():
+            if isinstance(section, dict) and isinstance(section.get('ros__parameters'), dict):
+                return dict(section['ros__parameters'])
+        return None
+
+    def __repr__(self) -> str:
+        duration = self.time[-1] - self.time[0] if len(self.time) else 0.0
+        return f'<{type(self).__name__} {self.name}: {len(self.time)} samples in {duration:.4g} s>'
+
+    def _freeze(self, **columns: int | None) -> None:
+        """Replace arrays of (n,) or (n, columns) by read-only copies, and check them."""
+        length = np.shape(self.time)
+        for field, count in {'time': None, **columns}.items():
+            rest = () if count is None else (count,)
+            values = np.array(getattr(self, field), dtype=np.float64)
+            if len(length) != 1 or values.shape != length + rest:
+                wanted = '(n,)' if count is None else f'(n, {count})'
+                raise ShapeError(
+                    f'{self.name}: {field} must have the shape {wanted} with the (n,) of time, '
+                    f'got {values.shape} and {length}'
+                )
+            if not np.isfinite(values).all():
+                raise ShapeError(f'{self.name}: {field} must be finite')
+            values.setflags(write=False)
+            object.__setattr__(self, field, values)
+        if not (np.diff(self.time) > 0.0).all():
+            raise ShapeError(f'{self.name}: time must increase strictly')
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
+class Recording(_AnyRecording):
     """
     Force and motion of the needle base during one experiment.
 
     Attributes
     ----------
     name : str
-        Where it comes from, for messages.
+        Name of the recording, for messages.
     time : ndarray, shape (n,)
         Time [s], strictly increasing.
-    depth : ndarray, shape (n,)
-        Inserted length s [m].
-    speed : ndarray, shape (n,), or None
-        Insertion speed s_dot [m/s], positive into the tissue; None if only positions were
-        recorded, which whoever needs the speed differentiates.
     force : ndarray, shape (n,)
         Force of the base on the needle f_y [N], positive into the tissue.
+    speed : ndarray, shape (n,), or None
+        Insertion speed [m/s], positive into the tissue; None if only positions were recorded.
+    depth : ndarray, shape (n,)
+        Inserted length s [m]. If it is not given, it is the integral of the speed from zero.
     losses : tuple of str
-        What was lost, left out or repaired on the way here, in words.
+        What was lost, left out or repaired while reading, in words.
     configuration : str
-        Parameter file of the plant that was recorded, ``''`` if there is none.
+        Parameter file of the recorded plant; empty if there is none.
     clock_offset : float
         Clock of the force minus clock of the motion [s], estimated from the times of reception
-        and already corrected; 0 if they agree as far as can be told.
+        and already corrected; 0 if they agree.
 
     Raises
     ------
     ShapeError
-        If the arrays differ in length, hold what is not finite, or time does not increase.
+        If the arrays differ in length or are not finite, time does not increase, or both speed
+        and depth are missing.
+
+    Examples
+    --------
+    >>> recording = Recording(time=[0.0, 0.1, 0.2], speed=[0.0, 0.01, 0.01], force=[0.0, 3.5, 3.6])
+    >>> recording
+    <Recording recording: 3 samples in 0.2 s>
+    >>> recording.depth.tolist()
+    [0.0, 0.0005, 0.0015]
 
     """
 
-    name: str
-    time: FloatArray
-    depth: FloatArray
-    speed: FloatArray | None
     force: FloatArray
-    losses: tuple[str, ...] = ()
-    configuration: str = ''
-    clock_offset: float = 0.0
+    speed: FloatArray | None = None
+    depth: FloatArray = None  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
-        _hold(self, time=(), depth=(), speed=(), force=())
+        if self.speed is None:
+            self._freeze(depth=None, force=None)
+            return
+        self._freeze(speed=None, force=None)
+        if self.depth is None:
+            object.__setattr__(self, 'depth', integrated(self.time, self.speed))
+        self._freeze(depth=None)
 
-    @property
-    def truth(self) -> Mapping[str, Any] | None:
-        """Parameters of the plant that was recorded, by name; None if it did not say."""
-        return _truth(self.configuration)
 
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class IndentationRecording:
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
+class IndentationRecording(_AnyRecording):
     """
     Force and motion of an end-effector that presses a tissue in the plane.
 
     Attributes
     ----------
     name : str
-        Where it comes from, for messages.
+        Name of the recording, for messages.
     time : ndarray, shape (n,)
         Time [s], strictly increasing.
+    force : ndarray, shape (n, 2)
+        Force of the end-effector on the tissue, x and z [N].
     position : ndarray, shape (n, 2)
         Position of the end-effector in the plane, x and z [m].
     off_plane : ndarray, shape (n,)
-        Its position along the third axis [m].
-    force : ndarray, shape (n, 2)
-        Force of the end-effector on the tissue, x and z [N].
+        Position of the end-effector along the third axis [m]; default zero.
     losses, configuration, clock_offset
         As those of a `Recording`.
 
     Raises
     ------
     ShapeError
-        If the arrays differ in length, hold what is not finite, or time does not increase.
+        If the arrays differ in length or are not finite, or time does not increase.
 
     """
 
-    name: str
-    time: FloatArray
-    position: FloatArray
-    off_plane: FloatArray
     force: FloatArray
-    losses: tuple[str, ...] = ()
-    configuration: str = ''
-    clock_offset: float = 0.0
+    position: FloatArray
+    off_plane: FloatArray = None  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
-        _hold(self, time=(), position=(2,), off_plane=(), force=(2,))
-
-    @property
-    def truth(self) -> Mapping[str, Any] | None:
-        """Parameters of the plant that was recorded, by name; None if it did not say."""
-        return _truth(self.configuration)
+        if self.off_plane is None:
+            object.__setattr__(self, 'off_plane', np.zeros(np.shape(self.time)))
+        self._freeze(position=2, off_plane=None, force=2)
 
 
-def _hold(recording: Recording | IndentationRecording, **shapes: tuple[int, ...]) -> None:
-    """Replace the arrays of a recording by copies that cannot change, and check them."""
-    name, length = recording.name, np.shape(recording.time)
-    for field, rest in shapes.items():
-        given = getattr(recording, field)
-        if given is None and field == 'speed':
-            continue
-        values = np.array(given, dtype=np.float64)
-        if len(length) != 1 or values.shape != length + rest:
-            raise ShapeError(
-                f'{name}: {field} must have the shape {_shape(rest)} with the (n,) of time, got '
-                f'{values.shape} and {length}'
-            )
-        if not np.isfinite(values).all():
-            raise ShapeError(f'{name}: {field} must be finite')
-        values.setflags(write=False)
-        object.__setattr__(recording, field, values)
-    if not (np.diff(recording.time) > 0.0).all():
-        raise ShapeError(f'{name}: time must increase strictly')
+def integrated(time: FloatArray, speed: FloatArray) -> FloatArray:
+    """
+    Integrate a speed from zero (trapezoidal rule).
 
+    Parameters
+    ----------
+    time, speed : ndarray, shape (n,)
+        Time [s] and speed [m/s].
 
-def _shape(rest: tuple[int, ...]) -> str:
-    return f'(n, {rest[0]})' if rest else '(n,)'
+    Returns
+    -------
+    ndarray, shape (n,)
+        Distance [m].
 
-
-def _truth(configuration: str) -> Mapping[str, Any] | None:
-    try:
-        document = yaml.safe_load(configuration)
-    except (yaml.YAMLError, ValueError, RecursionError):
-        return None
-    if not isinstance(document, dict):
-        return None
-    for section in document.values():
-        if isinstance(section, dict) and isinstance(section.get('ros__parameters'), dict):
-            return dict(section['ros__parameters'])
-    return None
+    """
+    steps = np.diff(time) * (speed[1:] + speed[:-1]) / 2.0
+    return np.concatenate([[0.0], np.cumsum(steps)])

@@ -1,1 +1,1 @@
-"""Identification of the stiffness of the tissue."""
+"""Stiffness of the tissue in the plane of deflection, from presses with an end-effector."""

@@ -16,11 +16,13 @@ from needle_dynamics import NeedleError, ParameterError
 from needle_identification import (
     check_distinct,
     ESTIMATORS,
+    Fit,
     FrictionSettings,
     FrictionSummary,
     identify_friction,
     identify_stiffness,
     ParameterEstimate,
+    Presses,
     read_friction_recording,
     read_indentation_recording,
     Statistic,
@@ -31,10 +33,8 @@ from needle_identification import (
     TERMS,
     write_result,
 )
-from needle_identification.friction.fit import Fit
+from needle_identification.estimation.formatting import between, measured
 from needle_identification.recordings.reading import TIMES
-from needle_identification.result import between, measured
-from needle_identification.stiffness.fit import Presses
 from needle_insertion.report.identify_report import (
     every_parameter,
     friction_report,

@@ -17,17 +17,16 @@ from needle_dynamics import FloatArray
 from needle_identification import (
     FrictionEstimate,
     FrictionSummary,
+    LevelEstimate,
+    LevelSummary,
     ParameterEstimate,
     Statistic,
     statistic,
-)
-from needle_identification.result import between, measured, model_parameters, rounded, spread
-from needle_identification.stiffness.fit import (
-    LevelEstimate,
-    LevelSummary,
     StiffnessEstimate,
     StiffnessSummary,
 )
+from needle_identification.estimation.formatting import between, measured, rounded, spread
+from needle_identification.result import model_parameters
 from needle_insertion.paper.tables import FORCE_LEVELS, TABLE_1, TABLE_2
 from needle_insertion.report.page import (
     bullets,

@@ -205,7 +205,7 @@ def test_wald_test_of_what_is_not_there_is_as_rare_as_it_says() -> None:
         ({'estimator': 'best'}, ParameterError, 'estimator must be one of ordinary, weighted'),
         ({'estimator': 'weighted'}, ParameterError, 'weighted needs the group of each sample'),
         ({'estimator': 'total'}, ParameterError, 'total needs the noise of each column'),
-        ({'used': np.ones(3, bool)}, ShapeError, r'do not fit: \(600, 3\), \(600,\), \(3,\)'),
+        ({'used': np.ones(3, bool)}, ShapeError, r'do not match: \(600, 3\), \(600,\), \(3,\)'),
         ({'used': np.arange(600) < 3}, IdentificationError, '3 parameters need more than 3'),
         ({'window': triang(1000)}, IdentificationError, 'independent samples, got 0.8'),
     ],

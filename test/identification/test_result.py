@@ -11,10 +11,11 @@ from needle_identification import (
     IdentificationError,
     result_yaml,
     Statistic,
+    StiffnessSummary,
     write_result,
 )
-from needle_identification.result import between, measured, model_parameters, rounded, UNKNOWN
-from needle_identification.stiffness.fit import StiffnessSummary
+from needle_identification.estimation.formatting import between, measured, rounded, UNKNOWN
+from needle_identification.result import model_parameters
 from needle_ros.settings import from_values
 import pytest
 import yaml

@@ -1,0 +1,236 @@
+"""Tests of the residuals of a fit, valid for correlated noise."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+import warnings
+
+from needle_dynamics import FloatArray
+from needle_identification.estimation.solvers import BoolArray, IntArray
+import numpy as np
+from scipy.special import betaincc, chdtrc, fdtrc, stdtr
+
+#: Fewest parts of the residual that are tested.
+_FEWEST_PARTS: Final = 10
+
+#: Fewest parts for the test of d'Agostino and Pearson; below, that of Shapiro and Wilk.
+_FEWEST_FOR_MOMENTS: Final = 20
+
+#: p-value below which a test fails.
+_SIGNIFICANCE: Final = 0.01
+
+#: What each test says if it fails, and if it does not.
+_WORDS: Final = {
+    'normality': (
+        'the residuals are not normal: outliers change the estimates; consider estimator huber',
+        'the residuals do not differ from normal noise',
+    ),
+    'trend': (
+        'the residuals drift with time: the sensor or the tissue changed during the recording',
+        'the residuals show no drift with time',
+    ),
+    'speed': (
+        'the residuals depend on the speed: the terms do not describe the friction',
+        'the residuals do not depend on the speed',
+    ),
+    'spread': (
+        'the noise depends on the speed: consider estimator weighted',
+        'the noise is the same at all speeds',
+    ),
+    'memory': (
+        'the residuals are correlated for longer than the standard errors assume',
+        'the residuals are not correlated for longer than the standard errors assume',
+    ),
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ResidualTest:
+    """
+    A test of the residuals of a fit.
+
+    Attributes
+    ----------
+    name : str
+        ``normality``, ``trend``, ``speed``, ``spread`` or ``memory``.
+    statistic, p_value : float
+        Statistic and p-value of the test; a small p-value is evidence against the model.
+    words : str
+        The result in words.
+
+    """
+
+    name: str
+    statistic: float
+    p_value: float
+    words: str
+
+    @property
+    def failed(self) -> bool:
+        """Whether the test is evidence against the model."""
+        return self.p_value < _SIGNIFICANCE
+
+
+def residual_tests(
+    residual: FloatArray,
+    *,
+    used: BoolArray,
+    time: FloatArray,
+    speed: FloatArray,
+    length: int,
+    parameters: int,
+) -> tuple[ResidualTest, ...]:
+    """
+    Test the means of the residual over parts as long as its correlation.
+
+    The means are nearly independent, although the samples are not.
+
+    Parameters
+    ----------
+    residual, time, speed : ndarray, shape (n,)
+        Response minus model, time [s], and the speed that it may depend on.
+    used : ndarray of bool, shape (n,)
+        Samples that were fitted; a part holds no other sample.
+    length : int
+        Length of a part [samples].
+    parameters : int
+        Number of fitted parameters.
+
+    Returns
+    -------
+    tuple of ResidualTest
+        The tests for which there are enough parts.
+
+    """
+    parts, follows = _parts(used, length)
+    if len(parts) < _FEWEST_PARTS:
+        return ()
+    means, speeds, times = (values[parts].mean(axis=1) for values in (residual, speed, time))
+    groups = np.array_split(np.argsort(speeds), min(10, len(parts) // 5))
+    with np.errstate(invalid='ignore', divide='ignore'):
+        found = {'normality': _normality(means), 'trend': _trend(times, means)}
+        if len(groups) > parameters:
+            found['speed'] = _lack_of_fit(means, groups, parameters)
+            found['spread'] = _equal_spread([means[group] for group in groups])
+        if np.count_nonzero(follows) >= _FEWEST_PARTS:
+            found['memory'] = _correlation(means[:-1][follows[1:]], means[follows])
+    # Residuals that are all equal give nan.
+    return tuple(
+        ResidualTest(name=name, statistic=statistic, p_value=p_value, words=_words(name, p_value))
+        for name, (statistic, p_value) in found.items()
+        if np.isfinite(p_value)
+    )
+
+
+def _words(name: str, p_value: float) -> str:
+    failed, passed = _WORDS[name]
+    return f'{failed if p_value < _SIGNIFICANCE else passed} (p = {p_value:.2g})'
+
+
+def _parts(used: BoolArray, length: int) -> tuple[IntArray, BoolArray]:
+    """Return the indices of the parts, shape (m, length), and which follow their predecessor."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], used.astype(np.int8), [0]])))
+    starts = [
+        start + length * k
+        for start, end in edges.reshape(-1, 2)
+        for k in range((end - start) // length)
+    ]
+    first = np.array(starts, dtype=np.int_)
+    follows = np.zeros(len(first), dtype=np.bool_)
+    follows[1:] = np.diff(first) == length
+    return first[:, np.newaxis] + np.arange(length), follows
+
+
+def _normality(values: FloatArray) -> tuple[float, float]:
+    """Test for a normal distribution by skewness and kurtosis (d'Agostino and Pearson)."""
+    if len(values) < _FEWEST_FOR_MOMENTS:
+        # A large import that few recordings need.
+        from scipy.stats import shapiro
+
+        with warnings.catch_warnings():
+            warnings.simplefilter('ignore')
+            found = shapiro(values)
+        return float(found.statistic), float(found.pvalue)
+    n = float(len(values))
+    squares = (values - values.mean()) ** 2
+    variance = squares.mean()
+    skewness = (squares * (values - values.mean())).mean() / variance**1.5
+    kurtosis = (squares**2).mean() / variance**2.0
+    found = float(_skewness_score(skewness, n) ** 2 + _kurtosis_score(kurtosis, n) ** 2)
+    return found, float(chdtrc(2.0, found))
+
+
+def _skewness_score(skewness: float, n: float) -> float:
+    """Transform the skewness of n normal values to a standard normal variable (d'Agostino)."""
+    y = skewness * np.sqrt(((n + 1) * (n + 3)) / (6.0 * (n - 2)))
+    kurtosis = (3.0 * (n**2 + 27 * n - 70) * (n + 1) * (n + 3)) / (
+        (n - 2.0) * (n + 5) * (n + 7) * (n + 9)
+    )
+    w = -1 + np.sqrt(2 * (kurtosis - 1))
+    scale = np.sqrt(2.0 / (w - 1))
+    return float(1 / np.sqrt(0.5 * np.log(w)) * np.log(y / scale + np.sqrt((y / scale) ** 2 + 1)))
+
+
+def _kurtosis_score(kurtosis: float, n: float) -> float:
+    """Transform the kurtosis of n normal values likewise (Anscombe and Glynn)."""
+    mean = 3.0 * (n - 1) / (n + 1)
+    variance = 24.0 * n * (n - 2) * (n - 3) / ((n + 1) * (n + 1.0) * (n + 3) * (n + 5))
+    x = (kurtosis - mean) / variance**0.5
+    skewness = (
+        6.0 * (n * n - 5 * n + 2) / ((n + 7) * (n + 9))
+        * ((6.0 * (n + 3) * (n + 5)) / (n * (n - 2) * (n - 3))) ** 0.5
+    )  # fmt: skip
+    a = 6.0 + 8.0 / skewness * (2.0 / skewness + (1 + 4.0 / skewness**2) ** 0.5)
+    below = 1 + x * (2 / (a - 4.0)) ** 0.5
+    root = np.sign(below) * ((1 - 2.0 / a) / np.abs(below)) ** (1 / 3)
+    return float((1 - 2 / (9.0 * a) - root) / (2 / (9.0 * a)) ** 0.5)
+
+
+def _trend(times: FloatArray, values: FloatArray) -> tuple[float, float]:
+    """Test for a monotonic relation (rank correlation of Spearman)."""
+    rho = np.corrcoef(_ranks(times), _ranks(values))[1, 0]
+    freedom = len(values) - 2
+    t = rho * np.sqrt((freedom / ((rho + 1.0) * (1.0 - rho))).clip(0))
+    return float(rho), float(2.0 * stdtr(freedom, -abs(t)))
+
+
+def _ranks(values: FloatArray) -> FloatArray:
+    """Rank values from one; equal values have their mean rank."""
+    _, places, counts = np.unique(values, return_inverse=True, return_counts=True)
+    return np.asarray((np.cumsum(counts) - (counts - 1) / 2.0)[places])
+
+
+def _lack_of_fit(
+    residual: FloatArray, groups: list[IntArray], parameters: int
+) -> tuple[float, float]:
+    """Compare the misfit between groups with the noise within them (F test)."""
+    between = sum(len(g) * residual[g].mean() ** 2 for g in groups)
+    within = sum(((residual[g] - residual[g].mean()) ** 2).sum() for g in groups)
+    free = len(groups) - parameters, len(residual) - len(groups)
+    found = float((between / free[0]) / (within / free[1]))
+    return found, float(fdtrc(*free, found))
+
+
+def _equal_spread(groups: list[FloatArray]) -> tuple[float, float]:
+    """Test for equal variances (Levene's test about the median)."""
+    off = [np.abs(group - np.median(group)) for group in groups]
+    count = sum(len(group) for group in groups)
+    mean = sum(len(group) * group.mean() for group in off) / count
+    free = len(groups) - 1.0, count - len(groups)
+    between = free[1] * sum(len(group) * (group.mean() - mean) ** 2 for group in off)
+    within = free[0] * sum(((group - group.mean()) ** 2).sum() for group in off)
+    found = float(between / within)
+    return found, float(fdtrc(*free, found))
+
+
+def _correlation(first: FloatArray, second: FloatArray) -> tuple[float, float]:
+    """Test for a linear relation (correlation of Pearson)."""
+    scaled = []
+    for values in (first, second):
+        off = values - values.mean()
+        largest = np.abs(off).max()
+        scaled.append(off / (largest * np.linalg.norm(off / largest, axis=-1)))
+    r = float(np.clip(scaled[0] @ scaled[1], -1.0, 1.0))
+    half = len(first) / 2 - 1
+    return r, float(2.0 * betaincc(half, half, (abs(r) + 1.0) / 2.0))

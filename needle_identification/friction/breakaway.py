@@ -1,0 +1,162 @@
+"""
+The force at which the needle breaks away, section 3.2.2.2 of the source.
+
+The base pushes with a rising force until the needle moves. A straight line through the force of
+the last 0.3 s of the rest is read at the time at which the motion begins.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import hypot, sqrt
+from typing import Final
+
+from needle_dynamics import FloatArray
+from needle_identification.errors import IdentificationError
+from needle_identification.estimation.estimate import ParameterEstimate
+from needle_identification.estimation.regression import regress
+from needle_identification.friction.design import Design
+from needle_identification.friction.filtering import CORRELATION_LENGTH, FilteredSignals
+from needle_identification.friction.settings import FrictionSettings
+import numpy as np
+from scipy.special import stdtrit
+
+#: Time before the motion in which the rise of the force is measured [s].
+_RISING: Final = 0.3
+
+#: Part of the force, and of mu_s, by which it must rise in that time.
+_SMALLEST_RISE: Final = 0.05
+
+#: Smallest rate of the rise [standard errors].
+_CLEAR_RISE: Final = 5.0
+
+#: Length of the correlation window here, of that elsewhere: the rise of the force is short too.
+_WINDOW_PART: Final = 0.4
+
+_UNKNOWN: Final = ParameterEstimate(name='breakaway_force', symbol='f_b', unit='N')
+
+
+def breakaway_force(
+    signals: FilteredSignals,
+    design: Design,
+    settings: FrictionSettings,
+    parameters: Sequence[ParameterEstimate],
+) -> ParameterEstimate | None:
+    """
+    Return the mean force at which the needle left a rest with a rising force.
+
+    Parameters
+    ----------
+    signals : FilteredSignals
+        Filtered force and motion.
+    design : Design
+        Regimes of the motion.
+    settings : FrictionSettings
+        The filter.
+    parameters : sequence of ParameterEstimate
+        Fitted parameters: mu_s, and the offset to subtract if there is one.
+
+    Returns
+    -------
+    ParameterEstimate or None
+        The force [N]; None if there is no such rest.
+
+    """
+    window = signals.window(_WINDOW_PART * CORRELATION_LENGTH / settings.cutoff)
+    starts = np.flatnonzero((design.regime[1:] != 0.0) & (design.regime[:-1] == 0.0)) + 1
+    changes = np.flatnonzero(np.diff(design.stroke)) + 1
+    found, signs = [], []
+    coulomb = [p.value for p in parameters if p.name == 'coulomb_friction' and p.determined]
+    least = _SMALLEST_RISE * max(coulomb, default=0.0)
+    for start in starts:
+        before, after = changes[changes < start], changes[changes > start]
+        rest = int(before[-1]) if len(before) else 0
+        end = int(after[0]) if len(after) else len(signals.time)
+        push = _push(signals, design, (rest, int(start), end), window, least)
+        if push is not None:
+            found.append(push)
+            signs.append(design.regime[start])
+    if not found:
+        return None
+    values, errors, half_widths = np.array(found).T
+    value, count, bias = float(values.mean()), len(found), float(np.mean(signs))
+    error = sqrt(float(errors @ errors)) / count
+    half_width = sqrt(float(half_widths @ half_widths)) / count
+    for parameter in parameters:
+        if parameter.name == 'offset' and parameter.determined:
+            value -= bias * parameter.value
+            error = hypot(error, bias * parameter.error)
+            half_width = hypot(half_width, bias * (parameter.interval[1] - parameter.value))
+    return _UNKNOWN.with_value(value, error, half_width)
+
+
+def _push(
+    signals: FilteredSignals,
+    design: Design,
+    span: tuple[int, int, int],
+    window: FloatArray,
+    least: float,
+) -> tuple[float, float, float] | None:
+    """
+    Return the size of the force when the motion began, its error and half its interval [N].
+
+    ``span`` holds the samples at which the rest begins, the motion begins, and the motion ends;
+    ``least`` is the smallest rise of the force [N].
+    """
+    rest, start, end = span
+    longest = round(_RISING / signals.period)
+    sign = float(design.regime[start])
+    early = max(rest + signals.half_filter, start - longest)
+    still = start - signals.margin
+    if min(still - early, 2 * (end - start)) < len(window):
+        return None
+    if sign * (signals.force[still] - signals.force[early]) <= 0.5 * least:
+        return None
+    around = (max(rest, start - longest), start, min(end, start + longest))
+    onset, onset_error = _onset(signals, design, around)
+    last = round((onset - signals.time[0]) / signals.period) - signals.half_filter
+    first = max(rest + signals.half_filter, last - longest)
+    if last - first < len(window):
+        return None
+    elapsed = signals.time[first:last] - onset
+    try:
+        line = regress(
+            np.column_stack([np.ones_like(elapsed), elapsed]),
+            signals.force[first:last],
+            window=window,
+        )
+    except IdentificationError:
+        return None
+    value, slope = sign * line.values
+    rise = slope * (last - first) * signals.period
+    if not (slope > _CLEAR_RISE * line.errors[1] and rise > max(_SMALLEST_RISE * value, least)):
+        return None
+    error = hypot(float(line.errors[0]), slope * onset_error)
+    return float(value), error, error * float(stdtrit(line.effective_samples - 2.0, 0.975))
+
+
+def _onset(
+    signals: FilteredSignals, design: Design, span: tuple[int, int, int]
+) -> tuple[float, float]:
+    """Return the time at which a step and a ramp of the speed fit best, and its error [s]."""
+    first, start, end = span
+    time, speed = signals.time[first:end], design.speed[first:end]
+    candidates = signals.time[first : start + 1]
+    misfits = np.array(
+        [_misfit(time[k:] - time[k], speed[k:]) for k in range(len(candidates))]
+    ) + np.concatenate([[0.0], np.cumsum(speed**2)[: len(candidates) - 1]])
+    best = int(np.argmin(misfits))
+    # The length of the filter counts as one independent sample.
+    independent = max(len(time) / (2 * signals.half_filter + 1) - 3.0, 1.0)
+    close = misfits <= misfits[best] * (1.0 + 4.0 / independent)
+    error = signals.period * max(np.count_nonzero(close) / 4.0, 1.0 / sqrt(12.0))
+    # The motion began after the sample before.
+    return float(candidates[best]) - 0.5 * signals.period, float(error)
+
+
+def _misfit(time: FloatArray, values: FloatArray) -> float:
+    """Return the sum of squares that a straight line leaves."""
+    centered, rest = time - time.mean(), values - values.mean()
+    total = float(centered @ centered)
+    explained = float(centered @ rest) ** 2 / total if total else 0.0
+    return float(rest @ rest) - explained

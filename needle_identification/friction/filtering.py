@@ -1,0 +1,241 @@
+"""
+Force and motion of a recording on an even time base, passed through one zero-phase filter.
+
+Force and speed pass the same low-pass filter of finite length (Hann window). A linear relation
+between them stays what it is. The filter mixes what lies before and after a change, so samples
+near a start, a stop or a reversal are left out later; see `design`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import ceil, e, sqrt
+from typing import Final
+
+from needle_dynamics import FloatArray
+from needle_identification.errors import IdentificationError
+from needle_identification.estimation.regression import triangular_window
+from needle_identification.estimation.solvers import BoolArray
+from needle_identification.friction.settings import FrictionSettings
+from needle_identification.recordings.recording import Recording
+import numpy as np
+from scipy.fft import next_fast_len
+from scipy.interpolate import BSpline, make_interp_spline
+from scipy.ndimage import maximum_filter1d
+from scipy.special import lambertw
+
+#: Half the length of a Hann window that halves the power at its cutoff [periods of the cutoff].
+HALF_LENGTH: Final = 0.36
+
+#: Length of the window that spans the correlation of filtered noise [periods of the cutoff].
+CORRELATION_LENGTH: Final = 3.0
+
+#: A longer step between samples is a gap [sampling periods].
+GAP: Final = 3.5
+
+#: Samples per period of the cutoff that are kept after the filter.
+_KEPT: Final = 8.0
+
+#: Largest number of points of the even time base per sample; beyond, it would be mostly gaps.
+_LARGEST_GRID: Final = 10.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FilteredSignals:
+    """
+    Filtered force and motion.
+
+    Attributes
+    ----------
+    time : ndarray, shape (n,)
+        Even time [s].
+    period : float
+        Its step [s].
+    motion : BSpline
+        Filtered speed [m/s] as a function of time [s].
+    force : ndarray, shape (n,)
+        Filtered force [N].
+    lost : ndarray of bool, shape (n,)
+        Samples within a gap of the recording.
+    half_filter : int
+        Half the length of the filter [samples].
+    margin : int
+        Distance from a change of the filtered speed at which the filtered force may still be
+        affected by the change [samples].
+    speed_noise, acceleration_noise : float
+        Standard deviations of the noise of filtered speed [m/s] and acceleration [m/s^2].
+
+    """
+
+    time: FloatArray
+    period: float
+    motion: BSpline
+    force: FloatArray
+    lost: BoolArray
+    half_filter: int
+    margin: int
+    speed_noise: float
+    acceleration_noise: float
+
+    def delayed_motion(self, lag: float) -> tuple[FloatArray, FloatArray]:
+        """
+        Return the motion at the time at which the force, which lags, shows it.
+
+        Parameters
+        ----------
+        lag : float
+            Lag of the force [s].
+
+        Returns
+        -------
+        speed, acceleration : ndarray, shape (n,)
+            Speed [m/s] and acceleration [m/s^2] a lag ago.
+
+        """
+        then = np.clip(self.time - lag, self.time[0], self.time[-1])
+        return np.asarray(self.motion(then)), np.asarray(self.motion(then, 1))
+
+    def window(self, duration: float) -> FloatArray:
+        """
+        Return a triangular window.
+
+        Parameters
+        ----------
+        duration : float
+            Its length [s].
+
+        Returns
+        -------
+        ndarray, shape (w,)
+            The window, for `regress`.
+
+        """
+        return triangular_window(ceil(duration / self.period))
+
+
+def filter_signals(recording: Recording, settings: FrictionSettings) -> FilteredSignals:
+    """
+    Filter force and motion of a recording.
+
+    Parameters
+    ----------
+    recording : Recording
+        Without speeds, the inserted length is differentiated by the same filter.
+    settings : FrictionSettings
+        Its cutoff is used.
+
+    Returns
+    -------
+    FilteredSignals
+        Signals on an even time base.
+
+    Raises
+    ------
+    IdentificationError
+        If the recording is too short or its stamps are too uneven.
+
+    """
+    time = recording.time
+    if len(time) < 3:
+        raise IdentificationError(f'too short: {len(time)} samples')
+    steps = np.diff(time)
+    period = float(np.median(steps))
+    duration = float(time[-1] - time[0])
+    if duration > _LARGEST_GRID * len(time) * period:
+        raise IdentificationError(
+            f'stamps too uneven: {len(time)} samples in {duration:g} s, most within {period:g} s'
+        )
+    grid = time[0] + period * np.arange(int(duration / period + 1e-6) + 1)
+    lost = steps[np.clip(np.searchsorted(time, grid), 1, len(steps)) - 1] > GAP * period
+    taps = filter_taps(settings.cutoff, period)
+    half = len(taps) // 2
+    if len(grid) <= 4 * half:
+        raise IdentificationError(
+            f'must last > {4 * half * period:.3g} s for a filter of {settings.cutoff:g} Hz, '
+            f'lasts {duration:.3g} s'
+        )
+    step = max(1, int(1.0 / (_KEPT * settings.cutoff * period)))
+    derivative = 1 if recording.speed is None else 0
+    measured = recording.depth if recording.speed is None else recording.speed
+    raw = np.asarray(np.interp(grid, time, measured), dtype=np.float64)
+    motion = _filtered_speed(grid, raw, taps, step, derivative)
+    impulse = np.zeros(8 * half + 8 * step + 17)
+    impulse[len(impulse) // 2] = 1.0
+    around = np.arange(len(impulse), dtype=np.float64) * period
+    response = _filtered_speed(around, impulse, taps, 1, derivative)
+    noise = _white_noise(raw, np.asarray(motion(grid)), np.asarray(motion(grid, 1)))
+    return FilteredSignals(
+        time=grid[::step],
+        period=step * period,
+        motion=motion,
+        force=_smooth(np.interp(grid, time, recording.force), taps)[::step],
+        lost=np.asarray(maximum_filter1d(lost.astype(np.uint8), step)[::step] > 0),
+        half_filter=ceil(half / step),
+        margin=max(1, ceil(2 * (half - 1) / step)),
+        speed_noise=noise * float(np.linalg.norm(response(around))),
+        acceleration_noise=noise * float(np.linalg.norm(response(around, 1))),
+    )
+
+
+def filter_taps(cutoff: float, period: float) -> FloatArray:
+    """
+    Return the filter of force and motion.
+
+    Parameters
+    ----------
+    cutoff : float
+        Frequency at which the filter halves the power [Hz].
+    period : float
+        Sampling period [s].
+
+    Returns
+    -------
+    ndarray, shape (2 h + 1,)
+        A Hann window with unit sum.
+
+    """
+    half = ceil(HALF_LENGTH / cutoff / period)
+    taps = 0.5 + 0.5 * np.cos(np.linspace(-np.pi, np.pi, 2 * half + 1))
+    return np.asarray(taps / taps.sum(), dtype=np.float64)
+
+
+def _smooth(signal: FloatArray, taps: FloatArray) -> FloatArray:
+    """Filter a signal that is held constant beyond its ends, by FFT of overlapping blocks."""
+    padded = np.pad(signal, len(taps) // 2, mode='edge')
+    overlap = len(taps) - 1
+    # The size with the fewest operations per sample.
+    size = next_fast_len(ceil(-overlap * lambertw(-1.0 / (2.0 * e * overlap), k=-1).real))
+    step = size - overlap
+    if max(size, 2 * len(taps)) >= len(padded):
+        size, step = next_fast_len(len(padded) + overlap, real=True), len(padded)
+    count = ceil((len(padded) + overlap) / step)
+    blocks = np.pad(padded, (0, count * step - len(padded))).reshape(count, step)
+    parts = np.fft.irfft(np.fft.rfft(blocks, size) * np.fft.rfft(taps, size), size)
+    parts[1:, :overlap] += parts[:-1, step : step + overlap]
+    return np.asarray(parts[:, :step].ravel()[overlap : len(padded)])
+
+
+def _filtered_speed(
+    time: FloatArray, raw: FloatArray, taps: FloatArray, step: int, derivative: int
+) -> BSpline:
+    """Return the filtered speed as a function of time, from speeds or (derivative 1) depths."""
+    start = raw[0] if derivative else 0.0
+    smooth = _smooth(raw - start, taps)
+    spline = make_interp_spline(time, smooth, k=5 if derivative else 3)
+    if derivative:
+        spline = make_interp_spline(time[::step], spline(time[::step], 1), k=3)
+    elif step > 1:
+        spline = make_interp_spline(time[::step], smooth[::step], k=3)
+    return spline
+
+
+def _white_noise(raw: FloatArray, speed: FloatArray, acceleration: FloatArray) -> float:
+    """Estimate the standard deviation of white noise from fourth differences, robustly."""
+    unsteady = np.abs(acceleration) > 0.1 * np.max(np.abs(acceleration))
+    steady = maximum_filter1d(unsteady.astype(np.uint8), 9) == 0
+    steady &= np.abs(speed) > 0.1 * np.max(np.abs(speed))
+    differences = np.abs(np.diff(raw, 4))[steady[2:-2]]
+    # The 80th percentile: counts of a constant speed may show no noise in half the strokes. The
+    # variance of the fourth difference of white noise is 70 times its own.
+    size = float(np.quantile(differences, 0.8)) if len(differences) else 0.0
+    return size / (1.2816 * sqrt(70.0))

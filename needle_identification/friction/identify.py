@@ -1,0 +1,197 @@
+r"""
+Friction of a needle from force and motion of its base, by linear regression.
+
+With the tip past the tissue, the axial row of equation (16) of [Boroomand2014]_ is friction (15),
+with optional further terms:
+
+.. math:: f_y(t + \tau) = \mu_s \operatorname{sgn}(\dot s) + \mu_v \dot s + ...
+
+The steps, each in a file of its own:
+
+================  =================================================================================
+`filtering`       force and motion through one zero-phase filter, on an even time base
+`lag`             the lag tau of the force
+`design`          samples in steady motion, regressors (`terms`), and the regression
+`intervals`       parameters with standard errors and confidence intervals
+`breakaway`       the force at which the needle begins to move
+`comparison`      other sets of terms
+`checks`          errors and warnings
+================  =================================================================================
+
+References
+----------
+.. [Boroomand2014] A. Boroomand, M. Tavakoli, R. Sloboda, N. Usmani, "Dynamical modeling
+   and controllability analysis of a flexible needle in soft tissue", 2014, section 3.2.2.2.
+
+"""
+
+from __future__ import annotations
+
+from math import nan, sqrt
+from typing import Final
+
+from needle_dynamics import FloatArray
+from needle_identification.errors import IdentificationError
+from needle_identification.estimation.regression import Regression
+from needle_identification.estimation.residual_tests import residual_tests
+from needle_identification.friction.breakaway import breakaway_force
+from needle_identification.friction.checks import (
+    check_friction,
+    lag_warnings,
+    mass_warnings,
+    model_warnings,
+    noise_warnings,
+    parameter_warnings,
+)
+from needle_identification.friction.comparison import compare_terms
+from needle_identification.friction.design import (
+    check_motion,
+    Design,
+    select_samples,
+    solve,
+    with_lag_column,
+)
+from needle_identification.friction.estimate import Fit, FrictionEstimate
+from needle_identification.friction.filtering import (
+    CORRELATION_LENGTH,
+    filter_signals,
+    FilteredSignals,
+    HALF_LENGTH,
+)
+from needle_identification.friction.intervals import parameter_estimates
+from needle_identification.friction.lag import accelerates, find_lag, lag_estimate, UNKNOWN_LAG
+from needle_identification.friction.settings import FrictionSettings
+from needle_identification.recordings.recording import Recording
+import numpy as np
+
+#: Part of the variance of the force below which the residual is rounding.
+_EXACT: Final = 1e-9
+
+
+def identify_friction(
+    recording: Recording, settings: FrictionSettings | None = None
+) -> FrictionEstimate:
+    """
+    Estimate friction from one recording.
+
+    Parameters
+    ----------
+    recording : Recording
+        Force and motion with the needle tip past the tissue, so that nothing is cut. Without
+        speeds the inserted length is differentiated, by the same zero-phase filter.
+    settings : FrictionSettings, optional
+        Terms, filter and estimator.
+
+    Returns
+    -------
+    FrictionEstimate
+        Estimates with standard errors that respect the correlation which filter and sensor leave
+        in the residuals, and warnings.
+
+    Raises
+    ------
+    IdentificationError
+        If the recording has too little motion, or the friction is negative or absent.
+
+    Examples
+    --------
+    From NumPy arrays: strokes in and out with 20 s of motion at 250 samples/s.
+
+    >>> import numpy as np
+    >>> time = np.arange(0.0, 20.0, 0.004)
+    >>> speed = 0.008 * np.sin(2.0 * time) + 0.006 * np.sin(3.1 * time)
+    >>> noise = np.random.default_rng(0).normal(scale=0.01, size=len(time))
+    >>> force = 0.56 * np.sign(speed) + 300.0 * speed + noise
+    >>> recording = Recording(time=time, speed=speed, force=force)
+    >>> estimate = identify_friction(recording)
+    >>> low, high = estimate['viscous_friction'].interval
+    >>> low < 300.0 < high
+    True
+
+    """
+    settings = settings or FrictionSettings()
+    try:
+        return _identify(recording, settings)
+    except IdentificationError as error:
+        raise IdentificationError(f'{recording.name}: {error}') from None
+
+
+def _identify(recording: Recording, settings: FrictionSettings) -> FrictionEstimate:
+    signals = filter_signals(recording, settings)
+    window = signals.window(CORRELATION_LENGTH / settings.cutoff)
+    coarse, fine = find_lag(signals, settings, window)
+    design, fit = _fitted(signals, settings, coarse, fine, window)
+    if design.estimates_lag and not fit.errors[-1] < HALF_LENGTH / settings.cutoff:
+        # Beyond the length of the filter the force is not linear in the lag.
+        fine = None
+        design, fit = _fitted(signals, settings, coarse, fine, window)
+    used = design.used
+    mean_speed = float(np.mean(np.abs(design.speed[used])))
+    parameters = parameter_estimates(fit, settings, mean_speed, signals.period)
+    check_friction(parameters)
+    lag = UNKNOWN_LAG
+    if design.estimates_lag and fine is not None and accelerates(design):
+        lag = lag_estimate(fine, fit, settings, signals.period)
+    # The resolution of positions and a mass make errors of the lag that its interval lacks.
+    lag_is_valid = recording.speed is not None and 'inertia' not in settings.terms
+    is_exact = 1.0 - fit.determination < _EXACT
+    tests = (
+        ()
+        if is_exact
+        else residual_tests(
+            fit.residual,
+            used=used,
+            time=signals.time,
+            speed=design.speed,
+            length=len(window),
+            parameters=len(fit.values),
+        )
+    )
+    comparison = () if is_exact else compare_terms(signals, design, settings, fit, window)
+    return FrictionEstimate(
+        name=recording.name,
+        terms=settings.terms,
+        estimator=settings.estimator,
+        parameters=parameters,
+        breakaway=breakaway_force(signals, design, settings, parameters),
+        lag=lag if lag_is_valid else None,
+        samples=fit.samples,
+        residual=sqrt(float(fit.residual @ fit.residual) / fit.samples),
+        determination=fit.determination,
+        condition=fit.condition,
+        tests=tests,
+        comparison=comparison,
+        warnings=(
+            *parameter_warnings(parameters),
+            *lag_warnings(lag, 0.0 if 'inertia' in settings.terms else coarse, signals.period),
+            *noise_warnings(signals, design, settings, fit),
+            *mass_warnings(parameters),
+            *model_warnings(settings, comparison, tests),
+        ),
+        fit=Fit(
+            time=signals.time,
+            speed=design.speed,
+            force=signals.force,
+            model=np.where(used, signals.force - fit.residual, nan),
+            used=used,
+        ),
+    )
+
+
+def _fitted(
+    signals: FilteredSignals,
+    settings: FrictionSettings,
+    coarse: float,
+    fine: float | None,
+    window: FloatArray,
+) -> tuple[Design, Regression]:
+    """Fit with a further lag as one more unknown, or at the coarse lag if there is no fine one."""
+    lag = coarse if fine is None else fine
+    # A coarse lag is wrong by up to half a step.
+    error = 0.5 * signals.half_filter * signals.period if fine is None else 0.0
+    is_corrected = 'inertia' not in settings.terms
+    design = select_samples(signals, settings, lag if is_corrected else 0.0, abs(lag) + error)
+    check_motion(signals, design, settings, window)
+    if is_corrected and fine is not None:
+        design = with_lag_column(signals, design, settings)
+    return design, solve(signals, design, settings, settings.terms, window)

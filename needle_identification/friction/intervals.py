@@ -1,0 +1,102 @@
+"""
+Friction parameters with their standard errors and confidence intervals.
+
+The interval of mu_s, like that of every coefficient, is that of the regression: its standard
+error, from `score_covariance`, times the quantile of Student's t. Ratios have intervals by the
+delta method.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from math import hypot, sqrt
+
+from needle_dynamics import FloatArray
+from needle_identification.estimation.estimate import ParameterEstimate
+from needle_identification.estimation.regression import Regression
+from needle_identification.friction.settings import FrictionSettings
+from needle_identification.friction.terms import columns_of
+import numpy as np
+from scipy.special import stdtrit
+
+
+def parameter_estimates(
+    fit: Regression, settings: FrictionSettings, mean_speed: float, period: float
+) -> tuple[ParameterEstimate, ...]:
+    """
+    Return the coefficients of the terms, then the ratios that follow from them.
+
+    Parameters
+    ----------
+    fit : Regression
+        Its first columns are those of the terms.
+    settings : FrictionSettings
+        The terms.
+    mean_speed : float
+        Mean speed [m/s] at which withdrawal is compared with insertion.
+    period : float
+        Sampling period [s]. The stamps of force and motion may differ by up to this.
+
+    Returns
+    -------
+    tuple of ParameterEstimate
+        The parameters.
+
+    """
+    columns = columns_of(settings.terms)
+    at = {column.name: k for k, column in enumerate(columns)}
+    intervals = fit.interval()
+    found = []
+    for k, column in enumerate(columns):
+        parameter = ParameterEstimate(name=column.name, symbol=column.symbol, unit=column.unit)
+        if fit.determined[k]:
+            low, high = intervals[k]
+            parameter = replace(
+                parameter,
+                value=float(fit.values[k]),
+                error=float(fit.errors[k]),
+                interval=(float(low), float(high)),
+                determined=True,
+            )
+        found.append(parameter)
+    if 'moving_mass' in at and 'viscous_friction' in at:
+        mass, viscous = found[at['moving_mass']], found[at['viscous_friction']]
+        if mass.determined and viscous.determined:
+            found[at['moving_mass']] = _widened(mass, viscous.value * period)
+    if 'withdrawal_coulomb' in at:
+        rows = np.zeros((2, len(fit.values)))
+        rows[0, [at['coulomb_friction'], at['viscous_friction']]] = 1.0, mean_speed
+        rows[1, [at['withdrawal_coulomb'], at['withdrawal_viscous']]] = 1.0, mean_speed
+        found.append(_ratio(fit, rows, 'withdrawal_friction', 'f_out / f_in'))
+    if 'stribeck_friction' in at and 'coulomb_friction' in at:
+        rows = np.zeros((2, len(fit.values)))
+        rows[[0, 1], [at['coulomb_friction'], at['stribeck_friction']]] = 1.0
+        found.append(_ratio(fit, rows, 'breakaway_friction', 'mu_b / mu_s'))
+    return tuple(found)
+
+
+def _widened(mass: ParameterEstimate, largest: float) -> ParameterEstimate:
+    """
+    Add the error by a lag that looks like a mass.
+
+    That error is uniform up to ``largest`` [kg] on either side.
+    """
+    low, high = mass.interval
+    return mass.with_value(
+        mass.value,
+        hypot(mass.error, largest / sqrt(3.0)),
+        hypot(0.5 * (high - low), 0.95 * largest),
+    )
+
+
+def _ratio(fit: Regression, rows: FloatArray, name: str, symbol: str) -> ParameterEstimate:
+    """Return 1 + (second row / first row) of the coefficients, with errors by the delta method."""
+    parameter = ParameterEstimate(name=name, symbol=symbol, unit='1')
+    taken = rows.any(axis=0)
+    if not fit.determined[taken].all():
+        return parameter
+    base, more = rows[:, taken] @ fit.values[taken]
+    gradient = (rows[1, taken] - more / base * rows[0, taken]) / base
+    error = sqrt(float(gradient @ fit.covariance[np.ix_(taken, taken)] @ gradient))
+    half_width = error * float(stdtrit(fit.degrees_of_freedom[taken].min(), 0.975))
+    return parameter.with_value(1.0 + float(more / base), error, half_width)

@@ -1,0 +1,80 @@
+"""Settings of the identification of friction."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Final
+
+from needle_identification.estimation.estimators import check_estimator, ESTIMATORS
+from needle_ros.errors import ParameterError
+from needle_ros.settings import check_constants, constant
+
+#: Terms of the friction force, by name; their equations are in `terms`.
+TERMS: Final = ('coulomb', 'viscous', 'offset', 'inertia', 'direction', 'stribeck')
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FrictionSettings:
+    """
+    Settings of `identify_friction` and `RecursiveFriction`.
+
+    Attributes
+    ----------
+    cutoff : float
+        Cutoff of the zero-phase low-pass filter of force and motion [Hz].
+    moving_speed : float
+        Speed above which the needle counts as moving [m/s].
+    largest_acceleration : float
+        Acceleration up to which samples are used without the term inertia [m/s^2].
+    stribeck_speed : float
+        Speed over which the breakaway friction decays [m/s].
+    terms : tuple of str
+        Terms of the friction force, of `TERMS`; the default is equation (15).
+    estimator : str
+        One of `ESTIMATORS`. ``weighted`` measures the noise in each stroke, ``total`` takes the
+        noise of the speed into account.
+
+    Raises
+    ------
+    ParameterError
+        If a setting is out of range, or a term is unknown or lacks another term.
+
+    """
+
+    cutoff: float = constant(
+        30.0, 'Hz', 'zero-phase low-pass filter of force and motion', open_low=True
+    )
+    moving_speed: float = constant(
+        1e-5, 'm/s', 'speed above which the needle counts as moving', open_low=True
+    )
+    largest_acceleration: float = constant(
+        0.2, 'm/s^2', 'acceleration up to which samples are used without inertia', open_low=True
+    )
+    stribeck_speed: float = constant(
+        1e-3, 'm/s', 'speed over which the breakaway friction decays', open_low=True
+    )
+    terms: tuple[str, ...] = field(
+        default=('coulomb', 'viscous'), metadata={'description': f'of {", ".join(TERMS)}'}
+    )
+    estimator: str = field(
+        default='ordinary', metadata={'description': f'one of {", ".join(ESTIMATORS)}'}
+    )
+
+    def __post_init__(self) -> None:
+        check_constants(self)
+        object.__setattr__(self, 'terms', tuple(self.terms))
+        if not self.terms or len(set(self.terms)) < len(self.terms):
+            raise ParameterError(f'terms must be distinct, at least one, got {list(self.terms)}')
+        for term in self.terms:
+            if term not in TERMS:
+                raise ParameterError(f'terms must be of {", ".join(TERMS)}, got {term!r}')
+        if 'direction' in self.terms and not {'coulomb', 'viscous'} <= set(self.terms):
+            raise ParameterError('the term direction needs the terms coulomb and viscous')
+        check_estimator(self.estimator)
+        if self.estimator == 'total' and (
+            'direction' in self.terms or 'viscous' not in self.terms
+        ):
+            raise ParameterError(
+                'the estimator total needs the term viscous and does not work with direction: '
+                'the noise of the speed is that of one column'
+            )

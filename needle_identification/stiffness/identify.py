@@ -1,0 +1,225 @@
+r"""
+Stiffness of the tissue in the plane of deflection, section 3.2.2.3 of [Boroomand2014]_.
+
+The end-effector presses the tissue with force F and moves it by d. The tissue answers with -F.
+For each force level the stiffness matrix K of F = K d is fitted to the presses of that level.
+The steps, each in a file of its own:
+
+============  =====================================================================================
+`plateaus`    holds and rests: the times in which force and position are steady
+`drift`       the zeros of force and position between the rests
+`presses`     displacement and force of each hold; force levels and directions
+`matrix`      the stiffness matrix with its errors
+`spring`      whether the tissue is a spring
+`principal`   principal stiffnesses
+============  =====================================================================================
+
+References
+----------
+.. [Boroomand2014] A. Boroomand, M. Tavakoli, R. Sloboda, N. Usmani, "Dynamical modeling
+   and controllability analysis of a flexible needle in soft tissue", 2014, section 3.2.2.3.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from itertools import pairwise
+from math import hypot, nan, sqrt
+from typing import Final
+
+from needle_identification.errors import IdentificationError
+from needle_identification.recordings.recording import IndentationRecording
+from needle_identification.stiffness.estimate import LevelEstimate, StiffnessEstimate
+from needle_identification.stiffness.matrix import ENTRIES, fit_matrix, MatrixFit
+from needle_identification.stiffness.plateaus import find_plateaus
+from needle_identification.stiffness.presses import find_presses, Presses
+from needle_identification.stiffness.principal import principal_estimates
+from needle_identification.stiffness.settings import StiffnessSettings
+from needle_identification.stiffness.spring import asymmetry_estimate, curl_estimate, judge_spring
+import numpy as np
+from numpy.typing import NDArray
+
+#: What is worth a warning, as a part of what was measured.
+_WORTH_WARNING: Final = 0.1
+
+#: Scatter over noise beyond which the presses do not follow one matrix.
+_LARGEST_SCATTER: Final = 2.0
+
+#: A clear change [standard errors].
+_CLEARLY: Final = 3.0
+
+#: Fewest directions without a warning.
+_FEWEST_DIRECTIONS: Final = 4
+
+
+def identify_stiffness(
+    recording: IndentationRecording, settings: StiffnessSettings | None = None
+) -> StiffnessEstimate:
+    """
+    Estimate the stiffness matrix at each force level of one recording.
+
+    A hold is the longest time in which force and position stay steady. Rests are the steady times
+    whose force is visited most often. The zeros of force and position are followed from rest to
+    rest, which removes slow drift and the bias of the sensor. Standard errors come from the
+    scatter of the presses about the matrix, intervals from Student's t.
+
+    Parameters
+    ----------
+    recording : IndentationRecording
+        Presses in any number of directions and levels, with rests between.
+    settings : StiffnessSettings, optional
+        What is steady, what is a rest, and the estimator.
+
+    Returns
+    -------
+    StiffnessEstimate
+        One matrix per level. What the presses do not determine is marked.
+
+    Raises
+    ------
+    IdentificationError
+        If there is no press.
+
+    Examples
+    --------
+    From NumPy arrays: presses of 1.2 N in eight directions on a tissue of 800 N/m.
+
+    >>> import numpy as np
+    >>> angles = np.repeat(np.arange(8) * np.pi / 4, 2)
+    >>> size = np.tile([1.2, 0.0], 8)
+    >>> force = np.repeat(np.column_stack([size * np.cos(angles), size * np.sin(angles)]), 100, 0)
+    >>> time = np.arange(len(force)) / 250.0
+    >>> recording = IndentationRecording(time=time, position=force / 800.0, force=force)
+    >>> estimate = identify_stiffness(recording)
+    >>> estimate.levels
+    (<LevelEstimate at 1.2 N: K = [[800, 0], [0, 800]] N/m>,)
+
+    """
+    settings = settings or StiffnessSettings()
+    try:
+        return _identify(recording, settings)
+    except IdentificationError as error:
+        raise IdentificationError(f'{recording.name}: {error}') from None
+
+
+def _identify(recording: IndentationRecording, settings: StiffnessSettings) -> StiffnessEstimate:
+    plateaus = find_plateaus(recording, settings)
+    presses, noise, warnings = find_presses(recording, plateaus, settings)
+    levels = []
+    by_doubt: dict[str, list[str]] = {}
+    for index in range(int(presses.level.max()) + 1):
+        fit = fit_matrix(
+            presses, noise, np.flatnonzero(presses.level == index), settings.estimator
+        )
+        level = _level(presses, presses.level == index, fit, settings)
+        levels.append(level)
+        for doubt, detail in _doubts(level, fit):
+            by_doubt.setdefault(doubt, []).append(f'{detail} at {level.force:.3g} N')
+    warnings += [f'{doubt} ({"; ".join(details)})' for doubt, details in by_doubt.items()]
+    size = np.maximum(np.hypot(*presses.displacement.T), 1e-15)
+    off_plane = float((np.abs(presses.off_plane) / size).max())
+    if off_plane > _WORTH_WARNING:
+        warnings.append(
+            f'the end-effector moved out of the plane by up to {off_plane:.0%} of its '
+            f'displacement in it (more than {_WORTH_WARNING:.0%}): the stiffness may be wrong'
+        )
+    return StiffnessEstimate(
+        name=recording.name,
+        levels=tuple(levels),
+        off_plane=off_plane,
+        warnings=tuple(warnings + _falling(presses, levels)),
+        presses=presses,
+    )
+
+
+def _level(
+    presses: Presses, chosen: NDArray[np.bool_], fit: MatrixFit, settings: StiffnessSettings
+) -> LevelEstimate:
+    """Collect the results of one level."""
+    k_zz = float(fit.matrix[1, 1])
+    curl, spring = curl_estimate(fit), asymmetry_estimate(fit)
+    first, second, angle = principal_estimates(fit)
+    force = presses.force[chosen]
+    is_spring, words = judge_spring(spring, curl, settings.largest_asymmetry)
+    residual = float((fit.residual**2).sum())
+    variation = float(((force - force.mean(axis=0)) ** 2).sum())
+    is_known = fit.known.any()
+    return LevelEstimate(
+        force=float(np.hypot(*force.T).mean()),
+        parameters=tuple(
+            fit.derived(name, name, 'N/m', float(fit.matrix[index]), _unit(*index))
+            for name, index in zip(ENTRIES, np.ndindex(2, 2), strict=True)
+        ),
+        curl=curl,
+        spring=spring,
+        is_spring=is_spring,
+        words=words,
+        principal=(first, second),
+        angle=angle,
+        tissue_stiffness=fit.derived(
+            'tissue_stiffness',
+            'k_a',
+            'N/m^2',
+            k_zz / settings.contact_length,
+            _unit(1, 1) / settings.contact_length,
+        ),
+        presses=len(force),
+        directions=len(np.unique(presses.direction[chosen])),
+        residual=sqrt(residual / len(force)) if is_known else nan,
+        determination=1.0 - residual / variation if is_known and variation > 0.0 else nan,
+        condition=fit.condition,
+    )
+
+
+def _unit(row: int, column: int) -> NDArray[np.float64]:
+    """Return the gradient of one entry of the matrix."""
+    gradient = np.zeros((2, 2))
+    gradient[row, column] = 1.0
+    return gradient
+
+
+def _doubts(level: LevelEstimate, fit: MatrixFit) -> Iterator[tuple[str, str]]:
+    """Yield what makes the matrix of a level doubtful, each with a detail of this level."""
+    if not fit.known.all():
+        lacking = ', '.join(p.symbol for p in level.parameters if not p.determined)
+        yield (
+            f'{lacking} not determined: at least three presses in two directions are needed',
+            f'{level.presses} in {level.directions}',
+        )
+        return
+    if level.directions < _FEWEST_DIRECTIONS:
+        yield 'few directions; the source has 8', f'{level.directions}'
+    if fit.scatter > _LARGEST_SCATTER:
+        yield (
+            'the presses scatter more than their noise: F = K d does not hold exactly',
+            f'{fit.scatter:.2g} times',
+        )
+    k_xx, k_zz = level['k_xx'].value, level['k_zz'].value
+    low, high = fit.derived('', '', '', k_xx - k_zz, np.diag([1.0, -1.0])).interval
+    if (low > 0.0 or high < 0.0) and abs(k_xx - k_zz) > _WORTH_WARNING * abs(k_zz):
+        yield (
+            'k_xx differs from k_zz: the tissue is anisotropic, or the motion left the plane',
+            f'{k_xx:.3g} and {k_zz:.3g} N/m',
+        )
+
+
+def _falling(presses: Presses, levels: Sequence[LevelEstimate]) -> list[str]:
+    """Warn where more force gave less displacement along it."""
+    along = (presses.force * presses.displacement).sum(axis=1) / np.hypot(*presses.force.T)
+    error = np.hypot(*presses.displacement_error.T)
+    falls: dict[tuple[int, int], int] = {}
+    directions = range(int(presses.direction.max()) + 1)
+    for direction in directions:
+        same = presses.direction == direction
+        met = np.unique(presses.level[same])
+        where = [same & (presses.level == level) for level in met]
+        for (low, before), (high, after) in pairwise(zip(met, where, strict=True)):
+            rise = along[after].mean() - along[before].mean()
+            if rise < -_CLEARLY * hypot(error[after].mean(), error[before].mean()):
+                falls[low, high] = falls.get((low, high), 0) + 1
+    return [
+        f'in {count} of {len(directions)} directions the displacement decreases as the force '
+        f'increases from {levels[low].force:.3g} to {levels[high].force:.3g} N'
+        for (low, high), count in sorted(falls.items())
+    ]

@@ -1,0 +1,241 @@
+r"""
+The stiffness matrix of one force level, by least squares over its presses.
+
+.. math:: F = K d, \qquad K = \begin{bmatrix} k_{xx} & k_{xz} \\ k_{zx} & k_{zz} \end{bmatrix}
+
+F is the force on the tissue and d the displacement of the end-effector, section 3.2.2.3 of
+[Boroomand2014]_.
+
+References
+----------
+.. [Boroomand2014] A. Boroomand, M. Tavakoli, R. Sloboda, N. Usmani, "Dynamical modeling
+   and controllability analysis of a flexible needle in soft tissue", 2014, section 3.2.2.3.
+
+"""
+
+from __future__ import annotations
+
+from math import inf, isfinite, nan, sqrt
+from typing import Final, NamedTuple
+
+from needle_dynamics import FloatArray
+from needle_identification.estimation.estimate import ParameterEstimate
+from needle_identification.estimation.regression import regress
+from needle_identification.estimation.solvers import BoolArray
+from needle_identification.stiffness.presses import Presses, PressNoise
+import numpy as np
+from numpy.linalg import norm
+from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
+from scipy.special import stdtrit
+
+#: Entries of the matrix, by row.
+ENTRIES: Final = ('k_xx', 'k_xz', 'k_zx', 'k_zz')
+
+#: Fewest presses of a level.
+_FEWEST_PRESSES: Final = 3
+
+#: Scatter of the displacements in both directions, over their error, that determines the matrix:
+#: attenuation by the noise of the displacements is then below 1 %.
+_SMALLEST_SPREAD: Final = 10.0
+
+#: A column that is not this much larger than its error is only noise.
+_LARGEST_NOISE: Final = 3.0
+
+
+class MatrixFit(NamedTuple):
+    """
+    A stiffness matrix with its errors.
+
+    Attributes
+    ----------
+    matrix : ndarray, shape (2, 2)
+        Stiffness matrix K [N/m]; columns that are not known are nan.
+    known : ndarray of bool, shape (2,)
+        Columns that the presses determine.
+    factors : ndarray, shape (2, 2, 2)
+        Factors A of the covariance: that of rows r and s of K is R_rs A_r A_s^T.
+    correlation : ndarray, shape (2, 2)
+        Correlation R of the residuals of the rows.
+    degrees_of_freedom : float
+        Of each row.
+    residual : ndarray, shape (m, 2)
+        Force minus K d [N].
+    scatter : float
+        Scatter of the presses about the matrix over their noise [1].
+    condition : float
+        Condition number of the displacements.
+
+    """
+
+    matrix: FloatArray
+    known: BoolArray
+    factors: FloatArray
+    correlation: FloatArray
+    degrees_of_freedom: float
+    residual: FloatArray
+    scatter: float
+    condition: float
+
+    def derived(
+        self, name: str, symbol: str, unit: str, value: float, gradient: FloatArray
+    ) -> ParameterEstimate:
+        """
+        Return a quantity that depends on the matrix, with propagated errors.
+
+        Parameters
+        ----------
+        name, symbol, unit : str
+            The quantity.
+        value : float
+            Its value.
+        gradient : ndarray, shape (2, 2)
+            Its derivatives with respect to the entries of the matrix.
+
+        Returns
+        -------
+        ParameterEstimate
+            The quantity; not determined if an entry that it depends on is not.
+
+        """
+        parameter = ParameterEstimate(name=name, symbol=symbol, unit=unit)
+        if not self.known[np.any(gradient != 0.0, axis=0)].all() or not isfinite(value):
+            return parameter
+        variance, freedom = self.variance_of(gradient)
+        error = sqrt(variance)
+        return parameter.with_value(value, error, error * float(stdtrit(freedom, 0.975)))
+
+    def variance_of(self, gradient: FloatArray) -> tuple[float, float]:
+        """
+        Return the variance of a quantity that depends on the matrix.
+
+        Parameters
+        ----------
+        gradient : ndarray, shape (2, 2)
+            Its derivatives with respect to the entries of the matrix.
+
+        Returns
+        -------
+        variance, degrees_of_freedom : float
+            Variance and its degrees of freedom (Satterthwaite), between those of one row and
+            those of both.
+
+        """
+        along = np.einsum('rij,ri->rj', self.factors, gradient)
+        parts = along @ along.T @ self.correlation
+        variance = max(float(np.trace(parts)), 0.0)
+        squares = float(np.trace(parts @ parts))
+        freedom = self.degrees_of_freedom
+        return variance, freedom * variance**2 / squares if squares > 0.0 else freedom
+
+
+_UNKNOWN: Final = MatrixFit(
+    matrix=np.full((2, 2), nan),
+    known=np.zeros(2, dtype=np.bool_),
+    factors=np.zeros((2, 2, 2)),
+    correlation=np.eye(2),
+    degrees_of_freedom=0.0,
+    residual=np.zeros((1, 2)),
+    scatter=0.0,
+    condition=inf,
+)
+
+
+def fit_matrix(
+    presses: Presses, noise: PressNoise, chosen: NDArray[np.int64], estimator: str
+) -> MatrixFit:
+    """
+    Solve F = K d over presses, as far as they determine K.
+
+    The rows of K are solved one by one, with the noise of force and displacement and of their
+    zeros. The errors come from the scatter of the presses about K.
+
+    Parameters
+    ----------
+    presses : Presses
+        All presses.
+    noise : PressNoise
+        Their noise.
+    chosen : ndarray of int, shape (m,)
+        Presses to use.
+    estimator : str
+        One of `ESTIMATORS`; ``weighted`` takes the noise of each press for its own.
+
+    Returns
+    -------
+    MatrixFit
+        The matrix.
+
+    """
+    displacement, force = presses.displacement[chosen], presses.force[chosen]
+    error = sqrt(float(np.mean(presses.displacement_error[chosen] ** 2)) * len(chosen))
+    if len(chosen) < _FEWEST_PRESSES:
+        return _UNKNOWN
+    columns = np.flatnonzero(norm(displacement, axis=0) > _LARGEST_NOISE * error)
+    singular = np.linalg.svd(displacement[:, columns], compute_uv=False)
+    if not len(columns) or singular[-1] < _SMALLEST_SPREAD * error:
+        condition = float(singular[0] / singular[-1]) if len(columns) else inf
+        return _UNKNOWN._replace(condition=condition)
+    displacement = displacement[:, columns]
+    start = np.zeros((2, 2))
+    start[:, columns] = np.linalg.lstsq(displacement, force, rcond=None)[0].T
+    covariances = noise.covariance(start, chosen, pooled=estimator != 'weighted')
+    matrix, factors = np.full((2, 2), nan), np.zeros((2, 2, 2))
+    known = np.isin(np.arange(2), columns)
+    residual = np.empty_like(force)
+    freedom = float(len(chosen) - len(columns))
+    freedoms = [freedom, freedom]
+    whitened = []
+    for row, covariance in enumerate(covariances):
+        size = float(np.mean(np.diag(covariance)))
+        root = np.linalg.cholesky(covariance / size)
+        x, y = (solve_triangular(root, a, lower=True) for a in (displacement, force[:, row]))
+        fit = regress(
+            x,
+            y,
+            estimator='ordinary' if estimator == 'weighted' else estimator,
+            noisy=np.ones(len(columns), dtype=np.bool_),
+            regressor_noise=np.full(len(columns), error / sqrt(len(chosen))),
+        )
+        deviation, freedoms[row], left = _deviation(fit.residual, freedom, estimator)
+        matrix[row, columns] = fit.values
+        known[columns] &= fit.determined
+        residual[:, row] = root @ fit.residual
+        normal = np.linalg.inv(x.T @ x)
+        factor = deviation * np.linalg.cholesky(normal)
+        factors[row][np.ix_(columns, np.arange(len(columns)))] = factor
+        whitened.append((left, fit.residual / sqrt(size)))
+    (left_x, scaled_x), (left_z, scaled_z) = whitened
+    norms = float(norm(left_x) * norm(left_z))
+    correlation = float(left_x @ left_z) / norms if norms > 0.0 else 0.0
+    return MatrixFit(
+        matrix=matrix,
+        known=known,
+        factors=factors,
+        correlation=np.array([[1.0, correlation], [correlation, 1.0]]),
+        degrees_of_freedom=min(freedoms),
+        residual=residual,
+        scatter=sqrt(float(scaled_x @ scaled_x + scaled_z @ scaled_z) / (2.0 * freedom)),
+        condition=fit.condition,
+    )
+
+
+def _deviation(
+    residual: FloatArray, freedom: float, estimator: str
+) -> tuple[float, float, FloatArray]:
+    """
+    Return the standard deviation of residuals, its degrees of freedom, and the residuals used.
+
+    With few presses the scatter of all is better known than that of each. For ``huber`` it is
+    that of the clipped residuals, P. J. Huber, "Robust Statistics", 1981, section 7.6; one degree
+    of freedom is lost for each clipped residual.
+    """
+    if estimator != 'huber':
+        return sqrt(float(residual @ residual) / freedom), freedom, residual
+    limit = 1.345 * 1.4826 * float(np.median(np.abs(residual)))
+    left = np.clip(residual, -limit, limit)
+    share = float(np.mean(np.abs(residual) <= limit))
+    count = len(residual)
+    correction = (1.0 + (count - freedom) / count * (1.0 - share) / share) / share
+    deviation = correction * sqrt(float(left @ left) / freedom)
+    return deviation, max(freedom - count * (1.0 - share), 1.0), left

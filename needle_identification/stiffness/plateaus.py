@@ -1,0 +1,250 @@
+"""
+Plateaus: the times in which force and position are steady, as holds of presses and as rests.
+
+A plateau is the longest time in which force and position stay steady. Plateaus near the force
+that is visited most often are rests, the others are holds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import ceil, hypot, inf, sqrt
+from typing import Final, NamedTuple
+
+from needle_dynamics import FloatArray
+from needle_identification.errors import IdentificationError
+from needle_identification.estimation.solvers import BoolArray
+from needle_identification.recordings.recording import IndentationRecording
+from needle_identification.stiffness.settings import StiffnessSettings
+import numpy as np
+from numpy.linalg import norm
+from numpy.typing import NDArray
+
+#: Bins in the shortest plateau; steadiness is judged by their means.
+_BINS: Final = 10.0
+
+#: A longer step between bins ends a plateau [bins].
+_GAP: Final = 4
+
+#: Steady: positions stay within this part of their whole range.
+_STEADY_MOTION: Final = 0.05
+
+#: Steady: the force changes from begin to end by at most this part of its tolerance. A ramp,
+#: however slow, uses all of the tolerance.
+_STEADY_TREND: Final = 1.0 / 3.0
+
+#: Noise does not leave a band this much wider by chance [standard deviations].
+_BAND: Final = 12.0
+
+#: Bins this far from the middle half of a plateau belong to a ramp [standard deviations].
+_RAMP: Final = 3.0
+
+#: Fewest samples of a plateau.
+_FEWEST_SAMPLES: Final = 4
+
+#: Noise below this part of the largest value is rounding.
+ROUNDING: Final = 1e-8
+
+
+class Plateaus(NamedTuple):
+    """
+    Steady times of a recording. Channels are force x, z, displacement x, z, and off-plane.
+
+    Attributes
+    ----------
+    time : ndarray, shape (p,)
+        Middle of each plateau [s].
+    mean, variance : ndarray, shape (p, 5)
+        Mean of each channel, and the variance of that mean.
+    rest : ndarray of bool, shape (p,)
+        Whether it is a rest.
+    missed : int
+        Number of times in which the end-effector pressed without a plateau.
+
+    """
+
+    time: FloatArray
+    mean: FloatArray
+    variance: FloatArray
+    rest: BoolArray
+    missed: int
+
+
+def find_plateaus(recording: IndentationRecording, settings: StiffnessSettings) -> Plateaus:
+    """
+    Find the holds and rests of a recording.
+
+    Parameters
+    ----------
+    recording : IndentationRecording
+        Presses with rests between.
+    settings : StiffnessSettings
+        What is steady, and what is a rest.
+
+    Returns
+    -------
+    Plateaus
+        In order of time.
+
+    Raises
+    ------
+    IdentificationError
+        If nothing is steady.
+
+    """
+    time = recording.time
+    channels = np.column_stack([recording.force, recording.position, recording.off_plane])
+    if len(time) < _FEWEST_SAMPLES:
+        raise IdentificationError(f'too short: {len(time)} samples')
+    width = max(settings.hold_time / _BINS, float(np.median(np.diff(time))))
+    number, first = np.unique(((time - time[0]) / width).astype(np.int64), return_index=True)
+    after = np.append(first[1:], len(time))
+    means = np.add.reduceat(channels, first) / (after - first)[:, np.newaxis]
+    shortest = max(2, ceil((settings.hold_time + settings.settle_time) / width))
+    runs, parts = [], []
+    for start, length in _steady_runs(number, means[:, :4], settings.level_tolerance, shortest):
+        begin = int(np.searchsorted(time, time[first[start]] + settings.settle_time))
+        end = int(after[start + length - 1])
+        if end - begin >= _FEWEST_SAMPLES:
+            runs.append((start, length))
+            parts.append((begin, end))
+    if not parts:
+        raise IdentificationError(
+            f'no force is steady within {settings.level_tolerance:g} N for '
+            f'{settings.hold_time:g} s; found neither a hold nor a rest'
+        )
+    mean = np.array([channels[begin:end].mean(axis=0) for begin, end in parts])
+    rest = _rests(mean[:, :2], settings.rest_force)
+    middle = np.array([time[begin:end].mean() for begin, end in parts])
+    zero = np.column_stack([np.interp(time[first], middle[rest], c) for c in mean[rest, :2].T])
+    size = np.hypot(*(means[:, :2] - zero).T)
+    pressed = size > settings.rest_force
+    held = np.zeros(len(means), dtype=np.bool_)
+    for (start, length), is_rest in zip(runs, rest, strict=True):
+        held[start : start + length] = not is_rest
+    edges = np.flatnonzero(np.diff(np.pad(pressed.astype(np.int8), 1))).reshape(-1, 2)
+    # Noise crosses the limit of a rest more than once, but not twice that limit.
+    high = size > 2.0 * settings.rest_force
+    missed = sum(high[up:down].any() and not held[up:down].any() for up, down in edges)
+    return Plateaus(middle, mean, _variances(channels, parts), rest, missed)
+
+
+def _steady_runs(
+    number: NDArray[np.int64], means: FloatArray, tolerance: float, shortest: int
+) -> list[tuple[int, int]]:
+    """Return (start, length) of the longest steady runs of bins that do not overlap."""
+    if len(means) < shortest:
+        return []
+    # Ramps have no second differences; their scatter is that of the noise times root 6.
+    noise = np.median(np.abs(np.diff(means[:, :2], n=2, axis=0, prepend=means[:1, :2])))
+    band = max(tolerance, _BAND * float(noise) / (0.6745 * sqrt(6.0)))
+    motion = float(np.ptp(means[:, 2:], axis=0).max()) * _STEADY_MOTION
+    scaled = means / [band, band, motion or 1.0, motion or 1.0]
+    gap = np.concatenate([[0], np.cumsum(np.diff(number) > _GAP)])
+    lengths = _steady_lengths(np.column_stack([scaled, 2.0 * gap]))
+    taken = np.zeros(len(means), dtype=np.bool_)
+    found = []
+    for start in np.argsort(-lengths, kind='stable'):
+        length = int(lengths[start])
+        if length < shortest:
+            break
+        if taken[start] or taken[start + length - 1]:
+            continue
+        taken[start : start + length] = True
+        # The ends of ramps may give a trend to a run that is a hold in its middle.
+        begin, end = _trimmed(scaled[start : start + length])
+        if _trend(scaled[start + begin : start + end, :2]) <= _STEADY_TREND:
+            found.append((int(start) + begin, end - begin))
+    return sorted(found)
+
+
+def _trend(values: FloatArray) -> float:
+    """Return the change from the first to the last row of the line through them."""
+    abscissa = np.linspace(-0.5, 0.5, len(values))
+    return float(norm(abscissa @ values / (abscissa @ abscissa)))
+
+
+def _trimmed(values: FloatArray) -> tuple[int, int]:
+    """Leave out at both ends, up to a quarter each, what differs from the middle half."""
+    quarter = len(values) // 4
+    middle = values[quarter : len(values) - quarter]
+    limit = _RAMP * middle.std(axis=0) + ROUNDING
+    alike = (np.abs(values - middle.mean(axis=0)) <= limit).all(axis=1)
+    alike[quarter : len(values) - quarter] = True
+    return int(alike.argmax()), len(values) - int(alike[::-1].argmax())
+
+
+def _steady_lengths(values: FloatArray) -> NDArray[np.int64]:
+    """For each row, count the rows from it on over which no column varies by more than 1."""
+    count = len(values)
+    # Smallest and largest values over 1, 2, 4, ... rows.
+    lows, highs = [values], [values]
+    while 2 ** len(lows) <= count:
+        half = 2 ** (len(lows) - 1)
+        lows.append(np.minimum(lows[-1][:-half], lows[-1][half:]))
+        highs.append(np.maximum(highs[-1][:-half], highs[-1][half:]))
+    end = np.arange(count)
+    low, high = np.full_like(values, inf), np.full_like(values, -inf)
+    for power in reversed(range(len(lows))):
+        rows = np.flatnonzero(end + 2**power <= count)
+        lower = np.minimum(low[rows], lows[power][end[rows]])
+        higher = np.maximum(high[rows], highs[power][end[rows]])
+        fits = (higher - lower <= 1.0).all(axis=1)
+        rows = rows[fits]
+        low[rows], high[rows] = lower[fits], higher[fits]
+        end[rows] += 2**power
+    return np.asarray(end - np.arange(count))
+
+
+def _rests(force: FloatArray, rest_force: float) -> BoolArray:
+    """Mark the rests: near the force that is visited most often, followed as it drifts."""
+    apart = np.hypot(*(force[:, np.newaxis] - force).transpose(2, 0, 1))
+    visits = np.count_nonzero(apart <= rest_force, axis=1)
+    start = min(range(len(force)), key=lambda i: (-visits[i], hypot(*force[i])))
+    rest = np.zeros(len(force), dtype=np.bool_)
+    for order in (range(start, len(force)), range(start, -1, -1)):
+        zero = force[start]
+        for i in order:
+            if hypot(*(force[i] - zero)) <= rest_force:
+                rest[i], zero = True, force[i]
+    return rest
+
+
+def _variances(channels: FloatArray, parts: list[tuple[int, int]]) -> FloatArray:
+    """
+    Return the variance of the mean of each part; all parts share their autocorrelation.
+
+    A steady trend within a part is drift or creep, not noise. The sum of autocorrelations ends
+    where it is a fifth of the lag, which balances its bias and its noise (A. Sokal, "Monte Carlo
+    methods in statistical mechanics", 1997).
+    """
+    rows, shapes = [], []
+    for begin, end in parts:
+        line = np.linspace(-1.0, 1.0, end - begin)
+        shape = np.column_stack([np.full_like(line, 1.0 / sqrt(len(line))), line / norm(line)])
+        rows.append(channels[begin:end] - shape @ (shape.T @ channels[begin:end]))
+        shapes.append(shape)
+    counts = np.array([[len(row)] for row in rows])
+    products = _autocorrelations(rows, int(counts.max()) // 4 + 1)
+    lags = np.arange(len(products))
+    # Mean and trend that were subtracted took their share of the noise at each lag.
+    taken = _autocorrelations(shapes, len(lags)).sum(axis=1)
+    free = np.maximum(counts.sum() - (2.0 * np.cumsum(taken) - taken[0]), 1.0)
+    sums = 2.0 * np.cumsum(products, axis=0) - products[0]
+    power = np.where(products[0] > 0.0, products[0] / counts.sum(), inf)
+    time = sums / free[:, np.newaxis] / power
+    enough = lags[:, np.newaxis] >= 5.0 * time
+    enough[-1] = True
+    time = np.maximum(np.take_along_axis(time, enough.argmax(axis=0)[np.newaxis], axis=0), 1.0)
+    variance = np.array([row.var(axis=0) for row in rows]) * time / counts
+    return np.asarray(np.maximum(variance, (ROUNDING * np.abs(channels).max(axis=0) + 1e-15) ** 2))
+
+
+def _autocorrelations(rows: Sequence[FloatArray], lags: int) -> FloatArray:
+    """Sum the products of samples by lag over all rows of shape (n, c), shape (lags, c)."""
+    products = np.zeros((lags, rows[0].shape[1]))
+    for row in rows:
+        spectrum = np.fft.rfft(row, 2 * len(row), axis=0)
+        found = np.fft.irfft(np.abs(spectrum) ** 2, axis=0)[: min(lags, len(row))]
+        products[: len(found)] += found
+    return products

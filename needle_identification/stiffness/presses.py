@@ -1,0 +1,243 @@
+"""Presses: displacement and force of each hold, relative to the rests around it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import pi
+from typing import Final, NamedTuple
+
+from needle_dynamics import FloatArray
+from needle_identification.errors import IdentificationError
+from needle_identification.recordings.recording import IndentationRecording
+from needle_identification.stiffness.drift import follow_zero
+from needle_identification.stiffness.plateaus import Plateaus
+from needle_identification.stiffness.settings import StiffnessSettings
+import numpy as np
+from numpy.typing import NDArray
+
+#: Forces within this angle press in the same direction [rad].
+_SAME_DIRECTION: Final = pi / 18.0
+
+#: Drift of the zero that is worth a warning, as a part of what was measured.
+_WORTH_WARNING: Final = 0.1
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
+class Presses:
+    """
+    Presses of a recording, relative to the rests around them.
+
+    Attributes
+    ----------
+    time : ndarray, shape (m,)
+        Middle of the hold [s].
+    displacement, force : ndarray, shape (m, 2)
+        Mean displacement [m] and force on the tissue [N] along x and z.
+    displacement_error, force_error : ndarray, shape (m, 2)
+        Their standard errors, which respect the autocorrelation of the samples.
+    off_plane : ndarray, shape (m,)
+        Displacement out of the plane [m].
+    level, direction : ndarray of int, shape (m,)
+        Index of the force level and of the direction.
+
+    """
+
+    time: FloatArray
+    displacement: FloatArray
+    force: FloatArray
+    displacement_error: FloatArray
+    force_error: FloatArray
+    off_plane: FloatArray
+    level: NDArray[np.int64]
+    direction: NDArray[np.int64]
+
+    def __repr__(self) -> str:
+        levels, directions = int(self.level.max()) + 1, int(self.direction.max()) + 1
+        return f'<Presses: {len(self.time)} in {directions} directions at {levels} force levels>'
+
+
+class PressNoise(NamedTuple):
+    """
+    Noise of the presses.
+
+    Attributes
+    ----------
+    force, displacement : ndarray, shape (m, 2)
+        Variance of the means of the holds [N^2], [m^2].
+    force_zero, displacement_zero : ndarray, shape (m, m)
+        Covariance of the zeros of each axis [N^2], [m^2].
+
+    """
+
+    force: FloatArray
+    displacement: FloatArray
+    force_zero: FloatArray
+    displacement_zero: FloatArray
+
+    def covariance(
+        self, matrix: FloatArray, chosen: NDArray[np.int64], *, pooled: bool
+    ) -> FloatArray:
+        """
+        Return the covariance of F - K d.
+
+        Parameters
+        ----------
+        matrix : ndarray, shape (2, 2)
+            Stiffness matrix K [N/m].
+        chosen : ndarray of int, shape (m,)
+            Presses.
+        pooled : bool
+            Whether all holds have the same noise, their mean.
+
+        Returns
+        -------
+        ndarray, shape (2, m, m)
+            One covariance among the presses for each row of K [N^2].
+
+        """
+        force, displacement = self.force[chosen], self.displacement[chosen]
+        squares: FloatArray = matrix**2
+        if pooled:
+            force, displacement, squares = (
+                np.full_like(a, a.mean()) for a in (force, displacement, squares)
+            )
+        else:
+            force, displacement = _bounded(force), _bounded(displacement)
+        among = np.ix_(chosen, chosen)
+        return np.array(
+            [
+                np.diag(force[:, row] + displacement @ squares[row])
+                + self.force_zero[among]
+                + squares[row].sum() * self.displacement_zero[among]
+                for row in range(2)
+            ]
+        )
+
+
+def _bounded(variance: FloatArray) -> FloatArray:
+    """Bound variances from below: rounding may make a hold look quiet by chance."""
+    return np.asarray(np.maximum(variance, 0.1 * variance.mean(axis=0)))
+
+
+def find_presses(
+    recording: IndentationRecording, plateaus: Plateaus, settings: StiffnessSettings
+) -> tuple[Presses, PressNoise, list[str]]:
+    """
+    Take the holds relative to the rests.
+
+    Parameters
+    ----------
+    recording : IndentationRecording
+        The recording.
+    plateaus : Plateaus
+        Its holds and rests.
+    settings : StiffnessSettings
+        What one force level is.
+
+    Returns
+    -------
+    presses : Presses
+        One per hold.
+    noise : PressNoise
+        Their noise.
+    warnings : list of str
+        What drifted and what was left out.
+
+    Raises
+    ------
+    IdentificationError
+        If there is no hold.
+
+    """
+    rest, hold = plateaus.rest, ~plateaus.rest
+    if not hold.any():
+        highest = float(np.hypot(*(recording.force - plateaus.mean[rest, :2][0]).T).max())
+        raise IdentificationError(
+            f'no hold: no force is steady for {settings.hold_time:g} s and more than '
+            f'{settings.rest_force:g} N from rest; the largest is {highest:.3g} N from rest'
+        )
+    time = plateaus.time[hold]
+    change = np.empty((len(time), 5))
+    covariances = []
+    for channels in (slice(0, 2), slice(2, 4), slice(4, 5)):
+        zero, covariance = follow_zero(
+            plateaus.time[rest],
+            plateaus.mean[rest, channels],
+            plateaus.variance[rest, channels].mean(axis=1),
+            time,
+        )
+        change[:, channels] = plateaus.mean[hold, channels] - zero
+        covariances.append(covariance)
+    force, displacement = change[:, :2], change[:, 2:4]
+    noise = PressNoise(
+        plateaus.variance[hold, :2], plateaus.variance[hold, 2:4], covariances[0], covariances[1]
+    )
+    presses = Presses(
+        time=time,
+        displacement=displacement,
+        force=force,
+        displacement_error=np.sqrt(noise.displacement + np.diag(covariances[1])[:, np.newaxis]),
+        force_error=np.sqrt(noise.force + np.diag(covariances[0])[:, np.newaxis]),
+        off_plane=change[:, 4],
+        level=grouped(np.hypot(*force.T), settings.level_tolerance),
+        direction=_directions(force),
+    )
+    for array in (getattr(presses, name) for name in Presses.__slots__):
+        array.setflags(write=False)
+    return presses, noise, _warnings(presses, plateaus, settings)
+
+
+def _warnings(presses: Presses, plateaus: Plateaus, settings: StiffnessSettings) -> list[str]:
+    warnings = []
+    if plateaus.missed:
+        warnings.append(
+            f'presses left out: {plateaus.missed}, without a force steady within '
+            f'{settings.level_tolerance:g} N for {settings.hold_time:g} s'
+        )
+    for what, unit, channels, usual in (
+        ('force', 'N', slice(0, 2), float(np.hypot(*presses.force.T).min())),
+        ('position', 'm', slice(2, 4), float(np.median(np.hypot(*presses.displacement.T)))),
+    ):
+        drift = float(np.hypot(*np.ptp(plateaus.mean[plateaus.rest, channels], axis=0)))
+        if drift > _WORTH_WARNING * usual:
+            warnings.append(
+                f'the {what} at rest drifted by {drift:.2g} {unit}; the drift was subtracted'
+            )
+    return warnings
+
+
+def grouped(sizes: FloatArray, tolerance: float) -> NDArray[np.int64]:
+    """
+    Put values that are close into groups.
+
+    Parameters
+    ----------
+    sizes : ndarray, shape (m,)
+        Values.
+    tolerance : float
+        A value farther than this above the mean of its group so far begins a new group.
+
+    Returns
+    -------
+    ndarray of int, shape (m,)
+        Group of each value, numbered from the smallest.
+
+    """
+    group = np.zeros(len(sizes), dtype=np.int64)
+    members: list[float] = []
+    number = -1
+    for i in np.argsort(sizes, kind='stable'):
+        if not members or sizes[i] - sum(members) / len(members) > tolerance:
+            number, members = number + 1, []
+        members.append(float(sizes[i]))
+        group[i] = number
+    return group
+
+
+def _directions(force: FloatArray) -> NDArray[np.int64]:
+    """Group forces by direction, beginning after the widest gap between directions."""
+    angle = np.arctan2(force[:, 1], force[:, 0])
+    order = np.sort(angle)
+    gaps = np.diff(order, append=order[0] + 2.0 * pi)
+    first = order[(int(gaps.argmax()) + 1) % len(order)]
+    return grouped((angle - first) % (2.0 * pi), _SAME_DIRECTION)
