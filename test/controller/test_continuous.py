@@ -17,7 +17,14 @@ from needle_controller import (
     Setpoint,
 )
 from needle_controller.laws.continuous import acceleration
-from needle_dynamics import Integrator, NeedleModel, NeedleParameters, ParameterError, ShapeError
+from needle_dynamics import (
+    FloatArray,
+    Integrator,
+    NeedleModel,
+    NeedleParameters,
+    ParameterError,
+    ShapeError,
+)
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest
@@ -31,21 +38,21 @@ MODEL = NeedleModel(
 DEPTH, SPEED = 0.15, 0.02
 
 
-def matrix(diagonal: list[float], skew: float = 0.0) -> np.ndarray:
+def matrix(diagonal: list[float], skew: float = 0.0) -> FloatArray:
     """Return a positive definite matrix: one that is not symmetric if ``skew`` is not zero."""
     gains = np.diag(diagonal)
     gains[0, -1], gains[-1, 0] = skew, -skew
     return gains
 
 
-def moving(depth: float = DEPTH, deflection: float = 5e-4) -> np.ndarray:
+def moving(depth: float = DEPTH, deflection: float = 5e-4) -> FloatArray:
     """Return the state of a bent needle in motion."""
     state = MODEL.state_at(depth, deflection)
     state[4:] = [-SPEED, 0.4, 1e-3, -5e-4]
     return state
 
 
-def goal(time: float) -> np.ndarray:
+def goal(time: float) -> FloatArray:
     """Return a steady insertion, 1 mm ahead of where the needle starts, to no deflection."""
     wanted = np.zeros((3, 4))
     wanted[0, 0] = MODEL.parameters.length - (DEPTH + 1e-3 + SPEED * time)
@@ -197,14 +204,13 @@ def test_inverse_dynamics_puts_the_poles_where_its_gains_say(actuation: str) -> 
 
 def sampled_end(
     kind: str,
-    gains: tuple[InverseDynamicsGains, InverseDynamicsGains, InverseDynamicsGains]
-    | tuple[PidGains, PidGains, PidGains],
+    gains: tuple[InverseDynamicsGains | PidGains, ...],
     period: float,
     duration: float,
-) -> np.ndarray:
+) -> FloatArray:
     """Run the sampled loop around the true needle; return its state at the end."""
     p = MODEL.parameters
-    law = InverseDynamics if kind == 'inverse_dynamics' else Pid
+    law: Any = InverseDynamics if kind == 'inverse_dynamics' else Pid
     insertion = law(axis=Axis.insertion(p), gains=gains[0], period=period)
     rotation = law(axis=Axis.rotation(p), gains=gains[1], period=period)
     state, count = moving(), round(duration / period)
@@ -234,7 +240,8 @@ PID_GAINS = (
 @pytest.mark.parametrize('kind', ['inverse_dynamics', 'pid'])
 def test_the_sampled_law_tends_to_the_continuous_one(kind: str) -> None:
     """Half the period, half the difference of the closed loops, in every coordinate together."""
-    gains = ID_GAINS
+    gains: tuple[InverseDynamicsGains | PidGains, ...] = ID_GAINS
+    law: ContinuousInverseDynamics | ContinuousPid
     if kind == 'inverse_dynamics':
         law = ContinuousInverseDynamics(
             model=MODEL,
@@ -244,7 +251,7 @@ def test_the_sampled_law_tends_to_the_continuous_one(kind: str) -> None:
         )
     else:
         gains = PID_GAINS
-        kp, kd, ki = np.transpose([(g.kp, g.kd, g.ki) for g in gains])
+        kp, kd, ki = np.transpose([(g.kp, g.kd, g.ki) for g in PID_GAINS])
         law = ContinuousPid(model=MODEL, kp=kp, kd=kd, ki=ki)
     duration = 0.016
     start = np.concatenate([moving(), np.zeros(law.integrals)])

@@ -1,6 +1,7 @@
 """The laws inside the simulation: friction as a set, sampled loops, and batches of them."""
 
 from dataclasses import replace
+from typing import Any
 
 from needle_controller import (
     ContinuousInverseDynamics,
@@ -246,7 +247,7 @@ def test_a_batch_does_not_depend_on_threads_nor_on_its_step() -> None:
     law = Pid(axis=Axis.insertion(BELIEVED), gains=PidGains(), period=PERIOD)
     needles = plants(5)
 
-    def run(**how: float) -> LoopBatch:
+    def run(**how: Any) -> LoopBatch:
         return run_batch(law, needles, START, REFERENCE, delay=1, limit=15.0, duration=0.8, **how)
 
     one, two, fine = run(workers=1, step=PERIOD), run(workers=2, step=PERIOD), run(step=1e-5)
@@ -266,7 +267,7 @@ def test_a_needle_that_leaves_its_range_is_told_apart() -> None:
 
 def test_a_batch_refuses_what_does_not_agree() -> None:
     law = Pid(axis=Axis.insertion(BELIEVED), gains=PidGains(), period=PERIOD)
-    options = {'delay': 1, 'limit': 15.0, 'duration': 0.1}
+    options: Any = {'delay': 1, 'limit': 15.0, 'duration': 0.1}
     with pytest.raises(ShapeError, match='one number of runs'):
         run_batch([law, law], plants(3), START, REFERENCE, **options)
     other = Pid(axis=law.axis, gains=PidGains(), period=2e-3)

@@ -252,7 +252,7 @@ def test_a_switch_has_no_bump(
     position: float, speed: float, last: float, axis: Axis, gains: InverseDynamicsGains | PidGains
 ) -> None:
     """Whatever law follows, its first force is the last one of the law before."""
-    law = InverseDynamics if isinstance(gains, InverseDynamicsGains) else Pid
+    law: Any = InverseDynamics if isinstance(gains, InverseDynamicsGains) else Pid
     loop = SampledLoop(Pid(axis=axis, gains=PidGains(), period=PERIOD), 1, 20.0)
     loop.last = last
     loop.switch(law(axis=axis, gains=gains, period=PERIOD))

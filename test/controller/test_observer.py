@@ -112,7 +112,7 @@ class Reference:
     def noise_root(self, depth: float) -> FloatArray:
         """Root of the density of the noise on p."""
         gram = self.model.modes.integrals(depth).gram
-        root = self.options.irregularity * np.asarray(cholesky(gram, lower=True))
+        root = np.asarray(self.options.irregularity * cholesky(gram, lower=True), float)
         if self.model.parameters.formulation == 'as_printed':
             root = np.linalg.solve(self.model.parameters.linear_density * gram, root)
         return root
@@ -319,8 +319,10 @@ def test_is_the_conditional_mean_of_all_that_was_measured(case: str) -> None:
     def simulated(unknowns: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         parts = [unknowns[low:high] for low, high in pairwise(borders)]
         parts = [part.reshape(*shape, -1) for part, shape in zip(parts, shapes, strict=True)]
-        parts[0], parts[1] = root @ parts[0], memory @ parts[1]
-        return reference.run(*parts, depths, speeds, windows)
+        start, memories, kicks, noise = parts
+        return reference.run(
+            root @ start, memory @ memories, kicks, noise, depths, speeds, windows
+        )
 
     rng = np.random.default_rng(5)
     states, wrenches, tips = simulated(units)
@@ -385,7 +387,8 @@ def test_errors_are_as_large_as_said_over_200_runs() -> None:
     ends = np.arange(10, count + 1, 20) * PERIOD
     windows = [(end - beliefs.tip_exposure, end) for end in ends]
     drawn = draw(reference, depths[0], count, cases, rng)
-    states, wrench, tips = reference.run(*drawn, depths, speeds, windows)
+    start, memory, kicks, noise = drawn
+    states, wrench, tips = reference.run(start, memory, kicks, noise, depths, speeds, windows)
     counts = np.array([beliefs.force_resolution, beliefs.torque_resolution]) / np.sqrt(12.0)
     wrench += counts[:, np.newaxis] * rng.normal(size=wrench.shape)
     tips += beliefs.tip_noise * rng.normal(size=tips.shape)
@@ -603,7 +606,8 @@ def simulate(
 def test_low_pass_belongs_to_the_state() -> None:
     """Taken for white noise, what the sensor's filter leaves is neither white nor in time."""
     parameters = preset('paper_mm')
-    for options, consistent in (({}, True), ({'cutoffs': ()}, False)):
+    cases: list[tuple[dict[str, Any], bool]] = [({}, True), ({'cutoffs': ()}, False)]
+    for options, consistent in cases:
         observer, rows = simulate(1, parameters, 0.1, 80, irregularity=0.0, **options)
         error = abs(rows[40:, 2] - rows[40:, 1]).max()
         assert (observer.nis.ratio < 1.5) == consistent

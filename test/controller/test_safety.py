@@ -20,12 +20,12 @@ SECOND = 1_000_000_000
 MILLISECOND = SECOND // 1000
 
 
-def stream(**options: list[float] | tuple[str, ...]) -> Stream:
+def stream(**options: Any) -> Stream:
     """Return the stream of a force sensor at 1 kHz."""
     return Stream('base_wrench', 0.5, **options)
 
 
-def safety(expected: tuple[str, ...] = (), **limits: bool | float) -> Safety:
+def safety(expected: tuple[str, ...] = (), **limits: Any) -> Safety:
     """Return the safety of a needle of the phantom that has begun at 10 s."""
     whole = Safety(
         SafetyLimits(**limits), ControllerSettings(), NeedleParameters(), expected=expected

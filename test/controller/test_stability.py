@@ -79,11 +79,12 @@ def test_what_is_accepted_is_stable_and_what_is_refused_is_not(
     axis: Axis, law: type[InverseDynamics] | type[Pid], scale: float
 ) -> None:
     """Acceptance and the growth of the error in the running loop agree."""
+    gains: InverseDynamicsGains | PidGains
     if law is Pid:
         gains = PidGains(kp=20.0 * scale, ki=0.0, kd=1.0 * scale, tolerance=0.0)
     else:
         gains = InverseDynamicsGains(kp=900.0 * scale, kv=60.0 * scale)
-    chosen = law(axis=axis, gains=gains, period=PERIOD)
+    chosen = law_of(gains, axis)
     stable = all(decays(chosen, unmodeled) for unmodeled in (0, 1))
     with nullcontext() if stable else pytest.raises(ParameterError, match='spectral radius'):
         check_stability(chosen, 1, 'gains')
@@ -109,8 +110,9 @@ gains_of_a_law = st.one_of(
 
 def law_of(gains: InverseDynamicsGains | PidGains, axis: Axis) -> InverseDynamics | Pid:
     """Return the law that the gains are for."""
-    kind = InverseDynamics if isinstance(gains, InverseDynamicsGains) else Pid
-    return kind(axis=axis, gains=gains, period=PERIOD)
+    if isinstance(gains, InverseDynamicsGains):
+        return InverseDynamics(axis=axis, gains=gains, period=PERIOD)
+    return Pid(axis=axis, gains=gains, period=PERIOD)
 
 
 @settings(PROPERTY, max_examples=60)

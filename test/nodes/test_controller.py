@@ -33,9 +33,7 @@ SLOW = {'rate': 200.0}
 class Bench:
     """A controller with a probe that plays the plant."""
 
-    def __init__(
-        self, graph: RosGraph, start: bool = True, **parameters: bool | float | str
-    ) -> None:
+    def __init__(self, graph: RosGraph, start: Any = True, **parameters: Any) -> None:
         self.graph = graph
         self.node = graph.node('probe')
         self.states = self.node.create_publisher(JointState, 'joint_states', SENSOR)
@@ -68,7 +66,8 @@ class Bench:
 
     def ask(self, message: JointState, fresh: bool = False) -> float:
         """Publish a joint state and return the force that answers it."""
-        count, asked = len(self.commands), []
+        count = len(self.commands)
+        asked: list[tuple[float, Time]] = []
 
         def answers() -> list[WrenchStamped]:
             # On a machine that is held up a measurement may be stale before it is read.
@@ -89,7 +88,7 @@ class Bench:
         """Return the answer of a service."""
         client = self.node.create_client(kind, f'controller/{name}')
         self.graph.spin_until(client.service_is_ready, name)
-        answers = []
+        answers: list[tuple[float, Future]] = []
 
         def answered() -> list[Future]:
             # One to a client that the node does not know yet is lost; none of them adds up.
@@ -722,7 +721,7 @@ def test_a_measurement_that_comes_again_after_a_stop_is_answered_with_none(
 class SimulatedTime(Bench):
     """A bench whose clock is what the test makes it."""
 
-    def __init__(self, graph: RosGraph, **parameters: float) -> None:
+    def __init__(self, graph: RosGraph, **parameters: Any) -> None:
         super().__init__(graph, use_sim_time=True, **parameters)
         self.clock = self.node.create_publisher(Clock, '/clock', 10)
         graph.spin_until(self.clock.get_subscription_count, 'the clock')

@@ -14,6 +14,7 @@ import pytest
 from rcl_interfaces.srv import GetParameters
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from rclpy.task import Future
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 from support.presses import write_presses
@@ -46,7 +47,7 @@ def call(ros_graph: RosGraph, service: str) -> tuple[bool, str]:
     """Call a service of the node; return success and message."""
     client = ros_graph.node('caller').create_client(Trigger, f'identification/{service}')
     ros_graph.spin_until(client.service_is_ready, 'the service')
-    asked = []
+    asked: list[Future] = []
     start = time.monotonic()
 
     def answered() -> bool:

@@ -9,7 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from needle_dynamics import ShapeError
 from needle_dynamics.plant_node import PlantNode
-from needle_identification.bags.bag import deserialize, encode, Topic
+from needle_identification.bags.bag import deserialize, encode
+from needle_identification.bags.storage import Topic
 from needle_ros import base_node
 from needle_ros.base_node import layout_of, reading_of, SENSOR
 from needle_ros.packed import Layout, Reading
@@ -134,7 +135,8 @@ def test_a_node_takes_any_layout(
 
     monkeypatch.setattr(base_node, 'deserialize_message', deserialized)
     node, teller = ros_graph.add(PlantNode, start=False), ros_graph.node('teller')
-    kind, taken = type(messages[0]), []
+    kind = type(messages[0])
+    taken: list[Any] = []
     node.listen(kind, 'words', SENSOR, taken.append)
     sender = teller.create_publisher(kind, 'words', SENSOR)
     ros_graph.spin_until(sender.get_subscription_count, 'the reader')

@@ -57,7 +57,7 @@ def drive(
     ends when so many seconds of it have passed.
     """
     heard = ['joint_states', 'base_wrench', 'tip_deflection', 'wrench_command', 'tracking_error']
-    errors = []
+    errors: list[JointState] = []
     with Graph(logs) as graph:
         probe = graph.node('probe')
         health = {}

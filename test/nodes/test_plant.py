@@ -1,6 +1,7 @@
 """The plant as the graph sees it."""
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 import signal
 from signal import Signals
@@ -33,7 +34,7 @@ import yaml
 #: Slow enough for a thread that also runs the test.
 RATE = {'rate': 200.0}
 
-NOISE = ForceSensorParameters().force_noise
+NOISE = ForceSensorParameters().per_axis('noise')[:3]
 
 
 def stamp_ns(message: Any) -> int:
@@ -432,6 +433,16 @@ def test_a_push_breaks_the_needle_away_and_a_motion_follows(ros_graph: RosGraph)
     assert states[-1].position[0] == pytest.approx(0.1, abs=1.5e-6)
 
 
+def has_refused_one(plant: PlantNode) -> bool:
+    """Tell whether the plant has refused one command."""
+    return plant.diagnose()[2]['commands refused'] == 1
+
+
+def has(messages: list[Any], count: int) -> bool:
+    """Tell whether so many messages have come."""
+    return len(messages) >= count
+
+
 def test_a_trajectory_sent_before_the_activation_begins_with_it(ros_graph: RosGraph) -> None:
     """With the same seed two runs are then the same, sample by sample."""
     runs = []
@@ -446,20 +457,16 @@ def test_a_trajectory_sent_before_the_activation_begins_with_it(ros_graph: RosGr
             start=False,
         )
         plant.trigger_configure()
-        ros_graph.spin_until(
-            lambda course=course: course.get_subscription_count(), 'the subscription'
-        )
+        ros_graph.spin_until(course.get_subscription_count, 'the subscription')
         course.publish(trajectory(['insertion'], (0.3, [], [2.0]), (0.6, [0.1], [])))
         assert course.wait_for_all_acked(Duration(seconds=10))
         for _ in range(10):
             ros_graph.executor.spin_once(timeout_sec=0.02)
         # Only the newest command counts: this one, refused, tells that the first was taken.
         course.publish(trajectory(['insertion']))
-        ros_graph.spin_until(
-            lambda plant=plant: plant.diagnose()[2]['commands refused'] == 1, 'the refusal'
-        )
+        ros_graph.spin_until(partial(has_refused_one, plant), 'the refusal')
         plant.trigger_activate()
-        ros_graph.spin_until(lambda wrenches=wrenches: len(wrenches) >= 150, 'readings')
+        ros_graph.spin_until(partial(has, wrenches, 150), 'readings')
         runs.append([message.wrench.force.y for message in wrenches[:150]])
     assert max(runs[0]) > 1.0
     assert runs[0] == runs[1]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 import subprocess
 import sys
@@ -51,7 +52,7 @@ def policies() -> dict[str, Profile]:
     for context in tree.iterfind('contexts/context'):
         (profile,) = context.iterfind('profiles/profile')
         node, namespace = profile.get('node'), profile.get('ns')
-        allowed = {rule: set() for rule in Profile._fields}
+        allowed: dict[str, set[str]] = {rule: set() for rule in Profile._fields}
         for block in profile.iterchildren('topics', 'services'):
             for rule in allowed.keys() & block.attrib.keys():
                 assert block.get(rule) == 'ALLOW'
@@ -91,6 +92,11 @@ def made(node: BaseNode) -> Profile:
     )
 
 
+def is_seen(node: BaseNode) -> bool:
+    """Tell whether the graph knows all that a node has made."""
+    return all(map(frozenset.issubset, made(node), used(node)))
+
+
 @pytest.mark.parametrize('name', NODES)
 def test_each_node_may_do_what_it_does_and_no_more(
     ros_graph: RosGraph, tmp_path: Path, name: str
@@ -106,10 +112,7 @@ def test_each_node_may_do_what_it_does_and_no_more(
         uses.append(made(node))
         if len(uses) == 1:
             # What rcl makes for every node is known to the graph only.
-            ros_graph.spin_until(
-                lambda node=node: all(map(frozenset.issubset, made(node), used(node))),
-                'its topics and services in the graph',
-            )
+            ros_graph.spin_until(partial(is_seen, node), 'its topics and services in the graph')
             uses.append(used(node))
         node.stop()
     together = Profile(*map(frozenset().union, *uses))

@@ -33,8 +33,8 @@ class Bench:
         self.graph = ros_graph
         self.probe = ros_graph.node('probe')
         #: Force with which each sample is answered; None: not at all.
-        self.force = None
-        self.states = []
+        self.force: float | None = None
+        self.states: list[JointState] = []
         self.probe.create_subscription(JointState, 'joint_states', self.on_state, SENSOR)
         self.wrenches = ros_graph.listen(self.probe, WrenchStamped, 'base_wrench', SENSOR)
         self.tips = ros_graph.listen(self.probe, PointStamped, 'tip_deflection', SENSOR)
@@ -118,7 +118,7 @@ def test_a_command_acts_from_the_sample_after_it(ros_graph: RosGraph) -> None:
         forces[k] = 0.56 + 3.0 * (1 + k % 5)
         bench.command(forces[k], stamp=message.header.stamp)
 
-    bench.on_state = answer
+    setattr(bench, 'on_state', answer)  # noqa: B010
     bench.probe.create_subscription(JointState, 'joint_states', answer, SENSOR)
     bench.until(lambda: len(bench.states) >= 50, 'samples')
     for message in bench.states[5:]:
