@@ -34,7 +34,7 @@ setup(
     long_description_content_type='text/markdown',
     python_requires='>=3.10',
     packages=find_packages(include=['needle_*']),
-    package_data={'': ['py.typed']},
+    package_data={'': ['py.typed'], 'needle_insertion.report': ['templates/*']},
     data_files=[
         ('share/ament_index/resource_index/packages', ['resource/needle_insertion']),
         (f'share/{NAME}', ['package.xml']),
@@ -45,7 +45,9 @@ setup(
         (f'lib/{NAME}', [f'scripts/{node}' for node in NODES]),
     ],
     install_requires=[
+        'jinja2>=3.1',
         'lz4>=4.0',
+        'markupsafe>=2.1',
         'matplotlib>=3.6',
         'mcap>=1.5',
         'numba>=0.58',

@@ -17,7 +17,7 @@ from benchmarks.measure import Bar, least_times
 from benchmarks.solvers import DEFLECTION, DEPTH, DURATION, FORCE
 from benchmarks.step import chains
 from needle_dynamics import Batch, NeedleModel, NeedleParameters, simulate_batch
-from needle_insertion.report.page import table
+from needle_insertion.report.text import table
 import numpy as np
 
 #: Number of insertions.

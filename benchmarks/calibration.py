@@ -60,7 +60,7 @@ from needle_insertion.experiment.protocol import (
     START_DEPTH,
 )
 from needle_insertion.paper.tables import FORCE_LEVELS
-from needle_insertion.report.page import table
+from needle_insertion.report.text import table
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solveh_banded

@@ -21,7 +21,7 @@ from needle_controller import (
 )
 from needle_dynamics import FloatArray, NeedleParameters
 from needle_insertion.paper.mismatch import sampled_laws
-from needle_insertion.report.page import table
+from needle_insertion.report.text import table
 import numpy as np
 
 #: Sample period [s], delay in periods, and the bar for a whole law with the observer [s].

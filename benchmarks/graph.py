@@ -40,7 +40,7 @@ from needle_insertion.experiment.ros_graph import (
     Graph,
     GraphError,
 )
-from needle_insertion.report.page import table
+from needle_insertion.report.text import table
 from needle_ros.base_node import COMMAND, LATCHED, SENSOR
 from needle_ros.timing import nanoseconds
 import numpy as np

@@ -31,7 +31,7 @@ from needle_identification import (
     read_friction_recording,
 )
 from needle_identification.recordings.series import LARGEST
-from needle_insertion.report.page import table
+from needle_insertion.report.text import table
 import numpy as np
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import get_typestore, Stores

@@ -34,7 +34,7 @@ from needle_dynamics import (
     NeedleParameters,
 )
 from needle_dynamics.simulated.integrators import DEFAULT_STEP
-from needle_insertion.report.page import table
+from needle_insertion.report.text import table
 import numpy as np
 from scipy.optimize import brentq, minimize_scalar
 

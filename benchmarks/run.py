@@ -10,7 +10,7 @@ from typing import TypeAlias
 
 from benchmarks import batches, control, identification, rods, solvers, step
 from benchmarks.measure import Bar, environment
-from needle_insertion.report.page import table
+from needle_insertion.report.text import table
 from tqdm import tqdm
 
 #: Returns its text and what it says of the bars; it is given what to tell its stages to.

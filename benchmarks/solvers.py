@@ -19,7 +19,7 @@ import warnings
 from benchmarks.measure import Bar, geometric, least_times, seconds
 from needle_dynamics import FloatArray, Integrator, NeedleModel, NeedleParameters
 from needle_dynamics.compiled.kernels import advance, evaluate, TERMS_PER_LENGTH
-from needle_insertion.report.page import table
+from needle_insertion.report.text import table
 import numba
 import numpy as np
 from scipy.integrate import quad, solve_ivp

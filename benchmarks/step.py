@@ -22,7 +22,7 @@ from unittest import mock
 from benchmarks.measure import Bar, least_times
 from needle_dynamics import FloatArray, Integrator, NeedleModel, NeedleParameters
 from needle_dynamics.compiled.kernels import advance
-from needle_insertion.report.page import table
+from needle_insertion.report.text import table
 import numba
 import numpy as np
 

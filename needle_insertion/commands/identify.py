@@ -4,21 +4,18 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
-from dataclasses import dataclass, fields, is_dataclass
-from hashlib import sha256
+from dataclasses import fields, is_dataclass, replace
 import json
 from math import isfinite
 from pathlib import Path
 import sys
 from typing import Any, Final
 
-from needle_dynamics import NeedleError, ParameterError
 from needle_identification import (
     check_distinct,
     ESTIMATORS,
     Fit,
     FrictionSettings,
-    FrictionSummary,
     identify_friction,
     identify_stiffness,
     ParameterEstimate,
@@ -27,37 +24,24 @@ from needle_identification import (
     read_indentation_recording,
     Statistic,
     StiffnessSettings,
-    StiffnessSummary,
     summarize,
     summarize_stiffness,
     TERMS,
     write_result,
 )
-from needle_identification.estimation.formatting import between, measured
 from needle_identification.recordings.reading import TIMES
-from needle_insertion.report.identify_report import (
-    every_parameter,
-    friction_report,
-    friction_statistics,
-    label_of,
-    MEAN_HEADS,
-    mean_row,
-    Origin,
-    Source,
-    stiffness_report,
-    with_deviation,
-)
-from needle_insertion.report.page import table
+from needle_insertion.commands.options import make_folder
+from needle_insertion.report.friction_tables import friction_text
+from needle_insertion.report.origin import digests, Origin, Source, with_name
+from needle_insertion.report.stiffness_tables import stiffness_text
+from needle_ros.errors import NeedleError, ParameterError
 import numpy as np
 from tqdm import tqdm
 
 #: Options that take an axis, which may begin with a minus sign.
 SIGNED: Final = ('--force-axis', '--motion-axis', '--axes')
 
-#: Bytes of a file read at once.
-_PIECE: Final = 1 << 20
-
-#: Arrays as long as the recording, for pictures: no part of what is printed.
+#: Arrays as long as the recording, for figures: they are not printed.
 _FOR_PICTURES: Final = (Fit, Presses)
 
 
@@ -229,15 +213,6 @@ def _settings(kind: Callable[..., Any], options: argparse.Namespace) -> Any:
     return kind(**values)
 
 
-@dataclass(frozen=True, slots=True)
-class _Found:
-    """What several recordings gave: an estimate and its source each, and those that failed."""
-
-    estimates: list[Any]
-    sources: list[Source]
-    failures: list[tuple[str, str]]
-
-
 def _run_friction(options: argparse.Namespace) -> int:
     settings = _settings(FrictionSettings, options)
     reading = {
@@ -245,17 +220,25 @@ def _run_friction(options: argparse.Namespace) -> int:
         'force_axis': options.force_axis,
         'motion_axis': options.motion_axis,
     }
-    found = _identify(
+    estimates, origin = _identify(
         options,
         lambda bag: read_friction_recording(bag, **reading),
         lambda recording: identify_friction(recording, settings),
+        Origin(settings=settings, reading=reading, result=options.output),
     )
-    if not found.estimates:
+    if not estimates:
         return 2
-    summary = summarize(found.estimates)
+    summary = summarize(estimates)
     if options.output is not None:
         write_result(options.output, summary)
-    return _tell(options, found, summary, settings, reading, _friction_tables, friction_report)
+
+    def write_page(folder: Path) -> Path:
+        # Draws: not wanted for tables.
+        from needle_insertion.report.friction_page import write_friction_page
+
+        return write_friction_page(folder, summary, origin)
+
+    return _tell(options, summary, origin, friction_text, write_page)
 
 
 def _run_stiffness(options: argparse.Namespace) -> int:
@@ -263,19 +246,27 @@ def _run_stiffness(options: argparse.Namespace) -> int:
     if len(options.axes) != 2:
         raise ParameterError(f'--axes must name two axes, got {",".join(options.axes)}')
     reading = {**_reading(options), 'axes': tuple(options.axes)}
-    found = _identify(
+    estimates, origin = _identify(
         options,
         lambda bag: read_indentation_recording(bag, **reading),
         lambda recording: identify_stiffness(recording, settings),
+        Origin(settings=settings, reading=reading, result=options.output),
     )
-    if not found.estimates:
+    if not estimates:
         return 2
     summary = summarize_stiffness(
-        found.estimates, force=options.level, level_tolerance=settings.level_tolerance
+        estimates, force=options.level, level_tolerance=settings.level_tolerance
     )
     if options.output is not None:
         write_result(options.output, None, summary)
-    return _tell(options, found, summary, settings, reading, _stiffness_tables, stiffness_report)
+
+    def write_page(folder: Path) -> Path:
+        # Draws: not wanted for tables.
+        from needle_insertion.report.stiffness_page import write_stiffness_page
+
+        return write_stiffness_page(folder, summary, origin)
+
+    return _tell(options, summary, origin, stiffness_text, write_page)
 
 
 def _reading(options: argparse.Namespace) -> dict[str, Any]:
@@ -287,90 +278,65 @@ def _reading(options: argparse.Namespace) -> dict[str, Any]:
 
 
 def _identify(
-    options: argparse.Namespace, read: Callable[[Path], Any], identify: Callable[[Any], Any]
-) -> _Found:
-    """Read and identify each recording; one that fails is named, and the others go on."""
+    options: argparse.Namespace,
+    read: Callable[[Path], Any],
+    identify: Callable[[Any], Any],
+    origin: Origin,
+) -> tuple[list[Any], Origin]:
+    """Identify each recording; report those that fail and go on. Fill in the origin."""
     check_distinct(options.bags)
-    found = _Found([], [], [])
+    estimates, sources, failures = [], [], []
     for bag in tqdm(options.bags, desc='bags', disable=None, leave=False):
         try:
             recording = read(bag)
-            found.estimates.append(identify(recording))
+            estimates.append(identify(recording))
         except (NeedleError, OSError) as error:
-            found.failures.append((str(bag), str(error)))
+            failures.append((str(bag), str(error)))
             continue
-        found.sources.append(
+        sources.append(
             Source(
                 name=recording.name,
                 losses=recording.losses,
                 clock_offset=recording.clock_offset,
                 samples=len(recording.time),
-                files=_files(bag) if options.report or options.json else (),
+                files=digests(bag) if options.report or options.json else (),
             )
         )
-    for bag, reason in found.failures:
-        sys.stderr.write(f'error: {reason if bag in reason else f"{bag}: {reason}"}\n')
-    return found
-
-
-def _files(bag: Path) -> tuple[tuple[str, str], ...]:
-    """Return the files of a recording with their SHA-256."""
-    found = []
-    for path in (
-        sorted(path for path in bag.iterdir() if path.is_file()) if bag.is_dir() else [bag]
-    ):
-        digest = sha256()
-        with path.open('rb') as stream:
-            while piece := stream.read(_PIECE):
-                digest.update(piece)
-        found.append((str(path), digest.hexdigest()))
-    return tuple(found)
+    for bag, reason in failures:
+        sys.stderr.write(f'error: {with_name(bag, reason)}\n')
+    return estimates, replace(origin, sources=tuple(sources), failures=tuple(failures))
 
 
 def _tell(
     options: argparse.Namespace,
-    found: _Found,
     summary: Any,
-    settings: Any,
-    reading: dict[str, Any],
-    tables: Callable[[Any], str],
-    report: Callable[..., Path],
+    origin: Origin,
+    text: Callable[[Any], str],
+    write_page: Callable[[Path], Path],
 ) -> int:
-    """Print, warn, and write the page; return the exit status."""
+    """Write the page, warn and print; return the exit status."""
     written = [] if options.output is None else [options.output]
     if options.report is not None:
-        try:
-            options.report.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise ParameterError(
-                f'{options.report} cannot be written: {error.strerror}'
-            ) from error
-        origin = Origin(
-            sources=found.sources,
-            failures=found.failures,
-            settings=settings,
-            reading=reading,
-            result=options.output,
-        )
-        written.append(report(options.report, summary, origin))
-    for estimate, source in zip(found.estimates, found.sources, strict=True):
+        make_folder(options.report)
+        written.append(write_page(options.report))
+    for estimate, source in zip(summary.estimates, origin.sources, strict=True):
         for words in (*source.losses, *estimate.warnings):
             sys.stderr.write(f'warning: {source.name}: {words}\n')
     if options.json:
         result = {
             **_plain(summary),
-            'settings': _plain(settings),
-            'reading': _plain(reading),
-            'recordings': [_plain(source) for source in found.sources],
-            'failures': [{'name': name, 'reason': reason} for name, reason in found.failures],
+            'settings': _plain(origin.settings),
+            'reading': _plain(origin.reading),
+            'recordings': [_plain(source) for source in origin.sources],
+            'failures': [{'name': name, 'reason': reason} for name, reason in origin.failures],
             'files': [str(path) for path in written],
         }
         sys.stdout.write(f'{json.dumps(result, indent=2, allow_nan=False)}\n')
     else:
-        sys.stdout.write(f'{tables(summary)}\n')
+        sys.stdout.write(f'{text(summary)}\n')
         for path in written:
             sys.stdout.write(f'wrote {path}\n')
-    return 2 if found.failures else 0
+    return 2 if origin.failures else 0
 
 
 def _plain(value: Any) -> Any:
@@ -383,7 +349,7 @@ def _plain(value: Any) -> Any:
     if isinstance(value, dict):
         return {str(key): _plain(one) for key, one in value.items()}
     if isinstance(value, (list, tuple)):
-        # What has names is found by them.
+        # Parameters and statistics are found by their names.
         if value and all(isinstance(one, (ParameterEstimate, Statistic)) for one in value):
             return {one.name: _plain(one) for one in value}
         return [_plain(one) for one in value]
@@ -392,54 +358,3 @@ def _plain(value: Any) -> Any:
     if isinstance(value, float) and not isfinite(value):
         return None
     return value
-
-
-def _friction_tables(summary: FrictionSummary) -> str:
-    means = friction_statistics(summary)
-    whole = table([mean_row(one) for one in means], MEAN_HEADS)
-    found = [(estimate, every_parameter(estimate)) for estimate in summary.estimates]
-    rows = [
-        (
-            estimate.name,
-            *(_cell(given.get(one.name)) for one in means),
-            f'{estimate.samples}',
-            f'{estimate.residual:.4f}',
-        )
-        for estimate, given in found
-    ]
-    symbols = [f'{label_of(one)} ± SE' for one in means]
-    return f'{whole}\n\n{table(rows, ("bag", *symbols, "samples", "residual [N]"))}'
-
-
-def _cell(one: ParameterEstimate | None) -> str:
-    return '' if one is None else measured(one.value, one.error)
-
-
-def _stiffness_tables(summary: StiffnessSummary) -> str:
-    """Return Table 2: a row for each entry, a column for each force; then k_a."""
-    names = [one.name for one in summary.levels[0].statistics]
-    rows = [
-        (
-            label_of(summary.levels[0][name]),
-            *(with_deviation(level[name]) for level in summary.levels),
-        )
-        for name in names
-    ]
-    heads = ['mean ± SE (STD)', *(f'{level.force:.2f} N' for level in summary.levels)]
-    by_force = [
-        (
-            f'{level.force:.2f} N',
-            *(between(level[name].interval) for name in names),
-            f'{level[names[0]].count}',
-        )
-        for level in summary.levels
-    ]
-    symbols = [summary.levels[0][name].symbol for name in names]
-    matrices = table(rows, heads)
-    intervals = table(by_force, ('95 % interval', *symbols, 'bags'))
-    result = summary.tissue_stiffness
-    return (
-        f'{matrices}\n\n{intervals}\n\n'
-        f'{result.symbol} = {measured(result.mean, result.error, result.unit)}, '
-        f'95 % interval {between(result.interval)}'
-    )

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 import json
+from pathlib import Path
 from typing import Any
 
-from needle_dynamics import ParameterError
+from needle_ros.errors import ParameterError
 
 
 def constants(words: Sequence[str]) -> dict[str, Any]:
@@ -39,3 +40,24 @@ def constants(words: Sequence[str]) -> dict[str, Any]:
         except json.JSONDecodeError:
             values[name] = text
     return values
+
+
+def make_folder(folder: Path) -> None:
+    """
+    Make a folder for results, with those that it is in.
+
+    Parameters
+    ----------
+    folder : Path
+        May exist.
+
+    Raises
+    ------
+    ParameterError
+        If it cannot be made.
+
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ParameterError(f'{folder} cannot be written: {error.strerror}') from error

@@ -14,7 +14,7 @@ from typing import Any, Final
 from needle_dynamics import ParameterError
 from needle_insertion.replay.recorded_run import configurations, RecordedRun
 from needle_insertion.replay.rerun import Rerun, Tally
-from needle_insertion.report.page import table
+from needle_insertion.report.text import table
 from needle_ros.timing import NANOSECONDS
 from tqdm import tqdm
 

@@ -28,7 +28,7 @@ from needle_dynamics import (
     NeedleParameters,
     simulate_batch,
 )
-from needle_insertion.report.page import Picture
+from needle_insertion.report.picture import Picture
 from needle_insertion.report.section import Grid, Section
 import numpy as np
 

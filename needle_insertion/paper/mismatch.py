@@ -28,7 +28,7 @@ from needle_controller.in_loop import LoopBatch, run_batch
 from needle_controller.laws.axis import BREAKAWAY_TIME
 from needle_dynamics import FloatArray, NeedleModel, NeedleParameters
 from needle_insertion.paper.figures import LAW_COLORS, LAWS
-from needle_insertion.report.page import Picture
+from needle_insertion.report.picture import Picture
 from needle_insertion.report.section import Grid, Section
 import numpy as np
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from needle_insertion.report.page import Picture
+from needle_insertion.report.picture import Picture
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

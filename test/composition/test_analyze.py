@@ -13,6 +13,7 @@ from needle_dynamics import NeedleError, NeedleModel, NeedleParameters
 from needle_dynamics.analysis import analyze, linearize, operating_point
 from needle_insertion.commands import analyze as command
 from needle_insertion.commands.analyze import add_arguments
+from needle_insertion.report import controllability
 import numpy as np
 from numpy.testing import assert_array_equal
 import pytest
@@ -87,8 +88,8 @@ def test_map_is_a_table_and_a_picture(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The map covers the needle and goes up to the deflection given; its picture has content."""
-    monkeypatch.setattr(command, 'DEPTHS', 13)
-    monkeypatch.setattr(command, 'DEFLECTIONS', 11)
+    monkeypatch.setattr(controllability, 'DEPTHS', 13)
+    monkeypatch.setattr(controllability, 'DEFLECTIONS', 11)
     folder = tmp_path / 'new' / 'folder'
     found = found_by(capsys, '--tip-deflection', '0.001', '--map', '-o', str(folder))
     assert found['files'] == [str(folder / f'controllability.{kind}') for kind in ('csv', 'png')]

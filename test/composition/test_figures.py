@@ -21,7 +21,7 @@ from needle_insertion.paper.figures import (
     READINGS,
     section,
 )
-from needle_insertion.report.page import png
+from needle_insertion.report.picture import png
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest

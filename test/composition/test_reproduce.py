@@ -8,41 +8,41 @@ from typing import Any
 
 from needle_identification import ParameterEstimate, Statistic
 from needle_insertion.cli import main
-from needle_insertion.commands import analyze, reproduce
-from needle_insertion.commands.reproduce import (
-    as_table,
-    count_held,
-    deviation_interval,
-    fewest,
-    Identified,
-    Line,
-    stiffness_truth,
-)
+from needle_insertion.commands.reproduce import add_arguments
 from needle_insertion.experiment.protocol import SHIPPED_BAGS
-from needle_insertion.paper import claims, figures, mismatch
+from needle_insertion.experiment.truth import Comparison, count_held, fewest, stiffness_truth
+from needle_insertion.paper import claims, figures, identified, mismatch, results
+from needle_insertion.paper.identified import (
+    deviation_interval,
+    IdentifiedTable,
+    identify_table,
+    Line,
+)
 from needle_insertion.paper.tables import FORCE_LEVELS, TABLE_1, TABLE_2
+from needle_insertion.report import controllability
+from needle_insertion.report.section import Section
 import numpy as np
 import pytest
 from support.pages import look_at
 
 
 @pytest.fixture(scope='module')
-def identified() -> dict[str, Identified]:
+def tables() -> dict[str, IdentifiedTable]:
     """Return what the shipped bags give."""
-    return {name: reproduce.identify(name) for name in reproduce.TABLES}
+    return {name: identify_table(name) for name in identified.TABLES}
 
 
 @pytest.fixture
-def once(monkeypatch: pytest.MonkeyPatch, identified: dict[str, Identified]) -> None:
+def once(monkeypatch: pytest.MonkeyPatch, tables: dict[str, IdentifiedTable]) -> None:
     """Have the shipped bags identified once for all tests."""
-    monkeypatch.setattr(reproduce, 'identify', lambda name, _recorded: identified[name])
+    monkeypatch.setattr(results, 'identify_table', lambda name, _recorded: tables[name])
 
 
 @pytest.fixture
 def coarse(monkeypatch: pytest.MonkeyPatch) -> None:
     """Have the map of controllability with fewer points."""
-    monkeypatch.setattr(analyze, 'DEPTHS', 9)
-    monkeypatch.setattr(analyze, 'DEFLECTIONS', 7)
+    monkeypatch.setattr(controllability, 'DEPTHS', 9)
+    monkeypatch.setattr(controllability, 'DEFLECTIONS', 7)
 
 
 @pytest.mark.usefixtures('once')
@@ -101,7 +101,7 @@ def test_a_line_holds_if_mean_and_std_are_in_their_intervals(
     """Each of the two can break it; of a single recording the STD is not known."""
     judged = line(mean, deviation)
     assert judged.holds == holds
-    assert ('DOES NOT HOLD' in as_table([judged])) == (not holds)
+    assert ('DOES NOT HOLD' in judged.row()) == (not holds)
 
 
 def test_the_interval_of_the_std_is_that_of_chi_squared() -> None:
@@ -128,10 +128,12 @@ def test_fewer_intervals_than_the_least_are_improbable(trials: int) -> None:
 
 def test_an_interval_counts_where_the_truth_is_known() -> None:
     """Held, missed, not determined, not known."""
-    sure = {'name': 'a', 'symbol': 'a', 'unit': 'N', 'value': 1.0, 'error': 0.5}
-    held = ParameterEstimate(**sure, interval=(0.0, 2.0), determined=True)
+    held = ParameterEstimate(
+        name='a', symbol='a', unit='N', value=1.0, error=0.5, interval=(0.0, 2.0), determined=True
+    )
     unknown = ParameterEstimate(name='a', symbol='a', unit='N')
-    assert count_held([held, held, unknown, held], [1.5, 2.5, 1.0, None]) == (1, 3)
+    pairs = ((held, 1.5), (held, 2.5), (unknown, 1.0), (held, None))
+    assert count_held([Comparison(estimate=e, truth=t) for e, t in pairs]) == (1, 3)
 
 
 def test_the_truth_of_a_place_is_that_of_the_level() -> None:
@@ -146,7 +148,7 @@ def test_without_recordings_there_is_one_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """What is missing, and where to get it, with exit status 2."""
-    monkeypatch.setattr(reproduce, 'SHIPPED_BAGS', tmp_path)
+    monkeypatch.setattr(identified, 'SHIPPED_BAGS', tmp_path)
     assert main(['reproduce', 'table-2']) == 2
     said = capsys.readouterr().err
     assert said.count('\n') == 1
@@ -159,8 +161,8 @@ def test_a_table_that_does_not_hold_ends_in_status_1(
     """Three recordings of one kind are not the population of the paper."""
     for k, bag in enumerate(sorted(SHIPPED_BAGS.glob('friction_*'))[:2]):
         (tmp_path / f'friction_{k}').symlink_to(bag)
-    monkeypatch.setitem(reproduce.TABLE_1, 'coulomb_friction', (5.6, 0.0374))
-    monkeypatch.setattr(reproduce, 'SHIPPED_BAGS', tmp_path)
+    monkeypatch.setitem(TABLE_1, 'coulomb_friction', (5.6, 0.0374))
+    monkeypatch.setattr(identified, 'SHIPPED_BAGS', tmp_path)
     assert main(['reproduce', 'table-1', '--json']) == 1
     assert not json.loads(capsys.readouterr().out)['holds']
 
@@ -176,7 +178,7 @@ def test_a_table_that_does_not_hold_ends_in_status_1(
 def test_every_result_can_be_asked_for(what: str) -> None:
     """Figures, tables, analysis, claims, mismatch, or all of them."""
     parser = ArgumentParser()
-    reproduce.add_arguments(parser)
+    add_arguments(parser)
     assert parser.parse_args([what]).what == what
 
 
@@ -209,7 +211,7 @@ def cheap(monkeypatch: pytest.MonkeyPatch, once: Any, coarse: Any) -> None:
     """Have all results, but few runs behind them."""
     figure = figures.FIGURES['figure-4']
     study = cache(lambda: mismatch.study(8))
-    monkeypatch.setattr(reproduce, '_study', study)
+    monkeypatch.setattr(results, '_study', study)
     monkeypatch.setattr(
         claims, 'claims',
         lambda tables, found, _progress: [
@@ -219,7 +221,7 @@ def cheap(monkeypatch: pytest.MonkeyPatch, once: Any, coarse: Any) -> None:
     )  # fmt: skip
     monkeypatch.setattr(
         figures, 'section',
-        lambda: reproduce.Section(
+        lambda: Section(
             title='Figures 4 to 8', paragraphs=(), pictures=(figure().picture,)
         ),
     )  # fmt: skip
@@ -275,4 +277,4 @@ def test_what_is_computed_is_not_recorded(
     assert main(['reproduce', 'figure-6', '--record', str(tmp_path / 'bags')]) == 2
     assert 'nothing to --record' in capsys.readouterr().err
     assert not (tmp_path / 'bags').exists()
-    assert {*reproduce.campaigns('all')} == {'friction', 'stiffness'}
+    assert {*results.campaigns('all')} == {'friction', 'stiffness'}

@@ -32,6 +32,9 @@ KEYS = {
     # Come with mcap.
     'lz4': 'mcap-ros2-support',
     'zstandard': 'mcap-ros2-support',
+    'jinja2': 'python3-jinja2',
+    # Comes with jinja2.
+    'markupsafe': 'python3-jinja2',
     'matplotlib': 'python3-matplotlib',
     'mcap': 'mcap-ros2-support',
     'numba': 'python3-numba',

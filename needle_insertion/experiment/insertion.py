@@ -1,0 +1,238 @@
+"""A controlled insertion of the simulated needle: recorded, read again, judged and drawn."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from geometry_msgs.msg import PointStamped
+from matplotlib.figure import Figure
+from needle_dynamics import FloatArray
+from needle_identification import read_topic
+from needle_insertion.experiment.ros_graph import ACTIVATE, CONFIGURE, Graph
+from needle_insertion.report.checks import Check
+from needle_ros.base_node import COMMAND, SENSOR
+from needle_ros.timing import seconds
+import numpy as np
+from rclpy.duration import Duration
+from sensor_msgs.msg import JointState
+
+#: The insertion: inserted length at the start and at the end [m], speed [m/s], sample rate [Hz].
+START_DEPTH, TARGET_DEPTH, SPEED, RATE = 0.02, 0.12, 0.010, 1000.0
+
+#: Tip deflection at the start [m], as in the paper's simulations.
+START_DEFLECTION: Final = 5e-4
+
+#: Topics sampled at `RATE`, whose messages are counted.
+COUNTED: Final = ('joint_states', 'base_wrench', 'tip_deflection', 'ground_truth')
+
+
+@dataclass(frozen=True, eq=False)
+class Insertion:
+    """
+    One recorded insertion.
+
+    Attributes
+    ----------
+    law : str
+        Name of the control law.
+    depth, reference, tip, force : ndarray, shape (2, n)
+        Times since the target was sent [s], and inserted length [m], its reference [m], tip
+        deflection [m] and commanded force [N] at these times.
+    completeness : dict
+        Messages in the bag over messages due, by topic of `COUNTED`.
+
+    """
+
+    law: str
+    depth: FloatArray
+    reference: FloatArray
+    tip: FloatArray
+    force: FloatArray
+    completeness: dict[str, float]
+
+
+def record_insertion(law: str, bag: Path, logs: Path, progress: Callable[[float], None]) -> None:
+    """
+    Drive the simulated needle to the target under a law and record everything.
+
+    Parameters
+    ----------
+    law : str
+        Name of the control law.
+    bag : Path
+        Bag to write.
+    logs : Path
+        Folder for what the nodes print.
+    progress : callable
+        Called with the fraction done.
+
+    Raises
+    ------
+    GraphError
+        If a node fails or the target is not reached in time.
+
+    """
+    with Graph(logs) as graph:
+        node = graph.node('demo')
+        state = graph.latest(node, JointState, 'joint_states', SENSOR)
+        reference = graph.latest(node, JointState, 'reference', SENSOR)
+        target = node.create_publisher(PointStamped, 'target', COMMAND)
+        recorder = graph.start('recorder', {'path': str(bag)})
+        controller = graph.start(
+            'controller', {'law': law, 'rate': RATE, 'reference.speed': SPEED}
+        )
+        start = {'depth': START_DEPTH, 'tip_deflection': START_DEFLECTION, 'rate': RATE}
+        plant = graph.start('plant', {'autostart': False, **start})
+        # The plant starts when the recorder listens to everything: the bag holds every sample.
+        listeners = {'target': 2, 'wrench_command': 2, 'reference': 2, 'joint_states': 3}
+        graph.spin_until(
+            lambda: all(
+                node.count_subscribers(name) >= listeners.get(name, 1)
+                for name in (*listeners, *COUNTED)
+            ),
+            'the nodes',
+        )
+        graph.change(node, 'plant', CONFIGURE, ACTIVATE)
+        graph.spin_until(lambda: reference.message and state.message, 'plant and controller')
+        message = PointStamped()
+        message.header.frame_id = 'needle_entry'
+        message.header.stamp = node.get_clock().now().to_msg()
+        message.point.y = TARGET_DEPTH
+        target.publish(message)
+
+        def arrived() -> bool:
+            done = (state.message.position[0] - START_DEPTH) / (TARGET_DEPTH - START_DEPTH)
+            progress(min(max(done, 0.0), 1.0))
+            return bool(reference.message and reference.message.position[0] == TARGET_DEPTH)
+
+        duration = (TARGET_DEPTH - START_DEPTH) / SPEED
+        graph.spin_until(arrived, 'the end of the insertion', timeout=duration + 30.0)
+        # The loop settles within a second; the recording shows that it stays there.
+        end = node.get_clock().now() + Duration(seconds=1.5)
+        graph.spin_until(lambda: node.get_clock().now() > end, 'the end of the recording')
+        recorder.interrupt()
+        controller.interrupt()
+        plant.interrupt()
+
+
+def read_insertion(law: str, bag: Path) -> Insertion:
+    """
+    Read what `record_insertion` recorded.
+
+    Parameters
+    ----------
+    law : str
+        Name of the control law.
+    bag : Path
+        The bag.
+
+    Returns
+    -------
+    Insertion
+        Times are since the target was sent.
+
+    Raises
+    ------
+    RecordingError
+        If the bag is not readable or lacks a topic.
+
+    """
+
+    def series(topic: str, value: Callable[[Any], float]) -> FloatArray:
+        pairs = [(seconds(m.header.stamp), value(m)) for _, m in read_topic(bag, f'/{topic}')]
+        return np.array(pairs).T
+
+    curves = {
+        'depth': series('joint_states', lambda m: m.position[0]),
+        'reference': series('reference', lambda m: m.position[0]),
+        'tip': series('tip_deflection', lambda m: m.point.z),
+        'force': series('wrench_command', lambda m: m.wrench.force.y),
+    }
+    completeness = {}
+    for topic in COUNTED:
+        stamps = series(topic, lambda _m: 0.0)[0]
+        completeness[topic] = len(stamps) / ((stamps[-1] - stamps[0]) * RATE + 1.0)
+    target = series('target', lambda m: m.point.y)[0, 0]
+    for curve in curves.values():
+        curve[0] -= target
+    return Insertion(law=law, completeness=completeness, **curves)
+
+
+def insertion_checks(run: Insertion) -> list[Check]:
+    """
+    Check depth, overshoot, tracking error and number of messages of an insertion.
+
+    Parameters
+    ----------
+    run : Insertion
+        The insertion.
+
+    Returns
+    -------
+    list of Check
+        One for each.
+
+    """
+    law = run.law.replace('_', ' ')
+    end, over = run.depth[1, -1] - TARGET_DEPTH, run.depth[1].max() - TARGET_DEPTH
+    reference = np.interp(run.depth[0], *run.reference)
+    worst = np.abs(run.depth[1] - reference)[run.depth[0] > 0.0].max()
+    topic, part = min(run.completeness.items(), key=lambda item: -abs(item[1] - 1.0))
+    return [
+        Check(
+            f'depth at the end, {law}',
+            f'{TARGET_DEPTH * 1e3:g} mm ± 0.5 mm',
+            f'{run.depth[1, -1] * 1e3:.4f} mm',
+            abs(end) < 5e-4,
+        ),
+        Check(f'overshoot, {law}', '< 1 mm', f'{max(over, 0.0) * 1e3:.4f} mm', over < 1e-3),
+        Check(f'largest tracking error, {law}', '< 1 mm', f'{worst * 1e3:.4f} mm', worst < 1e-3),
+        Check(
+            f'messages in the bag, {law}',
+            f'{RATE:g} Hz x duration ± 0.5 %',
+            f'{part:.3%} (worst: {topic})',
+            abs(part - 1.0) <= 0.005,
+        ),
+    ]
+
+
+def draw_insertions(runs: Sequence[Insertion]) -> Figure:
+    """
+    Draw depth, tracking error, force, and the tip deflection after the start.
+
+    Parameters
+    ----------
+    runs : sequence of Insertion
+        One for each control law.
+
+    Returns
+    -------
+    Figure
+        Four plots.
+
+    """
+    figure = Figure(figsize=(9.0, 9.0), layout='constrained')
+    axes = figure.subplots(4, 1)
+    labels = ('inserted length [mm]', 'tracking error [mm]', 'force [N]', 'tip deflection [mm]')
+    for axis, label in zip(axes, labels, strict=True):
+        axis.set_ylabel(label)
+        axis.set_xlabel('time since the target was sent [s]')
+        axis.grid(visible=True, alpha=0.3)
+    time, reference = runs[0].reference
+    axes[0].plot(time, reference * 1e3, 'k--', label='reference', zorder=3)
+    for run in runs:
+        time, reference = run.reference
+        depth = np.interp(time, *run.depth)
+        axes[0].plot(run.depth[0], run.depth[1] * 1e3, label=run.law.replace('_', ' '))
+        axes[1].plot(time, (reference - depth) * 1e3)
+        axes[2].plot(run.force[0], run.force[1])
+        axes[3].plot((run.tip[0] - run.tip[0, 0]) * 1e3, run.tip[1] * 1e3)
+    for axis in axes[:3]:
+        axis.set_xlim(-0.2, runs[0].depth[0, -1])
+    axes[3].set_xlim(0.0, 60.0)
+    axes[3].set_xlabel('time since the start of the plant [ms]')
+    axes[0].legend()
+    return figure

@@ -1,0 +1,63 @@
+"""Controllability and observability of the paper's needle, sections 3.2.3 to 3.2.6."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from needle_dynamics import NeedleModel, NeedleParameters
+from needle_insertion.report import controllability as report
+from needle_insertion.report.picture import Picture
+from needle_insertion.report.section import Grid, Section
+
+#: Operating points: inserted lengths [m], tip deflections [m], speed [m/s].
+DEPTHS: Final = (0.02, 0.1, 0.2)
+DEFLECTIONS: Final = (0.0, 5e-4)
+SPEED: Final = 5e-3
+
+
+def section() -> Section:
+    """
+    Return a table of the operating points and a map.
+
+    Returns
+    -------
+    Section
+        For the page of results.
+
+    """
+    parameters = NeedleParameters.preset('paper_si')
+    model = NeedleModel(parameters)
+    straight, bent = (
+        report.analyze_points(model, DEPTHS, (deflection,), (SPEED,)) for deflection in DEFLECTIONS
+    )
+    first, last = straight[0].result, bent[0].result
+    figure = report.draw_map(parameters, report.map_needle(parameters, SPEED), SPEED)
+    return Section(
+        title='Controllability and observability',
+        paragraphs=(
+            (
+                'Linearized about a straight needle, f_y and tau steer '
+                f'{first.state.rank} of {first.state.order} states, and the tip shows '
+                f'{first.observed.rank}. With a deflection of {1e3 * DEFLECTIONS[-1]:g} mm they '
+                f'steer {last.state.rank}, and it shows {last.observed.rank}. Ranks are taken in '
+                'natural units: in SI units the columns of [B, AB, ...] span more decades than '
+                'doubles have digits. The margin is the change of the pair that removes a rank.'
+            ),
+        ),
+        tables=(
+            Grid(
+                caption='States steered by f_y and tau, and seen in the tip deflection '
+                '(0.3 N s/m, complete equations)',
+                heads=report.POINT_HEADS,
+                rows=tuple(point.row() for point in (*straight, *bent)),
+            ),
+        ),
+        pictures=(
+            Picture(
+                'controllability',
+                'Distance of the linearized needle from losing controllability and observability, '
+                'and how far the base moves the tip, by inserted length and deflection.',
+                figure,
+            ),
+        ),
+    )

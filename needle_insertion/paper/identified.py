@@ -1,0 +1,349 @@
+"""Tables 1 and 2 of the paper, identified from recordings of a simulated robot."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from math import sqrt
+from pathlib import Path
+from typing import Any, Final
+
+from needle_identification import (
+    identify_friction,
+    identify_stiffness,
+    read_friction_recording,
+    read_indentation_recording,
+    Statistic,
+    summarize,
+    summarize_stiffness,
+)
+from needle_insertion.experiment.protocol import SHIPPED_BAGS
+from needle_insertion.experiment.truth import (
+    compare_friction,
+    compare_stiffness,
+    count_held,
+    fewest,
+    LEVEL,
+)
+from needle_insertion.paper.tables import FORCE_LEVELS, TABLE_1, TABLE_2
+from needle_insertion.report.section import Grid, Section
+from needle_ros.errors import NeedleError
+from scipy.special import chdtri
+from tqdm import tqdm
+
+_HEADS: Final = (
+    *('quantity', 'paper: mean ± STD', 'found: mean ± STD', '95 % of the mean'),
+    *('95 % of the STD', 'truth held', 'verdict'),
+)
+
+#: The unit that each table does not print.
+_UNITS: Final[Mapping[str, str]] = {
+    'table-1': (
+        'The paper prints no unit of mu_v. Here 0.3 is read as N s/mm, 300 N s/m, as on the rig '
+        'of the recordings. Figures 4 to 8 show it as N s/m as well.'
+    ),
+    'table-2': (
+        'The paper prints no unit of the stiffness. It is kN/m, if the 0.52 kN/m^2 of the text '
+        'are k_zz at 1.5 N.'
+    ),
+}
+
+
+class ReproduceError(NeedleError):
+    """There is nothing to reproduce a result from."""
+
+
+def verdict(holds: bool) -> str:
+    """
+    Return a verdict on a table as words.
+
+    Parameters
+    ----------
+    holds : bool
+        Whether the table comes out as the paper has it.
+
+    Returns
+    -------
+    str
+        The words.
+
+    """
+    return 'holds' if holds else 'DOES NOT HOLD'
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Line:
+    """
+    One published quantity beside what the recordings give.
+
+    Attributes
+    ----------
+    quantity : str
+        With its unit and condition.
+    paper : (float, float)
+        Published mean and standard deviation, SI.
+    found : Statistic
+        The same over the recordings.
+    held, known : int
+        Recordings whose 95 % interval holds their own true value, and those whose true value is
+        known.
+
+    """
+
+    quantity: str
+    paper: tuple[float, float]
+    found: Statistic
+    held: int = 0
+    known: int = 0
+
+    @property
+    def deviation_interval(self) -> tuple[float, float]:
+        """95 % confidence interval of the standard deviation of a normal population."""
+        return deviation_interval(self.found.deviation, self.found.count)
+
+    @property
+    def holds(self) -> bool:
+        """Whether both intervals hold what is published."""
+        return all(
+            low <= value <= high
+            for value, (low, high) in zip(
+                self.paper, (self.found.interval, self.deviation_interval), strict=True
+            )
+        )
+
+    def row(self) -> tuple[str, ...]:
+        """Return the cells of a table."""
+        return (
+            self.quantity,
+            _plus_minus(*self.paper),
+            _plus_minus(self.found.mean, self.found.deviation),
+            _interval(self.found.interval),
+            _interval(self.deviation_interval),
+            f'{self.held}/{self.known}' if self.known else '',
+            verdict(self.holds),
+        )
+
+    def document(self) -> dict[str, Any]:
+        """Return it for JSON."""
+        mean, deviation = self.paper
+        return {
+            'quantity': self.quantity,
+            'paper': {'mean': mean, 'deviation': deviation},
+            'found': asdict(self.found),
+            'deviation_interval': self.deviation_interval,
+            'truth': {'held': self.held, 'of': self.known},
+            'holds': self.holds,
+        }
+
+
+def _plus_minus(mean: float, deviation: float | None) -> str:
+    return f'{mean:.4g} ± {deviation:.3g}' if deviation is not None else f'{mean:.4g}'
+
+
+def _interval(interval: tuple[float, float]) -> str:
+    return f'{interval[0]:.4g} to {interval[1]:.4g}'
+
+
+def deviation_interval(deviation: float | None, count: int) -> tuple[float, float]:
+    """
+    Return the confidence interval of a standard deviation, by the chi-squared distribution.
+
+    Parameters
+    ----------
+    deviation : float or None
+        Standard deviation of a sample; None if there is none.
+    count : int
+        Size of the sample.
+
+    Returns
+    -------
+    (float, float)
+        95 % interval for a normal population.
+
+    """
+    if deviation is None:
+        return 0.0, float('inf')
+    low, high = (
+        deviation * sqrt((count - 1) / chdtri(count - 1, tail))
+        for tail in ((1.0 - LEVEL) / 2.0, (1.0 + LEVEL) / 2.0)
+    )
+    return float(low), float(high)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class IdentifiedTable:
+    """
+    A table of the paper, identified from recordings.
+
+    Attributes
+    ----------
+    name : str
+        One of `TABLES`.
+    bags : tuple of Path
+        The recordings.
+    lines : tuple of Line
+        What they give.
+
+    """
+
+    name: str
+    bags: tuple[Path, ...]
+    lines: tuple[Line, ...]
+
+    @property
+    def title(self) -> str:
+        """Such as ``Table 1``."""
+        return self.name.replace('-', ' ').capitalize()
+
+    @property
+    def truth(self) -> tuple[int, int]:
+        """Number of intervals that hold their own truth, and of truths that are known."""
+        return sum(line.held for line in self.lines), sum(line.known for line in self.lines)
+
+    @property
+    def is_true(self) -> bool:
+        """Whether no fewer intervals hold their truth than chance allows."""
+        held, known = self.truth
+        return held >= fewest(known)
+
+    @property
+    def holds(self) -> bool:
+        """Whether the recordings agree with the paper and with their own truth."""
+        return self.is_true and all(line.holds for line in self.lines)
+
+    @property
+    def words(self) -> str:
+        """How many intervals hold their own truth."""
+        held, known = self.truth
+        return (
+            f'95 % intervals of the {len(self.bags)} bags that hold their own truth: {held} of '
+            f'{known} (at least {fewest(known)} but for 1 % chance): {verdict(self.is_true)}'
+        )
+
+    def document(self) -> dict[str, Any]:
+        """Return it for JSON."""
+        held, known = self.truth
+        return {
+            'unit': 'SI',
+            'bags': [str(bag) for bag in self.bags],
+            'lines': [line.document() for line in self.lines],
+            'truth': {'held': held, 'of': known, 'least': fewest(known), 'holds': self.is_true},
+            'holds': self.holds,
+        }
+
+    def section(self) -> Section:
+        """Return it for the page."""
+        return Section(
+            title=self.title,
+            paragraphs=(
+                _UNITS[self.name],
+                (
+                    'The paper prints mean and STD over repeated experiments. Both are compared '
+                    'with the 95 % intervals that the recordings give. The recordings are of a '
+                    "simulated rig whose constants are drawn around the paper's: they show that "
+                    'the method finds the true values, not that the paper measured well. '
+                    f'{self.words}.'
+                ),
+            ),
+            tables=(
+                Grid(
+                    caption=f'{self.title} from {len(self.bags)} recordings',
+                    heads=_HEADS,
+                    rows=tuple(line.row() for line in self.lines),
+                ),
+            ),
+        )
+
+
+def _table_1(bags: Sequence[Path]) -> list[Line]:
+    """Return mu_s and mu_v over repeated experiments."""
+    recordings = [read_friction_recording(bag) for bag in _shown(bags, 'reading')]
+    estimates = [identify_friction(recording) for recording in _shown(recordings, 'fits')]
+    compared = list(map(compare_friction, recordings, estimates))
+    summary = summarize(estimates)
+    lines = []
+    for k, (name, paper) in enumerate(TABLE_1.items()):
+        held, known = count_held([one[k] for one in compared])
+        found = summary[name]
+        quantity = f'{found.symbol} [{found.unit}]'
+        lines.append(Line(quantity=quantity, paper=paper, found=found, held=held, known=known))
+    return lines
+
+
+def _table_2(bags: Sequence[Path]) -> list[Line]:
+    """Return each entry of the stiffness matrix at each level over several places, and k_a."""
+    recordings = [read_indentation_recording(bag) for bag in _shown(bags, 'reading')]
+    estimates = [identify_stiffness(recording) for recording in _shown(recordings, 'fits')]
+    for estimate in estimates:
+        if len(estimate.levels) != len(FORCE_LEVELS):
+            raise ReproduceError(
+                f'{estimate.name} must have {len(FORCE_LEVELS)} force levels as Table 2, got '
+                f'{[round(level.force, 2) for level in estimate.levels]} N'
+            )
+    compared = list(map(compare_stiffness, recordings, estimates))
+    summary = summarize_stiffness(estimates)
+    lines = []
+    for k, force in enumerate(FORCE_LEVELS):
+        for i, (entry, (means, deviations)) in enumerate(TABLE_2.items()):
+            held, known = count_held([one[i * len(FORCE_LEVELS) + k] for one in compared])
+            lines.append(
+                Line(
+                    quantity=f'{entry} at {force:g} N [N/m]',
+                    paper=(means[k], deviations[k]),
+                    found=summary.levels[k][entry],
+                    held=held,
+                    known=known,
+                )
+            )
+    tissue, (means, deviations) = summary.tissue_stiffness, TABLE_2['k_zz']
+    quantity = f'{tissue.symbol} at {FORCE_LEVELS[-1]:g} N [{tissue.unit}]'
+    # The paper takes k_zz for it, as a contact length of 1 m does.
+    lines.append(Line(quantity=quantity, paper=(means[-1], deviations[-1]), found=tissue))
+    return lines
+
+
+#: Tables by name: the experiment behind each, and what is made of its bags.
+TABLES: Final[Mapping[str, tuple[str, Callable[[Sequence[Path]], list[Line]]]]] = {
+    'table-1': ('friction', _table_1),
+    'table-2': ('stiffness', _table_2),
+}
+
+
+def identify_table(
+    name: str, recorded: Mapping[str, Sequence[Path]] | None = None
+) -> IdentifiedTable:
+    """
+    Identify a table of the paper from recordings.
+
+    Parameters
+    ----------
+    name : str
+        One of `TABLES`.
+    recorded : Mapping[str, sequence of Path], optional
+        Recordings by experiment; the shipped ones if not given.
+
+    Returns
+    -------
+    IdentifiedTable
+        What they give.
+
+    Raises
+    ------
+    ReproduceError
+        If there are no recordings, or they have other force levels than Table 2.
+
+    """
+    experiment, result = TABLES[name]
+    bags = (recorded or {}).get(experiment) or sorted(
+        path for path in SHIPPED_BAGS.glob(f'{experiment}_*') if path.is_dir()
+    )
+    if not bags:
+        raise ReproduceError(
+            f'{SHIPPED_BAGS} holds no {experiment}_*; run from a clone, or give --record DIR'
+        )
+    return IdentifiedTable(name=name, bags=tuple(bags), lines=tuple(result(bags)))
+
+
+def _shown(items: Sequence[Any], what: str) -> Any:
+    """Show progress over items."""
+    return tqdm(items, desc=what, disable=None, leave=False)

@@ -1,0 +1,287 @@
+"""The results of the paper, computed again: each as text, as JSON and on one page."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from functools import cache
+from math import nan
+from pathlib import Path
+from typing import Any, Final
+
+from needle_insertion.experiment.campaign import Campaign
+from needle_insertion.experiment.protocol import PROTOCOLS
+from needle_insertion.paper import claims, controllability, figures, mismatch, needle_constants
+from needle_insertion.paper.identified import (
+    IdentifiedTable,
+    identify_table,
+    ReproduceError,
+    TABLES,
+    verdict,
+)
+from needle_insertion.paper.tables import TABLE_2
+from needle_insertion.report.page import write_page
+from needle_insertion.report.section import Section
+from needle_insertion.report.text import table
+from tqdm import tqdm
+
+#: What there is to reproduce.
+RESULTS: Final = (
+    *figures.FIGURES,
+    *TABLES,
+    *('table-3', 'controllability', 'claims', 'mismatch', 'all'),
+)
+
+#: Tables that a result is judged by.
+_JUDGED_BY: Final[Mapping[str, tuple[str, ...]]] = {
+    **{name: (name,) for name in TABLES},
+    'claims': tuple(TABLES),
+    'all': tuple(TABLES),
+}
+
+#: Heads of `Result.verdicts`.
+VERDICT_HEADS: Final = ('where', 'what', 'verdict')
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Result:
+    """
+    One result, for the page, for the terminal and for JSON.
+
+    Attributes
+    ----------
+    section : Section
+        For the page.
+    text : str
+        For the terminal.
+    verdicts : tuple of (str, str, str)
+        Where, what, and the verdict on it.
+    document : Mapping[str, object]
+        For JSON.
+    holds : bool
+        False if a table does not come out as the paper has it.
+
+    """
+
+    section: Section
+    text: str
+    verdicts: tuple[tuple[str, str, str], ...] = ()
+    document: Mapping[str, Any] = field(default_factory=dict)
+    holds: bool = True
+
+
+def campaigns(what: str) -> dict[str, Campaign]:
+    """
+    Return the experiments behind a result.
+
+    Parameters
+    ----------
+    what : str
+        One of `RESULTS`.
+
+    Returns
+    -------
+    dict
+        Campaigns by the name of the experiment.
+
+    Raises
+    ------
+    ReproduceError
+        If no recordings are behind it.
+
+    """
+    if what not in _JUDGED_BY:
+        raise ReproduceError(f'{what} is computed: there is nothing to --record')
+    names = [TABLES[name][0] for name in _JUDGED_BY[what]]
+    return {name: Campaign(protocol=PROTOCOLS[name]) for name in names}
+
+
+def results(what: str, recorded: Mapping[str, Sequence[Path]] | None = None) -> dict[str, Result]:
+    """
+    Compute a result of the paper again, or all of them.
+
+    Parameters
+    ----------
+    what : str
+        One of `RESULTS`.
+    recorded : Mapping[str, sequence of Path], optional
+        Recordings by experiment; the shipped ones if not given.
+
+    Returns
+    -------
+    dict[str, Result]
+        By name, in the order of the page.
+
+    """
+    tables = {name: identify_table(name, recorded) for name in _JUDGED_BY.get(what, ())}
+    source = 'the shipped recordings' if recorded is None else 'the recordings'
+    jobs: dict[str, Callable[[], Result]] = {
+        'claims': lambda: _of_claims(_judged(tables, source)),
+        **{name: lambda name=name: _of_table(tables[name]) for name in TABLES},  # type: ignore[misc]
+        'table-3': lambda: _of_section(needle_constants.section()),
+        **{name: lambda name=name: _of_figure(name) for name in figures.FIGURES},  # type: ignore[misc]
+        'figures': lambda: _of_section(figures.section()),
+        'controllability': lambda: _of_section(controllability.section()),
+        'mismatch': lambda: _of_section(mismatch.section(_study())),
+    }
+    chosen = [name for name in jobs if name not in figures.FIGURES] if what == 'all' else [what]
+    return {name: jobs[name]() for name in tqdm(chosen, **_bar('results'))}
+
+
+def _of_table(found: IdentifiedTable) -> Result:
+    section = found.section()
+    (grid,) = section.tables
+    return Result(
+        section=section,
+        text=f'{table(grid.rows, grid.heads)}\n\n{found.words}',
+        verdicts=((found.title, 'means and STD are those printed', verdict(found.holds)),),
+        document=found.document(),
+        holds=found.holds,
+    )
+
+
+def _of_claims(judged: list[claims.Claim]) -> Result:
+    section = claims.section(judged)
+    rows = [(one.section, one.claim, one.words) for one in judged]
+    return Result(
+        section=section,
+        text=f'{section.paragraphs[0]}\n\n{table(rows, VERDICT_HEADS)}',
+        verdicts=tuple((one.section, one.claim, one.verdict) for one in judged),
+        document={'claims': [asdict(one) for one in judged]},
+    )
+
+
+def _of_section(section: Section, **more: object) -> Result:
+    grids = (f'{one.caption}\n\n{table(one.rows, one.heads)}' for one in section.tables)
+    captions = [one.caption for one in section.pictures]
+    return Result(
+        section=section,
+        text='\n\n'.join((*section.paragraphs, *grids, *captions)),
+        document={
+            'title': section.title,
+            'paragraphs': section.paragraphs,
+            'tables': [asdict(one) for one in section.tables],
+            'captions': captions,
+            **more,
+        },
+    )
+
+
+def _of_figure(name: str) -> Result:
+    found = figures.FIGURES[name]()
+    section = Section(
+        title=name.replace('-', ' ').capitalize(),
+        paragraphs=(),
+        tables=(found.table(),),
+        pictures=(found.picture,),
+    )
+    runs = [{'run': case, **asdict(one)} for case, one in found.outcomes.items()]
+    return _of_section(section, runs=runs)
+
+
+@cache
+def _study() -> mismatch.Mismatch:
+    with tqdm(total=2002, unit=' insertions', **_bar('mismatch')) as bar:
+        return mismatch.study(progress=bar.update)
+
+
+def _judged(tables: Mapping[str, IdentifiedTable], source: str) -> list[claims.Claim]:
+    study = _study()
+    with tqdm(unit=' claims', **_bar('claims')) as bar:
+        return claims.claims(statistics(tables, source), study, bar.update)
+
+
+def statistics(tables: Mapping[str, IdentifiedTable], source: str) -> claims.Tables:
+    """
+    Return identified tables as claims are judged by them: mu_v in N s/mm, stiffness in kN/m.
+
+    Parameters
+    ----------
+    tables : Mapping[str, IdentifiedTable]
+        All of `TABLES`.
+    source : str
+        Where they come from.
+
+    Returns
+    -------
+    claims.Tables
+        Means and STD.
+
+    """
+
+    def found(table_name: str, name: str, scale: float) -> list[tuple[float, float]]:
+        return [
+            (scale * one.mean, nan if one.deviation is None else scale * one.deviation)
+            for one in (line.found for line in tables[table_name].lines)
+            if one.name == name
+        ]
+
+    means_and_deviations = {
+        entry: list(zip(*found('table-2', entry, 1e-3), strict=True)) for entry in TABLE_2
+    }
+    return claims.Tables(
+        source=source,
+        friction={
+            'mu_s': found('table-1', 'coulomb_friction', 1.0)[0],
+            'mu_v': found('table-1', 'viscous_friction', 1e-3)[0],
+        },
+        stiffness={entry: (each[0], each[1]) for entry, each in means_and_deviations.items()},
+        repeats=min(len(one.bags) for one in tables.values()),
+    )
+
+
+def _bar(what: str) -> dict[str, Any]:
+    return {'desc': what, 'disable': None, 'leave': False}
+
+
+def write_results(folder: Path, found: Mapping[str, Result]) -> Path:
+    """
+    Write results on one page, with a short overview at the top.
+
+    Parameters
+    ----------
+    folder : Path
+        Where to write.
+    found : Mapping[str, Result]
+        Results by name.
+
+    Returns
+    -------
+    Path
+        The page, ``reproduce.html``.
+
+    Raises
+    ------
+    ParameterError
+        If a file cannot be written.
+
+    """
+    cards = []
+    if 'claims' in found:
+        said = [verdict for _where, _what, verdict in found['claims'].verdicts]
+        conditional, failed = said.count(claims.ONLY_IF), said.count(claims.FAILS)
+        cards.append(
+            (
+                'Claims of the paper',
+                f'{said.count(claims.HOLDS)} of {len(said)} hold',
+                f'{conditional} more under a condition, {failed} do not',
+            )
+        )
+    for one in (found[name] for name in TABLES if name in found):
+        lines, bags = (len(one.document[name]) for name in ('lines', 'bags'))
+        note = f'{lines} quantities, means and STD, from {bags} recordings'
+        cards.append((one.section.title, verdict(one.holds), note))
+    sections = [one.section for one in found.values()]
+    path = folder / 'reproduce.html'
+    write_page(
+        path,
+        'sections.html',
+        title='The paper, reproduced',
+        introduction='A. Boroomand, M. Tavakoli, R. Sloboda, N. Usmani, Dynamical modeling and '
+        'controllability analysis of a flexible needle in soft tissue (2014): its figures, tables '
+        'and claims, computed again.',
+        pictures=[picture for section in sections for picture in section.pictures],
+        cards=cards,
+        sections=sections,
+    )
+    return path

@@ -1,0 +1,301 @@
+"""Controllability and observability at operating points, as tables, JSON and a map."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import product
+from pathlib import Path
+from typing import Any, Final
+
+from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure
+from needle_dynamics import NeedleModel, NeedleParameters
+from needle_dynamics.analysis import (
+    Analysis,
+    analyze,
+    controllability_map,
+    ControllabilityMap,
+    linearize,
+    LinearSystem,
+    operating_point,
+    Structure,
+)
+from needle_identification.result import write_whole
+from needle_insertion.report.picture import png
+import numpy as np
+from tqdm import tqdm
+
+#: The map starts at this share of the needle's length, with this many depths and deflections.
+SHALLOWEST, DEPTHS, DEFLECTIONS = 0.05, 41, 31
+
+#: Largest tip deflection of the map if none is given [m].
+LARGEST_DEFLECTION: Final = 2e-3
+
+#: Column heads of `Point.row`.
+POINT_HEADS: Final = (
+    'depth, tip, speed',
+    *('steered', 'not steered', 'margin', 'next to lose'),
+    *('seen', 'not seen', 'margin', 'next to lose'),
+    'tip / base travel',
+)
+
+_MAPPED: Final = ('rank', 'distance', 'observed_rank', 'observed_margin', 'output_gain')
+
+_PANELS: Final = (
+    ('distance', 'distance from losing state controllability'),
+    ('output_gain', 'tip deflection per base travel'),
+    ('observed_margin', 'distance from seeing less of the state'),
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Point:
+    """
+    An operating point with what was found there.
+
+    Attributes
+    ----------
+    depth, deflection, speed, force : float
+        Inserted length [m], tip deflection [m], insertion speed [m/s] and force [N].
+    system : LinearSystem
+        The linearized model.
+    result : Analysis
+        Its controllability and observability.
+
+    """
+
+    depth: float
+    deflection: float
+    speed: float
+    force: float
+    system: LinearSystem
+    result: Analysis
+
+    def row(self) -> tuple[str, ...]:
+        """Return the cells of a table with the heads `POINT_HEADS`."""
+        found = self.result
+        return (
+            f'{1e2 * self.depth:g} cm, {1e3 * self.deflection:g} mm, {1e3 * self.speed:g} mm/s',
+            *_cells(found.state),
+            *_cells(found.observed),
+            f'{found.output_gain:.2g}' if found.output_controllable else 'not steered',
+        )
+
+    def document(self) -> dict[str, Any]:
+        """Return everything for JSON, in SI units."""
+        system, found = self.system, self.result
+        return {
+            'depth': self.depth,
+            'tip_deflection': self.deflection,
+            'speed': self.speed,
+            'force': self.force,
+            'states': system.names,
+            'inputs': ('f_y', 'tau'),
+            **{name: getattr(system, name).tolist() for name in ('A', 'B', 'C', 'D', 'drift')},
+            'natural_frequencies': system.frequencies.tolist(),
+            'controllability': _structure(found.state),
+            'observability': _structure(found.observed),
+            'output_controllability': {
+                'controllable': found.output_controllable,
+                'gain': found.output_gain,
+            },
+        }
+
+
+def _cells(found: Structure) -> tuple[str, ...]:
+    return f'{found.rank}/{found.order}', found.loss, f'{found.margin:.1e}', found.weakest
+
+
+def _structure(found: Structure) -> dict[str, Any]:
+    names = (
+        *('order', 'rank', 'deficiency', 'lost', 'combined', 'loss', 'distance', 'margin'),
+        'weakest',
+    )
+    return {
+        **{name: getattr(found, name) for name in names},
+        'eigenvalues': [[value.real, value.imag] for value in found.eigenvalues.tolist()],
+        'distances': found.distances.tolist(),
+    }
+
+
+def analyze_points(
+    model: NeedleModel,
+    depths: Sequence[float],
+    deflections: Sequence[float],
+    speeds: Sequence[float],
+    force: float = 0.0,
+    sliding: str | None = None,
+) -> list[Point]:
+    """
+    Analyze every combination of a depth, a deflection and a speed.
+
+    Parameters
+    ----------
+    model : NeedleModel
+        The needle.
+    depths, deflections : sequence of float
+        Inserted lengths and tip deflections [m].
+    speeds : sequence of float
+        Insertion speeds [m/s].
+    force : float
+        Insertion force [N].
+    sliding : str, optional
+        Branch of dry friction at speed 0, a key of `needle_dynamics.analysis.SLIDING`.
+
+    Returns
+    -------
+    list of Point
+        In the order of the values; speeds change fastest.
+
+    Raises
+    ------
+    NeedleError
+        If a point is not valid, or the needle sticks there.
+
+    """
+    points = []
+    for depth, deflection, speed in product(depths, deflections, speeds):
+        state = operating_point(model, depth, deflection, speed)
+        system = linearize(model, state, force, sliding=sliding)
+        points.append(
+            Point(
+                depth=depth,
+                deflection=deflection,
+                speed=speed,
+                force=force,
+                system=system,
+                result=analyze(system),
+            )
+        )
+    return points
+
+
+def map_needle(
+    parameters: NeedleParameters,
+    speed: float,
+    largest: float = LARGEST_DEFLECTION,
+    force: float = 0.0,
+    sliding: str | None = None,
+) -> ControllabilityMap:
+    """
+    Analyze a grid of inserted lengths and deflections.
+
+    Parameters
+    ----------
+    parameters : NeedleParameters
+        The needle.
+    speed : float
+        Insertion speed [m/s].
+    largest : float
+        Largest tip deflection [m].
+    force : float
+        Insertion force [N].
+    sliding : str, optional
+        Branch of dry friction at speed 0.
+
+    Returns
+    -------
+    ControllabilityMap
+        `DEPTHS` times `DEFLECTIONS` points.
+
+    """
+    length = parameters.length
+    deflections = np.linspace(0.0, largest, DEFLECTIONS)
+    depths = np.linspace(max(SHALLOWEST * length, parameters.minimum_depth), length, DEPTHS)
+    rows = [
+        controllability_map(parameters, [depth], deflections, speed, sliding, force)
+        for depth in tqdm(depths, desc='depths', disable=None, leave=False)
+    ]
+    return ControllabilityMap(
+        depths=np.concatenate([row.depths for row in rows]),
+        deflections=rows[0].deflections,
+        **{name: np.concatenate([getattr(row, name) for row in rows]) for name in _MAPPED},
+    )
+
+
+def draw_map(parameters: NeedleParameters, found: ControllabilityMap, speed: float) -> Figure:
+    """
+    Draw a map.
+
+    Parameters
+    ----------
+    parameters : NeedleParameters
+        The needle.
+    found : ControllabilityMap
+        The map.
+    speed : float
+        Insertion speed [m/s].
+
+    Returns
+    -------
+    Figure
+        Three panels, gray where the inputs do not move all of the state.
+
+    """
+    figure = Figure(figsize=(13.0, 4.6), layout='constrained')
+    order = 2 * (2 + parameters.modes)
+    lost = found.rank < order
+    for axes, (name, title) in zip(figure.subplots(1, 3, sharey=True), _PANELS, strict=True):
+        shown = np.ma.masked_array(getattr(found, name), lost).T
+        axes.set_facecolor('0.75')
+        mesh = axes.pcolormesh(
+            1e2 * found.depths,
+            1e3 * found.deflections,
+            shown,
+            norm=LogNorm() if shown.count() else None,
+            shading='nearest',
+        )
+        figure.colorbar(mesh, ax=axes, location='bottom')
+        axes.set(title=title, xlabel='inserted length [cm]')
+        axes.title.set_fontsize('medium')
+    figure.axes[0].set_ylabel('tip deflection [mm]')
+    figure.suptitle(
+        f'{parameters.formulation}, {parameters.modes} modes, {1e3 * speed:g} mm/s; '
+        'dimensionless; gray: the inputs do not move all of the state'
+    )
+    return figure
+
+
+def write_map(
+    folder: Path, parameters: NeedleParameters, found: ControllabilityMap, speed: float
+) -> list[Path]:
+    """
+    Write a map as a CSV and a PNG.
+
+    Parameters
+    ----------
+    folder : Path
+        Where to write.
+    parameters : NeedleParameters
+        The needle.
+    found : ControllabilityMap
+        The map.
+    speed : float
+        Insertion speed [m/s].
+
+    Returns
+    -------
+    list of Path
+        The files.
+
+    Raises
+    ------
+    ParameterError
+        If a file cannot be written.
+
+    """
+    depths, deflections = np.meshgrid(found.depths, found.deflections, indexing='ij')
+    columns = (depths, deflections, *(getattr(found, name) for name in _MAPPED))
+    lines = [','.join(('depth_m', 'tip_deflection_m', *_MAPPED))]
+    lines += [
+        ','.join(f'{value:.6g}' for value in line)
+        for line in zip(*(column.flat for column in columns), strict=True)
+    ]
+    contents = {
+        'controllability.csv': '\n'.join([*lines, '']).encode(),
+        'controllability.png': png(draw_map(parameters, found, speed)),
+    }
+    for name, content in contents.items():
+        write_whole(folder / name, content)
+    return [folder / name for name in contents]

@@ -1,0 +1,161 @@
+"""A simulated trajectory as a summary, a CSV, a figure and a bag."""
+
+from __future__ import annotations
+
+import csv
+from io import StringIO
+from pathlib import Path
+
+from matplotlib.figure import Figure
+from needle_dynamics import NeedleModel, Trajectory
+from needle_identification import BagWriter, encode, message_type
+from needle_identification.result import write_whole
+from needle_ros.timing import NANOSECONDS
+import numpy as np
+
+
+def summary(trajectory: Trajectory) -> dict[str, float]:
+    """
+    Return the main numbers of a trajectory.
+
+    Parameters
+    ----------
+    trajectory : Trajectory
+        The trajectory.
+
+    Returns
+    -------
+    dict
+        Values by what they are, with their units.
+
+    """
+    model = NeedleModel(trajectory.parameters)
+    states, tips = trajectory.states, trajectory.tip_deflection
+    return {
+        'duration [s]': float(trajectory.time[-1]),
+        'inserted length at the end [m]': float(trajectory.depth[-1]),
+        'insertion speed at the end [m/s]': float(-states[-1, model.coordinates]),
+        'largest tip deflection [m]': float(np.abs(tips).max()),
+        'tip deflection at the end [m]': float(tips[-1]),
+        'energy at the start [J]': model.energy(states[0]),
+        'energy at the end [J]': model.energy(states[-1], float(trajectory.time[-1])),
+    }
+
+
+def draw(trajectory: Trajectory) -> Figure:
+    """
+    Draw inserted length, modal coordinates and tip deflection over time.
+
+    Parameters
+    ----------
+    trajectory : Trajectory
+        The trajectory.
+
+    Returns
+    -------
+    Figure
+        Three plots.
+
+    """
+    result = Figure(figsize=(9.0, 7.0), layout='constrained')
+    above, middle, below = result.subplots(3, 1, sharex=True)
+    time = trajectory.time * 1e3
+    above.plot(time, trajectory.depth * 1e3)
+    above.set_ylabel('inserted length [mm]')
+    for i in range(trajectory.parameters.modes):
+        middle.plot(time, trajectory.states[:, 2 + i] * 1e3, label=f'q{i + 1}')
+    middle.set_ylabel('modal coordinates [1e-3 m^3/2]')
+    middle.legend()
+    below.plot(time, trajectory.tip_deflection * 1e3)
+    below.set_ylabel('tip deflection [mm]')
+    below.set_xlabel('time [ms]')
+    for axis in (above, middle, below):
+        axis.grid(visible=True, alpha=0.3)
+    return result
+
+
+def write_csv(path: Path, trajectory: Trajectory) -> None:
+    """
+    Write time, state and tip deflection of each sample, in SI units.
+
+    Parameters
+    ----------
+    path : Path
+        File to write.
+    trajectory : Trajectory
+        The trajectory.
+
+    Raises
+    ------
+    ParameterError
+        If the file cannot be written.
+
+    """
+    names = NeedleModel(trajectory.parameters).coordinate_names
+    text = StringIO(newline='')
+    writer = csv.writer(text)
+    writer.writerow(['time', *names, *(f'{name}_dot' for name in names), 'tip_deflection'])
+    rows = np.column_stack([trajectory.time, trajectory.states, trajectory.tip_deflection])
+    writer.writerows(rows.tolist())
+    write_whole(path, text.getvalue().encode())
+
+
+def write_bag(path: Path, trajectory: Trajectory) -> None:
+    """
+    Write the topics of the plant, stamped with the simulated time.
+
+    Parameters
+    ----------
+    path : Path
+        Folder of the bag; must not exist.
+    trajectory : Trajectory
+        The trajectory.
+
+    Raises
+    ------
+    RecordingError
+        If the bag cannot be written.
+
+    """
+    model = NeedleModel(trajectory.parameters)
+    m = model.coordinates
+    kinds = {
+        '/joint_states': 'sensor_msgs/msg/JointState',
+        '/ground_truth': 'sensor_msgs/msg/JointState',
+        '/tip_deflection': 'geometry_msgs/msg/PointStamped',
+    }
+    header, stamp = map(message_type, ('std_msgs/msg/Header', 'builtin_interfaces/msg/Time'))
+    joint, pointed = (message_type(kinds[name]) for name in ('/joint_states', '/tip_deflection'))
+    point = message_type('geometry_msgs/msg/Point')
+    empty = np.zeros(0)
+    tips = trajectory.tip_deflection
+    forces = np.append(trajectory.forces, trajectory.forces[-1])
+    with BagWriter(path) as bag:
+        for topic, kind in kinds.items():
+            bag.add_topic(topic, kind)
+        for k, state in enumerate(trajectory.states):
+            ns = round(trajectory.time[k] * NANOSECONDS)
+            at = stamp(sec=ns // NANOSECONDS, nanosec=ns % NANOSECONDS)
+            depth = trajectory.depth[k]
+            messages = {
+                '/joint_states': joint(
+                    header=header(stamp=at, frame_id=''),
+                    name=['insertion', 'rotation'],
+                    position=np.array([depth, state[1]]),
+                    velocity=np.array([-state[m], state[m + 1]]),
+                    effort=np.array([forces[k], 0.0]),
+                ),
+                '/ground_truth': joint(
+                    header=header(stamp=at, frame_id=''),
+                    name=list(model.coordinate_names),
+                    position=state[:m].copy(),
+                    velocity=state[m:].copy(),
+                    effort=empty,
+                ),
+                '/tip_deflection': pointed(
+                    header=header(stamp=at, frame_id='needle_entry'),
+                    point=point(x=0.0, y=float(depth), z=float(tips[k])),
+                ),
+            }
+            for topic, message in messages.items():
+                bag.write(topic, encode(message), ns)
