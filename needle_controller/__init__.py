@@ -1,48 +1,50 @@
-"""Control laws of the source in sampled form, references, and the controller node."""
+"""
+Control of a flexible needle: laws, references, observer, stability, safety, and closed loops.
+
+Units are SI throughout; signs and frames are those of docs/architecture.md.
+"""
 
 from needle_controller.controller import (
     Command,
     Controller,
     ControllerSettings,
+    DEFAULT_GAINS,
     LAWS,
     Measurement,
 )
-from needle_controller.laws.axis import Axis, Law, no_memory, Response, SampledLoop, Setpoint
+from needle_controller.in_loop.continuous import run_continuous
+from needle_controller.in_loop.run import LoopRun
+from needle_controller.in_loop.sampled import Commander, LoopBatch, run_batch, run_controller
+from needle_controller.laws.axis import Axis
 from needle_controller.laws.continuous import (
-    ACTUATIONS,
-    closed_loop,
-    closed_loop_matrix,
     ContinuousInverseDynamics,
     ContinuousLaw,
     ContinuousPid,
 )
 from needle_controller.laws.inverse_dynamics import InverseDynamics, InverseDynamicsGains
-from needle_controller.laws.pid import ANTI_WINDUP, Pid, PidGains
+from needle_controller.laws.law import Law, no_memory, SampledLoop
+from needle_controller.laws.pid import Pid, PidGains
 from needle_controller.observer.observer import Consistency, Observer, ObserverSettings
-from needle_controller.reference.reference import (
-    MinimumJerk,
-    ReferenceLimits,
-    REFERENCES,
-    Trapezoid,
-)
-from needle_controller.safety import Guard, Refusal, Safety, SafetyLimits, Stream
+from needle_controller.reference.guide import REFERENCES
+from needle_controller.reference.quintic import MinimumJerk
+from needle_controller.reference.setpoint import Reference, ReferenceLimits, Setpoint
+from needle_controller.reference.trapezoid import Trapezoid
+from needle_controller.safety import Guard, Safety, SafetyLimits, Stream
 from needle_controller.stability import (
     check_stability,
     Limit,
-    MARGIN,
     spectral_radius,
     stability_limit,
     transition_matrix,
 )
 
 __all__ = [
-    'ACTUATIONS',
-    'ANTI_WINDUP',
+    'DEFAULT_GAINS',
     'LAWS',
-    'MARGIN',
     'REFERENCES',
     'Axis',
     'Command',
+    'Commander',
     'Consistency',
     'ContinuousInverseDynamics',
     'ContinuousLaw',
@@ -54,15 +56,16 @@ __all__ = [
     'InverseDynamicsGains',
     'Law',
     'Limit',
+    'LoopBatch',
+    'LoopRun',
     'Measurement',
     'MinimumJerk',
     'Observer',
     'ObserverSettings',
     'Pid',
     'PidGains',
+    'Reference',
     'ReferenceLimits',
-    'Refusal',
-    'Response',
     'Safety',
     'SafetyLimits',
     'SampledLoop',
@@ -70,9 +73,10 @@ __all__ = [
     'Stream',
     'Trapezoid',
     'check_stability',
-    'closed_loop',
-    'closed_loop_matrix',
     'no_memory',
+    'run_batch',
+    'run_continuous',
+    'run_controller',
     'spectral_radius',
     'stability_limit',
     'transition_matrix',

@@ -4,53 +4,68 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from math import isfinite
+from math import isfinite, nan
 from typing import Final, TypeAlias
 
-from needle_controller.laws.axis import Axis, Law, SampledLoop, Setpoint
+from needle_controller.laws.axis import Axis, require_complete
 from needle_controller.laws.inverse_dynamics import InverseDynamics, InverseDynamicsGains
+from needle_controller.laws.law import Law, SampledLoop
 from needle_controller.laws.pid import Pid, PidGains
-from needle_controller.reference.reference import Guide, ReferenceLimits
+from needle_controller.reference.guide import Guide
+from needle_controller.reference.setpoint import ReferenceLimits, Setpoint
 from needle_controller.stability import check_stability, Limit, MARGIN
 from needle_dynamics import NeedleParameters
-from needle_ros.errors import (
-    ParameterError,
-)
+from needle_ros.errors import ParameterError
 from needle_ros.settings import check_constants, constant
 
-#: Control laws by name.
-LAWS: Final = ('inverse_dynamics', 'pid')
-
-#: What is driven.
+#: Controlled axes.
 AXES: Final = ('insertion', 'rotation')
 
 Gains: TypeAlias = InverseDynamicsGains | PidGains
 
+#: Default gains by law and axis. Those of rotation by PID make a closed loop of 20 rad/s on the
+#: rotary inertia of the source's needle.
+DEFAULT_GAINS: Final[Mapping[str, Mapping[str, Gains]]] = {
+    'inverse_dynamics': {
+        'insertion': InverseDynamicsGains(),
+        'rotation': InverseDynamicsGains(),
+    },
+    'pid': {'insertion': PidGains(), 'rotation': PidGains(kp=2.1e-7, ki=0.0, kd=2.1e-8)},
+}
+
+#: Control laws by name.
+LAWS: Final = tuple(DEFAULT_GAINS)
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ControllerSettings:
-    """What controller and reference need beside the gains."""
+    """Rate, delay and limits of a controller."""
 
     rate: float = constant(1000.0, 'Hz', 'rate of joint_states', low=1.0, high=10_000.0)
-    delay: float = constant(1.0, 'periods', 'whole periods from measurement to effect', high=20.0)
+    delay: float = constant(
+        1.0, 'periods', 'number of whole periods from a measurement to the effect of its command',
+        high=20.0,
+    )  # fmt: skip
     force_limit: float = constant(15.0, 'N', 'largest insertion force', open_low=True)
     torque_limit: float = constant(0.01, 'N m', 'largest torque', open_low=True)
     measurement_timeout: float = constant(
-        0.1, 's', 'age at which a measurement no longer counts', open_low=True
+        0.1, 's', 'age from which a measurement is stale', open_low=True
     )
     jump: float = constant(
-        2e-3, 'm', 'move that the speed does not explain, which is a fault; after a move of that '
-        'size during a fault the target no longer counts', open_low=True,
+        2e-3, 'm', 'displacement that the measured speed does not explain and that counts as a '
+        'fault; after a displacement of this size during a fault the target is cleared',
+        open_low=True,
     )  # fmt: skip
     stability_margin: float = constant(
-        MARGIN, '1', 'part by which every error has to shrink in a period', high=0.5
+        MARGIN, '1', 'required relative decrease of every control error per period', high=0.5
     )
     lowest_depth: float = constant(
-        0.0, 'm', 'least inserted length to control; no less than minimum_depth'
+        0.0, 'm', 'least inserted length to control; minimum_depth if that is larger'
     )
     highest_depth: float = constant(
-        10.0, 'm', 'largest inserted length to control; no more than the needle', open_low=True
-    )
+        10.0, 'm', 'largest inserted length to control; the needle length if that is smaller',
+        open_low=True,
+    )  # fmt: skip
 
     def __post_init__(self) -> None:
         check_constants(self)
@@ -59,19 +74,29 @@ class ControllerSettings:
 
     def depths(self, parameters: NeedleParameters) -> tuple[float, float]:
         """
-        Return the range of inserted lengths to control a needle in [m].
+        Return the range of inserted lengths to control a needle.
+
+        Parameters
+        ----------
+        parameters : NeedleParameters
+            Needle.
+
+        Returns
+        -------
+        tuple of float
+            Least and largest inserted length [m].
 
         Raises
         ------
         ParameterError
-            If nothing is left of it.
+            If the range is empty.
 
         """
         low = max(self.lowest_depth, parameters.minimum_depth)
         high = min(self.highest_depth, parameters.length)
         if not low < high:
             raise ParameterError(
-                f'lowest_depth and highest_depth must leave some of '
+                f'lowest_depth and highest_depth must leave a part of '
                 f'[{parameters.minimum_depth:g}, {parameters.length:g}] m, got '
                 f'{self.lowest_depth:g} and {self.highest_depth:g} m'
             )
@@ -81,14 +106,14 @@ class ControllerSettings:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Measurement:
     """
-    What the encoders say, SI units.
+    Readings of the encoders.
 
     Attributes
     ----------
     time : float
         Time of the sample [s].
     depth, speed : float
-        Inserted length [m] and insertion speed [m/s].
+        Inserted length [m] and insertion speed [m/s], positive into the tissue.
     angle, angular_speed : float
         Rotation of the base about x [rad], [rad/s].
 
@@ -101,36 +126,58 @@ class Measurement:
     angular_speed: float = 0.0
 
     def is_finite(self) -> bool:
-        """Return whether every number is finite."""
+        """
+        Return whether the readings are finite.
+
+        Returns
+        -------
+        bool
+            Whether every number is.
+
+        """
         return all(map(isfinite, (self.depth, self.speed, self.angle, self.angular_speed)))
+
+
+#: Setpoint of a command without a reference.
+NO_SETPOINT: Final = Setpoint(nan)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Command:
     """
-    What the controller answers to a measurement.
+    The answer of a controller to a measurement.
 
     Attributes
     ----------
-    force, torque : float
-        f_y [N], positive into the tissue, and tau [N m].
+    force : float
+        f_y [N], positive into the tissue.
+    torque : float
+        tau about x [N m].
     setpoint : Setpoint
-        Reference of the inserted length at the time of the measurement.
+        Reference of the inserted length at the time of the measurement; NaN without one.
     fault : str or None
         Why no force is commanded.
     notice : str or None
-        What people should know.
+        A message for the user.
 
     """
 
     force: float
-    torque: float
-    setpoint: Setpoint
+    torque: float = 0.0
+    setpoint: Setpoint = NO_SETPOINT
     fault: str | None = None
     notice: str | None = None
 
     def is_finite(self) -> bool:
-        """Return whether every force is finite."""
+        """
+        Return whether the command is finite.
+
+        Returns
+        -------
+        bool
+            Whether force and torque are.
+
+        """
         return isfinite(self.force) and isfinite(self.torque)
 
 
@@ -140,125 +187,127 @@ class Controller:
 
     Parameters
     ----------
-    law : str
-        Name of the law, one of `LAWS`.
     parameters : NeedleParameters
         Needle and tissue as the controller believes them to be.
-    settings : ControllerSettings
+    law : str
+        Control law, one of `LAWS`.
+    gains : Mapping[str, Mapping[str, Gains]], optional
+        Gains by law and axis, such as ``{'pid': {'insertion': PidGains(kp=2000.0)}}``. What is
+        missing has the values of `DEFAULT_GAINS`.
+    settings : ControllerSettings, optional
         Rate, delay and limits.
-    inverse_dynamics, pid : tuple of gains
-        Gains of insertion and rotation for each law.
     reference : str
-        Name of the reference, a key of `REFERENCES`.
-    limits : ReferenceLimits
+        Motion to a target, a key of `REFERENCES`.
+    limits : ReferenceLimits, optional
         Limits of the reference.
 
     Attributes
     ----------
     law : str
-        Name of the law.
+        Control law.
     guide : Guide
-        What it aims at: paths, pauses.
+        The reference: targets, paths, pauses.
     limits : dict of str to Limit
         What limits the stability of each axis.
+    period : float
+        Sample period [s].
+    delay : int
+        Periods from a measurement to the effect of its command.
 
     Raises
     ------
     ParameterError
-        If a name is unknown or the gains cannot be stable at this rate and delay.
+        If a name is unknown or the gains are unstable at this rate and delay.
+
+    Examples
+    --------
+    >>> from needle_controller import Controller, Measurement
+    >>> from needle_dynamics import NeedleParameters
+    >>> controller = Controller(NeedleParameters.preset('phantom'))
+    >>> controller.set_target(0.05)
+    >>> command = controller.command(Measurement(time=0.0, depth=0.02, speed=0.0))
+    >>> command.setpoint.position
+    0.02
+    >>> 0.0 < command.force < 15.0
+    True
 
     """
 
     def __init__(
         self,
-        law: str,
         parameters: NeedleParameters,
-        settings: ControllerSettings,
+        law: str = LAWS[0],
         *,
-        inverse_dynamics: tuple[InverseDynamicsGains, ...],
-        pid: tuple[PidGains, ...],
-        reference: str,
-        limits: ReferenceLimits,
+        gains: Mapping[str, Mapping[str, Gains]] | None = None,
+        settings: ControllerSettings | None = None,
+        reference: str = 'trapezoid',
+        limits: ReferenceLimits | None = None,
     ) -> None:
-        self._settings = settings
-        self._period = 1.0 / settings.rate
-        self._delay = int(settings.delay)
-        self._depths = settings.depths(parameters)
-        self.guide = Guide(reference, limits, self._depths)
-        self.law = ''
-        self.limits: dict[str, Limit] = {}
-        self._gains: dict[str, tuple[Gains, ...]] = {}
-        self._parameters = parameters
-        gains: dict[str, tuple[Gains, ...]] = {'inverse_dynamics': inverse_dynamics, 'pid': pid}
-        (insertion, rotation), self.limits = self._checked(law, parameters, gains)
-        self.law, self._gains = law, gains
-        self._insertion = SampledLoop(insertion, self._delay, settings.force_limit)
-        self._rotation = SampledLoop(rotation, self._delay, settings.torque_limit)
+        self._settings = settings = settings or ControllerSettings()
+        self.period, self.delay = 1.0 / settings.rate, int(settings.delay)
+        self.guide = Guide(reference, limits or ReferenceLimits(), settings.depths(parameters))
+        self.law, self._parameters, self._gains = law, parameters, _completed(gains or {})
+        (insertion, rotation), self.limits = self._checked(law, parameters, self._gains)
+        self._insertion = SampledLoop(insertion, self.delay, settings.force_limit)
+        self._rotation = SampledLoop(rotation, self.delay, settings.torque_limit)
         self.forget()
 
     def _checked(
-        self, name: str, parameters: NeedleParameters, gains: Mapping[str, tuple[Gains, ...]]
-    ) -> tuple[tuple[Law, Law], dict[str, Limit]]:
-        """Return the laws and what limits them, or refuse gains that cannot be stable."""
+        self, name: str, parameters: NeedleParameters, gains: Mapping[str, Mapping[str, Gains]]
+    ) -> tuple[list[Law], dict[str, Limit]]:
+        """Return the laws and what limits them, or reject unstable gains."""
         if name not in LAWS:
-            raise ParameterError(f'unknown {name!r}; valid: {", ".join(LAWS)}')
-        if len(gains[name]) != len(AXES):
-            raise ParameterError(
-                f'{name} needs gains of {", ".join(AXES)}, got {len(gains[name])}'
-            )
+            raise ParameterError(f'unknown law {name!r}; valid: {", ".join(LAWS)}')
+        require_complete(parameters)
         axes = Axis.insertion(parameters), Axis.rotation(parameters)
-        insertion, rotation = (
-            self._make(axis, chosen) for axis, chosen in zip(axes, gains[name], strict=True)
-        )
-        margin = self._settings.stability_margin
-        limits = {
-            axis: check_stability(law, self._delay, f'{name}.{axis} gains', margin=margin)
-            for axis, law in zip(AXES, (insertion, rotation), strict=True)
-        }
-        return (insertion, rotation), limits
-
-    def _make(self, axis: Axis, gains: Gains) -> Law:
-        if isinstance(gains, PidGains):
-            return Pid(axis=axis, gains=gains, period=self._period)
-        return InverseDynamics(axis=axis, gains=gains, period=self._period)
+        laws: list[Law] = []
+        limits: dict[str, Limit] = {}
+        for axis, where in zip(axes, AXES, strict=True):
+            chosen = gains[name][where]
+            law: Law
+            if isinstance(chosen, PidGains):
+                law = Pid(axis=axis, gains=chosen, period=self.period)
+            else:
+                law = InverseDynamics(axis=axis, gains=chosen, period=self.period)
+            limits[where] = check_stability(
+                law, self.delay, f'{name}.{where} gains', margin=self._settings.stability_margin
+            )
+            laws.append(law)
+        return laws, limits
 
     def change(
         self,
         parameters: NeedleParameters | None = None,
         *,
         law: str | None = None,
-        inverse_dynamics: tuple[InverseDynamicsGains, ...] | None = None,
-        pid: tuple[PidGains, ...] | None = None,
+        gains: Mapping[str, Mapping[str, Gains]] | None = None,
     ) -> None:
         """
-        Go on with other constants, gains or another law; target, reference and memory stay.
+        Continue with other constants, gains or another law; target, reference and memory stay.
 
-        With other gains or another law the first forces in a motion are the last ones again.
+        With other gains or another law during a motion, the first forces are the last ones again.
 
         Parameters
         ----------
         parameters : NeedleParameters, optional
             Needle and tissue.
         law : str, optional
-            Name of the law.
-        inverse_dynamics, pid : tuple of gains, optional
-            Gains.
+            Control law.
+        gains : Mapping[str, Mapping[str, Gains]], optional
+            Gains by law and axis; what is missing stays.
 
         Raises
         ------
         ParameterError
-            If the gains cannot be stable with them; the old ones then stay.
+            If the gains are unstable with the changes. Nothing is changed then.
 
         """
-        parameters = parameters or self._parameters
-        name = law or self.law
-        gains: dict[str, tuple[Gains, ...]] = {
-            'inverse_dynamics': inverse_dynamics or self._gains['inverse_dynamics'],
-            'pid': pid or self._gains['pid'],
-        }
-        (insertion, rotation), self.limits = self._checked(name, parameters, gains)
-        steady = (name, gains[name]) == (self.law, self._gains[self.law])
-        self._parameters, self.law, self._gains = parameters, name, gains
+        parameters, name = parameters or self._parameters, law or self.law
+        completed = _completed(gains or {}, self._gains)
+        (insertion, rotation), limits = self._checked(name, parameters, completed)
+        steady = (name, completed[name]) == (self.law, self._gains[self.law])
+        self.law, self._parameters, self._gains = name, parameters, completed
+        self.limits = limits
         if steady or not self.guide.moves:
             self._insertion.law, self._rotation.law = insertion, rotation
         else:
@@ -267,12 +316,12 @@ class Controller:
 
     @property
     def target(self) -> float | None:
-        """Inserted length to reach [m], None before the first target."""
+        """Inserted length to reach [m]; None without a target."""
         return self.guide.target
 
     def set_target(self, depth: float) -> None:
         """
-        Aim at an inserted length, from wherever the reference is now.
+        Go to an inserted length; see `Guide.aim`.
 
         Parameters
         ----------
@@ -282,7 +331,7 @@ class Controller:
         Raises
         ------
         ParameterError
-            If it is not finite or the needle cannot be there.
+            If it is not finite or out of range.
 
         """
         self.guide.aim(depth)
@@ -294,7 +343,7 @@ class Controller:
         speeds: Sequence[float] | None = None,
     ) -> None:
         """
-        Follow a path of inserted lengths from now on; see `Path` and `Joined`.
+        Follow a path of inserted lengths from now on; see `Path`.
 
         Parameters
         ----------
@@ -304,35 +353,35 @@ class Controller:
         Raises
         ------
         ParameterError
-            If it is not a valid path.
+            If the path is invalid.
 
         """
         self.guide.follow(times, positions, speeds)
 
     def forget(self) -> None:
-        """Let go and forget the target too, and all that is remembered."""
+        """Forget target, motion and the memory of the laws."""
         self.guide.forget()
-        for loop in (self._insertion, self._rotation):
-            loop.reset()
+        self._insertion.reset()
+        self._rotation.reset()
         self._seen: Measurement | None = None
         self._last_depth: float | None = None
         self._stopped = False
 
     def release(self) -> None:
         """
-        Let go: forget the motion; the next measurement starts anew from where the needle is.
+        Forget the motion: the next measurement starts a new one from where the needle is.
 
         Integrals stay as they are while nothing is commanded.
         """
         self.guide.release()
-        for loop in (self._insertion, self._rotation):
-            loop.stop()
+        self._insertion.stop()
+        self._rotation.stop()
         self._stopped = True
 
     def _gap(self, before: Measurement | None, measured: Measurement) -> float:
-        """Return the time between measurements [s] if it is too long, or negative; else zero."""
+        """Return the time between measurements [s] if it is too long or negative; else zero."""
         elapsed = measured.time - before.time if before is not None else 0.0
-        most = self._settings.measurement_timeout + self._period
+        most = self._settings.measurement_timeout + self.period
         return 0.0 if 0.0 <= elapsed <= most else elapsed
 
     def _fault(self, measured: Measurement) -> str | None:
@@ -358,48 +407,72 @@ class Controller:
         Parameters
         ----------
         measured : Measurement
-            Encoders.
+            Readings of the encoders.
         load : float
             Force of the bent needle against insertion [N], if it is known.
 
         Returns
         -------
         Command
-            Zero force while there is no target, or with the fault that a measurement has: it is
-            not finite, has moved by more than its speed explains, or is out of range. After a
-            gap, or a step back in time, the motion starts anew from where the needle is.
+            Zero force without a target, or with the fault of the measurement: it is not finite,
+            or the needle moved by more than its speed explains. After a gap or a step back in
+            time the motion starts anew from where the needle is.
 
         """
-        gap = self._gap(self._seen, measured)
         notice = None
+        gap = self._gap(self._seen, measured)
         if gap:
             if self.guide.moves:
-                notice = f'measurements went on after {gap:.3f} s; the motion starts anew'
+                notice = f'measurements continued after {gap:.3f} s; the motion starts anew'
             self.release()
         fault = self._fault(measured)
         if fault is not None:
             self.release()
         else:
-            last, self._last_depth = self._last_depth, measured.depth
-            moved = abs(measured.depth - last) if last is not None else 0.0
-            if self._stopped and moved > self._settings.jump and self.guide.aims:
-                seen = self._seen
-                self.forget()
-                self._seen, self._last_depth = seen, measured.depth
-                notice = (
-                    f'the needle is {moved:.6f} m from where it was before the fault; the target '
-                    'is forgotten'
-                )
-            self._stopped = False
-        if fault is not None or not self.guide.aims:
-            here = Setpoint(measured.depth)
-            return Command(force=0.0, torque=0.0, setpoint=here, fault=fault, notice=notice)
+            notice = self._returned(measured) or notice
+        if fault is not None or self.target is None:
+            return Command(
+                force=0.0, setpoint=Setpoint(measured.depth), fault=fault, notice=notice
+            )
         now = self.guide.at(measured.time, measured.depth)
-        later = measured.time + self._delay * self._period
-        ahead = self.guide.ahead(later)
+        ahead = self.guide.ahead(measured.time + self.delay * self.period)
         return Command(
             force=self._insertion.command(measured.depth, measured.speed, ahead, load),
             torque=self._rotation.command(measured.angle, measured.angular_speed, Setpoint(0.0)),
             setpoint=now,
             notice=notice,
         )
+
+    def _returned(self, measured: Measurement) -> str | None:
+        """Clear the target if the needle has moved during a fault; return a message then."""
+        last, self._last_depth = self._last_depth, measured.depth
+        moved = abs(measured.depth - last) if last is not None else 0.0
+        elsewhere = self._stopped and moved > self._settings.jump and self.target is not None
+        if elsewhere:
+            seen = self._seen
+            self.forget()
+            self._seen, self._last_depth = seen, measured.depth
+        self._stopped = False
+        if not elsewhere:
+            return None
+        return f'the needle has moved by {moved:.6f} m since the fault; the target is cleared'
+
+
+def _completed(
+    gains: Mapping[str, Mapping[str, Gains]],
+    defaults: Mapping[str, Mapping[str, Gains]] = DEFAULT_GAINS,
+) -> dict[str, dict[str, Gains]]:
+    """Return gains of every law and axis; reject unknown names and gains of another law."""
+    completed = {law: dict(axes) for law, axes in defaults.items()}
+    for law, axes in gains.items():
+        for axis, chosen in axes.items():
+            if law not in completed or axis not in completed[law]:
+                raise ParameterError(
+                    f'unknown gains {law}.{axis}; valid: {", ".join(LAWS)} with '
+                    f'{" and ".join(AXES)}'
+                )
+            kind = type(completed[law][axis])
+            if not isinstance(chosen, kind):
+                raise ParameterError(f'{law}.{axis} must be {kind.__name__}, got {chosen!r}')
+            completed[law][axis] = chosen
+    return completed

@@ -12,18 +12,17 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PointStamped, WrenchStamped
 from needle_controller.controller import (
-    AXES,
     Command,
     Controller,
     ControllerSettings,
+    DEFAULT_GAINS,
+    Gains,
     LAWS,
     Measurement,
 )
-from needle_controller.laws.axis import Setpoint
-from needle_controller.laws.inverse_dynamics import InverseDynamicsGains
-from needle_controller.laws.pid import PidGains
 from needle_controller.observer.observer import Observer, ObserverSettings
-from needle_controller.reference.reference import ReferenceLimits, REFERENCES
+from needle_controller.reference.guide import REFERENCES
+from needle_controller.reference.setpoint import ReferenceLimits
 from needle_controller.safety import (
     BY_HAND,
     DROPPED,
@@ -62,16 +61,6 @@ _WAITING = 'no joint_states yet'
 #: Where to retract to by default [m], or as near to it as the range of depths has.
 _RETRACT = 0.01
 
-#: Gains by law and axis. Rotation by PID: a closed loop of 20 rad/s on the rotary inertia of the
-#: source's needle.
-_GAINS: dict[str, dict[str, InverseDynamicsGains | PidGains]] = {
-    'inverse_dynamics': {axis: InverseDynamicsGains() for axis in AXES},
-    'pid': {
-        'insertion': PidGains(),
-        'rotation': PidGains(kp=2.1e-7, ki=0.0, kd=2.1e-8),
-    },
-}
-
 #: Sources of what is known of the bending.
 FEEDBACKS = ('observer', 'ground_truth', 'none')
 
@@ -101,7 +90,7 @@ class ControllerNode(ModelNode):
             'retract_depth',
             *(
                 f'{law}.{axis}.{item.name}'
-                for law, axes in _GAINS.items()
+                for law, axes in DEFAULT_GAINS.items()
                 for axis, gains in axes.items()
                 for item in fields(gains)
             ),
@@ -128,7 +117,7 @@ class ControllerNode(ModelNode):
         self.declare_settings('reference.', ReferenceLimits())
         self.declare_settings('safety.', SafetyLimits())
         self.declare_settings('observer.', ObserverSettings())
-        for law, axes in _GAINS.items():
+        for law, axes in DEFAULT_GAINS.items():
             for axis, gains in axes.items():
                 self.declare_settings(f'{law}.{axis}.', gains)
         self.declare_model()
@@ -172,16 +161,15 @@ class ControllerNode(ModelNode):
     # Transitions.
 
     def configure(self) -> None:
-        """Make the controller from the parameters; refuse gains that cannot be stable."""
+        """Make the controller from the parameters; reject unstable gains."""
         feedback = self.text('deflection_feedback', FEEDBACKS)
         parameters = self.model_parameters()
         self._settings = self.settings('', ControllerSettings)
         self._controller = Controller(
-            self.text('law', LAWS),
             parameters,
-            self._settings,
-            inverse_dynamics=self._gains('inverse_dynamics', InverseDynamicsGains),
-            pid=self._gains('pid', PidGains),
+            self.text('law', LAWS),
+            gains=self._gains(),
+            settings=self._settings,
             reference=self.text('reference.kind', tuple(REFERENCES)),
             limits=self.settings('reference.', ReferenceLimits),
         )
@@ -208,10 +196,12 @@ class ControllerNode(ModelNode):
         )
         self._safety.stop = stop
 
-    def _gains(
-        self, law: str, kind: type[Any], changes: Mapping[str, Any] | None = None
-    ) -> tuple[Any, ...]:
-        return tuple(self.settings(f'{law}.{axis}.', kind, changes) for axis in AXES)
+    def _gains(self, changes: Mapping[str, Any] | None = None) -> dict[str, dict[str, Gains]]:
+        gains: dict[str, dict[str, Gains]] = {}
+        for law, axes in DEFAULT_GAINS.items():
+            kind: Any = type(axes['insertion'])
+            gains[law] = {axis: self.settings(f'{law}.{axis}.', kind, changes) for axis in axes}
+        return gains
 
     def _retract_depth(self, changes: Mapping[str, Any]) -> float:
         """Return the depth to retract to, or refuse it."""
@@ -224,7 +214,7 @@ class ControllerNode(ModelNode):
         return float(min(max(value, low), high))
 
     def change(self, changes: Mapping[str, Any]) -> None:
-        """Go on with other gains, friction or law; refuse what cannot be stable."""
+        """Go on with other gains, friction or law; reject what is unstable."""
         if self._controller is None:
             return
         try:
@@ -233,8 +223,7 @@ class ControllerNode(ModelNode):
             self._controller.change(
                 parameters,
                 law=self.text('law', LAWS, changes),
-                inverse_dynamics=self._gains('inverse_dynamics', InverseDynamicsGains, changes),
-                pid=self._gains('pid', PidGains, changes),
+                gains=self._gains(changes),
             )
         except ParameterError as error:
             self._refuse(f'parameters: {error}')
@@ -590,7 +579,7 @@ class ControllerNode(ModelNode):
         self._wrench_command.publish(message)
 
     def _show(self, stamp: int, measured: Measurement, command: Command) -> None:
-        aim: Setpoint = command.setpoint
+        aim = command.setpoint
         self._reference.publish(self._aim.serialize(stamp, aim.position, aim.speed))
         self._tracking_error.publish(
             self._aim.serialize(stamp, aim.position - measured.depth, aim.speed - measured.speed)

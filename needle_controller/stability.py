@@ -1,37 +1,34 @@
 """
-Poles of the sampled loops, and the refusal of gains that cannot be stable.
+Poles of the sampled loops, and the rejection of gains that are unstable.
 
-What is accepted has all poles within 1 - margin with the delay of the graph, and within 1 with a
-period more that the law does not know of. That period is the reserve for what is not modeled; the
-setting ``margin`` asks for convergence: every error shrinks by at least this part in a period.
-Slow loops have poles close to one by right (the source's k_p = 1, k_v = 0.1 at 1 kHz: 1 - 5e-5),
-so that its default is small, yet far above the rounding of an eigenvalue.
+Accepted gains have all poles within 1 - margin at the configured delay, and within 1 with one more
+period of delay that the law does not know. That period is the reserve for everything that is not
+modeled. The setting ``margin`` requires convergence: every error decreases by at least this part
+in a period. The poles of slow loops are close to one (the source's k_p = 1, k_v = 0.1 at 1 kHz:
+1 - 5e-5). The default margin is therefore small, but far above the rounding of an eigenvalue.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from math import inf, log10
+from math import floor, inf, log10
 from typing import Final
 
-from needle_controller.compiled import laws as kernels
-from needle_controller.laws.axis import Law, SampledLoop, Setpoint
-from needle_dynamics import (
-    FloatArray,
-)
-from needle_ros.errors import (
-    ParameterError,
-)
+from needle_controller.compiled.laws import INTEGRAL, PID, RATE
+from needle_controller.laws.law import Law, SampledLoop
+from needle_controller.reference.setpoint import Setpoint
+from needle_dynamics import FloatArray
+from needle_ros.errors import ParameterError
 import numpy as np
 
-#: By how much a spectral radius has to be less than one, by default.
+#: Default distance of the spectral radius from one.
 MARGIN: Final = 1e-6
 
-#: Periods of delay held in reserve, that the law does not know of.
+#: Periods of delay in reserve, unknown to the law.
 RESERVE: Final = 1
 
-#: Largest factors by which gains and rate are changed in search of what would do.
+#: Largest factors on gains and rate in the search for stable ones.
 _MOST_GAIN: Final = 1e6
 _MOST_RATE: Final = 1e3
 
@@ -44,11 +41,11 @@ class Limit:
     Attributes
     ----------
     radius : float
-        Largest modulus of its poles.
+        Spectral radius: the largest modulus of the poles.
     bound : float
-        What the radius must not exceed: 1 - margin, or with the reserve what is just below 1.
+        Largest valid radius: 1 - margin, or with the reserve just below 1.
     unmodeled : int
-        Periods of delay beyond those that the law knows of: 0 or RESERVE.
+        Periods of delay that the law does not know: 0 or RESERVE.
 
     """
 
@@ -58,7 +55,7 @@ class Limit:
 
     @property
     def stable(self) -> bool:
-        """Whether the loop is stable by the margin."""
+        """Whether the loop is stable with its margin."""
         return self.radius <= self.bound
 
 
@@ -66,9 +63,9 @@ def transition_matrix(law: Law, delay: int, unmodeled: int = 0) -> FloatArray:
     """
     One period of the closed loop as a matrix, exact for its linear part.
 
-    The state is position, speed, what the law remembers (the integral and the filtered rate, as
-    far as its gains use them) and the commands on their way, those last that the law knows of.
-    The loop itself is probed, so that what is analyzed is what runs.
+    The state is position, speed, the memory of the law (integral and filtered rate, if its gains
+    use them) and the pending commands; the last ones are those that the law knows. The matrix is
+    found from the loop itself, so that what is analyzed is what runs.
 
     Parameters
     ----------
@@ -77,7 +74,7 @@ def transition_matrix(law: Law, delay: int, unmodeled: int = 0) -> FloatArray:
     delay : int
         Periods from measurement to effect that the law takes into account.
     unmodeled : int
-        Further periods that it does not know of.
+        Further periods that the law does not know.
 
     Returns
     -------
@@ -87,19 +84,16 @@ def transition_matrix(law: Law, delay: int, unmodeled: int = 0) -> FloatArray:
     """
     linear, late = law.linear(), delay + unmodeled
     loop, rest = SampledLoop(linear, delay, inf), Setpoint(0.0)
-    # A memory that no gain uses is not part of the loop, and the offset of a switch just fades.
-    c, used = law.constants, []
-    if c[kernels.KI] > 0.0:
-        used.append(kernels.INTEGRAL)
-    if c[kernels.FILTER_TIME] * c[kernels.KD] > 0.0:
-        used.append(kernels.RATE)
+    # Only memory that the gains use belongs to the loop; the offset after a switch just fades.
+    c = law.constants
+    used = [k for k, uses in ((INTEGRAL, c.ki), (RATE, c.filter_time * c.kd)) if uses > 0.0]
     first = 2 + len(used)
 
     def period(state: FloatArray) -> list[float]:
         position, speed = state[:2].tolist()
         commands: list[float] = state[first:].tolist()
         loop.memory[used] = state[2:first]
-        loop.on_the_way.extend(commands[unmodeled:])
+        loop.pending.extend(commands[unmodeled:])
         commands.append(loop.command(position, speed, rest))
         end = linear.axis.propagate(position, speed, commands[0], linear.period)
         return [*end, *loop.memory[used].tolist(), *commands[1:]]
@@ -109,7 +103,7 @@ def transition_matrix(law: Law, delay: int, unmodeled: int = 0) -> FloatArray:
 
 def spectral_radius(law: Law, delay: int, unmodeled: int = 0) -> float:
     """
-    Largest modulus of the poles of the sampled loop; below 1 it is stable.
+    Largest modulus of the poles of the sampled loop. The loop is stable if it is below 1.
 
     Parameters
     ----------
@@ -129,7 +123,7 @@ def spectral_radius(law: Law, delay: int, unmodeled: int = 0) -> float:
 
 def stability_limit(law: Law, delay: int, *, margin: float = MARGIN) -> Limit:
     """
-    Find what limits the stability of a loop with the delay of the graph and the reserve.
+    Find what limits the stability of a loop, with its delay and with the reserve.
 
     Parameters
     ----------
@@ -138,7 +132,7 @@ def stability_limit(law: Law, delay: int, *, margin: float = MARGIN) -> Limit:
     delay : int
         Periods from measurement to effect.
     margin : float
-        By how much the spectral radius has to be less than one, in [0, 1).
+        Required distance of the spectral radius from one, in [0, 1).
 
     Returns
     -------
@@ -148,7 +142,15 @@ def stability_limit(law: Law, delay: int, *, margin: float = MARGIN) -> Limit:
     Raises
     ------
     ParameterError
-        If ``margin`` is outside its range.
+        If ``margin`` is out of range.
+
+    Examples
+    --------
+    >>> from needle_controller import Axis, Pid, PidGains, stability_limit
+    >>> from needle_dynamics import NeedleParameters
+    >>> axis = Axis.insertion(NeedleParameters.preset('phantom'))
+    >>> stability_limit(Pid(axis=axis, gains=PidGains(), period=1e-3), delay=1).stable
+    True
 
     """
     if not 0.0 <= margin < 1.0:
@@ -163,7 +165,7 @@ def stability_limit(law: Law, delay: int, *, margin: float = MARGIN) -> Limit:
 
 def check_stability(law: Law, delay: int, name: str, *, margin: float = MARGIN) -> Limit:
     """
-    Reject gains that are unstable, or would be with the reserve of delay in the graph.
+    Reject gains that are unstable, or would be with the delay in reserve.
 
     Parameters
     ----------
@@ -174,7 +176,7 @@ def check_stability(law: Law, delay: int, name: str, *, margin: float = MARGIN) 
     name : str
         Name of the gains for the message.
     margin : float
-        By how much the spectral radius has to be less than one, in [0, 1).
+        Required distance of the spectral radius from one, in [0, 1).
 
     Returns
     -------
@@ -184,8 +186,18 @@ def check_stability(law: Law, delay: int, name: str, *, margin: float = MARGIN) 
     Raises
     ------
     ParameterError
-        Naming the gains, the rate, the delay and the spectral radius found, and the nearest
-        change that would do: a common factor on the gains, or else a rate.
+        If the gains are unstable. The message names gains, rate, delay and spectral radius, and
+        the nearest stable change: a common factor on the gains, or else a rate.
+
+    Examples
+    --------
+    >>> from needle_controller import Axis, InverseDynamics, InverseDynamicsGains, check_stability
+    >>> axis = Axis(inertia=2.0, viscous=300.0)
+    >>> law = InverseDynamics(axis=axis, gains=InverseDynamicsGains(kv=3000.0), period=1e-3)
+    >>> check_stability(law, delay=1, name='my gains')
+    Traceback (most recent call last):
+        ...
+    needle_ros.errors.ParameterError: my gains are unstable at 1000 Hz ...
 
     """
     limit = stability_limit(law, delay, margin=margin)
@@ -194,39 +206,40 @@ def check_stability(law: Law, delay: int, name: str, *, margin: float = MARGIN) 
     late = delay + limit.unmodeled
     bound = f'<= 1 - {margin:g}' if limit.unmodeled == 0 else '< 1'
     raise ParameterError(
-        f'{name} cannot be stable at {1.0 / law.period:.7g} Hz with a delay of {late} '
+        f'{name} are unstable at {1.0 / law.period:.7g} Hz with a delay of {late} '
         f'period{"" if late == 1 else "s"}: spectral radius {limit.radius:.7g} must be '
         f'{bound}; {_advice(law, delay, margin)}'
     )
 
 
 def _advice(law: Law, delay: int, margin: float) -> str:
-    """Say what would do: a factor on all gains, or else a rate."""
+    """Say what would be stable: a factor on all gains, or else a rate."""
 
     def accepts(changed: Law) -> bool:
         return stability_limit(changed, delay, margin=margin).stable
 
     for factor in _nearby():
         if accepts(law.scaled(factor)):
-            return f'all of them times {factor:g} would be'
+            return f'all of them times {factor:g} would be stable'
     for factor in _upwards(_MOST_RATE):
         rate = _digits(factor / law.period, 3)
         if accepts(replace(law, period=1.0 / rate)):
-            return f'a rate of {rate:.7g} Hz would do'
-    missing = [slot for slot in ('KP', 'KD') if law.constants[getattr(kernels, slot)] == 0.0]
+            return f'a rate of {rate:.7g} Hz would be stable'
+    damping = 'kd' if law.constants.kind == PID else 'kv'
+    gains = {'kp': law.constants.kp, damping: law.constants.kd}
+    missing = [name for name, gain in gains.items() if gain == 0.0]
     if missing:
-        names = {'KP': 'kp', 'KD': 'kd' if law.constants[kernels.LAW] == kernels.PID else 'kv'}
-        return f'{" and ".join(names[slot] for slot in missing)} must not be zero'
-    return 'neither a common factor on them nor a higher rate would do'
+        return f'{" and ".join(missing)} must not be zero'
+    return 'neither a common factor on them nor a higher rate would be stable'
 
 
 def _digits(value: float, digits: int) -> float:
     """Round a positive number to significant digits."""
-    return round(value, digits - 1 - int(np.floor(log10(value))))
+    return round(value, digits - 1 - floor(log10(value)))
 
 
 def _upwards(most: float) -> Iterator[float]:
-    """Yield factors above one, within a tenth of each other."""
+    """Yield factors above one, each 1.1 times the one before."""
     factor = 1.1
     while factor <= most:
         yield factor

@@ -3,59 +3,27 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from math import copysign, inf
 from typing import Final
 
-from needle_controller.laws.axis import BREAKAWAY_TIME
-from needle_dynamics import (
-    FloatArray,
-    NeedleModel,
-)
-from needle_dynamics.analysis import linearize, operating_point
-from needle_ros.errors import (
-    ParameterError,
-    ShapeError,
-)
+from needle_controller.laws.law import BREAKAWAY_TIME
+from needle_dynamics import FloatArray, NeedleModel
+from needle_ros.errors import ParameterError, ShapeError
 import numpy as np
 from numpy.typing import ArrayLike
 
-#: Which coordinates are driven: those of the base (f_y, tau), or every one.
+#: Driven coordinates: those of the base (f_y, tau), or every one, which no motor can do.
 ACTUATIONS: Final = ('physical', 'modal')
 
 #: Coordinates of the base, d and theta.
 _BASE: Final = 2
 
 
-def gain_matrix(name: str, gains: ArrayLike, size: int, *, may_vanish: bool = False) -> FloatArray:
-    """
-    Return gains as a matrix.
-
-    Parameters
-    ----------
-    name : str
-        Name for the message.
-    gains : array_like, shape (size,) or (size, size)
-        One gain per driven coordinate, or a matrix.
-    size : int
-        Number of driven coordinates.
-    may_vanish : bool
-        Accept positive semidefinite gains too.
-
-    Returns
-    -------
-    ndarray, shape (size, size)
-        A copy, read-only.
-
-    Raises
-    ------
-    ShapeError
-        If the size is wrong or an entry is not a finite number.
-    ParameterError
-        If the matrix is not positive definite, that is x^T K x is not positive for some x.
-
-    """
+def _gain_matrix(
+    name: str, gains: ArrayLike, size: int, *, may_vanish: bool = False
+) -> FloatArray:
+    """Return gains of ``size`` coordinates as a matrix; reject one that is not definite."""
     try:
         matrix = np.array(gains, dtype=float)
     except (TypeError, ValueError):
@@ -89,7 +57,8 @@ class ContinuousLaw(ABC):
     model : NeedleModel
         Needle and tissue as the law believes them to be; the plant may differ.
     actuation : str
-        ``physical``: f_y and tau alone. ``modal``: a generalized force on every coordinate.
+        ``physical``: f_y and tau alone. ``modal``: a generalized force on every coordinate, as
+        in the gain matrices of the source.
 
     """
 
@@ -103,7 +72,7 @@ class ContinuousLaw(ABC):
 
     @property
     def integrals(self) -> int:
-        """Number of integrals of the error that belong to the state of the closed loop."""
+        """Number of integrals of the error in the state of the closed loop."""
         return 0
 
     def _check_actuation(self) -> None:
@@ -121,12 +90,12 @@ class ContinuousLaw(ABC):
         state : ndarray, shape (2 (2 + n),)
             State X = [d, theta, q1, ..., qn] and rates.
         goal : array_like, shape (3, 2 + n)
-            Wanted q, q_dot and q_ddot.
+            Desired q, q_dot and q_ddot.
 
         Returns
         -------
         ndarray, shape (3, driven)
-            e = q_d - q, its rate, and the wanted acceleration.
+            e = q_d - q, its rate, and the desired acceleration.
 
         Raises
         ------
@@ -154,7 +123,7 @@ class ContinuousLaw(ABC):
         state : array_like, shape (2 (2 + n),)
             State X = [d, theta, q1, ..., qn] and rates.
         goal : array_like, shape (3, 2 + n)
-            Wanted q, q_dot and q_ddot.
+            Desired q, q_dot and q_ddot.
         integral : array_like, shape (integrals,)
             Integral of the errors of the driven coordinates.
         time : float
@@ -163,31 +132,13 @@ class ContinuousLaw(ABC):
         Returns
         -------
         ndarray, shape (2 + n,)
-            f_y [N], positive into the tissue, tau [N m], and the generalized force on each q_i.
+            f_y [N], positive into the tissue, tau [N m], and the generalized force on each q_i
+            [N m^-1/2].
 
         Raises
         ------
         ShapeError, InsertedLengthError
-            If the state, the goal or the integral is not valid.
-
-        """
-
-    @abstractmethod
-    def feedback(self, mass: FloatArray, free: FloatArray) -> FloatArray:
-        """
-        Return the law linearized at a straight needle, for `closed_loop_matrix`.
-
-        Parameters
-        ----------
-        mass : ndarray, shape (2 + n, 2 + n)
-            Mass matrix of the law's model.
-        free : ndarray, shape (2 + n, 2 (2 + n))
-            Its accelerations under constant forces, per deviation of the state.
-
-        Returns
-        -------
-        ndarray, shape (driven, 2 (2 + n) + integrals)
-            Generalized forces per deviation of the state and per integral.
+            If the state, the goal or the integral is invalid.
 
         """
 
@@ -197,8 +148,8 @@ class ContinuousInverseDynamics(ContinuousLaw):
     """
     F_c = M(q) (q_ddot_d + k_v e_dot + k_p e) + N', section 3.2.7.1.
 
-    N' are the bias forces with friction, break-away included: at rest friction counts in the
-    direction of the wanted acceleration.
+    N' are the bias forces with friction. At rest friction counts in the direction of the desired
+    acceleration, so that the law breaks away.
 
     Attributes
     ----------
@@ -206,8 +157,8 @@ class ContinuousInverseDynamics(ContinuousLaw):
         Gains [1/s^2] and [1/s], positive definite.
     breakaway_speed : float
         If positive, dry friction is compensated in proportion to the speed wanted
-        BREAKAWAY_TIME ahead, up to this speed [m/s]: what the sampled law tends to. 0 is the
-        source's law, the limit of it.
+        BREAKAWAY_TIME ahead, up to this speed [m/s]: the limit of the sampled law for short
+        periods. 0 is the law of the source.
 
     """
 
@@ -222,8 +173,8 @@ class ContinuousInverseDynamics(ContinuousLaw):
             raise ParameterError(
                 f'breakaway_speed must be finite and >= 0 m/s, got {self.breakaway_speed!r}'
             )
-        gains = gain_matrix('kp', self.kp, self.driven), gain_matrix('kv', self.kv, self.driven)
-        object.__setattr__(self, '_gains', gains)
+        kp, kv = (_gain_matrix(name, getattr(self, name), self.driven) for name in ('kp', 'kv'))
+        object.__setattr__(self, '_gains', (kp, kv))
 
     def forces(
         self, state: ArrayLike, goal: ArrayLike, integral: ArrayLike = (), time: float = 0.0
@@ -243,24 +194,16 @@ class ContinuousInverseDynamics(ContinuousLaw):
         return forces
 
     def _friction(self, speed: float, acceleration: float) -> float:
-        """Return viscous friction at the speed, and dry friction as far as it leans one way."""
+        """Return viscous friction, and the share of dry friction to compensate."""
         law = self.model.friction
         lean = (speed + BREAKAWAY_TIME * acceleration) / self.breakaway_speed
         lean = min(max(lean, -1.0), 1.0)
-        # Friction in the direction that the law leans to; from rest that which it breaks.
-        sign, pace = copysign(1.0, lean), abs(speed)
+        # Dry friction in the direction of the lean; from rest the one to overcome.
+        sign, modulus = copysign(1.0, lean), abs(speed)
         ahead = 1.0 if lean > 0.0 else law.withdrawal
-        dry = law.force(sign * pace, sign * inf) - sign * ahead * law.viscous * pace
+        dry = law.force(sign * modulus, sign * inf) - sign * ahead * law.viscous * modulus
         viscous = law.viscous * speed * (1.0 if speed > 0.0 else law.withdrawal)
         return abs(lean) * dry + viscous
-
-    def feedback(self, mass: FloatArray, free: FloatArray) -> FloatArray:
-        """Return the linear law; see `ContinuousLaw.feedback`."""
-        k, m = self.driven, self.model.coordinates
-        wanted = np.zeros((m, 2 * m))
-        wanted[:k, :k], wanted[:k, m : m + k] = -self._gains[0], -self._gains[1]
-        # The forces that turn the accelerations under none into the wanted ones.
-        return np.asarray((mass @ (wanted - free))[:k])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -287,9 +230,9 @@ class ContinuousPid(ContinuousLaw):
         k = self.driven
         ki = np.zeros(k) if self.ki is None else self.ki
         gains = (
-            gain_matrix('kp', self.kp, k),
-            gain_matrix('kd', self.kd, k),
-            gain_matrix('ki', ki, k, may_vanish=True),
+            _gain_matrix('kp', self.kp, k),
+            _gain_matrix('kd', self.kd, k),
+            _gain_matrix('ki', ki, k, may_vanish=True),
         )
         object.__setattr__(self, '_gains', gains)
 
@@ -318,16 +261,6 @@ class ContinuousPid(ContinuousLaw):
         forces[0] = -forces[0]
         return forces
 
-    def feedback(self, mass: FloatArray, free: FloatArray) -> FloatArray:
-        """Return the linear law; see `ContinuousLaw.feedback`."""
-        del mass, free
-        k, m = self.driven, self.model.coordinates
-        gains = np.zeros((k, 2 * m + self.integrals))
-        gains[:, :k], gains[:, m : m + k] = -self._gains[0], -self._gains[1]
-        if self.integrals:
-            gains[:, 2 * m :] = self._gains[2]
-        return gains
-
 
 def acceleration(
     model: NeedleModel, state: ArrayLike, forces: ArrayLike, time: float = 0.0
@@ -354,7 +287,7 @@ def acceleration(
     Raises
     ------
     ShapeError, InsertedLengthError
-        If the state or the forces are not valid.
+        If the state or the forces are invalid.
 
     """
     x, applied = model.checked_state(state), np.array(forces, dtype=float)
@@ -368,107 +301,3 @@ def acceleration(
         modal = model.mass_matrix(x)[_BASE:, _BASE:]
         result[_BASE:] += np.linalg.solve(modal, applied[_BASE:])
     return result
-
-
-def closed_loop(
-    law: ContinuousLaw, plant: NeedleModel, goal: ArrayLike | Callable[[float], ArrayLike]
-) -> Callable[[float, ArrayLike], FloatArray]:
-    """
-    Return the right-hand side of the closed loop, for any ODE solver.
-
-    Parameters
-    ----------
-    law : ContinuousLaw
-        Law.
-    plant : NeedleModel
-        The true needle.
-    goal : array_like, shape (3, 2 + n), or callable
-        Wanted q, q_dot and q_ddot, or a function of time [s] that returns them.
-
-    Returns
-    -------
-    callable
-        ``f(time, y)`` with y = [X, integral of the errors], shape (2 (2 + n) + integrals,).
-
-    Raises
-    ------
-    ParameterError
-        If law and plant do not have the same number of modes.
-
-    """
-    _check_modes(law, plant)
-    m = plant.coordinates
-
-    def derivative(time: float, y: ArrayLike) -> FloatArray:
-        whole = np.asarray(y, dtype=float)
-        x, integral = whole[: 2 * m], whole[2 * m :]
-        now = goal(time) if callable(goal) else goal
-        forces = law.forces(x, now, integral, time)
-        errors = law.errors(x, now)[0][: law.integrals]
-        return np.concatenate([x[m:], acceleration(plant, x, forces, time), errors])
-
-    return derivative
-
-
-def closed_loop_matrix(
-    law: ContinuousLaw,
-    plant: NeedleModel,
-    depth: float,
-    speed: float = 0.0,
-    sliding: str = 'insertion',
-    time: float = 0.0,
-) -> FloatArray:
-    """
-    Linearize the closed loop at a straight needle on its goal, where it has its equilibria.
-
-    Parameters
-    ----------
-    law : ContinuousLaw
-        Law.
-    plant : NeedleModel
-        The true needle.
-    depth, speed : float
-        Inserted length [m] and insertion speed [m/s].
-    sliding : str
-        As in `needle_dynamics.analysis.linearize`: which way it slides if it is at rest.
-    time : float
-        Time [s], for tissue that swells.
-
-    Returns
-    -------
-    ndarray, shape (N, N), N = 2 (2 + n) + integrals
-        Matrix for the deviations of [X, integral of the errors].
-
-    Raises
-    ------
-    ParameterError
-        If law and plant do not have the same number of modes.
-    InsertedLengthError
-        If ``depth`` is outside its range.
-
-    """
-    _check_modes(law, plant)
-    m, k = plant.coordinates, law.driven
-    rows = {}
-    for model in (plant, law.model):
-        state = operating_point(model, depth, 0.0, speed)
-        system = linearize(model, state, time=time, sliding=sliding)
-        rows[id(model)] = model.mass_matrix(state), system.A[m:]
-    mass, free = rows[id(plant)]
-    feedback = law.feedback(*rows[id(law.model)])
-    matrix = np.zeros((2 * m + law.integrals,) * 2)
-    matrix[:m, m : 2 * m] = np.eye(m)
-    matrix[m : 2 * m, : 2 * m] = free
-    driven = np.zeros((m, feedback.shape[1]))
-    driven[:k] = feedback
-    matrix[m : 2 * m, : feedback.shape[1]] += np.linalg.solve(mass, driven)
-    matrix[2 * m :, : law.integrals] = -np.eye(law.integrals)
-    return matrix
-
-
-def _check_modes(law: ContinuousLaw, plant: NeedleModel) -> None:
-    if law.model.coordinates != plant.coordinates:
-        raise ParameterError(
-            f'the law must have the {plant.modes.count} modes of the plant, got '
-            f'{law.model.modes.count}'
-        )

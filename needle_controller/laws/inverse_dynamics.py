@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from needle_controller.compiled import laws as kernels
-from needle_controller.laws.axis import Law
+from needle_controller.compiled.laws import INVERSE_DYNAMICS
+from needle_controller.laws.law import Law
 from needle_ros.settings import check_constants, constant
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class InverseDynamicsGains:
-    """Gains of the closed loop e_ddot + kv e_dot + kp e = 0, per axis."""
+    """Gains of the closed loop e_ddot + kv e_dot + kp e = 0 on one axis."""
 
     kp: float = constant(900.0, '1/s^2', 'position gain k_p')
     kv: float = constant(60.0, '1/s', 'speed gain k_v')
@@ -23,12 +23,21 @@ class InverseDynamicsGains:
     def __post_init__(self) -> None:
         check_constants(self)
 
-    def slots(self) -> dict[str, float]:
-        """Return the gains by the names of their slots in `needle_controller.compiled.laws`."""
-        return {'LAW': kernels.INVERSE_DYNAMICS, 'KP': self.kp, 'KD': self.kv}
-
     def scaled(self, factor: float) -> InverseDynamicsGains:
-        """Return all gains times a factor."""
+        """
+        Return all gains multiplied by a factor.
+
+        Parameters
+        ----------
+        factor : float
+            Factor.
+
+        Returns
+        -------
+        InverseDynamicsGains
+            Other gains.
+
+        """
         return replace(self, kp=factor * self.kp, kv=factor * self.kv)
 
 
@@ -42,11 +51,10 @@ class InverseDynamics(Law):
 
     .. math:: f = \mu_v \frac{u + h a - u e^{-x}}{1 - e^{-x}}, \quad x = \mu_v h / M
 
-    which tends to M a + mu_v u as h -> 0 (the continuous law), and to mu_v at the predicted
-    speed when friction is fast against the period; on an axis with stiffness its response takes
-    the place of the exponential. Coulomb friction is compensated in the direction of the
-    predicted speed: at rest that is the direction of the wanted acceleration, so that the law
-    breaks away.
+    It tends to M a + mu_v u as h -> 0 (the continuous law), and to mu_v times the predicted
+    speed if friction is fast compared with the period. Coulomb friction is compensated in the
+    direction of the predicted speed. At rest that is the direction of the wanted acceleration,
+    so that the law breaks away.
 
     Attributes
     ----------
@@ -58,8 +66,9 @@ class InverseDynamics(Law):
     gains: InverseDynamicsGains
 
     def __post_init__(self) -> None:
-        self._set_constants(self.gains.breakaway_speed, **self.gains.slots())
+        gains = self.gains
+        self._set_constants(gains.breakaway_speed, kind=INVERSE_DYNAMICS, kp=gains.kp, kd=gains.kv)
 
     def scaled(self, factor: float) -> InverseDynamics:
-        """Return the same law with all gains times a factor."""
+        """Return the law with all gains multiplied by a factor; see `Law.scaled`."""
         return replace(self, gains=self.gains.scaled(factor))

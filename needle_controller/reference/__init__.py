@@ -1,1 +1,1 @@
-"""References: the motion that a law follows."""
+"""References: where the needle should be over time, within limits of speed and acceleration."""

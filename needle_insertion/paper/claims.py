@@ -15,9 +15,7 @@ from functools import cache
 from math import cosh, pi, sin, sinh, sqrt
 from typing import Final
 
-from needle_controller import Pid, PidGains, stability_limit
-from needle_controller.in_loop import LoopRun, run_continuous
-from needle_controller.laws.axis import Axis
+from needle_controller import Axis, LoopRun, Pid, PidGains, run_continuous, stability_limit
 from needle_dynamics import FloatArray, Integrator, NeedleModel, NeedleParameters
 from needle_dynamics.analysis import Analysis, analyze, linearize, operating_point
 from needle_dynamics.compiled.kernels import decay_means

@@ -18,8 +18,13 @@ from typing import Final
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from needle_controller import ContinuousInverseDynamics, ContinuousLaw, ContinuousPid
-from needle_controller.in_loop import LoopRun, run_continuous
+from needle_controller import (
+    ContinuousInverseDynamics,
+    ContinuousLaw,
+    ContinuousPid,
+    LoopRun,
+    run_continuous,
+)
 from needle_dynamics import (
     FloatArray,
     FORMULATIONS,

@@ -18,14 +18,15 @@ from needle_controller import (
     InverseDynamics,
     InverseDynamicsGains,
     Law,
+    LoopBatch,
     MinimumJerk,
     Pid,
     PidGains,
     ReferenceLimits,
+    run_batch,
     Setpoint,
 )
-from needle_controller.in_loop import LoopBatch, run_batch
-from needle_controller.laws.axis import BREAKAWAY_TIME
+from needle_controller.laws.law import BREAKAWAY_TIME
 from needle_dynamics import FloatArray, NeedleModel, NeedleParameters
 from needle_insertion.paper.figures import LAW_COLORS, LAWS
 from needle_insertion.report.picture import Picture

@@ -3,8 +3,7 @@
 from math import exp, sqrt
 
 from matplotlib.figure import Figure
-from needle_controller import ContinuousPid
-from needle_controller.in_loop import run_continuous
+from needle_controller import ContinuousPid, run_continuous
 from needle_dynamics import Integrator, NeedleParameters
 from needle_insertion.paper import figures
 from needle_insertion.paper.figures import (

@@ -5,8 +5,6 @@ from typing import Any
 
 from needle_controller import (
     Axis,
-    closed_loop,
-    closed_loop_matrix,
     ContinuousInverseDynamics,
     ContinuousPid,
     InverseDynamics,
@@ -30,6 +28,7 @@ from numpy.testing import assert_allclose
 import pytest
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
+from support.closed_loop import closed_loop
 
 #: Friction slow enough for explicit solvers, and so weak that PID does not get stuck in it.
 MODEL = NeedleModel(
@@ -139,64 +138,6 @@ def test_the_law_may_believe_in_another_needle() -> None:
     assert_allclose(
         MODEL.inverse_dynamics(state, rate[4:]), law.forces(state, goal(0.0)), rtol=1e-9
     )
-
-
-LAWS = {
-    'inverse_dynamics': lambda model, size, actuation: ContinuousInverseDynamics(
-        model=model,
-        actuation=actuation,
-        kp=matrix([900.0, 400.0, 1600.0, 2500.0][:size], 20.0),
-        kv=matrix([60.0, 40.0, 30.0, 20.0][:size], 5.0),
-    ),
-    'pid': lambda model, size, actuation: ContinuousPid(
-        model=model,
-        actuation=actuation,
-        kp=matrix([50.0, 1e-6, 20.0, 30.0][:size], 1e-7),
-        kd=matrix([3.0, 1e-8, 0.1, 0.2][:size]),
-        ki=matrix([40.0, 1e-6, 9.0, 0.0][:size]),
-    ),
-}
-
-
-@pytest.mark.parametrize('kind', LAWS)
-@pytest.mark.parametrize(('actuation', 'size'), [('physical', 2), ('modal', 4)])
-@pytest.mark.parametrize('speed', [0.0, 0.01])
-def test_the_closed_loop_matrix_is_the_derivative(
-    kind: str, actuation: str, size: int, speed: float
-) -> None:
-    """Differences of the closed loop around a straight needle, the law believing in another."""
-    other = NeedleModel(replace(MODEL.parameters, viscous_friction=0.3, tissue_stiffness=400.0))
-    plant = NeedleModel(replace(MODEL.parameters, coulomb_friction=0.0))
-    law = LAWS[kind](NeedleModel(replace(other.parameters, coulomb_friction=0.0)), size, actuation)
-    found = closed_loop_matrix(law, plant, 0.1, speed)
-    point = np.zeros(8 + law.integrals)
-    point[0], point[4] = 0.1, -speed
-    aim = np.zeros((3, 4))
-    aim[0, 0], aim[1, 0] = 0.1, -speed
-    field = closed_loop(law, plant, aim)
-    # A step for each coordinate: lengths, angles, and modal coordinates of 1e-6.
-    steps = np.full(len(point), 1e-6)
-    columns = [
-        (field(0.0, point + step * unit) - field(0.0, point - step * unit)) / (2.0 * step)
-        for step, unit in zip(steps, np.eye(len(point)), strict=True)
-    ]
-    # Rounding of q_ddot over the step, and its second derivative by the depth.
-    scale = np.abs(found).max(axis=1, keepdims=True) + 1.0
-    assert_allclose(np.transpose(columns) / scale, found / scale, rtol=0.0, atol=1e-5)
-
-
-@pytest.mark.parametrize('actuation', ['physical', 'modal'])
-def test_inverse_dynamics_puts_the_poles_where_its_gains_say(actuation: str) -> None:
-    """Poles of s^2 + k_v s + k_p for each driven coordinate, with the law's own model."""
-    size = 2 if actuation == 'physical' else 4
-    law = ContinuousInverseDynamics(
-        model=MODEL, actuation=actuation, kp=np.full(size, 500.0), kv=np.full(size, 60.0)
-    )
-    poles = np.linalg.eigvals(closed_loop_matrix(law, MODEL, 0.1))
-    near = np.abs(poles[:, np.newaxis] - np.roots([1.0, 60.0, 500.0])).min(axis=0)
-    # Rounding of forces against a stiffness of 1e7.
-    assert near.max() < 1e-4
-    assert np.sum(np.abs(poles) < 100.0) == 2 * size
 
 
 # Convergence.
@@ -309,6 +250,3 @@ def test_bad_arguments_are_named() -> None:
         pid.forces(moving(), np.zeros(4), [0.0, 0.0])
     with pytest.raises(ShapeError, match=r'forces must be finite with shape \(4,\)'):
         acceleration(MODEL, moving(), [1.0, 2.0])
-    plant = NeedleModel(NeedleParameters.preset('phantom', modes=1))
-    with pytest.raises(ParameterError, match='must have the 1 modes of the plant, got 2'):
-        closed_loop(pid, plant, goal)

@@ -1,6 +1,7 @@
 """The controller as an object, around the true needle."""
 
 from math import inf, nan
+from typing import Any
 
 from needle_controller import (
     Command,
@@ -9,7 +10,6 @@ from needle_controller import (
     InverseDynamicsGains,
     Measurement,
     PidGains,
-    ReferenceLimits,
     Setpoint,
 )
 from needle_controller.compiled.laws import INTEGRAL
@@ -24,15 +24,7 @@ def controller(
     law: str = 'inverse_dynamics', preset: str = 'phantom', **changes: float
 ) -> Controller:
     """Return a controller with default gains."""
-    return Controller(
-        law,
-        NeedleParameters.preset(preset),
-        ControllerSettings(**changes),
-        inverse_dynamics=(InverseDynamicsGains(), InverseDynamicsGains()),
-        pid=(PidGains(), PidGains(kp=2.1e-7, ki=0.0, kd=2.1e-8)),
-        reference='trapezoid',
-        limits=ReferenceLimits(),
-    )
+    return Controller(NeedleParameters.preset(preset), law, settings=ControllerSettings(**changes))
 
 
 def insert(
@@ -142,7 +134,7 @@ def test_constants_that_its_gains_cannot_bear_are_refused() -> None:
     """Less friction than the gains need is refused with what would do; the law stays."""
     steering, other = controller('pid'), controller('pid')
     thin = NeedleParameters.preset('phantom', viscous_friction=0.3)
-    with pytest.raises(ParameterError, match=r'pid.insertion gains cannot be stable at 1000 Hz'):
+    with pytest.raises(ParameterError, match=r'pid.insertion gains are unstable at 1000 Hz'):
         steering.change(thin)
     measured = Measurement(time=0.5, depth=0.021, speed=1e-3)
     for each in (steering, other):
@@ -174,6 +166,43 @@ def test_unknown_names_are_listed() -> None:
         controller('sliding_mode')
 
 
+@pytest.mark.parametrize(
+    ('gains', 'reason'),
+    [
+        ({'lqr': {'insertion': PidGains()}}, 'unknown gains lqr.insertion; valid: inverse_dyn'),
+        ({'pid': {'deflection': PidGains()}}, 'with insertion and rotation'),
+        ({'pid': {'rotation': InverseDynamicsGains()}}, 'pid.rotation must be PidGains'),
+    ],
+)
+def test_gains_of_other_names_or_laws_are_rejected(gains: Any, reason: str) -> None:
+    """Only the gains of a law on its axes are taken."""
+    with pytest.raises(ParameterError, match=reason):
+        Controller(NeedleParameters.preset('phantom'), gains=gains)
+
+
+def test_gains_that_are_not_given_have_their_defaults() -> None:
+    """A robot without rotation gives gains of insertion only; a change keeps the others."""
+    plain = Controller(NeedleParameters.preset('phantom'), 'pid')
+    given = Controller(
+        NeedleParameters.preset('phantom'), 'pid', gains={'pid': {'insertion': PidGains()}}
+    )
+    measured = Measurement(time=0.0, depth=0.02, speed=0.0, angle=0.1)
+    for each in (plain, given):
+        each.set_target(0.05)
+        each.change(gains={'inverse_dynamics': {'insertion': InverseDynamicsGains(kp=400.0)}})
+    assert plain.command(measured) == given.command(measured)
+    assert plain.command(measured).torque < 0.0
+
+
+def test_the_printed_formulation_is_rejected() -> None:
+    """It is for the model and the integrator; a controller has the complete equations."""
+    printed = NeedleParameters.preset('phantom', formulation='as_printed')
+    with pytest.raises(ParameterError, match=r"formulation must be 'complete'.* got 'as_printed'"):
+        Controller(printed)
+    with pytest.raises(ParameterError, match="formulation must be 'complete'"):
+        controller().change(printed)
+
+
 def test_fractional_delay_is_refused() -> None:
     """A delay is a whole number of periods."""
     with pytest.raises(ParameterError, match='whole number'):
@@ -197,7 +226,7 @@ def test_a_switch_in_motion_goes_on_with_the_last_force(switch: str) -> None:
             steering.change(law='pid')
         elif i == 2000:
             stiff = InverseDynamicsGains(kp=2500.0, kv=100.0)
-            steering.change(inverse_dynamics=(stiff, InverseDynamicsGains()))
+            steering.change(gains={'inverse_dynamics': {'insertion': stiff}})
         measured = Measurement(time=i * PERIOD, depth=needle.depth, speed=needle.speed)
         forces.append(steering.command(measured).force)
         waiting.append(forces[-1])
@@ -213,8 +242,9 @@ def test_a_switch_in_motion_goes_on_with_the_last_force(switch: str) -> None:
 def test_a_switch_to_gains_that_cannot_be_stable_is_refused() -> None:
     """The reason names them, and the old law goes on."""
     steering = controller()
-    with pytest.raises(ParameterError, match=r'inverse_dynamics.insertion gains cannot be stable'):
-        steering.change(inverse_dynamics=(InverseDynamicsGains(kv=3000.0), InverseDynamicsGains()))
+    unstable = InverseDynamicsGains(kv=3000.0)
+    with pytest.raises(ParameterError, match=r'inverse_dynamics.insertion gains are unstable'):
+        steering.change(gains={'inverse_dynamics': {'insertion': unstable}})
     with pytest.raises(ParameterError, match='valid: inverse_dynamics, pid'):
         steering.change(law='bang_bang')
     assert steering.law == 'inverse_dynamics'
@@ -260,7 +290,7 @@ def test_a_needle_that_is_elsewhere_for_good_is_not_driven_to_the_old_target() -
         for i in range(100)
     ]
     assert [c.notice for c in commands if c.notice] == [
-        'the needle is 0.010000 m from where it was before the fault; the target is forgotten'
+        'the needle has moved by 0.010000 m since the fault; the target is cleared'
     ]
     assert steering.target is None
     assert not any(c.force for c in commands[51:])
@@ -303,7 +333,7 @@ def test_a_gap_or_a_step_back_in_time_starts_the_motion_anew(step: float) -> Non
         if i == 0:
             assert after.setpoint.position == where
             assert after.setpoint.speed == 0.0
-            assert f'went on after {7.001 if step > 0 else -6.999:.3f} s' in after.notice
+            assert f'continued after {7.001 if step > 0 else -6.999:.3f} s' in after.notice
         else:
             assert after.notice is None
     assert steering.target == 0.05
@@ -327,5 +357,5 @@ def test_a_range_of_depths_bounds_the_targets() -> None:
     for depth in (0.01, 0.11):
         with pytest.raises(ParameterError, match=r'must be in \[0.02, 0.1\] m'):
             steering.set_target(depth)
-    with pytest.raises(ParameterError, match='lowest_depth and highest_depth must leave some'):
+    with pytest.raises(ParameterError, match='lowest_depth and highest_depth must leave a part'):
         controller(lowest_depth=0.3)

@@ -4,27 +4,27 @@ from dataclasses import replace
 from typing import Any
 
 from needle_controller import (
+    Axis,
+    Command,
     ContinuousInverseDynamics,
     ContinuousPid,
     Controller,
     ControllerSettings,
     InverseDynamics,
     InverseDynamicsGains,
+    LoopBatch,
+    LoopRun,
+    Measurement,
     MinimumJerk,
     Pid,
     PidGains,
     ReferenceLimits,
-    SampledLoop,
-    Setpoint,
-)
-from needle_controller.in_loop import (
-    LoopBatch,
     run_batch,
     run_continuous,
     run_controller,
-    tip_deflections,
+    SampledLoop,
+    Setpoint,
 )
-from needle_controller.laws.axis import Axis
 from needle_dynamics import (
     InsertedLengthError,
     Integrator,
@@ -164,10 +164,10 @@ def test_agrees_with_the_sampled_law_inside_the_integrator() -> None:
 
 def test_refuses_what_it_cannot_run() -> None:
     law = pid(2.0, 0.01)
-    with pytest.raises(ShapeError, match='times must be at least two that ascend'):
+    with pytest.raises(ShapeError, match='times must be at least two, increasing'):
         run_continuous(law, MODEL, STRAIGHT, goal(0.16), [0.0])
     other = NeedleModel(NeedleParameters(modes=1))
-    with pytest.raises(ParameterError, match='1 modes of the plant'):
+    with pytest.raises(ParameterError, match='same number of modes, got 2 and 1'):
         run_continuous(law, other, other.state_at(0.1), goal(0.1), [0.0, 1.0])
     with pytest.raises(InsertedLengthError, match='left its range'):
         run_continuous(law, MODEL, STRAIGHT, goal(-0.5), np.linspace(0.0, 20.0, 3))
@@ -178,7 +178,9 @@ def test_tips_of_many_states_are_those_of_each() -> None:
     states = np.array([MODEL.state_at(depth, 1e-3 * depth) for depth in (0.02, 0.1, 0.2)])
     found = [MODEL.tip_deflection(x) for x in states]
     # Closed form here, series there: rounding of cosh and sinh at small depth.
-    assert_allclose(tip_deflections(MODEL, states), found, rtol=1e-9)
+    assert_allclose(
+        LoopRun(MODEL, np.zeros(3), states, np.zeros((3, 4))).tip_deflection, found, rtol=1e-9
+    )
 
 
 # Sampled loops.
@@ -220,18 +222,14 @@ def test_a_batch_is_the_controller_of_the_node(name: str, delay: int) -> None:
     )  # fmt: skip
     for i, plant in enumerate(needles):
         controller = Controller(
-            name,
             BELIEVED,
-            ControllerSettings(delay=float(delay), force_limit=2.0),
-            inverse_dynamics=(inverse, InverseDynamicsGains()),
-            pid=(gains, PidGains(kp=1e-6, ki=1e-6, kd=1e-8)),
+            name,
+            gains={'inverse_dynamics': {'insertion': inverse}, 'pid': {'insertion': gains}},
+            settings=ControllerSettings(delay=float(delay), force_limit=2.0),
             reference='minimum_jerk',
-            limits=ReferenceLimits(),
         )
         controller.set_target(0.024)
-        run = run_controller(
-            controller, plant, START, period=PERIOD, delay=delay, duration=DURATION, step=1e-4
-        )
+        run = run_controller(controller, plant, START, duration=DURATION, step=1e-4)
         # 1e-9: the same arithmetic, but for what the compiler may join.
         assert_allclose(batch.depths[i], run.depth, rtol=1e-9)
         assert_allclose(batch.states[i], run.states[-1], rtol=1e-9, atol=1e-12)
@@ -241,6 +239,39 @@ def test_a_batch_is_the_controller_of_the_node(name: str, delay: int) -> None:
         assert_allclose(batch.largest[i], np.abs(error).max(), rtol=1e-6)
         assert_allclose(batch.rms[i], np.sqrt((error**2).mean()), rtol=1e-6)
         assert batch.completed[i] == len(run.time) - 1
+
+
+class Proportional:
+    """A law of the user: a force in proportion to the error, and a torque."""
+
+    period, delay = PERIOD, 2
+
+    def __init__(self) -> None:
+        self.seen: list[Measurement] = []
+        self.loads: list[float] = []
+
+    def command(self, measured: Measurement, load: float = 0.0) -> Command:
+        self.seen.append(measured)
+        self.loads.append(load)
+        return Command(force=2000.0 * (0.024 - measured.depth), torque=1e-9)
+
+
+def test_an_own_law_runs_in_the_loop() -> None:
+    """Its commands act after its delay, on what the encoders measured; the load on request."""
+    own = Proportional()
+    run = run_controller(own, BELIEVED, START, duration=0.1)
+    assert len(own.seen) == len(run.time) - 1 == 100
+    assert_allclose([m.depth for m in own.seen], run.depth[:-1], rtol=1e-15)
+    assert (run.forces[:2, :2] == 0.0).all()
+    assert_allclose(run.forces[2:-1, 0], 2000.0 * (0.024 - run.depth[:-3]), rtol=1e-12)
+    assert (run.forces[2:, 1] == 1e-9).all()
+    assert not any(own.loads)
+    assert run.depth[-1] > run.depth[0]
+    told = Proportional()
+    run = run_controller(told, BELIEVED, START, duration=0.02, ground_truth=True)
+    model = NeedleModel(BELIEVED)
+    expected = [-model.bias_forces(x)[0] for x in run.states[:-1]]
+    assert_allclose(told.loads, expected, rtol=1e-12)
 
 
 def test_a_batch_does_not_depend_on_threads_nor_on_its_step() -> None:
@@ -268,10 +299,10 @@ def test_a_needle_that_leaves_its_range_is_told_apart() -> None:
 def test_a_batch_refuses_what_does_not_agree() -> None:
     law = Pid(axis=Axis.insertion(BELIEVED), gains=PidGains(), period=PERIOD)
     options: Any = {'delay': 1, 'limit': 15.0, 'duration': 0.1}
-    with pytest.raises(ShapeError, match='one number of runs'):
+    with pytest.raises(ShapeError, match='same number of runs'):
         run_batch([law, law], plants(3), START, REFERENCE, **options)
     other = Pid(axis=law.axis, gains=PidGains(), period=2e-3)
-    with pytest.raises(ParameterError, match='one period'):
+    with pytest.raises(ParameterError, match='same period'):
         run_batch([law, other], BELIEVED, START, REFERENCE, **options)
     with pytest.raises(ParameterError, match='duration must be'):
         run_batch(law, BELIEVED, START, REFERENCE, delay=1, limit=15.0, duration=0.0)

@@ -1,6 +1,6 @@
 """What the sampled laws do to the axes they believe in."""
 
-from math import isfinite
+from math import inf, isfinite
 from typing import Any
 
 from hypothesis import given, settings
@@ -95,7 +95,7 @@ def test_pid_is_evaluated_at_the_end_of_the_period(
     # Rounding of terms of the size of the gains.
     scale = 100.0
     assert abs(force - expected) < 1e-11 * scale
-    law.remember(position, speed, aim, memory, force, force)
+    assert law.step(position, speed, aim, memory, 0.0, inf) == force
     assert abs(memory[RATE] - low) < 1e-11 * scale
 
 
@@ -282,7 +282,7 @@ def test_a_stopped_loop_keeps_what_it_knows() -> None:
         loop.command(0.05, 0.0, Setpoint(0.051))
     integral = loop.memory[INTEGRAL]
     loop.stop()
-    assert list(loop.on_the_way) == [0.0, 0.0]
+    assert list(loop.pending) == [0.0, 0.0]
     assert loop.memory[INTEGRAL] == integral > 0.0
     loop.reset()
     assert not loop.memory.any()

@@ -228,8 +228,8 @@ def test_gains_that_cannot_be_stable_are_named() -> None:
     """The refusal names the gains, the rate, what was found and what would do."""
     law = InverseDynamics(axis=PHANTOM, gains=InverseDynamicsGains(kv=3000.0), period=PERIOD)
     words = (
-        r'my gains cannot be stable at 1000 Hz with a delay of 2 periods: spectral radius .* '
-        r'must be < 1; all of them times ([\d.]+) would be'
+        r'my gains are unstable at 1000 Hz with a delay of 2 periods: spectral radius .* '
+        r'must be < 1; all of them times ([\d.]+) would be stable'
     )
     with pytest.raises(ParameterError, match=words) as refusal:
         check_stability(law, 1, 'my gains')

@@ -7,7 +7,7 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PointStamped
-from needle_controller import closed_loop, ContinuousInverseDynamics
+from needle_controller import ContinuousInverseDynamics
 from needle_dynamics import FloatArray, NeedleModel, NeedleParameters
 from needle_identification.bags.bag import Bag, deserialize, encode
 from needle_identification.recorder_node import is_hidden
@@ -22,6 +22,7 @@ from rosgraph_msgs.msg import Clock
 from scipy.integrate import solve_ivp
 from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool
+from support.closed_loop import closed_loop
 
 START, TARGET, DURATION, RATE = 0.02, 0.12, 10.0, 1000.0
 

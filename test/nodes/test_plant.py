@@ -712,7 +712,7 @@ def test_the_controller_takes_friction_live_if_its_gains_can_bear_it(ros_graph: 
     assert node.set_parameters(friction[:1])[0].successful
     refused = node.set_parameters(friction[1:])[0]
     assert not refused.successful
-    assert refused.reason.startswith('pid.insertion gains cannot be stable at 200 Hz')
+    assert refused.reason.startswith('pid.insertion gains are unstable at 200 Hz')
     assert node.get_parameter('model.viscous_friction').value == 200.0
 
 

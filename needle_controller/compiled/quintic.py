@@ -1,0 +1,67 @@
+"""Extreme values of polynomials of fifth order."""
+
+from __future__ import annotations
+
+from needle_dynamics.arrays import FloatArray
+from needle_dynamics.compiled.cache import compiled
+import numpy as np
+
+
+@compiled
+def _value(c: FloatArray, x: float) -> float:
+    """Return the value of a polynomial at x; the constant coefficient comes first."""
+    value = 0.0
+    for j in range(len(c) - 1, -1, -1):
+        value = value * x + c[j]
+    return value
+
+
+@compiled
+def quintic_extremes(c: FloatArray) -> FloatArray:
+    """
+    Return the extreme values of a quintic and of its first two derivatives on [0, 1].
+
+    Parameters
+    ----------
+    c : ndarray, shape (6,)
+        Coefficients, the constant one first.
+
+    Returns
+    -------
+    ndarray, shape (3, 2)
+        Least and largest value of each.
+
+    """
+    derivatives, extremes = np.zeros((6, 6)), np.empty((3, 2))
+    derivatives[0] = c
+    for k in range(1, 6):
+        for j in range(6 - k):
+            derivatives[k, j] = (j + 1) * derivatives[k - 1, j + 1]
+    # Between two turning points a polynomial has at most one root. The roots of each derivative,
+    # beginning with the linear one, are the turning points of the derivative before it.
+    turns, count = np.array([0.0, 1.0, 0.0, 0.0, 0.0, 0.0]), 2
+    found = turns.copy()
+    for k in range(4, -1, -1):
+        values = np.array([_value(derivatives[k], turns[i]) for i in range(count)])
+        if k < 3:
+            extremes[k, 0], extremes[k, 1] = values.min(), values.max()
+        if k == 0:
+            break
+        number = 1
+        for i in range(count - 1):
+            positive = values[i] > 0.0
+            if (values[i + 1] > 0.0) == positive:
+                continue
+            low, high = turns[i], turns[i + 1]
+            for _ in range(53):
+                middle = 0.5 * (low + high)
+                if (_value(derivatives[k], middle) > 0.0) == positive:
+                    low = middle
+                else:
+                    high = middle
+            found[number] = low
+            number += 1
+        found[number] = 1.0
+        count = number + 1
+        turns[:] = found
+    return extremes

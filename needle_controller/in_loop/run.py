@@ -1,0 +1,47 @@
+"""The result of one run of a closed loop."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from needle_dynamics import FloatArray, NeedleModel
+import numpy as np
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LoopRun:
+    """
+    One run of a closed loop.
+
+    Attributes
+    ----------
+    model : NeedleModel
+        The plant.
+    time : ndarray, shape (k,)
+        Times [s].
+    states : ndarray, shape (k, 2 (2 + n))
+        States X = [d, theta, q1, ..., qn] and rates.
+    forces : ndarray, shape (k, 2 + n)
+        f_y [N], tau [N m] and generalized forces. For a continuous law at the times, for a
+        sampled one over the periods that begin there.
+    events : tuple of (float, str)
+        When the needle came to rest, broke away or touched the hub [s]; continuous laws only.
+
+    """
+
+    model: NeedleModel
+    time: FloatArray
+    states: FloatArray
+    forces: FloatArray
+    events: tuple[tuple[float, str], ...] = ()
+
+    @property
+    def depth(self) -> FloatArray:
+        """Inserted length [m], shape (k,)."""
+        return np.asarray(self.model.parameters.length - self.states[:, 0])
+
+    @property
+    def tip_deflection(self) -> FloatArray:
+        """Deflection of the tip [m], shape (k,)."""
+        values = self.model.modes.values(self.depth)
+        return np.asarray((values * self.states[:, 2 : self.model.coordinates]).sum(axis=1))

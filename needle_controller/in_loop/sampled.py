@@ -1,0 +1,293 @@
+"""The controller around the simulated needle, once, and its laws around thousands of needles."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from math import isfinite
+import os
+from typing import Protocol
+
+from needle_controller.compiled.loop import run_loop
+from needle_controller.controller import Command, Measurement
+from needle_controller.in_loop.run import LoopRun
+from needle_controller.laws.law import Law
+from needle_controller.reference.setpoint import Reference
+from needle_dynamics import FloatArray, Integrator, NeedleModel, NeedleParameters
+from needle_dynamics.simulated.integrators import DEFAULT_STEP, kernel_constants, kernel_tables
+from needle_ros.errors import ParameterError, ShapeError
+import numpy as np
+from numpy.typing import ArrayLike
+
+
+class Commander(Protocol):
+    """
+    What `run_controller` runs: a `Controller`, or any object of your own like it.
+
+    It is called from Python once in every period; nothing of it needs to be compiled.
+
+    Attributes
+    ----------
+    period : float
+        Sample period [s].
+    delay : int
+        Periods from a measurement to the effect of its command.
+
+    """
+
+    @property
+    def period(self) -> float:
+        """Sample period [s]."""
+
+    @property
+    def delay(self) -> int:
+        """Periods from a measurement to the effect of its command."""
+
+    def command(self, measured: Measurement, load: float = 0.0) -> Command:
+        """
+        Return the command that answers a measurement.
+
+        Parameters
+        ----------
+        measured : Measurement
+            Readings of the encoders.
+        load : float
+            Force of the bent needle against insertion [N]; 0 if it is not known.
+
+        Returns
+        -------
+        Command
+            Force and torque.
+
+        """
+
+
+def run_controller(
+    controller: Commander,
+    plant: NeedleParameters,
+    state: ArrayLike,
+    *,
+    duration: float,
+    step: float = DEFAULT_STEP,
+    ground_truth: bool = False,
+) -> LoopRun:
+    """
+    Run a controller on a simulated needle: the object of the node, or one of your own.
+
+    Parameters
+    ----------
+    controller : Commander
+        A `Controller` with its target set, or an object with ``period``, ``delay`` and
+        ``command`` as described by `Commander`.
+    plant : NeedleParameters
+        The true needle.
+    state : array_like, shape (2 (2 + n),)
+        Initial state.
+    duration : float
+        Time to simulate [s].
+    step : float
+        Longest step of the integrator [s].
+    ground_truth : bool
+        Tell the controller the load of the bent needle, as an observer without error would.
+
+    Returns
+    -------
+    LoopRun
+        Samples at the times of the measurements and one more. Each force acts over the period
+        that begins there.
+
+    Raises
+    ------
+    InsertedLengthError
+        If the needle leaves its range.
+
+    Examples
+    --------
+    >>> from needle_controller import Command, Controller, run_controller
+    >>> from needle_dynamics import NeedleModel, NeedleParameters
+    >>> plant = NeedleParameters.preset('phantom')
+    >>> start = NeedleModel(plant).state_at(0.02)
+    >>> controller = Controller(plant)
+    >>> controller.set_target(0.022)
+    >>> run = run_controller(controller, plant, start, duration=0.5)
+    >>> bool(abs(run.depth[-1] - 0.022) < 2e-5)
+    True
+
+    A law of your own, here a proportional one:
+
+    >>> class Proportional:
+    ...     period, delay = 1e-3, 1
+    ...     def command(self, measured, load=0.0):
+    ...         return Command(force=2000.0 * (0.022 - measured.depth))
+    >>> run = run_controller(Proportional(), plant, start, duration=0.5)
+    >>> bool(run.depth[-1] < 0.022)
+    True
+
+    """
+    integrator, period = Integrator(plant, state, step), controller.period
+    model, count = integrator.model, round(duration / period)
+    time = np.arange(count + 1, dtype=np.float64) * period
+    states = np.empty((count + 1, 2 * model.coordinates))
+    forces = np.zeros((count + 1, model.coordinates))
+    m, pending = model.coordinates, deque([(0.0, 0.0)] * controller.delay)
+    for k in range(count):
+        states[k] = x = integrator.state
+        measured = Measurement(
+            time=float(time[k]),
+            depth=integrator.depth,
+            speed=integrator.speed,
+            angle=float(x[1]),
+            angular_speed=float(x[m + 1]),
+        )
+        load = -float(model.bias_forces(x, measured.time)[0]) if ground_truth else 0.0
+        command = controller.command(measured, load)
+        pending.append((float(command.force), float(command.torque)))
+        applied = pending.popleft()
+        forces[k, :2] = applied
+        integrator.time = float(time[k])
+        integrator.advance(period, *applied)
+    states[count], forces[count] = integrator.state, forces[count - 1]
+    return LoopRun(model, time, states, forces)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LoopBatch:
+    """
+    Many runs of sampled laws.
+
+    Attributes
+    ----------
+    final, largest, rms : ndarray, shape (runs,)
+        Goal minus inserted length [m]: at the end, the largest in modulus, and the root mean
+        square.
+    states : ndarray, shape (runs, 2 (2 + n))
+        States at the end.
+    completed : ndarray, shape (runs,)
+        Periods completed before the needle left its range.
+    depths : ndarray, shape (runs, k + 1) or (runs, 0)
+        Inserted lengths at the times of the measurements [m], if they were kept.
+
+    """
+
+    final: FloatArray
+    largest: FloatArray
+    rms: FloatArray
+    states: FloatArray
+    completed: FloatArray
+    depths: FloatArray
+
+
+def run_batch(
+    laws: Law | Sequence[Law],
+    plants: NeedleParameters | Sequence[NeedleParameters],
+    states: ArrayLike,
+    reference: Reference,
+    *,
+    delay: int,
+    limit: float,
+    duration: float,
+    step: float = DEFAULT_STEP,
+    keep: bool = False,
+    workers: int | None = None,
+    progress: Callable[[], object] | None = None,
+) -> LoopBatch:
+    """
+    Run sampled laws of insertion on many needles, on all cores, as `run_controller` does.
+
+    The loop is compiled, so that the laws are those of this package: `InverseDynamics` and `Pid`.
+    Rotation is not coupled to insertion; here it rests. The laws do not know any load.
+
+    Parameters
+    ----------
+    laws : Law or sequence of Law
+        Law of insertion, for all runs or for each.
+    plants : NeedleParameters or sequence of them
+        The true needles.
+    states : array_like, shape (runs, 2 (2 + n)) or (2 (2 + n),)
+        Initial states.
+    reference : Reference
+        Motion to follow.
+    delay : int
+        Periods from a measurement to the effect of its command.
+    limit : float
+        Largest force [N].
+    duration : float
+        Time to simulate [s].
+    step : float
+        Longest step of the integrator [s].
+    keep : bool
+        Keep the inserted lengths of all periods.
+    workers : int, optional
+        Threads; one per core if not given.
+    progress : callable, optional
+        Called after each run.
+
+    Returns
+    -------
+    LoopBatch
+        Results; they do not depend on the number of threads.
+
+    Raises
+    ------
+    ShapeError
+        If the numbers of runs do not agree.
+    ParameterError, InsertedLengthError
+        If a value is invalid.
+
+    """
+    each_law = [laws] if isinstance(laws, Law) else list(laws)
+    each = [plants] if isinstance(plants, NeedleParameters) else list(plants)
+    starts = np.atleast_2d(np.array(states, dtype=float))
+    sizes = {len(each_law), len(each), len(starts)} - {1}
+    if len(sizes) > 1 or 0 in sizes:
+        raise ShapeError(
+            f'laws, plants and states must be for the same number of runs, got {len(each_law)}, '
+            f'{len(each)} and {len(starts)}'
+        )
+    periods = {law.period for law in each_law}
+    if len(periods) > 1:
+        raise ParameterError(f'laws must have the same period, got {sorted(periods)} s')
+    period = periods.pop()
+    if not (isfinite(duration) and duration >= period and step > 0.0 and delay >= 0):
+        raise ParameterError(
+            f'duration must be finite and >= {period:g} s, step > 0 and delay >= 0, got '
+            f'{duration!r}, {step!r} and {delay!r}'
+        )
+    count, runs = round(duration / period), sizes.pop() if sizes else 1
+    # What a command aims at: the reference when it takes effect.
+    setpoints = np.array([reference.at(k * period + delay * period) for k in range(count)])
+    goal = np.array([reference.at(k * period).position for k in range(count + 1)])
+    models = [NeedleModel(p) for p in each]
+    needles = [(kernel_constants(model), kernel_tables(model)) for model in models]
+    ends = np.array(
+        [models[i % len(models)].checked_state(starts[i % len(starts)]) for i in range(runs)]
+    )
+    errors, completed = np.empty((runs, 3)), np.empty(runs)
+    depths = np.full((runs, count + 1 if keep else 0), np.nan)
+
+    def run(share: range) -> None:
+        for i in share:
+            law = each_law[i % len(each_law)]
+            axis = law.axis.inertia, law.axis.coulomb, law.axis.viscous
+            completed[i] = run_loop(
+                *needles[i % len(needles)], ends[i], law.packed, axis, float(limit), setpoints,
+                goal, np.zeros(delay), float(step), depths[i], errors[i],
+            )  # fmt: skip
+            if progress is not None:
+                progress()
+
+    # The first run compiles the loop before the threads need it.
+    run(range(1))
+    workers = min(workers or os.cpu_count() or 1, runs)
+    with ThreadPoolExecutor(workers) as pool:
+        list(pool.map(run, [range(1 + k, runs, workers) for k in range(workers)]))
+    return LoopBatch(
+        final=errors[:, 0],
+        largest=errors[:, 1],
+        rms=np.sqrt(errors[:, 2]),
+        states=ends,
+        completed=completed,
+        depths=depths,
+    )

@@ -1,0 +1,312 @@
+"""Sampled control laws on one axis, and the loop around one: delay, limit, memory."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections import deque
+from dataclasses import dataclass, field, replace
+from math import exp
+from typing import Any, Final
+
+from needle_controller.compiled.laws import (
+    law_force,
+    law_match,
+    law_step,
+    LawConstants,
+    MEMORY,
+)
+from needle_controller.laws.axis import Axis
+from needle_controller.reference.setpoint import Setpoint
+from needle_dynamics import FloatArray
+from needle_ros.errors import ParameterError
+import numpy as np
+
+#: Coulomb friction is compensated in the direction of the speed that is wanted this much later
+#: [s], or at the end of the period if that is longer: a law then breaks away at any rate.
+BREAKAWAY_TIME: Final = 1e-3
+
+#: Time constant with which the force offset after a switch of laws fades [s].
+HANDOVER_TIME: Final = 0.1
+
+
+def no_memory() -> FloatArray:
+    """
+    Return the memory of a law at the beginning.
+
+    Returns
+    -------
+    ndarray, shape (3,)
+        Integral of the error, filtered rate of the error, and force offset after a switch; zeros.
+
+    """
+    return np.zeros(MEMORY)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Law(ABC):
+    """
+    A sampled control law on one axis. Its memory is kept by its loop.
+
+    Attributes
+    ----------
+    axis : Axis
+        Axis as the law believes it to be.
+    period : float
+        Sample period h [s].
+    constants : LawConstants
+        The law as compiled functions use it.
+
+    """
+
+    axis: Axis
+    period: float
+    constants: LawConstants = field(init=False, repr=False, compare=False)
+    #: The same as a plain tuple.
+    packed: tuple[float, ...] = field(init=False, repr=False, compare=False)
+
+    def _set_constants(self, breakaway_speed: float, **gains: float) -> None:
+        """Make the constants of axis, period and gains."""
+        unused = dict.fromkeys(('ki', 'filter_time', 'tolerance', 'tracking', 'feed_forward'), 0.0)
+        values: dict[str, Any] = {
+            **unused,
+            **self.axis.response(self.period)._asdict(),
+            'period': self.period,
+            'coulomb': self.axis.coulomb,
+            'breakaway_speed': breakaway_speed,
+            'ahead': max(self.period, BREAKAWAY_TIME),
+            'fade': exp(-self.period / HANDOVER_TIME),
+            **gains,
+        }
+        constants = LawConstants(**{name: float(value) for name, value in values.items()})
+        object.__setattr__(self, 'constants', constants)
+        object.__setattr__(self, 'packed', tuple(constants))
+
+    def force(
+        self,
+        position: float,
+        speed: float,
+        setpoint: Setpoint,
+        memory: FloatArray,
+        load: float = 0.0,
+    ) -> float:
+        """
+        Return the force for the next period, before any limit.
+
+        Parameters
+        ----------
+        position, speed : float
+            State of the axis.
+        setpoint : Setpoint
+            Reference.
+        memory : ndarray, shape (3,)
+            As from `no_memory`.
+        load : float
+            Known force against the motion [N].
+
+        Returns
+        -------
+        float
+            Force [N].
+
+        """
+        return law_force(self.packed, memory, _instant(position, speed, setpoint), float(load))
+
+    def step(
+        self,
+        position: float,
+        speed: float,
+        setpoint: Setpoint,
+        memory: FloatArray,
+        load: float,
+        limit: float,
+    ) -> float:
+        """
+        Return the force within a limit and update the memory.
+
+        Parameters
+        ----------
+        position, speed : float
+            State of the axis.
+        setpoint : Setpoint
+            Reference.
+        memory : ndarray, shape (3,)
+            As from `no_memory`; updated.
+        load : float
+            Known force against the motion [N].
+        limit : float
+            Largest force [N].
+
+        Returns
+        -------
+        float
+            Force for the next period [N].
+
+        """
+        instant = _instant(position, speed, setpoint)
+        return law_step(self.packed, memory, instant, float(load), float(limit))
+
+    def match(
+        self,
+        position: float,
+        speed: float,
+        setpoint: Setpoint,
+        memory: FloatArray,
+        load: float,
+        force: float,
+    ) -> None:
+        """
+        Set the memory such that the next force is a given one: a switch without a jump.
+
+        Parameters
+        ----------
+        position, speed : float
+            State of the axis.
+        setpoint : Setpoint
+            Reference.
+        memory : ndarray, shape (3,)
+            As from `no_memory`; overwritten.
+        load : float
+            Known force against the motion [N].
+        force : float
+            Force that the law shall return next [N].
+
+        """
+        instant = _instant(position, speed, setpoint)
+        law_match(self.packed, memory, instant, float(load), float(force))
+
+    def linear(self) -> Law:
+        """
+        Return the law without Coulomb friction, for its poles.
+
+        Returns
+        -------
+        Law
+            A linear law.
+
+        """
+        return replace(self, axis=self.axis.without_coulomb())
+
+    @abstractmethod
+    def scaled(self, factor: float) -> Law:
+        """
+        Return the law with all gains multiplied by a factor.
+
+        Parameters
+        ----------
+        factor : float
+            Factor.
+
+        Returns
+        -------
+        Law
+            The law with other gains.
+
+        """
+
+
+def _instant(position: float, speed: float, setpoint: Setpoint) -> tuple[float, ...]:
+    """Return what a law responds to, as compiled functions take it."""
+    return float(position), float(speed), *setpoint
+
+
+class SampledLoop:
+    """
+    A law with a delay and a force limit.
+
+    A command computed from a measurement takes effect ``delay`` periods later. The law responds
+    to the state predicted for that time from the commands that have not yet taken effect.
+
+    Parameters
+    ----------
+    law : Law
+        Control law.
+    delay : int
+        Periods from measurement to effect.
+    limit : float
+        Largest force [N].
+
+    Attributes
+    ----------
+    law, limit
+        As given.
+    pending : deque of float
+        Commands that have not yet taken effect [N].
+    memory : ndarray, shape (3,)
+        Memory of the law.
+    last : float
+        Last command [N].
+
+    """
+
+    def __init__(self, law: Law, delay: int, limit: float) -> None:
+        self.law = law
+        self.limit = limit
+        self.pending: deque[float] = deque([0.0] * delay, maxlen=delay)
+        self.memory = no_memory()
+        self.last = 0.0
+        self._take_over = False
+
+    def stop(self) -> None:
+        """Discard the pending commands; the memory of the law stays."""
+        for i in range(len(self.pending)):
+            self.pending[i] = 0.0
+        self.last = 0.0
+        self._take_over = False
+
+    def reset(self) -> None:
+        """Discard the pending commands and the memory."""
+        self.stop()
+        self.memory[:] = 0.0
+
+    def switch(self, law: Law) -> None:
+        """
+        Continue with another law, or other gains. Its first force is the last one again.
+
+        Parameters
+        ----------
+        law : Law
+            The new law.
+
+        Raises
+        ------
+        ParameterError
+            If it has another period.
+
+        """
+        if law.period != self.law.period:
+            raise ParameterError(
+                f'the period must stay {self.law.period:g} s, got {law.period!r} s'
+            )
+        self.law = law
+        self._take_over = True
+
+    def command(
+        self, position: float, speed: float, setpoint: Setpoint, load: float = 0.0
+    ) -> float:
+        """
+        Return the force to apply.
+
+        Parameters
+        ----------
+        position, speed : float
+            Measured now.
+        setpoint : Setpoint
+            Reference at the time when the command takes effect.
+        load : float
+            Known force against the motion [N].
+
+        Returns
+        -------
+        float
+            Force within the limit [N].
+
+        """
+        law = self.law
+        for force in self.pending:
+            position, speed = law.axis.propagate(position, speed, force - load, law.period)
+        if self._take_over:
+            self._take_over = False
+            law.match(position, speed, setpoint, self.memory, load, self.last)
+        self.last = force = law.step(position, speed, setpoint, self.memory, load, self.limit)
+        self.pending.append(force)
+        return force

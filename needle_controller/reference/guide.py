@@ -1,0 +1,211 @@
+"""The reference of a controller over time: a target or a path, with pauses."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from needle_controller.reference.path import brake, Joined, Path
+from needle_controller.reference.quintic import halt, MinimumJerk
+from needle_controller.reference.setpoint import Reference, ReferenceLimits, Setpoint
+from needle_controller.reference.trapezoid import Step, Trapezoid
+from needle_ros.errors import ParameterError
+
+#: References to a target by name.
+REFERENCES: dict[str, type[Trapezoid] | type[MinimumJerk] | type[Step]] = {
+    'trapezoid': Trapezoid,
+    'minimum_jerk': MinimumJerk,
+    'step': Step,
+}
+
+
+class Guide:
+    """
+    The reference of a controller: it goes to a target or along a path, and may be paused.
+
+    Every change begins at the present setpoint, with the next call of `at`: the reference does
+    not jump.
+
+    Parameters
+    ----------
+    kind : str
+        Motion to a target, a key of `REFERENCES`.
+    limits : ReferenceLimits
+        Limits.
+    depths : tuple of float
+        Least and largest inserted length [m].
+
+    Attributes
+    ----------
+    paused : bool
+        Whether it is paused.
+    target : float or None
+        Inserted length where the motion ends [m]; None without a target or path.
+
+    Raises
+    ------
+    ParameterError
+        If the kind is unknown.
+
+    """
+
+    def __init__(self, kind: str, limits: ReferenceLimits, depths: tuple[float, float]) -> None:
+        if kind not in REFERENCES:
+            raise ParameterError(f'unknown reference {kind!r}; valid: {", ".join(REFERENCES)}')
+        self._kind = REFERENCES[kind]
+        self._limits, self._depths = limits, depths
+        self._motion: Reference | None = None
+        self._motion_path: Path | None = None
+        self._start = self._now = 0.0
+        #: Time of the path that has passed at the last change [s].
+        self._passed = 0.0
+        self.forget()
+
+    def forget(self) -> None:
+        """Forget target, path and pause."""
+        self.target: float | None = None
+        self._path: Path | None = None
+        self.paused = False
+        self.release()
+
+    def release(self) -> None:
+        """Forget the motion: the next one starts at the needle, to the same target."""
+        self._mark()
+        self._motion = self._motion_path = None
+        self._change: Callable[[Setpoint], Reference] | None = self._plan
+
+    def _mark(self) -> None:
+        """Remember how much of the path has passed."""
+        if isinstance(self._motion, Joined) and self._motion_path is self._path:
+            self._passed = max(self._now - self._start - self._motion.offset, self._passed)
+
+    @property
+    def moves(self) -> bool:
+        """Whether a motion has been planned."""
+        return self._motion is not None
+
+    def aim(self, depth: float) -> None:
+        """
+        Go to an inserted length.
+
+        Parameters
+        ----------
+        depth : float
+            Inserted length [m].
+
+        Raises
+        ------
+        ParameterError
+            If it is not finite or out of range.
+
+        """
+        low, high = self._depths
+        if not low <= depth <= high:
+            raise ParameterError(f'target depth must be in [{low:g}, {high:g}] m, got {depth!r}')
+        self.target, self._path = depth, None
+        self._replan()
+
+    def follow(
+        self,
+        times: Sequence[float],
+        positions: Sequence[float],
+        speeds: Sequence[float] | None = None,
+    ) -> None:
+        """
+        Follow a path from now on.
+
+        Parameters
+        ----------
+        times, positions, speeds : sequence of float
+            Points of the path, as for `Path`; times count from now [s].
+
+        Raises
+        ------
+        ParameterError
+            If the path is invalid.
+
+        """
+        path = Path(times, positions, speeds, self._limits, self._depths)
+        self.target, self._path, self._passed = path.last, path, 0.0
+        self._replan()
+
+    def pause(self) -> None:
+        """Brake to rest within the limits and stay there."""
+        if not self.paused:
+            self.paused = True
+            self._change = self._brake
+
+    def resume(self) -> None:
+        """Continue to the target, or along the path from where it was left."""
+        if self.paused:
+            self.paused = False
+            self._change = self._plan
+
+    def _replan(self) -> None:
+        # A new target does not end a pause.
+        if not self.paused:
+            self._change = self._plan
+
+    def at(self, time: float, depth: float) -> Setpoint:
+        """
+        Return the setpoint now; plan a change that is due.
+
+        Parameters
+        ----------
+        time : float
+            Time now [s].
+        depth : float
+            Inserted length of the needle now [m], where a new motion starts.
+
+        Returns
+        -------
+        Setpoint
+            Setpoint now.
+
+        """
+        self._now = time
+        if self._change is not None:
+            # A step has no position on the way.
+            anew = self._motion is None or isinstance(self._motion, Step)
+            now = Setpoint(depth) if anew else self.ahead(time)
+            self._mark()
+            change, self._change = self._change, None
+            self._motion, self._motion_path, self._start = change(now), self._path, time
+        return self.ahead(time)
+
+    def ahead(self, time: float) -> Setpoint:
+        """
+        Return the setpoint at a later time if nothing changes.
+
+        Parameters
+        ----------
+        time : float
+            Time [s].
+
+        Returns
+        -------
+        Setpoint
+            Setpoint at that time.
+
+        """
+        return self._motion.at(time - self._start) if self._motion else Setpoint(0.0)
+
+    def _plan(self, now: Setpoint) -> Reference:
+        if self.paused:
+            return self._brake(now)
+        if self._path is not None:
+            if self._kind is not MinimumJerk:
+                now = Setpoint(now.position, now.speed)
+            return Joined(now, self._path, self._passed, self._limits)
+        target = now.position if self.target is None else self.target
+        if self._kind is MinimumJerk:
+            return MinimumJerk(now, target, self._limits, self._depths)
+        return self._kind(now, target, self._limits)
+
+    def _brake(self, now: Setpoint) -> Reference:
+        """Stop within the limit of acceleration, without passing the end of the motion."""
+        stop = halt if self._kind is MinimumJerk else brake
+        motion: Reference = stop(now, self._limits, self._depths)
+        if self._path is not None:
+            # Half of the braking counts: the time that the path takes to the same position.
+            self._passed += 0.5 * motion.duration
+        return motion

@@ -1,0 +1,326 @@
+"""A motion given by points, and the motion that joins it from anywhere."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+from math import copysign, isfinite, sqrt
+
+from needle_controller.reference.quintic import halt, MinimumJerk, Quintic
+from needle_controller.reference.setpoint import (
+    around,
+    LONGER,
+    Reference,
+    ReferenceLimits,
+    ROUNDING,
+    Setpoint,
+    SHORTEST,
+)
+from needle_controller.reference.trapezoid import Trapezoid
+from needle_ros.errors import ParameterError
+import numpy as np
+
+
+class Path:
+    """
+    A motion given by points: straight lines between positions, or cubics where speeds are given.
+
+    Corners between lines are rounded by parabolas with the limit of acceleration. The points
+    define the duration of the path. It ends at rest.
+
+    Parameters
+    ----------
+    times : sequence of float
+        Times of the points [s], not negative, increasing.
+    positions : sequence of float
+        Inserted lengths [m].
+    speeds : sequence of float, optional
+        Insertion speeds [m/s], zero at the end.
+    limits : ReferenceLimits
+        Limits.
+    depths : tuple of float
+        Least and largest inserted length [m].
+
+    Attributes
+    ----------
+    begin, end : float
+        Times of the first point and of the end [s].
+    last : float
+        Inserted length at the end [m].
+    depths : tuple of float
+        As given [m].
+
+    Raises
+    ------
+    ParameterError
+        If numbers are missing, not finite or beyond a limit, or times do not increase.
+
+    """
+
+    def __init__(
+        self,
+        times: Sequence[float],
+        positions: Sequence[float],
+        speeds: Sequence[float] | None,
+        limits: ReferenceLimits,
+        depths: tuple[float, float],
+    ) -> None:
+        _check(times, positions, speeds, depths)
+        #: Start time, position, speed, acceleration and jerk of each piece.
+        self._pieces: list[tuple[float, float, float, float, float]] = []
+        if speeds is None:
+            self._join_lines(times, positions, limits)
+        else:
+            self._join_cubics(times, positions, speeds, limits)
+            self._check_depths(*depths)
+        self._starts, self.depths = np.array([piece[0] for piece in self._pieces]), depths
+        self.begin, self.last = float(times[0]), float(positions[-1])
+
+    def _join_lines(
+        self, times: Sequence[float], positions: Sequence[float], limits: ReferenceLimits
+    ) -> None:
+        """Join lines by parabolas."""
+        ramp = limits.acceleration
+        speed, free = 0.0, times[0]
+        # At the first point it already has the speed of the first line.
+        if len(times) > 1:
+            speed = (positions[1] - positions[0]) / (times[1] - times[0])
+            self._pieces.append((times[0], positions[0], speed, 0.0, 0.0))
+        for k in range(len(times)):
+            following = 0.0
+            if k + 1 < len(times):
+                following = (positions[k + 1] - positions[k]) / (times[k + 1] - times[k])
+            if abs(following) > limits.speed * (1.0 + ROUNDING):
+                raise ParameterError(
+                    f'speed after {times[k]:g} s must be within {limits.speed:g} m/s, got '
+                    f'{following:g} m/s'
+                )
+            if k > 0:
+                half = 0.5 * abs(following - speed) / ramp
+                start = times[k] - half
+                if start < free - ROUNDING:
+                    raise ParameterError(
+                        f'speed changes from {speed:g} to {following:g} m/s at {times[k]:g} s '
+                        f'faster than the acceleration limit {ramp:g} m/s^2 allows'
+                    )
+                turn = copysign(ramp, following - speed)
+                self._pieces.append((start, positions[k] - half * speed, speed, turn, 0.0))
+                free = times[k] + half
+                at = positions[k] + half * following
+                self._pieces.append((free, at, following, 0.0, 0.0))
+            speed = following
+        self.end = free
+        # Exactly at the last position, and at rest.
+        self._pieces[len(self._pieces) - 1 :] = [(free, positions[-1], 0.0, 0.0, 0.0)]
+
+    def _join_cubics(
+        self,
+        times: Sequence[float],
+        positions: Sequence[float],
+        speeds: Sequence[float],
+        limits: ReferenceLimits,
+    ) -> None:
+        """Join cubics."""
+        if speeds[-1] != 0.0:
+            raise ParameterError(f'speed at the end must be 0, got {speeds[-1]:g} m/s')
+        for k in range(len(times) - 1):
+            t = times[k + 1] - times[k]
+            d, v0, v1 = positions[k + 1] - positions[k], speeds[k], speeds[k + 1]
+            a = (6.0 * d / t - 4.0 * v0 - 2.0 * v1) / t
+            jerk = (6.0 * (v0 + v1) - 12.0 * d / t) / (t * t)
+            inside = -a / jerk if jerk else -1.0
+            peaks = [abs(v0), abs(v1)]
+            if 0.0 < inside < t:
+                peaks.append(abs(v0 + 0.5 * a * inside))
+            for name, unit, found, bound in (
+                ('speed', 'm/s', max(peaks), limits.speed),
+                ('acceleration', 'm/s^2', max(abs(a), abs(a + jerk * t)), limits.acceleration),
+            ):
+                if found > bound * (1.0 + ROUNDING):
+                    raise ParameterError(
+                        f'{name} after {times[k]:g} s must be within {bound:g} {unit}, got '
+                        f'{found:g} {unit}'
+                    )
+            self._pieces.append((times[k], positions[k], v0, a, jerk))
+        self._pieces.append((times[-1], positions[-1], 0.0, 0.0, 0.0))
+        self.end = float(times[-1])
+
+    def _check_depths(self, low: float, high: float) -> None:
+        """Reject cubics that leave the range of depths between their points."""
+        for (start, p, v, a, jerk), after in pairwise(self._pieces):
+            span = after[0] - start
+            for turn in np.roots([0.5 * jerk, a, v]):
+                t = float(turn.real)
+                at = p + t * (v + t * (0.5 * a + t * jerk / 6.0))
+                if turn.imag == 0.0 and 0.0 < t < span and not low <= at <= high:
+                    raise ParameterError(
+                        f'path must stay in [{low:g}, {high:g}] m, got {at:g} m between its points'
+                    )
+
+    def at(self, time: float) -> Setpoint:
+        """
+        Return the setpoint at a time.
+
+        Parameters
+        ----------
+        time : float
+            Time [s]; before the first point the path is at that point.
+
+        Returns
+        -------
+        Setpoint
+            Desired inserted length, speed and acceleration.
+
+        """
+        k = max(int(np.searchsorted(self._starts, time, side='right')) - 1, 0)
+        start, p, v, a, jerk = self._pieces[k]
+        t = max(time - start, 0.0)
+        return Setpoint(
+            p + t * (v + t * (0.5 * a + t * jerk / 6.0)),
+            v + t * (a + 0.5 * t * jerk),
+            a + t * jerk,
+        )
+
+
+def _check(
+    times: Sequence[float],
+    positions: Sequence[float],
+    speeds: Sequence[float] | None,
+    depths: tuple[float, float],
+) -> None:
+    """Reject points that are missing, not finite, out of order or out of range."""
+    if not times or len(times) != len(positions):
+        raise ParameterError(
+            f'path needs one position for each of at least one time, got {len(positions)} '
+            f'positions and {len(times)} times'
+        )
+    if speeds is not None and len(speeds) != len(times):
+        raise ParameterError(
+            f'path needs a speed for each of its {len(times)} points or none, got {len(speeds)}'
+        )
+    if not all(map(isfinite, (*times, *positions, *(speeds or ())))):
+        raise ParameterError('times, positions and speeds must be finite')
+    if times[0] < 0.0 or any(late <= early for early, late in pairwise(times)):
+        raise ParameterError(f'times must be >= 0 and increasing, got {list(times)} s')
+    low, high = depths
+    if not all(low <= at <= high for at in positions):
+        raise ParameterError(
+            f'positions must be in [{low:g}, {high:g}] m, got {list(positions)} m'
+        )
+
+
+class Joined:
+    """
+    A path joined from elsewhere without a jump in position, speed or acceleration.
+
+    If limits and range of depths allow it, the motion meets the path at its first point in time.
+    Otherwise it meets the path later, and is then late by half of the additional time.
+
+    Parameters
+    ----------
+    start : Setpoint
+        Start of the motion.
+    path : Path
+        Path to join.
+    since : float
+        Present time on the path [s].
+    limits : ReferenceLimits
+        Limits of the motion that joins it.
+
+    Attributes
+    ----------
+    duration : float
+        Duration of the whole motion [s].
+    offset : float
+        Time of this motion at time zero of the path [s].
+
+    """
+
+    def __init__(self, start: Setpoint, path: Path, since: float, limits: ReferenceLimits) -> None:
+        self._path = path
+        self._halt: Reference | None = None
+        depths = around(path.depths, start)
+        if start.acceleration:
+            # A quintic with an acceleration at its start is only short: come to rest first.
+            stopped = halt(start, limits, depths)
+            self._halt, start = stopped, stopped.end
+        found = _join(start, path, since, limits, depths)
+        if found is None and start.speed:
+            self._halt = brake(start, limits, depths)
+            start = self._halt.at(self._halt.duration)
+            found = _join(start, path, since, limits, depths)
+        # If no quintic joins the path, go from rest to rest to its end.
+        joining, entry = found or (MinimumJerk(start, path.last, limits), path.end)
+        self._joining = joining
+        self._halting = self._halt.duration if self._halt else 0.0
+        self._joined = self._halting + (joining.duration if joining else 0.0)
+        self.offset = self._joined - entry
+        self.duration = max(path.end + self.offset, self._joined)
+
+    def at(self, time: float) -> Setpoint:
+        """Return the setpoint at a time [s]; see `Reference.at`."""
+        if time >= self.duration:
+            return Setpoint(self._path.last)
+        if self._halt is not None and time < self._halting:
+            return self._halt.at(time)
+        if self._joining is not None and time < self._joined:
+            return self._joining.at(time - self._halting)
+        return self._path.at(time - self.offset)
+
+
+def brake(start: Setpoint, limits: ReferenceLimits, depths: tuple[float, float]) -> Reference:
+    """
+    Return the shortest motion to rest, without a limit of jerk.
+
+    Parameters
+    ----------
+    start : Setpoint
+        Start of the motion.
+    limits : ReferenceLimits
+        Limits.
+    depths : tuple of float
+        Least and largest position on the way [m].
+
+    Returns
+    -------
+    Reference
+        The motion; it brakes harder than the limit only where the range of depths ends before.
+
+    """
+    low, high = depths
+    stop = start.position + 0.5 * start.speed * abs(start.speed) / limits.acceleration
+    slack = ROUNDING * (high - low)
+    if low - slack <= stop <= high + slack:
+        return Trapezoid(start, min(max(stop, low), high), limits)
+    return halt(start, limits, depths)
+
+
+def _join(
+    start: Setpoint,
+    path: Path,
+    since: float,
+    limits: ReferenceLimits,
+    depths: tuple[float, float],
+) -> tuple[Reference | None, float] | None:
+    """
+    Return the quintic to a path, and the time on the path where it meets it.
+
+    The quintic is None if the start is on the path; the result is None if there is no quintic.
+    """
+    first = max(since, path.begin)
+    least, entry = first - since, first
+    if least == 0.0 and start == path.at(first):
+        return None, first
+    duration = max(least, SHORTEST)
+    # A time that suffices to reach the end of the path from anywhere within the limits.
+    braking = abs(start.speed) / limits.acceleration
+    distance = abs(path.last - start.position)
+    enough = distance / limits.speed + braking + sqrt(distance / limits.acceleration)
+    longest = max(least, path.end - since) + 100.0 * enough
+    while duration < longest:
+        joining = Quintic(start, path.at(entry), duration)
+        if joining.within(limits) and joining.stays(depths):
+            return joining, entry
+        duration *= LONGER
+        entry = first + 0.5 * (duration - least)
+    return None

@@ -1,0 +1,246 @@
+"""Motions of least integrated squared jerk: polynomials of fifth order in time."""
+
+from __future__ import annotations
+
+from math import inf, sqrt
+
+from needle_controller.compiled.quintic import quintic_extremes
+from needle_controller.reference.setpoint import (
+    around,
+    LONGER,
+    ReferenceLimits,
+    ROUNDING,
+    Setpoint,
+    SHORTEST,
+)
+from needle_dynamics import FloatArray
+import numpy as np
+
+
+class Quintic:
+    """
+    The motion of least integrated squared jerk between two setpoints in a given time.
+
+    Parameters
+    ----------
+    start, end : Setpoint
+        Both ends, with their speeds and accelerations.
+    duration : float
+        Time between them [s].
+
+    """
+
+    def __init__(self, start: Setpoint, end: Setpoint, duration: float) -> None:
+        t = duration
+        self.duration = t
+        self.start, self.end = start, end
+        v0, a0 = start.speed * t, start.acceleration * t * t
+        v1, a1 = end.speed * t, end.acceleration * t * t
+        d = end.position - start.position
+        # Powers of time over duration.
+        c3 = 10.0 * d - 6.0 * v0 - 4.0 * v1 - 1.5 * a0 + 0.5 * a1
+        c4 = -15.0 * d + 8.0 * v0 + 7.0 * v1 + 1.5 * a0 - a1
+        c5 = 6.0 * d - 3.0 * (v0 + v1) - 0.5 * (a0 - a1)
+        self._c = start.position, v0, 0.5 * a0, c3, c4, c5
+
+    def at(self, time: float) -> Setpoint:
+        """Return the setpoint at a time [s]; outside the motion that of the nearer end."""
+        if time >= self.duration:
+            return self.end
+        if time <= 0.0:
+            return self.start
+        t = self.duration
+        x = time / t
+        p, v, a, c3, c4, c5 = self._c
+        return Setpoint(
+            p + x * (v + x * (a + x * (c3 + x * (c4 + x * c5)))),
+            (v + x * (2.0 * a + x * (3.0 * c3 + x * (4.0 * c4 + x * 5.0 * c5)))) / t,
+            (2.0 * a + x * (6.0 * c3 + x * (12.0 * c4 + x * 20.0 * c5))) / (t * t),
+        )
+
+    def within(self, limits: ReferenceLimits) -> bool:
+        """
+        Return whether the motion is within limits.
+
+        Parameters
+        ----------
+        limits : ReferenceLimits
+            Limits. Where an end exceeds one, the value of that end is the limit.
+
+        Returns
+        -------
+        bool
+            Whether speed and acceleration are within them, up to rounding.
+
+        """
+        ends = self.start, self.end
+        top = max(limits.speed, *(abs(end.speed) for end in ends)) * (1.0 + ROUNDING)
+        ramp = max(limits.acceleration, *(abs(end.acceleration) for end in ends))
+        ramp *= 1.0 + ROUNDING
+        _, speed, acceleration = self.extremes
+        return bool(np.abs(acceleration).max() <= ramp and np.abs(speed).max() <= top)
+
+    def stays(self, depths: tuple[float, float]) -> bool:
+        """
+        Return whether the motion stays in a range of positions.
+
+        Parameters
+        ----------
+        depths : tuple of float
+            Least and largest position [m].
+
+        Returns
+        -------
+        bool
+            Whether all positions are in the range, up to rounding.
+
+        """
+        low, high = depths
+        least, largest = self.extremes[0]
+        slack = ROUNDING * (high - low) if high - low < inf else 0.0
+        return bool(low - slack <= least and largest <= high + slack)
+
+    @property
+    def extremes(self) -> FloatArray:
+        """Least and largest position [m], speed [m/s] and acceleration [m/s^2], shape (3, 2)."""
+        t = self.duration
+        return np.asarray(quintic_extremes(np.array(self._c)) / [[1.0], [t], [t * t]])
+
+
+def shortest(distance: float, limits: ReferenceLimits) -> float:
+    """
+    Return the duration of the fastest quintic from rest to rest.
+
+    Parameters
+    ----------
+    distance : float
+        Distance [m], not negative.
+    limits : ReferenceLimits
+        Limits.
+
+    Returns
+    -------
+    float
+        Duration [s]: the peaks of the quintic are 15/8 D/T and 10/sqrt(3) D/T^2.
+
+    """
+    return max(
+        1.875 * distance / limits.speed,
+        sqrt(10.0 / sqrt(3.0) * distance / limits.acceleration),
+        SHORTEST,
+    )
+
+
+class MinimumJerk:
+    """
+    The quintic to a target, as short as the limits allow.
+
+    Parameters
+    ----------
+    start : Setpoint
+        Start of the motion, with its speed and acceleration.
+    target : float
+        Position of the end, at rest [m].
+    limits : ReferenceLimits
+        Limits. What the start already exceeds is allowed.
+    depths : tuple of float
+        Least and largest position on the way [m]; the start is always allowed.
+
+    Attributes
+    ----------
+    duration : float
+        Duration of the motion [s].
+
+    """
+
+    def __init__(
+        self,
+        start: Setpoint,
+        target: float,
+        limits: ReferenceLimits,
+        depths: tuple[float, float] = (-inf, inf),
+    ) -> None:
+        depths = around(depths, start)
+        least = max(
+            shortest(abs(target - start.position), limits),
+            2.0 * abs(start.speed) / limits.acceleration,
+        )
+        end = Setpoint(target)
+        motion = Quintic(start, end, least)
+        at_rest = start.speed == 0.0 and start.acceleration == 0.0
+
+        def fits() -> bool:
+            return at_rest or (motion.within(limits) and motion.stays(depths))
+
+        while not fits() and motion.duration < 100.0 * least:
+            motion = Quintic(start, end, LONGER * motion.duration)
+        self._halt: Quintic | None = None
+        self._motion = motion
+        if not fits():
+            # No single quintic is within the limits: come to rest first.
+            self._halt = halt(start, limits, depths)
+            distance = abs(target - self._halt.end.position)
+            self._motion = Quintic(self._halt.end, end, shortest(distance, limits))
+        self.duration = self._motion.duration + (self._halt.duration if self._halt else 0.0)
+
+    def at(self, time: float) -> Setpoint:
+        """Return the setpoint at a time [s]; see `Reference.at`."""
+        if self._halt is not None:
+            if time < self._halt.duration:
+                return self._halt.at(time)
+            time -= self._halt.duration
+        return self._motion.at(time)
+
+
+def halt(
+    start: Setpoint, limits: ReferenceLimits, depths: tuple[float, float] = (-inf, inf)
+) -> Quintic:
+    """
+    Return the motion to rest that does not reverse, within the limit of acceleration.
+
+    If it would leave the range of depths it ends at the end of the range. It then brakes as much
+    harder as necessary.
+
+    Parameters
+    ----------
+    start : Setpoint
+        Start of the motion. Its acceleration fades, so that the speed may first increase by up
+        to 4/27 of acceleration times duration.
+    limits : ReferenceLimits
+        Limits.
+    depths : tuple of float
+        Least and largest position on the way [m]; the start is always allowed.
+
+    Returns
+    -------
+    Quintic
+        The motion.
+
+    """
+    depths = around(depths, start)
+    v, a = start.speed, start.acceleration
+    time = max(1.5 * abs(v) / limits.acceleration, SHORTEST)
+
+    def motion() -> Quintic:
+        end = Setpoint(start.position + time * (0.5 * v + time * a / 12.0))
+        return Quintic(start, end, time)
+
+    # Its speed is a cubic: with more time its acceleration tends to that of the start.
+    for _ in range(40):
+        peak = np.abs(motion().extremes[2]).max()
+        if peak <= max(limits.acceleration, abs(a)) * (1.0 + ROUNDING):
+            break
+        time *= LONGER
+    found = motion()
+    if found.stays(depths):
+        return found
+    end = Setpoint(depths[1] if v > 0.0 or (v == 0.0 and a > 0.0) else depths[0])
+    # The longest duration that does not pass the end first.
+    short, long = 0.0, time
+    for _ in range(30):
+        middle = 0.5 * (short + long)
+        if Quintic(start, end, middle).stays(depths):
+            short = middle
+        else:
+            long = middle
+    return Quintic(start, end, short or long)

@@ -1,0 +1,111 @@
+"""The fastest motion within the limits, and the target as a step."""
+
+from __future__ import annotations
+
+from math import copysign, sqrt
+from typing import Final
+
+from needle_controller.reference.setpoint import ReferenceLimits, Setpoint
+
+
+class Step:
+    """
+    The target at once, as the source regulates.
+
+    Parameters
+    ----------
+    start : Setpoint
+        Not used; a step has the parameters of every reference.
+    target : float
+        Target [m].
+    limits : ReferenceLimits
+        Not used.
+
+    """
+
+    duration: Final = 0.0
+
+    def __init__(self, start: Setpoint, target: float, limits: ReferenceLimits) -> None:
+        del start, limits
+        self._target = target
+
+    def at(self, time: float) -> Setpoint:
+        """Return the setpoint at a time [s]; see `Reference.at`."""
+        del time
+        return Setpoint(self._target)
+
+
+class Trapezoid:
+    """
+    The fastest motion within the limits: accelerate, keep the speed, brake.
+
+    Parameters
+    ----------
+    start : Setpoint
+        Start of the motion; its acceleration is not used.
+    target : float
+        Position of the end, at rest [m].
+    limits : ReferenceLimits
+        Limits. If the start is faster than the limit, the motion first brakes.
+
+    Attributes
+    ----------
+    duration : float
+        Duration of the motion [s].
+
+    Examples
+    --------
+    >>> from needle_controller import ReferenceLimits, Setpoint, Trapezoid
+    >>> motion = Trapezoid(Setpoint(0.02), 0.05, ReferenceLimits(speed=0.01, acceleration=0.1))
+    >>> round(motion.duration, 9)
+    3.1
+    >>> motion.at(3.0)
+    Setpoint(position=0.0495, speed=0.01, acceleration=0.0)
+    >>> motion.at(5.0)
+    Setpoint(position=0.05, speed=0.0, acceleration=0.0)
+
+    """
+
+    def __init__(self, start: Setpoint, target: float, limits: ReferenceLimits) -> None:
+        top, ramp = limits.speed, limits.acceleration
+        position, speed = start.position, start.speed
+        #: (duration, acceleration) of each part.
+        parts: list[tuple[float, float]] = []
+        # First brake a motion in the wrong direction, too fast, or too far.
+        stop = position + copysign(speed * speed / (2.0 * ramp), speed)
+        sign = copysign(1.0, target - stop)
+        if speed * sign < 0.0:
+            parts.append((abs(speed) / ramp, -copysign(ramp, speed)))
+            position, speed = stop, 0.0
+        elif abs(speed) > top:
+            slowing = (abs(speed) - top) / ramp
+            parts.append((slowing, -sign * ramp))
+            position += sign * slowing * (abs(speed) + top) / 2.0
+            speed = sign * top
+        v0 = abs(speed)
+        distance = abs(target - position)
+        peak = min(top, sqrt(ramp * distance + 0.5 * v0 * v0))
+        cruise = distance - (2.0 * peak * peak - v0 * v0) / (2.0 * ramp)
+        parts.append((max(0.0, peak - v0) / ramp, sign * ramp))
+        parts.append((max(0.0, cruise) / peak if peak > 0.0 else 0.0, 0.0))
+        parts.append((peak / ramp, -sign * ramp))
+        self._start = start
+        self._target = target
+        self._parts = parts
+        self.duration = sum(part[0] for part in parts)
+
+    def at(self, time: float) -> Setpoint:
+        """Return the setpoint at a time [s]; see `Reference.at`."""
+        if time >= self.duration:
+            return Setpoint(self._target)
+        position, speed = self._start.position, self._start.speed
+        if time <= 0.0:
+            return Setpoint(position, speed)
+        for duration, acceleration in self._parts:
+            t = min(time, duration)
+            position += t * (speed + 0.5 * t * acceleration)
+            speed += t * acceleration
+            time -= t
+            if time <= 0.0:
+                break
+        return Setpoint(position, speed, acceleration)
