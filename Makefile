@@ -10,7 +10,7 @@ demo: setup
 	$(BIN)/needle demo
 
 test: setup
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n auto
 
 check: setup
 	$(BIN)/ruff format --check $(SOURCES)

@@ -74,7 +74,7 @@ def test_a_batch_has_the_numbers_that_rosbags_finds(
     assert_array_equal(read.used, np.arange(len(drawn)))
     assert_array_equal(read.values, expected)
     for stamp, message in zip(read.stamps, serialized, strict=True):
-        there = STORE.deserialize_cdr(message, MOTION).header.stamp
+        there = STORE.deserialize_cdr(message, MOTION).header.stamp  # type: ignore[attr-defined]
         assert stamp == there.sec * 10**9 + there.nanosec
 
 
