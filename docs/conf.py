@@ -38,6 +38,8 @@ suppress_warnings = ['config.cache']
 
 autodoc_member_order = 'bysource'
 autodoc_typehints = 'none'
+# numpydoc loads it; our own pages are those of docs/_ext/api.py.
+autosummary_generate = False
 numpydoc_class_members_toctree = False
 numpydoc_show_class_members = False
 

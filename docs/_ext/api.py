@@ -6,7 +6,9 @@ from pkgutil import iter_modules
 import sys
 from typing import Any
 
+from docutils.nodes import Element
 from sphinx.application import Sphinx
+from sphinx.environment import BuildEnvironment
 
 PACKAGES = (
     'needle_ros',
@@ -75,7 +77,18 @@ def write_pages(app: Sphinx) -> None:
     (folder / 'index.rst').write_text(text, encoding='utf-8')
 
 
+def resolve(app: Sphinx, env: BuildEnvironment, node: Element, content: Element) -> Element | None:
+    """Lead a reference to a name at the root of a package to where the name is defined."""
+    package, _, name = node.get('reftarget', '').rpartition('.')
+    if package not in PACKAGES or name not in getattr(import_module(package), '__all__', ()):
+        return None
+    target = f'{_home(package, name)}.{name}'
+    python = env.get_domain('py')
+    return python.resolve_xref(env, node['refdoc'], app.builder, 'obj', target, node, content)
+
+
 def setup(app: Sphinx) -> dict[str, Any]:
-    """Write the pages before Sphinx looks for them."""
+    """Write the pages before Sphinx looks for them, and find what they refer to."""
     app.connect('builder-inited', write_pages)
+    app.connect('missing-reference', resolve)
     return {'parallel_read_safe': True, 'parallel_write_safe': True}

@@ -14,6 +14,7 @@ PAGES = {
     REPOSITORY / 'README.md': DOCS / 'repository' / 'readme.md',
     REPOSITORY / 'CHANGELOG.md': DOCS / 'repository' / 'changelog.md',
     REPOSITORY / 'CONTRIBUTING.md': DOCS / 'repository' / 'contributing.md',
+    REPOSITORY / 'examples' / 'README.md': DOCS / 'repository' / 'examples.md',
     REPOSITORY / 'bags' / 'README.md': DOCS / 'repository' / 'recordings.md',
     REPOSITORY / 'config' / 'README.md': DOCS / 'repository' / 'layouts.md',
 }

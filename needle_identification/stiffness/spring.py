@@ -85,7 +85,7 @@ def asymmetry_estimate(fit: MatrixFit) -> ParameterEstimate:
     Returns
     -------
     ParameterEstimate
-        |K_a| / |K_s| [1], which is |curl| / (sqrt(2) |K_s|).
+        ``|K_a| / |K_s|`` [1], which is ``|curl| / (sqrt(2) |K_s|)``.
 
     """
     curl = float(fit.matrix[1, 0] - fit.matrix[0, 1])

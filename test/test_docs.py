@@ -1,0 +1,161 @@
+"""README and docs/: names, paths and commands exist, and the tutorial runs as it is printed."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from importlib.util import find_spec
+import os
+from pathlib import Path
+import re
+import shlex
+import subprocess
+import sys
+import xml.etree.ElementTree as ET
+
+from needle_insertion import cli
+import pytest
+import yaml
+
+ROOT = Path(__file__).parents[1]
+PAGES = sorted(
+    [*ROOT.glob('*.md'), *ROOT.glob('docs/*.md'), *ROOT.glob('docs/howto/*.md')]
+    + [ROOT / folder / 'README.md' for folder in ('bags', 'config', 'examples')]
+)
+#: What the changelog names may be gone.
+CURRENT = [page for page in PAGES if page.name != 'CHANGELOG.md']
+#: Pages whose `bash` lines are run, one page in one folder, and how these lines begin.
+RUN = {
+    'README.md': 'needle identify ',
+    'docs/tutorial.md': 'needle ',
+    'docs/howto/own-needle.md': 'needle ',
+    'docs/howto/own-friction.md': 'needle ',
+}
+
+
+def blocks(text: str, *languages: str) -> list[str]:
+    """Return the code blocks of a page in some languages."""
+    found = re.findall(r'^```(\w+)\n(.*?)^```', text, flags=re.DOTALL | re.MULTILINE)
+    return [body for language, body in found if language in languages]
+
+
+def command_lines(page: Path, program: str) -> list[str]:
+    """Return each command line of a program on a page."""
+    text = page.read_text(encoding='utf-8')
+    lines = '\n'.join(blocks(text, 'bash', 'console')).splitlines()
+    lines += re.findall(r'^    (\S.*)$', text, flags=re.MULTILINE)
+    plain = (line.removeprefix('$ ') for line in lines)
+    return [line for line in plain if line.startswith(f'{program} ')]
+
+
+def exists(name: str) -> bool:
+    """Return whether a dotted name is a module, or something in one."""
+    parts = name.split('.')
+    for count in range(len(parts), 0, -1):
+        try:
+            if find_spec('.'.join(parts[:count])) is None:
+                continue
+        except ModuleNotFoundError:
+            continue
+        found = import_module('.'.join(parts[:count]))
+        for part in parts[count:]:
+            if not hasattr(found, part):
+                return part in getattr(found, '__annotations__', {})
+            found = getattr(found, part)
+        return True
+    return False
+
+
+def test_names_in_the_documentation_exist() -> None:
+    """Every dotted name of ours in backticks is there."""
+    names = {
+        (page.name, name)
+        for page in CURRENT
+        for name in re.findall(r'`(needle_\w+(?:\.\w+)+)`', page.read_text(encoding='utf-8'))
+    }
+    files = {'py', 'yaml', 'md'}
+    assert [
+        found
+        for found in sorted(names)
+        if found[1].rpartition('.')[2] not in files and not exists(found[1])
+    ] == []
+
+
+def test_paths_in_the_documentation_exist() -> None:
+    """Every path in backticks below a folder of the repository is there."""
+    folders = {path.name for path in ROOT.iterdir() if path.is_dir() and path.name[0] != '.'}
+    made = {'build', 'demo_output', 'install', 'log'}
+    missing = []
+    for page in CURRENT:
+        for path in re.findall(r'`((?:\w+/)+[\w.*]*)`', page.read_text(encoding='utf-8')):
+            top = path.partition('/')[0]
+            if top in folders - made and '_build' not in path and not list(ROOT.glob(path)):
+                missing.append((page.name, path))
+    assert missing == []
+
+
+def test_links_in_the_documentation_exist() -> None:
+    """Every link to a file leads to one."""
+    missing = [
+        (page.name, link)
+        for page in PAGES
+        for link in re.findall(r'\]\((?!\w+:|#)([^)#\s]+)', page.read_text(encoding='utf-8'))
+        if not (page.parent / link).exists()
+    ]
+    assert missing == []
+
+
+def test_lines_of_the_readme_are_short() -> None:
+    """A terminal shows them whole."""
+    assert [
+        line for line in (ROOT / 'README.md').read_text().splitlines() if len(line) > 120
+    ] == []
+
+
+def test_commands_in_the_documentation_are_valid() -> None:
+    """The options of every `needle` command are known, whether or not its files are there."""
+    lines = [line for page in CURRENT for line in command_lines(page, 'needle')]
+    assert len(lines) > 20
+    for line in lines:
+        words = shlex.split(line, comments=True)[1:]
+        command = import_module(f'needle_insertion.commands.{words[0]}')
+        joined = cli._joined(words, getattr(command, 'SIGNED', ()))
+        cli._parser(words[0], command).parse_args(joined)
+
+
+def test_make_targets_in_the_documentation_exist() -> None:
+    """Every `make` command names a target of the Makefile."""
+    targets = set(re.findall(r'^([a-z]+):', (ROOT / 'Makefile').read_text(), flags=re.MULTILINE))
+    named = {line.split()[1] for page in CURRENT for line in command_lines(page, 'make')}
+    assert named <= targets
+    assert {'demo', 'test', 'check', 'docs'} <= named
+
+
+def test_citation_names_the_version() -> None:
+    """CITATION.cff has the version of package.xml, and cites the paper."""
+    citation = yaml.safe_load((ROOT / 'CITATION.cff').read_text(encoding='utf-8'))
+    assert citation['version'] == ET.parse(ROOT / 'package.xml').getroot().findtext('version')  # noqa: S314
+    assert citation['references'][0]['doi'] == '10.1142/S1793962313500311'
+
+
+@pytest.mark.parametrize('name', RUN)
+def test_page_runs_as_printed(name: str, tmp_path: Path) -> None:
+    """The commands of a page run one after the other and print what the page shows."""
+    (tmp_path / 'bags').symlink_to(ROOT / 'bags')
+    text = (ROOT / name).read_text(encoding='utf-8')
+    lines = '\n'.join(blocks(text, 'bash')).splitlines()
+    script = '\n'.join(line for line in lines if line.startswith(RUN[name]))
+    needle = f'needle() {{ {sys.executable} -m needle_insertion.cli "$@"; }}'
+    done = subprocess.run(
+        ['/bin/bash', '-eu', '-c', f'{needle}\n{script}'],
+        cwd=tmp_path,
+        env={**os.environ, 'PYTHONPATH': str(ROOT)},
+        capture_output=True,
+        text=True,
+        timeout=300.0,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    for shown in blocks(text, 'text'):
+        assert shown in done.stdout
+    for made in re.findall(r'^- `(\w+[\w/]*\.\w+)`,', text, flags=re.MULTILINE):
+        assert (tmp_path / made).is_file(), made

@@ -1,0 +1,42 @@
+"""Every script of examples/ runs, and prints what it says that it prints."""
+
+from __future__ import annotations
+
+from pathlib import Path
+import re
+import runpy
+
+import pytest
+
+EXAMPLES = Path(__file__).parents[1] / 'examples'
+
+#: What each script must print, as a pattern.
+PRINTED = {
+    'batch': r'median \d+\.\d mm, 95 % of them between',
+    'fit_from_arrays': r'coulomb_friction: 0\.50\d* N',
+    'own_controller': r'0\.280 mm short of the target; mu_s / k is 0\.280 mm',
+    'plot': r'wrote insertion\.png',
+    'simulate': r'depth at the end: 28\.1\d mm',
+}
+
+
+@pytest.mark.parametrize('name', sorted(path.stem for path in EXAMPLES.glob('*.py')))
+def test_example_runs(
+    name: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """The script runs by itself in an empty folder."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr('sys.argv', [name])
+    runpy.run_path(str(EXAMPLES / f'{name}.py'), run_name='__main__')
+    assert re.search(PRINTED[name], capsys.readouterr().out)
+
+
+def test_readme_lists_every_example() -> None:
+    """The table of examples/README.md has each script."""
+    page = (EXAMPLES / 'README.md').read_text(encoding='utf-8')
+    assert set(re.findall(r'\]\((\w+)\.py\)', page)) == {
+        path.stem for path in EXAMPLES.glob('*.py')
+    }
