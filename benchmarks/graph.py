@@ -32,7 +32,7 @@ from benchmarks import run as bench
 from benchmarks.bare import PERIOD, RATE, Sender, STREAMS
 from benchmarks.measure import Bar, version
 from geometry_msgs.msg import PointStamped, WrenchStamped
-from needle_identification.bags.bag import Bag
+from needle_identification import Bag
 from needle_insertion.experiment.ros_graph import (
     ACTIVATE,
     CONFIGURE,

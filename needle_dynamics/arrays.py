@@ -1,4 +1,4 @@
-"""The array type of all packages."""
+"""The array types of all packages."""
 
 from __future__ import annotations
 
@@ -9,3 +9,9 @@ from numpy.typing import NDArray
 
 #: NumPy array of doubles.
 FloatArray: TypeAlias = NDArray[np.float64]
+
+#: NumPy array of truth values.
+BoolArray: TypeAlias = NDArray[np.bool_]
+
+#: NumPy array of integers.
+IntArray: TypeAlias = NDArray[np.int64]

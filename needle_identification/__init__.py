@@ -1,51 +1,61 @@
 """
-Recordings of the needle base, and friction identified from them.
+Friction and stiffness identified from recordings of the needle base, without ROS.
 
-Reading, writing and mathematics, without ROS; the nodes are in ``*_node.py``.
+A `Recording` comes from a bag (`read_friction_recording`) or from NumPy arrays.
+`identify_friction` and `identify_stiffness` give parameters with confidence intervals;
+`summarize` and `summarize_stiffness` combine several recordings. Nodes are in ``*_node.py``.
 """
 
-from needle_identification.bags.bag import (
-    BagWriter,
-    check_distinct,
-    COMPRESSIONS,
-    encode,
-    message_counts,
-    message_type,
-    read_topic,
-)
-from needle_identification.bags.storage import OfferedQos
-from needle_identification.errors import IdentificationError, RecordingError
-from needle_identification.estimation.estimate import ParameterEstimate, Statistic, statistic
-from needle_identification.estimation.estimators import ESTIMATORS
-from needle_identification.estimation.regression import regress, Regression
-from needle_identification.estimation.residual_tests import ResidualTest
-from needle_identification.friction.comparison import Comparison
-from needle_identification.friction.estimate import Fit, FrictionEstimate
-from needle_identification.friction.identify import identify_friction
-from needle_identification.friction.recursive import RecursiveFriction
-from needle_identification.friction.settings import FrictionSettings, TERMS
-from needle_identification.friction.summary import FrictionSummary, summarize
-from needle_identification.recordings.reading import (
-    read_friction_recording,
-    read_indentation_recording,
-)
-from needle_identification.recordings.recording import IndentationRecording, Recording
-from needle_identification.result import result_yaml, write_result
-from needle_identification.stiffness.estimate import LevelEstimate, StiffnessEstimate
-from needle_identification.stiffness.identify import identify_stiffness
-from needle_identification.stiffness.presses import Presses
-from needle_identification.stiffness.settings import StiffnessSettings
-from needle_identification.stiffness.spring import asymmetry
-from needle_identification.stiffness.summary import (
-    LevelSummary,
-    StiffnessSummary,
-    summarize_stiffness,
-)
+from typing import TYPE_CHECKING
+
+from needle_ros.lazy import lazy_names
+
+if TYPE_CHECKING:
+    from needle_identification.bags.bag import (
+        Bag,
+        check_distinct,
+        message_counts,
+        read_topic,
+        Recorded,
+    )
+    from needle_identification.bags.messages import deserialize, encode, message_type
+    from needle_identification.bags.topics import OfferedQos, Topic
+    from needle_identification.bags.writer import BagWriter, COMPRESSIONS
+    from needle_identification.errors import IdentificationError, RecordingError
+    from needle_identification.estimation.estimate import ParameterEstimate, Statistic, statistic
+    from needle_identification.estimation.estimators import ESTIMATORS
+    from needle_identification.estimation.regression import regress, Regression
+    from needle_identification.estimation.residual_tests import ResidualTest
+    from needle_identification.friction.comparison import Comparison
+    from needle_identification.friction.estimate import Fit, FrictionEstimate
+    from needle_identification.friction.identify import identify_friction
+    from needle_identification.friction.recursive import RecursiveFriction
+    from needle_identification.friction.settings import FrictionSettings, TERMS
+    from needle_identification.friction.summary import FrictionSummary, summarize
+    from needle_identification.recordings.reading import (
+        read_friction_recording,
+        read_indentation_recording,
+    )
+    from needle_identification.recordings.recording import IndentationRecording, Recording
+    from needle_identification.result import result_yaml, write_result
+    from needle_identification.stiffness.estimate import LevelEstimate, StiffnessEstimate
+    from needle_identification.stiffness.identify import identify_stiffness
+    from needle_identification.stiffness.presses import Presses
+    from needle_identification.stiffness.settings import StiffnessSettings
+    from needle_identification.stiffness.spring import asymmetry
+    from needle_identification.stiffness.summary import (
+        LevelSummary,
+        StiffnessSummary,
+        summarize_stiffness,
+    )
+else:
+    __getattr__, __dir__ = lazy_names(__name__)
 
 __all__ = [
     'COMPRESSIONS',
     'ESTIMATORS',
     'TERMS',
+    'Bag',
     'BagWriter',
     'Comparison',
     'Fit',
@@ -59,6 +69,7 @@ __all__ = [
     'OfferedQos',
     'ParameterEstimate',
     'Presses',
+    'Recorded',
     'Recording',
     'RecordingError',
     'RecursiveFriction',
@@ -68,8 +79,10 @@ __all__ = [
     'StiffnessEstimate',
     'StiffnessSettings',
     'StiffnessSummary',
+    'Topic',
     'asymmetry',
     'check_distinct',
+    'deserialize',
     'encode',
     'identify_friction',
     'identify_stiffness',

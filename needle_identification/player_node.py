@@ -14,7 +14,7 @@ from typing import Any, Final
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticStatus
 from needle_identification.bags.bag import Bag, Recorded
-from needle_identification.bags.storage import offered_qos, OfferedQos, Topic
+from needle_identification.bags.topics import OfferedQos, Topic
 from needle_identification.errors import RecordingError
 from needle_identification.recorder_node import is_hidden, message_class
 from needle_ros.base_node import BaseNode, run
@@ -414,7 +414,7 @@ class PlayerNode(BaseNode):
 
 def _profile(topics: list[Topic]) -> QoSProfile:
     """Return what to offer: the most that any publisher did, so that every reader is served."""
-    offered = [qos for topic in topics for qos in offered_qos(topic.profiles)] or [OfferedQos()]
+    offered = [qos for topic in topics for qos in topic.offered_qos()] or [OfferedQos()]
     best_effort = all(qos.reliability == 'best_effort' for qos in offered)
     reliability = ReliabilityPolicy.BEST_EFFORT if best_effort else ReliabilityPolicy.RELIABLE
     if not any(qos.durability == 'transient_local' for qos in offered):

@@ -10,8 +10,8 @@ import time
 from typing import Any, Final, NamedTuple
 
 from diagnostic_msgs.msg import DiagnosticStatus
-from needle_identification.bags.bag import BagWriter, COMPRESSIONS
-from needle_identification.bags.storage import OfferedQos
+from needle_identification.bags.topics import OfferedQos
+from needle_identification.bags.writer import BagWriter, COMPRESSIONS
 from needle_identification.errors import RecordingError
 from needle_ros.base_node import BaseNode, run
 from rclpy.clock import Clock
@@ -70,7 +70,7 @@ class RecorderNode(BaseNode):
         if not path:
             raise RecordingError('path must name a folder to record to, got nothing')
         self._path = Path(path)
-        self._compression = self.text('compression', tuple(COMPRESSIONS))
+        self._compression = self.text('compression', COMPRESSIONS)
         names = self.get_parameter('topics').value
         self._all = '*' in names
         self._names = {self.resolve_topic_name(name) for name in names if name != '*'}

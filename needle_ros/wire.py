@@ -448,3 +448,26 @@ def decode(
 def _column(rows: NDArray[np.uint8], position: int, kind: str) -> NDArray[Any]:
     size = np.dtype(kind).itemsize
     return np.ascontiguousarray(rows[:, position : position + size]).view(kind)[:, 0]
+
+
+def read_string(message: bytes) -> str:
+    """
+    Read a std_msgs String.
+
+    Parameters
+    ----------
+    message : bytes
+        The serialized message.
+
+    Returns
+    -------
+    str
+        Its text.
+
+    Raises
+    ------
+    MessageError
+        If the bytes end before the text does.
+
+    """
+    return _Cursor(message).string()

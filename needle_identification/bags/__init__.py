@@ -1,1 +1,1 @@
-"""Bags: files of messages, read and written."""
+"""Bags: recordings on disk, written as MCAP, read in any form that rosbag2 writes."""

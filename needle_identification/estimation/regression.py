@@ -18,14 +18,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from needle_dynamics import FloatArray
+from needle_dynamics.arrays import BoolArray, FloatArray, IntArray
 from needle_identification.errors import IdentificationError
 from needle_identification.estimation.estimators import check_estimator
 from needle_identification.estimation.solvers import (
-    BoolArray,
     group_weights,
     huber,
-    IntArray,
     ROUNDING,
     Solution,
     total,

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 from typing import Final
 import warnings
 
-from needle_dynamics import FloatArray
-from needle_identification.estimation.solvers import BoolArray, IntArray
+from needle_dynamics.arrays import BoolArray, FloatArray, IntArray
 import numpy as np
 from scipy.special import betaincc, chdtrc, fdtrc, stdtr
 

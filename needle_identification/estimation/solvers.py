@@ -26,16 +26,12 @@ References
 
 from __future__ import annotations
 
-from typing import Final, NamedTuple, TypeAlias
+from typing import Final, NamedTuple
 
-from needle_dynamics import FloatArray
+from needle_dynamics.arrays import BoolArray, FloatArray, IntArray
 from needle_identification.errors import IdentificationError
 from needle_ros.errors import ParameterError
 import numpy as np
-from numpy.typing import NDArray
-
-BoolArray: TypeAlias = NDArray[np.bool_]
-IntArray: TypeAlias = NDArray[np.int_]
 
 #: Relative change of a solution, or size of a residual, that counts as rounding.
 ROUNDING: Final = 1e-9

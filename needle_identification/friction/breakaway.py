@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from math import hypot, sqrt
 from typing import Final
 
-from needle_dynamics import FloatArray
+from needle_dynamics.arrays import FloatArray
 from needle_identification.errors import IdentificationError
 from needle_identification.estimation.estimate import ParameterEstimate
 from needle_identification.estimation.regression import regress

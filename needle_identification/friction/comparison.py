@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from math import log, nan
 from typing import Final
 
-from needle_dynamics import FloatArray
+from needle_dynamics.arrays import FloatArray
 from needle_identification.errors import IdentificationError
 from needle_identification.estimation.regression import Regression, score_covariance
 from needle_identification.friction.design import Design, solve

@@ -12,10 +12,9 @@ from dataclasses import dataclass, replace
 from math import ceil
 from typing import Final
 
-from needle_dynamics import FloatArray
+from needle_dynamics.arrays import BoolArray, FloatArray, IntArray
 from needle_identification.errors import IdentificationError
 from needle_identification.estimation.regression import regress, Regression, window_span
-from needle_identification.estimation.solvers import BoolArray, IntArray
 from needle_identification.friction.filtering import FilteredSignals, HALF_LENGTH
 from needle_identification.friction.settings import FrictionSettings
 from needle_identification.friction.terms import columns_of, regressors

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from needle_dynamics import FloatArray
+from needle_dynamics.arrays import BoolArray, FloatArray
 from needle_identification.estimation.estimate import find_by_name, ParameterEstimate
 from needle_identification.estimation.formatting import measured
 from needle_identification.estimation.residual_tests import ResidualTest
-from needle_identification.estimation.solvers import BoolArray
 from needle_identification.friction.comparison import Comparison
 
 

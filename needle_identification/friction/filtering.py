@@ -12,10 +12,9 @@ from dataclasses import dataclass
 from math import ceil, e, sqrt
 from typing import Final
 
-from needle_dynamics import FloatArray
+from needle_dynamics.arrays import BoolArray, FloatArray
 from needle_identification.errors import IdentificationError
 from needle_identification.estimation.regression import triangular_window
-from needle_identification.estimation.solvers import BoolArray
 from needle_identification.friction.settings import FrictionSettings
 from needle_identification.recordings.recording import Recording
 import numpy as np

@@ -30,7 +30,7 @@ from __future__ import annotations
 from math import nan, sqrt
 from typing import Final
 
-from needle_dynamics import FloatArray
+from needle_dynamics.arrays import FloatArray
 from needle_identification.errors import IdentificationError
 from needle_identification.estimation.regression import Regression
 from needle_identification.estimation.residual_tests import residual_tests

@@ -11,7 +11,7 @@ from __future__ import annotations
 from dataclasses import replace
 from math import hypot, sqrt
 
-from needle_dynamics import FloatArray
+from needle_dynamics.arrays import FloatArray
 from needle_identification.estimation.estimate import ParameterEstimate
 from needle_identification.estimation.regression import Regression
 from needle_identification.friction.settings import FrictionSettings

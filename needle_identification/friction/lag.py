@@ -12,7 +12,7 @@ from dataclasses import replace
 from math import hypot
 from typing import Final
 
-from needle_dynamics import FloatArray
+from needle_dynamics.arrays import FloatArray
 from needle_identification.estimation.estimate import ParameterEstimate
 from needle_identification.estimation.regression import Regression
 from needle_identification.friction.design import (

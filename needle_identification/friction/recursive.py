@@ -14,7 +14,7 @@ from collections import deque
 from math import ceil, exp, inf, nan
 from typing import Final
 
-from needle_dynamics import FloatArray
+from needle_dynamics.arrays import FloatArray
 from needle_identification.estimation.estimate import ParameterEstimate
 from needle_identification.estimation.regression import determinable, Regression
 from needle_identification.friction.filtering import CORRELATION_LENGTH, filter_taps, GAP

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from needle_dynamics import FloatArray
+from needle_dynamics.arrays import FloatArray
 from needle_ros.errors import ShapeError
 import numpy as np
 import yaml

@@ -1,48 +1,48 @@
-"""Samples in bounded memory, however many there are and in whatever order they come."""
+"""Samples in order of time, in bounded memory."""
 
 from __future__ import annotations
 
 from typing import Final
 
-from needle_dynamics import FloatArray
+from needle_dynamics.arrays import FloatArray
 import numpy as np
 from numpy.typing import NDArray
 
-#: Finest bin [ns]: 400 Hz, ten times what a friction of 10 Hz and its filter need, and more.
+#: Finest bin [ns]: 400 Hz, far more than friction below the cutoff of its filter needs.
 FINEST: Final = 2_500_000
 
-#: Most samples that are kept.
+#: Largest number of samples that are kept.
 LARGEST: Final = 2**20
 
-#: Samples that are gathered before they are sorted in, at least.
+#: Smallest number of samples that are gathered before they are sorted in.
 _GATHERED: Final = 2**16
 
 
 class Series:
     """
-    Samples by their stamps.
+    Samples in order of stamp.
 
-    Samples that come no denser than two in a bin are kept as they are. Denser ones are averaged
-    over bins: one mean stamp and mean values for each, which delays nothing. When there are more
-    than `LARGEST`, neighbors are merged until there are not.
+    Samples with at most two in a bin are kept as they are. Denser ones are averaged over bins,
+    stamps and values alike, which causes no delay. When there are more than `LARGEST`, neighbors
+    are averaged until there are not.
 
     Parameters
     ----------
     columns : int
-        Values of one sample.
+        Number of values of one sample.
 
     Attributes
     ----------
-    stamps : ndarray, shape (n,)
-        Strictly increasing [ns]; up to date after `compact`, like all that follow.
+    stamps : ndarray of int64, shape (n,)
+        Strictly increasing stamps [ns]; up to date after `compact`, like all that follow.
     values : ndarray, shape (n, columns)
-        What was measured.
+        Measured values.
     late : int
-        Samples that came after one with a later stamp.
+        Number of samples that came after one with a later stamp.
     repeated : int
-        Samples left out because another one gathered with them had the same stamp.
+        Number of samples left out because another one had the same stamp.
     width : int
-        Width of the bins [ns], 0 for none.
+        Width of the bins [ns]; 0 for none.
 
     """
 
@@ -56,19 +56,29 @@ class Series:
         self._last = -(2**63)
 
     def add(self, stamps: NDArray[np.int64], values: FloatArray) -> None:
-        """Add finite samples in the order in which they came."""
+        """
+        Add samples in the order in which they came.
+
+        Parameters
+        ----------
+        stamps : ndarray of int64, shape (n,)
+            Stamps [ns].
+        values : ndarray, shape (n, columns)
+            Finite values.
+
+        """
         if len(stamps) == 0:
             return
         self.late += int(np.count_nonzero(stamps[1:] < stamps[:-1])) + int(stamps[0] < self._last)
         self._last = int(stamps[-1])
         self._gathered.append((stamps, values))
         self._count += len(stamps)
-        # In proportion to what is there, so that the cost of a sample does not grow.
+        # In proportion to the samples there are, so that the cost per sample does not grow.
         if self._count > max(_GATHERED, len(self.stamps)):
             self.compact()
 
     def compact(self) -> None:
-        """Sort in what was gathered, and average where there is too much."""
+        """Sort in what was gathered, and average where there are too many samples."""
         stamps = np.concatenate([self.stamps, *(stamps for stamps, _ in self._gathered)])
         values = np.concatenate([self.values, *(values for _, values in self._gathered)])
         weights = np.concatenate([self._weights, np.ones(self._count)])
@@ -94,7 +104,7 @@ class Series:
 def _binned(
     stamps: NDArray[np.int64], values: FloatArray, weights: FloatArray, width: int
 ) -> tuple[NDArray[np.int64], FloatArray, FloatArray]:
-    """Average what lies in one bin; what is alone in its bin stays as it is."""
+    """Average the samples of each bin; a sample alone in its bin stays as it is."""
     bins = stamps // width
     first = np.flatnonzero(np.diff(bins, prepend=bins[0] - 1))
     if len(first) == len(stamps):

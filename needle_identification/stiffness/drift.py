@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from math import exp, log
 
-from needle_dynamics import FloatArray
+from needle_dynamics.arrays import FloatArray
 import numpy as np
 from scipy.linalg import cho_solve_banded, cholesky_banded
 from scipy.optimize import minimize_scalar

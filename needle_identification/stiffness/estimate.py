@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from needle_dynamics import FloatArray
+from needle_dynamics.arrays import FloatArray
 from needle_identification.estimation.estimate import find_by_name, ParameterEstimate
 from needle_identification.stiffness.presses import Presses
 import numpy as np

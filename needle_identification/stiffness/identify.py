@@ -28,6 +28,7 @@ from itertools import pairwise
 from math import hypot, nan, sqrt
 from typing import Final
 
+from needle_dynamics.arrays import BoolArray, FloatArray
 from needle_identification.errors import IdentificationError
 from needle_identification.recordings.recording import IndentationRecording
 from needle_identification.stiffness.estimate import LevelEstimate, StiffnessEstimate
@@ -38,7 +39,6 @@ from needle_identification.stiffness.principal import principal_estimates
 from needle_identification.stiffness.settings import StiffnessSettings
 from needle_identification.stiffness.spring import asymmetry_estimate, curl_estimate, judge_spring
 import numpy as np
-from numpy.typing import NDArray
 
 #: What is worth a warning, as a part of what was measured.
 _WORTH_WARNING: Final = 0.1
@@ -134,7 +134,7 @@ def _identify(recording: IndentationRecording, settings: StiffnessSettings) -> S
 
 
 def _level(
-    presses: Presses, chosen: NDArray[np.bool_], fit: MatrixFit, settings: StiffnessSettings
+    presses: Presses, chosen: BoolArray, fit: MatrixFit, settings: StiffnessSettings
 ) -> LevelEstimate:
     """Collect the results of one level."""
     k_zz = float(fit.matrix[1, 1])
@@ -172,7 +172,7 @@ def _level(
     )
 
 
-def _unit(row: int, column: int) -> NDArray[np.float64]:
+def _unit(row: int, column: int) -> FloatArray:
     """Return the gradient of one entry of the matrix."""
     gradient = np.zeros((2, 2))
     gradient[row, column] = 1.0

@@ -18,14 +18,12 @@ from __future__ import annotations
 from math import inf, isfinite, nan, sqrt
 from typing import Final, NamedTuple
 
-from needle_dynamics import FloatArray
+from needle_dynamics.arrays import BoolArray, FloatArray, IntArray
 from needle_identification.estimation.estimate import ParameterEstimate
 from needle_identification.estimation.regression import regress
-from needle_identification.estimation.solvers import BoolArray
 from needle_identification.stiffness.presses import Presses, PressNoise
 import numpy as np
 from numpy.linalg import norm
-from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 from scipy.special import stdtrit
 
@@ -141,9 +139,7 @@ _UNKNOWN: Final = MatrixFit(
 )
 
 
-def fit_matrix(
-    presses: Presses, noise: PressNoise, chosen: NDArray[np.int64], estimator: str
-) -> MatrixFit:
+def fit_matrix(presses: Presses, noise: PressNoise, chosen: IntArray, estimator: str) -> MatrixFit:
     """
     Solve F = K d over presses, as far as they determine K.
 

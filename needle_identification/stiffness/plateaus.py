@@ -11,14 +11,12 @@ from collections.abc import Sequence
 from math import ceil, hypot, inf, sqrt
 from typing import Final, NamedTuple
 
-from needle_dynamics import FloatArray
+from needle_dynamics.arrays import BoolArray, FloatArray, IntArray
 from needle_identification.errors import IdentificationError
-from needle_identification.estimation.solvers import BoolArray
 from needle_identification.recordings.recording import IndentationRecording
 from needle_identification.stiffness.settings import StiffnessSettings
 import numpy as np
 from numpy.linalg import norm
-from numpy.typing import NDArray
 
 #: Bins in the shortest plateau; steadiness is judged by their means.
 _BINS: Final = 10.0
@@ -130,7 +128,7 @@ def find_plateaus(recording: IndentationRecording, settings: StiffnessSettings) 
 
 
 def _steady_runs(
-    number: NDArray[np.int64], means: FloatArray, tolerance: float, shortest: int
+    number: IntArray, means: FloatArray, tolerance: float, shortest: int
 ) -> list[tuple[int, int]]:
     """Return (start, length) of the longest steady runs of bins that do not overlap."""
     if len(means) < shortest:
@@ -174,7 +172,7 @@ def _trimmed(values: FloatArray) -> tuple[int, int]:
     return int(alike.argmax()), len(values) - int(alike[::-1].argmax())
 
 
-def _steady_lengths(values: FloatArray) -> NDArray[np.int64]:
+def _steady_lengths(values: FloatArray) -> IntArray:
     """For each row, count the rows from it on over which no column varies by more than 1."""
     count = len(values)
     # Smallest and largest values over 1, 2, 4, ... rows.

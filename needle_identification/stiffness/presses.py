@@ -6,14 +6,13 @@ from dataclasses import dataclass
 from math import pi
 from typing import Final, NamedTuple
 
-from needle_dynamics import FloatArray
+from needle_dynamics.arrays import FloatArray, IntArray
 from needle_identification.errors import IdentificationError
 from needle_identification.recordings.recording import IndentationRecording
 from needle_identification.stiffness.drift import follow_zero
 from needle_identification.stiffness.plateaus import Plateaus
 from needle_identification.stiffness.settings import StiffnessSettings
 import numpy as np
-from numpy.typing import NDArray
 
 #: Forces within this angle press in the same direction [rad].
 _SAME_DIRECTION: Final = pi / 18.0
@@ -48,8 +47,8 @@ class Presses:
     displacement_error: FloatArray
     force_error: FloatArray
     off_plane: FloatArray
-    level: NDArray[np.int64]
-    direction: NDArray[np.int64]
+    level: IntArray
+    direction: IntArray
 
     def __repr__(self) -> str:
         levels, directions = int(self.level.max()) + 1, int(self.direction.max()) + 1
@@ -74,9 +73,7 @@ class PressNoise(NamedTuple):
     force_zero: FloatArray
     displacement_zero: FloatArray
 
-    def covariance(
-        self, matrix: FloatArray, chosen: NDArray[np.int64], *, pooled: bool
-    ) -> FloatArray:
+    def covariance(self, matrix: FloatArray, chosen: IntArray, *, pooled: bool) -> FloatArray:
         """
         Return the covariance of F - K d.
 
@@ -206,7 +203,7 @@ def _warnings(presses: Presses, plateaus: Plateaus, settings: StiffnessSettings)
     return warnings
 
 
-def grouped(sizes: FloatArray, tolerance: float) -> NDArray[np.int64]:
+def grouped(sizes: FloatArray, tolerance: float) -> IntArray:
     """
     Put values that are close into groups.
 
@@ -234,7 +231,7 @@ def grouped(sizes: FloatArray, tolerance: float) -> NDArray[np.int64]:
     return group
 
 
-def _directions(force: FloatArray) -> NDArray[np.int64]:
+def _directions(force: FloatArray) -> IntArray:
     """Group forces by direction, beginning after the widest gap between directions."""
     angle = np.arctan2(force[:, 1], force[:, 0])
     order = np.sort(angle)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from math import atan2, hypot, nan
 
-from needle_dynamics import FloatArray
+from needle_dynamics.arrays import FloatArray
 from needle_identification.estimation.estimate import ParameterEstimate
 from needle_identification.stiffness.matrix import MatrixFit
 from needle_identification.stiffness.plateaus import ROUNDING

@@ -20,9 +20,7 @@ from needle_dynamics import (
 from needle_dynamics.simulated.assembly import assemble
 from needle_dynamics.simulated.indenter import Indenter, IndenterParameters
 from needle_dynamics.simulated.plant import BaseParameters, Plant, TipParameters
-from needle_identification import RecordingError
-from needle_identification.bags.bag import Bag, deserialize
-from needle_identification.bags.storage import Topic
+from needle_identification import Bag, deserialize, RecordingError, Topic
 from needle_ros.settings import as_number
 from needle_ros.timing import NANOSECONDS, nanoseconds
 import yaml

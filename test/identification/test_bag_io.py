@@ -12,6 +12,7 @@ import lz4.frame
 from mcap.reader import make_reader
 from mcap.writer import Writer as McapWriter
 from needle_identification import (
+    Bag,
     BagWriter,
     message_counts,
     OfferedQos,
@@ -20,7 +21,6 @@ from needle_identification import (
     Recording,
     RecordingError,
 )
-from needle_identification.bags.bag import Bag
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 import pytest
@@ -525,7 +525,7 @@ def test_a_broken_chunk_costs_its_own_messages_only(tmp_path: Path) -> None:
     assert numbers == [*range(10), *range(20, 30)]
     assert sum(len(batch.received) for batch in bag.batches(lambda _topic: True)) == 20
     assert bag.losses == [
-        'bag_0.mcap is broken: the checksum of a chunk is wrong; 20 of 30 messages read'
+        'bag_0.mcap is damaged: the checksum of a chunk is wrong; 20 of 30 messages read'
     ]
 
 
@@ -587,7 +587,7 @@ def damaged(tmp_path: Path, case: str) -> Path:
         ('empty.mcap', 'empty.mcap is not an MCAP file: begins with nothing'),
         (
             'broken.db3',
-            'broken.db3 holds no messages; broken.db3 is broken: file is not a database',
+            'broken.db3 holds no messages; broken.db3 is damaged: file is not a database',
         ),
         ('folder', 'folder holds no recording; valid:'),
         ('nested', 'nested holds no recording; valid:'),

@@ -197,7 +197,7 @@ def test_containers_are_read_whole_without_metadata_bare_and_cut_off(
     assert 'no readable metadata.yaml' in identified(tmp_path / 'bag')
     bare.write_bytes(file.read_bytes()[: int(0.85 * file.stat().st_size)])
     said = identified(bare)
-    assert re.search(f'{bare.name} (is cut off|is broken: .*); [0-9]+ messages read', said)
+    assert re.search(f'{bare.name} (is cut off|is damaged: .*); [0-9]+ messages read', said)
 
 
 @pytest.mark.parametrize('plugin', ['mcap', 'sqlite3'])
@@ -270,7 +270,7 @@ def at_position_zero(stamp: int, _depth: float, speed: float) -> bytes:
     ('make', 'said'),
     [
         (without_speed, 'has no velocity'),
-        (at_speed_zero, 'moves at the velocity 0'),
+        (at_speed_zero, 'moves with the velocity 0'),
         (at_speed_nan, 'has no velocity'),
         (without_position, 'has no position'),
         (at_position_zero, 'has no position'),
@@ -379,7 +379,7 @@ def test_a_tenth_of_a_second_may_be_latency_and_is_said(
     assert 'may be latency' not in identified(path, '--time', 'receive')
     assert main(['identify', 'friction', str(path)]) == 0
     assert (
-        'may be latency, left as it is; time receive would correct it' in capsys.readouterr().err
+        'may be latency, not corrected; time receive would correct it' in capsys.readouterr().err
     )
 
 

@@ -3,10 +3,8 @@
 from itertools import pairwise
 from pathlib import Path
 
-from needle_identification import BagWriter, OfferedQos
-from needle_identification.bags import bag as bag_io
-from needle_identification.bags.bag import Bag
-from needle_identification.bags.storage import offered_qos, Topic
+from needle_identification import Bag, BagWriter, OfferedQos, Topic
+from needle_identification.bags import bag as reading
 import pytest
 from rosbags.interfaces import (
     Qos,
@@ -60,7 +58,7 @@ def test_a_long_recording_is_put_in_order_piece_by_piece(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """No more waits than the window and the piece that is read; only the wanted topics do."""
-    monkeypatch.setattr(bag_io, '_WINDOW', 1000)
+    monkeypatch.setattr(reading, '_WINDOW', 1000)
     with BagWriter(tmp_path / 'bag') as writer:
         for name in ('/a', '/b'):
             writer.add_topic(name, TEXT)
@@ -83,7 +81,7 @@ def test_a_message_behind_the_window_comes_when_it_is_met(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Nothing is lost, whatever the order."""
-    monkeypatch.setattr(bag_io, '_WINDOW', 0)
+    monkeypatch.setattr(reading, '_WINDOW', 0)
     with BagWriter(tmp_path / 'bag') as writer:
         writer.add_topic('/a', TEXT)
         for k in range(10):
@@ -102,7 +100,7 @@ def test_what_was_offered_comes_back(tmp_path: Path) -> None:
         writer.add_topic('/a', TEXT, [weak, latched])
         writer.write('/a', text('x'), EPOCH)
     (topic,) = Bag(tmp_path / 'bag').topics()
-    assert offered_qos(topic.profiles) == (weak, latched)
+    assert topic.offered_qos() == (weak, latched)
     forever = QosTime(9223372036, 854775807)
     profile = Qos(
         QosHistory.KEEP_LAST, 5, QosReliability.BEST_EFFORT, QosDurability.VOLATILE, forever,
@@ -115,7 +113,7 @@ def test_what_was_offered_comes_back(tmp_path: Path) -> None:
         )
         writer.write(connection, EPOCH, text('x'))
     (message,) = Bag(path).messages(everything)
-    assert offered_qos(message.topic.profiles) == (weak,)
+    assert message.topic.offered_qos() == (weak,)
 
 
 @pytest.mark.parametrize(
@@ -134,4 +132,4 @@ def test_reads_what_any_version_of_rosbag2_stored(
     stored: str, found: tuple[OfferedQos, ...]
 ) -> None:
     """Numbers stand for the words in older recordings; what is not readable says nothing."""
-    assert offered_qos(stored) == found
+    assert Topic('/a', TEXT, profiles=stored).offered_qos() == found

@@ -173,7 +173,7 @@ def test_speed_that_is_not_there_is_none_and_said(tmp_path: Path) -> None:
     path = small_bag(tmp_path / 'zero', wrenches, [(t, d, 0.0) for t, d, _ in motions])
     read = read_friction_recording(path)
     assert read.speed is None
-    assert read.losses == ('/joints moves at the velocity 0, which is left out',)
+    assert read.losses == ('/joints moves with the velocity 0, which is left out',)
 
 
 def test_a_speed_that_is_there_mostly_is_taken_where_it_is(tmp_path: Path) -> None:
@@ -224,8 +224,8 @@ def test_without_header_stamps_the_time_of_reception_counts(tmp_path: Path) -> N
     read = read_friction_recording(tmp_path / 'bag')
     assert_allclose(read.time, np.arange(5) * 1e-2)
     assert read.losses == (
-        '5 of /ft without a stamp, taken at the time of reception',
-        '5 of /joints without a stamp, taken at the time of reception',
+        '5 of /ft without a stamp, the receive time is used',
+        '5 of /joints without a stamp, the receive time is used',
     )
 
 
@@ -550,7 +550,7 @@ def test_joints_of_an_indentation_may_lack_the_one_across(tmp_path: Path) -> Non
     assert_array_equal(read.off_plane, 0.0)
     assert_array_equal(read.position[:, 1], np.arange(11))
     assert read.losses == (
-        '/joint_states has no joint across the plane: off-plane motion unknown',
+        '/joint_states has no joint out of the plane: off-plane motion unknown',
     )
     with pytest.raises(RecordingError, match='must have the joints y and z, has x, z'):
         read_indentation_recording(path, axes=('y', 'z'))

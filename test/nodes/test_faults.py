@@ -9,7 +9,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PointStamped, WrenchStamped
 from needle_controller.controller_node import ControllerNode
 from needle_dynamics.plant_node import PlantNode
-from needle_identification.bags.bag import Bag
+from needle_identification import Bag
 from needle_ros.base_node import COMMAND, SENSOR
 from needle_ros.timing import seconds
 import numpy as np

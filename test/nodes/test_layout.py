@@ -9,8 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from needle_dynamics import ShapeError
 from needle_dynamics.plant_node import PlantNode
-from needle_identification.bags.bag import deserialize, encode
-from needle_identification.bags.storage import Topic
+from needle_identification import deserialize, encode, Topic
 from needle_ros import base_node
 from needle_ros.base_node import layout_of, reading_of, SENSOR
 from needle_ros.packed import Layout, Reading

@@ -9,7 +9,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PointStamped
 from needle_controller import ContinuousInverseDynamics
 from needle_dynamics import FloatArray, NeedleModel, NeedleParameters
-from needle_identification.bags.bag import Bag, deserialize, encode
+from needle_identification import Bag, deserialize, encode
 from needle_identification.recorder_node import is_hidden
 from needle_insertion.experiment.ros_graph import Graph
 from needle_ros.base_node import COMMAND, SENSOR

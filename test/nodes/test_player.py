@@ -13,8 +13,7 @@ from typing import Any
 from builtin_interfaces.msg._time import Time
 from diagnostic_msgs.msg import DiagnosticStatus
 from mcap.writer import Writer as McapWriter
-from needle_identification import BagWriter, OfferedQos, read_topic
-from needle_identification.bags.bag import Bag
+from needle_identification import Bag, BagWriter, OfferedQos, read_topic
 from needle_identification.player_node import PlayerNode
 from needle_identification.recorder_node import RecorderNode
 from needle_ros.base_node import LATCHED, SENSOR

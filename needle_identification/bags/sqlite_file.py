@@ -1,4 +1,4 @@
-"""Messages from sqlite3 files, damaged ones as far as they go."""
+"""Messages of sqlite3 files, also of damaged ones."""
 
 from __future__ import annotations
 
@@ -11,28 +11,39 @@ from tempfile import TemporaryDirectory
 from typing import Any
 from urllib.parse import quote
 
-from needle_identification.bags.storage import (
-    Batch,
-    BLOCK,
-    COMPRESSED,
-    joined,
-    LATEST,
-    MOST,
-    opened,
-    taken,
-    Tally,
-    topic_of,
-)
+from needle_identification.bags.batch import Batch, LARGEST_BATCH, LATEST, Tally
+from needle_identification.bags.compression import BLOCK, COMPRESSED, open_file, read_up_to
+from needle_identification.bags.topics import make_topic, Topic
 import numpy as np
 
 
 def sqlite_batches(file: Path, tally: Tally) -> Iterator[Batch]:
-    """Yield the messages in a file that may be compressed; sqlite3.Error if it breaks off."""
+    """
+    Read a sqlite3 file.
+
+    Parameters
+    ----------
+    file : Path
+        A ``.db3`` file, compressed or not.
+    tally : Tally
+        Counts what is read.
+
+    Yields
+    ------
+    Batch
+        Messages of the wanted topics.
+
+    Raises
+    ------
+    sqlite3.Error
+        If the file is damaged; what comes before is read.
+
+    """
     with ExitStack() as stack:
         if file.suffix in COMPRESSED:
             folder = stack.enter_context(TemporaryDirectory())
-            with opened(file) as stream, Path(folder, file.stem).open('wb') as copy:
-                while part := taken(stream, BLOCK):
+            with open_file(file) as stream, Path(folder, file.stem).open('wb') as copy:
+                while part := read_up_to(stream, BLOCK):
                     copy.write(part)
             file = Path(folder, file.stem)
         # A journal that was not merged into the file holds the end of a recording.
@@ -43,10 +54,8 @@ def sqlite_batches(file: Path, tally: Tally) -> Iterator[Batch]:
         yield from _rows(database, tally)
 
 
-def _rows(database: sqlite3.Connection, tally: Tally) -> Iterator[Batch]:
-    """Yield the messages in a database, a damaged one as far as it goes."""
-    # Otherwise nothing is read of a file whose end, with an index, is missing.
-    database.execute('PRAGMA writable_schema = ON')
+def _topics(database: sqlite3.Connection) -> dict[int, Topic]:
+    """Return the topics by their key in the database."""
     definitions: dict[Any, tuple[Any, Any]] = {}
     with suppress(sqlite3.Error):
         # Older recordings have no such table.
@@ -58,21 +67,26 @@ def _rows(database: sqlite3.Connection, tally: Tally) -> Iterator[Batch]:
         }
     profiles: dict[Any, Any] = {}
     with suppress(sqlite3.Error):
-        # Nor have the oldest this column.
+        # The oldest recordings have no such column.
         profiles.update(database.execute('SELECT id, offered_qos_profiles FROM topics'))
-    topics = {
-        key: topic_of(
-            *map(
-                _word, (name, kind, form, *definitions.get(kind, ('', '')), profiles.get(key, ''))
-            )
-        )
-        for key, name, kind, form in database.execute(
-            'SELECT id, name, type, serialization_format FROM topics'
-        )
-        if isinstance(key, int)
-    }
+    topics = {}
+    for key, name, kind, form in database.execute(
+        'SELECT id, name, type, serialization_format FROM topics'
+    ):
+        encoding, definition = definitions.get(kind, ('', ''))
+        words = map(_text, (name, kind, form, encoding, definition, profiles.get(key, '')))
+        if isinstance(key, int):
+            topics[key] = make_topic(*words)
+    return topics
+
+
+def _rows(database: sqlite3.Connection, tally: Tally) -> Iterator[Batch]:
+    """Yield the messages of a database, as far as it is readable."""
+    # Otherwise nothing is read of a file whose end, with an index, is missing.
+    database.execute('PRAGMA writable_schema = ON')
+    topics = _topics(database)
     wanted = ', '.join(str(key) for key, topic in topics.items() if tally.wanted(topic))
-    # Only what is wanted is loaded; images beside it are large.
+    # Only wanted data are loaded, not the images beside them.
     rows = database.execute(
         f'SELECT topic_id, timestamp, CASE WHEN topic_id IN ({wanted}) THEN data END FROM messages'  # noqa: S608
     )
@@ -80,9 +94,9 @@ def _rows(database: sqlite3.Connection, tally: Tally) -> Iterator[Batch]:
     while fault is None:
         some: list[tuple[int, int, bytes]] = []
         try:
-            some.extend(islice(rows, MOST))
+            some.extend(islice(rows, LARGEST_BATCH))
         except sqlite3.Error as error:
-            # What came before it is as good as any.
+            # What came before the fault is still good.
             fault = error
         if not some:
             break
@@ -91,19 +105,17 @@ def _rows(database: sqlite3.Connection, tally: Tally) -> Iterator[Batch]:
         for key, received, data in some:
             groups.setdefault(key, []).append((received, data))
         for key, group in groups.items():
-            if key not in topics:
-                tally.faults.append(f'is broken: {len(group)} messages of an unknown topic')
-            elif tally.enter(topics[key], len(group)):
+            if tally.enter(topics.get(key), len(group)):
                 times, parts = zip(*group, strict=True)
                 stamps = np.array([t if isinstance(t, int) else 0 for t in times])
-                yield joined(
+                yield Batch.joined(
                     topics[key],
                     np.clip(stamps, -LATEST, LATEST),
                     [part if isinstance(part, bytes) else b'' for part in parts],
-                ).plain()
+                ).decompressed()
     if fault is not None:
         raise fault
 
 
-def _word(value: Any) -> str:
+def _text(value: Any) -> str:
     return value.decode(errors='replace') if isinstance(value, bytes) else str(value)

@@ -1,0 +1,161 @@
+"""Batches: many messages of one topic, as arrays; and the count of what was read of a file."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+from needle_identification.bags.compression import compression_of, DAMAGED, decompress
+from needle_identification.bags.topics import Topic
+import numpy as np
+from numpy.typing import NDArray
+
+#: Largest number of messages in a batch.
+LARGEST_BATCH: Final = 2**14
+
+#: Receive times are limited to this, so that their differences fit in 64 bits [ns].
+LATEST: Final = 2**62
+
+#: Larger messages are not decompressed [bytes].
+_LARGEST_MESSAGE: Final = 2**26
+
+
+class Batch(NamedTuple):
+    """
+    Messages of one topic, in order.
+
+    Attributes
+    ----------
+    topic : Topic
+        The topic.
+    received : ndarray of int64, shape (m,)
+        Receive times [ns].
+    data : ndarray of uint8
+        Bytes that hold the messages.
+    begin, end : ndarray of int64, shape (m,)
+        Positions at which each message begins and ends.
+
+    """
+
+    topic: Topic
+    received: NDArray[np.int64]
+    data: NDArray[np.uint8]
+    begin: NDArray[np.int64]
+    end: NDArray[np.int64]
+
+    @classmethod
+    def joined(cls, topic: Topic, received: NDArray[np.int64], messages: Sequence[bytes]) -> Batch:
+        """
+        Make a batch of separate messages.
+
+        Parameters
+        ----------
+        topic : Topic
+            The topic.
+        received : ndarray of int64, shape (m,)
+            Receive times [ns].
+        messages : sequence of bytes
+            The messages.
+
+        Returns
+        -------
+        Batch
+            The batch.
+
+        """
+        lengths = np.array([len(message) for message in messages], dtype=np.int64)
+        end = np.cumsum(lengths)
+        data = np.frombuffer(b''.join(messages), dtype=np.uint8)
+        return cls(topic, received, data, end - lengths, end)
+
+    def messages(self) -> Iterator[tuple[int, bytes]]:
+        """
+        Go through the messages.
+
+        Yields
+        ------
+        int, bytes
+            Receive time [ns] and bytes.
+
+        """
+        for received, begin, end in zip(self.received, self.begin, self.end, strict=True):
+            yield int(received), self.data[begin:end].tobytes()
+
+    def decompressed(self) -> Batch:
+        """
+        Decompress messages that were compressed one by one.
+
+        Returns
+        -------
+        Batch
+            The same messages; a damaged one is empty.
+
+        """
+        compression = compression_of(next(self.messages())[1])
+        if not compression:
+            return self
+        parts = [b''] * len(self.received)
+        for k, (_, data) in enumerate(self.messages()):
+            with suppress(*DAMAGED):
+                parts[k] = decompress(compression, data, _LARGEST_MESSAGE)
+        return Batch.joined(self.topic, self.received, parts)
+
+
+@dataclass(slots=True)
+class Tally:
+    """
+    Counts what is read of a file.
+
+    Attributes
+    ----------
+    counts : dict
+        Messages by topic.
+    wanted : callable
+        Tells whether the messages of a topic are wanted.
+    faults : list of str
+        What is wrong with the file.
+    count : int
+        Messages read, of known topics.
+    written : int or None
+        Messages that the file should have, by its own statistics.
+    piece : int
+        Number of the piece that is being read; the pieces of a file are in order of time.
+
+    """
+
+    counts: dict[Topic, int]
+    wanted: Callable[[Topic], bool]
+    faults: list[str]
+    count: int = 0
+    written: int | None = None
+    piece: int = 0
+
+    def __str__(self) -> str:
+        of = '' if self.written is None else f' of {self.written}'
+        return f'{self.count}{of} messages'
+
+    def enter(self, topic: Topic | None, number: int) -> bool:
+        """
+        Count messages.
+
+        Parameters
+        ----------
+        topic : Topic or None
+            Their topic; None if it is unknown, which is a fault.
+        number : int
+            Number of messages.
+
+        Returns
+        -------
+        bool
+            Whether they are wanted.
+
+        """
+        if topic is None:
+            self.faults.append(f'is damaged: {number} messages of an unknown topic')
+            return False
+        self.counts[topic] = self.counts.get(topic, 0) + number
+        self.count += number
+        return self.wanted(topic)

@@ -1,0 +1,113 @@
+"""The files that a bag consists of."""
+
+from __future__ import annotations
+
+from pathlib import Path
+import re
+from typing import Final
+
+from needle_identification.bags.compression import uncompressed_name
+from needle_identification.errors import RecordingError
+import yaml
+
+#: File of a rosbag2 folder that lists the others; written when the bag is closed.
+METADATA: Final = 'metadata.yaml'
+
+_FORMS: Final = ('.mcap', '.db3')
+
+_VALID: Final = 'valid: a rosbag2 folder, an .mcap or a .db3 file'
+
+
+def form_of(file: Path) -> str:
+    """
+    Tell the form of storage of a file by its name.
+
+    Parameters
+    ----------
+    file : Path
+        A file, compressed or not.
+
+    Returns
+    -------
+    str
+        ``.mcap``, ``.db3``, or '' for another.
+
+    """
+    suffix = uncompressed_name(file).suffix
+    return suffix if suffix in _FORMS else ''
+
+
+def files_of(path: Path) -> tuple[list[Path], list[str]]:
+    """
+    List the files of a bag.
+
+    Parameters
+    ----------
+    path : Path
+        A rosbag2 folder, or one of its files alone.
+
+    Returns
+    -------
+    files : list of Path
+        In the order of recording.
+    losses : list of str
+        What is missing or does not belong to the bag.
+
+    Raises
+    ------
+    RecordingError
+        If there is no bag.
+
+    """
+    if not path.exists():
+        raise RecordingError(f'{path} does not exist; {_VALID}')
+    if path.is_file():
+        if path.suffix == '.bag':
+            raise RecordingError(
+                f'{path} is a recording of ROS 1; convert it first: '
+                f'rosbags-convert --src {path} --dst {path.with_suffix("")}'
+            )
+        if not form_of(path):
+            raise RecordingError(f'{path} is not a recording; {_VALID}')
+        return [path], []
+    # part_10 comes after part_9.
+    found = sorted(
+        (file for file in (path.iterdir() if path.is_dir() else ()) if file.is_file()),
+        key=lambda file: [len(file.name), file.name],
+    )
+    by_form = {form: [file for file in found if form_of(file) == form] for form in _FORMS}
+    chosen = next(filter(None, by_form.values()), [])
+    if not chosen:
+        inside = min(path.glob(f'*/{METADATA}'), default=None)
+        hint = _VALID if inside is None else f'name those inside, such as {inside.parent}'
+        raise RecordingError(f'{path} holds no recording; {hint}')
+    names = _names_in_metadata(path)
+    if names is None:
+        # The parts of one recording differ in a number at the end.
+        if len({re.sub(r'_\d+$', '', uncompressed_name(file).stem) for file in chosen}) > 1:
+            raise RecordingError(
+                f'{path} holds several recordings; name them, such as {chosen[0]}'
+            )
+        return chosen, [f'no readable {METADATA}: the recording was not closed']
+    there = {file.name for file in chosen}
+    losses = [f'{name} is missing' for name in names if name not in there]
+    if there.isdisjoint(names):
+        return chosen, losses
+    losses += [
+        f'{file.name} is not part of the recording by {METADATA}, left out'
+        for file in chosen
+        if file.name not in names
+    ]
+    return [path / name for name in names if name in there], losses
+
+
+def _names_in_metadata(folder: Path) -> list[str] | None:
+    """Return the files of a bag by its metadata; None if that is not readable."""
+    try:
+        document = yaml.safe_load((folder / METADATA).read_text(encoding='utf-8'))
+        paths = document['rosbag2_bagfile_information']['relative_file_paths']
+        if not isinstance(paths, list):
+            return None
+        return list(dict.fromkeys(Path(str(name)).name for name in paths))
+    except (OSError, yaml.YAMLError, KeyError, TypeError, ValueError, RecursionError):
+        return None

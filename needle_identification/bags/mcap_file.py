@@ -1,0 +1,238 @@
+"""
+Messages of MCAP files, also of damaged ones.
+
+A file is read from its start and chunk by chunk. One whose end is missing gives all that it
+holds, and a long file needs no more memory than a short one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import suppress
+from io import BytesIO
+from pathlib import Path
+import struct
+from typing import Final
+import zlib
+
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.records import Channel, Schema, Statistics
+from needle_identification.bags.batch import Batch, LARGEST_BATCH, LATEST, Tally
+from needle_identification.bags.compression import (
+    BLOCK,
+    DAMAGED,
+    decompress,
+    LARGEST,
+    open_file,
+    read_up_to,
+    skip,
+)
+from needle_identification.bags.topics import make_topic, Topic
+from needle_identification.errors import RecordingError
+import numpy as np
+from numpy.typing import NDArray
+
+_MAGIC: Final = b'\x89MCAP0\r\n'
+
+#: Opcode and length of a record.
+_HEAD: Final = struct.Struct('<BQ')
+
+#: Start, end, size, checksum and length of the name of the compression of a chunk.
+_CHUNK: Final = struct.Struct('<QQQII')
+
+#: The end of a file: a footer record and the magic bytes.
+_TAIL: Final = struct.Struct('<BQQQI8s')
+
+#: Channel, sequence number, log time and publish time come before the data of a message [bytes].
+_MESSAGE_HEAD: Final = 22
+
+#: What is raised at damaged bytes.
+DAMAGED_MCAP: Final = (*DAMAGED, McapError)
+
+
+class _Channels:
+    """Topics of a file by channel, and the messages of each by the statistics of the file."""
+
+    def __init__(self) -> None:
+        self.topics: dict[int, Topic] = {}
+        self.counts: dict[int, int] = {}
+        self._schemas = {0: Schema(id=0, data=b'', encoding='', name='no type')}
+
+    def define(self, opcode: int, record: bytes) -> None:
+        """Add a record if it is a schema, a channel or the statistics."""
+        stream = ReadDataStream(BytesIO(record))
+        if opcode == Opcode.SCHEMA:
+            schema = Schema.read(stream)
+            self._schemas[schema.id] = schema
+        elif opcode == Opcode.CHANNEL:
+            channel = Channel.read(stream)
+            schema = self._schemas[channel.schema_id]
+            self.topics[channel.id] = make_topic(
+                channel.topic,
+                schema.name,
+                channel.message_encoding,
+                schema.encoding,
+                schema.data.decode(errors='replace'),
+                channel.metadata.get('offered_qos_profiles', ''),
+            )
+        elif opcode == Opcode.STATISTICS:
+            self.counts = Statistics.read(stream).channel_message_counts
+
+
+def indexed_topics(file: Path) -> set[Topic] | None:
+    """
+    List the topics of a file by its own index.
+
+    Parameters
+    ----------
+    file : Path
+        An ``.mcap`` file.
+
+    Returns
+    -------
+    set of Topic or None
+        Topics with messages; None if the file has no valid index.
+
+    """
+    channels = _Channels()
+    try:
+        with file.open('rb') as stream:
+            stream.seek(-_TAIL.size, 2)
+            footer, _, start, _, checksum, magic = _TAIL.unpack(stream.read())
+            if (footer, magic) != (Opcode.FOOTER, _MAGIC) or not start or not checksum:
+                return None
+            stream.seek(start)
+            # The checksum covers everything before itself.
+            summary = stream.read()[: -4 - len(_MAGIC)]
+        if zlib.crc32(summary) != checksum:
+            return None
+        for begin, end in _records(summary):
+            for first, after in zip(begin.tolist(), end.tolist(), strict=True):
+                channels.define(summary[first - _HEAD.size], summary[first:after])
+        return {channels.topics[id_] for id_, number in channels.counts.items() if number} or None
+    except (OSError, *DAMAGED_MCAP):
+        return None
+
+
+def mcap_batches(file: Path, tally: Tally) -> Iterator[Batch]:
+    """
+    Read an MCAP file.
+
+    Parameters
+    ----------
+    file : Path
+        An ``.mcap`` file, compressed or not.
+    tally : Tally
+        Counts what is read.
+
+    Yields
+    ------
+    Batch
+        Messages of the wanted topics.
+
+    Raises
+    ------
+    RecordingError
+        If it is not an MCAP file.
+
+    """
+    channels = _Channels()
+    loose = bytearray()
+    is_complete = False
+    with open_file(file) as stream:
+        magic = read_up_to(stream, len(_MAGIC))
+        if magic != _MAGIC:
+            begin = repr(magic) if magic else 'nothing'
+            raise RecordingError(f'{file.name} is not an MCAP file: begins with {begin}')
+        while len(head := read_up_to(stream, _HEAD.size)) == _HEAD.size:
+            opcode, length = _HEAD.unpack(head)
+            if opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE, Opcode.CHUNK):
+                if length > LARGEST:
+                    tally.faults.append(f'is damaged: a record of {length} bytes')
+                    break
+                body = read_up_to(stream, length)
+                if opcode != Opcode.CHUNK:
+                    loose += head + body
+                if opcode == Opcode.CHUNK or len(loose) > BLOCK:
+                    yield from _batches(bytes(loose), channels, tally)
+                    loose.clear()
+                if opcode == Opcode.CHUNK:
+                    yield from _batches(_chunk_content(body, length, tally), channels, tally)
+            elif opcode == Opcode.STATISTICS:
+                tally.written = int.from_bytes(read_up_to(stream, length)[:8], 'little')
+            else:
+                skip(stream, length)
+                is_complete |= opcode == Opcode.DATA_END
+            if opcode == Opcode.FOOTER:
+                break
+    yield from _batches(bytes(loose), channels, tally)
+    if not is_complete:
+        tally.faults.insert(0, 'is cut off')
+    if tally.written not in (None, tally.count):
+        tally.faults.append('has lost messages')
+
+
+def _chunk_content(chunk: bytes, length: int, tally: Tally) -> bytes:
+    """Return the records of a chunk; of one that is cut off, what there is; none if damaged."""
+    try:
+        _, _, size, checksum, name_length = _CHUNK.unpack_from(chunk)
+        begin = _CHUNK.size + name_length + 8
+        if size > LARGEST:
+            raise ValueError(f'a chunk of {size} bytes')
+        data = decompress(chunk[_CHUNK.size : begin - 8].decode(), chunk[begin:], size)
+        if len(chunk) == length:
+            if len(data) != size:
+                raise ValueError(f'a chunk of {len(data)} instead of {size} bytes')
+            if checksum not in (0, zlib.crc32(data)):
+                raise ValueError('the checksum of a chunk is wrong')
+    except DAMAGED_MCAP as error:
+        tally.faults.append(f'is damaged: {error}')
+        return b''
+    return data
+
+
+def _records(content: bytes) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
+    """Yield where the whole records begin and end after their heads, in groups."""
+    length_of = struct.Struct('<Q').unpack_from
+    position, size = 0, len(content)
+    ends = [0]
+    with suppress(struct.error):
+        while True:
+            position += _HEAD.size + length_of(content, position + 1)[0]
+            if position > size:
+                break
+            ends.append(position)
+            if len(ends) > LARGEST_BATCH:
+                yield np.array(ends[:-1]) + _HEAD.size, np.array(ends[1:])
+                ends = [position]
+    yield np.array(ends[:-1], dtype=np.int64) + _HEAD.size, np.array(ends[1:], dtype=np.int64)
+
+
+def _batches(content: bytes, channels: _Channels, tally: Tally) -> Iterator[Batch]:
+    """Yield the messages among records."""
+    data = np.frombuffer(content, dtype=np.uint8)
+    for begin, end in _records(content):
+        opcodes = data[begin - _HEAD.size]
+        for k in np.flatnonzero((opcodes == Opcode.SCHEMA) | (opcodes == Opcode.CHANNEL)):
+            # The messages of a channel that cannot be read are of an unknown topic.
+            with suppress(*DAMAGED_MCAP):
+                channels.define(opcodes[k], content[begin[k] : end[k]])
+        tally.piece += 1
+        is_message = (opcodes == Opcode.MESSAGE) & (end - begin >= _MESSAGE_HEAD)
+        first, after = begin[is_message], end[is_message]
+        ids = _numbers(data, first, '<u2')
+        received = np.minimum(_numbers(data, first + 6, '<u8'), np.uint64(LATEST)).astype(np.int64)
+        for id_ in np.unique(ids):
+            topic = channels.topics.get(int(id_))
+            rows = np.flatnonzero(ids == id_)
+            if tally.enter(topic, len(rows)) and topic is not None:
+                starts = first[rows] + _MESSAGE_HEAD
+                yield Batch(topic, received[rows], data, starts, after[rows]).decompressed()
+
+
+def _numbers(data: NDArray[np.uint8], at: NDArray[np.int64], kind: str) -> NDArray[np.uint64]:
+    """Return the numbers of a kind at positions in bytes."""
+    size = np.dtype(kind).itemsize
+    return np.ascontiguousarray(data[at[:, np.newaxis] + np.arange(size)]).view(kind)[:, 0]

@@ -1,0 +1,151 @@
+"""Types of messages, and messages as objects; no ROS is needed."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+import re
+from typing import Any
+
+from needle_identification.bags.compression import DAMAGED
+from needle_identification.bags.topics import Topic
+from needle_identification.errors import RecordingError
+from rosbags.serde import SerdeError
+from rosbags.typesys import (
+    get_types_from_idl,
+    get_types_from_msg,
+    get_typestore,
+    Stores,
+    TypesysError,
+)
+from rosbags.typesys.store import Typestore
+
+
+@lru_cache(maxsize=1)
+def _jazzy() -> Typestore:
+    return get_typestore(Stores.ROS2_JAZZY)
+
+
+def message_type(type_name: str) -> Any:
+    """
+    Return the class of a standard message, for `encode`.
+
+    Parameters
+    ----------
+    type_name : str
+        Type, such as ``sensor_msgs/msg/JointState``.
+
+    Returns
+    -------
+    type
+        The class.
+
+    Raises
+    ------
+    RecordingError
+        If it is not a type of ROS 2 Jazzy.
+
+    """
+    try:
+        return _jazzy().types[type_name]
+    except KeyError:
+        raise _unknown(type_name) from None
+
+
+def _unknown(type_name: str) -> RecordingError:
+    return RecordingError(f'no definition of {type_name}; valid: the types of ROS 2 Jazzy')
+
+
+def definition_of(type_name: str) -> tuple[str, str]:
+    """
+    Return what a bag stores of a standard message.
+
+    Parameters
+    ----------
+    type_name : str
+        Type, such as ``sensor_msgs/msg/JointState``.
+
+    Returns
+    -------
+    definition, type_hash : str
+        Definition in the language ``ros2msg``, and hash of the type.
+
+    Raises
+    ------
+    RecordingError
+        If it is not a type of ROS 2 Jazzy.
+
+    """
+    try:
+        definition, _ = _jazzy().generate_msgdef(type_name, ros_version=2)
+        return definition, _jazzy().hash_rihs01(type_name)
+    except TypesysError as error:
+        raise _unknown(type_name) from error
+
+
+def encode(message: Any) -> bytes:
+    """
+    Serialize a message.
+
+    Parameters
+    ----------
+    message : object
+        Message of a class of `message_type`.
+
+    Returns
+    -------
+    bytes
+        The message as on the wire (CDR).
+
+    """
+    return bytes(_jazzy().serialize_cdr(message, message.__msgtype__))
+
+
+def deserialize(topic: Topic, data: bytes) -> Any:
+    """
+    Deserialize a message of a topic.
+
+    Parameters
+    ----------
+    topic : Topic
+        Topic of a bag; the bag holds the definition if the type is not of ROS 2 Jazzy.
+    data : bytes
+        The message as on the wire (CDR).
+
+    Returns
+    -------
+    object
+        The message.
+
+    Raises
+    ------
+    RecordingError
+        If the type is unknown, or the bytes are not of that type.
+
+    """
+    store = _store(topic.type_name, topic.encoding, topic.definition)
+    try:
+        return store.deserialize_cdr(data, topic.type_name)
+    except (*DAMAGED, SerdeError) as error:
+        raise RecordingError(f'is not a {topic.type_name}: {error}') from error
+
+
+@lru_cache(maxsize=64)
+def _store(type_name: str, encoding: str, definition: str) -> Typestore:
+    """Return a store that knows a type: that of Jazzy, else one with the definition of the bag."""
+    known = _jazzy().fielddefs
+    if type_name in known:
+        return _jazzy()
+    store = get_typestore(Stores.ROS2_JAZZY)
+    try:
+        if encoding == 'ros2msg':
+            types = get_types_from_msg(definition, type_name)
+        else:
+            types = {}
+            for part in re.split(r'^=+\nIDL: .*\n', definition, flags=re.MULTILINE):
+                types.update(get_types_from_idl(part) if part.strip() else {})
+        store.register({name: fields for name, fields in types.items() if name not in known})
+    except TypesysError as error:
+        raise RecordingError(f'the definition of {type_name} is not readable: {error}') from error
+    if type_name not in store.fielddefs:
+        raise RecordingError(f'the bag does not hold the definition of {type_name}')
+    return store

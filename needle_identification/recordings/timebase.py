@@ -1,0 +1,129 @@
+"""
+Force and motion on one time base, that of the force.
+
+Whether force and motion were stamped by different clocks is seen from the receive times, all by
+the clock of the recorder. A message is received later than it was stamped by its latency, minus
+what its clock is ahead. The latency that 5 % of the messages are below hardly varies. Where that
+of the two topics differs by more than `LARGEST_LATENCY`, their clocks differ, and the stamps of
+the force are shifted. A smaller difference may be one of latency, and the stamps stay.
+"""
+
+from __future__ import annotations
+
+from typing import Final, NamedTuple
+
+from needle_dynamics.arrays import BoolArray, FloatArray
+from needle_identification.bags.bag import Bag
+from needle_identification.errors import RecordingError
+from needle_identification.recordings.samples import are_gaps, Samples
+import numpy as np
+from numpy.typing import NDArray
+
+#: Largest difference of the latencies of two topics [s]. An optical tracker or an imager takes up
+#: to 0.2 s; clocks that were never set differ by more.
+LARGEST_LATENCY: Final = 0.25
+
+#: Difference of latencies that is worth mentioning [s].
+_NOTABLE_LATENCY: Final = 0.05
+
+#: The clocks must differ by this many times the variation of the latencies.
+_CERTAINTY: Final = 3.0
+
+
+class Merged(NamedTuple):
+    """
+    Force and motion on one time base.
+
+    Attributes
+    ----------
+    time : ndarray, shape (n,)
+        Time from the first sample [s].
+    force : ndarray, shape (n, k)
+        Values of the force.
+    motion : ndarray, shape (n, m)
+        Values of the motion, interpolated.
+    clock_offset : float
+        Clock of the force minus clock of the motion [s].
+
+    """
+
+    time: FloatArray
+    force: FloatArray
+    motion: FloatArray
+    clock_offset: float
+
+
+def merge(bag: Bag, force: Samples, motion: Samples) -> Merged:
+    """
+    Put force and motion on the time base of the force.
+
+    Parameters
+    ----------
+    bag : Bag
+        Their bag; what was left out or shifted is added to its losses.
+    force, motion : Samples
+        The samples.
+
+    Returns
+    -------
+    Merged
+        Samples of the force at which the motion is known.
+
+    Raises
+    ------
+    RecordingError
+        If force and motion do not overlap in time.
+
+    """
+    offset = _clock_offset(bag, force, motion)
+    stamps = force.stamps - offset
+    covered = _covered(stamps, motion.stamps)
+    if np.count_nonzero(covered) < 2:
+        spans = ' and '.join(
+            f'from {span[0] * 1e-9:.3f} to {span[-1] * 1e-9:.3f} s'
+            for span in (stamps, motion.stamps)
+        )
+        raise RecordingError(
+            f'{bag.path}: {force.topic} and {motion.topic} do not overlap in time; they last '
+            f'{spans}'
+        )
+    if not covered.all():
+        bag.losses.append(
+            f'{np.count_nonzero(~covered)} of {force.topic} not covered by {motion.topic}'
+        )
+    start = stamps[covered][0]
+    time = (stamps[covered] - start) * 1e-9
+    # Far from the start, seconds do not distinguish nanoseconds.
+    distinct = np.diff(time, prepend=-1.0) > 0.0
+    time = time[distinct]
+    motion_time = (motion.stamps - start) * 1e-9
+    columns = [np.interp(time, motion_time, column) for column in motion.values.T]
+    return Merged(time, force.values[covered][distinct], np.column_stack(columns), offset * 1e-9)
+
+
+def _clock_offset(bag: Bag, force: Samples, motion: Samples) -> int:
+    """Estimate how far the clock of the force is ahead [ns]; 0 if latency explains it."""
+    quantiles = [
+        np.quantile(samples.latency, (0.05, 0.5), method='lower') for samples in (force, motion)
+    ]
+    (force_low, force_mid), (motion_low, motion_mid) = quantiles
+    offset = int(motion_low - force_low)
+    variation = float(force_mid - force_low) + float(motion_mid - motion_low)
+    words = f'by the receive times {force.topic} is stamped {offset * 1e-9:.3f} s'
+    if abs(offset) > max(1e9 * LARGEST_LATENCY, _CERTAINTY * variation):
+        bag.losses.append(f'{words} after {motion.topic}: clocks differ, corrected')
+        return offset
+    if abs(offset) > max(1e9 * _NOTABLE_LATENCY, _CERTAINTY * variation):
+        bag.losses.append(
+            f'{words} after {motion.topic}: may be latency, not corrected; time receive would '
+            'correct it'
+        )
+    return 0
+
+
+def _covered(stamps: NDArray[np.int64], motion: NDArray[np.int64]) -> BoolArray:
+    """Mark the stamps at which the motion can be interpolated."""
+    steps = np.diff(motion)
+    after = np.clip(np.searchsorted(motion, stamps), 1, len(steps))
+    inside = (motion[0] <= stamps) & (stamps <= motion[-1])
+    return np.asarray(inside & ~are_gaps(steps)[after - 1])
