@@ -93,6 +93,16 @@ def test_paths_in_the_documentation_exist() -> None:
     assert missing == []
 
 
+def test_architecture_names_every_folder_once() -> None:
+    """The table of folders has each folder of the packages, and no folder that is not there."""
+    page = (ROOT / 'docs/architecture.md').read_text(encoding='utf-8')
+    named = re.findall(r'^\| `((?:\w+/)+)` \|', page, flags=re.MULTILINE)
+    assert len(named) == len(set(named))
+    assert all((ROOT / name).is_dir() for name in named)
+    sources = ROOT.glob('needle_*/**/*.py')
+    assert {f'{path.parent.relative_to(ROOT)}/' for path in sources} <= set(named)
+
+
 def test_links_in_the_documentation_exist() -> None:
     """Every link to a file leads to one."""
     missing = [
