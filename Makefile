@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 SOURCES := needle_ros needle_dynamics needle_controller needle_identification needle_insertion benchmarks examples test launch docs setup.py
 
-.PHONY: demo test check docs format setup lock bags clean
+.PHONY: demo test check docs format setup lock bags results clean
 
 demo: setup
 	$(BIN)/needle demo
@@ -52,6 +52,15 @@ bags: setup
 	$(BIN)/needle experiment friction --rate 100 --speed 20 bags
 	$(BIN)/needle experiment stiffness --rate 40 --speed 40 bags
 	cd bags && sha256sum friction_*/* stiffness_*/* > SHA256SUMS
+
+# What the shipped recordings give. The other pages of results: needle bench NAME -o docs/results/NAME.md
+results: setup
+	set -e; { printf '# Tables 1 and 2 from the shipped recordings\n\n'; \
+	printf 'This page is generated. Do not edit it, but run `make results` again.\n\n'; \
+	printf -- '- date: %s\n- version: %s\n' "$$(date -u '+%Y-%m-%d %H:%M UTC')" "$$($(BIN)/needle --version)"; \
+	for table in table-1 table-2; do \
+	printf '\n```bash\nneedle reproduce %s\n```\n\n```text\n' $$table; $(BIN)/needle reproduce $$table; printf '```\n'; \
+	done; } > docs/results/tables.md
 
 clean:
 	rm -rf $(VENV) build install log demo_output docs/_build docs/api docs/repository

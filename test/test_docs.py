@@ -18,7 +18,11 @@ import yaml
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted(
-    [*ROOT.glob('*.md'), *ROOT.glob('docs/*.md'), *ROOT.glob('docs/howto/*.md')]
+    [
+        path
+        for folder in ('.', 'docs', 'docs/howto', 'docs/results')
+        for path in (ROOT / folder).glob('*.md')
+    ]
     + [ROOT / folder / 'README.md' for folder in ('bags', 'config', 'examples')]
 )
 #: What the changelog names may be gone.
@@ -29,6 +33,7 @@ RUN = {
     'docs/tutorial.md': 'needle ',
     'docs/howto/own-needle.md': 'needle ',
     'docs/howto/own-friction.md': 'needle ',
+    'docs/results/tables.md': 'needle ',
 }
 
 
