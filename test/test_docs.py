@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import doctest
 from importlib import import_module
 from importlib.util import find_spec
 import os
@@ -37,6 +38,14 @@ RUN = {
 }
 
 
+#: Modules with examples in their docstrings.
+WITH_EXAMPLES = sorted(
+    '.'.join(path.relative_to(ROOT).with_suffix('').parts)
+    for path in ROOT.glob('needle_*/**/*.py')
+    if '>>> ' in path.read_text(encoding='utf-8')
+)
+
+
 def blocks(text: str, *languages: str) -> list[str]:
     """Return the code blocks of a page in some languages."""
     found = re.findall(r'^```(\w+)\n(.*?)^```', text, flags=re.DOTALL | re.MULTILINE)
@@ -68,6 +77,14 @@ def exists(name: str) -> bool:
             found = getattr(found, part)
         return True
     return False
+
+
+@pytest.mark.parametrize('module', WITH_EXAMPLES)
+def test_examples_in_docstrings_print_what_they_show(module: str) -> None:
+    """Each `>>>` in a docstring of a module gives the output below it."""
+    found = doctest.testmod(import_module(module), optionflags=doctest.ELLIPSIS)
+    assert found.attempted > 0
+    assert found.failed == 0
 
 
 def test_names_in_the_documentation_exist() -> None:

@@ -54,6 +54,7 @@ class BagWriter:
 
     Examples
     --------
+    >>> from needle_identification import BagWriter, encode, message_type, read_topic
     >>> from tempfile import TemporaryDirectory
     >>> folder = TemporaryDirectory()
     >>> text = message_type('std_msgs/msg/String')

@@ -92,8 +92,8 @@ def identify_stiffness(
     >>> time = np.arange(len(force)) / 250.0
     >>> recording = IndentationRecording(time=time, position=force / 800.0, force=force)
     >>> estimate = identify_stiffness(recording)
-    >>> estimate.levels
-    (<LevelEstimate at 1.2 N: K = [[800, 0], [0, 800]] N/m>,)
+    >>> [round(estimate.levels[0][name].value) for name in ('k_xx', 'k_xz', 'k_zx', 'k_zz')]
+    [800, 0, 0, 800]
 
     """
     settings = settings or StiffnessSettings()
