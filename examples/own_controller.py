@@ -1,36 +1,41 @@
 """
-Drive the simulated needle with a control law of your own.
+Close the loop around the simulated needle with a control law of your own.
 
-A law is any function of what is measured. It is called once per sample, and its force acts until
-the next one.
+A law is any object with a sample period, a delay and a method `command`. The shipped controller
+is one, too, so that both run in the same loop.
 """
 
-from needle_dynamics import Integrator, NeedleModel, NeedleParameters
+from needle_controller import Command, Controller, Measurement, run_controller
+from needle_dynamics import NeedleModel, NeedleParameters
 
-#: Sample period [s], and what the law aims at [m].
-PERIOD = 1e-3
+#: Depth to reach [m].
 TARGET = 0.05
 
 
-def law(depth: float, velocity: float) -> float:
-    """Return the insertion force [N]: a spring to the target, and damping."""
-    return 2000.0 * (TARGET - depth) - 20.0 * velocity
+class Spring:
+    """A spring to the target, and damping; the delay is in periods."""
+
+    period, delay = 1e-3, 1
+
+    def command(self, measured: Measurement, load: float = 0.0) -> Command:
+        """Return the force for a measurement; `load` is the known force of a bent needle."""
+        return Command(force=2000.0 * (TARGET - measured.depth) - 20.0 * measured.speed)
 
 
 def main() -> None:
-    """Insert from 2 cm for 4 s, and print the depth on the way."""
-    parameters = NeedleParameters.preset('phantom')
-    needle = Integrator(parameters, NeedleModel(parameters).state_at(depth=0.02))
-    for sample in range(4001):
-        if sample % 1000 == 0:
-            print(f'{sample * PERIOD:.0f} s: {1e3 * needle.depth:.3f} mm')
-        force = law(needle.depth, needle.speed)
-        # The motor has a limit.
-        needle.advance(PERIOD, max(-15.0, min(15.0, force)))
+    """Insert from 2 cm for 5 s with both, and print how far from the target they stop."""
+    needle = NeedleParameters.preset('phantom')
+    start = NeedleModel(needle).state_at(depth=0.02)
+    shipped = Controller(needle)
+    shipped.set_target(TARGET)
+    for name, controller in (('shipped controller', shipped), ('own law', Spring())):
+        run = run_controller(controller, needle, start, duration=5.0)
+        print(f'{name}: {1e3 * (TARGET - run.depth[-1]):.3f} mm short of the target')
 
-    # A spring does not overcome dry friction near the target: it stops mu_s / 2000 N/m short.
-    rest = 1e3 * parameters.coulomb_friction / 2000.0
-    print(f'{1e3 * (TARGET - needle.depth):.3f} mm short of the target; mu_s / k is {rest:.3f} mm')
+    # A spring does not overcome dry friction near the target.
+    print(
+        f'mu_s over the stiffness of the spring: {1e3 * needle.coulomb_friction / 2000.0:.3f} mm'
+    )
 
 
 if __name__ == '__main__':

@@ -14,7 +14,8 @@ EXAMPLES = Path(__file__).parents[1] / 'examples'
 PRINTED = {
     'batch': r'median \d+\.\d mm, 95 % of them between',
     'fit_from_arrays': r'coulomb_friction: 0\.50\d* N',
-    'own_controller': r'0\.280 mm short of the target; mu_s / k is 0\.280 mm',
+    'observer': r'1\.00 s: estimate -?0\.0\d\d mm, true -?0\.000 mm',
+    'own_controller': r'own law: 0\.280 mm short of the target',
     'plot': r'wrote insertion\.png',
     'simulate': r'depth at the end: 28\.1\d mm',
 }
