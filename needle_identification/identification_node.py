@@ -2,39 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 import sys
-import time
 from typing import Any, ClassVar, Final
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import WrenchStamped
-from needle_dynamics.compiled.cache import announce_compilation
+from needle_identification.application import ANSWER_TIME, Application
 from needle_identification.bags.bag import check_distinct
 from needle_identification.estimation.estimate import Statistic, statistic
-from needle_identification.estimation.formatting import measured
-from needle_identification.friction.estimate import FrictionEstimate
 from needle_identification.friction.identify import identify_friction
 from needle_identification.friction.live import LiveFriction
 from needle_identification.friction.settings import FrictionSettings
-from needle_identification.friction.summary import summarize
+from needle_identification.friction.summary import FrictionSummary, summarize
+from needle_identification.recordings import TIMES
 from needle_identification.recordings.reading import (
     read_friction_recording,
     read_indentation_recording,
-    TIMES,
+    signed_axis,
 )
 from needle_identification.result import model_parameters, NODES, write_result
-from needle_identification.stiffness.estimate import StiffnessEstimate
+from needle_identification.status import of_friction, of_statistic, of_stiffness, sentence, Status
 from needle_identification.stiffness.identify import identify_stiffness
 from needle_identification.stiffness.settings import StiffnessSettings
-from needle_identification.stiffness.summary import summarize_stiffness
+from needle_identification.stiffness.summary import StiffnessSummary, summarize_stiffness
 from needle_ros.base_node import BaseNode, LATCHED, run, SENSOR
-from needle_ros.errors import (
-    NeedleError,
-    ParameterError,
-)
+from needle_ros.errors import NeedleError, ParameterError
 from needle_ros.settings import check_constants, constant
 from needle_ros.timing import nanoseconds
 from rcl_interfaces.srv import SetParameters
@@ -48,27 +42,30 @@ from rclpy.task import Future
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
-#: Time that a node has to answer [s].
-_ANSWER_TIME: Final = 5.0
-
 #: What can be identified.
 WHAT: Final = ('friction', 'stiffness')
-
-_IDENTIFY: Final[Mapping[str, Callable[[Any, Any], Any]]] = {
-    'friction': identify_friction,
-    'stiffness': identify_stiffness,
-}
-_AXES: Final = ('x', 'y', 'z')
-_COEFFICIENTS: Final = ('model.coulomb_friction', 'model.viscous_friction')
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class IdentificationSettings:
-    """What the node itself needs to know."""
+    """
+    Settings of the node itself.
 
-    level: float = constant(0.0, 'N', 'stiffness: force of the result; the largest there is if 0')
+    Attributes
+    ----------
+    level : float
+        Force level of the resulting stiffness [N]; 0 for the largest.
+    forgetting : float
+        Time of steady motion in which the weight of a sample falls to 1 / e [s].
+
+    """
+
+    level: float = constant(0.0, 'N', 'stiffness: force level of the result; 0: the largest')
     forgetting: float = constant(
-        60.0, 's', 'live: time in motion after which a sample counts 1/e', open_low=True
+        60.0,
+        's',
+        'live: time in motion in which the weight of a sample falls to 1/e',
+        open_low=True,
     )
 
     def __post_init__(self) -> None:
@@ -79,13 +76,13 @@ class IdentificationNode(BaseNode):
     """
     Publishes ``friction`` or ``stiffness`` (latched) from the recordings named in ``bags``.
 
-    It identifies when it is activated with recordings, and whenever ``~/identify`` is called;
-    ``bags`` may change in between. With ``live`` it also takes ``joint_states`` and
-    ``base_wrench`` as they come and publishes ``friction`` once a second. ``~/apply`` sets
-    what was identified last in the nodes named in ``apply_to``; the answer tells what each took.
+    It identifies when it is activated with recordings, and when ``~/identify`` is called; ``bags``
+    may change in between. With ``live`` it also takes ``joint_states`` and ``base_wrench`` and
+    publishes ``friction`` once a second. ``~/apply`` sets the last result in the nodes named in
+    ``apply_to``; the answer says what each node set.
 
-    Recordings are identified all or none, within the callback: the node does nothing else for
-    some tenths of a second per recording.
+    All recordings are identified, or none, within the callback: meanwhile the node does nothing
+    else, for some tenths of a second per recording.
     """
 
     LIVE: ClassVar[frozenset[str]] = frozenset({'bags'})
@@ -105,25 +102,25 @@ class IdentificationNode(BaseNode):
             'friction: axis or joint of the motion, may be signed; y or insertion if empty',
         )
         self.declare_text('axes', ['x', 'z'], 'stiffness: axes of the plane, may be signed')
-        self.declare_text('time', 'header', f'time that counts: {" or ".join(TIMES)}')
+        self.declare_text('time', 'header', f'stamps to use: {" or ".join(TIMES)}')
         self.declare_settings('friction.', FrictionSettings())
         self.declare_settings('stiffness.', StiffnessSettings())
         self.declare_text('live', False, 'identify friction from the running topics too')
         self.declare_settings('', IdentificationSettings())
-        self.declare_text('apply_to', list(NODES), 'nodes that ~/apply sets parameters of')
-        self._bags: list[Path] = []
+        self.declare_text('apply_to', list(NODES), 'nodes in which ~/apply sets parameters')
+        self._bags: list[str] = []
         self._found: Sequence[Statistic] = ()
         self._words = ''
         self._live: LiveFriction | None = None
-        self._applications: list[_Application] = []
+        self._applications: list[tuple[Application, Trigger.Response, Future]] = []
         self._setters: dict[str, Client] = {}
         self._friction = self.create_publisher(DiagnosticArray, 'friction', LATCHED)
         self._stiffness = self.create_publisher(DiagnosticArray, 'stiffness', LATCHED)
         self.create_service(Trigger, '~/identify', self._on_identify)
         _answer_later(self.create_service(Trigger, '~/apply', self._on_apply))
-        # A simulation that pauses must not leave a caller waiting.
+        # A simulation that pauses must not keep a caller waiting.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(_ANSWER_TIME / 10.0, self._end_applications, clock=steady)
+        self.create_timer(ANSWER_TIME / 10.0, self._answer_applications, clock=steady)
 
     # Transitions.
 
@@ -131,39 +128,34 @@ class IdentificationNode(BaseNode):
         """Read what to identify from and how."""
         self._what = self.text('what', WHAT)
         self.text('time', TIMES)
-        self._settings: dict[str, Any] = {
-            'friction': self.settings('friction.', FrictionSettings),
-            'stiffness': self.settings('stiffness.', StiffnessSettings),
-        }
+        self._friction_settings = self.settings('friction.', FrictionSettings)
+        self._stiffness_settings = self.settings('stiffness.', StiffnessSettings)
         self._own = self.settings('', IdentificationSettings)
         self._is_live = bool(self.get_parameter('live').value)
-        self._force_sign, self._force_axis = _signed(self.text('force_axis'))
-        if self._force_axis not in _AXES:
-            raise ParameterError(
-                f'force_axis must be x, y or z, or signed: -x, got {self.text("force_axis")!r}'
-            )
-        self._joint_sign, self._joint = _signed(self.text('motion_axis') or 'insertion')
+        self._force_sign, self._force_axis = signed_axis(self.text('force_axis'), 'force_axis')
+        joint = self.text('motion_axis') or 'insertion'
+        self._joint_sign = -1.0 if joint.startswith('-') else 1.0
+        self._joint = joint.removeprefix('-')
         if len(self.get_parameter('axes').value) != 2:
             raise ParameterError(f'axes must be two, got {list(self.get_parameter("axes").value)}')
-        self._bags = _paths(self.get_parameter('bags').value)
+        self._bags = [name for name in self.get_parameter('bags').value if name]
         self._setters = {
             name: self.create_client(SetParameters, f'{name}/set_parameters')
             for name in self.get_parameter('apply_to').value
         }
 
     def cleanup(self) -> None:
-        """Let go of the nodes that results are applied to."""
+        """Disconnect from the nodes that results are applied to."""
         for client in self._setters.values():
             self.destroy_client(client)
         self._setters.clear()
 
     def activate(self) -> None:
-        """Identify, if there is something to identify from, and listen, if that is wanted."""
+        """Identify from the recordings, if there are any, and listen, if it is live."""
         if self._bags:
             self._identify()
         if self._is_live:
-            friction = self._settings['friction']
-            self._live = LiveFriction(friction, self._own.forgetting)
+            self._live = LiveFriction(self._friction_settings, self._own.forgetting)
             self._listening = (
                 self.create_subscription(JointState, 'joint_states', self._on_motion, SENSOR),
                 self.create_subscription(WrenchStamped, 'base_wrench', self._on_force, SENSOR),
@@ -178,8 +170,8 @@ class IdentificationNode(BaseNode):
                 self.destroy_subscription(subscription)
 
     def change(self, changes: Mapping[str, Any]) -> None:
-        """Identify from other recordings when asked next."""
-        self._bags = _paths(changes['bags'])
+        """Identify from other recordings the next time."""
+        self._bags = [name for name in changes['bags'] if name]
 
     def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
         """Report the last result."""
@@ -188,7 +180,7 @@ class IdentificationNode(BaseNode):
             if not self._live.samples:
                 message = f'no joint_states of {self._joint} paired with base_wrench'
                 return DiagnosticStatus.WARN, message, values
-            return DiagnosticStatus.OK, _sentence(self._live_statistics()), values
+            return DiagnosticStatus.OK, sentence(self._live_statistics()), values
         if not self._found:
             return DiagnosticStatus.OK, 'nothing identified yet', {}
         return DiagnosticStatus.OK, self._words, {}
@@ -209,62 +201,65 @@ class IdentificationNode(BaseNode):
     def _identify(self) -> None:
         """Identify from the recordings, all or none, publish and write the result."""
         check_distinct(self._bags)
-        estimates = []
-        for bag in self._bags:
-            recording = self._read(bag)
-            estimate = _IDENTIFY[self._what](recording, self._settings[self._what])
-            for words in (*recording.losses, *estimate.warnings):
-                self.get_logger().warning(f'{bag}: {words}')
-            estimates.append(estimate)
-        friction = summarize(estimates) if self._what == 'friction' else None
-        stiffness = None
-        if self._what == 'stiffness':
-            stiffness = summarize_stiffness(
-                estimates,
-                force=self._own.level or None,
-                level_tolerance=self._settings['stiffness'].level_tolerance,
-            )
-        output = self.text('output')
-        if output:
-            write_result(Path(output), friction, stiffness)
-        statuses: list[DiagnosticStatus] = []
-        if friction is not None:
-            self._found = friction.statistics
-            samples = sum(one.samples for one in friction.estimates)
-            statuses += [_of_statistic(one, samples=samples) for one in friction.statistics]
-            statuses += [_of_friction(one) for one in friction.estimates]
-            self._publish(self._friction, statuses)
-        if stiffness is not None:
-            self._found = (stiffness.tissue_stiffness,)
-            statuses.append(_of_statistic(stiffness.tissue_stiffness))
-            for level in stiffness.levels:
-                statuses += [
-                    _of_statistic(one, f' at {level.force:.2f} N') for one in level.statistics
-                ]
-            statuses += [_of_stiffness(one) for one in stiffness.estimates]
-            self._publish(self._stiffness, statuses)
-        self._words = f'{_sentence(self._found)} from {len(estimates)} recordings'
-        self.get_logger().info(self._words)
-
-    def _read(self, bag: Path) -> Any:
-        """Read a recording as the parameters say."""
-        topics: dict[str, Any] = {
+        reading: dict[str, Any] = {
             'wrench_topic': self.text('wrench_topic') or None,
             'motion_topic': self.text('motion_topic') or None,
             'time': self.text('time'),
         }
-        if self._what == 'stiffness':
-            axes = tuple(self.get_parameter('axes').value)
-            return read_indentation_recording(bag, axes=axes, **topics)
-        return read_friction_recording(
-            bag,
-            force_axis=self.text('force_axis'),
-            motion_axis=self.text('motion_axis') or None,
-            **topics,
+        if self._what == 'friction':
+            friction = self._identify_friction(reading)
+            self._write(friction, None)
+            self._found = friction.statistics
+            self._publish(self._friction, of_friction(friction))
+        else:
+            stiffness = self._identify_stiffness(reading)
+            self._write(None, stiffness)
+            self._found = (stiffness.tissue_stiffness,)
+            self._publish(self._stiffness, of_stiffness(stiffness))
+        self._words = f'{sentence(self._found)} from {len(self._bags)} recordings'
+        self.get_logger().info(self._words)
+
+    def _identify_friction(self, reading: Mapping[str, Any]) -> FrictionSummary:
+        axes: dict[str, Any] = {
+            'force_axis': self.text('force_axis'),
+            'motion_axis': self.text('motion_axis') or None,
+        }
+        return summarize(
+            self._estimates(
+                lambda bag: read_friction_recording(bag, **axes, **reading),
+                lambda recording: identify_friction(recording, self._friction_settings),
+            )
         )
 
-    def _publish(self, publisher: Publisher, statuses: list[DiagnosticStatus]) -> None:
-        message = DiagnosticArray(status=statuses)
+    def _identify_stiffness(self, reading: Mapping[str, Any]) -> StiffnessSummary:
+        axes = tuple(self.get_parameter('axes').value)
+        return summarize_stiffness(
+            self._estimates(
+                lambda bag: read_indentation_recording(bag, axes=axes, **reading),
+                lambda recording: identify_stiffness(recording, self._stiffness_settings),
+            ),
+            force=self._own.level or None,
+            level_tolerance=self._stiffness_settings.level_tolerance,
+        )
+
+    def _estimates(self, read: Callable[[str], Any], identify: Callable[[Any], Any]) -> list[Any]:
+        """Identify each recording and log what to know of it."""
+        estimates = []
+        for bag in self._bags:
+            recording = read(bag)
+            estimate = identify(recording)
+            for words in (*recording.losses, *estimate.warnings):
+                self.get_logger().warning(f'{bag}: {words}')
+            estimates.append(estimate)
+        return estimates
+
+    def _write(self, friction: FrictionSummary | None, stiffness: StiffnessSummary | None) -> None:
+        output = self.text('output')
+        if output:
+            write_result(output, friction, stiffness)
+
+    def _publish(self, publisher: Publisher, results: Iterable[Status]) -> None:
+        message = DiagnosticArray(status=[_message_of(result) for result in results])
         message.header.stamp = self.get_clock().now().to_msg()
         publisher.publish(message)
 
@@ -296,7 +291,7 @@ class IdentificationNode(BaseNode):
             samples = self._live.samples
             self._publish(
                 self._friction,
-                [_of_statistic(one, samples=samples, source='live') for one in found],
+                [of_statistic(one, samples=samples, source='live') for one in found],
             )
 
     # Into running nodes.
@@ -304,89 +299,48 @@ class IdentificationNode(BaseNode):
     def _on_apply(
         self, _request: Trigger.Request, response: Trigger.Response
     ) -> Trigger.Response | Future:
-        """Set what was found last; the answer comes when all nodes have answered."""
+        """Set the last result in other nodes; the answer comes when all of them have answered."""
         values = model_parameters(self._found)
         if not values:
-            response.message = 'nothing identified yet that plant and controller take'
+            response.message = 'nothing identified yet that plant and controller can use'
             return response
         request = SetParameters.Request(
             parameters=[
                 Parameter(name, value=one).to_parameter_msg() for name, one in values.items()
             ]
         )
-        asked = {
+        answers = {
             name: client.call_async(request) if client.service_is_ready() else None
             for name, client in self._setters.items()
         }
-        waiting = _Application(values, asked, response)
-        self._applications.append(waiting)
-        for future in asked.values():
-            if future is not None:
-                future.add_done_callback(lambda _future: self._end_applications())
-        self._end_applications()
-        return waiting.answer
+        later = Future()
+        self._applications.append((Application(values, answers), response, later))
+        for answer in answers.values():
+            if answer is not None:
+                answer.add_done_callback(lambda _answer: self._answer_applications())
+        self._answer_applications()
+        return later
 
-    def _end_applications(self) -> None:
+    def _answer_applications(self) -> None:
         """Answer those calls of ``~/apply`` that are complete or have waited long enough."""
-        for waiting in [one for one in self._applications if one.is_over]:
-            self._applications.remove(waiting)
-            response = waiting.finish()
-            # Two lines of code: rclpy refuses a second severity from the same one.
+        over = [one for one in self._applications if one[0].is_over]
+        for one in over:
+            self._applications.remove(one)
+            application, response, later = one
+            response.success, response.message = application.outcome()
+            later.set_result(response)
+            # Two lines of code: rclpy refuses a second severity from the same line.
             if response.success:
                 self.get_logger().info(response.message)
             else:
                 self.get_logger().error(response.message)
 
 
-class _Application:
-    """What other nodes were asked to take, and their answers."""
-
-    def __init__(
-        self,
-        values: Mapping[str, float | str],
-        asked: Mapping[str, Future | None],
-        response: Trigger.Response,
-    ) -> None:
-        self.answer = Future()
-        self._values, self._asked, self._response = values, asked, response
-        self._deadline = time.monotonic() + _ANSWER_TIME
-        # A target that runs takes the coefficients of (15); the others are offered.
-        self._needed = [name for name in _COEFFICIENTS if name in values] or list(values)
-
-    @property
-    def is_over(self) -> bool:
-        """True if all have answered or time is up."""
-        done = all(future is None or future.done() for future in self._asked.values())
-        return done or time.monotonic() > self._deadline
-
-    def finish(self) -> Trigger.Response:
-        """Say what was set where, or why not; this is a success if a node took all it needs."""
-        told = [self._outcome(name, future) for name, future in self._asked.items()]
-        verdicts = [verdict for verdict, _ in told if verdict is not None]
-        self._response.success = bool(verdicts) and all(verdicts)
-        self._response.message = '; '.join(words for _, words in told)
-        self.answer.set_result(self._response)
-        return self._response
-
-    def _outcome(self, node: str, future: Future | None) -> tuple[bool | None, str]:
-        if future is None:
-            return None, f'{node}: no such node'
-        if not future.done():
-            return False, f'{node}: no answer within {_ANSWER_TIME:g} s'
-        results = dict(zip(self._values, future.result().results, strict=True))
-        taken = [name for name, result in results.items() if result.successful]
-        words = [f'{name} = {_brief(self._values[name])}' for name in taken]
-        words += [
-            f'not {name}: {one.reason}' for name, one in results.items() if name not in taken
-        ]
-        return all(name in taken for name in self._needed), f'{node}: {", ".join(words)}'
-
-
 def _answer_later(service: Service) -> None:
     """
     Let the callback of a service return a future of its response.
 
-    Rclpy's events executor takes no coroutines for callbacks: what it gets back is what it sends.
+    The events executor of rclpy takes no coroutines as callbacks, and sends what they return.
     """
     send = service.send_response
 
@@ -399,90 +353,30 @@ def _answer_later(service: Service) -> None:
     service.send_response = send_later  # type: ignore[method-assign]
 
 
-def _paths(names: Sequence[str]) -> list[Path]:
-    return [Path(name) for name in names if name]
-
-
-def _signed(axis: str) -> tuple[float, str]:
-    return (-1.0, axis[1:]) if axis.startswith('-') else (1.0, axis)
-
-
-def _brief(value: float | str) -> str:
-    return value if isinstance(value, str) else f'{value:.6g}'
-
-
-def _of_statistic(
-    one: Statistic, where: str = '', *, samples: int | None = None, source: str = 'recordings'
-) -> DiagnosticStatus:
-    values = {
-        'estimate': one.mean,
-        'interval_low': one.interval[0],
-        'interval_high': one.interval[1],
-        'unit': one.unit,
-        'standard_error': one.error,
-        'standard_deviation': one.deviation,
-        'recordings': one.count,
-        'samples': samples,
-    }
-    level = DiagnosticStatus.OK if one.count else DiagnosticStatus.WARN
-    status = _status(f'{one.name}{where}', measured(one.mean, one.error, one.unit), values)
-    status.level, status.hardware_id = level, source
-    return status
-
-
-def _of_friction(estimate: FrictionEstimate) -> DiagnosticStatus:
-    others = (one for one in (estimate.breakaway, estimate.lag) if one is not None)
-    return _status(
-        estimate.name,
-        f'R^2 = {estimate.determination:.4f}',
-        {
-            **{
-                one.name: measured(one.value, one.error, one.unit)
-                for one in (*estimate.parameters, *others)
-            },
-            'samples': estimate.samples,
-            'residual': estimate.residual,
-            'determination': estimate.determination,
-            'condition': estimate.condition,
-        },
-    )
-
-
-def _of_stiffness(estimate: StiffnessEstimate) -> DiagnosticStatus:
-    worst = min(level.determination for level in estimate.levels)
-    return _status(
-        estimate.name,
-        f'R^2 >= {worst:.4f}',
-        {
-            'presses': sum(level.presses for level in estimate.levels),
-            'determination': worst,
-            'condition': max(level.condition for level in estimate.levels),
-            'off_plane': estimate.off_plane,
-            **{f'at {level.force:.2f} N': level.words for level in estimate.levels},
-        },
-    )
-
-
-def _status(name: str, words: str, values: Mapping[str, object]) -> DiagnosticStatus:
+def _message_of(result: Status) -> DiagnosticStatus:
     return DiagnosticStatus(
-        level=DiagnosticStatus.OK,
-        name=name,
-        message=words,
+        level=DiagnosticStatus.OK if result.is_determined else DiagnosticStatus.WARN,
+        name=result.name,
+        message=result.message,
+        hardware_id=result.source,
         values=[
             KeyValue(key=key, value=str(value))
-            for key, value in values.items()
+            for key, value in result.values.items()
             if value is not None
         ],
     )
 
 
-def _sentence(found: Sequence[Statistic]) -> str:
-    return ', '.join(f'{one.symbol} = {measured(one.mean, one.error, one.unit)}' for one in found)
-
-
 def main() -> int:
-    """Run the node."""
-    announce_compilation()
+    """
+    Run the node.
+
+    Returns
+    -------
+    int
+        Exit status.
+
+    """
     return run(IdentificationNode)
 
 

@@ -1,4 +1,4 @@
-"""Node that records topics, as they are offered, into an MCAP bag."""
+"""Node that records topics into an MCAP bag, each with the QoS that its publishers offer."""
 
 from __future__ import annotations
 
@@ -22,18 +22,19 @@ from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 from std_srvs.srv import Trigger
 
-#: Time between looks at the graph, and between writes that survive a crash [s].
+#: Time between checks for new topics, and between writes that survive a crash [s].
 _DISCOVERY_PERIOD: Final = 0.1
 _FLUSH_PERIOD: Final = 0.5
 
 #: Messages of one topic that may wait while the recorder is busy.
 _DEPTH: Final = 5000
 
+#: Topics of the middleware that * does not include.
 _NOT_FOR_ALL: Final = ('/rosout', '/parameter_events')
 
 
-class _Taken(NamedTuple):
-    """A subscription and the quality of service it asks for."""
+class _Recorded(NamedTuple):
+    """A subscription and the quality of service that it requests."""
 
     subscription: Subscription
     best_effort: bool
@@ -44,18 +45,18 @@ class RecorderNode(BaseNode):
     """
     Records while active, each topic with the quality of service that its publishers offer.
 
-    Messages are stored as they came over the wire, under the time they were received. A second
-    recording of the same node (``~/stop``, ``~/start``) goes to ``path`` with ``_2`` appended.
+    Messages are stored byte for byte, with the receive time. A second recording of the same node
+    (``~/stop``, ``~/start``) goes to ``path`` with ``_2`` appended.
     """
 
     def __init__(self, **node_options: Any) -> None:
         super().__init__('recorder', **node_options)
         self.declare_text('path', '', 'folder to record to; it must not exist')
-        self.declare_text('topics', ['*'], 'topics to record; * stands for all')
+        self.declare_text('topics', ['*'], 'topics to record; * stands for all but hidden ones')
         self.declare_text('compression', 'zstd', f'one of {", ".join(COMPRESSIONS)}')
         self._bag: BagWriter | None = None
         self._recordings = 0
-        self._taken: dict[str, _Taken] = {}
+        self._recorded: dict[str, _Recorded] = {}
         self._left_out: set[str] = set()
         self.create_service(Trigger, '~/start', self._on_start)
         self.create_service(Trigger, '~/stop', self._on_stop)
@@ -65,7 +66,7 @@ class RecorderNode(BaseNode):
         self.create_timer(_FLUSH_PERIOD, self._flush, clock=steady)
 
     def configure(self) -> None:
-        """Read where to record to and what."""
+        """Read what to record, and where to."""
         path = self.text('path')
         if not path:
             raise RecordingError('path must name a folder to record to, got nothing')
@@ -95,6 +96,8 @@ class RecorderNode(BaseNode):
             {'messages': sum(counts.values()), 'bytes': self._bag.size, **counts},
         )
 
+    # Services.
+
     def _on_start(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         try:
             if self._bag is not None or not self.is_active:
@@ -113,6 +116,8 @@ class RecorderNode(BaseNode):
             response.success = self.failure is None
         return response
 
+    # Recording.
+
     def _begin(self) -> None:
         number = self._recordings + 1
         path = self._path.with_name(f'{self._path.name}_{number}') if number > 1 else self._path
@@ -124,7 +129,7 @@ class RecorderNode(BaseNode):
         self._discover()
 
     def _end(self, bag: BagWriter) -> str:
-        """Close the bag and say what it holds, or why it cannot be completed."""
+        """Complete the bag; return what it holds, or why it cannot be completed."""
         self._release()
         try:
             bag.close()
@@ -137,13 +142,13 @@ class RecorderNode(BaseNode):
         return result
 
     def _release(self) -> None:
-        for taken in self._taken.values():
-            self.destroy_subscription(taken.subscription)
-        self._taken.clear()
+        for recorded in self._recorded.values():
+            self.destroy_subscription(recorded.subscription)
+        self._recorded.clear()
         self._bag = None
 
     def _give_up(self, bag: BagWriter, error: OSError) -> str:
-        """Stop after an error of the disk; what is in the file stays readable."""
+        """Stop after an error of the disk; what is in the file remains readable."""
         self._release()
         bag.abort()
         self.failure = f'recording to {bag.path} stopped: {error.strerror or error}'
@@ -159,8 +164,8 @@ class RecorderNode(BaseNode):
                 self._give_up(self._bag, error)
 
     def _on_message(self, topic: str, data: bytes) -> None:
-        # The time the middleware received it would be better, but the events executor of
-        # rclpy 7.1 raises SystemError for callbacks that ask for it.
+        # The receive time of the middleware would be better, but the events executor of rclpy
+        # 7.1 raises SystemError for callbacks that request it.
         if self._bag is not None:
             try:
                 self._bag.write(topic, data, time.time_ns())
@@ -172,26 +177,26 @@ class RecorderNode(BaseNode):
             if self._bag is not None and self._is_wanted(topic):
                 publishers = self.get_publishers_info_by_topic(topic)
                 if publishers:
-                    self._take(self._bag, topic, types, publishers)
+                    self._subscribe(self._bag, topic, types, publishers)
 
     def _is_wanted(self, topic: str) -> bool:
         wanted = topic in self._names or (self._all and not is_hidden(topic))
         return wanted and topic not in self._left_out
 
-    def _take(
+    def _subscribe(
         self, bag: BagWriter, topic: str, types: list[str], publishers: list[TopicEndpointInfo]
     ) -> None:
-        """Subscribe, or subscribe anew where a new publisher offers less than was asked for."""
+        """Subscribe, or subscribe again if a new publisher offers less than was requested."""
         offered = [publisher.qos_profile for publisher in publishers]
         best_effort = any(q.reliability == ReliabilityPolicy.BEST_EFFORT for q in offered)
         latched = all(q.durability == DurabilityPolicy.TRANSIENT_LOCAL for q in offered)
-        taken = self._taken.get(topic)
-        if taken and taken.best_effort >= best_effort and taken.latched <= latched:
+        recorded = self._recorded.get(topic)
+        if recorded and recorded.best_effort >= best_effort and recorded.latched <= latched:
             return
         try:
             kind = message_class(types)
-            if taken:
-                self.destroy_subscription(taken.subscription)
+            if recorded:
+                self.destroy_subscription(recorded.subscription)
             else:
                 bag.add_topic(topic, types[0], [_described(qos) for qos in offered])
         except RecordingError as error:
@@ -208,31 +213,51 @@ class RecorderNode(BaseNode):
             topic,
             partial(self._on_message, topic),
             QoSProfile(depth=_DEPTH, reliability=reliability, durability=durability),
-            # By default a mismatch is logged as final; here it ends with the next look.
+            # By default a mismatch is logged; here the next check for topics ends it.
             event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
             raw=True,
         )
-        self._taken[topic] = _Taken(subscription, best_effort, latched)
+        self._recorded[topic] = _Recorded(subscription, best_effort, latched)
 
 
 def is_hidden(topic: str) -> bool:
-    """Tell whether a topic is one of the middleware or of a tool: * does not stand for it."""
+    """
+    Tell whether a topic belongs to the middleware or to a tool, so that * does not include it.
+
+    Parameters
+    ----------
+    topic : str
+        Full name.
+
+    Returns
+    -------
+    bool
+        Whether it is hidden.
+
+    """
     return '/_' in topic or topic in _NOT_FOR_ALL
 
 
 def message_class(types: list[str]) -> Any:
     """
-    Import the class of a message; rosidl_runtime_py, which does this, is not in the wheels.
+    Import the class of the messages of a topic.
+
+    rosidl_runtime_py does the same, but is not in the wheels.
 
     Parameters
     ----------
     types : list of str
         Types of the topic, such as ``sensor_msgs/msg/JointState``.
 
+    Returns
+    -------
+    type
+        The class.
+
     Raises
     ------
     RecordingError
-        If there are several, or the package of the one is not installed.
+        If there are several types, or the package of the type is not installed.
 
     """
     if len(types) > 1:
@@ -254,7 +279,15 @@ def _described(qos: QoSProfile) -> OfferedQos:
 
 
 def main() -> int:
-    """Run the node."""
+    """
+    Run the node.
+
+    Returns
+    -------
+    int
+        Exit status.
+
+    """
     return run(RecorderNode)
 
 

@@ -16,6 +16,7 @@ from typing import Final, NamedTuple
 from needle_identification.bags.bag import Bag
 from needle_identification.bags.topics import Topic
 from needle_identification.errors import RecordingError
+from needle_identification.recordings import TIMES
 from needle_identification.recordings.recording import IndentationRecording, Recording
 from needle_identification.recordings.samples import from_speed, Gathering, with_speed
 from needle_identification.recordings.sources import (
@@ -29,9 +30,6 @@ from needle_identification.recordings.sources import (
 from needle_identification.recordings.timebase import merge
 from needle_ros import wire
 from needle_ros.errors import MessageError
-
-#: Stamps to use: that of the header of the message, or the receive time.
-TIMES: Final = ('header', 'receive')
 
 
 class _Wanted(NamedTuple):

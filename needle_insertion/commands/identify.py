@@ -29,7 +29,7 @@ from needle_identification import (
     TERMS,
     write_result,
 )
-from needle_identification.recordings.reading import TIMES
+from needle_identification.recordings import TIMES
 from needle_insertion.commands.options import make_folder
 from needle_insertion.report.friction_tables import friction_text
 from needle_insertion.report.origin import digests, Origin, Source, with_name

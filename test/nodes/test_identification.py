@@ -167,7 +167,7 @@ def test_the_service_takes_the_bags_that_are_named_now(
         ({'stiffness.estimator': 'luck'}, 'stiffness.estimator must be one of'),
         ({'what': 'mass'}, "what must be one of friction, stiffness, got 'mass'"),
         ({'time': 'now'}, "time must be one of header, receive, got 'now'"),
-        ({'force_axis': '-w'}, "force_axis must be x, y or z, or signed: -x, got '-w'"),
+        ({'force_axis': '-w'}, "force_axis must be x, y, z, -x, -y or -z, got '-w'"),
         ({'axes': ['x']}, "axes must be two, got ['x']"),
         ({'forgetting': 0.0}, 'forgetting must be finite, > 0'),
     ],
@@ -312,7 +312,7 @@ def test_a_node_that_does_not_answer_does_not_keep_it_waiting(
     ros_graph: RosGraph, bags: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The call ends with the reason, and meanwhile the node is at work."""
-    monkeypatch.setattr('needle_identification.identification_node._ANSWER_TIME', 0.3)
+    monkeypatch.setattr('needle_identification.application.ANSWER_TIME', 0.3)
     ros_graph.add(IdentificationNode, parameters={'bags': bags, 'apply_to': ['deaf']})
     # A node whose executor does not spin has the service, but answers nothing.
     deaf = Node('deaf', context=ros_graph.context)

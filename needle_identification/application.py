@@ -1,0 +1,83 @@
+"""Identified parameters that are set in running nodes, and the answers of these nodes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+import time
+from typing import Any, Final, Protocol
+
+#: Time that a node has to answer [s].
+ANSWER_TIME: Final = 5.0
+
+#: Parameters that a running plant can change; it cannot change the others.
+_COEFFICIENTS: Final = ('model.coulomb_friction', 'model.viscous_friction')
+
+
+class Answer(Protocol):
+    """The answer of a node to a SetParameters request, now or later."""
+
+    def done(self) -> bool:
+        """Return whether it has come."""
+
+    def result(self) -> Any:
+        """Return the response."""
+
+
+class Application:
+    """
+    Parameters that were offered to other nodes.
+
+    Parameters
+    ----------
+    values : mapping
+        Parameters by name.
+    answers : mapping
+        Answer of each node by name; None for a node that does not exist.
+
+    """
+
+    def __init__(
+        self, values: Mapping[str, float | str], answers: Mapping[str, Answer | None]
+    ) -> None:
+        self._values, self._answers = values, answers
+        self._deadline = time.monotonic() + ANSWER_TIME
+        self._needed = [name for name in _COEFFICIENTS if name in values] or list(values)
+
+    @property
+    def is_over(self) -> bool:
+        """Whether all nodes have answered or time is up."""
+        done = all(answer is None or answer.done() for answer in self._answers.values())
+        return done or time.monotonic() > self._deadline
+
+    def outcome(self) -> tuple[bool, str]:
+        """
+        Say what was set where, or why not.
+
+        Returns
+        -------
+        success : bool
+            Whether every node that exists set all parameters that it can change.
+        message : str
+            The outcome of each node.
+
+        """
+        outcomes = [self._of_node(name, answer) for name, answer in self._answers.items()]
+        verdicts = [verdict for verdict, _ in outcomes if verdict is not None]
+        return bool(verdicts) and all(verdicts), '; '.join(words for _, words in outcomes)
+
+    def _of_node(self, node: str, answer: Answer | None) -> tuple[bool | None, str]:
+        if answer is None:
+            return None, f'{node}: no such node'
+        if not answer.done():
+            return False, f'{node}: no answer within {ANSWER_TIME:g} s'
+        results = dict(zip(self._values, answer.result().results, strict=True))
+        taken = [name for name, result in results.items() if result.successful]
+        words = [f'{name} = {_brief(self._values[name])}' for name in taken]
+        words += [
+            f'not {name}: {one.reason}' for name, one in results.items() if name not in taken
+        ]
+        return all(name in taken for name in self._needed), f'{node}: {", ".join(words)}'
+
+
+def _brief(value: float | str) -> str:
+    return value if isinstance(value, str) else f'{value:.6g}'
