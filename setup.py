@@ -34,7 +34,11 @@ setup(
     long_description_content_type='text/markdown',
     python_requires='>=3.10',
     packages=find_packages(include=['needle_*']),
-    package_data={'': ['py.typed'], 'needle_insertion.report': ['templates/*']},
+    package_data={
+        '': ['py.typed'],
+        'needle_insertion.report': ['templates/*'],
+        'needle_insertion.paper.claims': ['*.yaml'],
+    },
     data_files=[
         ('share/ament_index/resource_index/packages', ['resource/needle_insertion']),
         (f'share/{NAME}', ['package.xml']),

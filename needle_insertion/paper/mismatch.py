@@ -28,7 +28,8 @@ from needle_controller import (
 )
 from needle_controller.laws.law import BREAKAWAY_TIME
 from needle_dynamics import FloatArray, NeedleModel, NeedleParameters
-from needle_insertion.paper.figures import LAW_COLORS, LAWS
+from needle_insertion.paper.figures import LAW_COLORS
+from needle_insertion.paper.runs import LAWS
 from needle_insertion.report.picture import Picture
 from needle_insertion.report.section import Grid, Section
 import numpy as np

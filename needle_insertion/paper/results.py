@@ -19,7 +19,7 @@ from needle_insertion.paper.identified import (
     TABLES,
     verdict,
 )
-from needle_insertion.paper.tables import TABLE_2
+from needle_insertion.paper.tables import TABLE_1, TABLE_2
 from needle_insertion.report.page import write_page
 from needle_insertion.report.section import Section
 from needle_insertion.report.text import table
@@ -188,12 +188,12 @@ def _study() -> mismatch.Mismatch:
 def _judged(tables: Mapping[str, IdentifiedTable], source: str) -> list[claims.Claim]:
     study = _study()
     with tqdm(unit=' claims', **_bar('claims')) as bar:
-        return claims.claims(statistics(tables, source), study, bar.update)
+        return claims.judge_claims(statistics(tables, source), study, bar.update)
 
 
 def statistics(tables: Mapping[str, IdentifiedTable], source: str) -> claims.Tables:
     """
-    Return identified tables as claims are judged by them: mu_v in N s/mm, stiffness in kN/m.
+    Return identified tables as claims are judged by them.
 
     Parameters
     ----------
@@ -205,28 +205,20 @@ def statistics(tables: Mapping[str, IdentifiedTable], source: str) -> claims.Tab
     Returns
     -------
     claims.Tables
-        Means and STD.
+        Means and standard deviations, SI.
 
     """
-
-    def found(table_name: str, name: str, scale: float) -> list[tuple[float, float]]:
-        return [
-            (scale * one.mean, nan if one.deviation is None else scale * one.deviation)
-            for one in (line.found for line in tables[table_name].lines)
-            if one.name == name
-        ]
-
-    means_and_deviations = {
-        entry: list(zip(*found('table-2', entry, 1e-3), strict=True)) for entry in TABLE_2
-    }
+    found: dict[str, list[tuple[float, float]]] = {}
+    for line in (line for one in tables.values() for line in one.lines):
+        mean, deviation = line.found.mean, line.found.deviation
+        pairs = found.setdefault(line.found.name, [])
+        pairs.append((mean, nan if deviation is None else deviation))
+    by_level = {entry: list(zip(*found[entry], strict=True)) for entry in TABLE_2}
     return claims.Tables(
         source=source,
-        friction={
-            'mu_s': found('table-1', 'coulomb_friction', 1.0)[0],
-            'mu_v': found('table-1', 'viscous_friction', 1e-3)[0],
-        },
-        stiffness={entry: (each[0], each[1]) for entry, each in means_and_deviations.items()},
-        repeats=min(len(one.bags) for one in tables.values()),
+        friction={name: found[name][0] for name in TABLE_1},
+        stiffness={entry: (means, scatter) for entry, (means, scatter) in by_level.items()},
+        experiments=min(len(one.bags) for one in tables.values()),
     )
 
 

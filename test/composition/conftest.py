@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 
-from needle_insertion.paper import figures
+from needle_insertion.paper import runs
 import pytest
 
 
@@ -10,5 +10,5 @@ import pytest
 def brief_inverse_dynamics() -> Iterator[None]:
     """Run figures 6 and 7 up to what they show; after that d alone goes on as exp(-0.05 t)."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(figures.CLOSED_LOOP, 'inverse_dynamics', 40.0)
+        patch.setitem(runs.CLOSED_LOOP, 'inverse_dynamics', 40.0)
         yield

@@ -1,0 +1,6 @@
+"""The claims of the paper, judged by what a run gives, with verdict and evidence."""
+
+from needle_insertion.paper.claims.claim import Claim, FAILS, HOLDS, ONLY_IF, Tables
+from needle_insertion.paper.claims.judge import judge_claims, section
+
+__all__ = ['FAILS', 'HOLDS', 'ONLY_IF', 'Claim', 'Tables', 'judge_claims', 'section']

@@ -1,0 +1,62 @@
+"""Claims about needles that the controllers do not know, section 3.2.8."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from needle_controller import run_continuous
+from needle_dynamics import NeedleModel
+from needle_insertion.paper.claims.claim import Finding, verdict
+from needle_insertion.paper.mismatch import Mismatch
+from needle_insertion.paper.runs import (
+    closed_loop,
+    DEFLECTION,
+    DEPTH,
+    LAWS,
+    needle,
+    Outcome,
+    paper_law,
+)
+import numpy as np
+
+
+def informed(study: Mismatch) -> Finding:
+    """Judge whether knowledge of the model helps, where it is exact and where it is not."""
+    model = needle('paper_mm', 'complete')
+    friction = 0.99 * model.parameters.coulomb_friction
+    believed = NeedleModel(replace(model.parameters, coulomb_friction=friction))
+    run = run_continuous(
+        paper_law('inverse_dynamics', believed),
+        model,
+        model.state_at(DEPTH, DEFLECTION),
+        np.zeros((3, 4)),
+        [0.0, 30.0],
+        method='DOP853',
+    )
+    inverse, pid = (
+        1e3 * abs(Outcome.of(closed_loop(law, 'paper_mm', 'complete', hub_stop=True)).error)
+        for law in LAWS
+    )
+    finals = [1e6 * float(np.median(np.abs(study.batches[law].final))) for law in LAWS]
+    known = [1e6 * float(study.nominal[law].rms[0]) for law in LAWS]
+    return Finding(
+        verdict(always=finals[0] < finals[1], sometimes=known[0] < known[1]),
+        {
+            'inverse_mm': inverse,
+            'pid_mm': pid,
+            'inverse_known_um': known[0],
+            'pid_known_um': known[1],
+            'inverse_um': finals[0],
+            'pid_um': finals[1],
+            'left_mm': 1e3 * float(run.states[-1, 0]),
+        },
+    )
+
+
+def not_zero(study: Mismatch) -> Finding:
+    """Judge the error on needles that the laws do not know."""
+    inverse, pid = (1e6 * float(np.abs(study.batches[law].final).min()) for law in LAWS)
+    return Finding(
+        verdict(always=min(inverse, pid) > 0.0),
+        {'needles': len(study.factors), 'inverse_um': inverse, 'pid_um': pid},
+    )
