@@ -11,21 +11,19 @@ of the sensor, then filtered, then read at the rate of the recording.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
-import json
-from math import atan2, pi, sqrt
+from math import pi, sqrt
 from multiprocessing import get_context
 import os
-import sys
-import time
-from typing import Any, Final, NamedTuple, TypeAlias
+from typing import Any, Final, NamedTuple
 from unittest import mock
 
-from benchmarks.measure import environment
+from benchmarks.bounds import friction_truth, RATE, stiffness_truth, Truth
+from benchmarks.measure import Bar
+from benchmarks.page import Answer, Section, Tick
 from needle_dynamics import (
     FloatArray,
     ForceSensor,
@@ -49,26 +47,15 @@ from needle_identification import (
     Recording,
     StiffnessSettings,
 )
-from needle_identification.friction.terms import columns_of, regressors
 from needle_insertion.experiment.population import draw_friction, draw_stiffness
 from needle_insertion.experiment.protocol import (
-    DIRECTIONS,
-    HOLD_TIME,
     indenter_name,
     Protocol,
     PROTOCOLS,
     START_DEPTH,
 )
 from needle_insertion.paper.tables import FORCE_LEVELS
-from needle_insertion.report.text import table
 import numpy as np
-from numpy.typing import NDArray
-from scipy.linalg import solveh_banded
-from scipy.signal import butter, sosfilt
-from tqdm import tqdm
-
-#: Samples per second of the recordings [Hz].
-RATE: Final = 250.0
 
 #: Share of intervals that must hold the truth, and error over the bound that is good enough.
 COVERAGE: Final = (0.93, 0.97)
@@ -86,15 +73,9 @@ _SIDE: Final = 2
 #: Recordings that a process takes at a time.
 _CHUNK: Final = 5
 
-#: Readings further apart have independent noise.
-_REACH: Final = 24
-
 _MOST_RECORDINGS: Final = 100_000
 
 _BASIC: Final = ('coulomb', 'viscous')
-
-#: Truth and Cramer-Rao bound of the variance by parameter; nan where there is none.
-_Truth: TypeAlias = Mapping[str, tuple[float, float]]
 
 
 class Found(NamedTuple):
@@ -229,76 +210,6 @@ def _command(machine: Plant | Indenter, protocol: Protocol) -> None:
     )
 
 
-def sensor_lag(parameters: ForceSensorParameters) -> float:
-    """Return by how much the filters of the sensor delay a slow force [s]."""
-    late = 0.0
-    for cutoff in parameters.cutoffs:
-        b, a = butter(2, cutoff, fs=parameters.rate)
-        order = np.arange(3)
-        late += float(b @ order / b.sum() - a @ order / a.sum()) / parameters.rate
-    return late
-
-
-def reading_noise(parameters: ForceSensorParameters, axis: int) -> FloatArray:
-    """
-    Return the covariance of the noise of readings by the distance of two.
-
-    White noise at the rate of the sensor passes its filters; every so many samples one is read
-    and rounded.
-
-    Parameters
-    ----------
-    parameters : ForceSensorParameters
-        The sensor.
-    axis : int
-        Force x y z, torque x y z.
-
-    Returns
-    -------
-    ndarray, shape (_REACH,)
-        Covariance of readings 0, 1, 2, ... apart [N^2].
-
-    """
-    every = round(parameters.rate / RATE)
-    response = np.zeros(2 * _REACH * every)
-    response[0] = parameters.per_axis('noise')[axis]
-    for cutoff in parameters.cutoffs:
-        response = sosfilt(butter(2, cutoff, fs=parameters.rate, output='sos'), response)
-    later = [response[every * k :] for k in range(_REACH)]
-    covariance = np.array([response[: len(part)] @ part for part in later])
-    covariance[0] += parameters.per_axis('resolution')[axis] ** 2 / 12.0
-    return covariance
-
-
-def information(regressors: FloatArray, noise: FloatArray, used: NDArray[np.bool_]) -> FloatArray:
-    """
-    Return Fisher's information on the coefficients of regressors.
-
-    Parameters
-    ----------
-    regressors : ndarray, shape (n, k)
-        Regressors at even times.
-    noise : ndarray, shape (m,)
-        Covariance of the noise by distance, zero beyond.
-    used : ndarray of bool, shape (n,)
-        What is known of these.
-
-    Returns
-    -------
-    ndarray, shape (k, k)
-        Its inverse is the Cramer-Rao bound of normal noise.
-
-    """
-    at = np.flatnonzero(used)
-    banded = np.zeros((len(noise), len(at)))
-    for row in range(min(len(noise), len(at))):
-        apart = at[row:] - at[: len(at) - row]
-        near = apart < len(noise)
-        banded[row, : len(apart)][near] = noise[apart[near]]
-    x = regressors[at]
-    return np.asarray(x.T @ solveh_banded(banded, x, lower=True))
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FrictionCase:
     """
@@ -403,7 +314,7 @@ def friction(seed: int, number: int) -> list[Found]:
             force=readings[case.stand_in],
         )
         estimate = identify_friction(recording, settings)
-        truth = friction_truth(needle, sensor, motion, settings)
+        truth = friction_truth(needle, sensor, motion.time, motion.speed, settings)
         if case.speed_noise:
             # The bound takes the speed for known.
             truth = {parameter: (value, np.nan) for parameter, (value, _) in truth.items()}
@@ -415,49 +326,7 @@ def friction(seed: int, number: int) -> list[Found]:
     return found
 
 
-def friction_truth(
-    needle: NeedleParameters,
-    sensor: ForceSensorParameters,
-    motion: Motion,
-    settings: FrictionSettings,
-) -> _Truth:
-    """
-    Return true parameters and Cramer-Rao bounds.
-
-    The bound takes every reading while the needle counts as moving, with the noise of the sensor
-    as its filters leave it, and as unknown the coefficients of the terms: what starts, stops and
-    lag cost an estimator is not in it.
-    """
-    coulomb, viscous = needle.coulomb_friction, needle.viscous_friction
-    breakaway = needle.breakaway_friction if needle.friction_law == 'stribeck' else 1.0
-    true = {
-        'coulomb_friction': coulomb,
-        'viscous_friction': viscous,
-        'offset': float(sensor.per_axis('bias')[1]),
-        'moving_mass': needle.moving_mass,
-        'withdrawal_coulomb': (needle.withdrawal_friction - 1.0) * coulomb,
-        'withdrawal_viscous': (needle.withdrawal_friction - 1.0) * viscous,
-        'withdrawal_friction': needle.withdrawal_friction,
-        'stribeck_friction': (breakaway - 1.0) * coulomb,
-        'breakaway_friction': breakaway,
-        'breakaway_force': breakaway * coulomb,
-        'lag': sensor_lag(sensor) - needle.moving_mass / viscous,
-    }
-    names = [column.name for column in columns_of(settings.terms)]
-    speed = motion.speed
-    acceleration = np.gradient(speed, motion.time)
-    known = information(
-        regressors(speed, acceleration, settings.terms, settings),
-        reading_noise(sensor, 1),
-        np.abs(speed) > settings.moving_speed,
-    )
-    bound = dict(zip(names, np.diag(np.linalg.inv(known)).tolist(), strict=True))
-    # No reading tells a mass from a lag of unknown size.
-    bound.pop('moving_mass', None)
-    return {name: (value, bound.get(name, np.nan)) for name, value in true.items()}
-
-
-def _compared(case: str, found: ParameterEstimate, truth: _Truth) -> Found:
+def _compared(case: str, found: ParameterEstimate, truth: Truth) -> Found:
     return Found(
         case, found.name, found.unit, *truth[found.name], found.value, found.error, *found.interval
     )
@@ -515,57 +384,6 @@ def stiffness(seed: int, number: int) -> list[Found]:
     return found
 
 
-def stiffness_truth(
-    matrix: FloatArray, force: float, sensor: ForceSensorParameters, tissue: IndenterParameters
-) -> _Truth:
-    """
-    Return true parameters of one level and Cramer-Rao bounds.
-
-    The bound takes all readings of all holds, of force and position, with their noise, and the
-    zeros of both for known.
-    """
-    angles = 2.0 * pi / DIRECTIONS * np.arange(DIRECTIONS)
-    forces = force * np.column_stack([np.cos(angles), np.sin(angles)])
-    displacement = np.linalg.solve(matrix, forces.T).T
-    constant = np.ones((round(RATE * HOLD_TIME), 1))
-    held = np.ones(len(constant), dtype=np.bool_)
-    of_force = 1.0 / information(constant, reading_noise(sensor, 0), held).item()
-    of_position = (tissue.position_noise**2 + tissue.encoder_resolution**2 / 12.0) / len(constant)
-    noise = of_force * np.eye(2) + of_position * matrix @ matrix.T
-    covariance = np.kron(noise, np.linalg.inv(displacement.T @ displacement))
-    true = _parts(matrix)
-    # Differences along each entry give the gradients, exact to the step squared.
-    step = 1e-3
-    changes = []
-    for entry in np.eye(4).reshape(4, 2, 2):
-        more, less = _parts(matrix + step * entry), _parts(matrix - step * entry)
-        changes.append([(more[name] - less[name]) / (2.0 * step) for name in true])
-    gradients = np.array(changes).T
-    bounds = np.einsum('ni,ij,nj->n', gradients, covariance, gradients)
-    return {
-        name: (value, float(bound))
-        for (name, value), bound in zip(true.items(), bounds, strict=True)
-    }
-
-
-def _parts(matrix: FloatArray) -> dict[str, float]:
-    """Return what is reported of a stiffness matrix, by name."""
-    symmetric = (matrix + matrix.T) / 2.0
-    half, shear = (matrix[0, 0] - matrix[1, 1]) / 2.0, symmetric[0, 1]
-    mean, radius = np.trace(matrix) / 2.0, np.hypot(half, shear)
-    curl = matrix[1, 0] - matrix[0, 1]
-    values = {
-        **dict(zip(('k_xx', 'k_xz', 'k_zx', 'k_zz'), matrix.ravel(), strict=True)),
-        'curl': curl,
-        'spring': abs(curl) / sqrt(2.0) / np.linalg.norm(symmetric),
-        'principal_stiffness_1': mean + radius,
-        'principal_stiffness_2': mean - radius,
-        'principal_angle': atan2(shear, half) / 2.0,
-        'tissue_stiffness': matrix[1, 1] / StiffnessSettings().contact_length,
-    }
-    return {name: float(value) for name, value in values.items()}
-
-
 def summarized(found: Iterable[Found]) -> list[Row]:
     """
     Put the estimates of each parameter in each case together.
@@ -619,10 +437,14 @@ def _root_mean_square(values: FloatArray) -> float:
     return sqrt(float(np.mean(values**2))) if len(values) else float('nan')
 
 
-_STUDIES: Final[Mapping[str, Callable[[int, int], list[Found]]]] = {
+STUDIES: Final[Mapping[str, Callable[[int, int], list[Found]]]] = {
     'friction': friction,
     'stiffness': stiffness,
 }
+
+
+#: Default cases of the studies.
+DEFAULT_CASES: Final = ('(15)', 'K, ordinary')
 
 
 def studied(
@@ -658,14 +480,25 @@ def studied(
         yield from pool.map(job, range(recordings), chunksize=_CHUNK)
 
 
-def run(options: argparse.Namespace) -> int:
+def compare(tick: Tick, recordings: int = 1000, seed: int = 2014) -> Answer:
     """
-    Study both kinds of recordings and print the table.
+    Compare the estimates from many recordings with the true values.
+
+    Parameters
+    ----------
+    tick : callable
+        Called with the name of each stage.
+    recordings : int
+        Number of recordings of each kind.
+    seed : int
+        Seed of the true values and the noise.
 
     Returns
     -------
-    int
-        0, whatever was found.
+    sections : list of Section
+        One row for each parameter in each case.
+    bars : list of Bar
+        Coverage and efficiency of the parameters that have a bound, in the default cases.
 
     Raises
     ------
@@ -673,47 +506,49 @@ def run(options: argparse.Namespace) -> int:
         If a number is out of range.
 
     """
-    if not 2 <= options.recordings <= _MOST_RECORDINGS:
-        raise ParameterError(
-            f'--recordings must be in [2, {_MOST_RECORDINGS}], got {options.recordings}'
-        )
-    if options.seed < 0:
-        raise ParameterError(f'--seed must be >= 0, got {options.seed}')
-    begin = time.perf_counter()
+    if not 2 <= recordings <= _MOST_RECORDINGS:
+        raise ParameterError(f'--recordings must be in [2, {_MOST_RECORDINGS}], got {recordings}')
+    if seed < 0:
+        raise ParameterError(f'--seed must be >= 0, got {seed}')
     workers = os.cpu_count() or 1
     rows: list[Row] = []
-    for name, study in _STUDIES.items():
-        recordings = studied(study, options.recordings, options.seed, workers)
-        shown = tqdm(recordings, total=options.recordings, desc=name, disable=None, leave=False)
-        rows += summarized(found for recording in shown for found in recording)
-    spent = time.perf_counter() - begin
-    if options.json:
-        document = {
-            'recordings': options.recordings,
-            'seed': options.seed,
-            'seconds': round(spent, 1),
-            'rows': [{**asdict(row), 'holds': row.holds} for row in rows],
-        }
-        sys.stdout.write(f'{json.dumps(document, indent=2)}\n')
-        return 0
-    heads = (
-        'case',
-        'parameter',
-        'n',
-        'coverage',
-        'error made',
-        'error given',
-        'bias',
-        'over bound',
-        'holds',
-    )
+    for name, study in STUDIES.items():
+        found: list[Found] = []
+        for number, part in enumerate(studied(study, recordings, seed, workers), 1):
+            tick(f'{name}, {number} of {recordings}')
+            found += part
+        rows += summarized(found)
     wrong = sum(not row.holds for row in rows)
-    sys.stdout.write(
-        f'{environment()}\n\n{table([row.cells() for row in rows], heads)}\n\n'
-        f'{options.recordings} recordings of each kind, seed {options.seed}, '
-        f'one in {_SIDE} for cases beside the default: '
-        f'{len(rows) - wrong} of {len(rows)} lines hold: coverage of the 95 % intervals within '
-        f'{COVERAGE[0]:.0%} to {COVERAGE[1]:.0%}, mean squared error at most {EFFICIENCY:g} times '
-        f'the Cramer-Rao bound\n{spent:.0f} s on {workers} cores\n'
+    section = Section(
+        'Estimates beside the true values',
+        (
+            'case',
+            'parameter',
+            'n',
+            'coverage',
+            'error made',
+            'error given',
+            'bias',
+            'over bound',
+            'holds',
+        ),
+        [row.cells() for row in rows],
+        f'{recordings} recordings of each kind, one in {_SIDE} for cases beside the default ones, '
+        f'seed {seed}. {len(rows) - wrong} of {len(rows)} rows hold: coverage of the 95 % '
+        f'intervals from {COVERAGE[0]:.0%} to {COVERAGE[1]:.0%}, mean squared error at most '
+        f'{EFFICIENCY:g} times the Cramer-Rao bound. The bars are on the rows of the default '
+        f'cases, {" and ".join(DEFAULT_CASES)}, that have a bound.',
     )
-    return 0
+    judged = [row for row in rows if row.case in DEFAULT_CASES and row.efficiency is not None]
+    coverage = [100.0 * row.coverage for row in judged]
+    low, high = (100.0 * limit for limit in COVERAGE)
+    bars = [
+        Bar('lowest coverage', min(coverage), low, '%', at_least=True),
+        Bar('highest coverage', max(coverage), high, '%'),
+        Bar(
+            'largest mean squared error over its bound',
+            max(row.efficiency for row in judged if row.efficiency is not None),
+            EFFICIENCY,
+        ),
+    ]
+    return [section], bars

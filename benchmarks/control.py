@@ -8,6 +8,7 @@ from math import exp, inf
 from typing import Final
 
 from benchmarks.measure import Bar, least_times
+from benchmarks.page import Answer, Section, Tick
 from needle_controller import (
     Axis,
     InverseDynamics,
@@ -21,7 +22,6 @@ from needle_controller import (
 )
 from needle_dynamics import FloatArray, NeedleParameters
 from needle_insertion.paper.mismatch import sampled_laws
-from needle_insertion.report.text import table
 import numpy as np
 
 #: Sample period [s], delay in periods, and the bar for a whole law with the observer [s].
@@ -133,7 +133,7 @@ def sampled_loop(axis: Axis, name: str) -> SampledLoop:
     return SampledLoop(law, DELAY, inf)
 
 
-def compare(tick: Callable[[str], None]) -> tuple[str, list[Bar]]:
+def compare(tick: Tick) -> Answer:
     """
     Measure the control step.
 
@@ -144,7 +144,7 @@ def compare(tick: Callable[[str], None]) -> tuple[str, list[Bar]]:
 
     Returns
     -------
-    text : str
+    sections : list of Section
         Costs, shares of the period, and what NumPy takes.
     bars : list of Bar
         Whole laws with the observer.
@@ -170,15 +170,14 @@ def compare(tick: Callable[[str], None]) -> tuple[str, list[Bar]]:
         plain = times.get(f'{name.replace(", with observer", "")}, NumPy')
         ratio = f'{plain / value:.1f} x' if plain and 'observer' not in name else ''
         rows.append((name, f'{1e6 * value:.2f}', f'{100.0 * value / PERIOD:.2f} %', ratio))
-    heads = ('control step', 'cost [us]', 'of 1 ms', 'NumPy takes')
+    section = Section(
+        'Cost of a control step',
+        ('control step', 'cost [us]', 'of 1 ms', 'NumPy takes'),
+        rows,
+        f'Preset phantom, two modes, delay of {DELAY} period, {1.0 / PERIOD:g} Hz.',
+    )
     bars = [
-        Bar(
-            f'{name}, with observer [us]',
-            f'<= {1e6 * BUDGET:g}',
-            1e6 * times[f'{name}, with observer'],
-            1e6 * BUDGET,
-            at_least=False,
-        )
+        Bar(f'{name}, with observer', 1e6 * times[f'{name}, with observer'], 1e6 * BUDGET, 'us')
         for name in ('inverse_dynamics', 'pid')
     ]
-    return table(rows, heads), bars
+    return [section], bars

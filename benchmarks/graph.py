@@ -13,7 +13,6 @@ watched.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, ExitStack
 from dataclasses import dataclass
@@ -28,9 +27,9 @@ from tempfile import TemporaryDirectory
 import time
 from typing import Any, Final, TypeAlias
 
-from benchmarks import run as bench
 from benchmarks.bare import PERIOD, RATE, Sender, STREAMS
-from benchmarks.measure import Bar, version
+from benchmarks.measure import Bar
+from benchmarks.page import Answer, Section, Tick, version
 from geometry_msgs.msg import PointStamped, WrenchStamped
 from needle_identification import Bag
 from needle_insertion.experiment.ros_graph import (
@@ -40,7 +39,6 @@ from needle_insertion.experiment.ros_graph import (
     Graph,
     GraphError,
 )
-from needle_insertion.report.text import table
 from needle_ros.base_node import COMMAND, LATCHED, SENSOR
 from needle_ros.timing import nanoseconds
 import numpy as np
@@ -95,8 +93,11 @@ class Plan:
     memory: float = 20.0
 
 
-QUICK: Final = Plan(rounds=1, turn=0.5, recording=2.0, memory=2.0)
-FULL: Final = Plan(recording=60.0, memory=600.0)
+PLANS: Final = {
+    'default': Plan(),
+    'quick': Plan(rounds=1, turn=0.5, recording=2.0, memory=2.0),
+    'full': Plan(recording=60.0, memory=600.0),
+}
 
 
 def cpu_seconds(process: int) -> float:
@@ -318,7 +319,7 @@ def compared(
     camps: Mapping[str, Camp],
     job: Callable[[Camp, float], Figures],
     plan: Plan,
-    tick: Callable[[str], None],
+    tick: Tick,
 ) -> dict[str, list[Figures]]:
     """Let the camps take turns; return the figures of the rounds by camp."""
     found: dict[str, list[Figures]] = {name: [] for name in camps}
@@ -345,7 +346,7 @@ def ratio(ours: Sequence[Figures], theirs: Sequence[Figures], what: str) -> floa
     return float(np.median(ratios)) if ratios else float('nan')
 
 
-def record(folder: Path, duration: float) -> tuple[str, list[Bar]]:
+def record(folder: Path, duration: float) -> Answer:
     """
     Record numbered messages and count those that are missing in the bag.
 
@@ -358,8 +359,8 @@ def record(folder: Path, duration: float) -> tuple[str, list[Bar]]:
 
     Returns
     -------
-    text : str
-        Table.
+    sections : list of Section
+        Messages sent and lost.
     bars : list of Bar
         Losses.
 
@@ -396,15 +397,11 @@ def record(folder: Path, duration: float) -> tuple[str, list[Bar]]:
         ('doubled', f'{sum(len(n) - len(np.unique(n)) for n in numbers.values())}'),
         *((f'CPU of the {name} [%]', f'{share:.1f}') for name, share in shares.items()),
     ]
-    text = f'Recorder, {len(topics)} topics for {duration:g} s\n{table(rows, ("", "found"))}'
-    most = Bar(
-        f'messages lost by the recorder in {duration:g} s',
-        'none',
-        float(sum(lost.values())),
-        0.0,
-        at_least=False,
+    section = Section(
+        'Recorder', ('figure', 'found'), rows, f'{len(topics)} topics, {duration:g} s.'
     )
-    return text, [most]
+    total = float(sum(lost.values()))
+    return [section], [Bar(f'messages lost by the recorder in {duration:g} s', total, 0.0)]
 
 
 def losses(numbers: Mapping[str, Any], sent: int) -> dict[str, int]:
@@ -445,9 +442,7 @@ def sample_numbers(path: Path) -> dict[str, Any]:
     return {topic: np.concatenate(found or [np.empty(0, int)]) for topic, found in numbers.items()}
 
 
-def watch_memory(
-    folder: Path, duration: float, tick: Callable[[str], None]
-) -> tuple[str, list[Bar]]:
+def watch_memory(folder: Path, duration: float, tick: Tick) -> Answer:
     """
     Run plant, controller and recorder, and watch their memory.
 
@@ -462,7 +457,7 @@ def watch_memory(
 
     Returns
     -------
-    text : str
+    sections : list of Section
         Memory of each node over time.
     bars : list of Bar
         The greatest growth after the warm-up.
@@ -499,60 +494,54 @@ def watch_memory(
     shown = [around(share) for share in _SHOWN]
     growth = around(1.0) - around(0.0)
     columns = [around(0.0), *shown, growth]
-    heads = ('[MB]', 'warm', *(f'{100 * share:.0f} %' for share in _SHOWN), 'growth')
-    text = f'Memory (resident) over {duration:g} s, of which {warm:g} s of warm-up\n' + table(
-        [(name, *(f'{c[k]:.2f}' for c in columns)) for k, name in enumerate(names)], heads
+    section = Section(
+        'Memory',
+        ('[MB]', 'warm', *(f'{100 * share:.0f} %' for share in _SHOWN), 'growth'),
+        [(name, *(f'{c[k]:.2f}' for c in columns)) for k, name in enumerate(names)],
+        f'Resident memory over {duration:g} s, of which {warm:g} s are warm-up.',
     )
     worst = int(np.argmax(growth))
-    bar = Bar(
-        f'growth in {duration:g} s, most: {names[worst]} [MB]',
-        f'<= {GROWTH:g}',
-        float(growth[worst]),
-        GROWTH,
-        at_least=False,
-    )
-    return text, [bar]
+    figure = f'growth of memory in {duration:g} s, largest: {names[worst]}'
+    return [section], [Bar(figure, float(growth[worst]), GROWTH, 'MB')]
 
 
-def compare(tick: Callable[[str], None], plan: Plan | None = None) -> tuple[str, list[Bar]]:
+def compare(tick: Tick, plan: str = 'default') -> Answer:
     """
     Measure the nodes of the suite beside bare ones.
 
     Parameters
     ----------
     tick : callable
-        Told what comes next.
-    plan : Plan, optional
-        How long to measure.
+        Called with the name of each stage.
+    plan : str
+        Duration of the measurements: a key of `PLANS`.
 
     Returns
     -------
-    text : str
-        Tables.
+    sections : list of Section
+        Times and CPU of the nodes, messages in the bag, memory.
     bars : list of Bar
         Round trip, CPU of the plant, losses of the recorder, growth of memory.
 
     """
-    plan = plan or Plan()
+    durations = PLANS[plan]
     # What was loaded so far is not looked through again while messages are timed.
     gc.collect()
     gc.freeze()
     try:
         with TemporaryDirectory() as name:
             folder = Path(name)
-            found = compare_camps(folder, plan, tick)
+            found = compare_camps(folder, durations, tick)
             tick('recorder')
-            recorded, losses = record(folder / 'recording', plan.recording)
-            watched, growth = watch_memory(folder / 'memory', plan.memory, tick)
+            recorded, losses = record(folder / 'recording', durations.recording)
+            watched, growth = watch_memory(folder / 'memory', durations.memory, tick)
     finally:
         gc.unfreeze()
-    text, bars = tabled(found, plan)
-    return '\n\n'.join([text, recorded, watched]), [*bars, *losses, *growth]
+    sections, bars = tabled(found, durations)
+    return [*sections, *recorded, *watched], [*bars, *losses, *growth]
 
 
-def compare_camps(
-    folder: Path, plan: Plan, tick: Callable[[str], None]
-) -> dict[str, list[Figures]]:
+def compare_camps(folder: Path, plan: Plan, tick: Tick) -> dict[str, list[Figures]]:
     """Start the camps and let them take turns; return the figures of the rounds by camp."""
     with ExitStack() as stack:
         camps = {}
@@ -579,7 +568,7 @@ def compare_camps(
     }
 
 
-def tabled(found: Mapping[str, list[Figures]], plan: Plan) -> tuple[str, list[Bar]]:
+def tabled(found: Mapping[str, list[Figures]], plan: Plan) -> Answer:
     """Return the figures of the camps side by side, and the bars."""
     ours, bare, usual = (found[name] for name in CAMPS)
 
@@ -597,37 +586,25 @@ def tabled(found: Mapping[str, list[Figures]], plan: Plan) -> tuple[str, list[Ba
         )
         for what in ours[0]
     ]
-    heads = (f'{RATE} Hz', CAMPS[0], CAMPS[1], 'ratio', CAMPS[2], 'ratio')
     bars = [
-        Bar(
-            f'{what}, {share}, over bare',
-            f'<= {most:g} x',
-            ratio(ours, bare, f'{what}, {share} [us]'),
-            most,
-            at_least=False,
-        )
+        Bar(f'{what}, {share}, over bare', ratio(ours, bare, f'{what}, {share} [us]'), most, 'x')
         for what in ('round trip', 'sample to command')
         for share, most in ROUND_TRIP.items()
     ]
     bars += [
-        Bar(f'{what}, over bare', f'<= {PLANT_CPU:g} x', ratio(ours, bare, f'{what} [%]'),
-            PLANT_CPU, at_least=False)
+        Bar(f'{what}, over bare', ratio(ours, bare, f'{what} [%]'), PLANT_CPU, 'x')
         for what in ('CPU of the plant, no commands', 'CPU of the plant')
-    ]  # fmt: skip
-    text = (
-        f'{version("rclpy")}; {plan.rounds} rounds of '
-        f'{plan.turn:g} s; medians over rounds, of ratios too; the worst of all\n'
-        f'{table(rows, heads)}\n'
-        'round trip: joint_states out, wrench_command back, from a probe in the place of the '
-        'plant\n'
-        'sample to command: from the time of a sample of the plant to the arrival of the command '
-        'that answers it, in a third process\n'
-        'period: between arrivals of joint_states there'
+    ]
+    section = Section(
+        'Nodes beside bare nodes',
+        (f'{RATE} Hz', CAMPS[0], CAMPS[1], 'ratio', CAMPS[2], 'ratio'),
+        rows,
+        f'{version("ros-jazzy-rclpy")}; {plan.rounds} rounds of {plan.turn:g} s; medians over the '
+        'rounds, also of the ratios; the largest of the worst values.\n\n'
+        '- round trip: from `joint_states` to `wrench_command`, seen by a probe in the place of '
+        'the plant\n'
+        '- sample to command: from the time of a sample of the plant to the arrival of the '
+        'command that answers it, in a third process\n'
+        '- period: between arrivals of `joint_states` in the third process',
     )
-    return text, bars
-
-
-def run(options: argparse.Namespace) -> int:
-    """Run ``needle bench graph``; return its exit status."""
-    plan = FULL if options.full else QUICK if options.quick else Plan()
-    return bench.ask([partial(compare, plan=plan)])
+    return [section], bars

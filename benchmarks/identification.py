@@ -22,6 +22,7 @@ import time
 from typing import Any, Final
 
 from benchmarks.measure import Bar, NOT_INSTALLED, optional
+from benchmarks.page import Answer, Section, Tick
 from needle_identification import (
     BagWriter,
     encode,
@@ -31,7 +32,6 @@ from needle_identification import (
     read_friction_recording,
 )
 from needle_identification.recordings.series import LARGEST
-from needle_insertion.report.text import table
 import numpy as np
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import get_typestore, Stores
@@ -228,21 +228,21 @@ def measured(reader: str, warm: Path, path: Path, repeats: int) -> dict[str, flo
     return dict(json.loads(done.stdout))
 
 
-def compare(tick: Callable[[str], None], messages: int = MESSAGES) -> tuple[str, list[Bar]]:
+def compare(tick: Tick, messages: int = MESSAGES) -> Answer:
     """
     Measure reading and identifying beside reading alone.
 
     Parameters
     ----------
     tick : callable
-        Told what comes next.
+        Called with the name of each stage.
     messages : int
         Messages of each topic in the shortest bag.
 
     Returns
     -------
-    text : str
-        Tables.
+    sections : list of Section
+        Time and memory of each reader, and of ours over the length of the bag.
     bars : list of Bar
         Speed beside that of the faster of the others, and growth of memory.
 
@@ -276,7 +276,7 @@ def _told(
     found: Mapping[str, Mapping[str, float]],
     lengths: Mapping[int, Mapping[str, float]],
     sizes: Mapping[int, int],
-) -> tuple[str, list[Bar]]:
+) -> Answer:
     best = found['needle_identification']['seconds']
     speeds = []
     for name in READERS:
@@ -306,37 +306,30 @@ def _told(
         )
         for times, one in lengths.items()
     ]
-    speed_heads = ('what', '', 'messages per second', 'time', 'peak memory')
-    length_heads = (
-        'length',
-        'messages',
-        'size',
-        'time',
-        'per second',
-        'peak memory',
-        'for the bag',
-    )
-    text = (
-        f'A bag (MCAP, zstd) with {messages} messages each of WrenchStamped and JointState at '
-        f'{_RATE:g} Hz; least of {_REPEATS} in one process each\n'
-        f'{table(speeds, speed_heads)}\n\n'
-        'Longer bags, from bag to result, once in one process each\n'
-        f'{table(memories, length_heads)}\n'
-        f'at most {LARGEST} samples of a topic are kept'
-    )
-    others = [one['seconds'] for name, one in found.items() if name != 'needle_identification']
-    longer, longest = LONGER[-2:]
-    bars = [
-        Bar('bag to result beside the faster reader', '>= 1 x', min(others) / best, 1.0),
-        Bar(
-            f'peak memory, {longest} times the length over {longer} times',
-            '<= 1.2 x',
-            lengths[longest]['memory'] / lengths[longer]['memory'],
-            1.2,
-            at_least=False,
+    sections = [
+        Section(
+            'From a bag to a result',
+            ('what', 'task', 'messages per second', 'time', 'peak memory'),
+            speeds,
+            f'A bag (MCAP, zstd) with {messages} messages each of WrenchStamped and JointState at '
+            f'{_RATE:g} Hz; least time of {_REPEATS}, in one process each.',
+        ),
+        Section(
+            'Longer bags',
+            ('length', 'messages', 'size', 'time', 'per second', 'peak memory', 'for the bag'),
+            memories,
+            'From a bag to a result, once, in one process each. At most '
+            f'{LARGEST} samples of a topic are kept.',
         ),
     ]
-    return text, bars
+    others = [one['seconds'] for name, one in found.items() if name != 'needle_identification']
+    longer, longest = LONGER[-2:]
+    growth = lengths[longest]['memory'] / lengths[longer]['memory']
+    bars = [
+        Bar('bag to result beside the faster reader', min(others) / best, 1.0, 'x', at_least=True),
+        Bar(f'peak memory, {longest} times the length over {longer} times', growth, 1.2, 'x'),
+    ]
+    return sections, bars
 
 
 if __name__ == '__main__':

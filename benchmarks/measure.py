@@ -1,70 +1,90 @@
-"""Measuring side by side: least times of interleaved jobs, and where they were taken."""
+"""Side-by-side timing: the least times of jobs that take turns, and bars on the results."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from datetime import datetime, timezone
-from importlib import import_module, metadata
-import os
-from pathlib import Path
-import platform
+from importlib import import_module
 import time
 from types import ModuleType
 from typing import Final
 
 import numpy as np
 
-#: What a line says of a tool that is not there.
+#: Shown in place of the figures of a tool that is not installed.
 NOT_INSTALLED: Final = 'not installed: pip install needle-insertion[bench]'
 
-#: A turn of a short job lasts this long [s]: the job before spoils the first runs of a turn.
+#: Duration of one turn of a short job [s]. The previous job slows down the first runs of a turn.
 _TURN: Final = 0.02
 
 
 @dataclass(frozen=True, slots=True)
 class Bar:
     """
-    One wanted figure and what was found.
+    A figure and the value that it must reach.
 
     Attributes
     ----------
-    what, wanted : str
-        The figure, and its bar in words.
+    figure : str
+        What is measured.
     found : float or None
-        What was measured; None if it could not be.
-    bar : float
-        Bar.
+        Measured value; None if it could not be measured.
+    limit : float
+        Value that must be reached.
+    unit : str
+        Unit of both.
     at_least : bool
-        True if the figure shall be at least ``bar``, False if at most.
+        True if the figure must be at least ``limit``, False if it must be at most ``limit``.
 
     """
 
-    what: str
-    wanted: str
+    figure: str
     found: float | None
-    bar: float
-    at_least: bool = True
+    limit: float
+    unit: str = ''
+    at_least: bool = False
+
+    @property
+    def missed(self) -> bool:
+        """Whether the figure was measured and does not reach the limit."""
+        if self.found is None:
+            return False
+        # NaN reaches no limit.
+        return not (self.found >= self.limit if self.at_least else self.found <= self.limit)
 
     @property
     def verdict(self) -> str:
-        """Say whether the bar is met, or by what factor it is missed."""
+        """``met``, or by what factor the limit is missed."""
         if self.found is None:
             return NOT_INSTALLED
-        found, bar = (self.found, self.bar) if self.at_least else (self.bar, self.found)
-        if found >= bar:
+        if not self.missed:
             return 'met'
-        # Nothing at all is no factor away from something.
-        return f'missed by a factor {bar / found:.2f}' if found > 0.0 else 'missed'
+        low, high = sorted((self.found, self.limit))
+        return f'missed by a factor {high / low:.2f}' if low > 0.0 else 'missed'
 
     def row(self) -> tuple[str, str, str, str]:
-        """Return the cells of a table."""
-        found = '' if self.found is None else f'{self.found:.3g}'
-        return self.what, self.wanted, found, self.verdict
+        """Return the cells of a table row: figure, limit, measured value and verdict."""
+        unit = f' {self.unit}' if self.unit else ''
+        wanted = f'{">=" if self.at_least else "<="} {self.limit:g}{unit}'
+        found = '' if self.found is None else f'{self.found:.3g}{unit}'
+        return self.figure, wanted, found, self.verdict
 
 
 def seconds(job: Callable[[], object]) -> float:
-    """Return the wall time of a job [s]."""
+    """
+    Measure the wall time of one call.
+
+    Parameters
+    ----------
+    job : callable
+        Called without arguments.
+
+    Returns
+    -------
+    float
+        Wall time [s].
+
+    """
     begin = time.perf_counter()
     job()
     return time.perf_counter() - begin
@@ -72,18 +92,18 @@ def seconds(job: Callable[[], object]) -> float:
 
 def least_times(jobs: Mapping[str, Callable[[], object]], repeats: int) -> dict[str, float]:
     """
-    Return the least wall time of each job, run in turn.
+    Measure the least wall time of each job; the jobs take turns.
 
-    Noise of a shared machine only adds to a time, and comes in spells: the least of many is
-    the best guess, and jobs that take turns share the spells. Short jobs are repeated within
-    their turn.
+    Other work on a shared machine only ever adds to a time, and comes in bursts. The least of
+    many times is therefore the best estimate, and jobs that take turns see the same bursts. Short
+    jobs are repeated within their turn.
 
     Parameters
     ----------
     jobs : Mapping[str, callable]
         Jobs by name. Each is run once more beforehand, to warm up.
     repeats : int
-        Rounds.
+        Number of rounds.
 
     Returns
     -------
@@ -105,41 +125,42 @@ def least_times(jobs: Mapping[str, Callable[[], object]], repeats: int) -> dict[
 
 
 def geometric(first: float, last: float, ratio: float) -> list[float]:
-    """Return first, first * ratio, ... up to last or down to it; the ends included."""
+    """
+    Return a geometric sequence.
+
+    Parameters
+    ----------
+    first, last : float
+        First value, and the value that the sequence does not pass.
+    ratio : float
+        Ratio of neighbors: above 1 if ``last`` is above ``first``, else below 1.
+
+    Returns
+    -------
+    list of float
+        ``first``, ``first * ratio``, ...; includes ``last`` if the sequence meets it.
+
+    """
     count = int(np.floor(np.log(last / first) / np.log(ratio) + 1e-9))
     return [first * ratio**k for k in range(count + 1)]
 
 
 def optional(name: str) -> ModuleType | None:
-    """Import a tool to compare with; None if it is not installed."""
+    """
+    Import a module of a tool to compare with.
+
+    Parameters
+    ----------
+    name : str
+        Module.
+
+    Returns
+    -------
+    module or None
+        None if it is not installed.
+
+    """
     try:
         return import_module(name)
     except ModuleNotFoundError:
         return None
-
-
-def version(name: str) -> str:
-    """Return a distribution with its version, or say that it is not installed."""
-    try:
-        return f'{name} {metadata.version(name)}'
-    except metadata.PackageNotFoundError:
-        return f'{name} not installed'
-
-
-def environment() -> str:
-    """Return the time, the machine and the versions, one line each."""
-    cpu = platform.processor() or platform.machine()
-    information = Path('/proc/cpuinfo')
-    if information.exists():
-        for line in information.read_text('utf-8').splitlines():
-            if line.startswith('model name'):
-                cpu = line.partition(':')[2].strip()
-                break
-    versions = [version(name) for name in ('numpy', 'scipy', 'numba', 'mujoco', 'pyelastica')]
-    return '\n'.join(
-        [
-            f'date: {datetime.now(timezone.utc):%Y-%m-%d %H:%M} UTC',
-            f'machine: {cpu}, {os.cpu_count()} cores, {platform.system()} {platform.machine()}',
-            f'versions: Python {platform.python_version()}, {", ".join(versions)}',
-        ]
-    )

@@ -26,6 +26,7 @@ from benchmarks.measure import (
     optional,
     seconds,
 )
+from benchmarks.page import Answer, Section, Tick
 from needle_dynamics import (
     FloatArray,
     Integrator,
@@ -34,7 +35,6 @@ from needle_dynamics import (
     NeedleParameters,
 )
 from needle_dynamics.simulated.integrators import DEFAULT_STEP
-from needle_insertion.report.text import table
 import numpy as np
 from scipy.optimize import brentq, minimize_scalar
 
@@ -357,14 +357,14 @@ def _cable_settings(mujoco: Any, *, plugin: bool) -> Iterator[tuple[float, Setti
                     break
 
 
-def mujoco_cable(tick: Callable[[str], None]) -> Setting | None:
+def mujoco_cable(tick: Tick) -> Setting | None:
     """
     Search the setting of MuJoCo that costs it least.
 
     Parameters
     ----------
     tick : callable
-        Told what comes next.
+        Called with the name of each stage.
 
     Returns
     -------
@@ -449,14 +449,14 @@ class _Rod:
         return time, tips
 
 
-def pyelastica_rod(tick: Callable[[str], None]) -> Setting | None:
+def pyelastica_rod(tick: Tick) -> Setting | None:
     """
     Search the setting of PyElastica that costs it least.
 
     Parameters
     ----------
     tick : callable
-        Told what comes next.
+        Called with the name of each stage.
 
     Returns
     -------
@@ -524,19 +524,19 @@ def mode_error(modes: NeedleModel) -> float:
     return float(sqrt(square) / (2.0 * pi) / needle_exact() - 1.0)
 
 
-def compare(tick: Callable[[str], None]) -> tuple[str, list[Bar]]:
+def compare(tick: Tick) -> Answer:
     """
     Compare what a simulated second of free vibration costs.
 
     Parameters
     ----------
     tick : callable
-        Told what comes next.
+        Called with the name of each stage.
 
     Returns
     -------
-    text : str
-        Table.
+    sections : list of Section
+        Cost of each tool.
     bars : list of Bar
         Ratios to ours, and our own frequency.
 
@@ -551,15 +551,6 @@ def compare(tick: Callable[[str], None]) -> tuple[str, list[Bar]]:
     own = spent[0] / ours.simulated
     rows = [item.row(time, own) for item, time in zip(settings, spent, strict=True)]
     rows += [(name, NOT_INSTALLED, *[''] * 5) for name, item in others.items() if item is None]
-    heads = (
-        'tool',
-        'discretization',
-        'step [s]',
-        'exact [Hz]',
-        'found',
-        'wall per simulated s [ms]',
-        'against ours',
-    )
     per_second = {
         name: None if item is None else spent[settings.index(item)] / item.simulated
         for name, item in others.items()
@@ -570,21 +561,27 @@ def compare(tick: Callable[[str], None]) -> tuple[str, list[Bar]]:
         return None if value is None else value / own
 
     modal = mode_error(NeedleModel(NeedleParameters.preset('paper_si')))
-    text = (
-        f'Free vibration, {LENGTH * 100:g} cm, base held; first frequency within '
-        f'{FREQUENCY_ERROR:.0%} of the exact one of the same equations\n{table(rows, heads)}\n'
-        f'ours: {STEPS_PER_PERIOD} steps a period (the modal flow is exact at any step), and the '
-        f'default step; the two-mode matrices alone are {modal:+.3%} off'
-    )
-    bars = [
-        Bar('free vibration, MuJoCo', '>= 50 x ours', ratio('MuJoCo'), 50.0),
-        Bar('free vibration, PyElastica', '>= 1000 x ours', ratio('PyElastica'), 1000.0),
-        Bar(
-            'our first frequency at 15 cm, error',
-            '<= 0.01',
-            max(abs(ours.error), abs(default.error)),
-            FREQUENCY_ERROR,
-            at_least=False,
+    section = Section(
+        'Free vibration',
+        (
+            'tool',
+            'discretization',
+            'step [s]',
+            'exact [Hz]',
+            'found',
+            'wall per simulated s [ms]',
+            'relative to ours',
         ),
+        rows,
+        f'{LENGTH * 100:g} cm, base held; first frequency within {FREQUENCY_ERROR:.0%} of the '
+        f'exact one of the same equations. Ours: {STEPS_PER_PERIOD} steps per period (the modal '
+        f'flow is exact at any step), and the default step. The error of the two-mode matrices '
+        f'alone is {modal:+.3%}.',
+    )
+    error = max(abs(ours.error), abs(default.error))
+    bars = [
+        Bar('free vibration, MuJoCo', ratio('MuJoCo'), 50.0, 'x ours', at_least=True),
+        Bar('free vibration, PyElastica', ratio('PyElastica'), 1000.0, 'x ours', at_least=True),
+        Bar('error of our first frequency at 15 cm', 100.0 * error, 100.0 * FREQUENCY_ERROR, '%'),
     ]
-    return text, bars
+    return [section], bars

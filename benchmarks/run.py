@@ -1,72 +1,149 @@
-"""Benchmarks: ratios measured side by side in one run, never a pass or fail on time."""
+"""Command `needle bench`: measures side by side, prints a page, and checks the bars."""
 
 from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Sequence
+from functools import partial
+from importlib import import_module
+from pathlib import Path
 import sys
 import time
 from typing import TypeAlias
 
-from benchmarks import batches, control, identification, rods, solvers, step
-from benchmarks.measure import Bar, environment
-from needle_insertion.report.text import table
+from benchmarks.measure import Bar
+from benchmarks.page import Answer, conclusion, header, Tick
 from tqdm import tqdm
 
-#: Returns its text and what it says of the bars; it is given what to tell its stages to.
-Question: TypeAlias = Callable[[Callable[[str], None]], tuple[str, list[Bar]]]
+#: Measures something.
+Question: TypeAlias = Callable[[Tick], Answer]
 
-#: Questions by subject. That of the graph is asked by `bench_graph`: it needs ROS.
-QUESTIONS: dict[str, tuple[Question, ...]] = {
-    'dynamics': (
-        step.compare,
-        solvers.compare,
-        rods.compare,
-        batches.compare,
-    ),
-    'identification': (identification.compare,),
-    'control': (control.compare,),
+#: Modules of each benchmark; those of `graph` need ROS. Each module has a function `compare`.
+MODULES = {
+    'dynamics': ('step', 'solvers', 'rods', 'batches'),
+    'identification': ('identification',),
+    'calibration': ('calibration',),
+    'control': ('control',),
+    'graph': ('graph',),
 }
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """
+    Add the names and the options of the benchmarks.
+
+    Parameters
+    ----------
+    parser : ArgumentParser
+        Parser of ``needle bench``.
+
+    """
+    parser.description = 'Measure side by side. The last line begins with met or missed.'
+    names = parser.add_subparsers(required=True, dest='name', metavar='NAME')
+    output = argparse.ArgumentParser(add_help=False)
+    output.add_argument('-o', '--output', type=Path, metavar='FILE', help='write the page, too')
+    add = partial(names.add_parser, parents=[output])
+    add('dynamics', help='the integrator beside SciPy, MuJoCo and PyElastica')
+    add('identification', help='from a bag to a result, beside other readers')
+    calibration = add('calibration', help='coverage and efficiency of the estimates')
+    calibration.add_argument(
+        '--recordings', type=int, metavar='N', help='simulated recordings of each kind'
+    )
+    calibration.add_argument(
+        '--seed', type=int, metavar='N', help='seed of the true values and the noise'
+    )
+    add('control', help='cost of a control step')
+    graph = add('graph', help='the nodes beside bare rclpy nodes')
+    plan = graph.add_mutually_exclusive_group()
+    plan.add_argument(
+        '--full',
+        dest='plan',
+        action='store_const',
+        const='full',
+        help='record for 60 s and watch the memory for 10 min',
+    )
+    plan.add_argument(
+        '--quick',
+        dest='plan',
+        action='store_const',
+        const='quick',
+        help='a trial, too short for reliable figures',
+    )
 
 
 def run(options: argparse.Namespace) -> int:
     """
-    Measure what is ours beside what else could be used, and print one table per question.
+    Run a benchmark and print its page.
 
     Parameters
     ----------
-    options : argparse.Namespace
-        ``subject``, one of `QUESTIONS`.
+    options : Namespace
+        As declared by `add_arguments`.
 
     Returns
     -------
     int
-        0, whatever was measured.
+        Exit status: 0 if no bar is missed, else 1.
+
+    Raises
+    ------
+    ParameterError
+        If a number is out of range.
 
     """
-    return ask(QUESTIONS[options.subject])
+    given = {key: value for key, value in vars(options).items() if value is not None}
+    name, output = given.pop('name'), given.pop('output', None)
+    words = [f'--{value}' if key == 'plan' else f'--{key} {value}' for key, value in given.items()]
+    questions = [
+        partial(import_module(f'benchmarks.{module}').compare, **given) for module in MODULES[name]
+    ]
+    page, missed = ask(name, ' '.join(('needle bench', name, *words)), questions)
+    if output is not None:
+        output.write_text(page, encoding='utf-8')
+    return int(missed)
 
 
-def ask(questions: Sequence[Question]) -> int:
-    """Ask questions as `run` does."""
+def ask(name: str, command: str, questions: Sequence[Question]) -> tuple[str, bool]:
+    """
+    Measure, and print the page as it grows.
+
+    Parameters
+    ----------
+    name, command : str
+        Name of the benchmark and its command line.
+    questions : sequence of callable
+        Called in turn.
+
+    Returns
+    -------
+    page : str
+        What was printed.
+    missed : bool
+        Whether a bar is missed.
+
+    """
     begin = time.perf_counter()
-    sys.stdout.write(f'{environment()}\n')
+    page = ''
     bars: list[Bar] = []
+    # Progress goes to the terminal only.
     with tqdm(disable=None, leave=False, unit=' stages') as progress:
 
-        def tick(what: str) -> None:
-            progress.set_description(what, refresh=False)
+        def tell(text: object) -> None:
+            nonlocal page
+            page += f'{text}\n'
+            progress.clear()
+            sys.stdout.write(f'{text}\n')
+            sys.stdout.flush()
+
+        def tick(stage: str) -> None:
+            progress.set_description(stage, refresh=False)
             progress.update()
 
+        tell(header(name, command))
         for question in questions:
-            text, found = question(tick)
+            sections, found = question(tick)
             bars += found
-            progress.clear()
-            sys.stdout.write(f'\n{text}\n')
-            sys.stdout.flush()
-    heads = ('figure', 'wanted', 'found', 'verdict')
-    sys.stdout.write(
-        f'\n{table([bar.row() for bar in bars], heads)}\n'
-        f'\n{time.perf_counter() - begin:.0f} s in all\n'
-    )
-    return 0
+            for section in sections:
+                tell(f'\n{section}')
+        tell(f'\n{conclusion(bars, time.perf_counter() - begin)}')
+    return page, any(bar.missed for bar in bars)

@@ -17,9 +17,9 @@ from unittest import mock
 import warnings
 
 from benchmarks.measure import Bar, geometric, least_times, seconds
+from benchmarks.page import Answer, Section, Tick
 from needle_dynamics import FloatArray, Integrator, NeedleModel, NeedleParameters
 from needle_dynamics.compiled.kernels import advance, evaluate, TERMS_PER_LENGTH
-from needle_insertion.report.text import table
 import numba
 import numpy as np
 from scipy.integrate import quad, solve_ivp
@@ -361,19 +361,19 @@ class OpenLoop:
         return min(found, key=lambda item: item[0])[1]
 
 
-def compare(tick: Callable[[str], None]) -> tuple[str, list[Bar]]:
+def compare(tick: Tick) -> Answer:
     """
     Compare our integrator with SciPy's solvers on the open-loop run.
 
     Parameters
     ----------
     tick : callable
-        Told what comes next.
+        Called with the name of each stage.
 
     Returns
     -------
-    text : str
-        Tables.
+    sections : list of Section
+        Cost of each solver.
     bars : list of Bar
         Ratios to the best of SciPy.
 
@@ -422,39 +422,29 @@ def compare(tick: Callable[[str], None]) -> tuple[str, list[Bar]]:
     rows += [row(item, compiled_times[item.name], 'compiled') for item in candidates]
     rows += [row(item, user_times[item.name], 'NumPy, Gauss') for item in candidates]
     rows.append(row(first, adaptive_time, 'NumPy, quad'))
-    heads = (
-        'solver',
-        'right-hand side',
-        'setting',
-        'error / peak',
-        'calls or steps',
-        'wall [ms]',
-        'wall / simulated',
-        'against ours',
+    section = Section(
+        'Open-loop run',
+        (
+            'solver',
+            'right-hand side',
+            'setting',
+            'error / peak',
+            'calls or steps',
+            'wall [ms]',
+            'wall / simulated',
+            'relative to ours',
+        ),
+        rows,
+        f'{FORCE:g} N, {DEPTH * 100:g} cm inserted, {DEFLECTION * 1e3:g} mm deflection, paper_si, '
+        f'{DURATION * 1e3:g} ms simulated, error at most {ACCURACY:.1%} of the peak.',
     )
-    text = (
-        f'Open-loop run: {FORCE:g} N, {DEPTH * 100:g} cm inserted, {DEFLECTION * 1e3:g} mm '
-        f'deflection, paper_si, {DURATION * 1e3:g} ms simulated, '
-        f'error <= {ACCURACY:.1%} of the peak\n{table(rows, heads)}'
-    )
+    fastest = min(compiled_times[item.name] for item in candidates)
     bars = [
-        Bar(
-            'open loop, best SciPy, compiled right-hand side',
-            '>= 100 x ours',
-            min(compiled_times[item.name] for item in candidates) / own,
-            100.0,
-        ),
-        Bar(
-            'open loop, best SciPy, NumPy and Gauss nodes',
-            '>= 1000 x ours',
-            user_times[first.name] / own,
-            1000.0,
-        ),
-        Bar(
-            'open loop, the same solver, NumPy and quad',
-            '>= 1000 x ours',
-            adaptive_time / own,
-            1000.0,
-        ),
+        Bar(f'open loop, {what}', spent / own, limit, 'x ours', at_least=True)
+        for what, spent, limit in (
+            ('best SciPy, compiled right-hand side', fastest, 100.0),
+            ('best SciPy, NumPy and Gauss nodes', user_times[first.name], 1000.0),
+            ('the same solver, NumPy and quad', adaptive_time, 1000.0),
+        )
     ]
-    return text, bars
+    return [section], bars

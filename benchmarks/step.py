@@ -20,9 +20,9 @@ from typing import Any, cast, Final, TypeVar
 from unittest import mock
 
 from benchmarks.measure import Bar, least_times
+from benchmarks.page import Answer, Section, Tick
 from needle_dynamics import FloatArray, Integrator, NeedleModel, NeedleParameters
 from needle_dynamics.compiled.kernels import advance
-from needle_insertion.report.text import table
 import numba
 import numpy as np
 
@@ -333,19 +333,19 @@ def grouped(counts: Mapping[str, float]) -> dict[str, float]:
     return {name: count for name, count in groups.items() if count}
 
 
-def compare(tick: Callable[[str], None]) -> tuple[str, list[Bar]]:
+def compare(tick: Tick) -> Answer:
     """
     Measure a step of `Integrator` and derive the bound from its operations.
 
     Parameters
     ----------
     tick : callable
-        Told what comes next.
+        Called with the name of each stage.
 
     Returns
     -------
-    text : str
-        Table.
+    sections : list of Section
+        Number and cost of the operations.
     bars : list of Bar
         Cost of a step, and its ratio to the bound.
 
@@ -386,15 +386,18 @@ def compare(tick: Callable[[str], None]) -> tuple[str, list[Bar]]:
     ]
     rows.append(('bound', '', '', f'{bound * 1e9:.3g}'))
     rows.append(('measured', '', '', f'{step * 1e9:.3g}'))
-    text = (
-        f'Cost of a step: two modes, one core, sliding; mean of {_STEPS} steps of {_STEP:g} s '
-        f'from {_DEPTH * 100:g} cm on; arithmetic bound from their operations\n'
-        f'{table(rows, ("operation", "in a step", "ns each", "ns in a step"))}\n'
-        f'counted: {sum(counts.values()):.0f} operations, '
+    section = Section(
+        'Cost of a step',
+        ('operation', 'in a step', 'ns each', 'ns in a step'),
+        rows,
+        f'Two modes, one core, sliding: mean of {_STEPS} steps of {_STEP:g} s from '
+        f'{_DEPTH * 100:g} cm. The bound is the sum of the costs of the operations. Counted: '
+        f'{sum(counts.values()):.0f} operations, '
         + ', '.join(f'{number:.4g} {name}' for name, number in sorted(counts.items()))
+        + '.',
     )
     bars = [
-        Bar('cost of a step, two modes [ns]', '<= 600 ns', step * 1e9, 600.0, at_least=False),
-        Bar('cost of a step over its bound', '<= 4', step / bound, 4.0, at_least=False),
+        Bar('cost of a step, two modes', step * 1e9, 600.0, 'ns'),
+        Bar('cost of a step over its bound', step / bound, 4.0),
     ]
-    return text, bars
+    return [section], bars

@@ -9,8 +9,8 @@ import pytest
 
 #: Files whose tests share what takes long to make: each file runs in one process.
 WHOLE = {
-    'test/composition/test_bench_graph.py',
-    'test/composition/test_bench_identification.py',
+    'test/bench/test_graph.py',
+    'test/bench/test_calibration.py',
     'test/composition/test_claims.py',
     'test/composition/test_experiment.py',
     'test/composition/test_reproduce.py',

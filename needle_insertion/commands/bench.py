@@ -7,7 +7,7 @@ from importlib import import_module
 from pathlib import Path
 import sys
 
-from needle_ros.errors import ParameterError
+_ROOT = Path(__file__).parents[2]
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -17,34 +17,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     Parameters
     ----------
     parser : ArgumentParser
-        Parser of the command.
+        Parser of the command. It ends the process with status 2 if this is not a clone.
 
     """
-    subjects = parser.add_subparsers(required=True, dest='subject', metavar='SUBJECT')
-    for subject, words in (
-        ('dynamics', 'the integrator'),
-        ('identification', 'from a bag to a result'),
-        ('control', 'a control step'),
-    ):
-        subjects.add_parser(subject, help=f'speed: {words}')
-    graph = subjects.add_parser('graph', help='speed: our nodes and bare rclpy nodes')
-    length = graph.add_mutually_exclusive_group()
-    length.add_argument('--full', action='store_true', help='record 60 s, watch memory for 10 min')
-    length.add_argument(
-        '--quick', action='store_true', help='a short trial; its numbers mean nothing'
-    )
-    intervals = subjects.add_parser('calibration', help='how often intervals hold the truth')
-    intervals.add_argument(
-        '--recordings',
-        type=int,
-        default=1000,
-        metavar='N',
-        help='simulated recordings of each kind (default 1000)',
-    )
-    intervals.add_argument(
-        '--seed', type=int, default=2014, help='of the true values and the noise (default 2014)'
-    )
-    intervals.add_argument('--json', action='store_true', help='print JSON instead of tables')
+    if not (_ROOT / 'benchmarks').is_dir():
+        parser.error('only a clone of the repository has the benchmarks; run it from there')
+    # A clone is not on the path.
+    sys.path.insert(0, str(_ROOT))
+    import_module('benchmarks.run').add_arguments(parser)
 
 
 def run(options: argparse.Namespace) -> int:
@@ -59,19 +39,7 @@ def run(options: argparse.Namespace) -> int:
     Returns
     -------
     int
-        Exit status.
-
-    Raises
-    ------
-    ParameterError
-        If this is not a clone.
+        Exit status: 0 if no bar is missed, else 1.
 
     """
-    root = Path(__file__).parents[2]
-    if not (root / 'benchmarks').is_dir():
-        raise ParameterError('needle bench needs a clone of the repository: benchmarks/ is there')
-    # A clone is not on the path.
-    sys.path.insert(0, str(root))
-    has_own_run = options.subject in ('graph', 'calibration')
-    module = import_module(f'benchmarks.{options.subject}' if has_own_run else 'benchmarks.run')
-    return int(module.run(options))
+    return int(import_module('benchmarks.run').run(options))

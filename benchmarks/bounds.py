@@ -1,0 +1,198 @@
+"""
+True parameters of simulated recordings, and the Cramer-Rao bound of their estimates.
+
+The bound takes the noise of the readings as it is in the simulation: white at the rate of the
+sensor, then filtered, then sampled at the rate of the recording.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from math import atan2, pi, sqrt
+from typing import Final, TypeAlias
+
+from needle_dynamics import (
+    FloatArray,
+    ForceSensorParameters,
+    IndenterParameters,
+    NeedleParameters,
+)
+from needle_identification import FrictionSettings, StiffnessSettings
+from needle_identification.friction.terms import columns_of, regressors
+from needle_insertion.experiment.protocol import DIRECTIONS, HOLD_TIME
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import solveh_banded
+from scipy.signal import butter, sosfilt
+
+#: Samples per second of the recordings [Hz].
+RATE: Final = 250.0
+
+#: Readings this many samples apart have independent noise.
+_REACH: Final = 24
+
+#: True value and Cramer-Rao bound of the variance by parameter; NaN where there is no bound.
+Truth: TypeAlias = Mapping[str, tuple[float, float]]
+
+
+def sensor_lag(parameters: ForceSensorParameters) -> float:
+    """Return by how much the filters of the sensor delay a slow force [s]."""
+    late = 0.0
+    for cutoff in parameters.cutoffs:
+        b, a = butter(2, cutoff, fs=parameters.rate)
+        order = np.arange(3)
+        late += float(b @ order / b.sum() - a @ order / a.sum()) / parameters.rate
+    return late
+
+
+def reading_noise(parameters: ForceSensorParameters, axis: int) -> FloatArray:
+    """
+    Return the covariance of the noise of readings by the distance of two.
+
+    White noise at the rate of the sensor passes its filters; every so many samples one is read
+    and rounded.
+
+    Parameters
+    ----------
+    parameters : ForceSensorParameters
+        The sensor.
+    axis : int
+        Force x y z, torque x y z.
+
+    Returns
+    -------
+    ndarray, shape (_REACH,)
+        Covariance of readings 0, 1, 2, ... apart [N^2].
+
+    """
+    every = round(parameters.rate / RATE)
+    response = np.zeros(2 * _REACH * every)
+    response[0] = parameters.per_axis('noise')[axis]
+    for cutoff in parameters.cutoffs:
+        response = sosfilt(butter(2, cutoff, fs=parameters.rate, output='sos'), response)
+    later = [response[every * k :] for k in range(_REACH)]
+    covariance = np.array([response[: len(part)] @ part for part in later])
+    covariance[0] += parameters.per_axis('resolution')[axis] ** 2 / 12.0
+    return covariance
+
+
+def information(regressors: FloatArray, noise: FloatArray, used: NDArray[np.bool_]) -> FloatArray:
+    """
+    Return Fisher's information on the coefficients of regressors.
+
+    Parameters
+    ----------
+    regressors : ndarray, shape (n, k)
+        Regressors at even times.
+    noise : ndarray, shape (m,)
+        Covariance of the noise by distance, zero beyond.
+    used : ndarray of bool, shape (n,)
+        What is known of these.
+
+    Returns
+    -------
+    ndarray, shape (k, k)
+        Its inverse is the Cramer-Rao bound of normal noise.
+
+    """
+    at = np.flatnonzero(used)
+    banded = np.zeros((len(noise), len(at)))
+    for row in range(min(len(noise), len(at))):
+        apart = at[row:] - at[: len(at) - row]
+        near = apart < len(noise)
+        banded[row, : len(apart)][near] = noise[apart[near]]
+    x = regressors[at]
+    return np.asarray(x.T @ solveh_banded(banded, x, lower=True))
+
+
+def friction_truth(
+    needle: NeedleParameters,
+    sensor: ForceSensorParameters,
+    time: FloatArray,
+    speed: FloatArray,
+    settings: FrictionSettings,
+) -> Truth:
+    """
+    Return true parameters and Cramer-Rao bounds.
+
+    The bound takes every reading while the needle counts as moving, with the noise of the sensor
+    as its filters leave it, and as unknown the coefficients of the terms: what starts, stops and
+    lag cost an estimator is not in it.
+    """
+    coulomb, viscous = needle.coulomb_friction, needle.viscous_friction
+    breakaway = needle.breakaway_friction if needle.friction_law == 'stribeck' else 1.0
+    true = {
+        'coulomb_friction': coulomb,
+        'viscous_friction': viscous,
+        'offset': float(sensor.per_axis('bias')[1]),
+        'moving_mass': needle.moving_mass,
+        'withdrawal_coulomb': (needle.withdrawal_friction - 1.0) * coulomb,
+        'withdrawal_viscous': (needle.withdrawal_friction - 1.0) * viscous,
+        'withdrawal_friction': needle.withdrawal_friction,
+        'stribeck_friction': (breakaway - 1.0) * coulomb,
+        'breakaway_friction': breakaway,
+        'breakaway_force': breakaway * coulomb,
+        'lag': sensor_lag(sensor) - needle.moving_mass / viscous,
+    }
+    names = [column.name for column in columns_of(settings.terms)]
+    acceleration = np.gradient(speed, time)
+    known = information(
+        regressors(speed, acceleration, settings.terms, settings),
+        reading_noise(sensor, 1),
+        np.abs(speed) > settings.moving_speed,
+    )
+    bound = dict(zip(names, np.diag(np.linalg.inv(known)).tolist(), strict=True))
+    # No reading tells a mass from a lag of unknown size.
+    bound.pop('moving_mass', None)
+    return {name: (value, bound.get(name, np.nan)) for name, value in true.items()}
+
+
+def stiffness_truth(
+    matrix: FloatArray, force: float, sensor: ForceSensorParameters, tissue: IndenterParameters
+) -> Truth:
+    """
+    Return true parameters of one level and Cramer-Rao bounds.
+
+    The bound takes all readings of all holds, of force and position, with their noise, and the
+    zeros of both for known.
+    """
+    angles = 2.0 * pi / DIRECTIONS * np.arange(DIRECTIONS)
+    forces = force * np.column_stack([np.cos(angles), np.sin(angles)])
+    displacement = np.linalg.solve(matrix, forces.T).T
+    constant = np.ones((round(RATE * HOLD_TIME), 1))
+    held = np.ones(len(constant), dtype=np.bool_)
+    of_force = 1.0 / information(constant, reading_noise(sensor, 0), held).item()
+    of_position = (tissue.position_noise**2 + tissue.encoder_resolution**2 / 12.0) / len(constant)
+    noise = of_force * np.eye(2) + of_position * matrix @ matrix.T
+    covariance = np.kron(noise, np.linalg.inv(displacement.T @ displacement))
+    true = _parts(matrix)
+    # Differences along each entry give the gradients, exact to the step squared.
+    step = 1e-3
+    changes = []
+    for entry in np.eye(4).reshape(4, 2, 2):
+        more, less = _parts(matrix + step * entry), _parts(matrix - step * entry)
+        changes.append([(more[name] - less[name]) / (2.0 * step) for name in true])
+    gradients = np.array(changes).T
+    bounds = np.einsum('ni,ij,nj->n', gradients, covariance, gradients)
+    return {
+        name: (value, float(bound))
+        for (name, value), bound in zip(true.items(), bounds, strict=True)
+    }
+
+
+def _parts(matrix: FloatArray) -> dict[str, float]:
+    """Return what is reported of a stiffness matrix, by name."""
+    symmetric = (matrix + matrix.T) / 2.0
+    half, shear = (matrix[0, 0] - matrix[1, 1]) / 2.0, symmetric[0, 1]
+    mean, radius = np.trace(matrix) / 2.0, np.hypot(half, shear)
+    curl = matrix[1, 0] - matrix[0, 1]
+    values = {
+        **dict(zip(('k_xx', 'k_xz', 'k_zx', 'k_zz'), matrix.ravel(), strict=True)),
+        'curl': curl,
+        'spring': abs(curl) / sqrt(2.0) / np.linalg.norm(symmetric),
+        'principal_stiffness_1': mean + radius,
+        'principal_stiffness_2': mean - radius,
+        'principal_angle': atan2(shear, half) / 2.0,
+        'tissue_stiffness': matrix[1, 1] / StiffnessSettings().contact_length,
+    }
+    return {name: float(value) for name, value in values.items()}
