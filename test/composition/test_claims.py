@@ -216,7 +216,7 @@ def pid(kp: float, kv: float, end: float = 60.0) -> tuple[FloatArray, FloatArray
     """Return time and tip of figure 8 (0.3 N s/mm) where the inertia does not count."""
     kp, kv, bound = 1e3 * kp, 1e4 * kv, MU_S / (1e3 * kp)
 
-    def depth(time: FloatArray) -> FloatArray:
+    def depth(time: FloatArray | float) -> FloatArray:
         fall = np.exp(-kp * time / (kv + MU_V['mm']))
         return np.asarray(LENGTH - bound - (WAY - bound) * fall)
 

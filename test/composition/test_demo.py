@@ -3,6 +3,7 @@
 from dataclasses import replace
 from math import inf, nan
 from pathlib import Path
+from typing import Any
 
 from needle_identification import (
     identify_friction,
@@ -66,9 +67,9 @@ def test_an_insertion_is_checked_for_depth_overshoot_tracking_and_messages(
     assert [check.passed for check in insertion_checks(insertion(**changes))] == verdicts
 
 
-def comparison(value: float, symbol: str = 'k_zz', **changes: object) -> Comparison:
+def comparison(value: float, symbol: str = 'k_zz', **changes: Any) -> Comparison:
     """Return a made-up estimate: the truth is 100, the interval reaches 10 to both sides."""
-    estimate = {
+    estimate: dict[str, Any] = {
         'name': symbol, 'symbol': symbol, 'unit': 'N/m', 'value': value, 'error': 4.0,
         'interval': (value - 10.0, value + 10.0), 'determined': True,
     }  # fmt: skip

@@ -5,6 +5,7 @@ from hypothesis import strategies as st
 from needle_insertion.experiment.population import draw_friction, draw_stiffness
 from needle_insertion.paper.tables import FORCE_LEVELS, TABLE_1, TABLE_2
 import numpy as np
+from numpy.typing import ArrayLike
 import pytest
 
 SEEDS = st.integers(0, 2**32)
@@ -22,7 +23,8 @@ def test_twenty_draws_have_the_mean_and_std_of_the_tables(seed: int) -> None:
     friction, stiffness = draw_friction(20, seed), draw_stiffness(20, seed)
     drawn = {name: np.array([d[name] for d in friction])[:, None] for name in TABLE_1}
     drawn |= {entry: np.array([d[entry] for d in stiffness]) for entry in TABLE_2}
-    for name, (means, deviations) in (TABLE_1 | TABLE_2).items():
+    tables: dict[str, tuple[ArrayLike, ArrayLike]] = {**TABLE_1, **TABLE_2}
+    for name, (means, deviations) in tables.items():
         found = drawn[name]
         assert np.all(abs(found.mean(0) - means) <= 0.015 * np.array(deviations))
         assert np.all(abs(found.std(0, ddof=1) / deviations - 1.0) <= 0.03)

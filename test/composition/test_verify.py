@@ -1,6 +1,6 @@
 """A recorded run computed anew is the run; what is not, is named: where, what, and why."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields, replace
 import json
 from math import sin
@@ -53,7 +53,7 @@ KINDS = {
     '/tip_deflection': 'geometry_msgs/msg/PointStamped',
     '/ground_truth': 'sensor_msgs/msg/JointState',
 }
-NODE = {
+NODE: dict[str, Any] = {
     'rate': RATE,
     'seed': 7,
     'mode': 'simulation',
@@ -135,7 +135,7 @@ def tip(at: int, depth: float, deflection: float) -> bytes:
     return encode(message_type(KINDS['/tip_deflection'])(header(at), point))
 
 
-def text(values: dict[str, float | str]) -> bytes:
+def text(values: Mapping[str, object]) -> bytes:
     document = yaml.safe_dump({'/plant': {'ros__parameters': values}})
     return encode(message_type(KINDS['/plant/configuration'])(document))
 
@@ -249,7 +249,7 @@ def carried(
     return messages
 
 
-def written(path: Path, messages: filter | list[Message]) -> object:
+def written(path: Path, messages: Iterable[Message]) -> Path:
     """Write messages into a bag, in the order in which they were received."""
     with BagWriter(path) as bag:
         for topic, kind in KINDS.items():
