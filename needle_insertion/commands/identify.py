@@ -31,9 +31,8 @@ from needle_identification import (
 )
 from needle_identification.recordings import TIMES
 from needle_insertion.commands.options import make_folder
-from needle_insertion.report.friction_tables import friction_text
+from needle_insertion.report.identify_text import friction_text, stiffness_text
 from needle_insertion.report.origin import digests, Origin, Source, with_name
-from needle_insertion.report.stiffness_tables import stiffness_text
 from needle_ros.errors import NeedleError, ParameterError
 import numpy as np
 from tqdm import tqdm
@@ -234,7 +233,7 @@ def _run_friction(options: argparse.Namespace) -> int:
 
     def write_page(folder: Path) -> Path:
         # Draws: not wanted for tables.
-        from needle_insertion.report.friction_page import write_friction_page
+        from needle_insertion.report.identify_page import write_friction_page
 
         return write_friction_page(folder, summary, origin)
 
@@ -262,7 +261,7 @@ def _run_stiffness(options: argparse.Namespace) -> int:
 
     def write_page(folder: Path) -> Path:
         # Draws: not wanted for tables.
-        from needle_insertion.report.stiffness_page import write_stiffness_page
+        from needle_insertion.report.identify_page import write_stiffness_page
 
         return write_stiffness_page(folder, summary, origin)
 

@@ -12,7 +12,7 @@ from needle_dynamics.simulated.integrators import DEFAULT_TOLERANCE
 from needle_identification.result import write_whole
 from needle_insertion.commands.options import constants
 from needle_insertion.report import trajectory as report
-from needle_insertion.report.picture import png
+from needle_insertion.report.content import png
 from needle_insertion.report.text import table
 from needle_ros.errors import ParameterError
 

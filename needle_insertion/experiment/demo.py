@@ -42,11 +42,14 @@ from needle_insertion.experiment.truth import (
     count_held,
     fewest,
 )
-from needle_insertion.report.checks import Check, CHECK_HEADS, check_table
-from needle_insertion.report.friction_figures import data_figure
+from needle_insertion.report.content import Picture
+from needle_insertion.report.identify_figures import (
+    friction_data,
+    stiffness_levels,
+    stiffness_presses,
+)
 from needle_insertion.report.page import write_page
-from needle_insertion.report.picture import Picture
-from needle_insertion.report.stiffness_figures import level_figure, press_figure
+from needle_insertion.report.text import Check, CHECK_HEADS, check_table
 from needle_ros.errors import NeedleError
 from tqdm import tqdm
 
@@ -181,19 +184,19 @@ def _pictures(
             'friction',
             'Friction, fresh recording: force over time and against speed, with the fit of (15) '
             'to steady motion.',
-            data_figure(friction),
+            friction_data(friction),
         ),
         Picture(
             'presses',
             'Stiffness, fresh recording. Left: force against displacement of each press. Right: '
             'where the end-effector came to rest, and where the fitted matrix puts it (ellipses).',
-            press_figure(stiffness),
+            stiffness_presses(stiffness),
         ),
         Picture(
             'stiffness',
             'Stiffness, fresh recording: entries of the matrix with 95 % intervals. The true '
             'values are the means of Table 2 (gray).',
-            level_figure(summarize_stiffness([stiffness])),
+            stiffness_levels(summarize_stiffness([stiffness])),
         ),
     ]
 

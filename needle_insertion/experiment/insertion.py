@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from needle_dynamics import FloatArray
 from needle_identification import read_topic
 from needle_insertion.experiment.ros_graph import ACTIVATE, CONFIGURE, Graph
-from needle_insertion.report.checks import Check
+from needle_insertion.report.text import Check
 from needle_ros.base_node import COMMAND, SENSOR
 from needle_ros.timing import seconds
 import numpy as np

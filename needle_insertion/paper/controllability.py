@@ -6,8 +6,7 @@ from typing import Final
 
 from needle_dynamics import NeedleModel, NeedleParameters
 from needle_insertion.report import controllability as report
-from needle_insertion.report.picture import Picture
-from needle_insertion.report.section import Grid, Section
+from needle_insertion.report.content import Grid, Picture, Section
 
 #: Operating points: inserted lengths [m], tip deflections [m], speed [m/s].
 DEPTHS: Final = (0.02, 0.1, 0.2)

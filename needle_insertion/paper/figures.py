@@ -22,8 +22,7 @@ from needle_insertion.paper.runs import (
     READINGS,
     SHOWN,
 )
-from needle_insertion.report.picture import Picture
-from needle_insertion.report.section import Grid, Section
+from needle_insertion.report.content import Grid, Picture, Section
 import numpy as np
 
 LAW_COLORS: Final[Mapping[str, str]] = {'inverse_dynamics': '#c25a00', 'pid': '#1f5fa8'}

@@ -26,7 +26,7 @@ from needle_insertion.experiment.truth import (
     LEVEL,
 )
 from needle_insertion.paper.tables import FORCE_LEVELS, TABLE_1, TABLE_2
-from needle_insertion.report.section import Grid, Section
+from needle_insertion.report.content import Grid, Section
 from needle_ros.errors import NeedleError
 from scipy.special import chdtri
 from tqdm import tqdm

@@ -30,8 +30,7 @@ from needle_controller.laws.law import BREAKAWAY_TIME
 from needle_dynamics import FloatArray, NeedleModel, NeedleParameters
 from needle_insertion.paper.figures import LAW_COLORS
 from needle_insertion.paper.runs import LAWS
-from needle_insertion.report.picture import Picture
-from needle_insertion.report.section import Grid, Section
+from needle_insertion.report.content import Grid, Picture, Section
 import numpy as np
 
 #: Relative half-width of the uniform distributions, and what they are of.

@@ -6,7 +6,7 @@ from math import pi
 from typing import Final
 
 from needle_dynamics import NeedleParameters
-from needle_insertion.report.section import Grid, Section
+from needle_insertion.report.content import Grid, Section
 
 #: Diameter of an 18 gauge needle [m].
 DIAMETER: Final = 1.27e-3

@@ -20,8 +20,8 @@ from needle_insertion.paper.identified import (
     verdict,
 )
 from needle_insertion.paper.tables import TABLE_1, TABLE_2
+from needle_insertion.report.content import Section
 from needle_insertion.report.page import write_page
-from needle_insertion.report.section import Section
 from needle_insertion.report.text import table
 from tqdm import tqdm
 

@@ -22,7 +22,7 @@ from needle_dynamics.analysis import (
     Structure,
 )
 from needle_identification.result import write_whole
-from needle_insertion.report.picture import png
+from needle_insertion.report.content import png
 import numpy as np
 from tqdm import tqdm
 

@@ -15,7 +15,7 @@ from typing import Any, Final
 
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 from needle_identification.result import write_whole
-from needle_insertion.report.picture import Picture
+from needle_insertion.report.content import Picture
 from needle_insertion.report.symbols import symbols
 
 #: A text that starts with a number and is longer, such as a checksum, is not a number.

@@ -1,8 +1,10 @@
-"""Tables as text for the terminal."""
+"""Tables and checks as text for the terminal."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
 
 
 def table(rows: Sequence[Sequence[str]], heads: Sequence[str]) -> str:
@@ -29,3 +31,51 @@ def table(rows: Sequence[Sequence[str]], heads: Sequence[str]) -> str:
         '  '.join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip()
         for line in lines
     )
+
+
+#: Heads of the rows of `Check.row`.
+CHECK_HEADS: Final = ('what', 'true or wanted', 'found', 'verdict')
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    """
+    One line of a result: what was wanted, what was found, and whether that is good enough.
+
+    Attributes
+    ----------
+    what : str
+        Quantity that was checked.
+    wanted, found : str
+        With units.
+    passed : bool
+        The verdict.
+
+    """
+
+    what: str
+    wanted: str
+    found: str
+    passed: bool
+
+    def row(self) -> tuple[str, str, str, str]:
+        """Return the cells of a table, the verdict as a word."""
+        return self.what, self.wanted, self.found, 'pass' if self.passed else 'FAIL'
+
+
+def check_table(checks: Sequence[Check]) -> str:
+    """
+    Return checks as aligned text.
+
+    Parameters
+    ----------
+    checks : sequence of Check
+        One for each row.
+
+    Returns
+    -------
+    str
+        Lines without a final newline.
+
+    """
+    return table([check.row() for check in checks], CHECK_HEADS)

@@ -21,7 +21,7 @@ from needle_insertion.paper.runs import (
     PID_KP,
     READINGS,
 )
-from needle_insertion.report.picture import png
+from needle_insertion.report.content import png
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest

@@ -11,10 +11,9 @@ from hypothesis import strategies as st
 from markupsafe import Markup
 from matplotlib.figure import Figure
 from needle_dynamics import ParameterError
-from needle_insertion.report.checks import Check, CHECK_HEADS, check_table
+from needle_insertion.report.content import Picture
 from needle_insertion.report.page import templates, write_page
-from needle_insertion.report.picture import Picture
-from needle_insertion.report.text import table
+from needle_insertion.report.text import Check, CHECK_HEADS, check_table, table
 import pytest
 from support.pages import look_at
 

@@ -21,7 +21,7 @@ from needle_insertion.paper.identified import (
 )
 from needle_insertion.paper.tables import FORCE_LEVELS, TABLE_1, TABLE_2
 from needle_insertion.report import controllability
-from needle_insertion.report.section import Section
+from needle_insertion.report.content import Section
 import numpy as np
 import pytest
 from support.pages import look_at

@@ -10,7 +10,7 @@ from typing import Any
 from needle_insertion.paper.claims import analysis, control, identified, mismatch, needle
 from needle_insertion.paper.claims.claim import Claim, FAILS, Finding, HOLDS, ONLY_IF, Tables
 from needle_insertion.paper.mismatch import Mismatch
-from needle_insertion.report.section import Grid, Section
+from needle_insertion.report.content import Grid, Section
 import yaml
 
 

@@ -1,4 +1,4 @@
-"""A figure with its caption, as a PNG."""
+"""What pages are made of, as plain data: pictures, tables and sections."""
 
 from __future__ import annotations
 
@@ -72,3 +72,48 @@ class Picture:
     def height(self) -> int:
         """Height [pixels]."""
         return int.from_bytes(self.image[20:24], 'big')
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Grid:
+    """
+    A table.
+
+    Attributes
+    ----------
+    caption : str
+        What it shows.
+    heads : tuple of str
+        Column heads.
+    rows : tuple of tuple of str
+        Cells; the first of a row names it.
+
+    """
+
+    caption: str
+    heads: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Section:
+    """
+    A heading and what stands below it.
+
+    Attributes
+    ----------
+    title : str
+        The heading.
+    paragraphs : tuple of str
+        Plain text.
+    tables : tuple of Grid
+        Tables.
+    pictures : tuple of Picture
+        Pictures with their captions.
+
+    """
+
+    title: str
+    paragraphs: tuple[str, ...]
+    tables: tuple[Grid, ...] = ()
+    pictures: tuple[Picture, ...] = ()

@@ -1,0 +1,297 @@
+"""Figures of identified friction and stiffness."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from math import isfinite
+import re
+from typing import Any, Final
+
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from needle_dynamics import FloatArray
+from needle_identification import (
+    FrictionEstimate,
+    LevelEstimate,
+    ParameterEstimate,
+    Statistic,
+    StiffnessEstimate,
+    StiffnessSummary,
+)
+from needle_insertion.paper.tables import FORCE_LEVELS, TABLE_2
+from needle_insertion.report.identify_text import label_of
+import numpy as np
+
+#: Colors: motion into the tissue and results, motion out of it, data, pale data, fits.
+_IN, _OUT, _DATA, _LIGHT, _FIT = '#1f5fa8', '#c25a00', '#8b95a1', '#c3cad2', '#111111'
+
+#: Directions of motion: sign, words, color and marker.
+_SIDES: Final = ((1.0, 'into the tissue', _IN, 'o'), (-1.0, 'out of it', _OUT, '^'))
+
+#: Points of a line; more cannot be seen.
+_MOST_POINTS: Final = 8000
+
+_SYMBOL: Final = re.compile(r'\b(mu|k|f)_(\w{1,3})\b')
+_GREEK: Final = {'mu': r'\mu'}
+
+
+def friction_data(estimate: FrictionEstimate) -> Figure:
+    """
+    Draw the filtered force over time and against speed, with the fit.
+
+    Parameters
+    ----------
+    estimate : FrictionEstimate
+        What a recording gave.
+
+    Returns
+    -------
+    Figure
+        Two plots.
+
+    """
+    fit = estimate.fit
+    figure = _new_figure(9.0, 7.5)
+    above, below = figure.subplots(2, 1)
+    time, force = _thinned(fit.time - fit.time[0], fit.force)
+    above.plot(time, force, color=_LIGHT, linewidth=3.0, label='measured, filtered')
+    model = np.where(fit.used, fit.model, np.nan)
+    above.plot(*_thinned(fit.time - fit.time[0], model), color=_FIT, linewidth=1.2, label='fit')
+    _label(above, 'time [s]', 'force on the needle [N]')
+    _legend_above(above)
+    for sign, words, color, mark in _SIDES:
+        side = fit.used & (np.sign(fit.speed) == sign)
+        speed, force = _thinned(1e3 * fit.speed[side], fit.force[side])
+        below.plot(speed, force, mark, color=color, markersize=2.5, alpha=0.4, label=words)
+        order = np.argsort(fit.speed[side])
+        line = _thinned(1e3 * fit.speed[side][order], fit.model[side][order])
+        below.plot(*line, color=_FIT, linewidth=1.2, label='fit' if sign < 0.0 else None)
+    below.axhline(0.0, color=_FIT, linewidth=0.6)
+    below.axvline(0.0, color=_FIT, linewidth=0.6)
+    _label(below, 'insertion speed [mm/s]', 'force on the needle [N]')
+    _legend_above(below, markerscale=2.0)
+    return figure
+
+
+def friction_residuals(estimate: FrictionEstimate) -> Figure:
+    """
+    Draw what the fit leaves, over time, against speed, and as a histogram.
+
+    Parameters
+    ----------
+    estimate : FrictionEstimate
+        What a recording gave.
+
+    Returns
+    -------
+    Figure
+        Three plots.
+
+    """
+    fit = estimate.fit
+    figure = _new_figure(9.0, 6.5)
+    over, against, often = figure.subplot_mosaic([['time', 'time'], ['speed', 'size']]).values()
+    residual = 1e3 * (fit.force - fit.model)
+    reach = float(np.abs(residual[fit.used]).max())
+    edges = np.linspace(-reach, reach, 41).tolist()
+    for sign, words, color, mark in _SIDES:
+        side = fit.used & (np.sign(fit.speed) == sign)
+        time, speed, left = _thinned(
+            fit.time[side] - fit.time[0], 1e3 * fit.speed[side], residual[side]
+        )
+        style: dict[str, Any] = {'color': color, 'markersize': 2.0, 'alpha': 0.5}
+        over.plot(time, left, mark, label=words, **style)
+        against.plot(speed, left, mark, **style)
+        often.hist(
+            residual[side], edges, color=color, histtype='step',
+            linewidth=1.4,
+        )  # fmt: skip
+    for axes in (over, against):
+        axes.axhline(0.0, color=_FIT, linewidth=0.8)
+    _label(over, 'time [s]', 'residual [mN]')
+    _label(against, 'insertion speed [mm/s]', 'residual [mN]')
+    _label(often, 'residual [mN]', 'samples')
+    _legend_above(over, markerscale=3.0)
+    return figure
+
+
+def stiffness_levels(summary: StiffnessSummary) -> Figure:
+    """
+    Draw each entry of the matrix against the force, beside Table 2.
+
+    Parameters
+    ----------
+    summary : StiffnessSummary
+        All recordings.
+
+    Returns
+    -------
+    Figure
+        Four plots.
+
+    """
+    figure = _new_figure(9.0, 6.5)
+    for axes, (name, (means, deviations)) in zip(
+        figure.subplots(2, 2, sharex=True).flat, TABLE_2.items(), strict=True
+    ):
+        axes.errorbar(
+            FORCE_LEVELS, means, deviations, fmt='D', color=_DATA, capsize=4.0, markersize=5.0,
+            label='Table 2, mean and STD', zorder=1,
+        )  # fmt: skip
+        # Beside one another, not on top.
+        for estimate in summary.estimates:
+            places = [(one.force - 0.012, one[name].value) for one in estimate.levels]
+            axes.plot(*np.transpose(places), '.', color=_IN, alpha=0.35, markersize=4.0)
+        rows = [(level.force + 0.012, level[name]) for level in summary.levels]
+        known = [(force, one.mean, *one.interval) for force, one in rows if isfinite(one.mean)]
+        if known:
+            force, mean, low, high = np.transpose(known)
+            axes.errorbar(
+                force, mean, (mean - low, high - mean), fmt='o', color=_IN, capsize=4.0,
+                label='identified, mean and 95 % interval', zorder=3,
+            )  # fmt: skip
+        _label(axes, '', f'{name} [N/m]')
+        axes.axhline(0.0, color=_FIT, linewidth=0.6)
+    for axes in figure.axes[2:]:
+        axes.set_xlabel('force [N]')
+    figure.legend(
+        *figure.axes[0].get_legend_handles_labels(), loc='outside upper left', ncols=2,
+        frameon=False,
+    )  # fmt: skip
+    return figure
+
+
+def stiffness_presses(estimate: StiffnessEstimate) -> Figure:
+    """
+    Draw the presses of one recording with the fitted matrices.
+
+    Parameters
+    ----------
+    estimate : StiffnessEstimate
+        What the recording gave.
+
+    Returns
+    -------
+    Figure
+        Force against displacement, and the displacements in the plane.
+
+    """
+    presses = estimate.presses
+    figure = _new_figure(9.0, 4.8)
+    left, right = figure.subplots(1, 2)
+    force = np.hypot(*presses.force.T)
+    along = np.einsum('ij,ij->i', presses.displacement, presses.force) / force
+    colors = colormaps['twilight_shifted'](np.linspace(0.1, 0.9, presses.direction.max() + 1))
+    for index, color in enumerate(colors):
+        of = presses.direction == index
+        way = presses.force[of].mean(axis=0)
+        order = np.argsort(force[of])
+        left.plot(
+            1e3 * np.append(0.0, along[of][order]), np.append(0.0, force[of][order]), 'o-',
+            color=color, markersize=4.0, linewidth=1.0,
+            label=f'{round(np.degrees(np.arctan2(way[1], way[0]))) % 360}°',
+        )  # fmt: skip
+        right.plot(*1e3 * presses.displacement[of].T, 'o', color=color, markersize=4.0)
+    turn = np.linspace(0.0, 2.0 * np.pi, 181)
+    circle = np.array([np.cos(turn), np.sin(turn)])
+    for level in estimate.levels:
+        if np.isfinite(level.matrix).all():
+            ellipse = 1e3 * np.linalg.solve(level.matrix, level.force * circle)
+            right.plot(*ellipse, color=_DATA, linewidth=0.8, zorder=1)
+    _principal_axes(right, estimate.levels[-1])
+    _label(left, 'displacement along the force [mm]', 'force [N]')
+    left.set(xlim=(0.0, None), ylim=(0.0, None))
+    left.legend(title='direction, from x toward z', ncols=2, frameon=False, loc='lower right')
+    _label(right, 'displacement x [mm]', 'displacement z [mm]')
+    right.set_aspect('equal', 'datalim')
+    return figure
+
+
+def _principal_axes(axes: Axes, level: LevelEstimate) -> None:
+    """Draw the principal axes of the largest force, each as long as that force moves it."""
+    if not level.angle.determined:
+        return
+    for one, name, turned, style in zip(
+        level.principal, ('stiffest', 'softest'), (0.0, np.pi / 2.0), ('-', '--'), strict=True
+    ):
+        way = level.angle.value + turned
+        reach = 1e3 * level.force / one.value * np.array([np.cos(way), np.sin(way)])
+        axes.plot(
+            *np.transpose([-reach, reach]), style, color=_FIT, linewidth=1.2,
+            label=f'{name}: {one.value:.0f} N/m',
+        )  # fmt: skip
+    _legend_above(axes)
+
+
+def spread_figure(
+    means: Sequence[Statistic], rows: Sequence[tuple[str, Mapping[str, ParameterEstimate]]]
+) -> Figure:
+    """
+    Draw each parameter of each recording with its interval, and the mean with its own.
+
+    Parameters
+    ----------
+    means : sequence of Statistic
+        Parameters to draw, a plot each.
+    rows : sequence of (str, Mapping[str, ParameterEstimate])
+        Recordings, and what each gave by the name of the parameter.
+
+    Returns
+    -------
+    Figure
+        The figure.
+
+    """
+    columns = min(len(means), 4)
+    lines = -(-len(means) // columns)
+    figure = _new_figure(9.0, lines * (1.2 + 0.24 * len(rows)))
+    panels = figure.subplots(lines, columns, sharey=True, squeeze=False)
+    for axes, mean in zip(panels.flat, means, strict=False):
+        for place, (_, found) in enumerate(rows):
+            one = found.get(mean.name)
+            if one is not None and one.determined:
+                axes.plot(one.interval, (place, place), color=_DATA, linewidth=1.6)
+                axes.plot(one.value, place, 'o', color=_IN, markersize=5.0)
+        if isfinite(mean.mean):
+            axes.axvspan(*mean.interval, color=_IN, alpha=0.12, linewidth=0.0)
+            axes.axvline(mean.mean, color=_IN, linewidth=1.2)
+        _label(axes, label_of(mean), '')
+        axes.tick_params(left=False)
+        axes.xaxis.get_major_formatter().set_useOffset(False)
+        axes.locator_params(axis='x', nbins=3)
+    for axes in panels.flat[len(means) :]:
+        axes.set_visible(False)
+    panels[0, 0].set_yticks(range(len(rows)), [name for name, _ in rows])
+    panels[0, 0].set_ylim(len(rows) - 0.5, -0.5)
+    return figure
+
+
+def _new_figure(width: float, height: float) -> Figure:
+    return Figure(figsize=(width, height), layout='constrained')
+
+
+def _label(axes: Axes, xlabel: str, ylabel: str) -> None:
+    """Label a plot, with symbols typeset, and give it a grid."""
+    axes.set(xlabel=_typeset(xlabel), ylabel=_typeset(ylabel))
+    axes.grid(visible=True, alpha=0.25)
+    axes.spines[['top', 'right']].set_visible(False)
+
+
+def _typeset(words: str) -> str:
+    words = words.replace('^2', '²').replace('tau', r'$\tau$')
+    return _SYMBOL.sub(lambda m: f'${_GREEK.get(m[1], m[1])}_{{{m[2]}}}$', words)
+
+
+def _legend_above(axes: Axes, **options: Any) -> None:
+    """Put the legend above the plot, where no data are."""
+    axes.legend(
+        loc='lower left', bbox_to_anchor=(0.0, 1.0), ncols=4, frameon=False,
+        borderaxespad=0.2, handletextpad=0.5, **options,
+    )  # fmt: skip
+
+
+def _thinned(*signals: FloatArray) -> list[FloatArray]:
+    """Leave out samples that cannot be seen."""
+    step = max(1, len(signals[0]) // _MOST_POINTS)
+    return [signal[::step] for signal in signals]

@@ -1,0 +1,349 @@
+"""The pages about identified friction and stiffness: result, data behind it, what to doubt."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from math import isfinite
+from pathlib import Path
+import re
+from typing import Any, Final
+
+from needle_identification import (
+    FrictionEstimate,
+    FrictionSummary,
+    LevelEstimate,
+    ParameterEstimate,
+    Statistic,
+    StiffnessEstimate,
+    StiffnessSummary,
+)
+from needle_identification.estimation.formatting import between, measured, rounded, spread
+from needle_identification.result import model_parameters
+from needle_insertion.paper.tables import FORCE_LEVELS, TABLE_1, TABLE_2
+from needle_insertion.report import identify_figures as figures
+from needle_insertion.report.content import Picture
+from needle_insertion.report.identify_text import (
+    friction_parameters,
+    friction_statistics,
+    label_of,
+    MEAN_HEADS,
+    mean_row,
+    parameter_cells,
+    with_deviation,
+)
+from needle_insertion.report.origin import Origin
+from needle_insertion.report.page import write_page
+import numpy as np
+
+#: Parameters that a plant takes while it runs.
+_LIVE: Final = ('model.coulomb_friction', 'model.viscous_friction')
+
+_ENTRY_HEADS: Final = tuple(f'{entry} [N/m]' for entry in TABLE_2)
+_QUALITY_HEADS: Final = ('residual [mN]', 'R²', 'condition')
+_NUMBERS: Final = re.compile(r'[-+]?\d[\d.e+-]*')
+
+
+def write_friction_page(folder: Path, summary: FrictionSummary, origin: Origin) -> Path:
+    """
+    Write ``friction.html`` and its pictures.
+
+    Parameters
+    ----------
+    folder : Path
+        Where to write.
+    summary : FrictionSummary
+        What was identified.
+    origin : Origin
+        What it was identified from, and how.
+
+    Returns
+    -------
+    Path
+        The page.
+
+    Raises
+    ------
+    ParameterError
+        If a file cannot be written.
+
+    """
+    estimates = summary.estimates
+    label = _short_names([estimate.name for estimate in estimates])
+    means = friction_statistics(summary)
+    main = [one for one in summary.statistics if one.name in TABLE_1]
+    shown = estimates[_typical(one[summary.statistics[0].name].value for one in estimates)]
+    values = model_parameters(summary.statistics)
+    path = folder / 'friction.html'
+    write_page(
+        path,
+        'friction.html',
+        title='Friction between needle and tissue',
+        introduction=f'Identified from {_counted(len(estimates), "recording")} of force and '
+        'motion of the needle base by regression on equation (15).',
+        pictures=_friction_pictures(label, means, shown, estimates),
+        cards=[_card(one) for one in main or summary.statistics[:2]],
+        origin=origin,
+        warnings=_warnings(estimates, label),
+        mean_rows=[(*mean_row(one), _published(one)) for one in means],
+        mean_heads=(*MEAN_HEADS, 'Table 1, mean ± STD'),
+        shown=shown,
+        name=label[shown.name],
+        term_rows=_term_rows(shown, estimates),
+        rows=[
+            (label[one.name], *parameter_cells(one, means), f'{one.samples}', *_quality(one))
+            for one in estimates
+        ],
+        heads=('recording', *map(label_of, means), 'samples used', *_QUALITY_HEADS),
+        values=values,
+        live=[
+            f'ros2 param set /plant {name} {values[name]:.6g}' for name in _LIVE if name in values
+        ],
+    )
+    return path
+
+
+def _published(one: Statistic) -> str:
+    if one.name not in TABLE_1:
+        return ''
+    mean, deviation = TABLE_1[one.name]
+    return f'{mean:g} ± {deviation:g} {one.unit}'
+
+
+def _term_rows(
+    shown: FrictionEstimate, estimates: Sequence[FrictionEstimate]
+) -> list[tuple[str, ...]]:
+    """Return the other sets of terms, each with the support that it has."""
+    supported = Counter(
+        one.terms for estimate in estimates for one in estimate.comparison if one.supported
+    )
+    return [
+        (
+            ', '.join(one.terms),
+            f'{supported[one.terms]} of {len(estimates)}',
+            f'{one.difference:+,.1f}' if isfinite(one.difference) else '',
+            one.words,
+        )
+        for one in shown.comparison
+    ]
+
+
+def _friction_pictures(
+    label: Mapping[str, str],
+    means: Sequence[Statistic],
+    shown: FrictionEstimate,
+    estimates: Sequence[FrictionEstimate],
+) -> list[Picture]:
+    name = label[shown.name]
+    rows = [(label[one.name], friction_parameters(one)) for one in estimates]
+    return [
+        Picture(
+            'friction_data',
+            f'{name}: force over time and against speed after the low-pass filter, and the fit '
+            f'of {", ".join(shown.terms)} to the samples in steady motion.',
+            figures.friction_data(shown),
+            f'Two plots of {name}. The force over time follows the strokes of the needle, with '
+            'the fitted force on top of it. Against speed the force jumps at zero by twice mu_s '
+            'and rises with slope mu_v.',
+        ),
+        Picture(
+            'friction_residuals',
+            f'{name}: measured minus fitted force, over time, against speed, and as a histogram, '
+            'separately for both directions.',
+            figures.friction_residuals(shown),
+            f'Three plots of the residual force of {name}, which has a root mean square of '
+            f'{1e3 * shown.residual:.2g} mN. A good fit leaves noise around zero without a trend.',
+        ),
+        Picture(
+            'friction_spread',
+            'Each recording with its 95 % interval. The line and the band are the mean and its '
+            'interval.',
+            figures.spread_figure(means, rows),
+            f'Dot plots of each parameter over {len(rows)} recordings with intervals.',
+        ),
+    ]
+
+
+def write_stiffness_page(folder: Path, summary: StiffnessSummary, origin: Origin) -> Path:
+    """
+    Write ``stiffness.html`` and its pictures.
+
+    Parameters
+    ----------
+    folder : Path
+        Where to write.
+    summary : StiffnessSummary
+        What was identified.
+    origin : Origin
+        What it was identified from, and how.
+
+    Returns
+    -------
+    Path
+        The page.
+
+    Raises
+    ------
+    ParameterError
+        If a file cannot be written.
+
+    """
+    estimates, levels, result = summary.estimates, summary.levels, summary.tissue_stiffness
+    label = _short_names([estimate.name for estimate in estimates])
+    force = next(level.force for level in levels if level[result.name] is result)
+    found = [_tissue_stiffness(one, force) for one in estimates]
+    shown = estimates[_typical(one.value for one in found)]
+    springs = [level.is_spring for estimate in estimates for level in estimate.levels]
+    rows = [(label[one.name], {result.name: k}) for one, k in zip(estimates, found, strict=True)]
+    path = folder / 'stiffness.html'
+    write_page(
+        path,
+        'stiffness.html',
+        title='Stiffness of the tissue',
+        introduction=f'Identified from {_counted(len(estimates), "recording")} of presses in the '
+        'plane of deflection, as in Table 2 of the paper.',
+        pictures=_stiffness_pictures(summary, force, rows, shown, label[shown.name]),
+        cards=[
+            _card(result),
+            (
+                'Is it a spring?',
+                f'{sum(springs)} of {len(springs)} matrices are',
+                'by the curl of the force, within its uncertainty',
+            ),
+        ],
+        origin=origin,
+        warnings=_warnings(estimates, label),
+        places=_counted(len(estimates), 'place'),
+        heads=('force', *_ENTRY_HEADS),
+        mean_rows=[
+            (f'{level.force:.2f} N', *(with_deviation(level[name]) for name in TABLE_2))
+            for level in levels
+        ],
+        published_rows=[
+            (f'{level:g} N', *(f'{means[k]:g} ({stds[k]:g})' for means, stds in TABLE_2.values()))
+            for k, level in enumerate(FORCE_LEVELS)
+        ],
+        result_heads=('force', *MEAN_HEADS[1:]),
+        result_rows=[
+            (f'{level.force:.2f} N', *mean_row(level[result.name])[1:]) for level in levels
+        ],
+        shown=shown,
+        name=label[shown.name],
+        spring_rows=[_spring_row(level) for level in shown.levels],
+        place_heads=(
+            *('recording', 'force [N]', *_ENTRY_HEADS, 'presses, directions', *_QUALITY_HEADS),
+        ),
+        place_rows=[
+            (
+                *(label[one.name], f'{level.force:.2f}', *map(_cell, level.parameters)),
+                *(f'{level.presses} in {level.directions}', *_quality(level)),
+            )
+            for one in estimates
+            for level in one.levels
+        ],
+        values=model_parameters([result]),
+    )
+    return path
+
+
+def _tissue_stiffness(estimate: StiffnessEstimate, force: float) -> ParameterEstimate:
+    """Return k_a of one recording at the level nearest to a force."""
+    return min(estimate.levels, key=lambda one: abs(one.force - force)).tissue_stiffness
+
+
+def _spring_row(level: LevelEstimate) -> tuple[str, ...]:
+    """Return force, curl, asymmetry, and the principal stiffnesses and their direction."""
+    return (
+        f'{level.force:.2f} N',
+        *map(_cell, (level.curl, level.spring, *level.principal)),
+        measured(np.degrees(level.angle.value), np.degrees(level.angle.error)),
+    )
+
+
+def _stiffness_pictures(
+    summary: StiffnessSummary,
+    force: float,
+    rows: Sequence[tuple[str, Mapping[str, ParameterEstimate]]],
+    shown: StiffnessEstimate,
+    name: str,
+) -> list[Picture]:
+    return [
+        Picture(
+            'stiffness_levels',
+            'Entries of the matrix against the force, with 95 % intervals of the mean. Small dots '
+            'are places. Gray is Table 2, mean and STD.',
+            figures.stiffness_levels(summary),
+            'Four plots of the entries of the stiffness matrix against force, beside Table 2.',
+        ),
+        Picture(
+            'stiffness_presses',
+            f'{name}. Left: force against displacement along each direction. Right: where the '
+            'end-effector came to rest, the ellipse on which each level of force ends according '
+            'to the fitted matrix, and the principal axes at the largest force.',
+            figures.stiffness_presses(shown),
+            f'Two plots of {name}. Force grows with displacement in each direction. The rest '
+            'positions of a level of force lie on an ellipse.',
+        ),
+        Picture(
+            'stiffness_spread',
+            f'k_a of each place at {force:.2f} N with its 95 % interval. The line and the band '
+            'are the mean and its interval.',
+            figures.spread_figure([summary.tissue_stiffness], rows),
+            f'Dot plot of k_a over {_counted(len(rows), "place")} with intervals.',
+        ),
+    ]
+
+
+# What both pages share.
+
+
+def _cell(one: ParameterEstimate) -> str:
+    return measured(one.value, one.error)
+
+
+def _quality(one: FrictionEstimate | LevelEstimate) -> tuple[str, ...]:
+    return f'{1e3 * one.residual:.2f}', f'{one.determination:.4f}', f'{one.condition:.1f}'
+
+
+def _card(one: Statistic) -> tuple[str, str, str]:
+    """Return a main result: what it is, its value, its interval and scatter."""
+    what = f'{one.name.replace("_", " ").capitalize()} {one.symbol}'
+    if not isfinite(one.mean):
+        return what, 'not determined', 'by these recordings'
+    note = f'95 % interval {between(one.interval)}'
+    if one.deviation is not None:
+        note += f'; STD {spread(one.deviation)} over {_counted(one.count, "recording")}'
+    return what, rounded(one.mean, one.error, one.unit), note
+
+
+def _counted(number: int, what: str) -> str:
+    return f'{number} {what}' if number == 1 else f'{number} {what}s'
+
+
+def _short_names(names: Sequence[str]) -> dict[str, str]:
+    """Return names of recordings without their folders, unless two would be the same."""
+    short = [Path(name).name or name for name in names]
+    return dict(zip(names, short if len(set(short)) == len(names) else names, strict=True))
+
+
+def _typical(values: Iterable[float]) -> int:
+    """Return the index of the value nearest to the median; 0 if all are nan."""
+    found = np.array(list(values))
+    if not np.isfinite(found).any():
+        return 0
+    return int(np.nanargmin(np.abs(found - np.nanmedian(found))))
+
+
+def _warnings(estimates: Sequence[Any], label: Mapping[str, str]) -> tuple[list[str], list[str]]:
+    """Return one of each group of warnings that differ in numbers only, and all if more."""
+    groups: dict[str, list[tuple[str, str]]] = {}
+    for estimate in estimates:
+        for words in estimate.warnings:
+            kind = _NUMBERS.sub('', words.partition(' (')[0])
+            groups.setdefault(kind, []).append((label[estimate.name], words))
+    short = [
+        f'{found[0][0]}: {found[0][1]}' + (f'; {len(found) - 1} more like it' if found[1:] else '')
+        for found in groups.values()
+    ]
+    full = [f'{name}: {words}' for found in groups.values() for name, words in found]
+    return short, full if len(full) > len(short) else []

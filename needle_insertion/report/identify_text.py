@@ -1,0 +1,216 @@
+"""Identified parameters as text: how they are written, and tables for the terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from math import isfinite
+from typing import Final
+
+from needle_identification import (
+    FrictionEstimate,
+    FrictionSummary,
+    ParameterEstimate,
+    Statistic,
+    statistic,
+    StiffnessSummary,
+)
+from needle_identification.estimation.formatting import between, measured, spread
+from needle_insertion.report.text import table
+
+#: Heads of the rows of `mean_row`.
+MEAN_HEADS: Final = ('parameter', 'mean ± SE', '95 % interval', 'STD over bags', 'bags')
+
+
+def label_of(one: ParameterEstimate | Statistic) -> str:
+    """
+    Return symbol and unit.
+
+    Parameters
+    ----------
+    one : ParameterEstimate or Statistic
+        A parameter.
+
+    Returns
+    -------
+    str
+        Such as ``mu_s [N]``.
+
+    """
+    return one.symbol if one.unit == '1' else f'{one.symbol} [{one.unit}]'
+
+
+def mean_row(one: Statistic) -> tuple[str, ...]:
+    """
+    Return a row of a table of means, with the heads `MEAN_HEADS`.
+
+    Parameters
+    ----------
+    one : Statistic
+        A parameter over the recordings.
+
+    Returns
+    -------
+    tuple of str
+        Table cells.
+
+    """
+    return (
+        f'{one.name.replace("_", " ").capitalize()} {label_of(one)}',
+        measured(one.mean, one.error),
+        between(one.interval) if isfinite(one.mean) else '',
+        '' if one.deviation is None else spread(one.deviation),
+        f'{one.count}',
+    )
+
+
+def with_deviation(one: Statistic) -> str:
+    """
+    Return mean ± standard error, and the standard deviation in brackets if there is one.
+
+    Parameters
+    ----------
+    one : Statistic
+        A parameter over the recordings.
+
+    Returns
+    -------
+    str
+        A table cell.
+
+    """
+    scatter = '' if one.deviation is None else f' ({spread(one.deviation)})'
+    return f'{measured(one.mean, one.error)}{scatter}'
+
+
+def friction_parameters(estimate: FrictionEstimate) -> dict[str, ParameterEstimate]:
+    """
+    Return all parameters of a recording, also the break-away force and the lag.
+
+    Parameters
+    ----------
+    estimate : FrictionEstimate
+        What the recording gave.
+
+    Returns
+    -------
+    dict
+        Parameters by name, times in milliseconds.
+
+    """
+    first, *others = estimate.parameters
+    found = [first, estimate.breakaway, *others, estimate.lag]
+    return {one.name: _in_milliseconds(one) for one in found if one is not None}
+
+
+def _in_milliseconds(one: ParameterEstimate) -> ParameterEstimate:
+    if one.unit != 's':
+        return one
+    low, high = (1e3 * end for end in one.interval)
+    return replace(
+        one, unit='ms', value=1e3 * one.value, error=1e3 * one.error, interval=(low, high)
+    )
+
+
+def friction_statistics(summary: FrictionSummary) -> list[Statistic]:
+    """
+    Return statistics of `friction_parameters`, each over the recordings that have it.
+
+    Parameters
+    ----------
+    summary : FrictionSummary
+        All recordings.
+
+    Returns
+    -------
+    list of Statistic
+        One for each parameter.
+
+    """
+    rows = [friction_parameters(estimate) for estimate in summary.estimates]
+    names = dict.fromkeys(name for row in rows for name in row)
+    return [statistic([row[name] for row in rows if name in row]) for name in names]
+
+
+def parameter_cells(estimate: FrictionEstimate, means: Sequence[Statistic]) -> list[str]:
+    """
+    Return the parameters of one recording.
+
+    Parameters
+    ----------
+    estimate : FrictionEstimate
+        What the recording gave.
+    means : sequence of Statistic
+        Parameters to show, in order.
+
+    Returns
+    -------
+    list of str
+        Table cells, '' where the recording does not have the parameter.
+
+    """
+    given = friction_parameters(estimate)
+    found = [given.get(one.name) for one in means]
+    return ['' if one is None else measured(one.value, one.error) for one in found]
+
+
+def friction_text(summary: FrictionSummary) -> str:
+    """
+    Return identified friction for the terminal.
+
+    Parameters
+    ----------
+    summary : FrictionSummary
+        All recordings.
+
+    Returns
+    -------
+    str
+        A table of the means, and one of the recordings.
+
+    """
+    means = friction_statistics(summary)
+    rows = [
+        (one.name, *parameter_cells(one, means), f'{one.samples}', f'{one.residual:.4f}')
+        for one in summary.estimates
+    ]
+    heads = ('bag', *(f'{label_of(one)} ± SE' for one in means), 'samples', 'residual [N]')
+    return f'{table([mean_row(one) for one in means], MEAN_HEADS)}\n\n{table(rows, heads)}'
+
+
+def stiffness_text(summary: StiffnessSummary) -> str:
+    """
+    Return identified stiffness for the terminal, as Table 2.
+
+    Parameters
+    ----------
+    summary : StiffnessSummary
+        All recordings.
+
+    Returns
+    -------
+    str
+        A row for each entry and a column for each force, the intervals, and k_a.
+
+    """
+    levels, result = summary.levels, summary.tissue_stiffness
+    entries = levels[0].statistics
+    forces = [f'{level.force:.2f} N' for level in levels]
+    rows = [
+        (label_of(one), *(with_deviation(level[one.name]) for level in levels)) for one in entries
+    ]
+    by_force = [
+        (
+            force,
+            *(between(one.interval) for one in level.statistics),
+            f'{level.statistics[0].count}',
+        )
+        for force, level in zip(forces, levels, strict=True)
+    ]
+    matrices = table(rows, ('mean ± SE (STD)', *forces))
+    intervals = table(by_force, ('95 % interval', *(one.symbol for one in entries), 'bags'))
+    return (
+        f'{matrices}\n\n{intervals}\n\n'
+        f'{result.symbol} = {measured(result.mean, result.error, result.unit)}, '
+        f'95 % interval {between(result.interval)}'
+    )
