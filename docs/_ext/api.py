@@ -9,6 +9,7 @@ from typing import Any
 from docutils.nodes import Element
 from sphinx.application import Sphinx
 from sphinx.environment import BuildEnvironment
+from sphinx.pycode import ModuleAnalyzer
 
 PACKAGES = (
     'needle_ros',
@@ -43,7 +44,12 @@ def _public_names(name: str) -> str:
     rows = ''
     for public in getattr(import_module(name), '__all__', ()):
         home = _home(name, public)
-        rows += f'   * - :py:obj:`~{home}.{public}`\n     - :py:mod:`{home}`\n'
+        has_page = hasattr(getattr(sys.modules[name], public), '__module__') or (
+            # A constant: with a comment `#:` it is on the page of its module.
+            ('', public) in ModuleAnalyzer.for_module(home).find_attr_docs()
+        )
+        where = f':py:obj:`~{home}.{public}`' if has_page else f'``{public}``'
+        rows += f'   * - {where}\n     - :py:mod:`{home}`\n'
     if not rows:
         return ''
     return _title('Public names', '-') + f'.. list-table::\n   :align: left\n\n{rows}\n'
