@@ -5,48 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import inf, nan, sqrt
-from typing import Protocol, TypeVar
+from typing import Generic, TypeVar
 
 from needle_identification.errors import IdentificationError
 from needle_identification.estimation.formatting import measured
 import numpy as np
 from scipy.special import stdtrit
-
-
-class _HasName(Protocol):
-    @property
-    def name(self) -> str: ...
-
-
-_Named = TypeVar('_Named', bound=_HasName)
-
-
-def find_by_name(items: Sequence[_Named], name: str) -> _Named:
-    """
-    Find the item of a name.
-
-    Parameters
-    ----------
-    items : sequence
-        Items that have a ``name``.
-    name : str
-        Name to look for.
-
-    Returns
-    -------
-    item
-        The first item of that name.
-
-    Raises
-    ------
-    KeyError
-        If there is none; the message lists the names.
-
-    """
-    for item in items:
-        if item.name == name:
-            return item
-    raise KeyError(f'{name!r}; valid: {", ".join(item.name for item in items)}')
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -61,7 +25,7 @@ class ParameterEstimate:
     symbol, unit : str
         Symbol in text, such as ``mu_s``, and unit; ``1`` for a pure number.
     value, error : float
-        Estimate and its standard error; nan and inf if the data do not determine the parameter.
+        Estimate and its standard error; nan and inf if not determined.
     interval : (float, float)
         95 % confidence interval.
     determined : bool
@@ -132,6 +96,24 @@ class Statistic:
 
     def __repr__(self) -> str:
         return f'<{self.name}: {measured(self.mean, self.error, self.unit)}, n = {self.count}>'
+
+
+_Named = TypeVar('_Named', ParameterEstimate, Statistic)
+
+
+class Named(Generic[_Named]):
+    """Results with names: ``results[name]`` is one, and KeyError lists the names."""
+
+    __slots__ = ()
+
+    def _named(self) -> Sequence[_Named]:
+        raise NotImplementedError
+
+    def __getitem__(self, name: str) -> _Named:
+        for item in self._named():
+            if item.name == name:
+                return item
+        raise KeyError(f'{name!r}; valid: {", ".join(item.name for item in self._named())}')
 
 
 def statistic(parameters: Sequence[ParameterEstimate]) -> Statistic:

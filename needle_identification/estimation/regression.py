@@ -1,12 +1,26 @@
 r"""
 Linear regression with standard errors that respect autocorrelation.
 
-The estimators are in `solvers`. The covariance of the parameters comes from the sums of their
-scores over a triangular window, so that it holds for noise that is correlated, uneven, or both
-[NeweyWest1987]_. Intervals are those of Student's t, with the degrees of freedom of Satterthwaite.
+With the regressors :math:`x_i` of sample i and its response :math:`y_i`, the estimators solve
+
+.. math:: \sum_i w_i \, x_i (y_i - x_i^T \beta) + n \Sigma \beta = 0
+
+``ordinary``: w = 1. ``weighted``: w = 1 / (noise variance measured in the group of the sample),
+the matrix W of section 3.2.2.1 of [Boroomand2014]_. ``huber``: w falls with the size of the
+residual [Huber1981]_. ``total``: Sigma is the covariance of the noise of the regressors, which
+ordinary least squares takes for signal; this is total least squares with exact and noisy columns
+and free noise of the response, which has a closed solution [VanHuffel1991]_.
+
+The covariance of the parameters comes from the sums of their scores over a triangular window, so
+that it holds for noise that is correlated, uneven, or both [NeweyWest1987]_. Intervals are those
+of Student's t, with the degrees of freedom of Satterthwaite.
 
 References
 ----------
+.. [Boroomand2014] A. Boroomand, M. Tavakoli, R. Sloboda, N. Usmani, "Dynamical modeling
+   and controllability analysis of a flexible needle in soft tissue", 2014, section 3.2.2.1.
+.. [Huber1981] P. J. Huber, "Robust Statistics", Wiley, 1981.
+.. [VanHuffel1991] S. Van Huffel, J. Vandewalle, "The Total Least Squares Problem", SIAM, 1991.
 .. [NeweyWest1987] W. K. Newey, K. D. West, "A simple, positive semi-definite,
    heteroskedasticity and autocorrelation consistent covariance matrix", Econometrica 55(3), 1987.
 
@@ -16,19 +30,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 from needle_dynamics.arrays import BoolArray, FloatArray, IntArray
 from needle_identification.errors import IdentificationError
 from needle_identification.estimation.estimators import check_estimator
-from needle_identification.estimation.solvers import (
-    group_weights,
-    huber,
-    ROUNDING,
-    Solution,
-    total,
-    weighted,
-)
 from needle_ros.errors import ParameterError, ShapeError
 import numpy as np
 from numpy.typing import ArrayLike
@@ -42,6 +48,21 @@ LARGEST_CONDITION: Final = 20.0
 #: Share of such a direction that a determined parameter may have; its error includes it.
 _LARGEST_SHARE: Final = 0.1
 
+#: Relative size of what counts as rounding.
+_ROUNDING: Final = 1e-9
+
+#: Weight of the noise of all groups in the variance of each group [correlation windows].
+_PRIOR: Final = 5.0
+
+#: Residual beyond which Huber's weight falls [standard deviations]. It makes the estimator 95 %
+#: efficient for normal noise.
+_HUBER_LIMIT: Final = 1.345
+
+#: Standard deviation of normal noise over its median absolute deviation.
+_DEVIATION_OVER_MEDIAN: Final = 1.4826
+
+_MAX_ITERATIONS: Final = 100
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
 class Regression:
@@ -53,8 +74,7 @@ class Regression:
     values, errors : ndarray, shape (k,)
         Parameters and their standard errors; nan and inf where not determined.
     covariance : ndarray, shape (k, k)
-        Covariance of the parameters; where one is not determined, nan off the diagonal and inf
-        on it.
+        Covariance of the parameters; nan, and inf on the diagonal, where not determined.
     determined : ndarray of bool, shape (k,)
         Whether the regressors distinguish the parameter from the others.
     condition : float
@@ -66,11 +86,9 @@ class Regression:
     samples : int
         Number of samples used.
     effective_samples : float
-        Number of independent samples with the same information: the samples used over the span
-        of the window.
+        Number of independent samples with the same information.
     degrees_of_freedom : ndarray, shape (k,)
-        Degrees of freedom of the errors; fewer than ``effective_samples - k`` where few samples
-        determine a parameter (Satterthwaite).
+        Degrees of freedom of the errors; few where few samples determine a parameter.
 
     """
 
@@ -135,14 +153,27 @@ class Regression:
         return found, float(fdtrc(len(at), freedom, found / len(at)))
 
 
+class _Solution(NamedTuple):
+    """
+    Parameters (k,), inverse of the normal matrix (k, k), and of each sample its influence (n, k).
+
+    The influence is the change of the normal equations with the response of the sample; its
+    scores (n, k) are its share in these equations, and sum to zero.
+    """
+
+    values: FloatArray
+    inverse: FloatArray
+    influence: FloatArray
+    scores: FloatArray
+
+
 def regress(
     regressors: ArrayLike,
     response: ArrayLike,
     *,
     estimator: str = 'ordinary',
-    window: FloatArray | None = None,
+    correlation: int = 1,
     groups: IntArray | None = None,
-    noisy: BoolArray | None = None,
     regressor_noise: FloatArray | None = None,
     used: BoolArray | None = None,
 ) -> Regression:
@@ -157,15 +188,12 @@ def regress(
         Response.
     estimator : str
         One of `ESTIMATORS`.
-    window : ndarray, shape (w,), optional
-        Window (triangular) that spans the correlation of the noise [samples]. Without it the
-        samples are independent.
+    correlation : int
+        Length over which the noise is correlated [samples]; 1 if the samples are independent.
     groups : ndarray of int, shape (n,), optional
         Group of each sample, in which ``weighted`` measures the noise.
-    noisy : ndarray of bool, shape (k,), optional
-        Columns that carry noise, for ``total``.
     regressor_noise : ndarray, shape (k,), optional
-        Standard deviation of that noise. Only noisy columns count.
+        Standard deviation of the noise of each column, for ``total``.
     used : ndarray of bool, shape (n,), optional
         Samples to use; default all. Samples that are not used keep the others at their true
         distance in time.
@@ -198,7 +226,7 @@ def regress(
     check_estimator(estimator)
     x, y, used = _checked(regressors, response, used)
     samples, k = int(np.count_nonzero(used)), x.shape[1]
-    span = 1.0 if window is None else window_span(window)
+    span = independent_span(correlation)
     effective = samples / span
     if effective <= k:
         raise IdentificationError(
@@ -212,39 +240,41 @@ def regress(
     basis, unknown = determinable(singular, directions)
     x = x @ basis
     if estimator == 'ordinary':
-        solution = weighted(x, y, used.astype(np.float64))
+        solution = _weighted(x, y, used.astype(np.float64))
     elif estimator == 'weighted':
-        solution = weighted(x, y, group_weights(x, y, used, groups, span))
+        solution = _weighted(x, y, _group_weights(x, y, used, groups, span))
     elif estimator == 'huber':
-        solution = huber(x, y, used)
+        solution = _huber(x, y, used)
     else:
-        noise = _noise_covariance(noisy, regressor_noise, norms)
-        solution = total(x, y, used, basis.T @ noise @ basis)
+        if regressor_noise is None or len(regressor_noise) != k:
+            raise ParameterError('total needs the noise of each column')
+        noise = np.diag(np.asarray(regressor_noise) / norms) ** 2
+        solution = _total(x, y, used, basis.T @ noise @ basis)
     return _with_errors(
-        solution, x, y, used, window, basis / norms[:, np.newaxis], unknown, singular
+        solution, x, y, used, correlation, basis / norms[:, np.newaxis], unknown, singular
     )
 
 
 def _with_errors(
-    solution: Solution,
+    solution: _Solution,
     x: FloatArray,
     y: FloatArray,
     used: BoolArray,
-    window: FloatArray | None,
+    correlation: int,
     back: FloatArray,
     unknown: BoolArray,
     singular: FloatArray,
 ) -> Regression:
     """Add covariance and degrees of freedom, and go back to the columns that were given."""
     samples, k = int(np.count_nonzero(used)), len(unknown)
-    effective = samples / (1.0 if window is None else window_span(window))
+    effective = samples / independent_span(correlation)
     residual = y - x @ solution.values
     # The fit itself takes as many degrees of freedom as it has parameters.
-    middle = score_covariance(solution.scores, window) * effective / (effective - k)
+    middle = score_covariance(solution.scores, correlation) * effective / (effective - k)
     # Effective number of samples behind each parameter, from the share of each sample in its
     # variance (Satterthwaite).
     shares = (solution.influence @ (back @ solution.inverse).T) ** 2
-    variance_of_shares = np.diag(score_covariance(shares, window))
+    variance_of_shares = np.diag(score_covariance(shares, correlation))
     behind = np.divide(
         shares.sum(axis=0) ** 2,
         variance_of_shares,
@@ -292,12 +322,72 @@ def _checked(
     return np.where(chosen[:, np.newaxis], x, 0.0), np.where(chosen, y, 0.0), chosen
 
 
-def _noise_covariance(
-    noisy: BoolArray | None, noise: FloatArray | None, norms: FloatArray
+def _weighted(x: FloatArray, y: FloatArray, weights: FloatArray) -> _Solution:
+    """Solve weighted least squares."""
+    root = np.sqrt(weights)[:, np.newaxis]
+    values: FloatArray = np.asarray(np.linalg.lstsq(root * x, root[:, 0] * y, rcond=None)[0])
+    influence = weights[:, np.newaxis] * x
+    inverse = np.asarray(np.linalg.inv(x.T @ influence))
+    return _Solution(values, inverse, influence, influence * (y - x @ values)[:, np.newaxis])
+
+
+def _group_weights(
+    x: FloatArray, y: FloatArray, used: BoolArray, groups: IntArray | None, span: float
 ) -> FloatArray:
-    if noisy is None or noise is None or not len(noisy) == len(noise) == len(norms):
-        raise ParameterError('total needs the noise of each column')
-    return np.diag(np.where(noisy, noise, 0.0) / norms) ** 2
+    """
+    Weigh each sample by the inverse of the noise variance measured in its group.
+
+    The variance of a group is taken about its own mean, so that a misfit of the model does not
+    count as noise. A few correlation windows of the noise of all groups are added to each group,
+    because a group of few samples may look less noisy than it is.
+    """
+    if groups is None or np.shape(groups) != y.shape:
+        raise ParameterError('weighted needs the group of each sample')
+    residual = y - x @ _weighted(x, y, used.astype(np.float64)).values
+    members = np.unique(np.asarray(groups)[used], return_inverse=True)[1]
+    count = np.bincount(members)
+    left = residual[used]
+    left = left - (np.bincount(members, left) / count)[members]
+    pooled = float(left @ left) / len(left)
+    weights = used.astype(np.float64)
+    if pooled > 0.0:
+        variance = (np.bincount(members, left**2) + _PRIOR * span * pooled) / (
+            count + _PRIOR * span
+        )
+        weights[used] = pooled / variance[members]
+    return weights
+
+
+def _huber(x: FloatArray, y: FloatArray, used: BoolArray) -> _Solution:
+    """Solve by iterated weights; the scale is the median absolute residual of each iteration."""
+    weights = used.astype(np.float64)
+    values = _weighted(x, y, weights).values
+    smallest = _ROUNDING * float(np.sqrt(np.mean(y[used] ** 2)))
+    limit = np.inf
+    for _ in range(_MAX_ITERATIONS):
+        size = np.abs(y - x @ values)
+        limit = _HUBER_LIMIT * max(_DEVIATION_OVER_MEDIAN * float(np.median(size[used])), smallest)
+        weights = np.where(size > limit, limit / np.maximum(size, limit), 1.0) * used
+        last, values = values, _weighted(x, y, weights).values
+        if np.linalg.norm(values - last) <= _ROUNDING * np.linalg.norm(values):
+            break
+    residual = y - x @ values
+    within = (used & (np.abs(residual) <= limit)).astype(np.float64)
+    # Only samples within the limit have influence.
+    influence = within[:, np.newaxis] * x
+    inverse = np.asarray(np.linalg.pinv(x.T @ influence))
+    scores = x * np.clip(residual, -limit, limit)[:, np.newaxis]
+    return _Solution(values, inverse, influence, scores)
+
+
+def _total(x: FloatArray, y: FloatArray, used: BoolArray, noise: FloatArray) -> _Solution:
+    """Solve without the part of the normal matrix that is noise of the regressors."""
+    normal = x.T @ x - np.count_nonzero(used) * noise
+    if np.linalg.eigvalsh(normal)[0] <= 0.0:
+        raise IdentificationError('the noise of the regressors exceeds their variation')
+    values = np.asarray(np.linalg.solve(normal, x.T @ y))
+    scores = x * (y - x @ values)[:, np.newaxis] + np.outer(used, noise @ values)
+    return _Solution(values, np.asarray(np.linalg.inv(normal)), x, np.asarray(scores))
 
 
 def determinable(singular: FloatArray, directions: FloatArray) -> tuple[FloatArray, BoolArray]:
@@ -319,28 +409,15 @@ def determinable(singular: FloatArray, directions: FloatArray) -> tuple[FloatArr
         Parameters that have a part in a direction that is null or nearly null.
 
     """
-    null = singular <= ROUNDING * singular[0]
+    null = singular <= _ROUNDING * singular[0]
     weak = singular * LARGEST_CONDITION < singular[0]
-    unknown = (np.abs(directions[null]) > np.sqrt(ROUNDING)).any(axis=0)
+    unknown = (np.abs(directions[null]) > np.sqrt(_ROUNDING)).any(axis=0)
     unknown |= (np.abs(directions[weak]) > _LARGEST_SHARE).any(axis=0)
     return directions[~null].T, np.asarray(unknown)
 
 
-def triangular_window(length: int) -> FloatArray:
-    """
-    Return a symmetric triangular window for `regress`.
-
-    Parameters
-    ----------
-    length : int
-        Number of samples, at least one.
-
-    Returns
-    -------
-    ndarray, shape (length,)
-        Weights that rise linearly to at most one in the middle.
-
-    """
+def _window(length: int) -> FloatArray:
+    """Return a triangular window that rises to at most one in the middle, shape (length,)."""
     rising = np.arange(1, (length + 1) // 2 + 1)
     if length % 2:
         half = 2.0 * rising / (length + 1.0)
@@ -349,25 +426,26 @@ def triangular_window(length: int) -> FloatArray:
     return np.concatenate([half, half[::-1]])
 
 
-def window_span(window: FloatArray) -> float:
+def independent_span(correlation: int) -> float:
     """
-    Return the number of samples that count as one independent sample.
+    Return how many correlated samples count as one independent sample.
 
     Parameters
     ----------
-    window : ndarray, shape (w,)
-        Window that spans the correlation of the noise.
+    correlation : int
+        Length over which the noise is correlated [samples].
 
     Returns
     -------
     float
-        Span of the window [samples].
+        Span of the triangular window of that length [samples].
 
     """
+    window = _window(correlation)
     return float(window.sum()) ** 2 / float(window @ window)
 
 
-def score_covariance(scores: FloatArray, window: FloatArray | None) -> FloatArray:
+def score_covariance(scores: FloatArray, correlation: int) -> FloatArray:
     """
     Return the covariance of the sum of correlated scores.
 
@@ -380,8 +458,8 @@ def score_covariance(scores: FloatArray, window: FloatArray | None) -> FloatArra
     ----------
     scores : ndarray, shape (n, k)
         Scores.
-    window : ndarray, shape (w,), or None
-        Window; None if the scores are independent.
+    correlation : int
+        Length over which the noise is correlated [samples].
 
     Returns
     -------
@@ -389,8 +467,7 @@ def score_covariance(scores: FloatArray, window: FloatArray | None) -> FloatArra
         Covariance.
 
     """
-    if window is None:
-        return np.asarray(scores.T @ scores)
+    window = _window(correlation)
     padded = np.pad(scores, ((len(window) // 2,) * 2, (0, 0)))
     sums = convolve1d(padded, window, axis=0, mode='constant')
     return np.asarray(sums.T @ sums / (window @ window))

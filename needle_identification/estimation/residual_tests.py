@@ -51,12 +51,10 @@ class ResidualTest:
 
     Attributes
     ----------
-    name : str
-        ``normality``, ``trend``, ``speed``, ``spread`` or ``memory``.
+    name, words : str
+        ``normality``, ``trend``, ``speed``, ``spread`` or ``memory``, and the result in words.
     statistic, p_value : float
         Statistic and p-value of the test; a small p-value is evidence against the model.
-    words : str
-        The result in words.
 
     """
 

@@ -8,7 +8,7 @@ the last 0.3 s of the rest is read at the time at which the motion begins.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import hypot, sqrt
+from math import ceil, hypot, sqrt
 from typing import Final
 
 from needle_dynamics.arrays import FloatArray
@@ -16,8 +16,7 @@ from needle_identification.errors import IdentificationError
 from needle_identification.estimation.estimate import ParameterEstimate
 from needle_identification.estimation.regression import regress
 from needle_identification.friction.design import Design
-from needle_identification.friction.filtering import CORRELATION_LENGTH, FilteredSignals
-from needle_identification.friction.settings import FrictionSettings
+from needle_identification.friction.filtering import CORRELATION_LENGTH
 import numpy as np
 from scipy.special import stdtrit
 
@@ -30,29 +29,22 @@ _SMALLEST_RISE: Final = 0.05
 #: Smallest rate of the rise [standard errors].
 _CLEAR_RISE: Final = 5.0
 
-#: Length of the correlation window here, of that elsewhere: the rise of the force is short too.
+#: Length of the correlation here, as a part of that elsewhere: the rise of the force is short.
 _WINDOW_PART: Final = 0.4
 
 _UNKNOWN: Final = ParameterEstimate(name='breakaway_force', symbol='f_b', unit='N')
 
 
 def breakaway_force(
-    signals: FilteredSignals,
-    design: Design,
-    settings: FrictionSettings,
-    parameters: Sequence[ParameterEstimate],
+    design: Design, parameters: Sequence[ParameterEstimate]
 ) -> ParameterEstimate | None:
     """
     Return the mean force at which the needle left a rest with a rising force.
 
     Parameters
     ----------
-    signals : FilteredSignals
-        Filtered force and motion.
     design : Design
-        Regimes of the motion.
-    settings : FrictionSettings
-        The filter.
+        Filtered force, and regimes of the motion.
     parameters : sequence of ParameterEstimate
         Fitted parameters: mu_s, and the offset to subtract if there is one.
 
@@ -62,7 +54,6 @@ def breakaway_force(
         The force [N]; None if there is no such rest.
 
     """
-    window = signals.window(_WINDOW_PART * CORRELATION_LENGTH / settings.cutoff)
     starts = np.flatnonzero((design.regime[1:] != 0.0) & (design.regime[:-1] == 0.0)) + 1
     changes = np.flatnonzero(np.diff(design.stroke)) + 1
     found, signs = [], []
@@ -71,8 +62,8 @@ def breakaway_force(
     for start in starts:
         before, after = changes[changes < start], changes[changes > start]
         rest = int(before[-1]) if len(before) else 0
-        end = int(after[0]) if len(after) else len(signals.time)
-        push = _push(signals, design, (rest, int(start), end), window, least)
+        end = int(after[0]) if len(after) else len(design.speed)
+        push = _push(design, (rest, int(start), end), least)
         if push is not None:
             found.append(push)
             signs.append(design.regime[start])
@@ -91,11 +82,7 @@ def breakaway_force(
 
 
 def _push(
-    signals: FilteredSignals,
-    design: Design,
-    span: tuple[int, int, int],
-    window: FloatArray,
-    least: float,
+    design: Design, span: tuple[int, int, int], least: float
 ) -> tuple[float, float, float] | None:
     """
     Return the size of the force when the motion began, its error and half its interval [N].
@@ -103,27 +90,30 @@ def _push(
     ``span`` holds the samples at which the rest begins, the motion begins, and the motion ends;
     ``least`` is the smallest rise of the force [N].
     """
+    signals = design.signals
+    cutoff = signals.settings.cutoff
+    correlation = ceil(_WINDOW_PART * CORRELATION_LENGTH / cutoff / signals.period)
     rest, start, end = span
     longest = round(_RISING / signals.period)
     sign = float(design.regime[start])
     early = max(rest + signals.half_filter, start - longest)
     still = start - signals.margin
-    if min(still - early, 2 * (end - start)) < len(window):
+    if min(still - early, 2 * (end - start)) < correlation:
         return None
     if sign * (signals.force[still] - signals.force[early]) <= 0.5 * least:
         return None
     around = (max(rest, start - longest), start, min(end, start + longest))
-    onset, onset_error = _onset(signals, design, around)
+    onset, onset_error = _onset(design, around)
     last = round((onset - signals.time[0]) / signals.period) - signals.half_filter
     first = max(rest + signals.half_filter, last - longest)
-    if last - first < len(window):
+    if last - first < correlation:
         return None
     elapsed = signals.time[first:last] - onset
     try:
         line = regress(
             np.column_stack([np.ones_like(elapsed), elapsed]),
             signals.force[first:last],
-            window=window,
+            correlation=correlation,
         )
     except IdentificationError:
         return None
@@ -135,10 +125,9 @@ def _push(
     return float(value), error, error * float(stdtrit(line.effective_samples - 2.0, 0.975))
 
 
-def _onset(
-    signals: FilteredSignals, design: Design, span: tuple[int, int, int]
-) -> tuple[float, float]:
+def _onset(design: Design, span: tuple[int, int, int]) -> tuple[float, float]:
     """Return the time at which a step and a ramp of the speed fit best, and its error [s]."""
+    signals = design.signals
     first, start, end = span
     time, speed = signals.time[first:end], design.speed[first:end]
     candidates = signals.time[first : start + 1]

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from contextlib import suppress
+from dataclasses import dataclass
 from math import log, nan
 from typing import Final
 
-from needle_dynamics.arrays import FloatArray
 from needle_identification.errors import IdentificationError
 from needle_identification.estimation.regression import Regression, score_covariance
-from needle_identification.friction.design import Design, solve
-from needle_identification.friction.filtering import FilteredSignals
-from needle_identification.friction.settings import FrictionSettings, TERMS
+from needle_identification.friction.design import Design
+from needle_identification.friction.settings import TERMS
 from needle_identification.friction.terms import columns_of
 import numpy as np
 
@@ -52,28 +51,16 @@ class Comparison:
     words: str
 
 
-def compare_terms(
-    signals: FilteredSignals,
-    design: Design,
-    settings: FrictionSettings,
-    fit: Regression,
-    window: FloatArray,
-) -> tuple[Comparison, ...]:
+def compare_terms(design: Design, fit: Regression) -> tuple[Comparison, ...]:
     """
     Try each term that was not chosen, and leave out each chosen one.
 
     Parameters
     ----------
-    signals : FilteredSignals
-        Filtered force and motion.
     design : Design
-        Samples to use.
-    settings : FrictionSettings
-        The chosen terms.
+        Samples to use, and the chosen terms.
     fit : Regression
-        Their fit.
-    window : ndarray, shape (w,)
-        Window that spans the correlation of the noise.
+        The fit of the chosen terms.
 
     Returns
     -------
@@ -81,9 +68,9 @@ def compare_terms(
         One per set of terms that could be fitted.
 
     """
-    chosen = settings.terms
-    samples = _independent_samples(fit, window)
-    tried = _tried(signals, design, settings, window)
+    chosen = design.signals.settings.terms
+    samples = _independent_samples(design, fit)
+    tried = _tried(design)
     p_values = _holm(
         [
             other.wald(which)[1] if other.determined[which].all() else 1.0
@@ -99,16 +86,14 @@ def compare_terms(
         if rest and not ('direction' in chosen and term in ('coulomb', 'viscous')):
             names = [column.name for column in columns_of(chosen)]
             which = [names.index(column.name) for column in columns_of([term])]
-            simpler = replace(settings, terms=rest, estimator='ordinary')
-            less = solve(signals, design, simpler, rest, window)
+            less = design.solve(rest, 'ordinary')
             found.append(_removed(rest, term, fit, which, _bic_difference(less, fit, samples)))
     return tuple(found)
 
 
-def _tried(
-    signals: FilteredSignals, design: Design, settings: FrictionSettings, window: FloatArray
-) -> list[tuple[str, Regression, list[int]]]:
+def _tried(design: Design) -> list[tuple[str, Regression, list[int]]]:
     """Fit each term that was not chosen; return term, fit and the positions of its columns."""
+    settings = design.signals.settings
     chosen = settings.terms
     found = []
     for term in TERMS:
@@ -120,11 +105,9 @@ def _tried(
             continue
         start = len(columns_of(chosen))
         which = list(range(start, start + len(columns_of([term]))))
-        try:
-            found.append((term, solve(signals, design, settings, (*chosen, term), window), which))
-        except IdentificationError:
-            # Not enough samples for one more parameter.
-            continue
+        # Too few samples for one more parameter are no fault of the chosen terms.
+        with suppress(IdentificationError):
+            found.append((term, design.solve((*chosen, term), settings.estimator), which))
     return found
 
 
@@ -138,10 +121,11 @@ def _holm(p_values: Sequence[float]) -> list[float]:
     return corrected.tolist()
 
 
-def _independent_samples(fit: Regression, window: FloatArray) -> float:
+def _independent_samples(design: Design, fit: Regression) -> float:
     """Return the number of independent samples with the same error of the mean residual."""
     left = fit.residual[:, np.newaxis]
-    number = fit.samples * float((left**2).sum() / score_covariance(left, window)[0, 0])
+    covariance = score_covariance(left, design.signals.correlation)[0, 0]
+    number = fit.samples * float((left**2).sum() / covariance)
     return min(max(number, len(fit.values) + 1.0), float(fit.samples))
 
 

@@ -14,18 +14,14 @@ from typing import Final
 
 from needle_dynamics.arrays import BoolArray, FloatArray, IntArray
 from needle_identification.errors import IdentificationError
-from needle_identification.estimation.regression import regress, Regression, window_span
+from needle_identification.estimation.regression import independent_span, regress, Regression
 from needle_identification.friction.filtering import FilteredSignals, HALF_LENGTH
-from needle_identification.friction.settings import FrictionSettings
 from needle_identification.friction.terms import columns_of, regressors
 import numpy as np
 from scipy.ndimage import maximum_filter1d
 
-#: Correlation windows of motion that a meaningful standard error needs.
-FEWEST_WINDOWS: Final = 10.0
-
-#: The needle moves if its speed is at least this many standard deviations of the noise.
-_CLEARLY: Final = 5.0
+#: Independent samples of motion that a meaningful standard error needs.
+FEWEST_SAMPLES: Final = 10.0
 
 #: Time after a change at which the filters of the sensor have settled too [lags of the force].
 _SETTLING: Final = 3.0
@@ -41,6 +37,8 @@ class Design:
 
     Attributes
     ----------
+    signals : FilteredSignals
+        Filtered force and motion.
     speed, acceleration : ndarray, shape (n,)
         Speed [m/s] and acceleration [m/s^2], delayed by the lag of the force.
     regime : ndarray, shape (n,)
@@ -54,6 +52,7 @@ class Design:
 
     """
 
+    signals: FilteredSignals
     speed: FloatArray
     acceleration: FloatArray
     regime: FloatArray
@@ -66,30 +65,124 @@ class Design:
         """Whether the regression has a column for the lag."""
         return self.lag_column.size > 0
 
+    @property
+    def is_enough(self) -> bool:
+        """Whether there are enough samples for standard errors."""
+        needed = FEWEST_SAMPLES * independent_span(self.signals.correlation)
+        return bool(np.count_nonzero(self.used) >= needed)
 
-def moving_threshold(signals: FilteredSignals, settings: FrictionSettings) -> float:
-    """
-    Return the speed above which the needle counts as moving.
+    def regressors(self, terms: Sequence[str]) -> FloatArray:
+        """
+        Return the regressors of terms and, if it is estimated, of the lag.
 
-    Parameters
-    ----------
-    signals : FilteredSignals
-        The noise of the speed.
-    settings : FrictionSettings
-        The smallest threshold.
+        Parameters
+        ----------
+        terms : sequence of str
+            Terms, of `TERMS`.
 
-    Returns
-    -------
-    float
-        Speed [m/s].
+        Returns
+        -------
+        ndarray, shape (n, k)
+            One column per coefficient.
 
-    """
-    return max(settings.moving_speed, _CLEARLY * signals.speed_noise)
+        """
+        columns = regressors(self.speed, self.acceleration, terms, self.signals.settings)
+        return np.column_stack([columns, self.lag_column])
+
+    def with_lag_column(self) -> Design:
+        """
+        Add the change of the fitted force with a further lag.
+
+        Returns
+        -------
+        Design
+            With a column for the lag.
+
+        """
+        settings, step = self.signals.settings, 0.5 * self.signals.period
+        early, now, late = (
+            regressors(
+                self.speed - shift * self.acceleration,
+                self.acceleration,
+                settings.terms,
+                settings,
+            )
+            for shift in (-step, 0.0, step)
+        )
+        used = self.used
+        solution = np.linalg.lstsq(now[used], self.signals.force[used], rcond=None)[0]
+        column = np.where(used, (late - early) @ solution / (2.0 * step), 0.0)
+        return replace(self, lag_column=column[:, np.newaxis])
+
+    def solve(self, terms: Sequence[str], estimator: str) -> Regression:
+        """
+        Fit terms to the force.
+
+        Parameters
+        ----------
+        terms : sequence of str
+            Terms, of `TERMS`.
+        estimator : str
+            One of `ESTIMATORS`.
+
+        Returns
+        -------
+        Regression
+            Coefficients of the terms, then what is left of the lag [s] if it is estimated.
+
+        Raises
+        ------
+        IdentificationError
+            If there are too few samples, or the noise of the speed exceeds its variation.
+
+        """
+        signals = self.signals
+        noise_of = {
+            'viscous_friction': signals.speed_noise,
+            'moving_mass': signals.acceleration_noise,
+        }
+        noise = [noise_of.get(column.name, 0.0) for column in columns_of(terms)]
+        if self.estimates_lag:
+            slope = np.linalg.norm(self.lag_column[self.used])
+            slope /= np.linalg.norm(self.acceleration[self.used])
+            noise.append(float(slope) * signals.acceleration_noise)
+        return regress(
+            self.regressors(terms),
+            signals.force,
+            estimator=estimator,
+            correlation=signals.correlation,
+            groups=self.stroke,
+            regressor_noise=np.array(noise),
+            used=self.used,
+        )
+
+    def check(self) -> None:
+        """
+        Reject a recording with too little motion or without force.
+
+        Raises
+        ------
+        IdentificationError
+            If the motion is too short, or the force is constant.
+
+        """
+        signals = self.signals
+        if not self.is_enough:
+            needed = FEWEST_SAMPLES * independent_span(signals.correlation) * signals.period
+            raise IdentificationError(
+                f'steady motion above {signals.settings.moving_speed:g} m/s must last '
+                f'{needed:.3g} s in all, lasts '
+                f'{np.count_nonzero(self.used) * signals.period:.3g} s: move longer, or choose '
+                'another axis or topic'
+            )
+        force = signals.force[self.used]
+        if np.ptp(force) == 0.0:
+            raise IdentificationError(
+                f'the force must vary, got {force[0]:g} N throughout: choose another axis or topic'
+            )
 
 
-def select_samples(
-    signals: FilteredSignals, settings: FrictionSettings, lag: float, settling_lag: float
-) -> Design:
+def select_samples(signals: FilteredSignals, lag: float, settling_lag: float) -> Design:
     """
     Select samples in steady regimes, farther from changes than the filters reach.
 
@@ -97,8 +190,6 @@ def select_samples(
     ----------
     signals : FilteredSignals
         Filtered force and motion.
-    settings : FrictionSettings
-        Which motion counts.
     lag : float
         Lag of the force [s].
     settling_lag : float
@@ -110,25 +201,26 @@ def select_samples(
         Without a column for the lag.
 
     """
-    speed, acceleration = signals.delayed_motion(lag)
-    moving = np.abs(speed) > moving_threshold(signals, settings)
-    regime = np.where(moving, np.sign(speed), 0.0)
+    settings, time = signals.settings, signals.time
+    then = np.clip(time - lag, time[0], time[-1])
+    speed, acceleration = np.asarray(signals.motion(then)), np.asarray(signals.motion(then, 1))
+    regime = np.where(np.abs(speed) > signals.moving_speed, np.sign(speed), 0.0)
     change = np.ones(len(speed), dtype=np.bool_)
     change[1:-1] = signals.lost[1:-1] | (regime[1:-1] != regime[:-2])
     # The sensor settles while the filter does, whose outer third weighs little.
-    settling = (
-        min(_SETTLING * settling_lag, _LONGEST_SETTLING) - HALF_LENGTH / settings.cutoff / 1.5
-    )
+    settling = min(_SETTLING * settling_lag, _LONGEST_SETTLING)
+    settling -= HALF_LENGTH / settings.cutoff / 1.5
     more = max(0, ceil(settling / signals.period))
     margin = signals.margin + more
-    used = (regime != 0.0) & (signals.time - lag >= signals.time[0])
-    used &= signals.time - lag <= signals.time[-1]
+    used = (regime != 0.0) & (time - lag >= time[0])
+    used &= time - lag <= time[-1]
     used &= maximum_filter1d(change.astype(np.uint8), 2 * margin + 1) == 0
     if 'inertia' not in settings.terms:
         large = np.abs(acceleration) > settings.largest_acceleration
         size = 2 * (signals.half_filter + more) + 1
         used &= maximum_filter1d(large.astype(np.uint8), size) == 0
     return Design(
+        signals=signals,
         speed=speed,
         acceleration=acceleration,
         regime=regime,
@@ -136,154 +228,3 @@ def select_samples(
         stroke=np.cumsum(change),
         lag_column=np.empty((len(speed), 0)),
     )
-
-
-def with_lag_column(
-    signals: FilteredSignals, design: Design, settings: FrictionSettings
-) -> Design:
-    """
-    Add the change of the fitted force with a further lag.
-
-    Parameters
-    ----------
-    signals : FilteredSignals
-        Filtered force and motion.
-    design : Design
-        Samples to use.
-    settings : FrictionSettings
-        The terms.
-
-    Returns
-    -------
-    Design
-        With a column for the lag.
-
-    """
-    step = 0.5 * signals.period
-    early, now, late = (
-        regressors(
-            design.speed - shift * design.acceleration,
-            design.acceleration,
-            settings.terms,
-            settings,
-        )
-        for shift in (-step, 0.0, step)
-    )
-    used = design.used
-    solution = np.linalg.lstsq(now[used], signals.force[used], rcond=None)[0]
-    column = np.where(used, (late - early) @ solution / (2.0 * step), 0.0)
-    return replace(design, lag_column=column[:, np.newaxis])
-
-
-def solve(
-    signals: FilteredSignals,
-    design: Design,
-    settings: FrictionSettings,
-    terms: Sequence[str],
-    window: FloatArray,
-) -> Regression:
-    """
-    Fit terms to the force.
-
-    Parameters
-    ----------
-    signals : FilteredSignals
-        Filtered force and motion.
-    design : Design
-        Samples to use.
-    settings : FrictionSettings
-        Estimator and constants of the terms.
-    terms : sequence of str
-        Terms to fit.
-    window : ndarray, shape (w,)
-        Window that spans the correlation of the noise.
-
-    Returns
-    -------
-    Regression
-        Coefficients of the columns of the terms, then that of the lag if the design has it [s].
-
-    Raises
-    ------
-    IdentificationError
-        If there are too few samples, or the noise of the speed exceeds its variation.
-
-    """
-    noise = [
-        {'viscous_friction': signals.speed_noise, 'moving_mass': signals.acceleration_noise}.get(
-            column.name, 0.0
-        )
-        for column in columns_of(terms)
-    ]
-    if design.estimates_lag:
-        slope = np.linalg.norm(design.lag_column[design.used])
-        slope /= np.linalg.norm(design.acceleration[design.used])
-        noise.append(float(slope) * signals.acceleration_noise)
-    columns = regressors(design.speed, design.acceleration, terms, settings)
-    return regress(
-        np.column_stack([columns, design.lag_column]),
-        signals.force,
-        estimator=settings.estimator,
-        window=window,
-        groups=design.stroke,
-        noisy=np.array(noise) > 0.0,
-        regressor_noise=np.array(noise),
-        used=design.used,
-    )
-
-
-def is_enough(design: Design, window: FloatArray) -> bool:
-    """
-    Tell whether a design has enough samples for standard errors.
-
-    Parameters
-    ----------
-    design : Design
-        Samples to use.
-    window : ndarray, shape (w,)
-        Window that spans the correlation of the noise.
-
-    Returns
-    -------
-    bool
-        Whether the samples span `FEWEST_WINDOWS` windows.
-
-    """
-    return bool(np.count_nonzero(design.used) >= FEWEST_WINDOWS * window_span(window))
-
-
-def check_motion(
-    signals: FilteredSignals, design: Design, settings: FrictionSettings, window: FloatArray
-) -> None:
-    """
-    Reject a recording with too little motion or without force.
-
-    Parameters
-    ----------
-    signals : FilteredSignals
-        Filtered force and motion.
-    design : Design
-        Samples to use.
-    settings : FrictionSettings
-        Which motion counts.
-    window : ndarray, shape (w,)
-        Window that spans the correlation of the noise.
-
-    Raises
-    ------
-    IdentificationError
-        If the motion is too short, or the force is constant.
-
-    """
-    if not is_enough(design, window):
-        samples = int(np.count_nonzero(design.used))
-        raise IdentificationError(
-            f'steady motion above {settings.moving_speed:g} m/s must last '
-            f'{FEWEST_WINDOWS * window_span(window) * signals.period:.3g} s in all, lasts '
-            f'{samples * signals.period:.3g} s: move longer, or choose another axis or topic'
-        )
-    force = signals.force[design.used]
-    if np.ptp(force) == 0.0:
-        raise IdentificationError(
-            f'the force must vary, got {force[0]:g} N throughout: choose another axis or topic'
-        )

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from needle_dynamics.arrays import BoolArray, FloatArray
-from needle_identification.estimation.estimate import find_by_name, ParameterEstimate
+from needle_identification.estimation.estimate import Named, ParameterEstimate
 from needle_identification.estimation.formatting import measured
 from needle_identification.estimation.residual_tests import ResidualTest
 from needle_identification.friction.comparison import Comparison
@@ -40,7 +40,7 @@ class Fit:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
-class FrictionEstimate:
+class FrictionEstimate(Named[ParameterEstimate]):
     """
     Friction of one recording.
 
@@ -60,12 +60,9 @@ class FrictionEstimate:
         Force at which the needle began to move after rests with a rising force [N], without the
         offset if that is a term; None if there is no such rest.
     lag : ParameterEstimate or None
-        Lag of the force behind the motion [s]; it was corrected. It is not determined where the
-        speed only jumps; such strokes show a large lag roughly, which is corrected too, with a
-        warning. A mass m beside viscous friction reduces it by m / mu_v. None if inertia is a
-        term, which looks like a lag, or if only positions were recorded: their resolution makes
-        an error that is not part of the standard error. Below 200 samples/s the motion between
-        samples increases the standard error: 0.8 ms at 100 samples/s.
+        Lag of the force behind the motion [s]; it was corrected. Not determined where the speed
+        only jumps. A mass m beside viscous friction reduces it by m / mu_v. None if inertia is a
+        term, which looks like a lag, or if only positions were recorded.
     samples : int
         Number of samples used.
     residual : float
@@ -100,27 +97,8 @@ class FrictionEstimate:
     warnings: tuple[str, ...]
     fit: Fit
 
-    def __getitem__(self, name: str) -> ParameterEstimate:
-        """
-        Return a parameter.
-
-        Parameters
-        ----------
-        name : str
-            Its name, such as ``coulomb_friction``.
-
-        Returns
-        -------
-        ParameterEstimate
-            The parameter.
-
-        Raises
-        ------
-        KeyError
-            If there is none of that name; the message lists the names.
-
-        """
-        return find_by_name(self.parameters, name)
+    def _named(self) -> tuple[ParameterEstimate, ...]:
+        return self.parameters
 
     def __repr__(self) -> str:
         found = ', '.join(

@@ -14,7 +14,6 @@ from typing import Final
 
 from needle_dynamics.arrays import BoolArray, FloatArray
 from needle_identification.errors import IdentificationError
-from needle_identification.estimation.regression import triangular_window
 from needle_identification.friction.settings import FrictionSettings
 from needle_identification.recordings.recording import Recording
 import numpy as np
@@ -26,11 +25,14 @@ from scipy.special import lambertw
 #: Half the length of a Hann window that halves the power at its cutoff [periods of the cutoff].
 HALF_LENGTH: Final = 0.36
 
-#: Length of the window that spans the correlation of filtered noise [periods of the cutoff].
+#: Length over which filtered noise is correlated [periods of the cutoff].
 CORRELATION_LENGTH: Final = 3.0
 
 #: A longer step between samples is a gap [sampling periods].
 GAP: Final = 3.5
+
+#: The needle moves if its speed is at least this many standard deviations of the noise.
+_CLEARLY: Final = 5.0
 
 #: Samples per period of the cutoff that are kept after the filter.
 _KEPT: Final = 8.0
@@ -46,70 +48,44 @@ class FilteredSignals:
 
     Attributes
     ----------
-    time : ndarray, shape (n,)
-        Even time [s].
+    settings : FrictionSettings
+        Settings of the identification.
+    time, force : ndarray, shape (n,)
+        Even time [s], and filtered force [N].
     period : float
-        Its step [s].
+        Step of the time [s].
     motion : BSpline
         Filtered speed [m/s] as a function of time [s].
-    force : ndarray, shape (n,)
-        Filtered force [N].
     lost : ndarray of bool, shape (n,)
         Samples within a gap of the recording.
-    half_filter : int
-        Half the length of the filter [samples].
-    margin : int
-        Distance from a change of the filtered speed at which the filtered force may still be
-        affected by the change [samples].
+    half_filter, margin : int
+        Half the length of the filter, and distance from a change of the filtered speed at which
+        the filtered force may still be affected by it [samples].
     speed_noise, acceleration_noise : float
         Standard deviations of the noise of filtered speed [m/s] and acceleration [m/s^2].
 
     """
 
+    settings: FrictionSettings
     time: FloatArray
+    force: FloatArray
     period: float
     motion: BSpline
-    force: FloatArray
     lost: BoolArray
     half_filter: int
     margin: int
     speed_noise: float
     acceleration_noise: float
 
-    def delayed_motion(self, lag: float) -> tuple[FloatArray, FloatArray]:
-        """
-        Return the motion at the time at which the force, which lags, shows it.
+    @property
+    def correlation(self) -> int:
+        """Length over which the filtered noise is correlated [samples]."""
+        return ceil(CORRELATION_LENGTH / self.settings.cutoff / self.period)
 
-        Parameters
-        ----------
-        lag : float
-            Lag of the force [s].
-
-        Returns
-        -------
-        speed, acceleration : ndarray, shape (n,)
-            Speed [m/s] and acceleration [m/s^2] a lag ago.
-
-        """
-        then = np.clip(self.time - lag, self.time[0], self.time[-1])
-        return np.asarray(self.motion(then)), np.asarray(self.motion(then, 1))
-
-    def window(self, duration: float) -> FloatArray:
-        """
-        Return a triangular window.
-
-        Parameters
-        ----------
-        duration : float
-            Its length [s].
-
-        Returns
-        -------
-        ndarray, shape (w,)
-            The window, for `regress`.
-
-        """
-        return triangular_window(ceil(duration / self.period))
+    @property
+    def moving_speed(self) -> float:
+        """Speed above which the needle counts as moving [m/s]."""
+        return max(self.settings.moving_speed, _CLEARLY * self.speed_noise)
 
 
 def filter_signals(recording: Recording, settings: FrictionSettings) -> FilteredSignals:
@@ -164,6 +140,7 @@ def filter_signals(recording: Recording, settings: FrictionSettings) -> Filtered
     response = _filtered_speed(around, impulse, taps, 1, derivative)
     noise = _white_noise(raw, np.asarray(motion(grid)), np.asarray(motion(grid, 1)))
     return FilteredSignals(
+        settings=settings,
         time=grid[::step],
         period=step * period,
         motion=motion,

@@ -30,36 +30,21 @@ from __future__ import annotations
 from math import nan, sqrt
 from typing import Final
 
-from needle_dynamics.arrays import FloatArray
 from needle_identification.errors import IdentificationError
 from needle_identification.estimation.regression import Regression
 from needle_identification.estimation.residual_tests import residual_tests
 from needle_identification.friction.breakaway import breakaway_force
-from needle_identification.friction.checks import (
-    check_friction,
-    lag_warnings,
-    mass_warnings,
-    model_warnings,
-    noise_warnings,
-    parameter_warnings,
-)
+from needle_identification.friction.checks import check_friction, fit_warnings, missing_term
 from needle_identification.friction.comparison import compare_terms
-from needle_identification.friction.design import (
-    check_motion,
-    Design,
-    select_samples,
-    solve,
-    with_lag_column,
-)
+from needle_identification.friction.design import Design, select_samples
 from needle_identification.friction.estimate import Fit, FrictionEstimate
 from needle_identification.friction.filtering import (
-    CORRELATION_LENGTH,
     filter_signals,
     FilteredSignals,
     HALF_LENGTH,
 )
 from needle_identification.friction.intervals import parameter_estimates
-from needle_identification.friction.lag import accelerates, find_lag, lag_estimate, UNKNOWN_LAG
+from needle_identification.friction.lag import find_lag, lag_estimate
 from needle_identification.friction.settings import FrictionSettings
 from needle_identification.recordings.recording import Recording
 import numpy as np
@@ -118,22 +103,17 @@ def identify_friction(
 
 def _identify(recording: Recording, settings: FrictionSettings) -> FrictionEstimate:
     signals = filter_signals(recording, settings)
-    window = signals.window(CORRELATION_LENGTH / settings.cutoff)
-    coarse, fine = find_lag(signals, settings, window)
-    design, fit = _fitted(signals, settings, coarse, fine, window)
+    has_inertia = 'inertia' in settings.terms
+    coarse, fine = find_lag(signals)
+    design, fit = _fitted(signals, coarse, fine)
     if design.estimates_lag and not fit.errors[-1] < HALF_LENGTH / settings.cutoff:
         # Beyond the length of the filter the force is not linear in the lag.
-        fine = None
-        design, fit = _fitted(signals, settings, coarse, fine, window)
+        design, fit = _fitted(signals, coarse, None)
     used = design.used
     mean_speed = float(np.mean(np.abs(design.speed[used])))
     parameters = parameter_estimates(fit, settings, mean_speed, signals.period)
     check_friction(parameters)
-    lag = UNKNOWN_LAG
-    if design.estimates_lag and fine is not None and accelerates(design):
-        lag = lag_estimate(fine, fit, settings, signals.period)
-    # The resolution of positions and a mass make errors of the lag that its interval lacks.
-    lag_is_valid = recording.speed is not None and 'inertia' not in settings.terms
+    lag = lag_estimate(fine, design, fit)
     is_exact = 1.0 - fit.determination < _EXACT
     tests = (
         ()
@@ -143,18 +123,21 @@ def _identify(recording: Recording, settings: FrictionSettings) -> FrictionEstim
             used=used,
             time=signals.time,
             speed=design.speed,
-            length=len(window),
+            length=signals.correlation,
             parameters=len(fit.values),
         )
     )
-    comparison = () if is_exact else compare_terms(signals, design, settings, fit, window)
+    comparison = () if is_exact else compare_terms(design, fit)
+    missing = missing_term(settings.terms, comparison)
+    doubts = [missing] if missing else [test.words for test in tests if test.failed]
     return FrictionEstimate(
         name=recording.name,
         terms=settings.terms,
         estimator=settings.estimator,
         parameters=parameters,
-        breakaway=breakaway_force(signals, design, settings, parameters),
-        lag=lag if lag_is_valid else None,
+        breakaway=breakaway_force(design, parameters),
+        # The resolution of positions and a mass make errors of the lag that its interval lacks.
+        lag=None if recording.speed is None or has_inertia else lag,
         samples=fit.samples,
         residual=sqrt(float(fit.residual @ fit.residual) / fit.samples),
         determination=fit.determination,
@@ -162,11 +145,8 @@ def _identify(recording: Recording, settings: FrictionSettings) -> FrictionEstim
         tests=tests,
         comparison=comparison,
         warnings=(
-            *parameter_warnings(parameters),
-            *lag_warnings(lag, 0.0 if 'inertia' in settings.terms else coarse, signals.period),
-            *noise_warnings(signals, design, settings, fit),
-            *mass_warnings(parameters),
-            *model_warnings(settings, comparison, tests),
+            *fit_warnings(design, fit, parameters, lag, 0.0 if has_inertia else coarse),
+            *doubts,
         ),
         fit=Fit(
             time=signals.time,
@@ -179,19 +159,16 @@ def _identify(recording: Recording, settings: FrictionSettings) -> FrictionEstim
 
 
 def _fitted(
-    signals: FilteredSignals,
-    settings: FrictionSettings,
-    coarse: float,
-    fine: float | None,
-    window: FloatArray,
+    signals: FilteredSignals, coarse: float, fine: float | None
 ) -> tuple[Design, Regression]:
     """Fit with a further lag as one more unknown, or at the coarse lag if there is no fine one."""
+    settings = signals.settings
     lag = coarse if fine is None else fine
     # A coarse lag is wrong by up to half a step.
     error = 0.5 * signals.half_filter * signals.period if fine is None else 0.0
     is_corrected = 'inertia' not in settings.terms
-    design = select_samples(signals, settings, lag if is_corrected else 0.0, abs(lag) + error)
-    check_motion(signals, design, settings, window)
+    design = select_samples(signals, lag if is_corrected else 0.0, abs(lag) + error)
+    design.check()
     if is_corrected and fine is not None:
-        design = with_lag_column(signals, design, settings)
-    return design, solve(signals, design, settings, settings.terms, window)
+        design = design.with_lag_column()
+    return design, design.solve(settings.terms, settings.estimator)

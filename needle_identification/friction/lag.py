@@ -12,19 +12,10 @@ from dataclasses import replace
 from math import hypot
 from typing import Final
 
-from needle_dynamics.arrays import FloatArray
 from needle_identification.estimation.estimate import ParameterEstimate
 from needle_identification.estimation.regression import Regression
-from needle_identification.friction.design import (
-    Design,
-    FEWEST_WINDOWS,
-    is_enough,
-    moving_threshold,
-    select_samples,
-    with_lag_column,
-)
+from needle_identification.friction.design import Design, FEWEST_SAMPLES, select_samples
 from needle_identification.friction.filtering import FilteredSignals
-from needle_identification.friction.settings import FrictionSettings
 from needle_identification.friction.terms import regressors
 import numpy as np
 from scipy.special import ndtri
@@ -52,24 +43,17 @@ _SMALLEST_ACCELERATION: Final = 0.01
 #: the samples.
 _SPLINE_ERROR: Final = 10.0
 
-#: The lag if it is not determined.
-UNKNOWN_LAG: Final = ParameterEstimate(name='lag', symbol='tau', unit='s')
+_UNKNOWN: Final = ParameterEstimate(name='lag', symbol='tau', unit='s')
 
 
-def find_lag(
-    signals: FilteredSignals, settings: FrictionSettings, window: FloatArray
-) -> tuple[float, float | None]:
+def find_lag(signals: FilteredSignals) -> tuple[float, float | None]:
     """
     Search for the lag of the force.
 
     Parameters
     ----------
     signals : FilteredSignals
-        Filtered force and motion.
-    settings : FrictionSettings
-        The terms; inertia is left out, because it looks like a lag.
-    window : ndarray, shape (w,)
-        Window that spans the correlation of the noise.
+        Filtered force and motion. The term inertia is left out, because it looks like a lag.
 
     Returns
     -------
@@ -79,20 +63,19 @@ def find_lag(
         Lag of least misfit [s]; None if the motion does not determine it.
 
     """
-    terms = tuple(term for term in settings.terms if term != 'inertia')
+    terms = tuple(term for term in signals.settings.terms if term != 'inertia')
     if not terms:
         return 0.0, None
-    simple = replace(settings, terms=terms, estimator='ordinary')
-    lag = coarse = _coarse_lag(signals, simple)
+    simple = replace(signals.settings, terms=terms, estimator='ordinary')
+    signals = replace(signals, settings=simple)
+    lag = coarse = _coarse_lag(signals)
     for _ in range(_MAX_ITERATIONS):
-        design = select_samples(signals, simple, lag, abs(lag))
-        if not is_enough(design, window) or _acceleration_is_noise(signals, design):
+        design = select_samples(signals, lag, abs(lag))
+        if not design.is_enough or _acceleration_is_noise(design):
             return coarse, None
-        design = with_lag_column(signals, design, simple)
-        used = design.used
-        x = regressors(design.speed[used], design.acceleration[used], terms, simple)
-        x = np.column_stack([x, design.lag_column[used]])
-        change = float(np.linalg.lstsq(x, signals.force[used], rcond=None)[0][-1])
+        design = design.with_lag_column()
+        x, used = design.regressors(terms), design.used
+        change = float(np.linalg.lstsq(x[used], signals.force[used], rcond=None)[0][-1])
         lag += change
         if abs(lag) > 2.0 * _LARGEST_LAG:
             return coarse, None
@@ -102,11 +85,10 @@ def find_lag(
     return coarse, lag
 
 
-def _coarse_lag(signals: FilteredSignals, settings: FrictionSettings) -> float:
+def _coarse_lag(signals: FilteredSignals) -> float:
     """Return the lag, in steps of half the filter, that fits far better than none, else zero."""
     every = max(1, len(signals.time) // _MAX_SAMPLES)
     time, force = signals.time[::every], signals.force[::every]
-    threshold = moving_threshold(signals, settings)
     step = signals.half_filter * signals.period
     count = int(_LARGEST_LAG / step)
     lags = step * np.arange(-count, count + 1)
@@ -114,9 +96,10 @@ def _coarse_lag(signals: FilteredSignals, settings: FrictionSettings) -> float:
     for lag in lags:
         then = np.clip(time - lag, time[0], time[-1])
         speed, acceleration = signals.motion(then), signals.motion(then, 1)
-        moving = np.abs(speed) > threshold
-        if np.count_nonzero(moving) <= FEWEST_WINDOWS:
+        moving = np.abs(speed) > signals.moving_speed
+        if np.count_nonzero(moving) <= FEWEST_SAMPLES:
             return 0.0
+        settings = signals.settings
         x = regressors(speed[moving], acceleration[moving], settings.terms, settings)
         solution = np.linalg.lstsq(x, force[moving], rcond=None)[0]
         misfits.append(float(np.mean((force[moving] - x @ solution) ** 2)))
@@ -124,54 +107,37 @@ def _coarse_lag(signals: FilteredSignals, settings: FrictionSettings) -> float:
     return float(lags[best]) if misfits[best] < _BETTER * misfits[count] else 0.0
 
 
-def _acceleration_is_noise(signals: FilteredSignals, design: Design) -> bool:
+def _acceleration_is_noise(design: Design) -> bool:
     power = float(np.mean(design.acceleration[design.used] ** 2))
-    return power * _LARGEST_NOISE <= signals.acceleration_noise**2
+    return power * _LARGEST_NOISE <= design.signals.acceleration_noise**2
 
 
-def accelerates(design: Design) -> bool:
-    """
-    Tell whether the motion determines a lag.
-
-    Parameters
-    ----------
-    design : Design
-        Samples to use.
-
-    Returns
-    -------
-    bool
-        Whether they accelerate by more than the filter leaves of jumps of the speed.
-
-    """
-    used = float(np.sqrt(np.mean(design.acceleration[design.used] ** 2)))
-    return used > _SMALLEST_ACCELERATION * float(np.max(np.abs(design.acceleration)))
-
-
-def lag_estimate(
-    lag: float, fit: Regression, settings: FrictionSettings, period: float
-) -> ParameterEstimate:
+def lag_estimate(lag: float | None, design: Design, fit: Regression) -> ParameterEstimate:
     """
     Return the lag with its error, to which the spline between samples adds.
 
     Parameters
     ----------
-    lag : float
+    lag : float or None
         Lag at which the force was fitted [s].
+    design : Design
+        The regression.
     fit : Regression
-        The fit; its last parameter is what is left of the lag.
-    settings : FrictionSettings
-        The filter.
-    period : float
-        Sampling period [s].
+        Its solution; the last parameter is what is left of the lag.
 
     Returns
     -------
     ParameterEstimate
-        The lag [s].
+        The lag [s]; not determined if it was not estimated, or the samples accelerate by no more
+        than the filter leaves of jumps of the speed.
 
     """
-    spline = _SPLINE_ERROR * period * (settings.cutoff * period) ** 4
+    used = float(np.sqrt(np.mean(design.acceleration[design.used] ** 2)))
+    accelerates = used > _SMALLEST_ACCELERATION * float(np.max(np.abs(design.acceleration)))
+    if lag is None or not design.estimates_lag or not accelerates:
+        return _UNKNOWN
+    period = design.signals.period
+    spline = _SPLINE_ERROR * period * (design.signals.settings.cutoff * period) ** 4
     value, low, high = lag + np.array([fit.values[-1], *fit.interval()[-1]])
     half_width = hypot(0.5 * (high - low), float(ndtri(0.975)) * spline)
-    return UNKNOWN_LAG.with_value(float(value), hypot(float(fit.errors[-1]), spline), half_width)
+    return _UNKNOWN.with_value(float(value), hypot(float(fit.errors[-1]), spline), half_width)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from needle_identification.errors import IdentificationError
 from needle_identification.estimation.estimate import (
-    find_by_name,
+    Named,
     ParameterEstimate,
     Statistic,
     statistic,
@@ -16,7 +16,7 @@ from needle_identification.friction.estimate import FrictionEstimate
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class FrictionSummary:
+class FrictionSummary(Named[Statistic]):
     """
     Friction over several recordings.
 
@@ -32,27 +32,8 @@ class FrictionSummary:
     statistics: tuple[Statistic, ...]
     estimates: tuple[FrictionEstimate, ...]
 
-    def __getitem__(self, name: str) -> Statistic:
-        """
-        Return the statistic of a parameter.
-
-        Parameters
-        ----------
-        name : str
-            Name of the parameter, such as ``coulomb_friction``.
-
-        Returns
-        -------
-        Statistic
-            Its mean and scatter.
-
-        Raises
-        ------
-        KeyError
-            If there is none of that name; the message lists the names.
-
-        """
-        return find_by_name(self.statistics, name)
+    def _named(self) -> tuple[Statistic, ...]:
+        return self.statistics
 
 
 def summarize(estimates: Sequence[FrictionEstimate]) -> FrictionSummary:

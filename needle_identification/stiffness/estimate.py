@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from needle_dynamics.arrays import FloatArray
-from needle_identification.estimation.estimate import find_by_name, ParameterEstimate
+from needle_identification.estimation.estimate import Named, ParameterEstimate
 from needle_identification.stiffness.presses import Presses
 import numpy as np
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
-class LevelEstimate:
+class LevelEstimate(Named[ParameterEstimate]):
     """
     Stiffness at one force level.
 
@@ -64,28 +64,9 @@ class LevelEstimate:
     determination: float
     condition: float
 
-    def __getitem__(self, name: str) -> ParameterEstimate:
-        """
-        Return a parameter.
-
-        Parameters
-        ----------
-        name : str
-            Its name, such as ``k_xx`` or ``curl``.
-
-        Returns
-        -------
-        ParameterEstimate
-            The parameter.
-
-        Raises
-        ------
-        KeyError
-            If there is none of that name; the message lists the names.
-
-        """
+    def _named(self) -> tuple[ParameterEstimate, ...]:
         others = (self.curl, self.spring, *self.principal, self.angle, self.tissue_stiffness)
-        return find_by_name((*self.parameters, *others), name)
+        return (*self.parameters, *others)
 
     def __repr__(self) -> str:
         (k_xx, k_xz), (k_zx, k_zz) = self.matrix.tolist()
@@ -96,16 +77,6 @@ class LevelEstimate:
     def matrix(self) -> FloatArray:
         """K [N/m], shape (2, 2), rows of force and columns of displacement; nan if unknown."""
         return np.array([p.value for p in self.parameters]).reshape(2, 2)
-
-    @property
-    def symmetric(self) -> FloatArray:
-        """The symmetric part of K, that of a spring [N/m], shape (2, 2)."""
-        return np.asarray((self.matrix + self.matrix.T) / 2.0)
-
-    @property
-    def antisymmetric(self) -> FloatArray:
-        """The antisymmetric part of K, which has the curl [N/m], shape (2, 2)."""
-        return np.asarray((self.matrix - self.matrix.T) / 2.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)

@@ -7,8 +7,7 @@ The steps, each in a file of its own:
 
 ============  =====================================================================================
 `plateaus`    holds and rests: the times in which force and position are steady
-`drift`       the zeros of force and position between the rests
-`presses`     displacement and force of each hold; force levels and directions
+`presses`     displacement and force of each hold, with the zeros between the rests
 `matrix`      the stiffness matrix with its errors
 `spring`      whether the tissue is a spring
 `principal`   principal stiffnesses
@@ -37,7 +36,7 @@ from needle_identification.stiffness.plateaus import find_plateaus
 from needle_identification.stiffness.presses import find_presses, Presses
 from needle_identification.stiffness.principal import principal_estimates
 from needle_identification.stiffness.settings import StiffnessSettings
-from needle_identification.stiffness.spring import asymmetry_estimate, curl_estimate, judge_spring
+from needle_identification.stiffness.spring import spring_estimates
 import numpy as np
 
 #: What is worth a warning, as a part of what was measured.
@@ -138,10 +137,9 @@ def _level(
 ) -> LevelEstimate:
     """Collect the results of one level."""
     k_zz = float(fit.matrix[1, 1])
-    curl, spring = curl_estimate(fit), asymmetry_estimate(fit)
+    curl, spring, is_spring, words = spring_estimates(fit, settings.largest_asymmetry)
     first, second, angle = principal_estimates(fit)
     force = presses.force[chosen]
-    is_spring, words = judge_spring(spring, curl, settings.largest_asymmetry)
     residual = float((fit.residual**2).sum())
     variation = float(((force - force.mean(axis=0)) ** 2).sum())
     is_known = fit.known.any()

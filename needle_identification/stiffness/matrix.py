@@ -115,8 +115,7 @@ class MatrixFit(NamedTuple):
         Returns
         -------
         variance, degrees_of_freedom : float
-            Variance and its degrees of freedom (Satterthwaite), between those of one row and
-            those of both.
+            Variance and its degrees of freedom (Satterthwaite).
 
         """
         along = np.einsum('rij,ri->rj', self.factors, gradient)
@@ -190,7 +189,6 @@ def fit_matrix(presses: Presses, noise: PressNoise, chosen: IntArray, estimator:
             x,
             y,
             estimator='ordinary' if estimator == 'weighted' else estimator,
-            noisy=np.ones(len(columns), dtype=np.bool_),
             regressor_noise=np.full(len(columns), error / sqrt(len(chosen))),
         )
         deviation, freedoms[row], left = _deviation(fit.residual, freedom, estimator)

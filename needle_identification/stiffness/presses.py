@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import pi
+from math import exp, log, pi
 from typing import Final, NamedTuple
 
 from needle_dynamics.arrays import FloatArray, IntArray
 from needle_identification.errors import IdentificationError
 from needle_identification.recordings.recording import IndentationRecording
-from needle_identification.stiffness.drift import follow_zero
 from needle_identification.stiffness.plateaus import Plateaus
 from needle_identification.stiffness.settings import StiffnessSettings
 import numpy as np
+from scipy.linalg import cho_solve_banded, cholesky_banded
+from scipy.optimize import minimize_scalar
 
 #: Forces within this angle press in the same direction [rad].
 _SAME_DIRECTION: Final = pi / 18.0
@@ -157,7 +158,7 @@ def find_presses(
     change = np.empty((len(time), 5))
     covariances = []
     for channels in (slice(0, 2), slice(2, 4), slice(4, 5)):
-        zero, covariance = follow_zero(
+        zero, covariance = _follow_zero(
             plateaus.time[rest],
             plateaus.mean[rest, channels],
             plateaus.variance[rest, channels].mean(axis=1),
@@ -238,3 +239,49 @@ def _directions(force: FloatArray) -> IntArray:
     gaps = np.diff(order, append=order[0] + 2.0 * pi)
     first = order[(int(gaps.argmax()) + 1) % len(order)]
     return grouped((angle - first) % (2.0 * pi), _SAME_DIRECTION)
+
+
+def _follow_zero(
+    times: FloatArray, rests: FloatArray, variance: FloatArray, at: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """
+    Estimate the zero between the rests as a random walk, measured with noise of known variance.
+
+    Rests of shape (r, c) at ``times`` have this ``variance`` (r,). Returned are the zeros ``at``
+    other times, (m, c), and their covariance in each channel, (m, m). The variance of the walk
+    is that of maximum likelihood: without drift every rest counts for every hold; where the
+    drift exceeds the noise, the zero is interpolated between neighbors.
+    """
+    mean: FloatArray = rests.mean(axis=0)
+    knots, place = np.unique(np.concatenate([times, at]), return_inverse=True)
+    seen, asked = place[: len(times)], place[len(times) :]
+    precision = np.zeros((len(knots), len(knots)))
+    precision[seen, seen] = 1.0 / variance
+    rate = _drift_rate(times, rests, variance) if len(times) > 1 else variance[0]
+    if len(knots) > 1:
+        difference = np.diff(np.eye(len(knots)), axis=0)
+        precision += difference.T @ (difference / (rate * np.diff(knots))[:, np.newaxis])
+    covariance = np.linalg.inv(precision)
+    gain = covariance[np.ix_(asked, seen)] / variance
+    zero: FloatArray = mean + gain @ (rests - mean)
+    return zero, np.asarray(covariance[np.ix_(asked, asked)])
+
+
+def _drift_rate(times: FloatArray, rests: FloatArray, variance: FloatArray) -> float:
+    """Return the variance per second of the random walk with the largest likelihood."""
+    step, change = np.diff(times), np.diff(rests, axis=0)
+    slow = 0.01 * float(np.median(variance)) / float(step.sum())
+    fast = 100.0 * max(slow, float((change**2).max() / step.min()))
+
+    def negative_log_likelihood(logarithm: float) -> float:
+        banded = np.zeros((2, len(step)))
+        banded[0] = np.exp(logarithm) * step + variance[:-1] + variance[1:]
+        banded[1, :-1] = -variance[1:-1]
+        factor = cholesky_banded(banded, lower=True)
+        fitted = cho_solve_banded((factor, True), change)
+        return float(2.0 * change.shape[1] * np.log(factor[0]).sum() + (change * fitted).sum())
+
+    found = minimize_scalar(
+        negative_log_likelihood, bounds=(log(slow), log(fast)), method='bounded'
+    )
+    return exp(found.x)

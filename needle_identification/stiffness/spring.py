@@ -55,58 +55,59 @@ def asymmetry(matrix: ArrayLike) -> float:
     return float(np.linalg.norm(k - k.T)) / symmetric if symmetric else nan
 
 
-def curl_estimate(fit: MatrixFit) -> ParameterEstimate:
+def spring_estimates(
+    fit: MatrixFit, limit: float
+) -> tuple[ParameterEstimate, ParameterEstimate, bool, str]:
     """
-    Return the curl of the force of the tissue.
+    Judge whether the tissue is a spring.
 
     Parameters
     ----------
     fit : MatrixFit
         Stiffness matrix with errors.
+    limit : float
+        Largest asymmetry of a spring [1].
 
     Returns
     -------
-    ParameterEstimate
-        k_zx - k_xz [N/m].
+    curl : ParameterEstimate
+        Curl of the force of the tissue, k_zx - k_xz [N/m].
+    spring : ParameterEstimate
+        Asymmetry of the matrix [1], which is |curl| / (sqrt(2) |K_s|).
+    is_spring : bool
+        Whether the whole interval of the asymmetry is within the limit.
+    words : str
+        The result in words: a spring, not a spring, or undecided.
 
     """
-    return fit.derived('curl', 'curl F', 'N/m', float(fit.matrix[1, 0] - fit.matrix[0, 1]), _CURL)
-
-
-def asymmetry_estimate(fit: MatrixFit) -> ParameterEstimate:
-    """
-    Return the asymmetry of a stiffness matrix with its errors.
-
-    Parameters
-    ----------
-    fit : MatrixFit
-        Stiffness matrix with errors.
-
-    Returns
-    -------
-    ParameterEstimate
-        ``|K_a| / |K_s|`` [1], which is ``|curl| / (sqrt(2) |K_s|)``.
-
-    """
-    curl = float(fit.matrix[1, 0] - fit.matrix[0, 1])
-    symmetric = (fit.matrix + fit.matrix.T) / 2.0
+    k = fit.matrix
+    curl = fit.derived('curl', 'curl F', 'N/m', float(k[1, 0] - k[0, 1]), _CURL)
+    symmetric = (k + k.T) / 2.0
     size = sqrt(2.0) * float(np.linalg.norm(symmetric)) or nan
-    gradient = (_CURL - 2.0 * curl / size**2 * symmetric) / size
-    signed = fit.derived('spring', '|K_a|/|K_s|', '1', curl / size, gradient)
-    if not signed.determined:
-        return signed
+    gradient = (_CURL - 2.0 * (k[1, 0] - k[0, 1]) / size**2 * symmetric) / size
+    value = float(k[1, 0] - k[0, 1]) / size
+    spring = fit.derived('spring', '|K_a|/|K_s|', '1', value, gradient)
+    if not spring.determined:
+        return curl, spring, False, 'undetermined: the presses do not determine the whole matrix'
     _, freedom = fit.variance_of(gradient)
-    value = abs(signed.value)
-    return replace(signed, value=value, interval=_unsigned_interval(value, signed.error, freedom))
+    low, high = _unsigned_interval(abs(value), spring.error, freedom)
+    spring = replace(spring, value=abs(value), interval=(low, high))
+    is_spring = high <= limit
+    verdict = 'a spring' if is_spring else 'not a spring' if low > limit else 'undecided'
+    words = (
+        f'{verdict}: antisymmetric part {spring.value:.2%} of the symmetric, 95 % interval '
+        f'{low:.2%} to {high:.2%}, limit {limit:.0%}; curl '
+        + ('zero within its error' if low == 0.0 else f'{curl.value:.3g} N/m')
+    )
+    return curl, spring, is_spring, words
 
 
 def _unsigned_interval(value: float, error: float, freedom: float) -> tuple[float, float]:
     """
     Return the 95 % interval of the size of a quantity with an arbitrary sign.
 
-    The interval holds each size for which the measured value is within the nearest 95 % of the
-    values that may be measured. Zero is among them where it is in the interval of Student's t of
-    the signed quantity.
+    It holds each size for which the measured value is among the nearest 95 % of possible values,
+    so zero where the interval of Student's t of the signed quantity holds zero.
     """
     if error <= ROUNDING * value:
         return value, value
@@ -122,39 +123,3 @@ def _unsigned_interval(value: float, error: float, freedom: float) -> tuple[floa
 
     low = brentq(excess, 0.0, found) if found > farthest else 0.0
     return low * error, brentq(excess, found, found + 1.01 * farthest) * error
-
-
-def judge_spring(
-    spring: ParameterEstimate, curl: ParameterEstimate, limit: float
-) -> tuple[bool, str]:
-    """
-    Judge by its asymmetry whether a tissue is a spring.
-
-    Parameters
-    ----------
-    spring : ParameterEstimate
-        Asymmetry of its stiffness matrix [1].
-    curl : ParameterEstimate
-        Curl of its force [N/m].
-    limit : float
-        Largest asymmetry of a spring [1].
-
-    Returns
-    -------
-    is_spring : bool
-        Whether the whole interval of the asymmetry is within the limit.
-    words : str
-        The result in words: a spring, not a spring, or undecided.
-
-    """
-    if not spring.determined:
-        return False, 'undetermined: the presses do not determine the whole matrix'
-    low, high = spring.interval
-    figure = (
-        f'antisymmetric part {spring.value:.2%} of the symmetric, 95 % interval '
-        f'{low:.2%} to {high:.2%}, limit {limit:.0%}; curl '
-        + ('zero within its error' if low == 0.0 else f'{curl.value:.3g} N/m')
-    )
-    if high <= limit:
-        return True, f'a spring: {figure}'
-    return False, f'{"not a spring" if low > limit else "undecided"}: {figure}'

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from needle_identification.errors import IdentificationError
-from needle_identification.estimation.estimate import find_by_name, Statistic, statistic
+from needle_identification.estimation.estimate import Named, Statistic, statistic
 from needle_identification.stiffness.estimate import StiffnessEstimate
 from needle_identification.stiffness.matrix import ENTRIES
 from needle_identification.stiffness.presses import grouped
@@ -15,7 +15,7 @@ import numpy as np
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class LevelSummary:
+class LevelSummary(Named[Statistic]):
     """
     One force level over several places: a column of Table 2.
 
@@ -31,27 +31,8 @@ class LevelSummary:
     force: float
     statistics: tuple[Statistic, ...]
 
-    def __getitem__(self, name: str) -> Statistic:
-        """
-        Return the statistic of a parameter.
-
-        Parameters
-        ----------
-        name : str
-            Name of the parameter, such as ``k_xx``.
-
-        Returns
-        -------
-        Statistic
-            Its mean and scatter.
-
-        Raises
-        ------
-        KeyError
-            If there is none of that name; the message lists the names.
-
-        """
-        return find_by_name(self.statistics, name)
+    def _named(self) -> tuple[Statistic, ...]:
+        return self.statistics
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

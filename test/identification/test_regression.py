@@ -17,7 +17,6 @@ import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 import pytest
 from scipy.signal import lfilter
-from scipy.signal.windows import triang
 
 VALUES = np.array([0.56, 300.0, -2.0])
 #: Columns of very different size, as sgn(v), v and an offset are.
@@ -35,7 +34,6 @@ def problem(
 def extras(n: int, noise: tuple[float, ...] = (0.0, 0.0, 0.0)) -> dict[str, Any]:
     return {
         'groups': np.arange(n) % 4,
-        'noisy': np.array(noise) > 0.0,
         'regressor_noise': np.array(noise),
     }
 
@@ -134,8 +132,8 @@ def test_intervals_cover_under_correlated_noise(estimator: str) -> None:
     for _ in range(runs):
         y = x @ [1.0, 2.0] + lfilter([0.1], [1.0, -0.9], rng.normal(size=n))
         found = regress(
-            x, y, estimator=estimator, window=triang(61), groups=np.arange(n) // 375,
-            noisy=np.array([False, True]), regressor_noise=np.zeros(2),
+            x, y, estimator=estimator, correlation=61, groups=np.arange(n) // 375,
+            regressor_noise=np.zeros(2),
         )  # fmt: skip
         low, high = found.interval().T
         covered.append((low <= [1.0, 2.0]) & (high >= [1.0, 2.0]))
@@ -161,7 +159,7 @@ def test_samples_that_are_not_used_do_not_matter_but_for_their_place() -> None:
 def test_what_stands_for_one_another_is_not_determined_and_the_rest_is(estimator: str) -> None:
     x, y, _ = problem(noise=0.1)
     x = np.column_stack([x, x[:, 0] - 3.0 * x[:, 2]])
-    extra = extras(len(y)) | {'noisy': np.zeros(4, bool), 'regressor_noise': np.zeros(4)}
+    extra = extras(len(y)) | {'regressor_noise': np.zeros(4)}
     found = regress(x, y, estimator=estimator, **extra)
     assert_array_equal(found.determined, [False, True, False, False])
     assert np.isnan(found.values[[0, 2, 3]]).all()
@@ -207,7 +205,7 @@ def test_wald_test_of_what_is_not_there_is_as_rare_as_it_says() -> None:
         ({'estimator': 'total'}, ParameterError, 'total needs the noise of each column'),
         ({'used': np.ones(3, bool)}, ShapeError, r'do not match: \(600, 3\), \(600,\), \(3,\)'),
         ({'used': np.arange(600) < 3}, IdentificationError, '3 parameters need more than 3'),
-        ({'window': triang(1000)}, IdentificationError, 'independent samples, got 0.8'),
+        ({'correlation': 1000}, IdentificationError, 'independent samples, got 0.8'),
     ],
 )
 def test_refuses_what_it_cannot_solve(

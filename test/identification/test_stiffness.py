@@ -143,7 +143,6 @@ def test_recovers_any_matrix_from_exact_presses(matrix: FloatArray) -> None:
     (level,) = identify_stiffness(pressed(matrix, grid((1.2,)))).levels
     # 1e-8: noise below this part of a reading is taken as rounding.
     assert_allclose(level.matrix, matrix, atol=float(1e-8 * np.linalg.norm(matrix)))
-    assert_allclose(level.symmetric + level.antisymmetric, matrix, atol=1e-5)
     truth = expected(matrix)
     for name in ('curl', 'spring', 'principal_stiffness_1', 'tissue_stiffness'):
         assert_allclose(level[name].value, truth[name], rtol=1e-6, atol=1e-5)
