@@ -35,7 +35,8 @@ from needle_dynamics import (
     NeedleParameters,
     ParameterError,
 )
-from needle_dynamics.simulated.plant import BaseMotion, BaseParameters, Plant
+from needle_dynamics.simulated.base import BaseMotion, BaseParameters
+from needle_dynamics.simulated.plant import Plant
 from needle_identification import (
     ESTIMATORS,
     FrictionSettings,

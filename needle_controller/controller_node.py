@@ -10,7 +10,7 @@ from time import monotonic
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
-from geometry_msgs.msg import PointStamped, WrenchStamped
+from geometry_msgs.msg import PointStamped
 from needle_controller.controller import (
     Command,
     Controller,
@@ -38,20 +38,20 @@ from needle_dynamics import (
 )
 from needle_dynamics.compiled.cache import announce_compilation
 from needle_dynamics.model_node import ModelNode
-from needle_dynamics.simulated.plant import joint_values
-from needle_ros.base_node import COMMAND, run, SENSOR
+from needle_ros import contract
+from needle_ros.base_node import run
 from needle_ros.errors import (
     NeedleError,
     ParameterError,
 )
-from needle_ros.packed import Layout, Reading
 from needle_ros.timing import NANOSECONDS, nanoseconds, seconds
+from needle_ros.trajectories import joint_values
+from needle_ros.wire import Reading
 import numpy as np
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.subscription import Subscription
-from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
 from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import JointTrajectory
@@ -137,15 +137,14 @@ class ControllerNode(ModelNode):
         self._refused = 0
         self._refusal: str | None = None
 
-        publisher = self.create_lifecycle_publisher
-        self._wrench_command = publisher(WrenchStamped, 'wrench_command', COMMAND)
-        self._reference = publisher(JointState, 'reference', SENSOR)
-        self._tracking_error = publisher(JointState, 'tracking_error', SENSOR)
-        self.listen(JointState, 'joint_states', SENSOR, self._on_joint_states)
-        self.create_subscription(PointStamped, 'target', self._on_target, COMMAND)
-        self.create_subscription(JointTrajectory, 'joint_trajectory', self._on_trajectory, COMMAND)
-        self.listen(WrenchStamped, 'base_wrench', SENSOR, self._on_wrench)
-        self.listen(PointStamped, 'tip_deflection', SENSOR, self._on_tip)
+        self._wrench_command = self.publisher(contract.WRENCH_COMMAND)
+        self._reference = self.publisher(contract.REFERENCE)
+        self._tracking_error = self.publisher(contract.TRACKING_ERROR)
+        self.listen(contract.JOINT_STATES, self._on_joint_states)
+        self.subscribe(contract.TARGET, self._on_target)
+        self.subscribe(contract.JOINT_TRAJECTORY, self._on_trajectory)
+        self.listen(contract.BASE_WRENCH, self._on_wrench)
+        self.listen(contract.TIP_DEFLECTION, self._on_tip)
         self.create_service(Trigger, '~/emergency_stop', self._on_emergency_stop)
         self.create_service(Trigger, '~/clear_stop', self._on_clear_stop)
         self.create_service(SetBool, '~/pause', self._on_pause)
@@ -153,8 +152,8 @@ class ControllerNode(ModelNode):
         #: One that stands still or jumps does not take the watchdog along.
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
 
-        self._wrench = Layout('needle_base', numbers=6)
-        self._aim = Layout('', names=['insertion'], counts=(1, 1, 0))
+        self._wrench = contract.WRENCH_COMMAND.template()
+        self._aim = contract.REFERENCE.template()
         #: What was commanded last: stamp, torque and message.
         self._last: tuple[int, float, bytes] = (0, 0.0, b'')
 
@@ -177,7 +176,7 @@ class ControllerNode(ModelNode):
         self._model = NeedleModel(parameters)
         noise: dict[str, tuple[float, ...]] = {}
         if feedback == 'ground_truth':
-            self._truths = self.listen(JointState, 'ground_truth', SENSOR, self._on_ground_truth)
+            self._truths = self.listen(contract.GROUND_TRUTH, self._on_ground_truth)
         elif feedback == 'observer':
             observed = self.settings('observer.', ObserverSettings)
             try:

@@ -22,7 +22,7 @@ from needle_ros.errors import (
     ParameterError,
 )
 from needle_ros.settings import check_constants, constant
-from needle_ros.timing import NANOSECONDS, Window
+from needle_ros.timing import NANOSECONDS, RateCounter
 
 #: What happens to messages that do not count but do no harm either: nobody is told.
 REPEATED: Final = 'repeated'
@@ -158,7 +158,7 @@ class Stream:
         self._stamped = stamped
         self._jumps, self._noise = jumps, noise
         self.counts: Counter[str] = Counter()
-        self.window = Window()
+        self.window = RateCounter()
         self.forget()
 
     def forget(self) -> None:
@@ -375,7 +375,7 @@ class Safety:
         Who else commands.
     streams : dict of str to Stream
         Inputs by topic.
-    saturation : Window
+    saturation : RateCounter
         Commands, those at their limit marked.
 
     """
@@ -394,7 +394,7 @@ class Safety:
         self.stops = 0
         self.rivals: str | None = None
         self.guard = Guard(limits, settings.depths(parameters))
-        self.saturation = Window()
+        self.saturation = RateCounter()
         noise = noise or {}
         timeout, base = limits.sensor_timeout, ('', 'needle_entry')
         self.streams = {

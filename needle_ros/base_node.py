@@ -1,9 +1,9 @@
 """
-What every node of this suite shares: lifecycle, parameters from dataclasses, diagnostics.
+What all nodes share: lifecycle, topics of the contract, parameters from dataclasses, diagnostics.
 
-A node's parameters are the fields of frozen dataclasses; `constant` gives each its unit,
-meaning and range, and the dataclass refuses what is not valid when it is made, so that a bad
-parameter file ends in a refused `configure` with one line that names the parameter.
+The parameters of a node are the fields of frozen dataclasses. `constant` gives each a unit, a
+meaning and a range, and the dataclass checks them when it is made. So an invalid parameter file
+ends in a refused `configure` with one line that names the parameter.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from collections.abc import Callable, Mapping
 import ctypes
 from dataclasses import fields
 import gc
+from importlib import import_module
 import os
 import signal
 import sys
@@ -23,14 +24,11 @@ from types import FrameType
 from typing import Any, ClassVar, TypeVar
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from geometry_msgs.msg import WrenchStamped
-from needle_ros.errors import (
-    NeedleError,
-    ParameterError,
-)
-from needle_ros.packed import Layout, Reading
+from needle_ros import contract
+from needle_ros.contract import Qos, Topic
+from needle_ros.errors import MessageError, NeedleError, ParameterError
 from needle_ros.settings import from_values, unknown_name
-from needle_ros.timing import nanoseconds
+from needle_ros.wire import Reader, Reading
 from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor, SetParametersResult
 import rclpy
 from rclpy.clock import Clock
@@ -40,28 +38,70 @@ from rclpy.executors import Executor
 from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
+from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from rclpy.serialization import deserialize_message
 from rclpy.subscription import Subscription
 from rclpy.task import Future
-from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 import yaml
 
-#: Latched topics: the last message reaches who comes late.
-LATCHED = QoSProfile(
-    depth=1,
-    reliability=ReliabilityPolicy.RELIABLE,
-    durability=DurabilityPolicy.TRANSIENT_LOCAL,
+
+def profile(qos: Qos) -> QoSProfile:
+    """
+    Return a quality of service of the contract as rclpy takes it.
+
+    Parameters
+    ----------
+    qos : Qos
+        Quality of service.
+
+    Returns
+    -------
+    QoSProfile
+        The profile.
+
+    """
+    reliable, latched = qos.reliable, qos.latched
+    return QoSProfile(
+        depth=qos.depth,
+        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+    )
+
+
+def message_class(type_name: str) -> Any:
+    """
+    Import the class of a message; rosidl_runtime_py, which does this, is not in the wheels.
+
+    Parameters
+    ----------
+    type_name : str
+        Type, such as ``sensor_msgs/msg/JointState``.
+
+    Returns
+    -------
+    type
+        The class.
+
+    Raises
+    ------
+    MessageError
+        If its package is not installed.
+
+    """
+    package, _, name = type_name.partition('/msg/')
+    try:
+        return getattr(import_module(f'{package}.msg'), name)
+    except (ImportError, AttributeError, TypeError) as error:
+        raise MessageError(f'{type_name} is not installed') from error
+
+
+#: The qualities of service of the contract.
+LATCHED, COMMAND, SENSOR = (
+    profile(qos) for qos in (contract.LATCHED, contract.COMMAND, contract.SENSOR)
 )
 
-#: Commands: only the newest counts, and it must arrive.
-COMMAND = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE)
-
-#: Sensor streams; a burst after a stall of the reader is not lost.
-SENSOR = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)
-
-#: Set in the environment of a node that shall not outlive the process that started it.
+#: Environment variable: if it is set, a node ends when the process that started it ends.
 END_WITH_PARENT = 'NEEDLE_END_WITH_PARENT'
 
 _PR_SET_PDEATHSIG = 1
@@ -70,38 +110,22 @@ _Settings = TypeVar('_Settings')
 _SUCCESS = TransitionCallbackReturn.SUCCESS
 
 
-def reading_of(message: Any) -> Reading:
-    """Return what a joint state, wrench or point with a header says."""
-    header = message.header
-    stamp, names = nanoseconds(header.stamp), ()
-    values: tuple[tuple[float, ...], ...]
-    if isinstance(message, JointState):
-        names = tuple(message.name)
-        values = tuple(message.position), tuple(message.velocity), tuple(message.effort)
-    elif isinstance(message, WrenchStamped):
-        force, torque = message.wrench.force, message.wrench.torque
-        values = ((force.x, force.y, force.z, torque.x, torque.y, torque.z),)
-    else:
-        values = ((message.point.x, message.point.y, message.point.z),)
-    return Reading(stamp, header.frame_id, names, values)
-
-
-def layout_of(kind: type, reading: Reading) -> Layout:
-    """Return the layout of the message of a type that says this."""
-    counts = [len(block) for block in reading.values]
-    if kind is JointState:
-        return Layout(reading.frame, names=reading.names, counts=counts)
-    return Layout(reading.frame, numbers=counts[0])
-
-
 class BaseNode(LifecycleNode):
     """
-    A lifecycle node that reads its parameters into dataclasses and says how it is.
+    A lifecycle node that reads its parameters into dataclasses and reports its state.
 
-    A subclass declares its parameters in ``__init__`` (`declare_settings`), overrides
-    `configure`, `activate`, `deactivate` and `diagnose`, and raises `NeedleError` for whatever
-    makes a transition impossible: the transition is then refused and the reason logged.
-    Parameters that it names in `LIVE` may change while it is configured: `change` is then called.
+    A subclass declares its parameters in ``__init__`` (`declare_settings`) and overrides
+    `configure`, `activate`, `deactivate` and `diagnose`. It raises `NeedleError` where a
+    transition is not possible: the transition is then refused and the reason logged. Parameters
+    that it names in `LIVE` may change while it is configured: `change` is then called.
+
+    Attributes
+    ----------
+    failure : str or None
+        Why the last transition was refused.
+    invalid : Counter
+        Number of invalid messages by topic.
+
     """
 
     #: Names of the parameters that may change while the node is configured.
@@ -110,15 +134,18 @@ class BaseNode(LifecycleNode):
     def __init__(self, name: str, **node_options: Any) -> None:
         super().__init__(name, **node_options)
         self.failure: str | None = None
-        #: Messages that were none, by topic.
-        self.unreadable: Counter[str] = Counter()
+        self.invalid: Counter[str] = Counter()
         self._descriptions: dict[str, Mapping[str, Any]] = {}
         self._configured = False
         self.declare_text('autostart', True, 'configure and activate at start')
-        self._configuration = self.create_publisher(String, '~/configuration', LATCHED)
-        self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
+        self._configuration = self.create_publisher(
+            String, contract.CONFIGURATION.name, profile(contract.CONFIGURATION.qos)
+        )
+        self._diagnostics = self.create_publisher(
+            DiagnosticArray, contract.DIAGNOSTICS.name, profile(contract.DIAGNOSTICS.qos)
+        )
         self._last_level = DiagnosticStatus.OK
-        # Not the node's clock: a simulation that stands still must be told of too.
+        # Not the node's clock: a paused simulation is reported too.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._health_timer = self.create_timer(1.0, self.publish_diagnostics, clock=steady)
         self.add_on_set_parameters_callback(self._check_change)
@@ -127,73 +154,169 @@ class BaseNode(LifecycleNode):
     # What a subclass fills in.
 
     def cleanup(self) -> None:
-        """Undo `configure`, as far as it came."""
+        """Undo `configure`, also if it raised halfway."""
 
     def configure(self) -> None:
-        """Read the parameters and make what the node needs; raise `NeedleError` to refuse."""
+        """
+        Read the parameters and make what the node needs.
+
+        Raises
+        ------
+        NeedleError
+            To refuse the transition.
+
+        """
 
     def activate(self) -> None:
-        """Begin to act; raise `NeedleError` to refuse."""
+        """
+        Begin to act.
+
+        Raises
+        ------
+        NeedleError
+            To refuse the transition.
+
+        """
 
     def deactivate(self) -> None:
-        """Stop acting and leave the world safe."""
+        """Stop acting, and leave no force applied."""
 
     def change(self, changes: Mapping[str, Any]) -> None:
-        """Go on with other values of parameters in `LIVE`; raise `NeedleError` to refuse them."""
+        """
+        Go on with other values of parameters that are in `LIVE`.
+
+        Parameters
+        ----------
+        changes : Mapping[str, Any]
+            The new values by parameter name.
+
+        Raises
+        ------
+        NeedleError
+            To refuse them.
+
+        """
 
     def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
-        """Return level, message and values for /diagnostics."""
+        """
+        Return what /diagnostics says of the node.
+
+        Returns
+        -------
+        level : bytes
+            A level of DiagnosticStatus.
+        message : str
+            The state in one line.
+        values : dict
+            Values by name.
+
+        """
         return DiagnosticStatus.OK, 'active' if self.is_active else 'not active', {}
 
     # Messages.
 
     def now(self) -> int:
-        """Return the time of the node's clock [ns]."""
-        # Without the objects that Clock.now makes, which take longer than to look.
+        """
+        Return the time of the node's clock.
+
+        Returns
+        -------
+        int
+            Time [ns].
+
+        """
+        # Clock.now makes objects, which takes three times as long.
         return int(self.get_clock().handle.get_now().nanoseconds)
 
-    def listen(
-        self, kind: type, topic: str, qos: QoSProfile, take: Callable[[Reading], None]
-    ) -> Subscription:
+    def publisher(self, topic: Topic) -> Publisher:
         """
-        Subscribe to joint states, wrenches or points that come at the sample rate.
+        Offer a topic of the contract while the node is active.
 
         Parameters
         ----------
-        kind : type
-            JointState, WrenchStamped or PointStamped.
-        topic : str
-            Topic.
-        qos : QoSProfile
-            Quality of service.
+        topic : Topic
+            The topic.
+
+        Returns
+        -------
+        Publisher
+            Takes messages, or their bytes.
+
+        """
+        kind = message_class(topic.type_name)
+        offered: Publisher = self.create_lifecycle_publisher(kind, topic.name, profile(topic.qos))
+        return offered
+
+    def subscribe(self, topic: Topic, take: Callable[[Any], None]) -> Subscription:
+        """
+        Subscribe to a topic of the contract.
+
+        Parameters
+        ----------
+        topic : Topic
+            The topic.
+        take : callable
+            Called with each message.
+
+        Returns
+        -------
+        Subscription
+            The subscription.
+
+        """
+        kind = message_class(topic.type_name)
+        return self.create_subscription(kind, topic.name, take, profile(topic.qos))
+
+    def listen(self, topic: Topic, take: Callable[[Reading], None]) -> Subscription:
+        """
+        Subscribe to a topic that comes at the sample rate; its messages are read from their bytes.
+
+        Parameters
+        ----------
+        topic : Topic
+            The topic, of a type that `wire` knows.
         take : callable
             Called with each `Reading`.
 
+        Returns
+        -------
+        Subscription
+            The subscription.
+
         """
-        layout: Layout | None = None
+        name, read = topic.name, Reader(topic.type_name).read
 
         def on_bytes(data: bytes) -> None:
-            nonlocal layout
-            reading = layout.deserialize(data) if layout is not None else None
-            if reading is None:
-                try:
-                    reading = reading_of(deserialize_message(data, kind))
-                except RuntimeError as error:
-                    self.unreadable[topic] += 1
-                    reason = ' '.join(str(error).split())
-                    self.get_logger().error(
-                        f'{topic} cannot be read: {reason}', throttle_duration_sec=1.0
-                    )
-                    return
-                layout = layout_of(kind, reading)
+            try:
+                reading = read(data)
+            except MessageError as error:
+                self.invalid[name] += 1
+                self.get_logger().error(
+                    f'invalid message on {name}: it {error}', throttle_duration_sec=1.0
+                )
+                return
             take(reading)
 
-        return self.create_subscription(kind, topic, on_bytes, qos, raw=True)
+        return self.create_subscription(
+            message_class(topic.type_name), name, on_bytes, profile(topic.qos), raw=True
+        )
 
     # Parameters.
 
     def declare_text(self, name: str, default: str | bool | list[str], description: str) -> None:
-        """Declare a parameter that is not a number."""
+        """
+        Declare a parameter that is not a number.
+
+        Parameters
+        ----------
+        name : str
+            Its name.
+        default : str, bool or list of str
+            Its default.
+        description : str
+            What it is.
+
+        """
         self.declare_parameter(name, default, ParameterDescriptor(description=description))
 
     def declare_settings(self, prefix: str, defaults: object) -> None:
@@ -241,12 +364,17 @@ class BaseNode(LifecycleNode):
         kind : type
             The dataclass.
         changes : Mapping[str, Any], optional
-            Values to take instead, by the names of the parameters.
+            Values to take instead, by parameter name.
+
+        Returns
+        -------
+        object
+            The dataclass instance.
 
         Raises
         ------
         ParameterError
-            Naming the parameter with its prefix.
+            If a value is not valid; the message names the parameter.
 
         """
         values = {
@@ -265,31 +393,66 @@ class BaseNode(LifecycleNode):
         changes: Mapping[str, Any] | None = None,
     ) -> str:
         """
-        Read a text parameter, one of ``valid`` if that is given; ``changes`` as in `settings`.
+        Read a text parameter.
+
+        Parameters
+        ----------
+        name : str
+            Its name.
+        valid : tuple of str
+            Valid values; any if empty.
+        changes : Mapping[str, Any], optional
+            Values to take instead, by parameter name.
+
+        Returns
+        -------
+        str
+            Its value.
 
         Raises
         ------
         ParameterError
-            Naming the parameter, what was found and what would be valid.
+            If the value is not valid.
 
         """
-        value = (changes or {}).get(name, self.get_parameter(name).value)
+        value = (changes or {}).get(name, self._value(name))
         if not isinstance(value, str) or (valid and value not in valid):
             raise ParameterError(f'{name} must be one of {", ".join(valid)}, got {value!r}')
         return value
 
     def configuration(self) -> str:
-        """Return all parameters as a ROS parameter file."""
+        """
+        Return all parameters as a ROS parameter file.
+
+        Returns
+        -------
+        str
+            YAML.
+
+        """
+        values = self.values()
+        document = {self.get_fully_qualified_name(): {'ros__parameters': values}}
+        return str(yaml.safe_dump(document, sort_keys=False))
+
+    def values(self) -> dict[str, Any]:
+        """
+        Return all parameters.
+
+        Returns
+        -------
+        dict
+            Values by name; an empty list is left out, as a parameter file cannot hold one.
+
+        """
         values = {}
         for name, parameter in sorted(self._parameters.items()):
             value = parameter.value
             if isinstance(value, (list, tuple, array)):
                 value = list(value)
-            # A parameter file cannot hold an empty list: where one is valid it is the default.
+            # Where an empty list is valid it is the default.
             if not name.startswith(('qos_overrides', 'start_type')) and value not in ([], None):
                 values[name] = value
-        document = {self.get_fully_qualified_name(): {'ros__parameters': values}}
-        return str(yaml.safe_dump(document, sort_keys=False))
+        return values
 
     def _check_overrides(self) -> None:
         known = sorted(self._parameters)
@@ -325,11 +488,19 @@ class BaseNode(LifecycleNode):
 
     @property
     def is_active(self) -> bool:
-        """True while the node acts."""
+        """Whether the node is active."""
         return bool(self._state_machine.current_state[1] == 'active')
 
     def start(self) -> bool:
-        """Configure and activate; return whether that went well."""
+        """
+        Configure and activate.
+
+        Returns
+        -------
+        bool
+            Whether both transitions were made.
+
+        """
         return bool(self.trigger_configure() == _SUCCESS and self.trigger_activate() == _SUCCESS)
 
     def stop(self) -> None:
@@ -338,7 +509,20 @@ class BaseNode(LifecycleNode):
             self.trigger_deactivate()
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Read the parameters; refuse what is not valid with one line that names it."""
+        """
+        Call `configure`, and publish the configuration.
+
+        Parameters
+        ----------
+        state : LifecycleState
+            State that the node leaves.
+
+        Returns
+        -------
+        TransitionCallbackReturn
+            Whether the transition is made.
+
+        """
 
         def configure() -> None:
             self._check_overrides()
@@ -356,20 +540,72 @@ class BaseNode(LifecycleNode):
         return self._attempt(configure, super().on_configure, state)
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Begin to act."""
+        """
+        Call `activate`.
+
+        Parameters
+        ----------
+        state : LifecycleState
+            State that the node leaves.
+
+        Returns
+        -------
+        TransitionCallbackReturn
+            Whether the transition is made.
+
+        """
         return self._attempt(self.activate, super().on_activate, state)
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Stop acting."""
+        """
+        Call `deactivate`.
+
+        Parameters
+        ----------
+        state : LifecycleState
+            State that the node leaves.
+
+        Returns
+        -------
+        TransitionCallbackReturn
+            Whether the transition is made.
+
+        """
         return self._attempt(self.deactivate, super().on_deactivate, state)
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Make the parameters free to change."""
+        """
+        Call `cleanup`; parameters may then change.
+
+        Parameters
+        ----------
+        state : LifecycleState
+            State that the node leaves.
+
+        Returns
+        -------
+        TransitionCallbackReturn
+            Whether the transition is made.
+
+        """
         self._configured = False
         return self._attempt(self.cleanup, super().on_cleanup, state)
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Leave the world safe."""
+        """
+        Call `deactivate` if the node is active.
+
+        Parameters
+        ----------
+        state : LifecycleState
+            State that the node leaves.
+
+        Returns
+        -------
+        TransitionCallbackReturn
+            Whether the transition is made.
+
+        """
 
         def leave() -> None:
             if state.label == 'active':
@@ -378,7 +614,20 @@ class BaseNode(LifecycleNode):
         return self._attempt(leave, super().on_shutdown, state)
 
     def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Return to unconfigured after an error that was not foreseen."""
+        """
+        Return to unconfigured after an unforeseen error.
+
+        Parameters
+        ----------
+        state : LifecycleState
+            State that the node leaves.
+
+        Returns
+        -------
+        TransitionCallbackReturn
+            Whether the transition is made.
+
+        """
         self._configured = False
         self.cleanup()
         return super().on_error(state)
@@ -395,7 +644,7 @@ class BaseNode(LifecycleNode):
             self.failure = str(error)
             self.get_logger().error(self.failure)
             return TransitionCallbackReturn.FAILURE
-        # rclpy would drop it without a word.
+        # rclpy would ignore it.
         except Exception as error:  # noqa: BLE001
             self.failure = f'{type(error).__name__}: {error}'
             self.get_logger().error(traceback.format_exc())
@@ -406,13 +655,13 @@ class BaseNode(LifecycleNode):
     # Diagnostics.
 
     def publish_diagnostics(self) -> None:
-        """Publish the state of the node; called once a second and on change."""
+        """Publish the state of the node, once a second and when it changes."""
         level, message, values = self.diagnose()
         if self.failure:
             level, message = DiagnosticStatus.ERROR, self.failure
         self._last_level = level
-        for topic, count in self.unreadable.items():
-            values[f'messages of {topic} that cannot be read'] = count
+        for topic, count in self.invalid.items():
+            values[f'invalid messages on {topic}'] = count
         status = DiagnosticStatus(
             level=level,
             name=self.get_fully_qualified_name(),
@@ -431,7 +680,7 @@ class BaseNode(LifecycleNode):
 
 def run(kind: Callable[[], BaseNode], arguments: list[str] | None = None) -> int:
     """
-    Run one node until SIGINT or SIGTERM, then deactivate it while the graph still lives.
+    Run one node until SIGINT or SIGTERM, then deactivate it while it can still publish.
 
     Parameters
     ----------
@@ -453,10 +702,10 @@ def run(kind: Callable[[], BaseNode], arguments: list[str] | None = None) -> int
         stopping = True
 
     if os.environ.get(END_WITH_PARENT):
-        # Linux sends the signal when the process that started this one ends, however it ends.
+        # Linux sends the signal when the process that started this one ends, in whatever way.
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
     try:
-        # Not rclpy's handlers: they end the context before the node can leave the world safe.
+        # Not rclpy's handlers: they end the context before the node can publish its last command.
         rclpy.init(args=arguments, signal_handler_options=rclpy.signals.SignalHandlerOptions.NO)
     except RuntimeError as error:
         # rcl could not read the arguments or the parameter file.
@@ -467,23 +716,23 @@ def run(kind: Callable[[], BaseNode], arguments: list[str] | None = None) -> int
         try:
             node = kind()
         except (ParameterException, NeedleError, RuntimeError) as error:
-            # The last is rcl's: a node that its security refuses.
+            # RuntimeError is rcl's, for a node that its security refuses.
             sys.stderr.write(f'error: {" ".join(str(error).split())}\n')
             return 2
         executor: Executor = EventsExecutor()
         executor.add_node(node)
         status = 0
         if node.get_parameter('autostart').value and not node.start():
-            # Give the reason on /diagnostics a moment to leave, then end.
+            # The reason, on /diagnostics.
             node.publish_diagnostics()
             status = 2
-        # A look through all that was imported takes 0.2 s, and would come some time later.
+        # A full collection takes 0.2 s: it shall not scan what was imported.
         gc.freeze()
         while not stopping and status == 0:
-            # Unlike spin_once it does not come back to Python at each event.
+            # Unlike spin_once it does not return to Python at each event.
             executor.spin_until_future_complete(Future(), timeout_sec=0.1)
         node.stop()
-        # What was published last (a zero force, a latched result) is still on its way.
+        # The last messages (a zero force, a latched result) are still to be sent.
         deadline = time.monotonic() + 0.1
         while time.monotonic() < deadline:
             executor.spin_once(timeout_sec=0.02)

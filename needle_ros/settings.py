@@ -62,7 +62,7 @@ def constant(
 
 def check_constants(values: object) -> None:
     """
-    Refuse a numeric field that is not finite or is outside its declared range.
+    Check that every numeric field is finite and in its declared range.
 
     Parameters
     ----------
@@ -72,7 +72,7 @@ def check_constants(values: object) -> None:
     Raises
     ------
     ParameterError
-        Naming the field, the value found, and the valid range with its unit.
+        If one is not; the message names the field, the value and the valid range with its unit.
 
     """
     for item in fields(values):  # type: ignore[arg-type]
@@ -146,7 +146,21 @@ def from_values(
 
 
 def as_number(value: Any) -> Any:
-    """Convert an integer, also in a tuple, to float; return any other value as it is."""
+    """
+    Convert integers to float.
+
+    Parameters
+    ----------
+    value : Any
+        A value, or a tuple of values.
+
+    Returns
+    -------
+    Any
+        The same with floats instead of integers; what is not an integer, or too large, is as it
+        was.
+
+    """
     if isinstance(value, tuple):
         return tuple(as_number(number) for number in value)
     is_integer = isinstance(value, int) and not isinstance(value, bool)
@@ -154,7 +168,22 @@ def as_number(value: Any) -> Any:
 
 
 def unknown_name(name: str, valid: Iterable[str]) -> str:
-    """Return the message for an unknown name, with the nearest valid one or all of them."""
+    """
+    Return the message for an unknown parameter.
+
+    Parameters
+    ----------
+    name : str
+        Its name.
+    valid : iterable of str
+        Valid names.
+
+    Returns
+    -------
+    str
+        The message, with the nearest valid name, or all of them if none is near.
+
+    """
     names = sorted(valid)
     close = get_close_matches(name, names, n=1)
     hint = f'did you mean {close[0]!r}?' if close else f'valid: {", ".join(names)}'

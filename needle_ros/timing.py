@@ -1,4 +1,4 @@
-"""Times as integers of nanoseconds, as stamps have them, and how often something happens."""
+"""Time stamps as integers of nanoseconds, and rates."""
 
 from __future__ import annotations
 
@@ -8,17 +8,43 @@ NANOSECONDS: Final = 1_000_000_000
 
 
 def nanoseconds(time: Any) -> int:
-    """Return a time or duration with ``sec`` and ``nanosec``, as messages have it [ns]."""
+    """
+    Convert a time or a duration of a message.
+
+    Parameters
+    ----------
+    time : builtin_interfaces Time or Duration
+        Whatever has ``sec`` and ``nanosec``.
+
+    Returns
+    -------
+    int
+        Time [ns].
+
+    """
     return int(time.sec) * NANOSECONDS + int(time.nanosec)
 
 
 def seconds(time: Any) -> float:
-    """Return a time or duration with ``sec`` and ``nanosec``, as messages have it [s]."""
+    """
+    Convert a time or a duration of a message.
+
+    Parameters
+    ----------
+    time : builtin_interfaces Time or Duration
+        Whatever has ``sec`` and ``nanosec``.
+
+    Returns
+    -------
+    float
+        Time [s].
+
+    """
     return float(time.sec + time.nanosec / NANOSECONDS)
 
 
-class Window:
-    """How many per second, and which share of them was marked, over the last full second."""
+class RateCounter:
+    """Counts events by the second: how many there were, and which share of them was marked."""
 
     def __init__(self) -> None:
         self._start: int | None = None
@@ -26,7 +52,17 @@ class Window:
         self._rate = self._share = 0.0
 
     def add(self, now: int, marked: bool = False) -> None:
-        """Count one at a time [ns]."""
+        """
+        Count an event.
+
+        Parameters
+        ----------
+        now : int
+            Its time [ns].
+        marked : bool
+            Whether it is marked.
+
+        """
         self._roll(now)
         self._count += 1
         self._marked += marked
@@ -41,11 +77,37 @@ class Window:
         self._start, self._count, self._marked = now, 0, 0
 
     def rate(self, now: int) -> float:
-        """Return the rate [Hz] of the last full second before a time [ns]."""
+        """
+        Return the rate in the last full second.
+
+        Parameters
+        ----------
+        now : int
+            Time [ns].
+
+        Returns
+        -------
+        float
+            Events per second [Hz].
+
+        """
         self._roll(now)
         return self._rate
 
     def share(self, now: int) -> float:
-        """Return the marked part of the last full second before a time [ns]."""
+        """
+        Return which share of the events was marked in the last full second.
+
+        Parameters
+        ----------
+        now : int
+            Time [ns].
+
+        Returns
+        -------
+        float
+            Share, from 0 to 1.
+
+        """
         self._roll(now)
         return self._share

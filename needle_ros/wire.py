@@ -9,7 +9,6 @@ are the same. This takes a tenth of the time that rclpy takes to convert a messa
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from functools import cached_property
 from itertools import count
 import struct
 from typing import Any, Final, NamedTuple
@@ -234,7 +233,7 @@ class Template:
         #: Made when it is first needed: a batch does without.
         self._format: _Format | None = None
 
-    @cached_property
+    @property
     def fixed(self) -> NDArray[np.intp]:
         """Positions of the bytes that a message of this template shares with it."""
         return np.concatenate([np.arange(begin, end) for begin, end in self._fixed])
@@ -300,6 +299,48 @@ class Template:
             self.names,
             tuple([found[block] for block in form.blocks]),
         )
+
+
+class Reader:
+    """
+    Reads the messages of a topic one by one, by the template of the message before.
+
+    Parameters
+    ----------
+    type_name : str
+        One of `TYPES`.
+
+    """
+
+    def __init__(self, type_name: str) -> None:
+        self._type_name = type_name
+        self._template = Template(type_name)
+
+    def read(self, message: bytes) -> Reading:
+        """
+        Read a message.
+
+        Parameters
+        ----------
+        message : bytes
+            The serialized message.
+
+        Returns
+        -------
+        Reading
+            Its content.
+
+        Raises
+        ------
+        MessageError
+            If the bytes are not a message of this type.
+
+        """
+        reading = self._template.read(message)
+        while reading is None:
+            self._template = Template.of(message, self._type_name)
+            reading = self._template.read(message)
+        return reading
 
 
 class _Format:

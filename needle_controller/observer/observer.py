@@ -63,7 +63,7 @@ from needle_dynamics import (
 )
 from needle_dynamics.compiled.kernels import evaluate, evaluate_many
 from needle_dynamics.model import ROUNDING
-from needle_dynamics.simulated.plant import TipParameters
+from needle_dynamics.simulated.tip_sensor import TipParameters
 from needle_ros.errors import (
     NeedleError,
     ParameterError,

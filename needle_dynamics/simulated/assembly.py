@@ -1,74 +1,164 @@
-"""A plant from its constants, whoever runs it: the node, or a recorded run computed anew."""
+"""A simulated plant from its parameters, as a node has them or a recording says them."""
 
 from __future__ import annotations
 
-from typing import Final
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from typing import Any, Final
 
 from needle_dynamics.model import NeedleModel
-from needle_dynamics.parameters import NeedleParameters
-from needle_dynamics.simulated.force_sensor import ForceSensor, ForceSensorParameters
+from needle_dynamics.parameters import NeedleParameters, PRESETS
+from needle_dynamics.simulated.base import BaseMotion, BaseParameters
+from needle_dynamics.simulated.force_sensor import (
+    ForceSensor,
+    ForceSensorParameters,
+    HIGHEST_RATE,
+)
 from needle_dynamics.simulated.indenter import Indenter, IndenterParameters
 from needle_dynamics.simulated.integrators import Integrator
-from needle_dynamics.simulated.plant import (
-    BaseMotion,
-    BaseParameters,
-    Plant,
-    TipParameters,
-    TipSensor,
-)
+from needle_dynamics.simulated.plant import Plant
+from needle_dynamics.simulated.tip_sensor import TipParameters, TipSensor
+from needle_ros.errors import ParameterError
+from needle_ros.settings import check_constants, constant, from_values
 
-#: What a plant stands in for.
+#: What is simulated: a needle that moves under commands, one that a robot moves, an end-effector.
 MODES: Final = ('simulation', 'robot', 'indenter')
 
 
-def assemble(
-    mode: str,
-    *,
-    rate: float,
-    seed: int,
-    step: float,
-    depth: float,
-    tip_deflection: float,
-    force_limit: float,
-    model: NeedleParameters,
-    sensor: ForceSensorParameters,
-    tip: TipParameters,
-    base: BaseParameters,
-    indenter: IndenterParameters,
-) -> Plant | Indenter:
-    """
-    Make a plant at its start.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlantSettings:
+    """Time, start and limits of a simulated plant."""
 
-    Parameters
+    rate: float = constant(
+        1000.0, 'Hz', 'samples per second of simulated time', low=1.0, high=HIGHEST_RATE
+    )
+    real_time_factor: float = constant(
+        1.0, '1', "simulated seconds per second of the node's clock; 0: as fast as possible",
+        high=100.0,
+    )  # fmt: skip
+    depth: float = constant(0.02, 'm', 'inserted length at the start', open_low=True)
+    tip_deflection: float = constant(
+        0.0, 'm', 'deflection of the tip at the start', low=-0.1, high=0.1
+    )
+    step: float = constant(2e-5, 's', 'longest step of the integrator', low=1e-7, high=1e-2)
+    command_timeout: float = constant(
+        0.1, 's', 'age at which a command no longer counts', open_low=True
+    )
+    force_limit: float = constant(1e3, 'N', 'largest force that a command may ask for')
+    torque_limit: float = constant(1.0, 'N m', 'largest torque that a command may ask for')
+    backlog: float = constant(0.5, 's', 'delay that is made up after a stall', open_low=True)
+
+    def __post_init__(self) -> None:
+        check_constants(self)
+
+
+#: Parameters by namespace, as settings with their default values.
+SETTINGS: Final[Mapping[str, Any]] = {
+    '': PlantSettings(),
+    'model.': NeedleParameters(),
+    'sensor.': ForceSensorParameters(),
+    'tip.': TipParameters(),
+    'base.': BaseParameters(),
+    'indenter.': IndenterParameters(),
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlantConstants:
+    """
+    All constants of a simulated plant.
+
+    Attributes
     ----------
     mode : str
         One of `MODES`.
-    rate : float
-        Samples per second [Hz].
     seed : int
         Seed of all noise.
-    step : float
-        Longest step of the integrator [s].
-    depth, tip_deflection : float
-        Inserted length and deflection of the tip at the start [m].
-    force_limit : float
-        Largest force of a push or press [N].
-    model, sensor, tip, base, indenter
-        Constants.
-
-    Raises
-    ------
-    ParameterError
-        If they do not go together.
-    InsertedLengthError
-        If the needle cannot be there.
+    own : PlantSettings
+        Time, start and limits.
+    model : NeedleParameters
+        Needle and tissue.
+    sensor : ForceSensorParameters
+        Force sensor.
+    tip : TipParameters
+        Sensor of the tip.
+    base : BaseParameters
+        Robot of mode `robot`.
+    indenter : IndenterParameters
+        Tissue and robot of mode `indenter`.
 
     """
-    felt = ForceSensor(sensor, rate, seed)
-    seen = TipSensor(tip, rate, seed)
-    if mode == 'indenter':
-        return Indenter(indenter, felt, rate, seed, force_limit)
-    state = NeedleModel(model).state_at(depth, tip_deflection)
-    reach = model.minimum_depth, model.length
-    carried = BaseMotion(base, depth, reach, force_limit) if mode == 'robot' else None
-    return Plant(Integrator(model, state, step), felt, rate, carried, seen)
+
+    mode: str
+    seed: int
+    own: PlantSettings
+    model: NeedleParameters
+    sensor: ForceSensorParameters
+    tip: TipParameters
+    base: BaseParameters
+    indenter: IndenterParameters
+
+    @classmethod
+    def of(cls, values: Mapping[str, Any]) -> PlantConstants:
+        """
+        Take the constants from the parameters of a plant.
+
+        Parameters
+        ----------
+        values : Mapping[str, Any]
+            Parameters by name, such as ``sensor.rate``; others than those of a plant do not
+            matter. A constant that is not there has its default, in ``model.preset`` if there is
+            one.
+
+        Returns
+        -------
+        PlantConstants
+            The constants.
+
+        Raises
+        ------
+        ParameterError
+            If a value is not valid; the message names the parameter.
+
+        """
+        mode, preset = values.get('mode', MODES[0]), values.get('model.preset', 'paper_si')
+        for name, value, valid in (('mode', mode, MODES), ('model.preset', preset, PRESETS)):
+            if value not in valid:
+                raise ParameterError(f'{name} must be one of {", ".join(valid)}, got {value!r}')
+        made = {}
+        for prefix, defaults in SETTINGS.items():
+            names = {item.name: f'{prefix}{item.name}' for item in fields(defaults)}
+            given = {name: values[full] for name, full in names.items() if full in values}
+            if prefix == 'model.':
+                given = {**asdict(PRESETS[preset]), **given}
+            made[prefix.rstrip('.') or 'own'] = from_values(type(defaults), given, prefix)
+        return cls(mode=mode, seed=values.get('seed', 1), **made)
+
+    def make(self) -> Plant | Indenter:
+        """
+        Make the plant at its start.
+
+        Returns
+        -------
+        Plant or Indenter
+            The plant.
+
+        Raises
+        ------
+        ParameterError
+            If the constants do not go together.
+        InsertedLengthError
+            If the needle cannot be there.
+
+        """
+        own, rate = self.own, self.own.rate
+        sensor = ForceSensor(self.sensor, rate, self.seed)
+        tip = TipSensor(self.tip, rate, self.seed)
+        if self.mode == 'indenter':
+            return Indenter(self.indenter, sensor, rate, self.seed, own.force_limit)
+        state = NeedleModel(self.model).state_at(own.depth, own.tip_deflection)
+        base = None
+        if self.mode == 'robot':
+            depths = self.model.minimum_depth, self.model.length
+            base = BaseMotion(self.base, own.depth, depths, own.force_limit)
+        return Plant(Integrator(self.model, state, own.step), sensor, rate, base, tip)

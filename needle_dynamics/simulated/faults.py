@@ -1,4 +1,4 @@
-"""Faults of a measurement on its way: what a sensor, its cable or its driver may do to it."""
+"""Faults of measurements, as a sensor, its cable or its driver may have."""
 
 from __future__ import annotations
 
@@ -8,19 +8,26 @@ from dataclasses import dataclass
 from math import ceil, nan
 from typing import Final, TypeAlias
 
-from needle_ros.errors import (
-    ParameterError,
-)
+from needle_ros.contract import BASE_WRENCH, JOINT_STATES, TIP_DEFLECTION
+from needle_ros.errors import ParameterError
 from needle_ros.settings import check_constants, constant
 import numpy as np
 
 #: Stamp [ns] and values of a measurement.
 Reading: TypeAlias = tuple[int, list[float]]
 
+#: Topics that a fault can hit, and which of their values a bias or a saturation changes: the
+#: position, force and torque, and the deflection.
+FAULTY: Final[Mapping[str, Sequence[int]]] = {
+    JOINT_STATES.name: (0,),
+    BASE_WRENCH.name: range(6),
+    TIP_DEFLECTION.name: (2,),
+}
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FaultParameters:
-    """How often, how late, how much."""
+    """Probability, delay and size of a fault."""
 
     probability: float = constant(1.0, '1', 'part of the measurements that the fault hits', high=1)
     delay: float = constant(0.05, 's', 'how much later delayed measurements leave', high=10.0)
@@ -77,10 +84,20 @@ class Fault:
         return bool(self._waiting)
 
     def later(self, calls: int, reading: Reading) -> None:
-        """Let a measurement leave so many calls from now."""
+        """
+        Hold a measurement back.
+
+        Parameters
+        ----------
+        calls : int
+            Number of calls of `leaves` after which it leaves.
+        reading : (int, list of float)
+            Its stamp [ns] and values.
+
+        """
         self._waiting.append((self._calls + calls, reading))
 
-    def leaves(self, stamp: int, values: Sequence[float], biased: int) -> list[Reading]:
+    def leaves(self, stamp: int, values: Sequence[float], biased: Sequence[int]) -> list[Reading]:
         """
         Pass a measurement on.
 
@@ -90,8 +107,8 @@ class Fault:
             Its time [ns].
         values : sequence of float
             Its values.
-        biased : int
-            How many of the values, from the first, a bias or saturation changes.
+        biased : sequence of int
+            Which of the values a bias or saturation changes.
 
         Returns
         -------
@@ -108,20 +125,20 @@ class Fault:
         return now
 
 
-def _drop(_fault: Fault, _reading: Reading, _biased: int) -> list[Reading]:
+def _drop(_fault: Fault, _reading: Reading, _biased: Sequence[int]) -> list[Reading]:
     return []
 
 
-def _delay(fault: Fault, reading: Reading, _biased: int) -> list[Reading]:
+def _delay(fault: Fault, reading: Reading, _biased: Sequence[int]) -> list[Reading]:
     fault.later(fault.late, reading)
     return []
 
 
-def _duplicate(_fault: Fault, reading: Reading, _biased: int) -> list[Reading]:
+def _duplicate(_fault: Fault, reading: Reading, _biased: Sequence[int]) -> list[Reading]:
     return [reading, reading]
 
 
-def _reorder(fault: Fault, reading: Reading, _biased: int) -> list[Reading]:
+def _reorder(fault: Fault, reading: Reading, _biased: Sequence[int]) -> list[Reading]:
     # What waits leaves after the next one, which then does not wait.
     if fault.has_waiting:
         return [reading]
@@ -129,29 +146,32 @@ def _reorder(fault: Fault, reading: Reading, _biased: int) -> list[Reading]:
     return []
 
 
-def _freeze(fault: Fault, reading: Reading, _biased: int) -> list[Reading]:
+def _freeze(fault: Fault, reading: Reading, _biased: Sequence[int]) -> list[Reading]:
     if fault.frozen is None:
         fault.frozen = reading[1]
     return [(reading[0], list(fault.frozen))]
 
 
-def _bias(fault: Fault, reading: Reading, biased: int) -> list[Reading]:
-    size, (stamp, values) = fault.parameters.size, reading
-    return [(stamp, [value + size for value in values[:biased]] + values[biased:])]
+def _bias(fault: Fault, reading: Reading, biased: Sequence[int]) -> list[Reading]:
+    return [_changed(reading, biased, lambda value: value + fault.parameters.size)]
 
 
-def _nan(_fault: Fault, reading: Reading, _biased: int) -> list[Reading]:
+def _nan(_fault: Fault, reading: Reading, _biased: Sequence[int]) -> list[Reading]:
     return [(reading[0], [nan] * len(reading[1]))]
 
 
-def _saturate(fault: Fault, reading: Reading, biased: int) -> list[Reading]:
-    bound, (stamp, values) = abs(fault.parameters.size), reading
-    kept = [min(max(value, -bound), bound) for value in values[:biased]]
-    return [(stamp, kept + values[biased:])]
+def _saturate(fault: Fault, reading: Reading, biased: Sequence[int]) -> list[Reading]:
+    bound = abs(fault.parameters.size)
+    return [_changed(reading, biased, lambda value: min(max(value, -bound), bound))]
+
+
+def _changed(reading: Reading, which: Sequence[int], change: Callable[[float], float]) -> Reading:
+    stamp, values = reading
+    return stamp, [change(value) if k in which else value for k, value in enumerate(values)]
 
 
 #: What a fault does to a measurement that it hits, by name.
-FAULTS: Final[Mapping[str, Callable[[Fault, Reading, int], list[Reading]]]] = {
+FAULTS: Final[Mapping[str, Callable[[Fault, Reading, Sequence[int]], list[Reading]]]] = {
     'drop': _drop,
     'delay': _delay,
     'duplicate': _duplicate,

@@ -8,13 +8,15 @@ from itertools import pairwise
 from math import hypot
 
 from needle_dynamics.arrays import FloatArray
+from needle_dynamics.simulated.base import on_grid
 from needle_dynamics.simulated.force_sensor import ForceSensor
-from needle_dynamics.simulated.plant import AT_REST, check_times, joint_values, on_grid
+from needle_dynamics.simulated.plant import AT_REST
 from needle_ros.errors import (
     JobError,
     ParameterError,
 )
 from needle_ros.settings import check_constants, constant
+from needle_ros.trajectories import check_times, joint_values
 import numpy as np
 
 #: Joints of the indenter's trajectories, the axes of the plane.
@@ -238,7 +240,12 @@ class Indenter:
 
     def advance(self, _force: float = 0.0, _torque: float = 0.0) -> Press:
         """
-        Advance by one sample interval; a commanded wrench does not count.
+        Advance by one sample interval; commands do not act on the end-effector.
+
+        Parameters
+        ----------
+        _force, _torque : float
+            Not used: they let an indenter stand for a `Plant`.
 
         Returns
         -------

@@ -1,229 +1,151 @@
-"""A recorded run of a plant: its parameters, what was commanded, what was measured, by sample."""
+"""What a bag says of a plant: what was done to it and what it measured, by number of sample."""
 
 from __future__ import annotations
 
-from bisect import bisect_right
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from bisect import bisect_left, bisect_right
+from collections import Counter, defaultdict
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field, fields
-from itertools import pairwise
-from math import inf, isfinite
+from dataclasses import fields
+from itertools import chain, pairwise
+import json
+from math import inf
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-from needle_dynamics import (
-    ForceSensorParameters,
-    NeedleError,
-    NeedleParameters,
-    PRESETS,
-)
-from needle_dynamics.simulated.assembly import assemble
-from needle_dynamics.simulated.indenter import Indenter, IndenterParameters
-from needle_dynamics.simulated.plant import BaseParameters, Plant, TipParameters
+from needle_dynamics import FloatArray, NeedleError
+from needle_dynamics.simulated.assembly import SETTINGS
+from needle_dynamics.simulated.run import CONFIGURED, Event, PARAMETERS, PlantRun, TRAJECTORY
 from needle_identification import Bag, deserialize, RecordingError, Topic
-from needle_ros.settings import as_number
-from needle_ros.timing import NANOSECONDS, nanoseconds
+from needle_ros.contract import TIP_DEFLECTION, TOPICS
+from needle_ros.errors import MessageError
+from needle_ros.timing import NANOSECONDS, nanoseconds, seconds
+from needle_ros.wire import Reader, TYPES
+import numpy as np
+from numpy.typing import NDArray
 import yaml
 
-#: The numbers of a message.
-Values = tuple[float, ...]
+#: Message types by the last part of the name of a topic.
+_TYPES: Final = {topic.name.rpartition('/')[2]: topic.type_name for topic in TOPICS}
 
-#: Parameters by name, and when they were recorded [ns].
-Configurations = list[tuple[int, dict[str, Any]]]
+#: What is read beside measurements and commands.
+_OTHERS: Final = ('configuration', 'events', 'joint_trajectory')
 
+#: Parameters without which a plant cannot be made again.
+_NEEDED: Final = ('mode', 'seed', 'rate', 'step', 'depth', 'force_limit', 'command_timeout')
 
-class Quantity(NamedTuple):
-    """A number of a topic: its name, unit and, if it is rounded to counts, its resolution."""
-
-    name: str
-    unit: str
-    resolution: float = 0.0
+#: Messages of a topic, each with the time at which it was recorded [ns].
+_Messages = list[tuple[int, Any]]
 
 
-@dataclass(frozen=True, slots=True)
-class Command:
-    """Forces commanded, and the stamp of the sample that they answer [ns]."""
-
-    stamp: int
-    force: float = 0.0
-    torque: float = 0.0
-
-
-@dataclass(frozen=True, slots=True)
-class Event:
-    """A trajectory, or parameters that changed, and the sample before which it was recorded."""
-
-    kind: str
-    content: Any
-    near: int
-
-
-@dataclass(slots=True)
-class Entry:
-    """A sample: its stamp [ns], sample intervals since the one before, and what was recorded."""
-
-    stamp: int
-    gap: int = 1
-    rows: dict[str, list[Values]] = field(default_factory=dict)
-
-
-def configurations(path: Path) -> dict[str, Configurations]:
+def recorded_runs(path: Path) -> list[RecordedRun]:
     """
-    Return what the plants in a bag said of their parameters, by their names.
+    Read the runs of all plants in a bag.
+
+    Parameters
+    ----------
+    path : Path
+        The bag.
+
+    Returns
+    -------
+    list of RecordedRun
+        One for each plant.
 
     Raises
     ------
     RecordingError
-        If the bag is not readable or holds none.
+        If the bag is not readable or has no plant, or lacks what is needed.
 
     """
-    plants: dict[str, Configurations] = {}
-    for _, received, message in _messages(Bag(path), lambda name: name.endswith('/configuration')):
-        # Some other text.
-        with suppress(yaml.YAMLError, AttributeError, KeyError, TypeError):
-            for name, node in yaml.safe_load(message.data).items():
-                values = node['ros__parameters']
-                if 'mode' in values and 'sensor.force_noise' in values:
-                    plants.setdefault(str(name), []).append((received, values))
-    if not plants:
+    bag, invalid = Bag(path), Counter[str]()
+    messages: dict[str, _Messages] = defaultdict(list)
+    readers: dict[str, Reader] = {}
+
+    def wanted(topic: Topic) -> bool:
+        kind = topic.name.rpartition('/')[2]
+        return _TYPES.get(kind) == topic.type_name and (
+            kind in _OTHERS or topic.type_name in TYPES
+        )
+
+    for received, topic, data in bag.messages(wanted):
+        name, kind = topic.name, topic.type_name
+        try:
+            if kind in TYPES:
+                message = readers.setdefault(name, Reader(kind)).read(data)
+            else:
+                message = deserialize(topic, data)
+            messages[name].append((received, message))
+        except (MessageError, RecordingError):
+            invalid[name] += 1
+    losses = [*bag.losses, *(f'{n} messages of {name} are invalid' for name, n in invalid.items())]
+    plants = [name for name in messages if name.endswith('/configuration')]
+    runs = [
+        RecordedRun(path, name.rpartition('/')[0], messages, losses)
+        for name in plants
+        if _configurations(messages[name])
+    ]
+    if not runs:
         raise RecordingError(
             f'{path} holds no parameters of a plant; record /plant/configuration with the rest'
         )
-    return plants
+    return runs
 
 
-def _messages(bag: Bag, wanted: Callable[[str], bool]) -> Iterator[tuple[str, int, Any]]:
-    """Yield topic, receive time [ns] and decoded message."""
-    for received, topic, data in bag.messages(lambda known: wanted(known.name)):
-        yield topic.name, received, _decoded(bag, topic, data)
+def _configurations(messages: _Messages) -> list[tuple[int, dict[str, Any]]]:
+    """Read the parameters of a plant, and when they were recorded [ns]."""
+    found = []
+    for received, message in messages:
+        # Some other text, or another node.
+        with suppress(yaml.YAMLError, AttributeError, KeyError, TypeError):
+            for node in yaml.safe_load(message.data).values():
+                values = node['ros__parameters']
+                if 'mode' in values and 'sensor.force_noise' in values:
+                    found.append((received, values))
+    return found
 
 
-def _decoded(bag: Bag, topic: Topic, data: bytes) -> Any:
-    try:
-        return deserialize(topic, data)
-    except RecordingError as error:
-        raise RecordingError(f'{bag.path}: a message of {topic.name} {error}') from error
+def _events(messages: _Messages) -> list[tuple[int, int, Event]]:
+    """Read events, with stamp [ns] and number of the sample from which each counts."""
+    found = []
+    for _, message in messages:
+        for status in message.status:
+            # Some other diagnostics.
+            with suppress(ValueError, KeyError):
+                content = {item.key: json.loads(item.value) for item in status.values}
+                number = int(content.pop('sample'))
+                event = Event(status.message, content)
+                found.append((nanoseconds(message.header.stamp), number, event))
+    return found
 
 
-#: Constants that the parameters of a plant hold, by prefix.
-_KINDS: Final[Mapping[str, Any]] = {
-    'model.': NeedleParameters,
-    'sensor.': ForceSensorParameters,
-    'tip.': TipParameters,
-    'base.': BaseParameters,
-    'indenter.': IndenterParameters,
-}
-
-
-def settings(prefix: str, values: Mapping[str, Any]) -> Any:
-    """Make constants from parameters; what the recording does not know is as it is by default."""
-    kind = _KINDS[prefix]
-    given: dict[str, Any] = {}
-    for item in fields(kind):
-        value = values.get(prefix + item.name)
-        if value is not None:
-            value = tuple(value) if isinstance(value, list) else value
-            given[item.name] = as_number(value) if 'unit' in item.metadata else value
-    if prefix == 'model.' and values.get('model.preset') in PRESETS:
-        return NeedleParameters.preset(values['model.preset'], **given)
-    return kind(**given)
-
-
-def _foreign(values: Mapping[str, Any]) -> list[str]:
-    """Name the constants that only the recording has, or only this version."""
-    known = {
-        f'{prefix}{item.name}' for prefix, kind in _KINDS.items() for item in fields(kind)
-    } | {'model.preset'}
-    given = {name for name in values if name.startswith(tuple(_KINDS))}
-    # An empty list cannot be in a parameter file: then it is the default.
-    lacking = {
-        name
-        for name in known - given - {'model.preset'}
-        if getattr(settings(f'{name.partition(".")[0]}.', {}), name.partition('.')[2]) != ()
+def _trajectory(message: Any) -> Event:
+    points = message.points
+    content = {
+        'joints': list(message.joint_names),
+        'times': [seconds(point.time_from_start) for point in points],
+        'positions': [point.positions.tolist() for point in points],
+        'efforts': [point.effort.tolist() for point in points],
     }
-    return [
-        f'{words} {", ".join(sorted(names))}'
-        for words, names in (('with', given - known), ('without', lacking))
-        if names
-    ]
+    return Event(TRAJECTORY, content)
 
 
-def plant_from(values: Mapping[str, Any]) -> Plant | Indenter:
+class Rows(NamedTuple):
     """
-    Make the plant that parameters describe.
+    Messages of a topic, in the order of the samples.
 
-    Parameters
+    Attributes
     ----------
-    values : mapping
-        Parameters of the node by name.
-
-    Raises
-    ------
-    ParameterError
-        If one is not valid.
-    KeyError
-        If one is missing.
+    numbers, stamps : ndarray, shape (n,)
+        Numbers of the samples, from 1, and stamps [ns].
+    values : ndarray, shape (n, k)
+        Numbers of the messages, nan for those that an older plant did not publish.
 
     """
-    return assemble(
-        values['mode'],
-        rate=float(values['rate']),
-        seed=values['seed'],
-        step=float(values['step']),
-        depth=float(values['depth']),
-        tip_deflection=float(values['tip_deflection']),
-        force_limit=float(values['force_limit']),
-        model=settings('model.', values),
-        sensor=settings('sensor.', values),
-        tip=settings('tip.', values),
-        base=settings('base.', values),
-        indenter=settings('indenter.', values),
-    )
 
-
-def _vector(vector: Any) -> Values:
-    return float(vector.x), float(vector.y), float(vector.z)
-
-
-#: Outputs of a plant, and how their numbers are taken.
-_OUTPUTS: Final[Mapping[str, Callable[[Any], Values]]] = {
-    'joint_states': lambda m: tuple(map(float, (*m.position, *m.velocity, *m.effort))),
-    'base_wrench': lambda m: (*_vector(m.wrench.force), *_vector(m.wrench.torque)),
-    'tip_deflection': lambda m: (float(m.point.y), float(m.point.z)),
-    'ground_truth': lambda m: tuple(map(float, (*m.position, *m.velocity))),
-    'end_effector_pose': lambda m: _vector(m.pose.position),
-}
-
-
-def _named(values: Mapping[str, Any], plant: Plant | Indenter) -> dict[str, list[Quantity]]:
-    """Name the numbers of each output."""
-    counts = settings('sensor.', values).per_axis('resolution').tolist()
-    axes = [f'{kind}.{axis}' for kind in ('force', 'torque') for axis in 'xyz']
-    units = ['N'] * 3 + ['N m'] * 3
-    wrench = [Quantity(*each) for each in zip(axes, units, counts, strict=True)]
-    if isinstance(plant, Indenter):
-        count = settings('indenter.', values).encoder_resolution
-        pose = [Quantity(f'position.{axis}', 'm', count) for axis in 'xyz']
-        return {'base_wrench': wrench, 'end_effector_pose': pose}
-    count = plant.base.limits.encoder_resolution if plant.base is not None else 0.0
-    names = plant.integrator.model.coordinate_names
-    kinds = ['m', 'rad', *['m^1.5'] * (len(names) - 2)]
-    return {
-        'joint_states': [
-            Quantity('position of insertion', 'm', count),
-            Quantity('position of rotation', 'rad'),
-            Quantity('velocity of insertion', 'm/s'),
-            Quantity('velocity of rotation', 'rad/s'),
-            Quantity('effort of insertion', 'N'),
-            Quantity('effort of rotation', 'N m'),
-        ],
-        'base_wrench': wrench,
-        'tip_deflection': [Quantity('point.y', 'm'), Quantity('point.z', 'm')],
-        'ground_truth': [
-            *(Quantity(name, unit) for name, unit in zip(names, kinds, strict=True)),
-            *(Quantity(f'{name} rate', f'{u}/s') for name, u in zip(names, kinds, strict=True)),
-        ],
-    }
+    numbers: NDArray[np.int64]
+    stamps: NDArray[np.int64]
+    values: FloatArray
 
 
 class RecordedRun:
@@ -236,194 +158,167 @@ class RecordedRun:
         The bag.
     name : str
         Full name of the plant.
-    configurations : sequence
-        Its parameters.
+    messages : mapping
+        Messages of the bag by topic, each with the time at which it was recorded [ns].
+    losses : list of str
+        What is broken in the bag.
 
     Attributes
     ----------
     values : dict
-        Its first parameters by name.
-    mode : str
-        What it stood in for.
-    rate, period, timeout : float
-        Samples per second [Hz], time from one to the next [ns], age at which a command no longer
-        counts [ns].
+        Parameters at the start, by name.
+    constants : PlantConstants
+        Constants at the start.
     topics : dict
-        Kind of output by topic.
-    quantities : dict
-        What the numbers of each topic are.
+        Topics of the plant by full name.
     rows : dict
-        Stamps [ns] and numbers of each topic, as recorded.
-    entries : list of Entry
-        The same by sample, but for the tip.
-    tips : dict
-        Numbers of the tip by stamp.
-    commands : list of Command
-        In the order in which they count.
-    events : list of Event
-        What else was asked of it, in order.
-    losses, missing, foreign : list of str
-        What is broken in the bag, topics without messages, parameters of another version.
+        Messages of each topic that has any.
+    numbers : list of int
+        Numbers of the samples of which something is in the bag.
+    events : dict
+        What was done, by the number of the sample from which it counts.
+    commands : dict
+        Stamp [ns], frame, force [N] and torque [N m] of the commands, by the number of the
+        sample after which they came.
+    notes : list of str
+        What is broken in the bag, and what it does not say.
     faults : str
         Faults that were switched on, '' for none.
 
     Raises
     ------
     RecordingError
-        If the bag is not readable, a parameter is missing or not valid, or nothing was measured.
+        If a parameter is missing or not valid, or nothing was measured.
 
     """
 
-    def __init__(self, path: Path, name: str, configurations: Configurations) -> None:
+    def __init__(
+        self, path: Path, name: str, messages: Mapping[str, _Messages], losses: list[str]
+    ) -> None:
         self.path, self.name = path, name
-        self.values = dict(configurations[0][1])
+        space = name.rpartition('/')[0]
+        configurations = _configurations(messages[f'{name}/configuration'])
+        said = _events(messages.get(f'{name}/events', []))
+        made = (event.content for _, _, event in said if event.kind == CONFIGURED)
+        self.values = dict(next(made, configurations[0][1]))
+        lacking = next((name for name in _NEEDED if name not in self.values), None)
+        if lacking:
+            raise RecordingError(f'{path}: the parameters of {name} lack {lacking!r}')
         try:
-            plant = plant_from(self.values)
-            self.rate = float(self.values['rate'])
-            self.timeout = NANOSECONDS * float(self.values['command_timeout'])
-            self.mode = str(self.values['mode'])
-        except KeyError as error:
-            raise RecordingError(f'{path}: the parameters of {name} lack {error}') from error
+            plant = PlantRun(self.values)
         except NeedleError as error:
             raise RecordingError(f'{path}: the parameters of {name}: {error}') from error
-        self.period = NANOSECONDS / self.rate
-        self.foreign = _foreign(self.values)
-        self.faults = _faults(configurations)
-        named = _named(self.values, plant)
-        space = name.rpartition('/')[0]
-        self.topics = {f'{space}/{kind}': kind for kind in named}
-        self.quantities = {f'{space}/{kind}': numbers for kind, numbers in named.items()}
-        self.rows: dict[str, list[tuple[int, Values]]] = {topic: [] for topic in self.topics}
-        self.tips: dict[int, list[Values]] = {}
-        self.losses: list[str] = []
-        #: When samples came, and which [ns].
+        self.constants = plant.constants
+        self.topics = {f'{space}/{topic.name}': topic for topic in plant.topics.values()}
+        self._period = NANOSECONDS / self.constants.own.rate
+        #: Stamps [ns] and numbers of samples, from which those of others follow.
+        self._anchors = [(stamp, number) for stamp, number, _ in said]
+        #: When samples were recorded [ns], and their numbers.
         self._arrivals: list[tuple[int, int]] = []
-        asked = self._read(space)
-        self.missing = [topic for topic, found in self.rows.items() if not found]
-        self.entries = self._samples()
-        self.commands = self._commanded(asked)
-        self.events = self._happened(asked, configurations)
+        self.rows = self._measured(messages)
+        self.numbers = sorted({number for _, number in self._arrivals})
+        trajectories = messages.get(f'{space}/joint_trajectory', [])
+        done = [(number, event) for _, number, event in said]
+        self.events: dict[int, list[Event]] = defaultdict(list)
+        for number, event in done or self._guessed(configurations, trajectories):
+            self.events[number].append(event)
+        self.commands: dict[int, list[tuple[int, str, float, float]]] = defaultdict(list)
+        for received, (stamp, frame, _, (values,)) in messages.get(f'{space}/wrench_command', []):
+            number = self._number(stamp) if stamp else self._newest(received)
+            self.commands[number].append((stamp, frame, values[1], values[3]))
+        faults = {
+            f'fault.kind = {values["fault.kind"]} on {values.get("fault.topic")}'
+            for _, values in configurations
+            if values.get('fault.kind', 'none') != 'none'
+        }
+        self.faults = ' and '.join(sorted(faults))
+        self.notes = [*losses, *self._unsaid(has_events=bool(said))]
 
-    def _read(self, space: str) -> list[tuple[int, str, Any]]:
-        """Read what was measured; return what was asked: receive time [ns], kind, message."""
-        kinds = ('wrench_command', 'joint_trajectory')
-        asked = {f'{space}/{kind}': kind for kind in kinds}
-        bag = Bag(self.path)
-        found: list[tuple[int, str, Any]] = []
-        for topic, received, message in _messages(bag, {*self.topics, *asked}.__contains__):
-            if topic in asked:
-                found.append((received, asked[topic], message))
-                continue
-            kind = self.topics[topic]
-            stamp, values = nanoseconds(message.header.stamp), _OUTPUTS[kind](message)
-            if len(values) != len(self.quantities[topic]):
-                raise RecordingError(
-                    f'{self.path}: {topic} holds {len(values)} numbers, a plant in mode '
-                    f'{self.mode} says {len(self.quantities[topic])}'
-                )
-            self.rows[topic].append((stamp, values))
-            if kind == 'tip_deflection':
-                self.tips.setdefault(stamp, []).append(values)
-            else:
-                self._arrivals.append((received, stamp))
-        self.losses += bag.losses
-        if not self._arrivals:
-            listing = ', '.join(t for t, kind in self.topics.items() if kind != 'tip_deflection')
-            raise RecordingError(f'{self.path} holds nothing that was measured; record {listing}')
-        return found
+    def _measured(self, messages: Mapping[str, _Messages]) -> dict[str, Rows]:
+        """Put the measurements in the order of the samples."""
+        sampled = [name for name in self.topics if not name.endswith(TIP_DEFLECTION.name)]
+        stamps = [reading.stamp for name in sampled for _, reading in messages.get(name, [])]
+        if not stamps:
+            raise RecordingError(
+                f'{self.path} holds nothing that was measured; record {", ".join(sampled)}'
+            )
+        self._anchors = self._anchors or [(min(stamps), 1)]
+        rows = {}
+        for name, topic in self.topics.items():
+            found, width = [], len(topic.quantities)
+            for received, reading in messages.get(name, []):
+                values = [*chain(*reading.values)]
+                if len(values) not in (width, 2 * len(topic.joints)):
+                    raise RecordingError(
+                        f'{self.path}: {name} holds {len(values)} numbers, a plant in mode '
+                        f'{self.constants.mode} says {width}'
+                    )
+                number = self._number(reading.stamp)
+                if name in sampled:
+                    self._arrivals.append((received, number))
+                values += [np.nan] * (width - len(values))
+                found.append((number, reading.stamp, values))
+            if found:
+                numbers, times, table = zip(*sorted(found, key=lambda row: row[0]), strict=True)
+                rows[name] = Rows(np.array(numbers), np.array(times), np.array(table))
+        self._arrivals.sort()
+        return rows
 
-    def _samples(self) -> list[Entry]:
-        """Gather what was recorded of each sample, in the order of the stamps."""
-        entries: dict[int, Entry] = {}
-        for topic, found in self.rows.items():
-            # A message of the tip is about an earlier sample than the one it leaves with.
-            for stamp, values in found if self.topics[topic] != 'tip_deflection' else ():
-                entry = entries.setdefault(stamp, Entry(stamp))
-                entry.rows.setdefault(topic, []).append(values)
-        ordered = [entries[stamp] for stamp in sorted(entries)]
-        for early, late in pairwise(ordered):
-            late.gap = max(1, round((late.stamp - early.stamp) / self.period))
-        return ordered
+    def _number(self, stamp: int) -> int:
+        """Return the number of the sample of a stamp [ns]."""
+        begin, number = self._anchors[max(bisect_right(self._anchors, (stamp, inf)) - 1, 0)]
+        return number + round((stamp - begin) / self._period)
 
-    def _newest(self, received: int) -> int | None:
-        """Return the stamp of the sample that came last before a message [ns]."""
-        k = bisect_right(self._arrivals, (received, -1))
-        return self._arrivals[k - 1][1] if k else None
-
-    def _commanded(self, asked: Sequence[tuple[int, str, Any]]) -> list[Command]:
-        """Return the forces commanded, without those that a newer one had overtaken."""
-        limits = [float(self.values.get(f'{n}_limit', inf)) for n in ('force', 'torque')]
-        commands: list[Command] = []
-        for received, kind, message in asked:
-            if kind == 'joint_trajectory':
-                continue
-            # Without a stamp it counts from when it came.
-            stamp = nanoseconds(message.header.stamp) or self._newest(received) or 0
-            if not commands or stamp >= commands[-1].stamp:
-                commands.append(_command(stamp, message, limits))
-        return commands
-
-    def _happened(
-        self, asked: Sequence[tuple[int, str, Any]], configurations: Configurations
-    ) -> list[Event]:
-        """Return trajectories and changes of parameters, and where among the samples they came."""
-        found: list[tuple[int, str, Any]] = []
-        if self.mode != 'simulation':
-            found += [(at, kind, m) for at, kind, m in asked if kind == 'joint_trajectory']
-        for (_, before), (at, after) in pairwise(configurations):
-            if _without_faults(before) != _without_faults(after):
-                found.append((at, 'configuration', (before, after)))
-        found.sort(key=lambda event: event[0])
-        stamps = [entry.stamp for entry in self.entries]
-        events = []
-        for at, kind, content in found:
-            newest = self._newest(at)
-            near = 0 if newest is None else bisect_right(stamps, newest)
-            events.append(Event(kind, content, near))
-        return events
-
-    def limits(self, part: float) -> dict[str, list[float]]:
+    def stamp(self, number: int) -> int:
         """
-        Return the largest difference allowed of each number of each topic.
+        Return the time of a sample.
 
         Parameters
         ----------
-        part : float
-            Part of the largest value of the same topic and unit; a count comes on top.
+        number : int
+            Number of the sample.
+
+        Returns
+        -------
+        int
+            Its stamp [ns], to a nanosecond.
 
         """
-        limits = {}
-        for topic, found in self.rows.items():
-            largest: dict[str, float] = {}
-            for k, quantity in enumerate(self.quantities[topic]):
-                sizes = (abs(values[k]) for _, values in found if isfinite(values[k]))
-                largest[quantity.unit] = max(largest.get(quantity.unit, 0.0), *sizes, 0.0)
-            limits[topic] = [
-                # A count is the difference of two rounded numbers.
-                part * largest[q.unit] + (1.0 + 1e-6) * q.resolution
-                for q in self.quantities[topic]
-            ]
-        return limits
+        after = bisect_right(self._anchors, number, key=lambda anchor: anchor[1])
+        begin, known = self._anchors[max(after - 1, 0)]
+        return begin + round((number - known) * self._period)
 
+    def _newest(self, received: int) -> int:
+        """Return the number of the newest sample when a message was recorded, 0 for none."""
+        before = self._arrivals[: bisect_left(self._arrivals, (received, 0))]
+        return max((number for _, number in before), default=0)
 
-def _command(stamp: int, message: Any, limits: Sequence[float]) -> Command:
-    """Return the forces of a message; none for one that a plant refuses."""
-    force, torque = message.wrench.force.y, message.wrench.torque.x
-    if abs(force) <= limits[0] and abs(torque) <= limits[1]:
-        return Command(stamp, force, torque)
-    return Command(stamp)
+    def _guessed(
+        self, configurations: list[tuple[int, dict[str, Any]]], trajectories: _Messages
+    ) -> Iterator[tuple[int, Event]]:
+        """Yield what was done to a plant that did not say so, with the sample after it came."""
+        found = [(received, _trajectory(message)) for received, message in trajectories]
+        if self.constants.mode == 'simulation':
+            found.clear()
+        for (_, old), (received, new) in pairwise(configurations):
+            changes = {name: new[name] for name in new if new[name] != old.get(name)}
+            found.append((received, Event(PARAMETERS, changes)))
+        for received, event in sorted(found, key=lambda each: each[0]):
+            yield self._newest(received) + 1, event
 
-
-def _without_faults(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Leave out what does not reach the plant, but what it measures."""
-    return {name: value for name, value in values.items() if not name.startswith('fault.')}
-
-
-def _faults(configurations: Sequence[tuple[int, Mapping[str, Any]]]) -> str:
-    """Name the faults that were switched on."""
-    found = {
-        f'fault.kind = {values["fault.kind"]} on {values.get("fault.topic")}'
-        for _, values in configurations
-        if values.get('fault.kind', 'none') != 'none'
-    }
-    return ' and '.join(sorted(found))
+    def _unsaid(self, *, has_events: bool) -> Iterator[str]:
+        """Say what the bag does not say."""
+        if not has_events:
+            yield (
+                f'{self.name}/events is not in the bag: trajectories and changes of parameters '
+                'are taken to count from the sample after they were recorded'
+            )
+        missing = [topic for topic in self.topics if topic not in self.rows]
+        if missing:
+            yield f'not in the bag: {", ".join(missing)}'
+        known = {f'{prefix}{x.name}' for prefix, kind in SETTINGS.items() for x in fields(kind)}
+        namespaces = tuple(filter(None, SETTINGS))
+        given = {name for name in self.values if name.startswith(namespaces)}
+        foreign = given - known - {'model.preset'}
+        if foreign:
+            yield f'recorded by another version, with {", ".join(sorted(foreign))}'

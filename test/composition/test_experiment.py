@@ -11,8 +11,8 @@ import time
 from typing import Any
 
 from needle_dynamics import ParameterError
+from needle_dynamics.simulated.base import BaseParameters
 from needle_dynamics.simulated.indenter import IndenterParameters
-from needle_dynamics.simulated.plant import BaseParameters
 from needle_identification import (
     BagWriter,
     encode,

@@ -25,7 +25,8 @@ from needle_dynamics import (
     ShapeError,
 )
 from needle_dynamics.analysis import linearize, observability, operating_point
-from needle_dynamics.simulated.plant import Plant, Sample, TipParameters, TipSensor
+from needle_dynamics.simulated.plant import Plant, Sample
+from needle_dynamics.simulated.tip_sensor import TipParameters, TipSensor
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest

@@ -1,5 +1,6 @@
 """What faults do to measurements."""
 
+from collections.abc import Sequence
 from typing import Any
 
 from hypothesis import given
@@ -20,7 +21,7 @@ def through(
     delay: float = 0.05,
     size: float = 0.0,
     seed: int = 1,
-    biased: int = 1,
+    biased: Sequence[int] = (0,),
 ) -> list[Any]:
     """Return what leaves at each call."""
     parameters = FaultParameters(probability=probability, delay=delay, size=size)

@@ -18,15 +18,9 @@ from needle_dynamics import (
     PRESETS,
     ShapeError,
 )
-from needle_dynamics.simulated.plant import (
-    BaseMotion,
-    BaseParameters,
-    Plant,
-    Sample,
-    TipParameters,
-    TipReading,
-    TipSensor,
-)
+from needle_dynamics.simulated.base import BaseMotion, BaseParameters
+from needle_dynamics.simulated.plant import Plant, Sample
+from needle_dynamics.simulated.tip_sensor import TipParameters, TipReading, TipSensor
 from needle_ros.errors import (
     JobError,
 )

@@ -131,7 +131,7 @@ def test_in_a_pause_time_stands_and_steps_are_single_samples(ros_graph: RosGraph
     bench = Bench(ros_graph, publish_clock=True)
     clocks = ros_graph.listen(bench.probe, Clock, '/clock', SENSOR)
     bench.further(20)
-    assert bench.call('step') == (False, 'step refused: time goes on; pause first')
+    assert bench.call('step') == (False, 'step refused: time is not paused; pause first')
     granted, said = bench.call('pause', data=True)
     assert granted
     assert said.startswith('paused at ')

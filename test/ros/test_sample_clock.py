@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from needle_ros.errors import (
     JobError,
 )
-from needle_ros.pace import Pace
+from needle_ros.sample_clock import SampleClock
 from needle_ros.timing import NANOSECONDS
 import pytest
 
@@ -21,16 +21,16 @@ def make(
     backlog: float = 0.5,
     own: bool = False,
     lockstep: bool = False,
-) -> Pace:
-    """Return a pace that has begun."""
-    pace = Pace(rate, factor, backlog, own=own, lockstep=lockstep)
-    pace.begin(BEGIN)
-    return pace
+) -> SampleClock:
+    """Return a clock that has begun."""
+    clock = SampleClock(rate, factor, backlog, own=own, lockstep=lockstep)
+    clock.begin(BEGIN)
+    return clock
 
 
-def take(pace: Pace, now: int) -> list[int]:
+def take(clock: SampleClock, now: int) -> list[int]:
     """Take what is due; return the stamps."""
-    return [pace.take() for _ in range(pace.due(now))]
+    return [clock.take() for _ in range(clock.due(now))]
 
 
 ticks = st.lists(st.integers(0, 300_000_000), min_size=1, max_size=60)
@@ -42,11 +42,11 @@ def test_samples_are_at_multiples_of_the_period_and_never_early(
     steps: list[int], rate: float, factor: float
 ) -> None:
     """However late the looks are, no sample is missing, twice, or of the future."""
-    pace = make(rate, factor, own=True)
+    clock = make(rate, factor, own=True)
     now, stamps = BEGIN, []
     for step in steps:
         now += step
-        stamps += take(pace, now)
+        stamps += take(clock, now)
     assert stamps == [BEGIN + round((k + 1) / rate * NANOSECONDS) for k in range(len(stamps))]
     # A nanosecond of rounding.
     assert not stamps or stamps[-1] <= BEGIN + (now - BEGIN) * factor + 1
@@ -56,35 +56,35 @@ def test_samples_are_at_multiples_of_the_period_and_never_early(
 @settings(max_examples=60)
 def test_the_clocks_time_skips_what_is_beyond_the_backlog(steps: list[int]) -> None:
     """The newest stamp is within a period of the clock's now; every sample is taken or lost."""
-    pace = make(100.0, backlog=0.1)
+    clock = make(100.0, backlog=0.1)
     now, taken = BEGIN, 0
     for step in steps:
         now += step
-        due = pace.due(now)
+        due = clock.due(now)
         assert due <= 10
         for _ in range(due):
             taken += 1
-            assert pace.take() <= now + 1
+            assert clock.take() <= now + 1
     # A nanosecond of rounding for each time that samples were lost.
-    assert now - pace.stamp < NANOSECONDS / 100.0 + len(steps) + 1
-    assert taken + pace.lost == pytest.approx((now - BEGIN) / 1e7, abs=1.0)
+    assert now - clock.stamp < NANOSECONDS / 100.0 + len(steps) + 1
+    assert taken + clock.lost == pytest.approx((now - BEGIN) / 1e7, abs=1.0)
 
 
 def test_a_time_of_its_own_waits_for_a_machine_that_stalls() -> None:
     """After a stall of a second half of it is made up in bursts; the rest has been waited."""
-    pace = make(own=True)
+    clock = make(own=True)
     stamps = []
     for k in range(1000):
-        stamps += take(pace, BEGIN + NANOSECONDS + k * 1_000_000)
-    assert pace.waited == pytest.approx(0.5 * NANOSECONDS, abs=2e6)
-    assert pace.lost == 0
+        stamps += take(clock, BEGIN + NANOSECONDS + k * 1_000_000)
+    assert clock.waited == pytest.approx(0.5 * NANOSECONDS, abs=2e6)
+    assert clock.lost == 0
     assert {b - a for a, b in pairwise(stamps)} == {1_000_000}
 
 
 def test_as_fast_as_possible_is_not_bound_to_the_clock() -> None:
-    """Without a pace samples are due at once, and as many as readers can bear."""
-    pace = make(factor=0.0)
-    stamps = [stamp for _ in range(10) for stamp in take(pace, BEGIN)]
+    """Without a clock samples are due at once, and as many as readers can bear."""
+    clock = make(factor=0.0)
+    stamps = [stamp for _ in range(10) for stamp in take(clock, BEGIN)]
     assert len(stamps) == 200
     assert stamps[-1] == BEGIN + 200_000_000
 
@@ -92,85 +92,85 @@ def test_as_fast_as_possible_is_not_bound_to_the_clock() -> None:
 @pytest.mark.parametrize('factor', [0.0, 1.0])
 def test_in_lockstep_each_sample_waits_for_its_answer(factor: float) -> None:
     """Time begins at zero and goes on by a sample for every answer, if it is the right one."""
-    pace = make(factor=factor, lockstep=True)
+    clock = make(factor=factor, lockstep=True)
     now = BEGIN
     for k in range(1, 50):
         now += 5_000_000
-        assert take(pace, now) == [k * 1_000_000]
-        assert take(pace, now + 50_000_000) == []
-        pace.answered(k * 1_000_000 - 1)
-        assert take(pace, now + 50_000_000) == []
-        assert pace.awaited == pace.simulated(now) == k * 1_000_000
-        pace.answered(k * 1_000_000)
-    assert pace.lost == 0
+        assert take(clock, now) == [k * 1_000_000]
+        assert take(clock, now + 50_000_000) == []
+        clock.answered(k * 1_000_000 - 1)
+        assert take(clock, now + 50_000_000) == []
+        assert clock.awaited == clock.simulated(now) == k * 1_000_000
+        clock.answered(k * 1_000_000)
+    assert clock.lost == 0
 
 
 def test_in_lockstep_it_is_no_faster_than_its_pace() -> None:
     """An answer that comes at once does not make time run faster."""
-    pace = make(lockstep=True)
+    clock = make(lockstep=True)
     for k in range(1, 3001):
         # The clock is looked at ten times a period.
-        for stamp in take(pace, BEGIN + k * 100_000):
-            pace.answered(stamp)
-    assert pace.stamp == 300_000_000
+        for stamp in take(clock, BEGIN + k * 100_000):
+            clock.answered(stamp)
+    assert clock.stamp == 300_000_000
 
 
 @pytest.mark.parametrize('own', [False, True])
 def test_a_pause_ends_with_the_run(own: bool) -> None:
     """Who begins again is not held by a pause of before."""
-    pace = make(own=own)
-    pace.pause()
-    pace.begin(BEGIN)
-    assert take(pace, BEGIN + 5_000_000)
-    pace.begin(BEGIN, paused=True)
-    assert not take(pace, BEGIN + 5_000_000)
+    clock = make(own=own)
+    clock.pause()
+    clock.begin(BEGIN)
+    assert take(clock, BEGIN + 5_000_000)
+    clock.begin(BEGIN, paused=True)
+    assert not take(clock, BEGIN + 5_000_000)
 
 
 @pytest.mark.parametrize('own', [False, True])
 def test_in_a_pause_time_stands_still(own: bool) -> None:
     """Afterwards a time of its own goes on where it stood, the clock's at the clock's now."""
-    pace = make(own=own)
-    before = take(pace, BEGIN + 10_000_000)[-1]
-    pace.pause()
+    clock = make(own=own)
+    before = take(clock, BEGIN + 10_000_000)[-1]
+    clock.pause()
     later = BEGIN + 5 * NANOSECONDS
-    assert take(pace, later) == []
-    assert pace.simulated(later) == before
-    pace.resume(later)
-    first = take(pace, later + 1_000_000)[0]
+    assert take(clock, later) == []
+    assert clock.simulated(later) == before
+    clock.resume(later)
+    first = take(clock, later + 1_000_000)[0]
     assert first == (before + 1_000_000 if own else later)
-    assert pace.lost == pace.waited == 0
+    assert clock.lost == clock.waited == 0
 
 
 @pytest.mark.parametrize('own', [False, True])
 def test_a_step_is_one_sample(own: bool) -> None:
     """Each step is a period on in a time of its own, and the clock's now where that is time."""
-    pace = make(own=own)
-    with pytest.raises(JobError, match='time goes on; pause first'):
-        pace.step(BEGIN)
-    pace.pause()
-    stamps = [pace.step(BEGIN + k * NANOSECONDS) for k in (1, 2, 3)]
+    clock = make(own=own)
+    with pytest.raises(JobError, match='time is not paused; pause first'):
+        clock.step(BEGIN)
+    clock.pause()
+    stamps = [clock.step(BEGIN + k * NANOSECONDS) for k in (1, 2, 3)]
     wanted = [1_000_000, 2_000_000, 3_000_000] if own else [k * NANOSECONDS for k in (1, 2, 3)]
     assert [stamp - BEGIN for stamp in stamps] == wanted
-    assert pace.due(BEGIN + 4 * NANOSECONDS) == 0
+    assert clock.due(BEGIN + 4 * NANOSECONDS) == 0
 
 
 def test_a_step_in_lockstep_waits_for_the_answer_too() -> None:
     """A second step is refused until the first sample has been answered."""
-    pace = make(lockstep=True)
-    pace.pause()
-    stamp = pace.step(BEGIN)
+    clock = make(lockstep=True)
+    clock.pause()
+    stamp = clock.step(BEGIN)
     with pytest.raises(JobError, match=r'no command has answered the sample of 0.001000 s'):
-        pace.step(BEGIN)
-    pace.answered(stamp)
-    assert pace.step(BEGIN) == 2_000_000
+        clock.step(BEGIN)
+    clock.answered(stamp)
+    assert clock.step(BEGIN) == 2_000_000
 
 
 @pytest.mark.parametrize('own', [False, True])
 def test_a_clock_that_is_set_back_does_not_stop_it(own: bool) -> None:
     """The clock's time follows; a time of its own goes on where it was."""
-    pace = make(own=own)
-    newest = take(pace, BEGIN + 100_000_000)[-1] if not own else BEGIN
+    clock = make(own=own)
+    newest = take(clock, BEGIN + 100_000_000)[-1] if not own else BEGIN
     back = BEGIN - 3600 * NANOSECONDS
-    assert take(pace, back) == []
-    first = take(pace, back + 1_000_000)[0]
+    assert take(clock, back) == []
+    first = take(clock, back + 1_000_000)[0]
     assert first == (newest if own else back) + 1_000_000

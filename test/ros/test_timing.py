@@ -5,7 +5,7 @@ from fractions import Fraction
 from builtin_interfaces.msg import Time
 from hypothesis import given
 from hypothesis import strategies as st
-from needle_ros.timing import NANOSECONDS, nanoseconds, seconds, Window
+from needle_ros.timing import NANOSECONDS, nanoseconds, RateCounter, seconds
 
 MILLISECOND = NANOSECONDS // 1000
 
@@ -22,7 +22,7 @@ def test_times_are_those_of_the_message(sec: int, nanosec: int) -> None:
 
 def test_rates_and_shares_are_those_of_the_last_second() -> None:
     """In any second that is full; of a time that went back nothing is left."""
-    window = Window()
+    window = RateCounter()
     for i in range(2001):
         window.add(i * MILLISECOND, i % 4 == 0)
     # 1000 in the second, and a quarter of them: whole numbers.

@@ -1,0 +1,192 @@
+"""Which commanded force acts on the needle, from one sample of the plant to the next."""
+
+from __future__ import annotations
+
+from typing import Final, NamedTuple
+
+from needle_ros.contract import BASE
+from needle_ros.timing import NANOSECONDS
+
+
+class Command(NamedTuple):
+    """
+    Forces on the needle.
+
+    Attributes
+    ----------
+    stamp : int
+        Time from which they count [ns].
+    force : float
+        Insertion force [N], positive into the tissue.
+    torque : float
+        Torque about the insertion axis [N m].
+
+    """
+
+    stamp: int = 0
+    force: float = 0.0
+    torque: float = 0.0
+
+
+class Answer(NamedTuple):
+    """
+    What became of a command.
+
+    Attributes
+    ----------
+    counts : bool
+        Whether it counts; an invalid command counts as no force.
+    complaint : str
+        Why it does not act, '' if it acts or a newer one came before.
+
+    """
+
+    counts: bool
+    complaint: str = ''
+
+
+_COUNTS: Final = Answer(counts=True)
+
+
+class Commands:
+    """
+    Decides from when, and how long, a command acts.
+
+    The command that is newest when a sample is taken acts until the next sample: a zero-order
+    hold. A command counts if its stamp is within the timeout of now and not older than that of
+    the newest. It stands for no force if it is invalid, when it is older than the timeout, and
+    while several nodes command.
+
+    Parameters
+    ----------
+    timeout : float
+        Age at which a command no longer counts [s].
+    force_limit : float
+        Largest valid force [N], either sign.
+    torque_limit : float
+        Largest valid torque [N m], either sign.
+
+    Attributes
+    ----------
+    held : Command
+        The command that acts until the next sample.
+    newest : Command
+        The command that will act from the next sample on, if it is not too old by then.
+    refused : int
+        Number of invalid commands.
+    stale : int
+        Number of commands that were too old, or too far in the future.
+    overtaken : int
+        Number of commands that came after a newer one.
+    rivals : int
+        Number of nodes that command beyond the one that may.
+
+    """
+
+    def __init__(self, timeout: float, force_limit: float, torque_limit: float) -> None:
+        self._timeout = timeout * NANOSECONDS
+        self._limits = force_limit, torque_limit
+        self.refused = self.stale = self.overtaken = 0
+        self.begin()
+
+    def begin(self) -> None:
+        """Forget the commands and who gave them, as at an activation."""
+        self.held = self.newest = Command()
+        self.rivals = 0
+
+    def forget(self) -> None:
+        """Let no force act; commands older than the newest still do not count."""
+        self.held = self.newest = Command(self.newest.stamp)
+
+    def offer(self, stamp: int, frame: str, force: float, torque: float, now: int) -> Answer:
+        """
+        Take in a command.
+
+        Parameters
+        ----------
+        stamp : int
+            Its stamp [ns]; 0 stands for now.
+        frame : str
+            Its frame.
+        force : float
+            Insertion force [N].
+        torque : float
+            Torque [N m].
+        now : int
+            Simulated time [ns].
+
+        Returns
+        -------
+        Answer
+            Whether it counts, and what is wrong with it.
+
+        """
+        stamp = stamp or now
+        age = now - stamp
+        if abs(age) > self._timeout:
+            self.stale += 1
+            return Answer(
+                counts=False,
+                complaint=f'command ignored, it is {age / NANOSECONDS:.3f} s old: command_timeout '
+                f'is {self._timeout / NANOSECONDS:g} s',
+            )
+        # A newest one from the future is of the time before the clock was set back.
+        if stamp < self.newest.stamp <= now + self._timeout:
+            self.overtaken += 1
+            return Answer(counts=False)
+        complaint = self._complaint(frame, force, torque)
+        if complaint:
+            self.refused += 1
+        # While several nodes command none of them may.
+        acts = not complaint and not self.rivals
+        self.newest = Command(stamp, force, torque) if acts else Command(stamp)
+        return Answer(counts=True, complaint=complaint) if complaint else _COUNTS
+
+    def _complaint(self, frame: str, force: float, torque: float) -> str:
+        """Return what is wrong with a command."""
+        if frame not in ('', BASE):
+            return f'wrench_command must be in {BASE}, got {frame!r}; no force is applied'
+        largest, strongest = self._limits
+        # Written so that NaN is refused too.
+        if not (abs(force) <= largest and abs(torque) <= strongest):
+            return (
+                f'wrench_command must be within {largest:g} N and {strongest:g} N m, got force.y '
+                f'= {force}, torque.x = {torque}; no force is applied'
+            )
+        return ''
+
+    def count_commanders(self, number: int) -> bool:
+        """
+        Take note of how many nodes publish commands.
+
+        Parameters
+        ----------
+        number : int
+            Their number.
+
+        Returns
+        -------
+        bool
+            Whether it has changed from one to several or back; then no force acts until the next
+            command.
+
+        """
+        rivals = max(0, number - 1)
+        if rivals == self.rivals:
+            return False
+        self.rivals = rivals
+        self.newest = Command(self.newest.stamp)
+        return True
+
+    def hold(self, stamp: int) -> None:
+        """
+        Let the newest command act until the next sample, unless it is too old.
+
+        Parameters
+        ----------
+        stamp : int
+            Time of the sample that was just taken [ns].
+
+        """
+        fresh = stamp - self.newest.stamp <= self._timeout
+        self.held = self.newest if fresh else Command(self.newest.stamp)

@@ -1,0 +1,295 @@
+"""
+A run of a simulated plant: its samples, and what was done to it between them.
+
+The node advances one, and so does a replay: what was done is an `Event`, which counts from the
+next sample on, and which a replay performs again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Final, NamedTuple
+
+from needle_dynamics.simulated.assembly import PlantConstants
+from needle_dynamics.simulated.commands import Command, Commands
+from needle_dynamics.simulated.indenter import Press
+from needle_dynamics.simulated.plant import Plant, Sample
+from needle_ros.contract import (
+    BASE_WRENCH,
+    END_EFFECTOR_POSE,
+    ground_truth,
+    JOINT_STATES,
+    TIP_DEFLECTION,
+    Topic,
+)
+from needle_ros.timing import NANOSECONDS
+
+#: Kinds of events.
+CONFIGURED: Final = 'configured'
+TIME: Final = 'time'
+TRAJECTORY: Final = 'trajectory'
+PARAMETERS: Final = 'parameters'
+TARE: Final = 'tare'
+RESET: Final = 'reset'
+
+#: Stamps are rounded to nanoseconds, so that a period may be off by one [ns].
+_ROUNDING: Final = 2
+
+
+class Event(NamedTuple):
+    """
+    What was done to a plant beside commands; it counts from the next sample on.
+
+    Attributes
+    ----------
+    kind : str
+        ``configured``: the plant was made from the parameters in ``content``. ``time``: the
+        sample is not one period after the one before. ``trajectory``: it follows the one in
+        ``content``, the arguments of `PlantRun.follow`. ``parameters``: those in ``content``
+        changed. ``tare``: the force sensor was zeroed. ``reset``: the plant is at its start.
+    content : Mapping[str, Any]
+        Values that JSON can hold.
+
+    """
+
+    kind: str
+    content: Mapping[str, Any] = {}
+
+
+class Measurement(NamedTuple):
+    """
+    What the plant publishes of a sample on one topic.
+
+    Attributes
+    ----------
+    topic : str
+        Name of the topic.
+    age : int
+        Sample intervals since the time that the stamp says.
+    values : list of float
+        The numbers, in the order of the message.
+
+    """
+
+    topic: str
+    age: int
+    values: list[float]
+
+
+class PlantRun:
+    """
+    A simulated plant under commands and events.
+
+    Parameters
+    ----------
+    values : Mapping[str, Any]
+        Parameters of the plant by name, see `PlantConstants.of`.
+
+    Attributes
+    ----------
+    constants : PlantConstants
+        Its constants now.
+    plant : Plant or Indenter
+        The plant.
+    commands : Commands
+        The commands.
+    number : int
+        Number of samples taken.
+    sample : Sample, Press or None
+        The newest sample.
+    topics : dict
+        Topics that it publishes on, by name.
+
+    Raises
+    ------
+    ParameterError
+        If a parameter is not valid; the message names it.
+    InsertedLengthError
+        If the needle cannot be where it shall start.
+
+    """
+
+    def __init__(self, values: Mapping[str, Any]) -> None:
+        self._values = dict(values)
+        self.constants = PlantConstants.of(values)
+        self.plant = self.constants.make()
+        own = self.constants.own
+        self.commands = Commands(own.command_timeout, own.force_limit, own.torque_limit)
+        self.number = 0
+        self.sample: Sample | Press | None = None
+        topics = [BASE_WRENCH, END_EFFECTOR_POSE]
+        #: Generalized forces on q1..qn: nothing commands them.
+        self._free = [0.0] * self.constants.model.modes
+        self._commanded = self.constants.mode == 'simulation'
+        if isinstance(self.plant, Plant):
+            truth = ground_truth(self.constants.model.modes, commanded=self._commanded)
+            topics = [BASE_WRENCH, TIP_DEFLECTION, truth, JOINT_STATES]
+        self.topics: dict[str, Topic] = {topic.name: topic for topic in topics}
+        self._period = NANOSECONDS / own.rate
+        self._stamp: int | None = None
+        self._events = [Event(CONFIGURED, self._values)]
+
+    # Events.
+
+    def follow(
+        self,
+        joints: Sequence[str],
+        times: Sequence[float],
+        positions: Sequence[Sequence[float]],
+        efforts: Sequence[Sequence[float]],
+    ) -> None:
+        """
+        Have the plant follow a trajectory from now.
+
+        Parameters
+        ----------
+        joints : sequence of str
+            Names of the joints.
+        times : sequence of float
+            Time of each point from now [s].
+        positions : sequence of sequence of float
+            Position of each joint at each point, or none [m].
+        efforts : sequence of sequence of float
+            Force of each joint at each point, or none [N].
+
+        Raises
+        ------
+        ParameterError
+            If the plant cannot follow it.
+
+        """
+        self.plant.follow(joints, times, positions, efforts)
+        content = {'joints': joints, 'times': times, 'positions': positions, 'efforts': efforts}
+        self._events.append(Event(TRAJECTORY, content))
+
+    def change(self, changes: Mapping[str, Any]) -> None:
+        """
+        Go on with other friction; the state stays.
+
+        Parameters
+        ----------
+        changes : Mapping[str, Any]
+            Parameters that change, by name.
+
+        Raises
+        ------
+        ParameterError
+            If a value is not valid.
+
+        """
+        values = {**self._values, **changes}
+        constants = PlantConstants.of(values)
+        if constants.model != self.constants.model:
+            if isinstance(self.plant, Plant):
+                self.plant.integrator.change(constants.model)
+            self._events.append(Event(PARAMETERS, dict(changes)))
+        self._values, self.constants = values, constants
+
+    def tare(self) -> None:
+        """
+        Zero the force sensor.
+
+        Raises
+        ------
+        JobError
+            If the plant moves, or has not rested long enough.
+
+        """
+        self.plant.tare()
+        self._events.append(Event(TARE))
+
+    def reset(self) -> None:
+        """Put state, sensor and noise back to their start; time goes on."""
+        self.plant = self.constants.make()
+        self.commands.forget()
+        self._events.append(Event(RESET))
+
+    def perform(self, event: Event) -> None:
+        """
+        Do again what was done to a plant.
+
+        Parameters
+        ----------
+        event : Event
+            Any but ``configured``, which makes another run.
+
+        Raises
+        ------
+        NeedleError
+            If this plant refuses it.
+
+        """
+        if event.kind == TRAJECTORY:
+            self.follow(**event.content)
+        elif event.kind == PARAMETERS:
+            self.change(event.content)
+        elif event.kind == TARE:
+            self.tare()
+        elif event.kind == RESET:
+            self.reset()
+
+    def events(self) -> list[Event]:
+        """
+        Hand over the events since the last call.
+
+        Returns
+        -------
+        list of Event
+            Called after a sample: those that count from this sample on.
+
+        """
+        events, self._events = self._events, []
+        return events
+
+    # Samples.
+
+    def take(self, stamp: int, command: Command | None = None) -> list[Measurement]:
+        """
+        Take a sample.
+
+        Parameters
+        ----------
+        stamp : int
+            Its time [ns].
+        command : Command, optional
+            What acted since the sample before, if that is known; otherwise the command held.
+
+        Returns
+        -------
+        list of Measurement
+            What the plant publishes, `joint_states` last: who answers it has all the others.
+
+        Raises
+        ------
+        InsertedLengthError
+            If the needle left the tissue.
+
+        """
+        acting = self.commands.held if command is None else command
+        self.sample = sample = self.plant.advance(acting.force, acting.torque)
+        if self._stamp is None or abs(stamp - self._stamp - self._period) > _ROUNDING:
+            self._events.append(Event(TIME))
+        self._stamp = stamp
+        self.number += 1
+        self.commands.hold(stamp)
+        measured = [Measurement('base_wrench', 0, sample.wrench.tolist())]
+        if isinstance(sample, Press):
+            pose = [*sample.position.tolist(), 0.0, 0.0, 0.0, 1.0]
+            return [*measured, Measurement('end_effector_pose', 0, pose)]
+        tip = sample.tip
+        if tip is not None:
+            measured.append(
+                Measurement('tip_deflection', tip.age, [0.0, tip.depth, tip.deflection])
+            )
+        state = sample.state.tolist()
+        middle = len(state) // 2
+        joints = [
+            sample.joint_position, state[1], sample.speed, state[middle + 1],
+            sample.force, acting.torque,
+        ]  # fmt: skip
+        if self._commanded:
+            # Insertion makes d smaller.
+            state += [-acting.force, acting.torque, *self._free]
+        measured.append(Measurement('ground_truth', 0, state))
+        measured.append(Measurement('joint_states', 0, joints))
+        return measured

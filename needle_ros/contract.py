@@ -1,0 +1,375 @@
+"""
+The contract on the wire: every topic of the suite, what its messages hold, and who publishes it.
+
+Lengths are in m, angles in rad, forces in N and torques in N m. Depths, velocities and forces
+along the needle are positive into the tissue. Stamps are sample times.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Final, NamedTuple
+
+from needle_ros.wire import JOINT_STATE, POINT, POSE, Template, WRENCH
+
+#: Frames: at rest at the entry point, and parallel to it at the needle base.
+ENTRY: Final = 'needle_entry'
+BASE: Final = 'needle_base'
+
+#: The joint along the needle, and the one about it.
+INSERTION: Final = 'insertion'
+ROTATION: Final = 'rotation'
+
+#: Axes of the indenter's plane, which are its joints.
+PLANE: Final = ('x', 'z')
+
+EVERY_NODE: Final = 'every node'
+USER: Final = 'user'
+
+
+class Qos(NamedTuple):
+    """
+    Quality of service that the publishers of a topic offer.
+
+    Attributes
+    ----------
+    name : str
+        What it is called in the documentation.
+    reliable : bool
+        Whether a lost message is sent again.
+    latched : bool
+        Whether readers that come late get the messages of before.
+    depth : int
+        Messages kept for a reader that is busy or comes late.
+
+    """
+
+    name: str
+    reliable: bool
+    latched: bool
+    depth: int
+
+
+#: A burst after a stall of the reader is not lost.
+SENSOR: Final = Qos('best effort', reliable=False, latched=False, depth=50)
+
+#: Only the newest counts, and it must arrive.
+COMMAND: Final = Qos('reliable', reliable=True, latched=False, depth=1)
+
+#: The last message reaches readers that come late.
+LATCHED: Final = Qos('latched', reliable=True, latched=True, depth=1)
+
+#: Every message reaches every reader, also one that comes late.
+LOG: Final = Qos('latched', reliable=True, latched=True, depth=1000)
+
+#: As rclpy listens to /clock.
+CLOCK_QOS: Final = Qos('best effort', reliable=False, latched=False, depth=1)
+
+DIAGNOSTICS_QOS: Final = Qos('reliable', reliable=True, latched=False, depth=10)
+
+
+class Joint(NamedTuple):
+    """
+    A joint of a JointState.
+
+    Attributes
+    ----------
+    name : str
+        Name of the joint.
+    unit : str
+        Unit of its position; that of its velocity is the same per second.
+    effort : str
+        Unit of its effort, '' if the topic has no efforts.
+
+    """
+
+    name: str
+    unit: str
+    effort: str = ''
+
+
+class Quantity(NamedTuple):
+    """
+    A number of a message.
+
+    Attributes
+    ----------
+    name : str
+        Field, with the joint if there is one: ``force.y``, ``position of insertion``.
+    unit : str
+        SI unit.
+
+    """
+
+    name: str
+    unit: str
+
+
+def _vector(field: str, unit: str, axes: str = 'xyz') -> tuple[Quantity, ...]:
+    return tuple(Quantity(f'{field}.{axis}', unit) for axis in axes)
+
+
+#: Numbers of the message types whose numbers are always the same, in their order.
+_QUANTITIES: Final = {
+    WRENCH: _vector('force', 'N') + _vector('torque', 'N m'),
+    POINT: _vector('point', 'm'),
+    POSE: _vector('position', 'm') + _vector('orientation', '1', 'xyzw'),
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Topic:
+    """
+    A topic.
+
+    Attributes
+    ----------
+    name : str
+        Name, relative to the namespace of the node; ``~`` stands for the node.
+    type_name : str
+        Message type.
+    publisher : str
+        Node that publishes it, `EVERY_NODE`, or `USER`.
+    meaning : str
+        What its messages hold, for people.
+    qos : Qos
+        Quality of service.
+    frame : str
+        Frame of the header, '' if it has none.
+    joints : tuple of Joint
+        Joints of a JointState.
+
+    """
+
+    name: str
+    type_name: str
+    publisher: str
+    meaning: str
+    qos: Qos = SENSOR
+    frame: str = ''
+    joints: tuple[Joint, ...] = ()
+
+    @property
+    def quantities(self) -> tuple[Quantity, ...]:
+        """Numbers of a message, in their order; empty for a type that `wire` does not know."""
+        if self.type_name != JOINT_STATE:
+            return _QUANTITIES.get(self.type_name, ())
+        return (
+            *(Quantity(f'position of {joint.name}', joint.unit) for joint in self.joints),
+            *(Quantity(f'velocity of {joint.name}', f'{joint.unit}/s') for joint in self.joints),
+            *(Quantity(f'effort of {j.name}', j.effort) for j in self.joints if j.effort),
+        )
+
+    def template(self) -> Template:
+        """
+        Return the template of its messages.
+
+        Returns
+        -------
+        Template
+            It writes and reads them.
+
+        """
+        efforts = sum(bool(joint.effort) for joint in self.joints)
+        return Template(
+            self.type_name,
+            self.frame,
+            names=[joint.name for joint in self.joints],
+            counts=(len(self.joints), len(self.joints), efforts),
+        )
+
+
+JOINT_STATES: Final = Topic(
+    name='joint_states',
+    type_name=JOINT_STATE,
+    publisher='plant',
+    meaning='encoders of the robot: inserted length and rotation; effort: axial force and torque '
+    'on the needle',
+    joints=(Joint(INSERTION, 'm', 'N'), Joint(ROTATION, 'rad', 'N m')),
+)
+
+BASE_WRENCH: Final = Topic(
+    name='base_wrench',
+    type_name=WRENCH,
+    publisher='plant',
+    meaning='force sensor, what the base exerts on the needle: `force.y` axial, `force.z` lateral '
+    '[N], `torque.x` [N m]; mode `indenter`: force of the end-effector on the tissue',
+    frame=BASE,
+)
+
+TIP_DEFLECTION: Final = Topic(
+    name='tip_deflection',
+    type_name=POINT,
+    publisher='plant',
+    meaning='tracker or imager: `point.y` inserted length, `point.z` deflection of the tip [m]',
+    frame=ENTRY,
+)
+
+END_EFFECTOR_POSE: Final = Topic(
+    name='end_effector_pose',
+    type_name=POSE,
+    publisher='plant',
+    meaning='mode `indenter`: position of the end-effector [m]',
+    frame=ENTRY,
+)
+
+
+GROUND_TRUTH: Final = Topic(
+    name='ground_truth',
+    type_name=JOINT_STATE,
+    publisher='plant',
+    meaning='simulation only: d (length outside the tissue), theta and q1..qn, the whole state; '
+    'effort, in mode `simulation`: generalized forces that were applied since the sample before',
+    joints=(Joint('d', 'm'), Joint('theta', 'rad'), Joint('q1', 'm^1.5'), Joint('q2', 'm^1.5')),
+)
+
+
+def ground_truth(modes: int, *, commanded: bool) -> Topic:
+    """
+    Return `GROUND_TRUTH` of a plant.
+
+    Parameters
+    ----------
+    modes : int
+        Number of shape modes.
+    commanded : bool
+        Whether it has efforts: those of a needle that moves under commands, mode `simulation`.
+
+    Returns
+    -------
+    Topic
+        The topic with all joints.
+
+    """
+    bending = [Joint(f'q{k + 1}', 'm^1.5', 'N m^-0.5') for k in range(modes)]
+    joints = (Joint('d', 'm', 'N'), Joint('theta', 'rad', 'N m'), *bending)
+    if not commanded:
+        joints = tuple(joint._replace(effort='') for joint in joints)
+    return replace(GROUND_TRUTH, joints=joints)
+
+
+NEEDLE_SHAPE: Final = Topic(
+    name='needle_shape',
+    type_name='visualization_msgs/msg/Marker',
+    publisher='plant',
+    meaning='the needle as a line, 30 Hz while somebody listens',
+    frame=ENTRY,
+)
+
+NEEDLE_POSES: Final = Topic(
+    name='needle_poses',
+    type_name='geometry_msgs/msg/PoseArray',
+    publisher='plant',
+    meaning='poses along the needle, y along it, 30 Hz while somebody listens',
+    frame=ENTRY,
+)
+
+CLOCK: Final = Topic(
+    name='/clock',
+    type_name='rosgraph_msgs/msg/Clock',
+    publisher='plant',
+    meaning='simulated time, with `publish_clock` or `lockstep`',
+    qos=CLOCK_QOS,
+)
+
+EVENTS: Final = Topic(
+    name='~/events',
+    type_name='diagnostic_msgs/msg/DiagnosticArray',
+    publisher='plant',
+    meaning='what the plant began to apply beside commands, and the number of the sample from '
+    'which it counts: [replay.md](replay.md)',
+    qos=LOG,
+)
+
+WRENCH_COMMAND: Final = Topic(
+    name='wrench_command',
+    type_name=WRENCH,
+    publisher='controller',
+    meaning='force and torque on the needle: `force.y` [N], `torque.x` [N m]; the stamp is that '
+    'of the sample it answers',
+    qos=COMMAND,
+    frame=BASE,
+)
+
+REFERENCE: Final = Topic(
+    name='reference',
+    type_name=JOINT_STATE,
+    publisher='controller',
+    meaning='inserted length and velocity that the controller aims at',
+    joints=(Joint(INSERTION, 'm'),),
+)
+
+TRACKING_ERROR: Final = Topic(
+    name='tracking_error',
+    type_name=JOINT_STATE,
+    publisher='controller',
+    meaning='reference less measurement',
+    joints=(Joint(INSERTION, 'm'),),
+)
+
+TARGET: Final = Topic(
+    name='target',
+    type_name=POINT,
+    publisher=USER,
+    meaning='`point.y`: inserted length to reach [m]',
+    qos=COMMAND,
+    frame=ENTRY,
+)
+
+JOINT_TRAJECTORY: Final = Topic(
+    name='joint_trajectory',
+    type_name='trajectory_msgs/msg/JointTrajectory',
+    publisher=USER,
+    meaning='to the controller: `insertion`, positions [m] to follow, and velocities [m/s] or '
+    'none; to a plant in mode `robot`: `insertion`, positions [m], or efforts [N] of a push; in '
+    'mode `indenter`: efforts of `x` and `z` [N]',
+    qos=COMMAND,
+)
+
+FRICTION: Final = Topic(
+    name='friction',
+    type_name='diagnostic_msgs/msg/DiagnosticArray',
+    publisher='identification',
+    meaning='estimate, interval, unit and number of samples of each coefficient',
+    qos=LATCHED,
+)
+
+STIFFNESS: Final = replace(FRICTION, name='stiffness')
+
+CONFIGURATION: Final = Topic(
+    name='~/configuration',
+    type_name='std_msgs/msg/String',
+    publisher=EVERY_NODE,
+    meaning='all parameters of the node as a parameter file',
+    qos=LATCHED,
+)
+
+DIAGNOSTICS: Final = Topic(
+    name='/diagnostics',
+    type_name='diagnostic_msgs/msg/DiagnosticArray',
+    publisher=EVERY_NODE,
+    meaning='state of the node, 1 Hz and on change',
+    qos=DIAGNOSTICS_QOS,
+)
+
+#: All topics.
+TOPICS: Final = (
+    JOINT_STATES,
+    BASE_WRENCH,
+    TIP_DEFLECTION,
+    GROUND_TRUTH,
+    END_EFFECTOR_POSE,
+    NEEDLE_SHAPE,
+    NEEDLE_POSES,
+    CLOCK,
+    EVENTS,
+    WRENCH_COMMAND,
+    REFERENCE,
+    TRACKING_ERROR,
+    TARGET,
+    JOINT_TRAJECTORY,
+    FRICTION,
+    STIFFNESS,
+    CONFIGURATION,
+    DIAGNOSTICS,
+)
