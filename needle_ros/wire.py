@@ -469,7 +469,8 @@ def decode(
         if number < _TEMPLATES:
             alike = pending[(end - begin)[pending] == len(message)]
         rows = np.lib.stride_tricks.sliding_window_view(data, len(message))[begin[alike]]
-        same = (rows[:, template.fixed] == message[template.fixed]).all(axis=1)
+        fixed = template.fixed
+        same = (rows[:, fixed] == message[fixed]).all(axis=1)
         if not same.all():
             alike, rows = alike[same], rows[same]
         wanted = choice(template)

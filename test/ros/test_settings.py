@@ -1,0 +1,79 @@
+"""Settings from values: checked, with defaults, and errors that name what is wrong."""
+
+from __future__ import annotations
+
+from array import array
+from dataclasses import dataclass, field
+from typing import Any
+
+from needle_ros.errors import ParameterError
+from needle_ros.settings import as_number, check_constants, constant, from_values, unknown_name
+import pytest
+
+
+@dataclass(frozen=True, kw_only=True)
+class Robot:
+    """A robot."""
+
+    gain: float = constant(2.0, '1/s', 'gain', open_low=True, high=50.0)
+    offset: float = constant(0.0, '1', 'offset', low=-1.0)
+    levels: tuple[float, ...] = constant((1.0, 2.0), 'N', 'levels')
+    joints: tuple[str, ...] = field(default=('x', 'z'), metadata={'description': 'joints'})
+    law: str = 'pid'
+
+    def __post_init__(self) -> None:
+        check_constants(self)
+
+
+def test_values_are_taken_as_they_are_meant() -> None:
+    """Integers as floats, lists and arrays as tuples; what is not given has its default."""
+    made = from_values(Robot, {'gain': 3, 'levels': [1, 2.5], 'law': 'pd'})
+    assert made == Robot(gain=3.0, levels=(1.0, 2.5), law='pd')
+    assert isinstance(made.gain, float)
+    assert from_values(Robot, {'levels': array('d', [4.0])}).levels == (4.0,)
+    assert from_values(Robot, {}) == Robot()
+
+
+def test_an_empty_list_is_the_default() -> None:
+    """A parameter file cannot hold one: it arrives as None."""
+    assert from_values(Robot, {'levels': None, 'joints': None}) == Robot()
+
+
+@pytest.mark.parametrize(
+    ('values', 'complaint'),
+    [
+        ({'gain': None}, 'arm.gain must be a number, got None'),
+        ({'gain': 0}, 'arm.gain must be finite, > 0 and <= 50 1/s, got 0.0'),
+        ({'gain': 51.0}, 'arm.gain must be finite, > 0 and <= 50 1/s, got 51.0'),
+        ({'gain': 10**400}, 'arm.gain must be finite, got an integer of too many digits'),
+        ({'offset': -2}, 'arm.offset must be finite, >= -1, got -2.0'),
+        ({'levels': [1.0, float('nan')]}, 'arm.levels must be finite, >= 0 N, got nan'),
+        ({'levels': ['a']}, "arm.levels must be a number, got 'a'"),
+        ({'gains': 1.0}, "unknown parameter 'arm.gains'; did you mean 'arm.gain'?"),
+        (
+            {'xyzzy': 1.0},
+            (
+                "unknown parameter 'arm.xyzzy'; valid: arm.gain, arm.joints, arm.law, "
+                'arm.levels, arm.offset'
+            ),
+        ),
+    ],
+)
+def test_what_is_not_valid_is_named(values: dict[str, Any], complaint: str) -> None:
+    """The name with its namespace, what was found, and what would be valid."""
+    with pytest.raises(ParameterError) as caught:
+        from_values(Robot, values, 'arm.')
+    assert str(caught.value) == complaint
+
+
+def test_only_integers_become_floats() -> None:
+    """Booleans and texts are left for the check."""
+    kept = (True, 'a', 1.5, 10**301)
+    assert as_number(kept) == kept
+    assert [type(value) for value in as_number((1, 2))] == [float, float]
+
+
+def test_an_unknown_name_has_a_hint() -> None:
+    """The nearest name, or all of them."""
+    assert unknown_name('rat', ['rate', 'mode']) == "unknown parameter 'rat'; did you mean 'rate'?"
+    assert unknown_name('q', ['rate', 'mode']) == "unknown parameter 'q'; valid: mode, rate"
