@@ -111,6 +111,8 @@ class PlantNode(ModelNode):
         self.declare_settings('fault.', FaultParameters())
 
         self._run: PlantRun | None = None
+        #: Samples taken before the plant was configured again.
+        self._number = 0
         self._halted: str | None = None
         self._fault: Fault | None = None
         self._faulty = ''
@@ -152,7 +154,7 @@ class PlantNode(ModelNode):
 
     def configure(self) -> None:
         """Make the plant from the parameters."""
-        plant_run = PlantRun(self.values())
+        plant_run = PlantRun(self.values(), self._number)
         constants = plant_run.constants
         own, mode = constants.own, constants.mode
         lockstep = bool(self.get_parameter('lockstep').value)
@@ -201,6 +203,8 @@ class PlantNode(ModelNode):
 
     def cleanup(self) -> None:
         """Forget the plant."""
+        if self._run is not None:
+            self._number = self._run.number
         self._run = None
         if self._clock_topic is not None:
             self.destroy_publisher(self._clock_topic)

@@ -17,6 +17,7 @@ from needle_dynamics.simulated.plant import Plant, Sample
 from needle_ros.contract import (
     BASE_WRENCH,
     END_EFFECTOR_POSE,
+    GROUND_TRUTH,
     ground_truth,
     JOINT_STATES,
     TIP_DEFLECTION,
@@ -84,6 +85,8 @@ class PlantRun:
     ----------
     values : Mapping[str, Any]
         Parameters of the plant by name, see `PlantConstants.of`.
+    number : int
+        Number of samples that were taken before it.
 
     Attributes
     ----------
@@ -94,7 +97,7 @@ class PlantRun:
     commands : Commands
         The commands.
     number : int
-        Number of samples taken.
+        Number of samples taken, with those before it.
     sample : Sample, Press or None
         The newest sample.
     topics : dict
@@ -109,13 +112,13 @@ class PlantRun:
 
     """
 
-    def __init__(self, values: Mapping[str, Any]) -> None:
+    def __init__(self, values: Mapping[str, Any], number: int = 0) -> None:
         self._values = dict(values)
         self.constants = PlantConstants.of(values)
         self.plant = self.constants.make()
         own = self.constants.own
         self.commands = Commands(own.command_timeout, own.force_limit, own.torque_limit)
-        self.number = 0
+        self.number = number
         self.sample: Sample | Press | None = None
         topics = [BASE_WRENCH, END_EFFECTOR_POSE]
         #: Generalized forces on q1..qn: nothing commands them.
@@ -272,14 +275,14 @@ class PlantRun:
         self._stamp = stamp
         self.number += 1
         self.commands.hold(stamp)
-        measured = [Measurement('base_wrench', 0, sample.wrench.tolist())]
+        measured = [Measurement(BASE_WRENCH.name, 0, sample.wrench.tolist())]
         if isinstance(sample, Press):
             pose = [*sample.position.tolist(), 0.0, 0.0, 0.0, 1.0]
-            return [*measured, Measurement('end_effector_pose', 0, pose)]
+            return [*measured, Measurement(END_EFFECTOR_POSE.name, 0, pose)]
         tip = sample.tip
         if tip is not None:
             measured.append(
-                Measurement('tip_deflection', tip.age, [0.0, tip.depth, tip.deflection])
+                Measurement(TIP_DEFLECTION.name, tip.age, [0.0, tip.depth, tip.deflection])
             )
         state = sample.state.tolist()
         middle = len(state) // 2
@@ -290,6 +293,6 @@ class PlantRun:
         if self._commanded:
             # Insertion makes d smaller.
             state += [-acting.force, acting.torque, *self._free]
-        measured.append(Measurement('ground_truth', 0, state))
-        measured.append(Measurement('joint_states', 0, joints))
+        measured.append(Measurement(GROUND_TRUTH.name, 0, state))
+        measured.append(Measurement(JOINT_STATES.name, 0, joints))
         return measured

@@ -216,7 +216,7 @@ class Rerun:
         names = ', '.join(sorted(event.content))
         self.notes.append(_WORDS[event.kind].format(number=number, names=names))
         if event.kind == CONFIGURED:
-            return PlantRun(event.content)
+            return PlantRun(event.content, number - 1)
         plant.perform(event)
         return plant
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields, replace
 import json
 from math import sin
@@ -51,7 +51,7 @@ KINDS = {
     '/tip_deflection': 'geometry_msgs/msg/PointStamped',
     '/ground_truth': 'sensor_msgs/msg/JointState',
 }
-NODE = {
+NODE: dict[str, Any] = {
     'rate': RATE,
     'seed': 7,
     'mode': 'simulation',
@@ -68,7 +68,7 @@ MODEL = NeedleParameters.preset('phantom')
 TIP = TipParameters(rate=50.0, noise=1e-5, delay=0.012)
 
 
-def configuration(**changes: object) -> dict[str, object]:
+def configuration(**changes: object) -> dict[str, Any]:
     """Return the parameters as the node says them."""
     values = dict(NODE)
     for prefix, constants in (
@@ -133,7 +133,7 @@ def tip(at: int, depth: float, deflection: float) -> bytes:
     return encode(message_type(KINDS['/tip_deflection'])(header(at), point))
 
 
-def text(values: dict[str, float | str]) -> bytes:
+def text(values: Mapping[str, Any]) -> bytes:
     document = yaml.safe_dump({'/plant': {'ros__parameters': values}})
     return encode(message_type(KINDS['/plant/configuration'])(document))
 
@@ -204,7 +204,7 @@ def measured(sample: Sample, k: int, torque: float, acting: float | None = None)
         seen = at - sample.tip.age * PERIOD
         data = tip(seen, sample.tip.depth, sample.tip.deflection)
         result.append(Message('/tip_deflection', 0, seen, data))
-    efforts = () if acting is None else (-acting, torque, 0.0, 0.0)
+    efforts = [] if acting is None else [-acting, torque, 0.0, 0.0]
     data = joints(at, names, state[:m], state[m:], efforts)
     result.append(Message('/ground_truth', 0, at, data))
     position, velocity = [sample.joint_position, state[1]], [sample.speed, state[m + 1]]
@@ -263,7 +263,7 @@ def carried(comes: int, recorded: int) -> list[Message]:
     """Run with a base that takes a trajectory before a sample; it is recorded near another."""
     plant = needle('robot')
     times, depths = zip(*POINTS, strict=True)
-    content = {
+    content: dict[str, Any] = {
         'joints': ['insertion'],
         'times': times,
         'positions': [[depth] for depth in depths],
