@@ -60,7 +60,7 @@ class NeedleParameters:
         default=(), metadata={'description': 'stiffness of each of these layers [N/m^2]'}
     )
     swelling: float = constant(
-        0.0, '1', 'growth of the tissue stiffness by swelling in the long run',
+        0.0, '1', 'final relative change of the tissue stiffness by swelling',
         low=-1.0, open_low=True,
     )  # fmt: skip
     swelling_time: float = constant(1.0, 's', 'time constant of the swelling', open_low=True)
@@ -71,16 +71,19 @@ class NeedleParameters:
         default='coulomb', metadata={'description': f'one of {", ".join(FRICTION_LAWS)}'}
     )
     withdrawal_friction: float = constant(
-        1.0, '1', 'friction on withdrawal over that on insertion'
+        1.0, '1', 'ratio of friction on withdrawal to friction on insertion'
     )
     breakaway_friction: float = constant(
-        1.0, '1', 'friction at rest over Coulomb friction (law stribeck)', low=1.0
+        1.0, '1', 'ratio of friction at rest to Coulomb friction (law stribeck)', low=1.0
     )
     stribeck_speed: float = constant(
-        1e-3, 'm/s', 'speed over which break-away friction falls (law stribeck)', open_low=True
+        1e-3,
+        'm/s',
+        'speed scale over which break-away friction decays (law stribeck)',
+        open_low=True,
     )
     smoothing_speed: float = constant(
-        1e-4, 'm/s', 'speed over which friction turns (law tanh)', open_low=True
+        1e-4, 'm/s', 'speed scale over which friction changes sign (law tanh)', open_low=True
     )
     modes: int = field(default=2, metadata={'description': 'number of shape modes n'})
     formulation: str = field(

@@ -339,7 +339,7 @@ class PlantNode(ModelNode):
             plant_run.reset()
             self._halted = None
             self._set_fault({})
-            return 'needle and noise are at their start; time goes on'
+            return 'needle and noise are reset; time continues'
 
         return self._answer(response, 'reset', reset)
 
@@ -377,7 +377,7 @@ class PlantNode(ModelNode):
             measured = plant_run.take(stamp)
         except NeedleError as error:
             self._halted = str(error)
-            self.get_logger().error(f'{error}; the plant stands still')
+            self.get_logger().error(f'{error}; the plant has stopped')
             self.report_change()
             return
         self._sampled += 1
@@ -464,7 +464,7 @@ class PlantNode(ModelNode):
             **self._run.plant.report,
             'real-time factor': f'{samples / rate:.3f}',
             'commands per second [Hz]': f'{commands:.1f}',
-            'samples made up after stalls': self._made_up,
+            'samples computed after stalls': self._made_up,
             'samples given up': clock.lost,
             'waited for the machine [s]': f'{clock.waited / NANOSECONDS:.3f}',
             'commands refused': given.refused + self._refused_trajectories,
@@ -484,9 +484,9 @@ class PlantNode(ModelNode):
         if self._looks >= _REPEAT:
             warnings.append(f'no command answers the sample of {clock.stamp / NANOSECONDS:.6f} s')
         if clock.lost:
-            warnings.append(f'{clock.lost} samples given up after stalls')
+            warnings.append(f'{clock.lost} samples skipped after stalls')
         if commands > _TOO_MANY * max(samples, rate):
-            warnings.append(f'{commands:.0f} commands come per second for {samples:.0f} samples')
+            warnings.append(f'{commands:.0f} commands per second for {samples:.0f} samples')
         if self._fault is not None:
             warnings.append(f'{self._faulty} has the fault {self.text("fault.kind")}')
         if warnings:

@@ -46,7 +46,9 @@ class PlantSettings:
     )
     force_limit: float = constant(1e3, 'N', 'largest force that a command may ask for')
     torque_limit: float = constant(1.0, 'N m', 'largest torque that a command may ask for')
-    backlog: float = constant(0.5, 's', 'delay that is made up after a stall', open_low=True)
+    backlog: float = constant(
+        0.5, 's', 'longest delay after a stall whose samples are still computed', open_low=True
+    )
 
     def __post_init__(self) -> None:
         check_constants(self)

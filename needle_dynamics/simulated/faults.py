@@ -29,10 +29,10 @@ FAULTY: Final[Mapping[str, Sequence[int]]] = {
 class FaultParameters:
     """Probability, delay and size of a fault."""
 
-    probability: float = constant(1.0, '1', 'part of the measurements that the fault hits', high=1)
-    delay: float = constant(0.05, 's', 'how much later delayed measurements leave', high=10.0)
+    probability: float = constant(1.0, '1', 'probability that a measurement is affected', high=1)
+    delay: float = constant(0.05, 's', 'delay of delayed measurements', high=10.0)
     size: float = constant(
-        0.0, 'SI', 'what a bias adds, or where a measurement saturates (either sign), in its unit',
+        0.0, 'SI', 'size of a bias, or bound of a saturated measurement (both signs), in its unit',
         low=-1e3, high=1e3,
     )  # fmt: skip
 

@@ -37,21 +37,23 @@ class IndenterParameters:
     )
     stiffness_xx: tuple[float, ...] = constant(
         (1260.0, 820.0, 1100.0, 1030.0, 960.0), 'N/m',
-        'force along x per motion along x, each level',
+        'force along x per displacement along x, by level',
     )  # fmt: skip
     stiffness_xz: tuple[float, ...] = constant(
-        (40.0, 40.0, 10.0, 1.0, -5.0), 'N/m', 'force along x per motion along z, each level',
+        (40.0, 40.0, 10.0, 1.0, -5.0), 'N/m', 'force along x per displacement along z, by level',
         low=-1e6,
     )  # fmt: skip
     stiffness_zx: tuple[float, ...] = constant(
         (-100.0, -100.0, -110.0, -110.0, -110.0), 'N/m',
-        'force along z per motion along x, each level', low=-1e6,
+        'force along z per displacement along x, by level', low=-1e6,
     )  # fmt: skip
     stiffness_zz: tuple[float, ...] = constant(
-        (1010.0, 810.0, 690.0, 600.0, 520.0), 'N/m', 'force along z per motion along z, each level'
+        (1010.0, 810.0, 690.0, 600.0, 520.0),
+        'N/m',
+        'force along z per displacement along z, by level',
     )
     off_plane: float = constant(
-        1e-4, 'm/N', 'motion along y per magnitude of the force', low=-1.0, high=1.0
+        1e-4, 'm/N', 'displacement along y per magnitude of the force', low=-1.0, high=1.0
     )
     position_noise: float = constant(1e-5, 'm', 'standard deviation of white position noise')
     encoder_resolution: float = constant(1e-6, 'm', 'length per count of the position')
