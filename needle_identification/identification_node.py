@@ -23,7 +23,7 @@ from needle_identification.recordings.reading import (
     signed_axis,
 )
 from needle_identification.result import model_parameters, NODES, write_result
-from needle_identification.status import of_friction, of_statistic, of_stiffness, sentence, Status
+from needle_identification.status import live_statuses, sentence, Status, summary_statuses
 from needle_identification.stiffness.identify import identify_stiffness
 from needle_identification.stiffness.settings import StiffnessSettings
 from needle_identification.stiffness.summary import StiffnessSummary, summarize_stiffness
@@ -48,17 +48,7 @@ WHAT: Final = ('friction', 'stiffness')
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class IdentificationSettings:
-    """
-    Settings of the node itself.
-
-    Attributes
-    ----------
-    level : float
-        Force level of the resulting stiffness [N]; 0 for the largest.
-    forgetting : float
-        Time of steady motion in which the weight of a sample falls to 1 / e [s].
-
-    """
+    """Settings of the node itself; each field says its meaning and unit."""
 
     level: float = constant(0.0, 'N', 'stiffness: force level of the result; 0: the largest')
     forgetting: float = constant(
@@ -206,16 +196,19 @@ class IdentificationNode(BaseNode):
             'motion_topic': self.text('motion_topic') or None,
             'time': self.text('time'),
         }
+        output = self.text('output')
         if self._what == 'friction':
             friction = self._identify_friction(reading)
-            self._write(friction, None)
+            if output:
+                write_result(output, friction)
             self._found = friction.statistics
-            self._publish(self._friction, of_friction(friction))
+            self._publish(self._friction, summary_statuses(friction))
         else:
             stiffness = self._identify_stiffness(reading)
-            self._write(None, stiffness)
+            if output:
+                write_result(output, None, stiffness)
             self._found = (stiffness.tissue_stiffness,)
-            self._publish(self._stiffness, of_stiffness(stiffness))
+            self._publish(self._stiffness, summary_statuses(stiffness))
         self._words = f'{sentence(self._found)} from {len(self._bags)} recordings'
         self.get_logger().info(self._words)
 
@@ -253,11 +246,6 @@ class IdentificationNode(BaseNode):
             estimates.append(estimate)
         return estimates
 
-    def _write(self, friction: FrictionSummary | None, stiffness: StiffnessSummary | None) -> None:
-        output = self.text('output')
-        if output:
-            write_result(output, friction, stiffness)
-
     def _publish(self, publisher: Publisher, results: Iterable[Status]) -> None:
         message = DiagnosticArray(status=[_message_of(result) for result in results])
         message.header.stamp = self.get_clock().now().to_msg()
@@ -288,11 +276,7 @@ class IdentificationNode(BaseNode):
         if self._live is not None and found:
             if any(one.count for one in found):
                 self._found = found
-            samples = self._live.samples
-            self._publish(
-                self._friction,
-                [of_statistic(one, samples=samples, source='live') for one in found],
-            )
+            self._publish(self._friction, live_statuses(found, self._live.samples))
 
     # Into running nodes.
 

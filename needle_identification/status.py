@@ -19,16 +19,14 @@ class Status(NamedTuple):
 
     Attributes
     ----------
-    name : str
-        Parameter or recording.
-    message : str
-        The result in words.
+    name, message : str
+        Parameter or recording, and the result in words.
     values : mapping
         Values by name; None for one that does not apply.
     is_determined : bool
         Whether the data determine it.
     source : str
-        Where it comes from: ``recordings`` or ``live``.
+        Where a parameter comes from: ``recordings`` or ``live``.
 
     """
 
@@ -39,29 +37,55 @@ class Status(NamedTuple):
     source: str = ''
 
 
-def of_statistic(
-    one: Statistic, *, level: str = '', samples: int | None = None, source: str = 'recordings'
-) -> Status:
+def live_statuses(found: Sequence[Statistic], samples: int) -> list[Status]:
     """
-    Report a parameter.
+    Report parameters that were identified from running topics.
 
     Parameters
     ----------
-    one : Statistic
-        The parameter.
-    level : str
-        Force level of a stiffness; follows the name.
-    samples : int, optional
-        Number of samples it comes from.
-    source : str
-        ``recordings`` or ``live``.
+    found : sequence of Statistic
+        Parameters.
+    samples : int
+        Number of samples they come from.
 
     Returns
     -------
-    Status
-        Estimate, interval, unit and numbers of recordings and samples.
+    list of Status
+        One per parameter.
 
     """
+    return [_of_statistic(one, samples=samples, source='live') for one in found]
+
+
+def summary_statuses(summary: FrictionSummary | StiffnessSummary) -> list[Status]:
+    """
+    Report what was identified from recordings.
+
+    Parameters
+    ----------
+    summary : FrictionSummary or StiffnessSummary
+        Parameters over all recordings.
+
+    Returns
+    -------
+    list of Status
+        One per parameter and force level, then one per recording.
+
+    """
+    if isinstance(summary, FrictionSummary):
+        samples = sum(one.samples for one in summary.estimates)
+        statuses = [_of_statistic(one, samples=samples) for one in summary.statistics]
+        return [*statuses, *map(_of_friction, summary.estimates)]
+    statuses = [_of_statistic(summary.tissue_stiffness)]
+    for level in summary.levels:
+        at = f' at {level.force:.2f} N'
+        statuses += [_of_statistic(one, level=at) for one in level.statistics]
+    return [*statuses, *map(_of_stiffness, summary.estimates)]
+
+
+def _of_statistic(
+    one: Statistic, *, level: str = '', samples: int | None = None, source: str = 'recordings'
+) -> Status:
     values = {
         'estimate': one.mean,
         'interval_low': one.interval[0],
@@ -76,35 +100,10 @@ def of_statistic(
     return Status(f'{one.name}{level}', message, values, one.count > 0, source)
 
 
-def of_friction(summary: FrictionSummary) -> list[Status]:
-    """
-    Report the friction over recordings.
-
-    Parameters
-    ----------
-    summary : FrictionSummary
-        The friction.
-
-    Returns
-    -------
-    list of Status
-        One per parameter, then one per recording.
-
-    """
-    samples = sum(one.samples for one in summary.estimates)
-    return [
-        *(of_statistic(one, samples=samples) for one in summary.statistics),
-        *map(_of_friction_estimate, summary.estimates),
-    ]
-
-
-def _of_friction_estimate(estimate: FrictionEstimate) -> Status:
-    others = (one for one in (estimate.breakaway, estimate.lag) if one is not None)
+def _of_friction(estimate: FrictionEstimate) -> Status:
+    parameters = (*estimate.parameters, estimate.breakaway, estimate.lag)
     values = {
-        **{
-            one.name: measured(one.value, one.error, one.unit)
-            for one in (*estimate.parameters, *others)
-        },
+        **{p.name: measured(p.value, p.error, p.unit) for p in parameters if p is not None},
         'samples': estimate.samples,
         'residual': estimate.residual,
         'determination': estimate.determination,
@@ -113,33 +112,7 @@ def _of_friction_estimate(estimate: FrictionEstimate) -> Status:
     return Status(estimate.name, f'R^2 = {estimate.determination:.4f}', values)
 
 
-def of_stiffness(summary: StiffnessSummary) -> list[Status]:
-    """
-    Report the stiffness over places.
-
-    Parameters
-    ----------
-    summary : StiffnessSummary
-        The stiffness.
-
-    Returns
-    -------
-    list of Status
-        k_a, then one per entry and force level, then one per recording.
-
-    """
-    return [
-        of_statistic(summary.tissue_stiffness),
-        *(
-            of_statistic(one, level=f' at {level.force:.2f} N')
-            for level in summary.levels
-            for one in level.statistics
-        ),
-        *map(_of_stiffness_estimate, summary.estimates),
-    ]
-
-
-def _of_stiffness_estimate(estimate: StiffnessEstimate) -> Status:
+def _of_stiffness(estimate: StiffnessEstimate) -> Status:
     worst = min(level.determination for level in estimate.levels)
     values = {
         'presses': sum(level.presses for level in estimate.levels),

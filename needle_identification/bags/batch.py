@@ -7,7 +7,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
-from needle_identification.bags.compression import compression_of, DAMAGED, decompress
+from needle_identification.bags.compression import DAMAGED, decompress
 from needle_identification.bags.topics import Topic
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,9 @@ LARGEST_BATCH: Final = 2**14
 
 #: Receive times are limited to this, so that their differences fit in 64 bits [ns].
 LATEST: Final = 2**62
+
+#: How compressed messages begin; others begin with 0.
+_COMPRESSED: Final = {b'\x28\xb5\x2f\xfd': 'zstd', b'\x04\x22\x4d\x18': 'lz4'}
 
 #: Larger messages are not decompressed [bytes].
 _LARGEST_MESSAGE: Final = 2**26
@@ -32,10 +35,8 @@ class Batch(NamedTuple):
         The topic.
     received : ndarray of int64, shape (m,)
         Receive times [ns].
-    data : ndarray of uint8
-        Bytes that hold the messages.
-    begin, end : ndarray of int64, shape (m,)
-        Positions at which each message begins and ends.
+    data, begin, end : ndarray
+        Bytes that hold the messages, and where each begins and ends, shape (m,).
 
     """
 
@@ -93,8 +94,8 @@ class Batch(NamedTuple):
             The same messages; a damaged one is empty.
 
         """
-        compression = compression_of(next(self.messages())[1])
-        if not compression:
+        compression = _COMPRESSED.get(next(self.messages())[1][:4])
+        if compression is None:
             return self
         parts = [b''] * len(self.received)
         for k, (_, data) in enumerate(self.messages()):
@@ -116,10 +117,8 @@ class Tally:
         Tells whether the messages of a topic are wanted.
     faults : list of str
         What is wrong with the file.
-    count : int
-        Messages read, of known topics.
-    written : int or None
-        Messages that the file should have, by its own statistics.
+    count, written : int
+        Messages read of known topics, and messages that the file should have, if it says so.
     piece : int
         Number of the piece that is being read; the pieces of a file are in order of time.
 

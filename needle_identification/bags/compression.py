@@ -19,9 +19,6 @@ BLOCK: Final = 2**20
 #: A larger record or chunk is a damaged length [bytes].
 LARGEST: Final = 2**30
 
-#: How compressed data begin; a message that is not compressed begins with 0.
-_MAGIC: Final = {b'\x28\xb5\x2f\xfd': 'zstd', b'\x04\x22\x4d\x18': 'lz4'}
-
 #: What readers raise at damaged bytes.
 DAMAGED: Final = (
     RuntimeError,
@@ -34,24 +31,6 @@ DAMAGED: Final = (
     TypeError,
     ValueError,
 )
-
-
-def uncompressed_name(file: Path) -> Path:
-    """
-    Return the name of a file without the ending of its compression.
-
-    Parameters
-    ----------
-    file : Path
-        A file, compressed or not.
-
-    Returns
-    -------
-    Path
-        Its name when it is decompressed.
-
-    """
-    return file.with_suffix('') if file.suffix in COMPRESSED else file
 
 
 def open_file(file: Path) -> Any:
@@ -101,40 +80,6 @@ def read_up_to(stream: Any, length: int) -> bytes:
             parts.append(part)
             length -= len(part)
     return parts[0] if len(parts) == 1 else b''.join(parts)
-
-
-def skip(stream: Any, length: int) -> None:
-    """
-    Read past bytes, in bounded memory.
-
-    Parameters
-    ----------
-    stream : binary stream
-        Stream to read.
-    length : int
-        Number of bytes.
-
-    """
-    while length > 0 and (part := read_up_to(stream, min(length, BLOCK))):
-        length -= len(part)
-
-
-def compression_of(data: bytes) -> str:
-    """
-    Tell how data are compressed.
-
-    Parameters
-    ----------
-    data : bytes
-        Data; their first four bytes are enough.
-
-    Returns
-    -------
-    str
-        ``zstd``, ``lz4``, or '' if they are not compressed.
-
-    """
-    return _MAGIC.get(data[:4], '')
 
 
 def decompress(compression: str, data: bytes, size: int) -> bytes:

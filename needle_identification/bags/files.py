@@ -6,7 +6,7 @@ from pathlib import Path
 import re
 from typing import Final
 
-from needle_identification.bags.compression import uncompressed_name
+from needle_identification.bags.compression import COMPRESSED
 from needle_identification.errors import RecordingError
 import yaml
 
@@ -33,8 +33,13 @@ def form_of(file: Path) -> str:
         ``.mcap``, ``.db3``, or '' for another.
 
     """
-    suffix = uncompressed_name(file).suffix
+    suffix = _uncompressed(file).suffix
     return suffix if suffix in _FORMS else ''
+
+
+def _uncompressed(file: Path) -> Path:
+    """Return the name of a file without the ending of its compression."""
+    return file.with_suffix('') if file.suffix in COMPRESSED else file
 
 
 def files_of(path: Path) -> tuple[list[Path], list[str]]:
@@ -84,7 +89,7 @@ def files_of(path: Path) -> tuple[list[Path], list[str]]:
     names = _names_in_metadata(path)
     if names is None:
         # The parts of one recording differ in a number at the end.
-        if len({re.sub(r'_\d+$', '', uncompressed_name(file).stem) for file in chosen}) > 1:
+        if len({re.sub(r'_\d+$', '', _uncompressed(file).stem) for file in chosen}) > 1:
             raise RecordingError(
                 f'{path} holds several recordings; name them, such as {chosen[0]}'
             )

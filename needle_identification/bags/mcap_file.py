@@ -12,7 +12,7 @@ from contextlib import suppress
 from io import BytesIO
 from pathlib import Path
 import struct
-from typing import Final
+from typing import Any, Final
 import zlib
 
 from mcap.data_stream import ReadDataStream
@@ -27,7 +27,6 @@ from needle_identification.bags.compression import (
     LARGEST,
     open_file,
     read_up_to,
-    skip,
 )
 from needle_identification.bags.topics import make_topic, Topic
 from needle_identification.errors import RecordingError
@@ -163,7 +162,7 @@ def mcap_batches(file: Path, tally: Tally) -> Iterator[Batch]:
             elif opcode == Opcode.STATISTICS:
                 tally.written = int.from_bytes(read_up_to(stream, length)[:8], 'little')
             else:
-                skip(stream, length)
+                _skip(stream, length)
                 is_complete |= opcode == Opcode.DATA_END
             if opcode == Opcode.FOOTER:
                 break
@@ -172,6 +171,12 @@ def mcap_batches(file: Path, tally: Tally) -> Iterator[Batch]:
         tally.faults.insert(0, 'is cut off')
     if tally.written not in (None, tally.count):
         tally.faults.append('has lost messages')
+
+
+def _skip(stream: Any, length: int) -> None:
+    """Read past bytes, in bounded memory."""
+    while length > 0 and (part := read_up_to(stream, min(length, BLOCK))):
+        length -= len(part)
 
 
 def _chunk_content(chunk: bytes, length: int, tally: Tally) -> bytes:

@@ -18,16 +18,7 @@ from needle_ros.timing import NANOSECONDS
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlaybackSettings:
     """
-    Which part of a recording is played, and how fast.
-
-    Attributes
-    ----------
-    rate : float
-        Speed over that of the recording [1]; 0 for as fast as possible.
-    start, end : float
-        Times in the recording at which to begin and to end [s]; end 0 for the end of it.
-    delay : float
-        Time before the first message [s].
+    Which part of a recording is played, and how fast; each field says its meaning and unit.
 
     Raises
     ------

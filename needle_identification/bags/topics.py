@@ -25,12 +25,9 @@ class OfferedQos(NamedTuple):
 
     Attributes
     ----------
-    reliability : str
-        ``reliable`` or ``best_effort``.
-    durability : str
-        ``volatile`` or ``transient_local``.
-    history : str
-        ``keep_last`` or ``keep_all``.
+    reliability, durability, history : str
+        ``reliable`` or ``best_effort``, ``volatile`` or ``transient_local``, ``keep_last`` or
+        ``keep_all``.
     depth : int
         Number of messages that are kept.
 

@@ -16,18 +16,10 @@ TERMS: Final = ('coulomb', 'viscous', 'offset', 'inertia', 'direction', 'stribec
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FrictionSettings:
     """
-    Settings of `identify_friction` and `RecursiveFriction`.
+    Settings of `identify_friction` and `RecursiveFriction`; each field says its meaning and unit.
 
     Attributes
     ----------
-    cutoff : float
-        Cutoff of the zero-phase low-pass filter of force and motion [Hz].
-    moving_speed : float
-        Speed above which the needle counts as moving [m/s].
-    largest_acceleration : float
-        Acceleration up to which samples are used without the term inertia [m/s^2].
-    stribeck_speed : float
-        Speed over which the breakaway friction decays [m/s].
     terms : tuple of str
         Terms of the friction force, of `TERMS`; the default is equation (15).
     estimator : str

@@ -18,14 +18,12 @@ from needle_identification.bags.topics import Topic
 from needle_identification.errors import RecordingError
 from needle_identification.recordings import TIMES
 from needle_identification.recordings.recording import IndentationRecording, Recording
-from needle_identification.recordings.samples import from_speed, Gathering, with_speed
-from needle_identification.recordings.sources import (
+from needle_identification.recordings.samples import (
     AXES,
-    Joint,
-    Odometry,
-    PlaneJoints,
+    Gathering,
+    position_and_speed,
     Source,
-    Vector,
+    source_of,
 )
 from needle_identification.recordings.timebase import merge
 from needle_ros import wire
@@ -101,13 +99,12 @@ def read_friction_recording(
     wrench = _chosen(bag, topics, _WRENCH, wrench_topic)
     motion = _chosen(bag, topics, _FRICTION_MOTION, motion_topic)
     source, direction = _motion_source(motion.type_name, motion_axis)
-    gathered, configuration = _read(bag, {wrench: Vector(axis), motion: source}, time)
+    force_source = source_of(wrench.type_name, [axis])
+    gathered, configuration = _read(bag, {wrench: force_source, motion: source}, time)
     force = gathered[wrench].samples(bag)
     moved = gathered[motion].samples(bag)
-    if motion.type_name == wire.TWIST:
-        moved = from_speed(moved, bag)
-    elif motion.type_name in (wire.JOINT_STATE, wire.ODOMETRY):
-        moved = with_speed(moved, bag)
+    if motion.type_name in (wire.TWIST, wire.JOINT_STATE, wire.ODOMETRY):
+        moved = position_and_speed(moved, bag)
     else:
         bag.losses.append(f'{motion.name} has no velocity')
     merged = merge(bag, force, moved._replace(values=direction * moved.values))
@@ -163,9 +160,11 @@ def read_indentation_recording(
     topics = bag.topics()
     wrench = _chosen(bag, topics, _WRENCH, wrench_topic)
     motion = _chosen(bag, topics, _INDENTATION_MOTION, motion_topic)
-    is_joints = motion.type_name == wire.JOINT_STATE
-    source: Source = (PlaneJoints if is_joints else Vector)(*plane, across)
-    gathered, configuration = _read(bag, {wrench: Vector(*plane), motion: source}, time)
+    sources = {
+        wrench: source_of(wrench.type_name, plane),
+        motion: source_of(motion.type_name, (*plane, across)),
+    }
+    gathered, configuration = _read(bag, sources, time)
     merged = merge(bag, gathered[wrench].samples(bag), gathered[motion].samples(bag))
     return IndentationRecording(
         name=str(path),
@@ -213,9 +212,10 @@ def _motion_source(type_name: str, axis: str | None) -> tuple[Source, float]:
     """Return what to take for a motion along an axis or of a joint, and its sign."""
     if type_name == wire.JOINT_STATE:
         backward = axis is not None and axis.startswith('-')
-        return Joint(axis[1:] if axis and backward else axis), -1.0 if backward else 1.0
+        joint = axis[1:] if axis and backward else axis
+        return source_of(type_name, 'y', joint), -1.0 if backward else 1.0
     sign, name = signed_axis('y' if axis is None else axis, 'motion axis')
-    return (Odometry if type_name == wire.ODOMETRY else Vector)(name), sign
+    return source_of(type_name, [name]), sign
 
 
 def _chosen(bag: Bag, topics: Sequence[Topic], wanted: _Wanted, name: str | None) -> Topic:

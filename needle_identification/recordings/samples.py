@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+from collections.abc import Sequence, Set
 from typing import Final, NamedTuple, NoReturn
 
 from needle_dynamics.arrays import BoolArray, FloatArray
@@ -11,16 +13,214 @@ from needle_identification.bags.topics import Topic
 from needle_identification.errors import RecordingError
 from needle_identification.recordings.recording import integrated
 from needle_identification.recordings.series import FINEST, Series
-from needle_identification.recordings.sources import LARGEST, Source
 from needle_ros import wire
 import numpy as np
 from numpy.typing import NDArray
+
+#: Axes of a frame, in the order of messages.
+AXES: Final = ('x', 'y', 'z')
+
+#: A larger number is no measurement [SI].
+_LARGEST: Final = 1e100
+
+#: Joint of the plant that moves the needle.
+_INSERTION: Final = 'insertion'
+
+#: Names of joints that are kept, for messages.
+_MAX_NAMES: Final = 100
 
 #: A longer step between samples is a gap [sampling periods].
 _GAP: Final = 10.0
 
 #: Latencies that are kept of a batch, and of a topic.
 _LATENCIES: Final = (64, 2**16)
+
+
+class Source(ABC):
+    """
+    What to take from the messages of a topic.
+
+    It is called with the template of messages, and returns the positions of the numbers to take
+    [bytes], as `wire.decode` needs them.
+
+    Attributes
+    ----------
+    columns, width : int
+        How many numbers are taken of each message, and how many values are made of them.
+
+    """
+
+    columns: int
+    width: int
+
+    @abstractmethod
+    def __call__(self, template: wire.Template) -> Sequence[int] | None:
+        """Choose numbers; None if the messages are not wanted."""
+
+    def _measured(self, numbers: FloatArray) -> FloatArray:
+        """Return the values from the numbers, (n, columns), nan where a message lacks one."""
+        return numbers
+
+    def _complaint(self) -> str:
+        """Say what is wrong with the topic as a whole."""
+        return ''
+
+    def _losses(self) -> list[str]:
+        """Say what the topic lacks."""
+        return []
+
+
+class _Vector(Source):
+    """Components of the first vector of a message."""
+
+    def __init__(self, *axes: str) -> None:
+        self.columns = self.width = len(axes)
+        self._offsets = [8 * AXES.index(axis) for axis in axes]
+
+    def __call__(self, template: wire.Template) -> list[int]:
+        begin, _ = template.arrays[0]
+        return [begin + offset for offset in self._offsets]
+
+
+class _Odometry(Source):
+    """Position, speed and whether there is one: the pose is in a frame, the twist in the body."""
+
+    columns, width = 10, 3
+
+    def __init__(self, axis: str) -> None:
+        self._axis = AXES.index(axis)
+
+    def __call__(self, template: wire.Template) -> list[int]:
+        begin, _ = template.arrays[0]
+        # Position and orientation (7 numbers), their covariance (36), velocity (3).
+        return [begin + 8 * k for k in (*range(7), *range(43, 46))]
+
+    def _measured(self, numbers: FloatArray) -> FloatArray:
+        imaginary, real, body = numbers[:, 3:6], numbers[:, 6:7], numbers[:, 7:]
+        twice = 2.0 * np.cross(imaginary, body)
+        velocity = body + real * twice + np.cross(imaginary, twice)
+        return _position_and_speed(numbers[:, self._axis], velocity[:, self._axis])
+
+
+class _Joint(Source):
+    """Position, speed and whether there is one of a joint; by default that of the plant."""
+
+    columns, width = 2, 3
+
+    def __init__(self, joint: str | None) -> None:
+        self._joint = joint
+        self._seen: set[str] = set()
+        self._used: set[str] = set()
+        self._has_position = self._has_speed = False
+
+    def __call__(self, template: wire.Template) -> list[int] | None:
+        if len(self._seen) < _MAX_NAMES:
+            self._seen.update(template.names)
+        joint = self._joint or _INSERTION
+        if self._joint is None and joint not in template.names and len(template.names) == 1:
+            [joint] = template.names
+        if joint not in template.names:
+            return None
+        self._used.add(joint)
+        index = template.names.index(joint)
+        position, speed = (_element(array, index) for array in template.arrays[:2])
+        self._has_position |= position >= 0
+        self._has_speed |= speed >= 0
+        return [position, speed]
+
+    def _measured(self, numbers: FloatArray) -> FloatArray:
+        position, speed = numbers.T
+        return _position_and_speed(position if self._has_position else 0.0 * speed, speed)
+
+    def _complaint(self) -> str:
+        if len(self._used) != 1:
+            what = 'several joints' if self._used else f'no joint {self._joint or _INSERTION!r}'
+            names = f'motion_axis must name one of {_listing(self._seen)}'
+            return f'has {what}; {names}' if self._seen else 'has joints without names'
+        if not (self._has_position or self._has_speed):
+            return f'has neither position nor velocity of {_listing(self._used)}'
+        return ''
+
+
+class _PlaneJoints(Source):
+    """Positions of two joints that move an end-effector in a plane, and of one out of it."""
+
+    columns = width = 3
+
+    def __init__(self, *joints: str) -> None:
+        self._joints = joints
+        self._seen: set[str] = set()
+        self._is_used = self._is_flat = False
+
+    def __call__(self, template: wire.Template) -> list[int] | None:
+        if len(self._seen) < _MAX_NAMES:
+            self._seen.update(template.names)
+        if not set(self._joints[:2]) <= set(template.names):
+            return None
+        self._is_used = True
+        self._is_flat |= self._joints[2] not in template.names
+        positions = template.arrays[0]
+        return [
+            _element(positions, template.names.index(joint)) if joint in template.names else -1
+            for joint in self._joints
+        ]
+
+    def _measured(self, numbers: FloatArray) -> FloatArray:
+        if self._is_flat:
+            numbers[:, 2] = np.nan_to_num(numbers[:, 2])
+        return numbers
+
+    def _complaint(self) -> str:
+        if self._is_used:
+            return ''
+        wanted = ' and '.join(self._joints[:2])
+        return f'must have the joints {wanted}, has {_listing(self._seen)}'
+
+    def _losses(self) -> list[str]:
+        return ['has no joint out of the plane: off-plane motion unknown'] if self._is_flat else []
+
+
+def _listing(names: Set[str]) -> str:
+    shown = (' '.join(name.split()) for name in sorted(names)[:_MAX_NAMES])
+    return ', '.join(shown) or 'none'
+
+
+def _element(array: tuple[int, int], index: int) -> int:
+    begin, length = array
+    return begin + 8 * index if index < length else -1
+
+
+def _position_and_speed(position: FloatArray, speed: FloatArray) -> FloatArray:
+    known = np.abs(speed) < _LARGEST
+    return np.column_stack([position, np.where(known, speed, 0.0), known])
+
+
+def source_of(type_name: str, axes: Sequence[str], joint: str | None = None) -> Source:
+    """
+    Choose what to take from the messages of a type.
+
+    Parameters
+    ----------
+    type_name : str
+        Message type.
+    axes : sequence of str
+        One axis along the motion, or two of a plane and the one across; of `AXES`. Of a
+        JointState with three axes the joints of that name.
+    joint : str, optional
+        Joint along the motion of a JointState; default that of the plant, or the only one.
+
+    Returns
+    -------
+    Source
+        Its values are the components; or, for a motion of a JointState or Odometry, position,
+        speed, and whether there is a speed.
+
+    """
+    if type_name == wire.JOINT_STATE:
+        return _PlaneJoints(*axes) if len(axes) == 3 else _Joint(joint)
+    if type_name == wire.ODOMETRY and len(axes) == 1:
+        return _Odometry(*axes)
+    return _Vector(*axes)
 
 
 class Samples(NamedTuple):
@@ -96,8 +296,8 @@ class Gathering:
             self._unstamped += int(np.count_nonzero(~stamped))
             stamps = np.where(stamped, decoded.stamps, received)
         with np.errstate(all='ignore'):
-            values = self._source.measured(decoded.values)
-        usable = (np.abs(values) < LARGEST).all(axis=1)
+            values = self._source._measured(decoded.values)
+        usable = (np.abs(values) < _LARGEST).all(axis=1)
         self._unusable += int(np.count_nonzero(~usable))
         self._series.add(stamps[usable], values[usable])
         few, many = _LATENCIES
@@ -126,7 +326,7 @@ class Gathering:
 
         """
         name, series = self._topic.name, self._series
-        if complaint := self._source.complaint():
+        if complaint := self._source._complaint():
             self._reject(bag, complaint)
         series.compact()
         for count, what in (
@@ -151,7 +351,7 @@ class Gathering:
         if len(gaps):
             places = '1 place' if len(gaps) == 1 else f'{len(gaps)} places'
             bag.losses.append(f'{name} pauses in {places}, {1e-9 * gaps.sum():.3g} s in all')
-        bag.losses += [f'{name} {loss}' for loss in self._source.losses()]
+        bag.losses += [f'{name} {loss}' for loss in self._source._losses()]
         return Samples(name, series.stamps, series.values, np.concatenate(self._latencies))
 
     def _reject(self, bag: Bag, complaint: str) -> NoReturn:
@@ -177,14 +377,14 @@ def are_gaps(steps: NDArray[np.int64]) -> BoolArray:
     return np.asarray(steps > _GAP * np.median(steps))
 
 
-def with_speed(samples: Samples, bag: Bag) -> Samples:
+def position_and_speed(samples: Samples, bag: Bag) -> Samples:
     """
-    Keep what was measured of position and speed.
+    Take position and speed as far as they were measured; a speed alone is integrated.
 
     Parameters
     ----------
     samples : Samples
-        Values are position, speed, and whether there is a speed.
+        Values are position, speed, and whether there is a speed; or the speed alone.
     bag : Bag
         The bag; what is missing is added to its losses.
 
@@ -195,11 +395,13 @@ def with_speed(samples: Samples, bag: Bag) -> Samples:
 
     """
     topic, _, values, _ = samples
+    if values.shape[1] == 1:
+        return _from_speed(samples, bag)
     position, speed, share = values.T
     known = share > 0.0
     if speed.any() and not position.any():
         alone = (speed[known] / share[known])[:, np.newaxis]
-        return from_speed(samples._replace(stamps=samples.stamps[known], values=alone), bag)
+        return _from_speed(samples._replace(stamps=samples.stamps[known], values=alone), bag)
     if np.count_nonzero(known) < max(2.0, 0.5 * len(known)):
         bag.losses.append(f'{topic} has no velocity')
     elif not speed.any() and np.ptp(position) > 0.0:
@@ -213,23 +415,7 @@ def with_speed(samples: Samples, bag: Bag) -> Samples:
     return samples._replace(values=values[:, :1])
 
 
-def from_speed(samples: Samples, bag: Bag) -> Samples:
-    """
-    Integrate a speed.
-
-    Parameters
-    ----------
-    samples : Samples
-        Values are the speed alone.
-    bag : Bag
-        The bag; that there is no position is added to its losses.
-
-    Returns
-    -------
-    Samples
-        Values are position, from zero, and speed.
-
-    """
+def _from_speed(samples: Samples, bag: Bag) -> Samples:
     bag.losses.append(f'{samples.topic} has no position: depth is the integral of speed from 0')
     time = (samples.stamps - samples.stamps[0]) * 1e-9
     speed = samples.values[:, 0]

@@ -11,26 +11,10 @@ from needle_ros.settings import check_constants, constant
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StiffnessSettings:
     """
-    Settings of `identify_stiffness`.
+    Settings of `identify_stiffness`; each field says its meaning and unit.
 
-    Attributes
-    ----------
-    contact_length : float
-        Length of tissue that the end-effector presses [m]; k_a is k_zz over this length. The
-        default gives the number of the source.
-    level_tolerance : float
-        Forces this close are one force level, and a force that stays within it is steady [N].
-    rest_force : float
-        Force up to which the end-effector is at rest [N].
-    hold_time : float
-        Shortest steady force that counts as a hold or a rest [s].
-    settle_time : float
-        Time left out at the beginning of each hold and rest [s].
-    largest_asymmetry : float
-        Largest `asymmetry` that counts as a spring [1]. The mean matrices of Table 2 reach
-        0.086, and the source calls their tissue a spring.
-    estimator : str
-        One of `ESTIMATORS`.
+    The mean matrices of Table 2 have an asymmetry of up to 0.086, and the source calls their
+    tissue a spring; ``largest_asymmetry`` is the next round number.
 
     Raises
     ------
