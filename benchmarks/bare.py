@@ -1,8 +1,8 @@
 """
-Bare rclpy nodes to compare with: they send what the suite's send, and do nothing else.
+Bare rclpy nodes to compare with: they send the messages of our nodes, and do nothing else.
 
-Run as ``python -m benchmarks.bare ROLE EXECUTOR``; nothing of the suite is imported,
-so that neither its memory nor its garbage weighs on them.
+Run as ``python -m benchmarks.bare ROLE EXECUTOR``. None of our packages is imported, so that
+neither their memory nor their garbage slows these nodes down.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from rclpy.task import Future
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool
 
-#: Quality of service of the suite's topics.
+#: Quality of service of our topics.
 SENSOR: Final = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)
 COMMAND: Final = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE)
 LATCHED: Final = QoSProfile(
@@ -46,19 +46,27 @@ STREAMS: Final = {
 RATE: Final = 1000
 PERIOD: Final = 1_000_000_000 // RATE
 
-#: Most samples that are made up at one tick.
+#: Largest number of late samples that are made up at one tick.
 _BURST: Final = 10
 
 _PR_SET_PDEATHSIG = 1
 
 
-def time_message(stamp: int) -> Time:
+def _time_message(stamp: int) -> Time:
     """Return a time [ns] as a message."""
     return Time(sec=stamp // 1_000_000_000, nanosec=stamp % 1_000_000_000)
 
 
 class Sender:
-    """Sends one sample of each stream, filled as the plant fills it: from numbers, each time."""
+    """
+    Publishes samples of the plant, filled from numbers each time as the plant does.
+
+    Parameters
+    ----------
+    node : rclpy.node.Node
+        Node that publishes.
+
+    """
 
     def __init__(self, node: Node) -> None:
         self._publishers = [node.create_publisher(t, n, SENSOR) for n, t in STREAMS.items()]
@@ -68,18 +76,49 @@ class Sender:
         self._joints = JointState(name=['insertion', 'rotation'])
 
     def destroy(self, node: Node) -> None:
-        """Undo what was made."""
+        """
+        Destroy the publishers.
+
+        Parameters
+        ----------
+        node : rclpy.node.Node
+            Node that publishes.
+
+        """
         for publisher in self._publishers:
             node.destroy_publisher(publisher)
 
     def has_readers(self) -> bool:
-        """Tell whether each stream is read by someone."""
+        """
+        Return whether every topic has a subscription.
+
+        Returns
+        -------
+        bool
+            True if so.
+
+        """
         return all(publisher.get_subscription_count() for publisher in self._publishers)
 
     def send(self, stamp: int, depth: float = 0.05) -> int:
-        """Send the sample of a time [ns]; return when joint_states, the last, left [ns]."""
+        """
+        Send a sample.
+
+        Parameters
+        ----------
+        stamp : int
+            Time stamp [ns].
+        depth : float
+            Insertion depth [m].
+
+        Returns
+        -------
+        int
+            Time just before ``joint_states``, the last message, was sent [ns].
+
+        """
         wrench, tip, truth, joints = self._wrench, self._tip, self._truth, self._joints
-        stamped = time_message(stamp)
+        stamped = _time_message(stamp)
         for message in (wrench, tip, truth, joints):
             message.header.stamp = stamped
         force, torque = wrench.wrench.force, wrench.wrench.torque
@@ -97,7 +136,17 @@ class Sender:
 
 
 class Clocked(Node, ABC):
-    """Does something at every period while ``run`` says so; what is missed is made up."""
+    """
+    Does something in every period while the topic ``run`` says so, and makes up missed periods.
+
+    Parameters
+    ----------
+    name : str
+        Name of the node.
+    **options
+        For `rclpy.node.Node`.
+
+    """
 
     def __init__(self, name: str, **options: Any) -> None:
         super().__init__(name, **options)
@@ -120,11 +169,19 @@ class Clocked(Node, ABC):
 
     @abstractmethod
     def sample(self, stamp: int) -> None:
-        """Do what is due at a time [ns]."""
+        """
+        Do what is due in a period.
+
+        Parameters
+        ----------
+        stamp : int
+            Time [ns].
+
+        """
 
 
 class BarePlant(Clocked):
-    """Sends the plant's messages and takes its command."""
+    """Sends the messages of the plant and takes its command."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__('bare_plant', **options)
@@ -133,7 +190,15 @@ class BarePlant(Clocked):
         self.create_subscription(WrenchStamped, 'wrench_command', self._on_command, COMMAND)
 
     def sample(self, stamp: int) -> None:
-        """Send a sample."""
+        """
+        Send a sample.
+
+        Parameters
+        ----------
+        stamp : int
+            Time [ns].
+
+        """
         self._sender.send(stamp)
 
     def _on_command(self, message: WrenchStamped) -> None:
@@ -141,7 +206,7 @@ class BarePlant(Clocked):
 
 
 class BareEcho(Node):
-    """Answers each joint_states as the controller does: the command first, then two more."""
+    """Answers each ``joint_states`` with the messages of the controller, the command first."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__('bare_echo', **options)
@@ -178,11 +243,11 @@ class BareEcho(Node):
 
 class BareSource(Clocked):
     """
-    Numbers messages for a recorder: the plant's four streams and the command.
+    Sends numbered messages to a recorder: the four topics of the plant and the command.
 
-    The stamp is the number of the sample, in periods. Numbers begin once each stream has a
-    reader; how many have been sent, in how many seconds, is said on stdout when ``run`` becomes
-    false.
+    The time stamp is the number of the sample, in periods. The first sample is sent when every
+    topic has a subscription. When ``run`` becomes false, the node prints how many samples it has
+    sent, and in how many seconds.
     """
 
     def __init__(self, **options: Any) -> None:
@@ -199,13 +264,21 @@ class BareSource(Clocked):
             sys.stdout.flush()
 
     def sample(self, _stamp: int) -> None:
-        """Send the next number in each stream, if all are read."""
+        """
+        Send the next number on each topic, once all have a subscription.
+
+        Parameters
+        ----------
+        _stamp : int
+            Not used.
+
+        """
         if self._sent or (self._sender.has_readers() and self._command.get_subscription_count()):
             if not self._sent:
                 self._begin = time.monotonic()
             self._sent += 1
             self._sender.send(self._sent * PERIOD)
-            self._wrench.header.stamp = time_message(self._sent * PERIOD)
+            self._wrench.header.stamp = _time_message(self._sent * PERIOD)
             self._command.publish(self._wrench)
 
 
@@ -214,7 +287,17 @@ EXECUTORS: Final = {'events': EventsExecutor, 'single': SingleThreadedExecutor}
 
 
 def main(role: str, executor_name: str) -> None:
-    """Run one node until a signal ends the process, or the process that started it ends."""
+    """
+    Run one node until the process is killed, or the process that started it ends.
+
+    Parameters
+    ----------
+    role : str
+        A key of `ROLES`.
+    executor_name : str
+        A key of `EXECUTORS`.
+
+    """
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     rclpy.init(signal_handler_options=rclpy.signals.SignalHandlerOptions.NO)
     executor: Executor = EXECUTORS[executor_name]()

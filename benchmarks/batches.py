@@ -1,8 +1,8 @@
 """
-Many insertions at once: one thread beside two, and the memory that they take.
+Many insertions at once: the speed-up by a second thread, and the memory.
 
-How much a second thread can give depends on what else the machine does: a loop of sums and
-products, which shares nothing between its threads, is measured beside as the ceiling.
+The speed-up depends on what else the machine does. A loop of sums and products, which shares
+nothing between its threads, is measured beside it as the upper limit.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ RUNS: Final = 2000
 #: Step [s] from which the steps grow.
 _STEP: Final = 1.4e-5
 
-#: Interval of the runs whose memory is looked at [s].
+#: Interval of the runs whose memory is measured [s].
 _INTERVAL: Final = DURATION / 300
 
 #: Rounds of the loop in all threads together: it lasts about as long as the insertions.
@@ -36,7 +36,7 @@ _REPEATS: Final = 30
 
 class Batches:
     """
-    The open-loop run under frictions from half to one and a half of that of the source.
+    The open-loop run with friction from 0.5 to 1.5 times that of the paper.
 
     Parameters
     ----------
@@ -61,7 +61,24 @@ class Batches:
         interval: float = DURATION,
         keep: bool = False,
     ) -> Batch:
-        """Simulate all insertions."""
+        """
+        Simulate all insertions.
+
+        Parameters
+        ----------
+        workers : int
+            Number of threads.
+        duration, interval : float
+            Simulated time, and time between the samples [s].
+        keep : bool
+            Whether all samples are kept, or the final states only.
+
+        Returns
+        -------
+        Batch
+            Result.
+
+        """
         return simulate_batch(
             self._parameters,
             self._start,
@@ -75,7 +92,22 @@ class Batches:
         )
 
     def peak_memory(self, part: float, *, keep: bool) -> int:
-        """Return the most memory that a part of the duration holds at once [bytes]."""
+        """
+        Return the peak memory of a run.
+
+        Parameters
+        ----------
+        part : float
+            Simulated time over `DURATION`.
+        keep : bool
+            Whether all samples are kept.
+
+        Returns
+        -------
+        int
+            Memory [bytes].
+
+        """
         job = partial(self.run, 2, duration=part * DURATION, interval=_INTERVAL, keep=keep)
         job()
         tracemalloc.start()

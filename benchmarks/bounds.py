@@ -36,7 +36,20 @@ Truth: TypeAlias = Mapping[str, tuple[float, float]]
 
 
 def sensor_lag(parameters: ForceSensorParameters) -> float:
-    """Return by how much the filters of the sensor delay a slow force [s]."""
+    """
+    Return the delay of a slow force by the filters of a sensor.
+
+    Parameters
+    ----------
+    parameters : ForceSensorParameters
+        Sensor.
+
+    Returns
+    -------
+    float
+        Delay [s].
+
+    """
     late = 0.0
     for cutoff in parameters.cutoffs:
         b, a = butter(2, cutoff, fs=parameters.rate)
@@ -47,22 +60,21 @@ def sensor_lag(parameters: ForceSensorParameters) -> float:
 
 def reading_noise(parameters: ForceSensorParameters, axis: int) -> FloatArray:
     """
-    Return the covariance of the noise of readings by the distance of two.
+    Return the covariance of the noise of two readings.
 
-    White noise at the rate of the sensor passes its filters; every so many samples one is read
-    and rounded.
+    White noise at the rate of the sensor passes its filters, is sampled at `RATE`, and rounded.
 
     Parameters
     ----------
     parameters : ForceSensorParameters
-        The sensor.
+        Sensor.
     axis : int
         Force x y z, torque x y z.
 
     Returns
     -------
     ndarray, shape (_REACH,)
-        Covariance of readings 0, 1, 2, ... apart [N^2].
+        Covariance of readings that are 0, 1, 2, ... samples apart [N^2].
 
     """
     every = round(parameters.rate / RATE)
@@ -78,21 +90,21 @@ def reading_noise(parameters: ForceSensorParameters, axis: int) -> FloatArray:
 
 def information(regressors: FloatArray, noise: FloatArray, used: NDArray[np.bool_]) -> FloatArray:
     """
-    Return Fisher's information on the coefficients of regressors.
+    Return the Fisher information on the coefficients of regressors.
 
     Parameters
     ----------
     regressors : ndarray, shape (n, k)
-        Regressors at even times.
+        Regressors, equally spaced in time.
     noise : ndarray, shape (m,)
-        Covariance of the noise by distance, zero beyond.
+        Covariance of the noise of two samples by their distance; zero beyond.
     used : ndarray of bool, shape (n,)
-        What is known of these.
+        Samples that are used.
 
     Returns
     -------
     ndarray, shape (k, k)
-        Its inverse is the Cramer-Rao bound of normal noise.
+        Information. Its inverse is the Cramer-Rao bound for normal noise.
 
     """
     at = np.flatnonzero(used)
@@ -113,11 +125,28 @@ def friction_truth(
     settings: FrictionSettings,
 ) -> Truth:
     """
-    Return true parameters and Cramer-Rao bounds.
+    Return the true parameters of a recording of friction, and their Cramer-Rao bounds.
 
-    The bound takes every reading while the needle counts as moving, with the noise of the sensor
-    as its filters leave it, and as unknown the coefficients of the terms: what starts, stops and
-    lag cost an estimator is not in it.
+    The bound uses every reading while the needle moves, with the filtered noise of the sensor.
+    Only the coefficients of the terms are unknown: it does not include what an estimator loses
+    by starts, stops and an unknown lag.
+
+    Parameters
+    ----------
+    needle : NeedleParameters
+        Needle.
+    sensor : ForceSensorParameters
+        Force sensor.
+    time, speed : ndarray, shape (n,)
+        Motion [s], [m/s].
+    settings : FrictionSettings
+        Terms of the friction force.
+
+    Returns
+    -------
+    Truth
+        By parameter.
+
     """
     coulomb, viscous = needle.coulomb_friction, needle.viscous_friction
     breakaway = needle.breakaway_friction if needle.friction_law == 'stribeck' else 1.0
@@ -142,7 +171,7 @@ def friction_truth(
         np.abs(speed) > settings.moving_speed,
     )
     bound = dict(zip(names, np.diag(np.linalg.inv(known)).tolist(), strict=True))
-    # No reading tells a mass from a lag of unknown size.
+    # A mass cannot be told from an unknown lag.
     bound.pop('moving_mass', None)
     return {name: (value, bound.get(name, np.nan)) for name, value in true.items()}
 
@@ -151,10 +180,27 @@ def stiffness_truth(
     matrix: FloatArray, force: float, sensor: ForceSensorParameters, tissue: IndenterParameters
 ) -> Truth:
     """
-    Return true parameters of one level and Cramer-Rao bounds.
+    Return the true parameters of one force level, and their Cramer-Rao bounds.
 
-    The bound takes all readings of all holds, of force and position, with their noise, and the
-    zeros of both for known.
+    The bound uses all readings of force and position of all holds, with their noise. The zeros
+    of both are known.
+
+    Parameters
+    ----------
+    matrix : ndarray, shape (2, 2)
+        Stiffness [N/m].
+    force : float
+        Force level [N].
+    sensor : ForceSensorParameters
+        Force sensor.
+    tissue : IndenterParameters
+        Noise of the position.
+
+    Returns
+    -------
+    Truth
+        By parameter.
+
     """
     angles = 2.0 * pi / DIRECTIONS * np.arange(DIRECTIONS)
     forces = force * np.column_stack([np.cos(angles), np.sin(angles)])
@@ -181,7 +227,7 @@ def stiffness_truth(
 
 
 def _parts(matrix: FloatArray) -> dict[str, float]:
-    """Return what is reported of a stiffness matrix, by name."""
+    """Return the parameters of a stiffness matrix by name."""
     symmetric = (matrix + matrix.T) / 2.0
     half, shear = (matrix[0, 0] - matrix[1, 1]) / 2.0, symmetric[0, 1]
     mean, radius = np.trace(matrix) / 2.0, np.hypot(half, shear)

@@ -1,12 +1,11 @@
 """
-Whether the intervals hold the truth as often as they say, and how near the best the errors are.
+Coverage of the confidence intervals, and efficiency of the estimates.
 
-Many recordings are made with the plant, the end-effector and the force sensor of the stand-ins,
-without ROS, along the protocols of `needle experiment`; each has true parameters of its own. All
-that identification reports of each is compared with the truth: the share of 95 % intervals that
-hold it, and the mean squared error over the Cramer-Rao bound. No unbiased estimator stays below
-the bound, which takes the noise of the readings for what it is in the stand-in: white at the rate
-of the sensor, then filtered, then read at the rate of the recording.
+Many recordings are simulated without ROS: the plant or the indenter with its force sensor follows
+a protocol of `needle experiment`. Every recording has its own true parameters. All estimates are
+compared with these: the share of the 95 % intervals that hold the true value, and the mean
+squared error over the Cramer-Rao bound (`benchmarks.bounds`), which no unbiased estimator can
+beat.
 """
 
 from __future__ import annotations
@@ -58,7 +57,7 @@ from needle_insertion.experiment.protocol import (
 from needle_insertion.paper.tables import FORCE_LEVELS
 import numpy as np
 
-#: Share of intervals that must hold the truth, and error over the bound that is good enough.
+#: Limits of the coverage, and of the mean squared error over the Cramer-Rao bound.
 COVERAGE: Final = (0.93, 0.97)
 EFFICIENCY: Final = 1.3
 
@@ -101,15 +100,15 @@ class Row:
     Attributes
     ----------
     case : str
-        Terms, estimator and what is special about the recordings.
+        Terms, estimator and kind of recording.
     name, unit : str
-        The parameter.
+        Parameter.
     count, undetermined : int
-        Estimates, and those of them that were said not to be determined.
+        Number of estimates, and how many of them are reported as undetermined.
     coverage : float
-        Share of the 95 % intervals that hold the truth.
+        Share of the 95 % intervals that hold the true value.
     deviation, error, bias : float
-        Root mean square of the error made, of the standard errors given, and the mean error.
+        Root mean square of the errors, root mean square of the standard errors, mean error.
     efficiency : float or None
         Mean squared error over the Cramer-Rao bound; None where there is no bound.
 
@@ -128,13 +127,21 @@ class Row:
 
     @property
     def holds(self) -> bool:
-        """Whether coverage and efficiency are as wanted."""
+        """Whether coverage and efficiency are within their limits."""
         return COVERAGE[0] <= self.coverage <= COVERAGE[1] and (
             self.efficiency is None or self.efficiency <= EFFICIENCY
         )
 
     def cells(self) -> tuple[str, ...]:
-        """Return the cells of a table."""
+        """
+        Return the cells of a table row.
+
+        Returns
+        -------
+        tuple of str
+            Cells.
+
+        """
         return (
             self.case,
             f'{self.name} [{self.unit}]',
@@ -155,7 +162,7 @@ class Row:
 
 
 class _Felt(ForceSensor):
-    """Keeps what a sensor would feel, for any number of sensors to read."""
+    """Keeps the true wrenches, so that several sensors can read them."""
 
     def __init__(self) -> None:
         super().__init__(ForceSensorParameters(rate=RATE), RATE, 0)
@@ -172,7 +179,17 @@ class _Felt(ForceSensor):
 
 
 class Motion(NamedTuple):
-    """A base in robot mode: time, measured motion, shape (n,) each, and what the sensor feels."""
+    """
+    An insertion in robot mode.
+
+    Attributes
+    ----------
+    time, depth, speed : ndarray, shape (n,)
+        Time and measured motion [s], [m], [m/s].
+    felt : _Felt
+        True wrenches.
+
+    """
 
     time: FloatArray
     depth: FloatArray
@@ -181,7 +198,20 @@ class Motion(NamedTuple):
 
 
 def insertion(parameters: NeedleParameters) -> Motion:
-    """Run the friction protocol on the plant in robot mode."""
+    """
+    Run the friction protocol on the plant in robot mode.
+
+    Parameters
+    ----------
+    parameters : NeedleParameters
+        Needle.
+
+    Returns
+    -------
+    Motion
+        Recording without the readings of a force sensor.
+
+    """
     protocol = PROTOCOLS['friction']
     base = BaseMotion(BaseParameters(), START_DEPTH, (parameters.minimum_depth, parameters.length))
     start = NeedleModel(parameters).state_at(START_DEPTH, 0.0)
@@ -214,12 +244,12 @@ def _command(machine: Plant | Indenter, protocol: Protocol) -> None:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FrictionCase:
     """
-    What is identified from which recording.
+    A kind of recording, and how friction is identified from it.
 
     Attributes
     ----------
-    stand_in : str
-        Which recording.
+    kind : str
+        Kind of recording.
     terms : tuple of str
         Terms of the friction force.
     estimator : str
@@ -229,11 +259,11 @@ class FrictionCase:
     late : bool
         Whether the force is late, or early, by an unknown part of a sample period.
     speed_noise : float
-        Standard deviation of white noise of the speed [m/s], which the stand-in has none of.
+        Standard deviation of white noise of the speed [m/s].
 
     """
 
-    stand_in: str = 'plain'
+    kind: str = 'plain'
     terms: tuple[str, ...] = _BASIC
     estimator: str = 'ordinary'
     speed: bool = True
@@ -247,14 +277,14 @@ FRICTION_CASES: Final[Mapping[str, FrictionCase]] = {
     **{f'(15), {e}': FrictionCase(estimator=e) for e in ESTIMATORS if e != 'ordinary'},
     '(15), total, noisy speed': FrictionCase(estimator='total', speed_noise=2e-4),
     '(15), positions only': FrictionCase(speed=False),
-    '(15), no filter': FrictionCase(stand_in='unfiltered'),
-    '+ offset': FrictionCase(stand_in='biased', terms=(*_BASIC, 'offset')),
-    '+ inertia': FrictionCase(stand_in='unfiltered', terms=(*_BASIC, 'inertia')),
+    '(15), no filter': FrictionCase(kind='unfiltered'),
+    '+ offset': FrictionCase(kind='biased', terms=(*_BASIC, 'offset')),
+    '+ inertia': FrictionCase(kind='unfiltered', terms=(*_BASIC, 'inertia')),
     '+ inertia, stamps off': FrictionCase(
-        stand_in='unfiltered', terms=(*_BASIC, 'inertia'), late=True
+        kind='unfiltered', terms=(*_BASIC, 'inertia'), late=True
     ),
-    '+ direction': FrictionCase(stand_in='one-way', terms=(*_BASIC, 'direction')),
-    '+ break-away': FrictionCase(stand_in='sticky', terms=(*_BASIC, 'stribeck')),
+    '+ direction': FrictionCase(kind='one-way', terms=(*_BASIC, 'direction')),
+    '+ break-away': FrictionCase(kind='sticky', terms=(*_BASIC, 'stribeck')),
 }
 
 
@@ -284,7 +314,7 @@ def friction(seed: int, number: int) -> list[Found]:
     motions = {
         name: (needle, insertion(needle))
         for name, changes in needles.items()
-        if name in {case.stand_in for case in cases.values()}
+        if name in {case.kind for case in cases.values()}
         for needle in [NeedleParameters.preset('phantom', **drawn, **changes)]
     }
     motions['biased'] = motions['unfiltered'] = motions['plain']
@@ -297,12 +327,12 @@ def friction(seed: int, number: int) -> list[Found]:
     readings = {
         name: motion.felt.read(sensors[name], int(rng.integers(2**32)))
         for name, (_, motion) in motions.items()
-        if name in {case.stand_in for case in cases.values()}
+        if name in {case.kind for case in cases.values()}
     }
     found: list[Found] = []
     for name, case in cases.items():
-        needle, motion = motions[case.stand_in]
-        sensor = sensors[case.stand_in]
+        needle, motion = motions[case.kind]
+        sensor = sensors[case.kind]
         moved = motion.time - (late if case.late else 0.0)
         depth, speed = (np.interp(moved, motion.time, a) for a in (motion.depth, motion.speed))
         speed = speed + case.speed_noise * rng.standard_normal(len(speed))
@@ -312,7 +342,7 @@ def friction(seed: int, number: int) -> list[Found]:
             time=motion.time,
             depth=depth,
             speed=speed if case.speed else None,
-            force=readings[case.stand_in],
+            force=readings[case.kind],
         )
         estimate = identify_friction(recording, settings)
         truth = friction_truth(needle, sensor, motion.time, motion.speed, settings)

@@ -1,4 +1,4 @@
-"""`needle bench control`: what a control step costs, against the period of 1 kHz and a bar."""
+"""Cost of a control step."""
 
 from __future__ import annotations
 
@@ -56,7 +56,22 @@ class NumpyInverseDynamics:
         self.last = 0.0
 
     def command(self, position: float, speed: float, target: FloatArray) -> float:
-        """Return the force for a measurement of a needle that moves inward."""
+        """
+        Return the force for a measurement of a needle that moves inward.
+
+        Parameters
+        ----------
+        position, speed : float
+            Measured insertion depth [m] and speed [m/s].
+        target : ndarray, shape (3,)
+            Target depth, speed and acceleration.
+
+        Returns
+        -------
+        float
+            Force [N].
+
+        """
         p, g, h = self.p, self.gains, PERIOD
         rate = p.viscous_friction / p.moving_mass
         fall = exp(-rate * h)
@@ -76,12 +91,12 @@ class NumpyInverseDynamics:
 
 def jobs() -> dict[str, Callable[[], object]]:
     """
-    Return what is measured: each job is one control step, on a needle that moves.
+    Return the control steps that are measured, on a needle that moves.
 
     Returns
     -------
     dict[str, callable]
-        By name.
+        One control step each, by name.
 
     """
     parameters = NeedleParameters.preset('phantom')
@@ -101,7 +116,7 @@ def jobs() -> dict[str, Callable[[], object]]:
     found: dict[str, Callable[[], object]] = {}
     for name, law in sampled_laws(parameters, PERIOD).items():
         loop = SampledLoop(law, DELAY, _LIMIT)
-        rotation = sampled_loop(Axis.rotation(parameters), name)
+        rotation = _sampled_loop(Axis.rotation(parameters), name)
 
         def physical(
             loop: SampledLoop = loop, rotation: SampledLoop = rotation, load: float = 0.0
@@ -119,12 +134,12 @@ def jobs() -> dict[str, Callable[[], object]]:
 
 
 def _observed(physical: Callable[..., float], observe: Callable[[], float]) -> Callable[[], float]:
-    """Return the step of a law that is told the load by the observer."""
+    """Return the step of a law with the load from the observer."""
     return lambda: physical(load=observe())
 
 
-def sampled_loop(axis: Axis, name: str) -> SampledLoop:
-    """Return the loop of a law on an axis, with gains for what is light and free of friction."""
+def _sampled_loop(axis: Axis, name: str) -> SampledLoop:
+    """Return the loop of a law on an axis with little inertia and no friction."""
     law = (
         InverseDynamics(axis=axis, gains=InverseDynamicsGains(), period=PERIOD)
         if name == 'inverse_dynamics'

@@ -1,10 +1,9 @@
 """
-How fast a bag becomes a result, beside what else reads it, and in how much memory.
+Time and memory from a bag to a result, beside other readers of bags.
 
-A bag of one length is read and friction identified from it, and the same bag is read by the
-libraries that do so in Python: their messages are made into objects and the same numbers taken
-from these. Bags of ten and thirty times the length show what memory grows with. Each is done in a
-process of its own, whose peak is its own.
+Friction is identified from a bag. Other Python libraries read the same bag into message objects
+and take the same numbers from these. Bags of ten and thirty times the length show how the memory
+grows. Every measurement has its own process, and so its own peak memory.
 """
 
 from __future__ import annotations
@@ -54,7 +53,7 @@ _WRENCH: Final = 'geometry_msgs/msg/WrenchStamped'
 _MOTION: Final = 'sensor_msgs/msg/JointState'
 _TOPICS: Final = {'/base_wrench': _WRENCH, '/joint_states': _MOTION}
 
-#: Number in a message that stands for what is patched into it later.
+#: Number in a message that is replaced later.
 _MARK: Final = struct.unpack('<d', b'needle!!')[0]
 
 _START: Final = 1_700_000_000
@@ -101,7 +100,7 @@ def write_bag(path: Path, messages: int) -> None:
 
 
 def _strokes(time: np.ndarray[Any, Any]) -> tuple[np.ndarray[Any, Any], ...]:
-    """Return inserted length [m], speed [m/s] and force [N] of strokes eased by a sine."""
+    """Return depth [m], speed [m/s] and force [N] of strokes with sinusoidal speed."""
     number, phase = np.divmod(time, _STROKE)
     most = 0.004 * (1.0 + number % 5) * np.where(number // 5 % 2, -1.0, 1.0)
     turn = 2.0 * np.pi / _STROKE
@@ -113,10 +112,10 @@ def _strokes(time: np.ndarray[Any, Any]) -> tuple[np.ndarray[Any, Any], ...]:
 def _patched(
     message: bytes, stamps: np.ndarray[Any, Any], values: list[np.ndarray[Any, Any]]
 ) -> Iterator[bytes]:
-    """Yield copies of a message with other stamps, and values in the place of the mark."""
+    """Yield copies of a message with other stamps, and with values in place of the mark."""
     size = len(message)
     copies = np.tile(np.frombuffer(message, dtype=np.uint8), (len(stamps), 1))
-    # After the four bytes that say how the rest is encoded comes the stamp.
+    # The time stamp follows the four bytes that tell the encoding.
     time = np.column_stack([_START + stamps // 10**9, stamps % 10**9]).astype('<i4')
     copies[:, 4:12] = time.view(np.uint8)
     at = -1
@@ -128,12 +127,33 @@ def _patched(
 
 
 def ours(path: Path) -> FrictionEstimate:
-    """Read a bag and identify friction from it."""
+    """
+    Read a bag and identify friction from it.
+
+    Parameters
+    ----------
+    path : Path
+        Bag.
+
+    Returns
+    -------
+    FrictionEstimate
+        Result.
+
+    """
     return identify_friction(read_friction_recording(path))
 
 
 def any_reader(path: Path) -> None:
-    """Take the same numbers from the objects that rosbags makes."""
+    """
+    Read the same numbers with rosbags.
+
+    Parameters
+    ----------
+    path : Path
+        Bag.
+
+    """
     rows: dict[str, list[tuple[float, ...]]] = {topic: [] for topic in _TOPICS}
     with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
         wanted = [connection for connection in reader.connections if connection.topic in rows]
@@ -144,7 +164,15 @@ def any_reader(path: Path) -> None:
 
 
 def mcap_ros2(path: Path) -> None:
-    """Take the same numbers from the objects that mcap-ros2-support makes."""
+    """
+    Read the same numbers with mcap-ros2-support.
+
+    Parameters
+    ----------
+    path : Path
+        Bag.
+
+    """
     reader = optional('mcap_ros2.reader')
     rows: dict[str, list[tuple[float, ...]]] = {topic: [] for topic in _TOPICS}
     [file] = path.glob('*.mcap')
@@ -165,7 +193,7 @@ def _arrays(rows: Mapping[str, list[tuple[float, ...]]]) -> list[np.ndarray[Any,
     return [np.array(values) for values in rows.values()]
 
 
-#: What reads a bag, by name.
+#: Functions that read a bag, by name.
 READERS: Final[Mapping[str, Callable[[Path], object]]] = {
     'needle_identification': ours,
     'rosbags AnyReader': any_reader,
@@ -174,13 +202,21 @@ READERS: Final[Mapping[str, Callable[[Path], object]]] = {
 
 
 def peak_memory() -> float:
-    """Return the most memory that this process has had [bytes]."""
+    """
+    Return the peak memory of this process.
+
+    Returns
+    -------
+    float
+        Memory [bytes].
+
+    """
     status = Path('/proc/self/status')
     if status.exists():
         for line in status.read_text('ascii').splitlines():
             if line.startswith('VmHWM'):
                 return 1024.0 * float(line.split()[1])
-    # Elsewhere; on Linux it would hold what the process had before it became this one.
+    # Other systems. On Linux this would include the process before exec.
     return float(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
 
 
@@ -193,16 +229,16 @@ def measure(reader: str, warm: Path, path: Path, repeats: int) -> dict[str, floa
     reader : str
         One of `READERS`.
     warm : Path
-        A short bag to read beforehand, so that what is compiled is there.
+        A short bag to read beforehand, so that everything is compiled.
     path : Path
-        The bag.
+        Bag.
     repeats : int
-        How often; the least time counts.
+        How often the bag is read.
 
     Returns
     -------
     dict
-        ``seconds``, ``memory`` [bytes], and ``before``, that before the bag was read.
+        Least time ``seconds`` [s], peak ``memory`` [bytes], and that ``before`` reading [bytes].
 
     """
     read = READERS[reader]
@@ -217,7 +253,20 @@ def measure(reader: str, warm: Path, path: Path, repeats: int) -> dict[str, floa
 
 
 def measured(reader: str, warm: Path, path: Path, repeats: int) -> dict[str, float]:
-    """Read a bag in a process of its own, as `measure` does."""
+    """
+    Call `measure` in another process.
+
+    Parameters
+    ----------
+    reader, warm, path, repeats
+        As for `measure`.
+
+    Returns
+    -------
+    dict
+        As from `measure`.
+
+    """
     done = subprocess.run(
         [sys.executable, '-m', __name__, reader, str(warm), str(path), str(repeats)],
         capture_output=True,

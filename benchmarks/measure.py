@@ -63,7 +63,15 @@ class Bar:
         return f'missed by a factor {high / low:.2f}' if low > 0.0 else 'missed'
 
     def row(self) -> tuple[str, str, str, str]:
-        """Return the cells of a table row: figure, limit, measured value and verdict."""
+        """
+        Return the cells of a table row.
+
+        Returns
+        -------
+        tuple of str
+            Figure, limit, measured value and verdict.
+
+        """
         unit = f' {self.unit}' if self.unit else ''
         wanted = f'{">=" if self.at_least else "<="} {self.limit:g}{unit}'
         found = '' if self.found is None else f'{self.found:.3g}{unit}'

@@ -1,11 +1,10 @@
 """
-A needle that vibrates with its base held: our integrator, MuJoCo's cable and PyElastica.
+A needle that vibrates with its base held: our integrator, MuJoCo and PyElastica.
 
-Each tool takes, by search, the discretization and the time step that cost it least while its
-first frequency is within 1 % of the exact one of its own equations. The rods of the others have
-no tissue; half of their first element is inside the clamp, which is where a chain of rigid or
-constant-strain elements is best clamped (clamped at the element's end it converges one order
-slower). Neither is damped.
+For each tool, a search finds the discretization and the time step of least cost with a first
+frequency within 1 % of the exact one of its own equations. The rods of the other tools have no
+tissue. Half of their first element is inside the clamp: a chain of rigid or constant-strain
+elements that is clamped at the end of an element converges one order slower. None is damped.
 """
 
 from __future__ import annotations
@@ -41,10 +40,10 @@ from scipy.optimize import brentq, minimize_scalar
 #: Inserted length [m] that vibrates.
 LENGTH: Final = 0.15
 
-#: What the first frequency may be off.
+#: Largest relative error of the first frequency.
 FREQUENCY_ERROR: Final = 0.01
 
-#: Our step has no limit from frequency; a period is then shown by this many.
+#: Our step has no limit from the frequency; this many steps show a period.
 STEPS_PER_PERIOD: Final = 20
 
 #: Deflection of the tip at the start over the length: small, as the exact frequency is linear.
@@ -58,7 +57,7 @@ def beam_frequency(
     length: float, bending_stiffness: float, linear_density: float, foundation: float = 0.0
 ) -> float:
     """
-    First frequency of a clamped-free Euler-Bernoulli beam on an elastic foundation.
+    Return the first frequency of a clamped-free Euler-Bernoulli beam on an elastic foundation.
 
     Parameters
     ----------
@@ -84,7 +83,7 @@ def beam_frequency(
 
 def measured_frequency(time: FloatArray, values: FloatArray, near: float) -> float:
     """
-    Frequency of the sinusoid that fits samples best, between 0.7 and 1.3 of a guess.
+    Return the frequency of the sinusoid that fits samples best, from 0.7 to 1.3 times a guess.
 
     Parameters
     ----------
@@ -118,20 +117,20 @@ def measured_frequency(time: FloatArray, values: FloatArray, near: float) -> flo
 @dataclass(frozen=True, slots=True)
 class Setting:
     """
-    A tool with the discretization and the step it was given.
+    A tool with its discretization and time step.
 
     Attributes
     ----------
     tool, discretization : str
-        For people.
+        Names.
     step : float
         Time step [s].
     frequency, exact : float
-        First frequency found, and that of the tool's own equations [Hz].
+        First frequency of the simulation, and the exact one of the same equations [Hz].
     job : callable
         Simulates for ``simulated`` seconds.
     simulated : float
-        Time that one job simulates [s].
+        Simulated time of one job [s].
 
     """
 
@@ -149,7 +148,22 @@ class Setting:
         return self.frequency / self.exact - 1.0
 
     def row(self, spent: float, ours: float) -> tuple[str, ...]:
-        """Return the cells of a table, given the least time of a job and ours per second."""
+        """
+        Return the cells of a table row.
+
+        Parameters
+        ----------
+        spent : float
+            Least time of a job [s].
+        ours : float
+            Time of our integrator per simulated second [s].
+
+        Returns
+        -------
+        tuple of str
+            Cells.
+
+        """
         per_second = spent / self.simulated
         return (
             self.tool,
@@ -163,14 +177,22 @@ class Setting:
 
 
 def needle_exact() -> float:
-    """Return the first frequency of the needle clamped at the entry, in its tissue [Hz]."""
+    """
+    Return the first frequency of the needle, clamped at the entry, in its tissue.
+
+    Returns
+    -------
+    float
+        Frequency [Hz].
+
+    """
     p = NeedleParameters.preset('paper_si')
     return beam_frequency(LENGTH, p.bending_stiffness, p.linear_density, p.tissue_stiffness)
 
 
 def needle(step: float) -> Setting:
     """
-    Return our integrator with the base held, at a given step.
+    Return our integrator with the base held.
 
     Parameters
     ----------
@@ -180,7 +202,7 @@ def needle(step: float) -> Setting:
     Returns
     -------
     Setting
-        With the first frequency as sampled at the steps, or every 1/20 period if these are finer.
+        Its first frequency is sampled at the steps, or every 1/20 of a period if they are finer.
 
     """
     p = NeedleParameters.preset('paper_si')
@@ -206,7 +228,7 @@ def needle(step: float) -> Setting:
 
 
 def _section() -> tuple[float, float, float, float]:
-    """Radius [m], density, Young's modulus for that circle, and the bare exact frequency [Hz]."""
+    """Return radius, density and Young's modulus of the rod, and its exact first frequency."""
     p = NeedleParameters.preset('paper_si')
     radius = sqrt(p.area / pi)
     modulus = p.bending_stiffness / (0.25 * pi * radius**4)
@@ -252,7 +274,7 @@ _FLEX = """
 
 
 class _Cable:
-    """A cantilever of MuJoCo, as elastic cable (before 4.0) or as one-dimensional flex."""
+    """A cantilever of MuJoCo: an elastic cable (before 4.0), or a one-dimensional flex."""
 
     def __init__(self, mujoco: Any, *, plugin: bool, elements: int, how: str, step: float) -> None:
         self._mujoco = mujoco
@@ -291,7 +313,7 @@ class _Cable:
         mujoco.mj_forward(self.model, self.data)
 
     def _deflect(self, *, plugin: bool) -> None:
-        """Start as if held by a force at the tip."""
+        """Start with the shape of a static force at the tip."""
         m, d = self.model, self.data
         if plugin:
             for j in range(m.njnt):
@@ -309,7 +331,7 @@ class _Cable:
         self._mujoco.mj_step(self.model, self.data, steps)
 
     def sample(self, duration: float) -> tuple[FloatArray, FloatArray] | None:
-        """Return time and tip deflection, or None if the run blew up."""
+        """Return time and tip deflection, or None if the run is unstable."""
         step = self.model.opt.timestep
         stride = max(1, round(5e-4 / step))
         count = int(duration / (stride * step))
@@ -323,7 +345,7 @@ class _Cable:
 
 
 def _cable_settings(mujoco: Any, *, plugin: bool) -> Iterator[tuple[float, Setting]]:
-    """Yield the largest fitting step of each discretization and integrator, with its cost."""
+    """Yield the cost and the largest valid step of each discretization and integrator."""
     exact = _section()[-1]
     names = (
         ('Euler', 'implicitfast', 'implicit', 'RK4') if plugin else ('Euler', 'RK4', 'discrete')
@@ -359,7 +381,7 @@ def _cable_settings(mujoco: Any, *, plugin: bool) -> Iterator[tuple[float, Setti
 
 def mujoco_cable(tick: Tick) -> Setting | None:
     """
-    Search the setting of MuJoCo that costs it least.
+    Search the setting of least cost of MuJoCo.
 
     Parameters
     ----------
@@ -429,7 +451,7 @@ class _Rod:
             self._time = self._stepper.step(self._simulator, self._time, self.step)
 
     def holds(self, steps: int) -> bool:
-        """Say whether the step is stable, with every mode stirred."""
+        """Return whether the step is stable, with every mode excited."""
         random = np.random.default_rng(1)
         for rates in (self.rod.velocity_collection, self.rod.omega_collection):
             rates[:, 1:] += 1e-2 * random.standard_normal(rates[:, 1:].shape)
@@ -451,7 +473,7 @@ class _Rod:
 
 def pyelastica_rod(tick: Tick) -> Setting | None:
     """
-    Search the setting of PyElastica that costs it least.
+    Search the setting of least cost of PyElastica.
 
     Parameters
     ----------
@@ -505,7 +527,7 @@ def pyelastica_rod(tick: Tick) -> Setting | None:
 
 def mode_error(modes: NeedleModel) -> float:
     """
-    Relative error of the first modal frequency at `LENGTH`, from the matrices themselves.
+    Return the error of the first frequency of the matrices of a model at `LENGTH`.
 
     Parameters
     ----------
@@ -515,7 +537,7 @@ def mode_error(modes: NeedleModel) -> float:
     Returns
     -------
     float
-        Error to `needle_exact`, positive as for any Ritz value.
+        Relative error; positive, as of every Ritz value.
 
     """
     p = modes.parameters
@@ -526,7 +548,7 @@ def mode_error(modes: NeedleModel) -> float:
 
 def compare(tick: Tick) -> Answer:
     """
-    Compare what a simulated second of free vibration costs.
+    Compare the cost of a simulated second of free vibration.
 
     Parameters
     ----------

@@ -1,10 +1,10 @@
 """
-The source's open-loop run: our integrator beside SciPy's solvers, at equal error.
+The open-loop run of the paper: our integrator beside the solvers of SciPy, at equal error.
 
-Every candidate is timed for the bare solution without output in between. SciPy's are judged at
-their own steps, so that no interpolation counts against them; ours, which does not show its
-steps, by a run in one call to each time of a grid, as the run that is timed is one call to the
-last. Each takes the loosest setting on a fine grid that meets the error.
+Every solver is timed for the final state only, with the loosest setting on a fine grid that meets
+the error. The error of the solvers of SciPy is taken at their own steps, so that interpolation
+adds nothing. Ours does not report its steps; its error is taken over runs to each time of a grid,
+each in one call like the run that is timed.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ import numba
 import numpy as np
 from scipy.integrate import quad, solve_ivp
 
-#: The open-loop run of the source: 3 N, 2 cm inserted, 0.5 mm deflection; it ends before the hub.
+#: Open-loop run of the paper: 3 N, 2 cm inserted, 0.5 mm deflection; it ends before the hub.
 FORCE, DEPTH, DEFLECTION, DURATION = 3.0, 0.02, 5e-4, 0.0285
 
-#: Error that counts as equal: this part of the peak tip deflection.
+#: Error of all solvers, over the peak of the tip deflection.
 ACCURACY: Final = 1e-3
 
 METHODS: Final = ('RK45', 'DOP853', 'Radau', 'BDF', 'LSODA')
@@ -36,10 +36,10 @@ METHODS: Final = ('RK45', 'DOP853', 'Radau', 'BDF', 'LSODA')
 _TOLERANCE_RATIO: Final = 10.0**-0.125
 _STEP_RATIO: Final = 2.0**-0.0625
 
-#: Times at which ours is judged [s]: several in a period of the fastest mode.
+#: Interval of the times at which our error is taken [s]; several in a period of each mode.
 _GRID: Final = 1e-5
 
-#: Absolute tolerance over relative, where it is not in proportion to the peak of each number.
+#: Absolute over relative tolerance, where it is not proportional to the peak of each state.
 _ABSOLUTE: Final = 1e-4
 
 _NODES: Final = 16
@@ -50,7 +50,7 @@ _Function = TypeVar('_Function', bound=Callable[..., object])
 
 
 def _compiled(function: _Function) -> _Function:
-    # Not kept on disk: Numba would not notice a change of `evaluate`.
+    # Not cached on disk: Numba would not notice a change of `evaluate`.
     return cast(_Function, numba.njit(error_model='numpy')(function))
 
 
@@ -105,7 +105,7 @@ def _derivative(
 
 def compiled_right_hand_side(model: NeedleModel, force: float) -> RightHandSide:
     """
-    Return the equations of motion as SciPy wants them, compiled.
+    Return the equations of motion for SciPy, compiled.
 
     Parameters
     ----------
@@ -148,10 +148,9 @@ def user_right_hand_side(
     """
     Return the equations of motion as a user of NumPy and SciPy would write them.
 
-    G and H are integrated anew at each call. Someone who knows the integrands to be smooth takes
-    Gauss-Legendre nodes, tabulated once, and all nodes in one NumPy expression: that is the
-    default here, and the harder opponent. `scipy.integrate.quad` per entry is what one writes
-    first.
+    G and H are integrated in each call: by default with tabulated Gauss-Legendre nodes, all in
+    one NumPy expression, which is the faster way; or with `scipy.integrate.quad` for each entry,
+    which is what one writes first.
 
     Parameters
     ----------
@@ -233,13 +232,13 @@ class Candidate:
     Attributes
     ----------
     name, setting : str
-        For people.
+        Names.
     error : float
         Largest error of the tip deflection over its peak.
     evaluations : int
-        Calls of the right-hand side, or steps of ours.
+        Calls of the right-hand side, or steps of our integrator.
     run : callable
-        The bare run, given a right-hand side.
+        Runs the solver on a right-hand side.
 
     """
 
@@ -251,7 +250,7 @@ class Candidate:
 
 
 class OpenLoop:
-    """The run, its reference, and the search for settings."""
+    """Open-loop run with its reference solution, and the search for settings."""
 
     def __init__(self) -> None:
         self.parameters = NeedleParameters.preset('paper_si')
@@ -274,12 +273,27 @@ class OpenLoop:
         self._peaks = np.where(peaks > 0.0, peaks, 1.0)
 
     def _tips(self, states: FloatArray) -> FloatArray:
-        """Tip deflections of states, shape (8, n); unchecked, as a solver may leave the range."""
+        """Return the tip deflections of states, shape (8, n), also outside the valid range."""
         values = self.model.modes.values(self.parameters.length - states[0])
         return np.asarray((values * states[2:4].T).sum(axis=1))
 
     def error(self, time: FloatArray, states: FloatArray) -> float:
-        """Return the largest error of the tip deflection over its peak; states of shape (8, n)."""
+        """
+        Return the largest error of the tip deflection over its peak.
+
+        Parameters
+        ----------
+        time : ndarray, shape (n,)
+            Times [s].
+        states : ndarray, shape (8, n)
+            States at these times.
+
+        Returns
+        -------
+        float
+            Error; infinite if the run does not reach the end.
+
+        """
         if time[-1] < DURATION * (1.0 - 1e-9) or not np.isfinite(states).all():
             return float('inf')
         exact = self._tips(self._solution(np.minimum(time, DURATION)))
@@ -288,7 +302,24 @@ class OpenLoop:
     def solve(
         self, method: str, relative: float, absolute: Any, right_hand_side: RightHandSide
     ) -> Any:
-        """Run a solver of SciPy."""
+        """
+        Run a solver of SciPy.
+
+        Parameters
+        ----------
+        method : str
+            One of `METHODS`.
+        relative, absolute
+            Tolerances of `scipy.integrate.solve_ivp`.
+        right_hand_side : callable
+            Equations of motion.
+
+        Returns
+        -------
+        Bunch
+            From `scipy.integrate.solve_ivp`.
+
+        """
         return solve_ivp(
             right_hand_side,
             (0.0, DURATION),
@@ -299,20 +330,65 @@ class OpenLoop:
         )
 
     def integrate(self, step: float, duration: float, *, graded: bool) -> FloatArray:
-        """Run our integrator from the start in one call; the state at the end."""
+        """
+        Run our integrator from the start in one call.
+
+        Parameters
+        ----------
+        step, duration : float
+            Time step and duration [s].
+        graded : bool
+            Whether the steps grow with depth.
+
+        Returns
+        -------
+        ndarray, shape (8,)
+            Final state.
+
+        """
         integrator = Integrator(self.parameters, self.start, step, graded=graded)
         integrator.advance(duration, FORCE)
         return integrator.state
 
     def own_error(self, step: float, *, graded: bool) -> float:
-        """Return the error of our integrator at a step, over runs to each time of the grid."""
+        """
+        Return the error of our integrator over runs to each time of the grid.
+
+        Parameters
+        ----------
+        step : float
+            Time step [s].
+        graded : bool
+            Whether the steps grow with depth.
+
+        Returns
+        -------
+        float
+            Error as of `error`.
+
+        """
         count = round(DURATION / _GRID)
         time = np.linspace(0.0, DURATION, count + 1)[1:]
         states = [self.integrate(step, end, graded=graded) for end in time]
         return self.error(time, np.array(states).T)
 
     def steps(self, step: float, *, graded: bool) -> int:
-        """Count the steps of our integrator, one evaluation of the modes each."""
+        """
+        Count the steps of our integrator, by the evaluations of the modes.
+
+        Parameters
+        ----------
+        step : float
+            Time step [s].
+        graded : bool
+            Whether the steps grow with depth.
+
+        Returns
+        -------
+        int
+            Number of steps.
+
+        """
         source = cast(Any, advance).py_func
         with (
             mock.patch('needle_dynamics.simulated.integrators.advance', source),
@@ -322,7 +398,25 @@ class OpenLoop:
         return call.call_count
 
     def ours(self, *, graded: bool) -> Candidate:
-        """Return our integrator at its longest step that meets the error."""
+        """
+        Return our integrator at the longest step that meets the error.
+
+        Parameters
+        ----------
+        graded : bool
+            Whether the steps grow with depth.
+
+        Returns
+        -------
+        Candidate
+            Integrator with that step.
+
+        Raises
+        ------
+        RuntimeError
+            If no step meets the error.
+
+        """
 
         def run(_unused: RightHandSide) -> None:
             # It has its own equations.
@@ -341,7 +435,20 @@ class OpenLoop:
         raise RuntimeError('the integrator does not reach the accuracy')
 
     def scipy(self, method: str) -> Candidate:
-        """Return a solver of SciPy at its loosest tolerances that meet the error."""
+        """
+        Return a solver of SciPy at the loosest tolerances that meet the error.
+
+        Parameters
+        ----------
+        method : str
+            One of `METHODS`.
+
+        Returns
+        -------
+        Candidate
+            Solver with these tolerances.
+
+        """
         found = []
         for name, weights in (('1e-4 rtol', _ABSOLUTE), ('rtol x peaks', self._peaks)):
             for relative in geometric(0.1, 1e-9, _TOLERANCE_RATIO):

@@ -1,11 +1,11 @@
 """
-Cost of a step beside the arithmetic it cannot do without.
+Cost of a step, and a bound on it from its arithmetic.
 
-The operations of the steps that are measured are counted by running the source of the compiled
-kernel on numbers that count, and each kind is then timed in a loop of its own, in the dependency
-that it has in the step: the series of the modes side by side, other sums and products in eight
-independent chains, and what takes long (division, root, sine and cosine, exponentials) in two
-chains, as each needs the one before and there are two modes.
+The source of the compiled kernel is run on numbers that count their operations. Each kind of
+operation is then timed in a loop of its own, with the dependencies that it has in the step: the
+series of the modes side by side, other sums and products in eight independent chains, and slow
+operations (division, root, sine and cosine, exponentials) in two chains, since there are two
+modes.
 """
 
 from __future__ import annotations
@@ -50,8 +50,8 @@ def _compiled(function: _Function) -> _Function:
     return cast(_Function, numba.njit(error_model='numpy', nogil=True)(function))
 
 
-class Tally:
-    """Counts operations, those within one function apart."""
+class _Tally:
+    """Counts operations, those within one function separately."""
 
     def __init__(self) -> None:
         self.counts: Counter[str] = Counter()
@@ -70,9 +70,9 @@ class Tally:
 
 
 class _Counted(float):
-    """A number that counts what is done with it."""
+    """A number that counts the operations on it."""
 
-    tally: Tally
+    tally: _Tally
 
     def _is(self, operation: str, value: float) -> _Counted:
         self.tally.add(operation)
@@ -113,17 +113,17 @@ def count_operations(function: Callable[..., object], arguments: tuple[Any, ...]
     Parameters
     ----------
     function : callable
-        Compiled by Numba; what it calls of its own module is followed.
+        Compiled by Numba; calls of compiled functions are followed.
     arguments : tuple
         Numbers, arrays, tuples of numbers; arrays are copied.
 
     Returns
     -------
     Counter
-        Number of operations by kind; those in a function named `SERIES` begin with 'series '.
+        Number of operations by kind; names of those in a function `SERIES` begin with 'series '.
 
     """
-    tally = Tally()
+    tally = _Tally()
     number = type('Number', (_Counted,), {'tally': tally})
 
     def counting(name: str, value: float) -> _Counted:
@@ -178,12 +178,12 @@ def _start() -> tuple[NeedleParameters, FloatArray]:
 
 def operations_of_a_step(steps: int = _STEPS) -> dict[str, float]:
     """
-    Count the operations of a step of `Integrator` that slides, with two modes.
+    Count the operations of a step of `Integrator` for a sliding needle with two modes.
 
     Parameters
     ----------
     steps : int
-        Number of steps, from the second on, of which the mean is taken.
+        Number of steps to average over, from the second step.
 
     Returns
     -------
@@ -221,7 +221,22 @@ def _columns_loop(columns: int) -> Callable[[FloatArray, FloatArray, float, int]
 
 @_compiled
 def chains(a: float, b: float, repeats: int) -> float:
-    """Sum and multiply in eight independent chains, as fast as one core can."""
+    """
+    Add and multiply in eight independent chains.
+
+    Parameters
+    ----------
+    a, b : float
+        Factor and summand.
+    repeats : int
+        Number of operations in each chain.
+
+    Returns
+    -------
+    float
+        Sum of the chains.
+
+    """
     x0, x1, x2, x3, x4, x5, x6, x7 = a, 2.0 * a, 3.0 * a, 4.0 * a, 5.0 * a, 6.0 * a, 7.0 * a, b
     for _ in range(repeats):
         x0 = x0 * a + b
@@ -303,7 +318,7 @@ _LOOPS: Final[dict[str, tuple[Callable[[float, float, int], float], int]]] = {
 
 def grouped(counts: Mapping[str, float]) -> dict[str, float]:
     """
-    Group operations as they are timed: products with sums, sines with cosines.
+    Group operations as they are timed: products with sums, and sines with cosines.
 
     Parameters
     ----------

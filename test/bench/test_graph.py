@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from benchmarks import endurance
 from benchmarks import graph as bench_graph
 from benchmarks.bare import PERIOD, STREAMS
-from benchmarks.graph import Figures, Plan
+from benchmarks.graph import Plan
 from benchmarks.measure import Bar
 from benchmarks.page import Section
+from benchmarks.pairs import Figures, PAIRS
 from needle_identification import BagWriter, encode, message_type
 import numpy as np
 import pytest
@@ -21,42 +23,42 @@ def found(
     plan = Plan(rounds=1, turn=0.2, recording=1.0, memory=1.0)
     told: list[str] = []
     folder = tmp_path_factory.mktemp('graph')
-    camps = bench_graph.compare_camps(folder, plan, told.append)
-    return plan, told, camps
+    pairs = bench_graph.compare_pairs(folder, plan, told.append)
+    return plan, told, pairs
 
 
-def test_every_camp_has_every_figure(
+def test_every_pair_has_every_figure(
     found: tuple[Plan, list[str], dict[str, list[dict[str, float]]]],
 ) -> None:
-    plan, told, camps = found
-    assert tuple(camps) == bench_graph.CAMPS
-    names = list(camps['needle'][0])
+    plan, told, pairs = found
+    assert tuple(pairs) == PAIRS
+    names = list(pairs['needle'][0])
     assert len(names) == len(set(names)) == 14
-    for [figures] in camps.values():
+    for [figures] in pairs.values():
         assert list(figures) == names
         assert all(np.isfinite(value) and value >= 0.0 for value in figures.values())
         assert figures['round trip, p50 [us]'] > 0.0
     assert 'starting: needle' in told
-    [section], bars = bench_graph.tabled(camps, plan)
+    section, bars = bench_graph.side_by_side(pairs, plan)
     assert [row[0] for row in section.rows] == names
-    assert set(bench_graph.CAMPS) < set(section.heads)
+    assert set(PAIRS) < set(section.heads)
     assert [bar.limit for bar in bars] == [1.3, 1.5, 1.3, 1.5, 1.5, 1.5]
     assert all(bar.found > 0.0 and not bar.at_least for bar in bars)
 
 
 def test_the_recorder_is_given_what_is_counted(tmp_path: Path) -> None:
-    [section], [bar] = bench_graph.record(tmp_path, 1.0)
+    [section], [bar] = endurance.record(tmp_path, 1.0)
     assert 'lost' in [row[0] for row in section.rows]
     # What is lost depends on the machine; most of it is there.
     assert 0.0 <= bar.found < 5000.0
-    numbers = bench_graph.sample_numbers(tmp_path / 'bag')
+    numbers = endurance.sample_numbers(tmp_path / 'bag')
     assert set(numbers) == {*STREAMS, 'wrench_command'}
     for found in numbers.values():
         assert 0 < found.min() < found.max()
 
 
 def test_memory_is_watched_over_time(tmp_path: Path) -> None:
-    [section], [bar] = bench_graph.watch_memory(tmp_path, 1.0, lambda _stage: None)
+    [section], [bar] = endurance.watch_memory(tmp_path, 1.0, lambda _stage: None)
     assert [row[0] for row in section.rows] == ['plant', 'controller', 'recorder']
     assert bar.figure.startswith('growth of memory in 1 s')
 
@@ -81,14 +83,14 @@ def write_bag(path: Path, numbers: list[int]) -> None:
 def test_numbers_in_a_bag_are_those_of_the_stamps(tmp_path: Path) -> None:
     expected = [1, 2, 2, 5, 1234]
     write_bag(tmp_path / 'bag', expected)
-    numbers = bench_graph.sample_numbers(tmp_path / 'bag')
+    numbers = endurance.sample_numbers(tmp_path / 'bag')
     assert numbers.pop('tip_deflection').tolist() == expected
     assert all(len(others) == 0 for others in numbers.values())
 
 
 def test_losses_are_what_is_missing_after_the_first_second() -> None:
     numbers = {'a': np.array([900, 1001, 1002, 1002, 1004, 1005]), 'b': np.arange(1000, 1006)}
-    assert bench_graph.losses(numbers, 1005) == {'a': 1, 'b': 0}
+    assert endurance.losses(numbers, 1005) == {'a': 1, 'b': 0}
 
 
 def test_a_ratio_is_the_median_of_those_within_rounds() -> None:
@@ -105,7 +107,7 @@ def test_all_parts_are_on_the_page(
         ([Section(name, (), [])], [Bar(name, 1.0, limit)])
         for name, limit in (('recorder', 0.0), ('memory', 2.0))
     ]
-    monkeypatch.setattr(bench_graph, 'compare_camps', lambda *_: found[2])
+    monkeypatch.setattr(bench_graph, 'compare_pairs', lambda *_: found[2])
     monkeypatch.setattr(bench_graph, 'record', lambda *_: parts[0])
     monkeypatch.setattr(bench_graph, 'watch_memory', lambda *_: parts[1])
     sections, bars = bench_graph.compare(lambda _stage: None, 'quick')
