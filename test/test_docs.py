@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import ast
 import doctest
+from functools import cache
 from importlib import import_module
 from importlib.util import find_spec
 import os
@@ -60,22 +62,49 @@ def command_lines(page: Path, program: str) -> list[str]:
     return [line for line in plain if line.startswith(f'{program} ')]
 
 
+def is_module(name: str) -> bool:
+    """Return whether a dotted name is that of a module."""
+    try:
+        return find_spec(name) is not None
+    except ModuleNotFoundError:
+        # The part before the last dot is not a package.
+        return False
+
+
 def exists(name: str) -> bool:
     """Return whether a dotted name is a module, or something in one."""
     parts = name.split('.')
-    for count in range(len(parts), 0, -1):
-        try:
-            if find_spec('.'.join(parts[:count])) is None:
-                continue
-        except ModuleNotFoundError:
-            continue
-        found = import_module('.'.join(parts[:count]))
-        for part in parts[count:]:
-            if not hasattr(found, part):
-                return part in getattr(found, '__annotations__', {})
-            found = getattr(found, part)
-        return True
-    return False
+    modules = ['.'.join(parts[:k]) for k in range(len(parts), 0, -1)]
+    module = next((one for one in modules if is_module(one)), '')
+    found = import_module(module) if module else None
+    for part in parts[module.count('.') + 1 :]:
+        if not hasattr(found, part):
+            return part in getattr(found, '__annotations__', {})
+        found = getattr(found, part)
+    return found is not None
+
+
+@cache
+def functions_in(file: str) -> set[str]:
+    """Return the names of the functions in all test files of a name."""
+    return {
+        node.name
+        for path in (ROOT / 'test').rglob(f'{file}.py')
+        for node in ast.walk(ast.parse(path.read_text(encoding='utf-8')))
+        if isinstance(node, ast.FunctionDef)
+    }
+
+
+def is_test(name: str) -> bool:
+    """Return whether there is a test of a name such as `test_model.test_power_balance`."""
+    file, _, test = name.partition('.')
+    return test in functions_in(file)
+
+
+def unproved(rows: list[str]) -> list[str]:
+    """Return the rows that name no test and do not say: not in the package."""
+    proof = re.compile(r'`test_\w+\.test_\w+`|not in the package')
+    return [row for row in rows if not proof.search(row) or row.count(' | ') < 2]
 
 
 @pytest.mark.parametrize('module', WITH_EXAMPLES)
@@ -87,18 +116,40 @@ def test_examples_in_docstrings_print_what_they_show(module: str) -> None:
 
 
 def test_names_in_the_documentation_exist() -> None:
-    """Every dotted name of ours in backticks is there."""
-    names = {
+    """Every dotted name of ours in backticks is there, and every test."""
+    files = ('.py', '.yaml', '.md')
+    named = [
         (page.name, name)
         for page in CURRENT
-        for name in re.findall(r'`(needle_\w+(?:\.\w+)+)`', page.read_text(encoding='utf-8'))
-    }
-    files = {'py', 'yaml', 'md'}
+        for name in re.findall(r'`((?:needle|test)_\w+(?:\.\w+)+)`', page.read_text('utf-8'))
+        if not name.endswith(files)
+    ]
+    assert len(named) > 150
     assert [
-        found
-        for found in sorted(names)
-        if found[1].rpartition('.')[2] not in files and not exists(found[1])
+        found for found in named if not (is_test if found[1][0] == 't' else exists)(found[1])
     ] == []
+
+
+def test_every_equation_and_every_table_has_one_row() -> None:
+    """Equations (1) to (19) name a function each, Tables 1 to 3 have a row, every row a test."""
+    page = (ROOT / 'docs/equations.md').read_text(encoding='utf-8')
+    section = page.partition('## Numbered equations')[2].partition('## ')[0]
+    for number in range(1, 20):
+        (row,) = [line for line in section.splitlines() if line.startswith(f'| ({number}) |')]
+        assert re.search(r'`needle_\w+(\.\w+)+`', row), row
+    rows = re.findall(r'^\| (?!no\.|where|table|place|what ).*', page, flags=re.MULTILINE)
+    for number in (1, 2, 3):
+        assert sum(row.startswith(f'| {number} |') for row in rows) == 1
+    assert len(rows) > 80
+    assert unproved(rows) == []
+
+
+def test_a_wrong_name_is_found() -> None:
+    """The checks above can fail."""
+    wrong = ('needle_dynamics.nothing', 'needle_dynamics.model.NeedleModel.nothing', 'none.such')
+    assert not any(exists(name) for name in wrong)
+    assert not is_test('test_model.test_nothing')
+    assert unproved(['| (1) | a law | `needle_dynamics.model` | |']) != []
 
 
 def test_paths_in_the_documentation_exist() -> None:
