@@ -10,7 +10,6 @@ import os
 from pathlib import Path
 from typing import Final
 
-from needle_dynamics import NeedleParameters
 from needle_identification.errors import IdentificationError
 from needle_identification.estimation.estimate import Statistic
 from needle_identification.estimation.formatting import UNKNOWN
@@ -21,11 +20,6 @@ import yaml
 
 #: Nodes that use the result.
 NODES: Final = ('plant', 'controller')
-
-#: Numeric constants of the model, by name.
-_CONSTANTS: Final = {
-    item.name: item for item in fields(NeedleParameters) if 'unit' in item.metadata
-}
 
 
 def model_parameters(statistics: Iterable[Statistic]) -> dict[str, float | str]:
@@ -46,9 +40,13 @@ def model_parameters(statistics: Iterable[Statistic]) -> dict[str, float | str]:
         Values in SI units by name, such as ``model.coulomb_friction``.
 
     """
+    # Imported here: the model takes longer than all else that identification needs.
+    from needle_dynamics import NeedleParameters
+
+    constants = {item.name: item for item in fields(NeedleParameters) if 'unit' in item.metadata}
     values: dict[str, float | str] = {}
     for statistic in statistics:
-        item = _CONSTANTS.get(statistic.name)
+        item = constants.get(statistic.name)
         if item is not None and isfinite(statistic.mean):
             low, high = item.metadata['low'], item.metadata['high']
             # More digits than any experiment gives.
