@@ -6,6 +6,7 @@ from pathlib import Path
 
 from benchmarks import endurance
 from benchmarks import graph as bench_graph
+from benchmarks import pairs as bench_pairs
 from benchmarks.bare import PERIOD, STREAMS
 from benchmarks.graph import Plan
 from benchmarks.measure import Bar
@@ -23,7 +24,10 @@ def found(
     plan = Plan(rounds=1, turn=0.2, recording=1.0, memory=1.0)
     told: list[str] = []
     folder = tmp_path_factory.mktemp('graph')
-    pairs = bench_graph.compare_pairs(folder, plan, told.append)
+    with pytest.MonkeyPatch.context() as patch:
+        # Figures need time to settle, their presence does not.
+        patch.setattr(bench_pairs, '_SETTLE', 0.05)
+        pairs = bench_graph.compare_pairs(folder, plan, told.append)
     return plan, told, pairs
 
 
