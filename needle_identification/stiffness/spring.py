@@ -73,7 +73,7 @@ def spring_estimates(
     curl : ParameterEstimate
         Curl of the force of the tissue, k_zx - k_xz [N/m].
     spring : ParameterEstimate
-        Asymmetry of the matrix [1], which is |curl| / (sqrt(2) |K_s|).
+        Asymmetry of the matrix [1], which is ``|curl| / (sqrt(2) |K_s|)``.
     is_spring : bool
         Whether the whole interval of the asymmetry is within the limit.
     words : str
