@@ -24,7 +24,7 @@ AXES: Final = ('insertion', 'rotation')
 Gains: TypeAlias = InverseDynamicsGains | PidGains
 
 #: Default gains by law and axis. Those of rotation by PID make a closed loop of 20 rad/s on the
-#: rotary inertia of the source's needle.
+#: rotary inertia of the paper's needle.
 DEFAULT_GAINS: Final[Mapping[str, Mapping[str, Gains]]] = {
     'inverse_dynamics': {
         'insertion': InverseDynamicsGains(),
@@ -416,14 +416,14 @@ class Controller:
         Command
             Zero force without a target, or with the fault of the measurement: it is not finite,
             or the needle moved by more than its speed explains. After a gap or a step back in
-            time the motion starts anew from where the needle is.
+            time the motion starts again from where the needle is.
 
         """
         notice = None
         gap = self._gap(self._seen, measured)
         if gap:
             if self.guide.moves:
-                notice = f'measurements continued after {gap:.3f} s; the motion starts anew'
+                notice = f'measurements continued after {gap:.3f} s; the motion starts again'
             self.release()
         fault = self._fault(measured)
         if fault is not None:

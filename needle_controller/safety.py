@@ -24,7 +24,7 @@ from needle_ros.errors import (
 from needle_ros.settings import check_constants, constant
 from needle_ros.timing import NANOSECONDS, RateCounter
 
-#: What happens to messages that do not count but do no harm either: nobody is told.
+#: Checks whose failures are counted but not reported: the messages do no harm.
 REPEATED: Final = 'repeated'
 DROPPED: Final = 'dropped'
 
@@ -46,11 +46,13 @@ class SafetyLimits:
     """
     Limits of what is measured; beyond them the controller stops until ``~/clear_stop``.
 
-    The force sensor of the source ends at 100 N and 5 N m. Friction keeps the needle of the
+    The force sensor of the paper ends at 100 N and 5 N m. Friction keeps the needle of the
     presets `phantom` and `paper_mm` below 0.05 m/s at 15 N; `paper_si` has next to none.
     """
 
-    speed: float = constant(0.1, 'm/s', 'largest insertion speed, either way', open_low=True)
+    speed: float = constant(
+        0.1, 'm/s', 'largest insertion speed, in both directions', open_low=True
+    )
     tracking_error: float = constant(
         0.01, 'm', 'largest distance of the needle from the reference', open_low=True
     )
@@ -58,16 +60,16 @@ class SafetyLimits:
         2e-3, 'm', 'how far beyond lowest_depth and highest_depth the needle may be'
     )
     tip_deflection: float = constant(
-        0.05, 'm', 'largest deflection of the tip, either way', open_low=True
+        0.05, 'm', 'largest deflection of the tip, in both directions', open_low=True
     )
     axial_load: float = constant(
-        30.0, 'N', 'largest axial force on the force sensor, either way', open_low=True
+        30.0, 'N', 'largest axial force on the force sensor, in both directions', open_low=True
     )
     lateral_load: float = constant(
-        10.0, 'N', 'largest lateral force on the force sensor, either way', open_low=True
+        10.0, 'N', 'largest lateral force on the force sensor, in both directions', open_low=True
     )
     moment_load: float = constant(
-        1.0, 'N m', 'largest moment on the force sensor, either way', open_low=True
+        1.0, 'N m', 'largest moment on the force sensor, in both directions', open_low=True
     )
     tip_jump: float = constant(
         0.02, 'm', 'change of tip_deflection from one sample to the next that is a fault of '
@@ -422,7 +424,7 @@ class Safety:
         self._stale: set[str] = set()
 
     def begin(self, now: int) -> None:
-        """Expect everything anew from a time [ns] on; a stop stays."""
+        """Forget all readings, and expect new ones from a time [ns] on; a stop stays."""
         self._seen = self._begun = now
         self._stale.clear()
         for stream in self.streams.values():
@@ -441,14 +443,14 @@ class Safety:
             return False
         self.stop = reason
         self.stops += 1
-        # The reference is let go: how far off it was no longer counts.
+        # There is no reference any more, so the distance from it no longer counts.
         self.guard.forget('reference')
         return True
 
     def clear(self, now: int) -> str | None:
         """Release the stop, or return why not."""
         for stream in self.streams.values():
-            # What was said before it fell silent says nothing of now.
+            # Readings from before the silence say nothing about the present.
             if stream.silence(now) * NANOSECONDS > stream.timeout:
                 self.guard.forget(stream.name)
         required = self.warning(now) if self.limits.sensors_required else None

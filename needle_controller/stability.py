@@ -4,7 +4,7 @@ Poles of the sampled loops, and the rejection of gains that are unstable.
 Accepted gains have all poles within 1 - margin at the configured delay, and within 1 with one more
 period of delay that the law does not know. That period is the reserve for everything that is not
 modeled. The setting ``margin`` requires convergence: every error decreases by at least this part
-in a period. The poles of slow loops are close to one (the source's k_p = 1, k_v = 0.1 at 1 kHz:
+in a period. The poles of slow loops are close to one (the paper's k_p = 1, k_v = 0.1 at 1 kHz:
 1 - 5e-5). The default margin is therefore small, but far above the rounding of an eigenvalue.
 """
 

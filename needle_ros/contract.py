@@ -252,7 +252,7 @@ NEEDLE_SHAPE: Final = Topic(
     name='needle_shape',
     type_name='visualization_msgs/msg/Marker',
     publisher='plant',
-    meaning='the needle as a line, 30 Hz while somebody listens',
+    meaning='the needle as a line, 30 Hz while there is a subscriber',
     frame=ENTRY,
 )
 
@@ -260,7 +260,7 @@ NEEDLE_POSES: Final = Topic(
     name='needle_poses',
     type_name='geometry_msgs/msg/PoseArray',
     publisher='plant',
-    meaning='poses along the needle, y along it, 30 Hz while somebody listens',
+    meaning='poses along the needle, y along it, 30 Hz while there is a subscriber',
     frame=ENTRY,
 )
 

@@ -1,4 +1,4 @@
-"""The control laws of section 3.2.7 as the source has them, in continuous time, for analysis."""
+"""The control laws of section 3.2.7 as the paper has them, in continuous time, for analysis."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class ContinuousLaw(ABC):
         Needle and tissue as the law believes them to be; the plant may differ.
     actuation : str
         ``physical``: f_y and tau alone. ``modal``: a generalized force on every coordinate, as
-        in the gain matrices of the source.
+        in the gain matrices of the paper.
 
     """
 
@@ -158,7 +158,7 @@ class ContinuousInverseDynamics(ContinuousLaw):
     breakaway_speed : float
         If positive, dry friction is compensated in proportion to the speed wanted
         BREAKAWAY_TIME ahead, up to this speed [m/s]: the limit of the sampled law for short
-        periods. 0 is the law of the source.
+        periods. 0 is the law of the paper.
 
     """
 
@@ -214,7 +214,7 @@ class ContinuousPid(ContinuousLaw):
     Attributes
     ----------
     kp, kd : array_like, shape (driven,) or (driven, driven)
-        Gains, positive definite; the source writes k_v for kd.
+        Gains, positive definite; the paper writes k_v for kd.
     ki : array_like, shape (driven,) or (driven, driven), optional
         Gain of the integral, positive semidefinite; none if not given.
 

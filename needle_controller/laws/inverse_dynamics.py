@@ -1,4 +1,4 @@
-"""Inverse dynamics control, section 3.2.7.1 of the source, in sampled form."""
+"""Inverse dynamics control, section 3.2.7.1 of the paper, in sampled form."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""PID control, section 3.2.7.2 of the source, in the implicit sampled form."""
+"""PID control, section 3.2.7.2 of the paper, in the implicit sampled form."""
 
 from __future__ import annotations
 

@@ -10,7 +10,7 @@ from needle_controller.reference.setpoint import ReferenceLimits, Setpoint
 
 class Step:
     """
-    The target at once, as the source regulates.
+    The target at once, as the paper regulates.
 
     Parameters
     ----------

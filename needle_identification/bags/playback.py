@@ -27,7 +27,9 @@ class PlaybackSettings:
 
     """
 
-    rate: float = constant(1.0, '1', 'speed over that of the recording; 0: as fast as possible')
+    rate: float = constant(
+        1.0, '1', 'playback speed relative to the recording; 0: as fast as possible'
+    )
     start: float = constant(0.0, 's', 'time in the recording at which to begin')
     end: float = constant(0.0, 's', 'time in the recording at which to end; 0: its end')
     delay: float = constant(

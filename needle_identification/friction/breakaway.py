@@ -1,5 +1,5 @@
 """
-The force at which the needle breaks away, section 3.2.2.2 of the source.
+The force at which the needle breaks away, section 3.2.2.2 of the paper.
 
 The base pushes with a rising force until the needle moves. A straight line through the force of
 the last 0.3 s of the rest is read at the time at which the motion begins.

@@ -187,7 +187,7 @@ def _doubts(level: LevelEstimate, fit: MatrixFit) -> Iterator[tuple[str, str]]:
         )
         return
     if level.directions < _FEWEST_DIRECTIONS:
-        yield 'few directions; the source has 8', f'{level.directions}'
+        yield 'few directions; the paper has 8', f'{level.directions}'
     if fit.scatter > _LARGEST_SCATTER:
         yield (
             'the presses scatter more than their noise: F = K d does not hold exactly',

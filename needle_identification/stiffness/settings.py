@@ -13,7 +13,7 @@ class StiffnessSettings:
     """
     Settings of `identify_stiffness`; each field says its meaning and unit.
 
-    The mean matrices of Table 2 have an asymmetry of up to 0.086, and the source calls their
+    The mean matrices of Table 2 have an asymmetry of up to 0.086, and the paper calls their
     tissue a spring; ``largest_asymmetry`` is the next round number.
 
     Raises
@@ -26,7 +26,7 @@ class StiffnessSettings:
     contact_length: float = constant(
         1.0,
         'm',
-        'length of tissue that the end-effector presses; 1 m gives the number of the source',
+        'length of tissue that the end-effector presses; 1 m gives the value of the paper',
         open_low=True,
     )
     level_tolerance: float = constant(

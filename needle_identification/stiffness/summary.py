@@ -70,7 +70,7 @@ def summarize_stiffness(
     estimates : sequence of StiffnessEstimate
         One per place. A level that a place lacks is the mean of the other places.
     force : float, optional
-        Force level of the resulting tissue stiffness [N]; default the largest, as in the source.
+        Force level of the resulting tissue stiffness [N]; default the largest, as in the paper.
     level_tolerance : float, optional
         Levels of different places this close are one level [N].
 
