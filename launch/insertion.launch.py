@@ -1,4 +1,4 @@
-"""Plant and controller, with a recorder and RViz where asked for."""
+"""Plant and controller, and optionally a recorder and RViz."""
 
 from launch import LaunchContext, LaunchDescription
 from launch.actions import DeclareLaunchArgument, OpaqueFunction, SetEnvironmentVariable
@@ -7,17 +7,23 @@ from launch_ros.actions import Node
 from launch_ros.substitutions import FindPackageShare
 import yaml
 
-#: Default and meaning of each argument; what is empty is as the parameter file has it.
+#: Default and meaning of each argument; an empty one leaves the value of the parameter file.
 ARGUMENTS = {
     'params_file': ('', 'ROS parameter file; empty: config/insertion.yaml of this package'),
-    'mode': ('', 'of the plant: simulation, robot or indenter; only the first is controlled'),
-    'preset': ('', 'constants of the model, in plant and controller: phantom, paper_si, ...'),
-    'law': ('', 'of the controller: inverse_dynamics or pid'),
-    'lockstep': ('', 'true: each sample waits for the command that answers the one before'),
-    'real_time_factor': ('', 'pace of simulated time; 0: as fast as possible'),
-    'bag': ('', 'folder to record to; empty: nothing is recorded'),
+    'mode': (
+        '',
+        'mode of the plant: simulation, robot or indenter; the controller runs only in simulation',
+    ),
+    'preset': (
+        '',
+        'constants of the model in plant and controller: phantom, paper_si or paper_mm',
+    ),
+    'law': ('', 'law of the controller: inverse_dynamics or pid'),
+    'lockstep': ('', 'true: each sample waits for the command that answers the sample before'),
+    'real_time_factor': ('', 'simulated seconds per second; 0: as fast as possible'),
+    'bag': ('', 'folder to record to; empty: no recording'),
     'rviz': ('false', 'true: show the needle in RViz, which must be installed'),
-    'discovery': ('LOCALHOST', 'who may join: LOCALHOST, SUBNET, OFF or SYSTEM_DEFAULT'),
+    'discovery': ('LOCALHOST', 'which nodes may join: LOCALHOST, SUBNET, OFF or SYSTEM_DEFAULT'),
 }
 
 #: Parameters that arguments set, by node.
