@@ -9,10 +9,8 @@ import sys
 
 from needle_dynamics import NeedleModel, NeedleParameters, PRESETS, simulate
 from needle_dynamics.simulated.integrators import DEFAULT_TOLERANCE
-from needle_identification.result import write_whole
 from needle_insertion.commands.options import constants
 from needle_insertion.report import trajectory as report
-from needle_insertion.report.content import png
 from needle_insertion.report.text import table
 from needle_ros.errors import ParameterError
 
@@ -96,12 +94,7 @@ def run(options: argparse.Namespace) -> int:
         tolerance=options.tolerance,
     )
     for path in options.output:
-        if path.suffix == '.csv':
-            report.write_csv(path, trajectory)
-        elif path.suffix == '.png':
-            write_whole(path, png(report.draw(trajectory)))
-        else:
-            report.write_bag(path, trajectory)
+        report.write(path, trajectory)
     summary = report.summary(trajectory)
     if options.json:
         sys.stdout.write(f'{json.dumps(summary, indent=2)}\n')

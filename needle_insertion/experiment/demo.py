@@ -39,8 +39,7 @@ from needle_insertion.experiment.truth import (
     compare_friction,
     compare_stiffness,
     Comparison,
-    count_held,
-    fewest,
+    Coverage,
 )
 from needle_insertion.report.content import Picture
 from needle_insertion.report.identify_figures import (
@@ -254,13 +253,13 @@ def shipped_checks(source: str, bags: Sequence[Sequence[Comparison]]) -> list[Ch
     """
     checks = []
     for symbol, group in _by_symbol([one for bag in bags for one in bag]).items():
-        held, known = count_held(group)
+        found = Coverage.of(group)
         checks.append(
             Check(
                 f'{symbol}, {source}',
-                f'in 95 % of the intervals (>= {fewest(known)} of {known})',
-                f'in {held} of {known}',
-                held >= fewest(known),
+                f'in 95 % of the intervals (>= {found.least} of {found.known})',
+                f'in {found.held} of {found.known}',
+                found.is_enough,
             )
         )
     return checks

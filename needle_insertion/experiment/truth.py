@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -18,8 +18,8 @@ from needle_insertion.paper.tables import TABLE_1, TABLE_2
 import numpy as np
 from scipy.special import bdtr
 
-#: Probability with which an interval holds the truth, and the probability of a shortfall below
-#: which it is not taken for chance.
+#: Probability with which an interval holds the true value, and the probability of a shortfall
+#: below which it is not taken for chance.
 LEVEL: Final = 0.95
 IMPROBABLE: Final = 0.01
 
@@ -45,10 +45,56 @@ class Comparison:
     force: float | None = None
 
     @property
-    def held(self) -> bool:
+    def holds(self) -> bool:
         """Whether the interval is known and holds the true value."""
         low, high = self.estimate.interval
         return self.estimate.determined and self.truth is not None and low <= self.truth <= high
+
+
+@dataclass(frozen=True, slots=True)
+class Coverage:
+    """
+    How many 95 % intervals hold the true value.
+
+    Attributes
+    ----------
+    held, known : int
+        Intervals that hold it, and intervals whose true value is known.
+
+    """
+
+    held: int = 0
+    known: int = 0
+
+    @classmethod
+    def of(cls, comparisons: Iterable[Comparison]) -> Coverage:
+        """
+        Count intervals.
+
+        Parameters
+        ----------
+        comparisons : iterable of Comparison
+            Estimates beside their true values.
+
+        Returns
+        -------
+        Coverage
+            Over all of them.
+
+        """
+        known = [one.holds for one in comparisons if one.truth is not None]
+        return cls(sum(known), len(known))
+
+    @property
+    def least(self) -> int:
+        """Number of intervals that hold the true value at least, except by 1 % chance."""
+        chances = bdtr(np.arange(self.known + 1), self.known, LEVEL)
+        return int(np.searchsorted(chances, IMPROBABLE))
+
+    @property
+    def is_enough(self) -> bool:
+        """Whether no fewer intervals hold the true value than chance allows."""
+        return self.held >= self.least
 
 
 def compare_friction(recording: Recording, estimate: FrictionEstimate) -> list[Comparison]:
@@ -96,7 +142,7 @@ def compare_stiffness(
     return [
         Comparison(
             estimate=level[entry],
-            truth=stiffness_truth(recording.truth, entry, level.force),
+            truth=_stiffness(recording.truth, entry, level.force),
             force=level.force,
         )
         for entry in TABLE_2
@@ -104,66 +150,11 @@ def compare_stiffness(
     ]
 
 
-def stiffness_truth(truth: Mapping[str, Any] | None, entry: str, force: float) -> float | None:
-    """
-    Return the true stiffness at the level of the indenter that is nearest to a force.
-
-    Parameters
-    ----------
-    truth : Mapping[str, Any] or None
-        Parameters of the plant by name, if they are known.
-    entry : str
-        A key of Table 2.
-    force : float
-        Force [N].
-
-    Returns
-    -------
-    float or None
-        Stiffness [N/m]; None if it is not known.
-
-    """
+def _stiffness(truth: Mapping[str, Any] | None, entry: str, force: float) -> float | None:
+    """Return the true stiffness at the level of the indenter that is nearest to a force."""
     known = truth or {}
     values = known.get(f'indenter.{indenter_name(entry)}')
     if values is None:
         return None
     levels = np.array(known['indenter.force_levels'])
     return float(values[int(np.abs(levels - force).argmin())])
-
-
-def count_held(comparisons: Sequence[Comparison]) -> tuple[int, int]:
-    """
-    Count the intervals that hold the truth.
-
-    Parameters
-    ----------
-    comparisons : sequence of Comparison
-        Estimates beside their true values.
-
-    Returns
-    -------
-    (int, int)
-        Intervals that hold the truth, and truths that are known.
-
-    """
-    known = [one for one in comparisons if one.truth is not None]
-    return sum(one.held for one in known), len(known)
-
-
-def fewest(trials: int) -> int:
-    """
-    Return how many 95 % intervals hold the truth at least, except with a probability of 1 %.
-
-    Parameters
-    ----------
-    trials : int
-        Number of intervals.
-
-    Returns
-    -------
-    int
-        Quantile of the binomial distribution.
-
-    """
-    chances = bdtr(np.arange(trials + 1), trials, LEVEL)
-    return int(np.searchsorted(chances, IMPROBABLE))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Final
 
@@ -134,16 +134,8 @@ def _open_outcomes() -> dict[tuple[str, ...], Outcome]:
     return {case: Outcome.of(open_loop(*case)) for case in CASES}
 
 
-def figure_4() -> PaperFigure:
-    """
-    Draw the tip deflection in the open loop.
-
-    Returns
-    -------
-    PaperFigure
-        Figure 4.
-
-    """
+def _figure_4() -> PaperFigure:
+    """Draw the tip deflection in the open loop."""
     figure = Figure(figsize=(10.0, 6.0), layout='constrained')
     grid = figure.subplots(2, 2, sharex='row')
     for axes, case in zip(grid.flat, CASES, strict=True):
@@ -166,16 +158,8 @@ def figure_4() -> PaperFigure:
     return PaperFigure(picture=Picture('figure_4', caption, figure), outcomes=found)
 
 
-def figure_5() -> PaperFigure:
-    """
-    Draw the state variables in the open loop.
-
-    Returns
-    -------
-    PaperFigure
-        Figure 5.
-
-    """
+def _figure_5() -> PaperFigure:
+    """Draw the state variables in the open loop."""
     figure = Figure(figsize=(12.0, 7.0), layout='constrained')
     grid = figure.subplots(3, 4, sharex='col')
     for column, case in zip(grid.T, CASES, strict=True):
@@ -228,16 +212,8 @@ def _draw_closed(axes: Axes, law: str, *, hub_stop: bool, k: int | None = None) 
     axes.grid(visible=True, alpha=0.3)
 
 
-def figure_6() -> PaperFigure:
-    """
-    Draw the state variables under inverse dynamics.
-
-    Returns
-    -------
-    PaperFigure
-        Figure 6.
-
-    """
+def _figure_6() -> PaperFigure:
+    """Draw the state variables under inverse dynamics."""
     figure = Figure(figsize=(11.0, 7.0), layout='constrained')
     grid = figure.subplots(3, 2, sharex=True)
     for column, (hub_stop, words) in zip(grid.T, _HUB.items(), strict=True):
@@ -262,16 +238,8 @@ def figure_6() -> PaperFigure:
     return PaperFigure(picture=Picture('figure_6', caption, figure), outcomes=found)
 
 
-def figure_7() -> PaperFigure:
-    """
-    Draw the tip deflection under inverse dynamics.
-
-    Returns
-    -------
-    PaperFigure
-        Figure 7.
-
-    """
+def _figure_7() -> PaperFigure:
+    """Draw the tip deflection under inverse dynamics."""
     figure = Figure(figsize=(11.0, 4.2), layout='constrained')
     for axes, (hub_stop, words) in zip(figure.subplots(1, 2), _HUB.items(), strict=True):
         _draw_closed(axes, 'inverse_dynamics', hub_stop=hub_stop)
@@ -290,16 +258,8 @@ def figure_7() -> PaperFigure:
     return PaperFigure(picture=Picture('figure_7', caption, figure), outcomes=found)
 
 
-def figure_8() -> PaperFigure:
-    """
-    Draw the tip deflection under PID, and the position error that it leaves.
-
-    Returns
-    -------
-    PaperFigure
-        Figure 8.
-
-    """
+def _figure_8() -> PaperFigure:
+    """Draw the tip deflection under PID, and the position error that it leaves."""
     figure = Figure(figsize=(11.0, 4.2), layout='constrained')
     left, right = figure.subplots(1, 2)
     _draw_closed(left, 'pid', hub_stop=True)
@@ -327,12 +287,13 @@ def figure_8() -> PaperFigure:
     return PaperFigure(picture=Picture('figure_8', caption, figure), outcomes=found)
 
 
-FIGURES: Final = {
-    'figure-4': figure_4,
-    'figure-5': figure_5,
-    'figure-6': figure_6,
-    'figure-7': figure_7,
-    'figure-8': figure_8,
+#: Functions that draw the figures, by name.
+FIGURES: Final[Mapping[str, Callable[[], PaperFigure]]] = {
+    'figure-4': _figure_4,
+    'figure-5': _figure_5,
+    'figure-6': _figure_6,
+    'figure-7': _figure_7,
+    'figure-8': _figure_8,
 }
 
 

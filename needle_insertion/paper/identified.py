@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from math import sqrt
 from pathlib import Path
 from typing import Any, Final
@@ -21,8 +21,7 @@ from needle_insertion.experiment.protocol import SHIPPED_BAGS
 from needle_insertion.experiment.truth import (
     compare_friction,
     compare_stiffness,
-    count_held,
-    fewest,
+    Coverage,
     LEVEL,
 )
 from needle_insertion.paper.tables import FORCE_LEVELS, TABLE_1, TABLE_2
@@ -84,17 +83,15 @@ class Line:
         Published mean and standard deviation, SI.
     found : Statistic
         The same over the recordings.
-    held, known : int
-        Recordings whose 95 % interval holds their own true value, and those whose true value is
-        known.
+    truth : Coverage
+        Recordings whose 95 % interval holds their own true value.
 
     """
 
     quantity: str
     paper: tuple[float, float]
     found: Statistic
-    held: int = 0
-    known: int = 0
+    truth: Coverage = field(default_factory=Coverage)
 
     @property
     def deviation_interval(self) -> tuple[float, float]:
@@ -119,7 +116,7 @@ class Line:
             _plus_minus(self.found.mean, self.found.deviation),
             _interval(self.found.interval),
             _interval(self.deviation_interval),
-            f'{self.held}/{self.known}' if self.known else '',
+            f'{self.truth.held}/{self.truth.known}' if self.truth.known else '',
             verdict(self.holds),
         )
 
@@ -131,17 +128,17 @@ class Line:
             'paper': {'mean': mean, 'deviation': deviation},
             'found': asdict(self.found),
             'deviation_interval': self.deviation_interval,
-            'truth': {'held': self.held, 'of': self.known},
+            'truth': {'held': self.truth.held, 'of': self.truth.known},
             'holds': self.holds,
         }
 
 
 def _plus_minus(mean: float, deviation: float | None) -> str:
-    return f'{mean:.4g} ± {deviation:.3g}' if deviation is not None else f'{mean:.4g}'
+    return f'{mean:.4g}' if deviation is None else f'{mean:.4g} ± {deviation:.3g}'
 
 
 def _interval(interval: tuple[float, float]) -> str:
-    return f'{interval[0]:.4g} to {interval[1]:.4g}'
+    return '{:.4g} to {:.4g}'.format(*interval)
 
 
 def deviation_interval(deviation: float | None, count: int) -> tuple[float, float]:
@@ -196,38 +193,39 @@ class IdentifiedTable:
         return self.name.replace('-', ' ').capitalize()
 
     @property
-    def truth(self) -> tuple[int, int]:
-        """Number of intervals that hold their own truth, and of truths that are known."""
-        return sum(line.held for line in self.lines), sum(line.known for line in self.lines)
-
-    @property
-    def is_true(self) -> bool:
-        """Whether no fewer intervals hold their truth than chance allows."""
-        held, known = self.truth
-        return held >= fewest(known)
+    def truth(self) -> Coverage:
+        """How many intervals of all lines hold their own true value."""
+        found = [line.truth for line in self.lines]
+        return Coverage(sum(one.held for one in found), sum(one.known for one in found))
 
     @property
     def holds(self) -> bool:
-        """Whether the recordings agree with the paper and with their own truth."""
-        return self.is_true and all(line.holds for line in self.lines)
+        """Whether the recordings agree with the paper and with their own true values."""
+        return self.truth.is_enough and all(line.holds for line in self.lines)
 
     @property
     def words(self) -> str:
-        """How many intervals hold their own truth."""
-        held, known = self.truth
+        """How many intervals hold their own true value."""
+        truth = self.truth
         return (
-            f'95 % intervals of the {len(self.bags)} bags that hold their own truth: {held} of '
-            f'{known} (at least {fewest(known)} but for 1 % chance): {verdict(self.is_true)}'
+            f'95 % intervals of the {len(self.bags)} bags that hold their own true value: '
+            f'{truth.held} of {truth.known} (at least {truth.least} but for 1 % chance): '
+            f'{verdict(truth.is_enough)}'
         )
 
     def document(self) -> dict[str, Any]:
         """Return it for JSON."""
-        held, known = self.truth
+        truth = self.truth
         return {
             'unit': 'SI',
             'bags': [str(bag) for bag in self.bags],
             'lines': [line.document() for line in self.lines],
-            'truth': {'held': held, 'of': known, 'least': fewest(known), 'holds': self.is_true},
+            'truth': {
+                'held': truth.held,
+                'of': truth.known,
+                'least': truth.least,
+                'holds': truth.is_enough,
+            },
             'holds': self.holds,
         }
 
@@ -263,10 +261,9 @@ def _table_1(bags: Sequence[Path]) -> list[Line]:
     summary = summarize(estimates)
     lines = []
     for k, (name, paper) in enumerate(TABLE_1.items()):
-        held, known = count_held([one[k] for one in compared])
-        found = summary[name]
+        truth, found = Coverage.of(one[k] for one in compared), summary[name]
         quantity = f'{found.symbol} [{found.unit}]'
-        lines.append(Line(quantity=quantity, paper=paper, found=found, held=held, known=known))
+        lines.append(Line(quantity=quantity, paper=paper, found=found, truth=truth))
     return lines
 
 
@@ -285,14 +282,12 @@ def _table_2(bags: Sequence[Path]) -> list[Line]:
     lines = []
     for k, force in enumerate(FORCE_LEVELS):
         for i, (entry, (means, deviations)) in enumerate(TABLE_2.items()):
-            held, known = count_held([one[i * len(FORCE_LEVELS) + k] for one in compared])
             lines.append(
                 Line(
                     quantity=f'{entry} at {force:g} N [N/m]',
                     paper=(means[k], deviations[k]),
                     found=summary.levels[k][entry],
-                    held=held,
-                    known=known,
+                    truth=Coverage.of(one[i * len(FORCE_LEVELS) + k] for one in compared),
                 )
             )
     tissue, (means, deviations) = summary.tissue_stiffness, TABLE_2['k_zz']

@@ -1,5 +1,5 @@
 """
-What both laws make of a needle that they know badly: friction and stiffness 30 % off.
+Both control laws on needles with other friction and stiffness than they believe: 30 % off.
 
 The sampled laws of the node with their default gains, at 1 kHz with a delay of one period, drive
 the base (`physical`). They believe in the preset; each run has a needle of its own.
@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Any, Final
 
 from matplotlib.figure import Figure
 from needle_controller import (
@@ -33,18 +33,21 @@ from needle_insertion.paper.runs import LAWS
 from needle_insertion.report.content import Grid, Picture, Section
 import numpy as np
 
-#: Relative half-width of the uniform distributions, and what they are of.
+#: Largest relative deviation of the uniform distributions, and the constants that are drawn.
 WIDTH: Final = 0.3
 DRAWN: Final = ('coulomb_friction', 'viscous_friction', 'tissue_stiffness')
 
-#: The insertion: from, to [m], and time to look at it [s]; the reference takes 9.4 s.
+#: The insertion: from, to [m], and duration of the run [s]; the reference takes 9.4 s.
 START: Final = 0.02
 TARGET: Final = 0.07
 DURATION: Final = 11.5
 DEFLECTION: Final = 5e-4
 
-#: Longest step [s]: the modal flow is exact, and a hundredth of it moves no error by a nanometer.
+#: Longest step [s]: the modal flow is exact; a hundredth of it changes no error by a nanometer.
 STEP: Final = 1e-3
+
+#: Preset that the laws believe in, and the middle of the true needles.
+PRESET: Final = 'phantom'
 
 _MEASURES: Final = {
     'final': 'depth error at the end',
@@ -75,7 +78,7 @@ class Mismatch:
 
     def shares(self, law: str) -> FloatArray:
         """
-        Tell what the final error comes from.
+        Return the share of each factor in the variance of the final error.
 
         Parameters
         ----------
@@ -85,8 +88,7 @@ class Mismatch:
         Returns
         -------
         ndarray, shape (3,)
-            Part of the variance of the final error that each factor alone explains: that of the
-            means within 20 equal bins of it.
+            Variance of the means within 20 equal bins of a factor, over the whole variance.
 
         """
         final = self.batches[law].final
@@ -101,7 +103,6 @@ class Mismatch:
 def study(
     runs: int = 1000,
     seed: int = 2014,
-    preset: str = 'phantom',
     *,
     step: float = STEP,
     progress: Callable[[], object] | None = None,
@@ -115,8 +116,6 @@ def study(
         Runs of each law.
     seed : int
         Seed of the needles.
-    preset : str
-        The needle that the laws believe in, and the middle of the true ones.
     step : float
         Longest step of the integrator [s].
     progress : callable, optional
@@ -128,19 +127,13 @@ def study(
         Results.
 
     """
-    believed = NeedleParameters.preset(preset)
-    random = np.random.default_rng(seed)
-    factors = random.uniform(1.0 - WIDTH, 1.0 + WIDTH, (runs, len(DRAWN)))
-    plants = [
-        replace(
-            believed,
-            **{
-                name: float(factor) * getattr(believed, name)
-                for name, factor in zip(DRAWN, row, strict=True)
-            },
-        )
-        for row in factors
+    believed = NeedleParameters.preset(PRESET)
+    factors = np.random.default_rng(seed).uniform(1.0 - WIDTH, 1.0 + WIDTH, (runs, len(DRAWN)))
+    means = np.array([getattr(believed, name) for name in DRAWN])
+    drawn: list[dict[str, Any]] = [
+        dict(zip(DRAWN, map(float, row), strict=True)) for row in factors * means
     ]
+    plants = [replace(believed, **constants) for constants in drawn]
     start = NeedleModel(believed).state_at(START, DEFLECTION)
     reference = MinimumJerk(Setpoint(START), TARGET, ReferenceLimits())
     settings = ControllerSettings()
@@ -167,7 +160,22 @@ def study(
 
 
 def sampled_laws(parameters: NeedleParameters, period: float) -> dict[str, Law]:
-    """Return both laws of insertion with their default gains, for a needle and a period [s]."""
+    """
+    Return both laws of insertion with their default gains.
+
+    Parameters
+    ----------
+    parameters : NeedleParameters
+        Needle that the laws believe in.
+    period : float
+        Sample period [s].
+
+    Returns
+    -------
+    dict
+        Laws by name.
+
+    """
     axis = Axis.insertion(parameters)
     return {
         'inverse_dynamics': InverseDynamics(
@@ -177,7 +185,7 @@ def sampled_laws(parameters: NeedleParameters, period: float) -> dict[str, Law]:
     }
 
 
-def table(found: Mismatch) -> Grid:
+def _table(found: Mismatch) -> Grid:
     """Return median, 95 % and largest of each error, beside the run without mismatch."""
     rows = []
     for law, batch in found.batches.items():
@@ -185,12 +193,8 @@ def table(found: Mismatch) -> Grid:
             values = 1e3 * np.abs(getattr(batch, name))
             middle, most = np.quantile(values, (0.5, 0.95))
             known = 1e3 * abs(float(getattr(found.nominal[law], name)[0]))
-            rows.append(
-                (
-                    f'{LAWS[law]}, {words} [mm]',
-                    *(f'{value:.3g}' for value in (known, middle, most, values.max())),
-                )
-            )
+            cells = (f'{value:.3g}' for value in (known, middle, most, values.max()))
+            rows.append((f'{LAWS[law]}, {words} [mm]', *cells))
     return Grid(
         caption=f'{len(found.factors)} insertions with friction and stiffness up to '
         f'{100.0 * WIDTH:g} % off',
@@ -199,8 +203,8 @@ def table(found: Mismatch) -> Grid:
     )
 
 
-def draw(found: Mismatch) -> Figure:
-    """Draw the distribution of each error, and what the final one comes from."""
+def _figure(found: Mismatch) -> Figure:
+    """Draw the distribution of each error, and the final error against that of mu_s."""
     figure = Figure(figsize=(12.0, 4.2), layout='constrained')
     axes = figure.subplots(1, 4)
     for panel, (name, words) in zip(axes[:3], _MEASURES.items(), strict=True):
@@ -211,81 +215,68 @@ def draw(found: Mismatch) -> Figure:
             known = 1e3 * abs(float(getattr(found.nominal[law], name)[0]))
             panel.axvline(known, color=LAW_COLORS[law], linestyle=':', linewidth=1.0)
         panel.set(xscale='log', xlabel=f'{words} [mm]', ylim=(0.0, 1.0))
-        panel.grid(visible=True, alpha=0.3)
     axes[0].set_ylabel('share of the runs')
     axes[0].legend(fontsize='small')
+    friction = 100.0 * (found.factors[:, 0] - 1.0)
     for law, batch in found.batches.items():
-        axes[3].plot(
-            100.0 * (found.factors[:, 0] - 1.0),
-            1e3 * batch.final,
-            '.',
-            markersize=2.5,
-            color=LAW_COLORS[law],
-        )
+        axes[3].plot(friction, 1e3 * batch.final, '.', markersize=2.5, color=LAW_COLORS[law])
     axes[3].set(
         xlabel=r'true $\mu_s$ over believed - 1 [%]', ylabel='signed error at the end [mm]'
     )
-    axes[3].grid(visible=True, alpha=0.3)
+    for panel in axes:
+        panel.grid(visible=True, alpha=0.3)
     return figure
 
 
-def section(found: Mismatch | None = None) -> Section:
+def section(found: Mismatch) -> Section:
     """
-    Return the mismatch study for the page.
+    Return the study for the page.
 
     Parameters
     ----------
-    found : Mismatch, optional
-        The study; run now if not given.
+    found : Mismatch
+        The study.
 
     Returns
     -------
     Section
-        Plain data.
+        For the page of results.
 
     """
-    found = found or study()
     finals = {name: 1e3 * np.abs(batch.final) for name, batch in found.batches.items()}
-    largest = {name: 1e3 * batch.largest for name, batch in found.batches.items()}
     better = 100.0 * float(np.mean(finals['pid'] < finals['inverse_dynamics']))
+    final = {name: float(np.median(values)) for name, values in finals.items()}
+    largest = {name: 1e3 * float(np.median(b.largest)) for name, b in found.batches.items()}
     inverse = 100.0 * found.shares('inverse_dynamics')
     gains = InverseDynamicsGains()
     fade = 1e3 * gains.breakaway_speed / (gains.kp * BREAKAWAY_TIME)
     caption = (
         'Distribution of the errors over the runs (dotted: the needle is known exactly), and the '
         'final error against the error in mu_s. Inverse dynamics stops where Coulomb friction '
-        f'holds the needle: what the law has against it fades within {fade:.2f} mm of the goal. '
-        'The integral of PID goes on to within its tolerance.'
+        f'holds the needle: its compensation fades within {fade:.2f} mm of the goal. The integral '
+        'of PID goes on to within its tolerance.'
     )
     return Section(
         title='Needles that the controller does not know',
         paragraphs=(
             (
                 f'{len(found.factors)} insertions from {100.0 * START:g} to {100.0 * TARGET:g} cm '
-                'in '
-                '9.4 s with each law, sampled at 1 kHz, one period late, default gains, f_y '
-                'alone. '
-                'mu_s, mu_v and k_a of the needle are each uniform within 30 % of what the law '
-                'believes (preset phantom; the needles are the same for both laws). No observer: '
-                'the '
-                'laws are not told the force of the bent needle, which starts with 0.5 mm of '
-                'deflection that rings out within tens of milliseconds.'
+                'in 9.4 s with each law, sampled at 1 kHz, one period late, default gains, f_y '
+                'alone. mu_s, mu_v and k_a of the needle are each uniform within 30 % of what the '
+                f'law believes (preset {PRESET}; the needles are the same for both laws). No '
+                'observer: the laws do not know the force of the bent needle, which starts with '
+                '0.5 mm of deflection that rings out within tens of milliseconds.'
             ),
             (
                 f'At the end PID is nearer in {better:.0f} % of the runs: median '
-                f'{np.median(finals["pid"]):.2g} mm against '
-                f'{np.median(finals["inverse_dynamics"]):.2g}'
-                ' mm. On the way the largest error of inverse dynamics is '
-                f'{np.median(largest["inverse_dynamics"]):.2g} mm in the median, that of PID '
-                f'{np.median(largest["pid"]):.2g} mm. Of the variance of the final error of '
-                'inverse '
-                f'dynamics mu_s alone explains {inverse[0]:.0f} %, mu_v {inverse[1]:.0f} % and '
-                'k_a '
-                f'{inverse[2]:.0f} %: the stiffness of the tissue does not matter to the base of '
-                'a '
-                'needle that is nearly straight.'
+                f'{final["pid"]:.2g} mm against {final["inverse_dynamics"]:.2g} mm. On the way '
+                f'the largest error of inverse dynamics is {largest["inverse_dynamics"]:.2g} mm '
+                f'in the median, that of PID {largest["pid"]:.2g} mm. Of the variance of the '
+                f'final error of inverse dynamics mu_s alone explains {inverse[0]:.0f} %, mu_v '
+                f'{inverse[1]:.0f} % and k_a {inverse[2]:.0f} %: the stiffness of the tissue does '
+                'not matter to the base of a needle that is nearly straight.'
             ),
         ),
-        tables=(table(found),),
-        pictures=(Picture('mismatch', caption, draw(found)),),
+        tables=(_table(found),),
+        pictures=(Picture('mismatch', caption, _figure(found)),),
     )

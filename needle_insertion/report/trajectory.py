@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from needle_dynamics import NeedleModel, Trajectory
 from needle_identification import BagWriter, encode, message_type
 from needle_identification.result import write_whole
+from needle_insertion.report.content import png
 from needle_ros.timing import NANOSECONDS
 import numpy as np
 
@@ -42,21 +43,44 @@ def summary(trajectory: Trajectory) -> dict[str, float]:
     }
 
 
-def draw(trajectory: Trajectory) -> Figure:
+def write(path: Path, trajectory: Trajectory) -> None:
     """
-    Draw inserted length, modal coordinates and tip deflection over time.
+    Write a trajectory in the format that the name of the file asks for.
 
     Parameters
     ----------
+    path : Path
+        A ``.csv`` or ``.png`` file, or a folder for a bag, which must not exist.
     trajectory : Trajectory
         The trajectory.
 
-    Returns
-    -------
-    Figure
-        Three plots.
+    Raises
+    ------
+    NeedleError
+        If the file or the bag cannot be written.
 
     """
+    if path.suffix == '.csv':
+        write_whole(path, _csv(trajectory).encode())
+    elif path.suffix == '.png':
+        write_whole(path, png(_figure(trajectory)))
+    else:
+        _write_bag(path, trajectory)
+
+
+def _csv(trajectory: Trajectory) -> str:
+    """Return time, state and tip deflection of each sample, in SI units."""
+    names = NeedleModel(trajectory.parameters).coordinate_names
+    text = StringIO(newline='')
+    writer = csv.writer(text)
+    writer.writerow(['time', *names, *(f'{name}_dot' for name in names), 'tip_deflection'])
+    rows = np.column_stack([trajectory.time, trajectory.states, trajectory.tip_deflection])
+    writer.writerows(rows.tolist())
+    return text.getvalue()
+
+
+def _figure(trajectory: Trajectory) -> Figure:
+    """Draw inserted length, modal coordinates and tip deflection over time."""
     result = Figure(figsize=(9.0, 7.0), layout='constrained')
     above, middle, below = result.subplots(3, 1, sharex=True)
     time = trajectory.time * 1e3
@@ -74,49 +98,8 @@ def draw(trajectory: Trajectory) -> Figure:
     return result
 
 
-def write_csv(path: Path, trajectory: Trajectory) -> None:
-    """
-    Write time, state and tip deflection of each sample, in SI units.
-
-    Parameters
-    ----------
-    path : Path
-        File to write.
-    trajectory : Trajectory
-        The trajectory.
-
-    Raises
-    ------
-    ParameterError
-        If the file cannot be written.
-
-    """
-    names = NeedleModel(trajectory.parameters).coordinate_names
-    text = StringIO(newline='')
-    writer = csv.writer(text)
-    writer.writerow(['time', *names, *(f'{name}_dot' for name in names), 'tip_deflection'])
-    rows = np.column_stack([trajectory.time, trajectory.states, trajectory.tip_deflection])
-    writer.writerows(rows.tolist())
-    write_whole(path, text.getvalue().encode())
-
-
-def write_bag(path: Path, trajectory: Trajectory) -> None:
-    """
-    Write the topics of the plant, stamped with the simulated time.
-
-    Parameters
-    ----------
-    path : Path
-        Folder of the bag; must not exist.
-    trajectory : Trajectory
-        The trajectory.
-
-    Raises
-    ------
-    RecordingError
-        If the bag cannot be written.
-
-    """
+def _write_bag(path: Path, trajectory: Trajectory) -> None:
+    """Write the topics of the plant, stamped with the simulated time."""
     model = NeedleModel(trajectory.parameters)
     m = model.coordinates
     kinds = {

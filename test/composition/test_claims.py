@@ -482,23 +482,23 @@ def test_a_wrong_number_is_found(
 # --- claims about the tables ------------------------------------------------------------------
 
 
-@pytest.mark.parametrize('judge', [judges.consistency, judges.spring, judges.linear])
+@pytest.mark.parametrize('judge', [judges._consistency, judges._spring, judges._linear])
 def test_an_ideal_tissue_makes_the_claims_of_table_2_hold(judge: Callable[..., object]) -> None:
     """A linear spring with little scatter; the printed table is not one."""
     even, none = ((1e3,) * 5, (50.0,) * 5), ((0.0,) * 5, (50.0,) * 5)
     ideal = Tables(stiffness={'k_xx': even, 'k_xz': none, 'k_zx': none, 'k_zz': even})
     assert judge(ideal)[0] == HOLDS  # type: ignore[index]
     assert judge(Tables())[0] != HOLDS  # type: ignore[index]
-    assert judges.off_plane(ideal).verdict == FAILS
+    assert judges._off_plane(ideal).verdict == FAILS
 
 
 def test_scatter_and_distance_from_the_tables_count() -> None:
     """A scatter of 16 % is not small; 0.02 N are 2.4 standard errors of 0.0374 N in 20."""
     means, scatter = (1e3,) * 5, (160.0,) * 5
     loose = Tables(stiffness={'k_xx': (means, scatter), 'k_zz': (means, scatter)})
-    assert judges.consistency(loose).verdict == FAILS
+    assert judges._consistency(loose).verdict == FAILS
     friction = {'coulomb_friction': (0.58, 0.0374), 'viscous_friction': (300.0, 44.7)}
-    apart = judges.identifiable(Tables(friction=friction)).numbers['apart']
+    apart = judges._identifiable(Tables(friction=friction)).numbers['apart']
     assert apart == pytest.approx(0.02 / 0.0374 * sqrt(20))
 
 
@@ -507,8 +507,8 @@ def test_verdicts_on_friction_follow_the_tables(study: mismatch.Mismatch) -> Non
         source='another needle',
         friction={'coulomb_friction': (0.8, 0.03), 'viscous_friction': (900.0, 40.0)},
     )
-    assert judges.identifiable(far).verdict == FAILS
-    assert judges.reading_of_table_1(far).verdict == FAILS
+    assert judges._identifiable(far).verdict == FAILS
+    assert judges._reading_of_table_1(far).verdict == FAILS
     (said,) = (one for one in claims.judge_claims(far, study) if one.name == 'reading_of_table_1')
     assert 'From another needle: 0.9 with an STD of 0.04 N s/mm' in said.evidence
 

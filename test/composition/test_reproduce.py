@@ -10,7 +10,7 @@ from needle_identification import ParameterEstimate, Statistic
 from needle_insertion.cli import main
 from needle_insertion.commands.reproduce import add_arguments
 from needle_insertion.experiment.protocol import SHIPPED_BAGS
-from needle_insertion.experiment.truth import Comparison, count_held, fewest, stiffness_truth
+from needle_insertion.experiment.truth import _stiffness, Comparison, Coverage
 from needle_insertion.paper import figures, identified, mismatch, results
 from needle_insertion.paper.claims import judge
 from needle_insertion.paper.identified import (
@@ -81,7 +81,7 @@ def line(mean: float, deviation: float | None, count: int = 20) -> Line:
         name='a', symbol='a', unit='N', mean=mean, deviation=deviation, error=0.2,
         interval=(mean - reach, mean + reach), count=count,
     )  # fmt: skip
-    return Line(quantity='a [N]', paper=(10.0, 1.0), found=found, held=19, known=20)
+    return Line(quantity='a [N]', paper=(10.0, 1.0), found=found, truth=Coverage(19, 20))
 
 
 @pytest.mark.parametrize(
@@ -120,11 +120,12 @@ def test_the_interval_of_the_std_is_that_of_chi_squared() -> None:
 
 @pytest.mark.parametrize('trials', [1, 20, 40, 400])
 def test_fewer_intervals_than_the_least_are_improbable(trials: int) -> None:
-    """If each holds its truth in 95 %, fewer than `fewest` do so once in a hundred at most."""
+    """If each holds its truth in 95 %, fewer than `least` do so once in a hundred at most."""
+    least = Coverage(known=trials).least
     held = np.random.default_rng(trials).binomial(trials, 0.95, size=20000)
     # Three standard errors of a share of 0.01 in 20000.
-    assert np.mean(held < fewest(trials)) <= 0.01 + 3.0 * np.sqrt(0.01 / 20000)
-    assert np.mean(held <= fewest(trials)) >= 0.01 - 3.0 * np.sqrt(0.01 / 20000)
+    assert np.mean(held < least) <= 0.01 + 3.0 * np.sqrt(0.01 / 20000)
+    assert np.mean(held <= least) >= 0.01 - 3.0 * np.sqrt(0.01 / 20000)
 
 
 def test_an_interval_counts_where_the_truth_is_known() -> None:
@@ -134,15 +135,16 @@ def test_an_interval_counts_where_the_truth_is_known() -> None:
     )
     unknown = ParameterEstimate(name='a', symbol='a', unit='N')
     pairs = ((held, 1.5), (held, 2.5), (unknown, 1.0), (held, None))
-    assert count_held([Comparison(estimate=e, truth=t) for e, t in pairs]) == (1, 3)
+    compared = [Comparison(estimate=e, truth=t) for e, t in pairs]
+    assert Coverage.of(compared) == Coverage(held=1, known=3)
 
 
 def test_the_truth_of_a_place_is_that_of_the_level() -> None:
     """The nearest level counts, not what lies between; without a configuration it is unknown."""
     truth = {'indenter.force_levels': [1.1, 1.2], 'indenter.stiffness_zz': [900.0, 700.0]}
-    assert stiffness_truth(truth, 'k_zz', 1.198) == 700.0
-    assert stiffness_truth(truth, 'k_xx', 1.1) is None
-    assert stiffness_truth(None, 'k_zz', 1.1) is None
+    assert _stiffness(truth, 'k_zz', 1.198) == 700.0
+    assert _stiffness(truth, 'k_xx', 1.1) is None
+    assert _stiffness(None, 'k_zz', 1.1) is None
 
 
 def test_without_recordings_there_is_one_line(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import cache
 
 from needle_dynamics.analysis import Analysis
-from needle_insertion.paper.claims.claim import Finding, verdict
+from needle_insertion.paper.claims.claim import Finding, finding
 from needle_insertion.paper.controllability import DEFLECTIONS, DEPTHS, SPEED
 from needle_insertion.paper.runs import CASES, needle
 from needle_insertion.report.controllability import analyze_points
@@ -21,35 +21,36 @@ def _analyses(deflection: float) -> tuple[Analysis, ...]:
     )
 
 
-def controllability() -> Finding:
+def _controllability() -> Finding:
     """Judge state controllability by the ranks."""
     straight, bent = map(_analyses, DEFLECTIONS)
     least, most = (
         {one.state.rank for one in bent},
         {one.state.rank for one in straight},
     )
-    return Finding(
-        verdict(always=least == most == {8}, sometimes=least == {8}),
+    return finding(
         {
             'bent': min(least),
             'straight': min(most),
             'distance': min(one.state.distance for one in bent),
         },
+        always=least == most == {8},
+        sometimes=least == {8},
     )
 
 
-def inadequate() -> Finding:
+def _inadequate() -> Finding:
     """Judge the inputs by how far they move the tip sideways."""
     gains = [one.output_gain for one in _analyses(DEFLECTIONS[-1])]
-    return Finding(verdict(always=max(gains) < 0.1), {'least': min(gains), 'most': max(gains)})
+    return finding({'least': min(gains), 'most': max(gains)}, always=max(gains) < 0.1)
 
 
-def modes_observable() -> Finding:
+def _modes_observable() -> Finding:
     """Judge whether q1, q2 and their rates show in the tip."""
     straight, bent = map(_analyses, DEFLECTIONS)
     found = [one.observed for one in (*straight, *bent)]
     hidden = {name for one in found for name in (*one.lost, *one.combined)}
-    return Finding(
-        verdict(always=not any(name.startswith(('q', 'bending')) for name in hidden)),
+    return finding(
         {'margin': min(one.observed.margin for one in straight)},
+        always=not any(name.startswith(('q', 'bending')) for name in hidden),
     )

@@ -32,12 +32,14 @@ class Finding(NamedTuple):
     numbers: Numbers
 
 
-def verdict(*, always: bool, sometimes: bool = False) -> str:
+def finding(numbers: Numbers, *, always: bool, sometimes: bool = False) -> Finding:
     """
-    Return a verdict.
+    Derive a verdict.
 
     Parameters
     ----------
+    numbers : Numbers
+        Numbers of the evidence.
     always : bool
         Whether the claim holds.
     sometimes : bool
@@ -45,13 +47,11 @@ def verdict(*, always: bool, sometimes: bool = False) -> str:
 
     Returns
     -------
-    str
-        `HOLDS`, `ONLY_IF` or `FAILS`.
+    Finding
+        Verdict and numbers.
 
     """
-    if always:
-        return HOLDS
-    return ONLY_IF if sometimes else FAILS
+    return Finding(HOLDS if always else ONLY_IF if sometimes else FAILS, numbers)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

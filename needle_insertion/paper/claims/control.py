@@ -6,7 +6,7 @@ from math import exp, sqrt
 
 from needle_controller import Axis, LoopRun, Pid, PidGains, stability_limit
 from needle_dynamics import NeedleParameters
-from needle_insertion.paper.claims.claim import Finding, verdict
+from needle_insertion.paper.claims.claim import Finding, finding
 from needle_insertion.paper.runs import (
     base_alone,
     CASES,
@@ -31,7 +31,7 @@ def _with_hub(law: str, factors: tuple[float, float] = (1.0, 1.0)) -> LoopRun:
     return closed_loop(law, 'paper_mm', 'complete', hub_stop=True, factors=factors)
 
 
-def error_equation() -> Finding:
+def _error_equation() -> Finding:
     """Judge the error of inverse dynamics by the exact solution of its equation."""
     run = closed_loop('inverse_dynamics', 'paper_si', 'complete')
     early = run.time <= 20.0
@@ -43,17 +43,18 @@ def error_equation() -> Finding:
         exact = np.exp(-damping * times) * (np.cos(w * times) + damping / w * np.sin(w * times))
         error = max(error, float(np.abs(run.states[early, k] / start[k] - exact).max()))
     p = run.model.parameters
-    return Finding(
-        verdict(always=False, sometimes=error < 1e-3),
+    return finding(
         {
             'error': error,
             'pushed_mn': 1e3 * p.moving_mass * INVERSE_DYNAMICS_KP[0] * (p.length - DEPTH),
             'friction': p.coulomb_friction,
         },
+        always=False,
+        sometimes=error < 1e-3,
     )
 
 
-def positive_definite() -> Finding:
+def _positive_definite() -> Finding:
     """Judge stability by the poles of the sampled loop."""
     p = NeedleParameters.preset('paper_mm')
     gains = PidGains(kp=PID_KP, ki=0.0, kd=PID_KV, tolerance=0.0)
@@ -65,25 +66,27 @@ def positive_definite() -> Finding:
     decay = exp(-p.viscous_friction / p.moving_mass * 1e-3)
     textbook = decay - (1.0 - decay) * PID_KV / p.viscous_friction
     ends = [Outcome.of(_with_hub(law)).final for law in LAWS]
-    return Finding(
-        verdict(always=max(slow, fast) < 1.0, sometimes=max(ends) < 1e-6),
+    return finding(
         {'at_1_khz': slow, 'at_1_mhz': fast, 'textbook': textbook},
+        always=max(slow, fast) < 1.0,
+        sometimes=max(ends) < 1e-6,
     )
 
 
-def same_inputs() -> Finding:
+def _same_inputs() -> Finding:
     """Judge the inputs by the forces at the start of figures 6 to 8."""
     inverse, pid = (
         closed_loop(law, 'paper_si', 'complete', hub_stop=True).forces[0, 2:] for law in LAWS
     )
-    return Finding(
-        verdict(always=not inverse.any() and not pid.any(), sometimes=True),
+    return finding(
         {
             'inverse_1': float(inverse[0]),
             'inverse_2': float(inverse[1]),
             'pid_1': float(pid[0]),
             'pid_2': float(pid[1]),
         },
+        always=not inverse.any() and not pid.any(),
+        sometimes=True,
     )
 
 
@@ -94,20 +97,20 @@ def _turns(run: LoopRun) -> int:
     return int(np.count_nonzero(np.diff(np.sign(tip))))
 
 
-def tip_varies() -> Finding:
+def _tip_varies() -> Finding:
     """Judge figure 4 by the peak of the tip."""
     found = [Outcome.of(open_loop(*case)) for case in CASES]
-    return Finding(
-        verdict(always=all(abs(one.peak) > DEFLECTION for one in found)),
+    return finding(
         {
             'turns': _turns(open_loop(*CASES[0])),
             'peak_mm': 1e3 * found[0].peak,
             'peak_ms': 1e3 * found[0].peak_time,
         },
+        always=all(abs(one.peak) > DEFLECTION for one in found),
     )
 
 
-def smoother() -> Finding:
+def _smoother() -> Finding:
     """Judge smoothness by how often the tip changes sides in a second."""
 
     def rate(run: LoopRun) -> float:
@@ -117,18 +120,19 @@ def smoother() -> Finding:
     free, controlled = rate(free_run), max(rate(_with_hub(law)) for law in LAWS)
     alone = min(rate(base_alone(law, 'paper_mm')) for law in LAWS)
     peaks = [1e3 * abs(Outcome.of(run).peak) for run in (free_run, *map(_with_hub, LAWS))]
-    return Finding(
-        verdict(always=alone < 1.0, sometimes=controlled < 0.1 * free),
+    return finding(
         {
             'free': free,
             'controlled': controlled,
             'alone': alone,
             **dict(zip(('free_mm', 'inverse_mm', 'pid_mm'), peaks, strict=True)),
         },
+        always=alone < 1.0,
+        sometimes=controlled < 0.1 * free,
     )
 
 
-def zero_deflection() -> Finding:
+def _zero_deflection() -> Finding:
     """Judge the deflection that inverse dynamics leaves."""
     modal = max(
         Outcome.of(closed_loop('inverse_dynamics', *case, hub_stop=hub)).final
@@ -137,33 +141,34 @@ def zero_deflection() -> Finding:
     )
     alone = min(Outcome.of(base_alone('inverse_dynamics', reading)).final for reading in READINGS)
     pid = Outcome.of(_with_hub('pid')).final
-    return Finding(
-        verdict(always=alone < 1e-6, sometimes=modal < 1e-6),
+    return finding(
         {'modal_nm': 1e9 * modal, 'alone_mm': 1e3 * alone, 'pid_nm': 1e9 * pid},
+        always=alone < 1e-6,
+        sometimes=modal < 1e-6,
     )
 
 
-def fully_inserted() -> Finding:
+def _fully_inserted() -> Finding:
     """Judge the wanted state by the length that is inserted."""
     free, held = (
         closed_loop('inverse_dynamics', 'paper_si', 'complete', hub_stop=hub)
         for hub in (False, True)
     )
     deepest, stopped = Outcome.of(free).deepest, Outcome.of(held).deepest
-    return Finding(
-        verdict(always=deepest <= 0.2, sometimes=stopped <= 0.2),
+    return finding(
         {'deepest_cm': 100.0 * deepest, 'arrival': hub_time(held)},
+        always=deepest <= 0.2,
+        sometimes=stopped <= 0.2,
     )
 
 
-def minimum_deflection() -> Finding:
+def _minimum_deflection() -> Finding:
     """Judge the gains of PID by the peaks of four other pairs of gains."""
     pairs = (1.0, 1.0), (2.0, 1.0), (0.5, 1.0), (1.0, 2.0), (1.0, 0.5)
     peaks = {pair: 1e3 * abs(Outcome.of(_with_hub('pid', pair)).peak) for pair in pairs}
     best = min(peaks, key=lambda pair: peaks[pair])
     paper = peaks[1.0, 1.0]
-    return Finding(
-        verdict(always=best == (1.0, 1.0)),
+    return finding(
         {
             'paper_mm': paper,
             'half_kv_mm': peaks[1.0, 0.5],
@@ -172,4 +177,5 @@ def minimum_deflection() -> Finding:
             'kv': best[1],
             'rank': sorted(peaks.values()).index(paper) + 1,
         },
+        always=best == (1.0, 1.0),
     )

@@ -7,7 +7,7 @@ from typing import Final
 
 from needle_dynamics import FloatArray
 from needle_identification import asymmetry, StiffnessSettings
-from needle_insertion.paper.claims.claim import Finding, Tables, verdict
+from needle_insertion.paper.claims.claim import Finding, finding, Tables
 from needle_insertion.paper.runs import hub_time, open_loop, READINGS
 from needle_insertion.paper.tables import FORCE_LEVELS, TABLE_1, TABLE_2
 import numpy as np
@@ -16,35 +16,37 @@ import numpy as np
 _THOUSAND: Final = 1e3
 
 
-def reading_of_table_1(tables: Tables) -> Finding:
+def _reading_of_table_1(tables: Tables) -> Finding:
     """Judge the unit of mu_v by the time of an insertion."""
     si, mm = (hub_time(open_loop(reading, 'complete', 0.0)) for reading in READINGS)
     mean, deviation = tables.friction['viscous_friction']
     published, scatter = TABLE_1['viscous_friction']
-    return Finding(
-        verdict(always=False, sometimes=abs(mean - published) < 2.0 * scatter),
+    return finding(
         {
             'si_ms': 1e3 * si,
             'mm_s': mm,
             'mean': mean / _THOUSAND,
             'deviation': deviation / _THOUSAND,
         },
+        always=False,
+        sometimes=abs(mean - published) < 2.0 * scatter,
     )
 
 
-def identifiable(tables: Tables) -> Finding:
+def _identifiable(tables: Tables) -> Finding:
     """Judge the method by the mean of mu_s that it finds."""
     mean, deviation = tables.friction['coulomb_friction']
     error = deviation / sqrt(tables.experiments)
     apart = abs(mean - TABLE_1['coulomb_friction'][0]) / error
-    return Finding(
-        verdict(always=False, sometimes=apart < 3.0),
+    return finding(
         {
             'mean': mean,
             'deviation': deviation,
             'experiments': tables.experiments,
             'apart': apart,
         },
+        always=False,
+        sometimes=apart < 3.0,
     )
 
 
@@ -52,7 +54,7 @@ def _means(tables: Tables) -> dict[str, FloatArray]:
     return {entry: np.array(means) for entry, (means, _) in tables.stiffness.items()}
 
 
-def consistency(tables: Tables) -> Finding:
+def _consistency(tables: Tables) -> Finding:
     """Judge the scatter of k_xx and k_zz over the places."""
     xx, zz = (
         100.0 * np.array(deviations) / np.abs(means)
@@ -60,8 +62,7 @@ def consistency(tables: Tables) -> Finding:
     )
     small = np.maximum(xx, zz) < 15.0
     levels = [f'{level:g}' for level, one in zip(FORCE_LEVELS, small, strict=True) if one]
-    return Finding(
-        verdict(always=bool(small.all()), sometimes=bool(small.any())),
+    return finding(
         {
             'levels': ', '.join(levels),
             'xx_least': float(xx.min()),
@@ -70,10 +71,12 @@ def consistency(tables: Tables) -> Finding:
             'zz_most': float(zz.max()),
             'zz_last': float(zz[-1]),
         },
+        always=bool(small.all()),
+        sometimes=bool(small.any()),
     )
 
 
-def spring(tables: Tables) -> Finding:
+def _spring(tables: Tables) -> Finding:
     """Judge whether the tissue is a spring by the curl of the force."""
     mean = _means(tables)
     matrices = np.stack([mean[entry] for entry in TABLE_2], axis=-1).reshape(-1, 2, 2)
@@ -81,8 +84,7 @@ def spring(tables: Tables) -> Finding:
     scatter = np.hypot(tables.stiffness['k_xz'][1], tables.stiffness['k_zx'][1])
     errors = np.abs(mean['k_xz'] - mean['k_zx']) / (scatter / sqrt(tables.experiments))
     limit = StiffnessSettings().largest_asymmetry
-    return Finding(
-        verdict(always=bool((errors < 2.0).all()), sometimes=bool((parts <= limit).all())),
+    return finding(
         {
             'least': 100.0 * float(parts.min()),
             'most': 100.0 * float(parts.max()),
@@ -90,31 +92,35 @@ def spring(tables: Tables) -> Finding:
             'least_errors': float(errors.min()),
             'most_errors': float(errors.max()),
         },
+        always=bool((errors < 2.0).all()),
+        sometimes=bool((parts <= limit).all()),
     )
 
 
-def linear(tables: Tables) -> Finding:
+def _linear(tables: Tables) -> Finding:
     """Judge linearity by how k_zz changes with the force."""
     ratio = float(_means(tables)['k_zz'][0] / _means(tables)['k_zz'][-1])
     fall = 1.0 - 1.0 / ratio
-    return Finding(verdict(always=abs(fall) < 0.1), {'fall': 100.0 * fall, 'ratio': ratio})
+    return finding({'fall': 100.0 * fall, 'ratio': ratio}, always=abs(fall) < 0.1)
 
 
-def off_plane(tables: Tables) -> Finding:
+def _off_plane(tables: Tables) -> Finding:
     """Judge the difference of k_xx and k_zz under larger forces."""
     xx, zz = (_means(tables)[entry] for entry in ('k_xx', 'k_zz'))
     apart = np.abs(xx - zz) / (0.5 * (xx + zz))
-    return Finding(
-        verdict(always=False, sometimes=bool(apart[2:].min() > apart[:2].max())),
+    return finding(
         {f'at_{k}': 100.0 * float(value) for k, value in enumerate(apart, 1)},
+        always=False,
+        sometimes=bool(apart[2:].min() > apart[:2].max()),
     )
 
 
-def tissue_stiffness(tables: Tables) -> Finding:
+def _tissue_stiffness(tables: Tables) -> Finding:
     """Judge the unit of k_a."""
     k = float(_means(tables)['k_zz'][-1])
     means, deviations = TABLE_2['k_zz']
-    return Finding(
-        verdict(always=False, sometimes=abs(k - means[-1]) < 2.0 * deviations[-1]),
+    return finding(
         {'k_zz': k / _THOUSAND, 'over_1_cm': k / 0.01 / _THOUSAND},
+        always=False,
+        sometimes=abs(k - means[-1]) < 2.0 * deviations[-1],
     )

@@ -50,15 +50,16 @@ def _entries() -> list[dict[str, Any]]:
 
 
 def _judged(entry: dict[str, Any], tables: Tables, study: Mismatch) -> Claim:
-    """Judge a claim by the function of its name."""
+    """Judge a claim by the function of its name, which is private to its module."""
+    name = f'_{entry["name"]}'
     modules: tuple[tuple[ModuleType, tuple[Any, ...]], ...] = (
         *((needle, ()), (identified, (tables,)), (analysis, ()), (control, ())),
         (mismatch, (study,)),
     )
     judge, arguments = next(
-        (getattr(module, entry['name']), arguments)
+        (getattr(module, name), arguments)
         for module, arguments in modules
-        if hasattr(module, entry['name'])
+        if hasattr(module, name)
     )
     finding: Finding = judge(*arguments)
     words = {

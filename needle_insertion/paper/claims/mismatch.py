@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from needle_controller import run_continuous
 from needle_dynamics import NeedleModel
-from needle_insertion.paper.claims.claim import Finding, verdict
+from needle_insertion.paper.claims.claim import Finding, finding
 from needle_insertion.paper.mismatch import Mismatch
 from needle_insertion.paper.runs import (
     closed_loop,
@@ -20,7 +20,7 @@ from needle_insertion.paper.runs import (
 import numpy as np
 
 
-def informed(study: Mismatch) -> Finding:
+def _informed(study: Mismatch) -> Finding:
     """Judge whether knowledge of the model helps, where it is exact and where it is not."""
     model = needle('paper_mm', 'complete')
     friction = 0.99 * model.parameters.coulomb_friction
@@ -39,8 +39,7 @@ def informed(study: Mismatch) -> Finding:
     )
     finals = [1e6 * float(np.median(np.abs(study.batches[law].final))) for law in LAWS]
     known = [1e6 * float(study.nominal[law].rms[0]) for law in LAWS]
-    return Finding(
-        verdict(always=finals[0] < finals[1], sometimes=known[0] < known[1]),
+    return finding(
         {
             'inverse_mm': inverse,
             'pid_mm': pid,
@@ -50,13 +49,15 @@ def informed(study: Mismatch) -> Finding:
             'pid_um': finals[1],
             'left_mm': 1e3 * float(run.states[-1, 0]),
         },
+        always=finals[0] < finals[1],
+        sometimes=known[0] < known[1],
     )
 
 
-def not_zero(study: Mismatch) -> Finding:
+def _not_zero(study: Mismatch) -> Finding:
     """Judge the error on needles that the laws do not know."""
     inverse, pid = (1e6 * float(np.abs(study.batches[law].final).min()) for law in LAWS)
-    return Finding(
-        verdict(always=min(inverse, pid) > 0.0),
+    return finding(
         {'needles': len(study.factors), 'inverse_um': inverse, 'pid_um': pid},
+        always=min(inverse, pid) > 0.0,
     )

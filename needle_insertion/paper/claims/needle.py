@@ -6,7 +6,7 @@ from functools import cache
 from math import pi, sqrt
 
 from needle_dynamics import FloatArray, Integrator, mode_shapes, NeedleModel, NeedleParameters
-from needle_insertion.paper.claims.claim import Finding, verdict
+from needle_insertion.paper.claims.claim import Finding, finding
 from needle_insertion.paper.runs import (
     CASES,
     DEFLECTION,
@@ -33,32 +33,34 @@ def _bias(formulation: str) -> tuple[FloatArray, FloatArray]:
     return whole, rest
 
 
-def zero_rows() -> Finding:
+def _zero_rows() -> Finding:
     """Judge the rows of N for d and theta."""
     model = needle('paper_si', 'complete')
     straight = model.state_at(DEPTH)
     straight[4:6] = -1.0, 1.0
     whole, _ = _bias('complete')
     largest = float(np.abs(whole[:, :2]).max())
-    return Finding(
-        verdict(always=largest == 0.0, sometimes=not np.any(model.bias_forces(straight)[:2])),
+    return finding(
         {'largest': largest, 'percent': 100.0 * largest / model.parameters.coulomb_friction},
+        always=largest == 0.0,
+        sometimes=not np.any(model.bias_forces(straight)[:2]),
     )
 
 
-def rates_in_bias() -> Finding:
+def _rates_in_bias() -> Finding:
     """Judge the part of the rates in the row of q1 of N."""
     complete, printed = (
         100.0 * float(np.abs(whole - rest)[:, 2].max() / np.abs(whole[:, 2]).max())
         for whole, rest in (_bias('complete'), _bias('as_printed'))
     )
-    return Finding(
-        verdict(always=min(complete, printed) > 0.0, sometimes=complete > printed),
+    return finding(
         {'complete': complete, 'printed': printed},
+        always=min(complete, printed) > 0.0,
+        sometimes=complete > printed,
     )
 
 
-def independence() -> Finding:
+def _independence() -> Finding:
     """Judge by how much d depends on an initial deflection."""
 
     def apart(reading: str, formulation: str) -> float:
@@ -68,13 +70,14 @@ def independence() -> Finding:
     printed = max(apart(reading, 'as_printed') for reading in READINGS)
     si, mm = (apart(reading, 'complete') for reading in READINGS)
     part = max(si, mm) / (NeedleParameters().length - DEPTH)
-    return Finding(
-        verdict(always=0.0 < printed < 1e-2, sometimes=0.0 < part < 1e-2),
+    return finding(
         {'printed': printed, 'si_mm': 1e3 * si, 'mm_mm': 1e3 * mm, 'percent': 100.0 * part},
+        always=0.0 < printed < 1e-2,
+        sometimes=0.0 < part < 1e-2,
     )
 
 
-def two_modes_cause() -> Finding:
+def _two_modes_cause() -> Finding:
     """Judge whether that dependence vanishes with more modes, over the first 20 ms."""
 
     def path(modes: int, deflection: float) -> FloatArray:
@@ -89,12 +92,10 @@ def two_modes_cause() -> Finding:
     one, two, three = (
         1e3 * float(np.abs(path(n, DEFLECTION) - path(n, 0.0)).max()) for n in (1, 2, 3)
     )
-    return Finding(
-        verdict(always=three < 0.1 * two), {'one_mm': one, 'two_mm': two, 'three_mm': three}
-    )
+    return finding({'one_mm': one, 'two_mm': two, 'three_mm': three}, always=three < 0.1 * two)
 
 
-def deflection_changes() -> Finding:
+def _deflection_changes() -> Finding:
     """Judge whether a deflection grows during insertion, and only if there is one."""
     peaks = {case: abs(Outcome.of(open_loop(*case)).peak) for case in CASES}
     straight = max(
@@ -102,17 +103,17 @@ def deflection_changes() -> Finding:
         for reading in READINGS
     )
     peak = peaks['paper_si', 'complete']
-    return Finding(
-        verdict(always=straight == 0.0 and min(peaks.values()) > DEFLECTION),
+    return finding(
         {
             'peak_mm': 1e3 * peak,
             'grown': peak / DEFLECTION,
             'printed_mm': 1e3 * peaks['paper_si', 'as_printed'],
         },
+        always=straight == 0.0 and min(peaks.values()) > DEFLECTION,
     )
 
 
-def spring_at_the_tip() -> Finding:
+def _spring_at_the_tip() -> Finding:
     """Judge one spring at the tip, which stores what the tissue does in the first shape."""
     model = needle('paper_si', 'complete')
     at = model.modes.integrals(DEPTH)
@@ -120,10 +121,10 @@ def spring_at_the_tip() -> Finding:
     tissue = np.array([shape @ at.gram @ shape for shape in shapes])
     tip = (shapes @ at.value) ** 2
     ratio = float(tip[1] / tip[0] * tissue[0] / tissue[1])
-    return Finding(verdict(always=abs(ratio - 1.0) < 0.02, sometimes=True), {'ratio': ratio})
+    return finding({'ratio': ratio}, always=abs(ratio - 1.0) < 0.02, sometimes=True)
 
 
-def two_modes() -> Finding:
+def _two_modes() -> Finding:
     """Judge two modes by the exact clamped beam on an elastic foundation."""
     model = needle('paper_si', 'complete')
     p = model.parameters
@@ -142,43 +143,42 @@ def two_modes() -> Finding:
         excess = np.sqrt(squares * p.linear_density / (bending + p.tissue_stiffness)) - 1.0
         errors.append((1.0 - compliance / exact, *excess))
     deflection, first, second = map(float, np.max(errors, axis=0))
-    return Finding(
-        verdict(
-            always=max(deflection, first, second) < 0.05, sometimes=max(deflection, first) < 0.05
-        ),
+    return finding(
         {'deflection': 100.0 * deflection, 'first': 100.0 * first, 'second': 100.0 * second},
+        always=max(deflection, first, second) < 0.05,
+        sometimes=max(deflection, first) < 0.05,
     )
 
 
-def axis_of_rotation() -> Finding:
+def _axis_of_rotation() -> Finding:
     """Judge the axis that theta turns about by the moments of inertia of a round wire."""
     p = NeedleParameters()
     mass = p.linear_density * p.length
     across, along = mass * p.length**2 / 12.0, 0.5 * mass * p.area / pi
     of_across, of_along = p.rotary_inertia / across, p.rotary_inertia / along
-    return Finding(
-        verdict(always=0.5 < of_across < 2.0),
+    return finding(
         {'across': across, 'along': along, 'of_across': of_across, 'of_along': of_along},
+        always=0.5 < of_across < 2.0,
     )
 
 
-def friction_matters() -> Finding:
+def _friction_matters() -> Finding:
     """Judge friction by the time of an insertion with and without it."""
     p = NeedleParameters()
     free = sqrt(2.0 * (p.length - DEPTH) * p.moving_mass / FORCE)
     si, mm = (hub_time(open_loop(reading, 'complete', 0.0)) for reading in READINGS)
-    return Finding(
-        verdict(always=min(si, mm) > 1.1 * free),
-        {'none_ms': 1e3 * free, 'si_ms': 1e3 * si, 'mm_s': mm},
+    return finding(
+        {'none_ms': 1e3 * free, 'si_ms': 1e3 * si, 'mm_s': mm}, always=min(si, mm) > 1.1 * free
     )
 
 
-def transients() -> Finding:
+def _transients() -> Finding:
     """Judge static models by how long a deflection rings."""
     p = NeedleParameters.preset('phantom')
     fade = p.linear_density * 2.0 / p.tissue_damping
     rings = Outcome.of(open_loop('paper_mm', 'complete')).final
-    return Finding(
-        verdict(always=False, sometimes=rings > DEFLECTION),
+    return finding(
         {'rings_mm': 1e3 * rings, 'fade_ms': 1e3 * fade},
+        always=False,
+        sometimes=rings > DEFLECTION,
     )
