@@ -1,9 +1,11 @@
-"""A private ROS graph: nodes as processes on a domain of their own, watched from one node."""
+"""A private ROS graph: nodes as processes on a domain of their own, and nodes to watch them."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from dataclasses import dataclass
+from functools import partial
 import gc
 import os
 from pathlib import Path
@@ -43,15 +45,15 @@ DEACTIVATE = Transition.TRANSITION_DEACTIVATE
 CLEANUP = Transition.TRANSITION_CLEANUP
 
 
-#: Time that a node may take to start, with all to be compiled on a busy machine [s].
+#: Longest start of a node, with everything to compile on a busy machine [s].
 _START: Final = 180.0
 
-#: Time that the nodes have to end by themselves at the end of a graph [s].
+#: Time in which the nodes may end by themselves at the end of a graph [s].
 _PATIENCE: Final = 3.0
 
 
 class GraphError(JobError):
-    """A node did not start, ended early, or what was waited for did not come."""
+    """A node did not start, ended early, or did not do what was expected in time."""
 
 
 class NodeProcess:
@@ -94,45 +96,70 @@ class NodeProcess:
         )
 
     def check(self) -> None:
-        """Raise `GraphError` with the node's last words if it has ended."""
+        """
+        Require that the node runs.
+
+        Raises
+        ------
+        GraphError
+            With its last line of output, if it has ended.
+
+        """
         status = self.process.poll()
         if status is not None:
             raise GraphError(
-                f'{self.name} ended early with status {status}: {self.last_words() or "no output"}'
+                f'{self.name} ended early with status {status}: {self.last_line() or "no output"}'
             )
 
-    def last_words(self) -> str:
-        """Return the last line the node printed."""
+    def last_line(self) -> str:
+        """Return the last line that the node has printed."""
         self._log.flush()
         lines = Path(self._log.name).read_text(encoding='utf-8', errors='replace').splitlines()
         return lines[-1] if lines else ''
 
     def kill(self) -> None:
-        """End the node at once, as a crash does, and wait."""
+        """End the node at once, as a crash does, and wait for it."""
         self.killed = True
         self.process.kill()
         self.process.wait()
 
     def interrupt(self, timeout: float = 15.0) -> None:
-        """End the node as Ctrl-C does and wait; raise `GraphError` if it does not end well."""
+        """
+        End the node as Ctrl-C does, and wait for it.
+
+        Parameters
+        ----------
+        timeout : float
+            Longest time to wait [s].
+
+        Raises
+        ------
+        GraphError
+            If it does not end in time, or with an error.
+
+        """
         self.process.send_signal(signal.SIGINT)
         try:
             status = self.process.wait(timeout)
         except subprocess.TimeoutExpired as error:
             raise GraphError(f'{self.name} did not end within {timeout:g} s') from error
         if status != 0:
-            raise GraphError(f'{self.name} ended with status {status}: {self.last_words()}')
+            raise GraphError(f'{self.name} ended with status {status}: {self.last_line()}')
 
 
+@dataclass(slots=True)
 class Latest:
-    """The newest message of a topic, None before the first."""
+    """
+    The newest message of a topic.
 
-    def __init__(self) -> None:
-        self.message: Any = None
+    Attributes
+    ----------
+    message : message or None
+        None before the first.
 
-    def take(self, message: Any) -> None:
-        """Take a message."""
-        self.message = message
+    """
+
+    message: Any = None
 
 
 class Graph:
@@ -144,7 +171,7 @@ class Graph:
     logs : Path
         Folder for what the nodes print.
     executor : type of executor
-        Spins the nodes in this process, in the caller's thread: an error in a callback is an
+        Runs the nodes of this process in the thread of the caller: an error in a callback is an
         error of the caller.
 
     """
@@ -190,10 +217,10 @@ class Graph:
             self._nodes.clear()
             self._life_cycles.clear()
             del self.executor
-            # rclpy's nodes are in cycles; until these are gone DDS keeps them in the domain, where
-            # the next graph would find them.
+            # rclpy's nodes are in reference cycles. Until these are collected DDS keeps the nodes
+            # in the domain, where the next graph would find them.
             gc.collect()
-            # Who is killed leaves its shared memory behind.
+            # A process that is killed leaves its shared memory behind.
             for started in self._processes:
                 if started.process.poll() is None:
                     started.process.terminate()
@@ -202,7 +229,7 @@ class Graph:
                 with suppress(subprocess.TimeoutExpired):
                     started.process.wait(max(0.0, deadline - time.monotonic()))
         finally:
-            # All before any: a second interrupt may come while waiting.
+            # Kill all before waiting for any: a second interrupt may come while waiting.
             for started in self._processes:
                 if started.process.poll() is None:
                     started.process.kill()
@@ -213,27 +240,89 @@ class Graph:
             self._domain.__exit__(kind, error, trace)
 
     def add(self, kind: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
-        """Make a node in this process and spin it along."""
+        """
+        Make a node in this process.
+
+        Parameters
+        ----------
+        kind : callable
+            Its class.
+        *arguments, **options : object
+            Arguments of the class, besides the context.
+
+        Returns
+        -------
+        Node
+            Spun by `spin_until`.
+
+        """
         node = kind(*arguments, context=self.context, **options)
         self._nodes.append(node)
         self.executor.add_node(node)
         return node
 
     def node(self, name: str) -> Node:
-        """Make a plain node in this process, to watch and to command."""
+        """
+        Make a plain node in this process, to watch and to command.
+
+        Parameters
+        ----------
+        name : str
+            Its name.
+
+        Returns
+        -------
+        Node
+            Spun by `spin_until`.
+
+        """
         node: Node = self.add(Node, name)
         return node
 
     def latest(self, node: Node, kind: type, topic: str, qos: QoSProfile) -> Latest:
-        """Watch a topic for its newest message."""
+        """
+        Watch a topic for its newest message.
+
+        Parameters
+        ----------
+        node : Node
+            Node of this process that subscribes.
+        kind : type
+            Message type.
+        topic : str
+            Name of the topic.
+        qos : QoSProfile
+            Quality of service.
+
+        Returns
+        -------
+        Latest
+            Holds the newest message.
+
+        """
         latest = Latest()
-        node.create_subscription(kind, topic, latest.take, qos)
+        node.create_subscription(kind, topic, partial(setattr, latest, 'message'), qos)
         return latest
 
     def start(self, name: str, parameters: Mapping[str, object] | None = None) -> NodeProcess:
-        """Start a node of the suite as a process."""
+        """
+        Start a node of the suite as a process.
+
+        Parameters
+        ----------
+        name : str
+            A key of `MODULES`.
+        parameters : Mapping[str, object], optional
+            Parameters by name.
+
+        Returns
+        -------
+        NodeProcess
+            The process.
+
+        """
         self._logs.mkdir(parents=True, exist_ok=True)
-        # Closed with the graph: the process writes to it until then.
+        # The process writes to it until the graph closes it.
         log = (self._logs / f'{name}.log').open('a', encoding='utf-8')
         self._files.append(log)
         process = NodeProcess(name, parameters or {}, self.environment, log)
@@ -242,7 +331,14 @@ class Graph:
 
     def wait_for(self, node: Node, name: str) -> None:
         """
-        Wait until a node of the suite answers a node of this process, with all its clients.
+        Wait until a node of the suite answers a node of this process.
+
+        Parameters
+        ----------
+        node : Node
+            Node of this process, with all its clients.
+        name : str
+            Name of the other node.
 
         Raises
         ------
@@ -255,8 +351,8 @@ class Graph:
         self._life_cycles[name] = node.create_client(ChangeState, f'{name}/change_state')
         probe = node.create_client(GetState, f'{name}/get_state')
         self.spin_until(probe.service_is_ready, f'the node {name}')
-        # An answer to a client that the other side does not know yet is lost. Clients become
-        # known in the order they were made: once the last has its answer, all will.
+        # The answer to a client that the other side does not know yet is lost. Clients become
+        # known in the order in which they were made: once the last has an answer, all will.
         answers: list[Future] = []
         start = time.monotonic()
 
@@ -270,12 +366,12 @@ class Graph:
 
     def change(self, node: Node, name: str, *transitions: int) -> None:
         """
-        Take a node, started with ``autostart`` off, through transitions of its life cycle.
+        Change the life cycle state of a node that was started without ``autostart``.
 
         Parameters
         ----------
         node : Node
-            Node in this process that asks for it.
+            Node of this process that asks for it.
         name : str
             Name of the other node.
         *transitions : int
@@ -284,7 +380,7 @@ class Graph:
         Raises
         ------
         GraphError
-            If it refuses.
+            If a transition fails.
 
         """
         self.wait_for(node, name)
@@ -293,23 +389,32 @@ class Graph:
             answer = client.call_async(ChangeState.Request(transition=Transition(id=transition)))
             self.spin_until(answer.done, f'the answer of {name}', _START)
             if not answer.result().success:
-                said = [p.last_words() for p in self._processes if p.name == name]
+                said = [p.last_line() for p in self._processes if p.name == name]
                 raise GraphError(f'{name} refused to start: {"".join(said[-1:])}')
 
     def spin_until(self, condition: Callable[[], Any], what: str, timeout: float = 60.0) -> None:
         """
-        Spin until a condition holds.
+        Run the nodes of this process until a condition holds.
+
+        Parameters
+        ----------
+        condition : callable
+            Returns whether it holds.
+        what : str
+            What is waited for, for the message.
+        timeout : float
+            Longest time to wait [s].
 
         Raises
         ------
         GraphError
-            If it does not within the timeout [s], or a process of the graph has ended.
+            If it does not hold in time, or a process of the graph has ended.
 
         """
         deadline = time.monotonic() + timeout
         while not condition():
             for started in self._processes:
-                # One that was interrupted on purpose has ended well.
+                # A process that was interrupted on purpose ends with status 0.
                 if started.process.poll() not in (None, 0) and not started.killed:
                     started.check()
             if time.monotonic() > deadline:
