@@ -1,4 +1,4 @@
-"""`needle analyze`: what it prints and writes, and how it refuses."""
+"""`needle analyze`: what it prints and writes, and what it rejects."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def test_json_holds_the_analysis_of_each_point(capsys: pytest.CaptureFixture[str
         }
 
 
-def test_table_says_in_words_what_is_lost(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_table_names_lost_states(capsys: pytest.CaptureFixture[str]) -> None:
     """One line a point: a straight and a deflected needle, out of the box."""
     assert run() == 0
     lines = capsys.readouterr().out.splitlines()

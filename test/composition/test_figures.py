@@ -37,7 +37,7 @@ def test_all_runs_begin_where_the_paper_says(case: tuple[str, ...]) -> None:
         assert (run.states[0, 4:] == 0.0).all()
 
 
-def test_the_open_loop_tells_the_readings_and_the_formulations_apart() -> None:
+def test_the_open_loop_distinguishes_readings_and_formulations() -> None:
     # 2 %: the way to the terminal speed and the force of the deflection.
     assert_allclose(hub_time(open_loop('paper_mm', 'complete')), 0.18 * 300.0 / 2.44, rtol=0.02)
     assert 0.028 < hub_time(open_loop('paper_si', 'complete')) < 0.029
@@ -64,7 +64,7 @@ def test_the_open_loop_has_converged() -> None:
 
 
 @pytest.mark.parametrize('hub_stop', [False, True])
-def test_inverse_dynamics_leaves_nothing_of_reading_and_formulation(hub_stop: bool) -> None:
+def test_inverse_dynamics_cancels_reading_and_formulation(hub_stop: bool) -> None:
     # Of a peak of 100 mm and 30 mm; where the hub is touched differs by the solver's tolerance.
     tips = [
         closed_loop('inverse_dynamics', *case, hub_stop=hub_stop).tip_deflection for case in CASES

@@ -102,7 +102,7 @@ def test_terms_are_a_list_or_repeated(capsys: pytest.CaptureFixture[str]) -> Non
         (['--motion-axis', '-slide'], 'slide'),
     ],
 )
-def test_what_is_not_valid_is_named_in_one_line(
+def test_invalid_options_are_named_in_one_line(
     capsys: pytest.CaptureFixture[str], words: list[str], complaint: str
 ) -> None:
     """Exit status 2; the line says what was found and what would be valid."""
@@ -119,7 +119,7 @@ def test_what_is_not_valid_is_named_in_one_line(
         ['--force-axis=-y', '--motion-axis=-insertion'],
     ],
 )
-def test_signed_axes_are_taken_as_they_are_written(
+def test_signed_axes_are_accepted_in_both_forms(
     capsys: pytest.CaptureFixture[str], words: list[str]
 ) -> None:
     """Force and motion both turned around leave friction what it is."""
@@ -131,13 +131,13 @@ def test_signed_axes_are_taken_as_they_are_written(
         assert turned[name]['mean'] == pytest.approx(straight[name]['mean'], abs=tolerance)
 
 
-def test_a_force_turned_around_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
-    """Friction that drives is none."""
+def test_a_force_of_the_wrong_sign_is_rejected(capsys: pytest.CaptureFixture[str]) -> None:
+    """Friction cannot drive the needle."""
     _, err = identify(capsys, 'friction', BAGS[0], '--force-axis', '-y', status=2)
     assert 'must not be negative' in err
 
 
-def test_a_bad_bag_among_good_ones_is_named_and_the_others_go_on(
+def test_a_bad_bag_is_named_and_the_others_are_used(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     """The result is that of the others; exit status 2 tells a script that it is not of all."""
@@ -165,7 +165,7 @@ def test_nothing_is_written_if_no_bag_can_be_used(
     assert not list(tmp_path.iterdir())
 
 
-def test_what_the_data_do_not_determine_is_said(
+def test_undetermined_parameters_are_reported(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     """A single term too many for one speed is no tight number, and not in the file."""
@@ -228,7 +228,7 @@ def test_a_folder_that_cannot_be_made_ends_in_one_line(capsys: pytest.CaptureFix
 # Stiffness.
 
 
-def test_stiffness_is_told_by_force_as_table_2(
+def test_stiffness_is_printed_by_force_as_in_table_2(
     capsys: pytest.CaptureFixture[str], places: list[str]
 ) -> None:
     """Each entry of the matrix at each force, and k_a at the largest."""

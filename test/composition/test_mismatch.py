@@ -42,7 +42,7 @@ def test_the_same_seed_gives_the_same_numbers_and_another_one_others(found: Mism
         assert (again.batches[law].final != other.batches[law].final).any()
 
 
-def test_an_exact_model_is_what_the_errors_are_held_against(found: Mismatch) -> None:
+def test_errors_are_compared_with_those_of_an_exact_model(found: Mismatch) -> None:
     for law, nominal in found.nominal.items():
         assert nominal.rms[0] < np.median(found.batches[law].rms) * 1.1
     assert found.nominal['inverse_dynamics'].rms < found.nominal['pid'].rms

@@ -32,7 +32,7 @@ def test_twenty_draws_have_the_mean_and_std_of_the_tables(seed: int) -> None:
 
 @settings(max_examples=30, deadline=None)
 @given(repeats=st.integers(1, 60), seed=SEEDS)
-def test_every_draw_is_a_tissue_that_can_be(repeats: int, seed: int) -> None:
+def test_every_draw_is_a_possible_tissue(repeats: int, seed: int) -> None:
     """Friction is positive, and pressing the tissue costs energy at every level, anywhere."""
     assert all(value > 0.0 for drawn in draw_friction(repeats, seed) for value in drawn.values())
     places = draw_stiffness(repeats, seed)
@@ -55,7 +55,7 @@ def test_a_place_has_one_quantile_per_entry(seed: int) -> None:
         assert (orders == orders[:, :1]).all()
 
 
-def test_a_seed_gives_one_draw() -> None:
+def test_a_seed_gives_the_same_draw() -> None:
     """The same seed gives the same draw, another seed another."""
     for draw in (draw_friction, draw_stiffness):
         assert draw(20, 7) == draw(20, 7)

@@ -46,7 +46,7 @@ def test_columns_of_a_table_line_up(rows: list[tuple[str, str, str]]) -> None:
             start += width + 2
 
 
-def test_a_failure_is_told_in_capitals() -> None:
+def test_a_failure_is_printed_in_capitals() -> None:
     """The verdict follows the check."""
     text = check_table([Check('x', '1', '2', passed=False), Check('y', '1', '1', passed=True)])
     assert text.splitlines()[2].endswith('FAIL')
@@ -185,7 +185,7 @@ def test_the_same_content_gives_the_same_bytes(tmp_path: Path) -> None:
     assert pages[0] == pages[1]
 
 
-def test_a_page_is_shown_whole_even_on_a_telephone(tmp_path: Path) -> None:
+def test_a_page_fits_a_telephone(tmp_path: Path) -> None:
     """Pictures have loaded with their texts, nothing outside is asked for, nothing sticks out."""
     path = tmp_path / 'page.html'
     blocks = [
@@ -212,7 +212,7 @@ def test_what_a_page_would_load_from_outside_is_noticed(tmp_path: Path) -> None:
     assert seen.requests == ['http://127.0.0.1:9/outside.png']
 
 
-def test_names_the_page_that_cannot_be_written(tmp_path: Path) -> None:
+def test_a_page_that_cannot_be_written_is_named(tmp_path: Path) -> None:
     """A folder that is not there ends in one line, and nothing is left."""
     with pytest.raises(ParameterError, match=r'no/page.html cannot be written: No such file'):
         show(tmp_path / 'no' / 'page.html', [])

@@ -269,10 +269,10 @@ def test_a_claim_that_does_not_hold_is_a_finding(
     assert 'does not hold' in capsys.readouterr().out
 
 
-def test_what_is_computed_is_not_recorded(
+def test_a_computed_result_cannot_be_recorded(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A recording for a figure is refused in one line."""
+    """A recording for a figure is rejected in one line."""
     assert main(['reproduce', 'figure-6', '--record', str(tmp_path / 'bags')]) == 2
     assert 'nothing to --record' in capsys.readouterr().err
     assert not (tmp_path / 'bags').exists()
