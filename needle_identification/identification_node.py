@@ -8,7 +8,6 @@ import sys
 from typing import Any, ClassVar, Final
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from geometry_msgs.msg import WrenchStamped
 from needle_identification.application import ANSWER_TIME, Application
 from needle_identification.bags.bag import check_distinct
 from needle_identification.estimation.estimate import Statistic, statistic
@@ -22,15 +21,17 @@ from needle_identification.recordings.reading import (
     read_indentation_recording,
     signed_axis,
 )
+from needle_identification.recordings.samples import AXES
 from needle_identification.result import model_parameters, NODES, write_result
 from needle_identification.status import live_statuses, sentence, Status, summary_statuses
 from needle_identification.stiffness.identify import identify_stiffness
 from needle_identification.stiffness.settings import StiffnessSettings
 from needle_identification.stiffness.summary import StiffnessSummary, summarize_stiffness
-from needle_ros.base_node import BaseNode, LATCHED, run, SENSOR
+from needle_ros import contract
+from needle_ros.base_node import BaseNode, profile, run
 from needle_ros.errors import NeedleError, ParameterError
 from needle_ros.settings import check_constants, constant
-from needle_ros.timing import nanoseconds
+from needle_ros.wire import Reading
 from rcl_interfaces.srv import SetParameters
 from rclpy.client import Client
 from rclpy.clock import Clock
@@ -39,7 +40,6 @@ from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 from rclpy.service import Service
 from rclpy.task import Future
-from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
 #: What can be identified.
@@ -104,8 +104,11 @@ class IdentificationNode(BaseNode):
         self._live: LiveFriction | None = None
         self._applications: list[tuple[Application, Trigger.Response, Future]] = []
         self._setters: dict[str, Client] = {}
-        self._friction = self.create_publisher(DiagnosticArray, 'friction', LATCHED)
-        self._stiffness = self.create_publisher(DiagnosticArray, 'stiffness', LATCHED)
+        # Not lifecycle publishers: it publishes while it is being activated.
+        self._friction, self._stiffness = (
+            self.create_publisher(DiagnosticArray, topic.name, profile(topic.qos))
+            for topic in (contract.FRICTION, contract.STIFFNESS)
+        )
         self.create_service(Trigger, '~/identify', self._on_identify)
         _answer_later(self.create_service(Trigger, '~/apply', self._on_apply))
         # A simulation that pauses must not keep a caller waiting.
@@ -147,8 +150,8 @@ class IdentificationNode(BaseNode):
         if self._is_live:
             self._live = LiveFriction(self._friction_settings, self._own.forgetting)
             self._listening = (
-                self.create_subscription(JointState, 'joint_states', self._on_motion, SENSOR),
-                self.create_subscription(WrenchStamped, 'base_wrench', self._on_force, SENSOR),
+                self.listen(contract.JOINT_STATES, self._on_motion),
+                self.listen(contract.BASE_WRENCH, self._on_force),
             )
             self._timer = self.create_timer(1.0, self._publish_live)
 
@@ -253,19 +256,19 @@ class IdentificationNode(BaseNode):
 
     # Running topics.
 
-    def _on_motion(self, message: JointState) -> None:
-        live = self._live
-        if live is None or self._joint not in message.name:
+    def _on_motion(self, reading: Reading) -> None:
+        if self._live is None or self._joint not in reading.names:
             return
-        at, sign = list(message.name).index(self._joint), self._joint_sign
-        if len(message.position) > at:
-            speed = sign * message.velocity[at] if len(message.velocity) > at else None
-            live.take_motion(nanoseconds(message.header.stamp), sign * message.position[at], speed)
+        at, sign = reading.names.index(self._joint), self._joint_sign
+        position, velocity, _ = reading.values
+        if len(position) > at:
+            speed = sign * velocity[at] if len(velocity) > at else None
+            self._live.take_motion(reading.stamp, sign * position[at], speed)
 
-    def _on_force(self, message: WrenchStamped) -> None:
+    def _on_force(self, reading: Reading) -> None:
         if self._live is not None:
-            force = getattr(message.wrench.force, self._force_axis)
-            self._live.take_force(nanoseconds(message.header.stamp), self._force_sign * force)
+            force = reading.values[0][AXES.index(self._force_axis)]
+            self._live.take_force(reading.stamp, self._force_sign * force)
 
     def _live_statistics(self) -> list[Statistic]:
         estimates = () if self._live is None else self._live.estimate()
@@ -352,15 +355,7 @@ def _message_of(result: Status) -> DiagnosticStatus:
 
 
 def main() -> int:
-    """
-    Run the node.
-
-    Returns
-    -------
-    int
-        Exit status.
-
-    """
+    """Run the node; return its exit status."""
     return run(IdentificationNode)
 
 

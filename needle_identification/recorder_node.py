@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
-from importlib import import_module
 from pathlib import Path
 import sys
 import time
@@ -13,7 +13,8 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from needle_identification.bags.topics import OfferedQos
 from needle_identification.bags.writer import BagWriter, COMPRESSIONS
 from needle_identification.errors import RecordingError
-from needle_ros.base_node import BaseNode, run
+from needle_ros.base_node import BaseNode, message_class, run
+from needle_ros.errors import MessageError
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.event_handler import SubscriptionEventCallbacks
@@ -194,12 +195,12 @@ class RecorderNode(BaseNode):
         if recorded and recorded.best_effort >= best_effort and recorded.latched <= latched:
             return
         try:
-            kind = message_class(types)
+            kind = class_of(types)
             if recorded:
                 self.destroy_subscription(recorded.subscription)
             else:
                 bag.add_topic(topic, types[0], [_described(qos) for qos in offered])
-        except RecordingError as error:
+        except (RecordingError, MessageError) as error:
             self._left_out.add(topic)
             self.get_logger().warning(f'{topic} left out: {error}')
             return
@@ -238,15 +239,13 @@ def is_hidden(topic: str) -> bool:
     return '/_' in topic or topic in _NOT_FOR_ALL
 
 
-def message_class(types: list[str]) -> Any:
+def class_of(types: Sequence[str]) -> Any:
     """
     Import the class of the messages of a topic.
 
-    rosidl_runtime_py does the same, but is not in the wheels.
-
     Parameters
     ----------
-    types : list of str
+    types : sequence of str
         Types of the topic, such as ``sensor_msgs/msg/JointState``.
 
     Returns
@@ -257,16 +256,14 @@ def message_class(types: list[str]) -> Any:
     Raises
     ------
     RecordingError
-        If there are several types, or the package of the type is not installed.
+        If there are several types.
+    MessageError
+        If the package of the type is not installed.
 
     """
     if len(types) > 1:
         raise RecordingError(f'it has several types: {", ".join(types)}')
-    package, _, name = types[0].partition('/msg/')
-    try:
-        return getattr(import_module(f'{package}.msg'), name)
-    except (ImportError, AttributeError, TypeError) as error:
-        raise RecordingError(f'{types[0]} is not installed') from error
+    return message_class(types[0])
 
 
 def _described(qos: QoSProfile) -> OfferedQos:
@@ -279,15 +276,7 @@ def _described(qos: QoSProfile) -> OfferedQos:
 
 
 def main() -> int:
-    """
-    Run the node.
-
-    Returns
-    -------
-    int
-        Exit status.
-
-    """
+    """Run the node; return its exit status."""
     return run(RecorderNode)
 
 
