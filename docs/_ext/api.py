@@ -1,6 +1,9 @@
 """One page for each public module of the packages, written into docs/api before Sphinx reads."""
 
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
 from importlib import import_module
+from math import inf
 from pathlib import Path
 from pkgutil import iter_modules
 import sys
@@ -83,6 +86,36 @@ def write_pages(app: Sphinx) -> None:
     (folder / 'index.rst').write_text(text, encoding='utf-8')
 
 
+def _range(meta: Mapping[str, Any]) -> str:
+    low = '' if meta['low'] == -inf else f'{">" if meta["open_low"] else ">="} {meta["low"]:g}'
+    high = '' if meta['high'] == inf else f'<= {meta["high"]:g}'
+    return ', '.join(part for part in (low, high) if part)
+
+
+def list_fields(
+    _app: Sphinx, what: str, _name: str, value: object, _options: object, lines: list[str]
+) -> None:
+    """Add the fields of settings to a class, with what their metadata say of them."""
+    items = fields(value) if what == 'class' and is_dataclass(value) else ()
+    described = [item for item in items if 'description' in item.metadata]
+    if described:
+        lines += ['', '.. list-table::', '   :header-rows: 1', '']
+        heads = ('field', 'default', 'unit', 'range', 'meaning')
+        rows = [
+            (
+                f'``{item.name}``',
+                f'``{item.default!r}``',
+                item.metadata.get('unit', ''),
+                _range(item.metadata) if 'unit' in item.metadata else '',
+                item.metadata['description'],
+            )
+            for item in described
+        ]
+        for row in (heads, *rows):
+            lines += [f'   {"  -" if k else "* -"} {cell}' for k, cell in enumerate(row)]
+        lines.append('')
+
+
 def resolve(app: Sphinx, env: BuildEnvironment, node: Element, content: Element) -> Element | None:
     """Lead a reference to a name at the root of a package to where the name is defined."""
     package, _, name = node.get('reftarget', '').rpartition('.')
@@ -96,5 +129,6 @@ def resolve(app: Sphinx, env: BuildEnvironment, node: Element, content: Element)
 def setup(app: Sphinx) -> dict[str, Any]:
     """Write the pages before Sphinx looks for them, and find what they refer to."""
     app.connect('builder-inited', write_pages)
+    app.connect('autodoc-process-docstring', list_fields)
     app.connect('missing-reference', resolve)
     return {'parallel_read_safe': True, 'parallel_write_safe': True}
