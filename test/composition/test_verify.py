@@ -7,6 +7,7 @@ from dataclasses import dataclass, fields, replace
 import json
 from math import sin
 from pathlib import Path
+import re
 from typing import Any
 
 from geometry_msgs.msg import WrenchStamped
@@ -27,12 +28,16 @@ from needle_insertion.cli import main
 from needle_insertion.experiment.campaign import Campaign
 from needle_insertion.experiment.protocol import PROTOCOLS, SHIPPED_BAGS
 from needle_insertion.experiment.record import record
-from needle_insertion.experiment.ros_graph import ACTIVATE, CONFIGURE, Graph
+from needle_insertion.experiment.ros_graph import ACTIVATE, CONFIGURE, DEACTIVATE, Graph
 from needle_insertion.replay.rerun import Rerun, verify
 from needle_ros.base_node import COMMAND, SENSOR
 import numpy as np
 import pytest
+from rcl_interfaces.srv import SetParameters
+from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
+from std_srvs.srv import SetBool, Trigger
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 import yaml
 
 RATE = 200.0
@@ -707,3 +712,64 @@ def test_a_run_under_commands_over_dds_is_computed_anew(tmp_path: Path) -> None:
     result = only(path)
     exact(result)
     assert result.topics['/joint_states'].compared > 250
+
+
+def test_all_that_is_done_to_a_plant_is_done_again(tmp_path: Path) -> None:
+    """Also what was done before the recorder came: events are latched."""
+    path = tmp_path / 'bag'
+    with Graph(tmp_path / 'logs') as graph:
+        node = graph.node('operator')
+        heard: list[JointState] = []
+        course = node.create_publisher(JointTrajectory, 'joint_trajectory', COMMAND)
+        node.create_subscription(JointState, 'joint_states', heard.append, SENSOR)
+
+        def further(count: int) -> None:
+            seen = len(heard)
+            graph.spin_until(lambda: len(heard) >= seen + count, 'samples')
+
+        def call(kind: Any, name: str, request: Any) -> Any:
+            client = node.create_client(kind, f'plant/{name}')
+            graph.spin_until(client.service_is_ready, name)
+            answer = client.call_async(request)
+            graph.spin_until(answer.done, name)
+            return answer.result()
+
+        graph.start('plant', {'mode': 'robot', 'rate': RATE, 'depth': 0.1, 'seed': 3})
+        graph.spin_until(lambda: heard and course.get_subscription_count(), 'the plant')
+        further(40)
+        assert call(Trigger, 'tare', Trigger.Request()).success
+        points = [JointTrajectoryPoint(positions=[0.11]), JointTrajectoryPoint(effort=[2.0])]
+        for second, point in enumerate(points, 1):
+            point.time_from_start.sec = second
+        course.publish(JointTrajectory(joint_names=['insertion'], points=points))
+        further(100)
+        recorder = graph.start('recorder', {'path': str(path)})
+        graph.spin_until(lambda: node.count_subscribers('joint_states') == 2, 'the recorder')
+        further(200)
+        friction = Parameter('model.coulomb_friction', value=0.8).to_parameter_msg()
+        changed = call(
+            SetParameters, 'set_parameters', SetParameters.Request(parameters=[friction])
+        )
+        assert changed.results[0].successful
+        further(40)
+        assert call(SetBool, 'pause', SetBool.Request(data=True)).success
+        assert call(SetBool, 'pause', SetBool.Request(data=False)).success
+        further(40)
+        assert call(Trigger, 'reset', Trigger.Request()).success
+        further(40)
+        graph.change(node, 'plant', DEACTIVATE, ACTIVATE)
+        further(40)
+        recorder.interrupt()
+    result = only(path)
+    exact(result)
+    assert result.recorded.numbers[0] > 100
+    said = [re.sub(r' (before|from) sample \d+.*', '', note) for note in result.notes]
+    # A stall of a busy machine is a pause too.
+    pause = 'time was paused, or samples were given up,'
+    assert [note for note in said if note != pause] == [
+        'the sensor was zeroed (~/tare)',
+        'joint_trajectory',
+        'model.coulomb_friction changed',
+        'the plant was put back (~/reset)',
+    ]
+    assert said.count(pause) >= 2
