@@ -21,7 +21,7 @@ from needle_dynamics.simulated.faults import Fault, FaultParameters, FAULTS, FAU
 from needle_dynamics.simulated.plant import Plant, Sample
 from needle_dynamics.simulated.run import Event, PlantRun
 from needle_ros import contract
-from needle_ros.base_node import profile, run
+from needle_ros.base_node import run
 from needle_ros.errors import JobError, NeedleError, ParameterError
 from needle_ros.sample_clock import SampleClock
 from needle_ros.timing import NANOSECONDS, RateCounter, seconds
@@ -189,8 +189,7 @@ class PlantNode(ModelNode):
         self._full_scale = [limit * (1.0 - 1e-9) for limit in limits]
         self._run = plant_run
         if publishes:
-            topic = contract.CLOCK
-            self._clock_topic = self.create_publisher(Clock, topic.name, profile(topic.qos))
+            self._clock_topic = self.publisher(contract.CLOCK, always=True)
 
     @staticmethod
     def _write(

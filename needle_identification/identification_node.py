@@ -28,7 +28,7 @@ from needle_identification.stiffness.identify import identify_stiffness
 from needle_identification.stiffness.settings import StiffnessSettings
 from needle_identification.stiffness.summary import StiffnessSummary, summarize_stiffness
 from needle_ros import contract
-from needle_ros.base_node import BaseNode, profile, run
+from needle_ros.base_node import BaseNode, run
 from needle_ros.errors import NeedleError, ParameterError
 from needle_ros.settings import check_constants, constant
 from needle_ros.wire import Reading
@@ -104,11 +104,8 @@ class IdentificationNode(BaseNode):
         self._live: LiveFriction | None = None
         self._applications: list[tuple[Application, Trigger.Response, Future]] = []
         self._setters: dict[str, Client] = {}
-        # Not lifecycle publishers: it publishes while it is being activated.
-        self._friction, self._stiffness = (
-            self.create_publisher(DiagnosticArray, topic.name, profile(topic.qos))
-            for topic in (contract.FRICTION, contract.STIFFNESS)
-        )
+        self._friction = self.publisher(contract.FRICTION, always=True)
+        self._stiffness = self.publisher(contract.STIFFNESS, always=True)
         self.create_service(Trigger, '~/identify', self._on_identify)
         _answer_later(self.create_service(Trigger, '~/apply', self._on_apply))
         # A simulation that pauses must not keep a caller waiting.
@@ -126,7 +123,7 @@ class IdentificationNode(BaseNode):
         self._own = self.settings('', IdentificationSettings)
         self._is_live = bool(self.get_parameter('live').value)
         self._force_sign, self._force_axis = signed_axis(self.text('force_axis'), 'force_axis')
-        joint = self.text('motion_axis') or 'insertion'
+        joint = self.text('motion_axis') or contract.INSERTION
         self._joint_sign = -1.0 if joint.startswith('-') else 1.0
         self._joint = joint.removeprefix('-')
         if len(self.get_parameter('axes').value) != 2:

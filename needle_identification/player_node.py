@@ -15,8 +15,8 @@ from needle_identification.bags.bag import Bag, Recorded
 from needle_identification.bags.playback import Playback, PlaybackSettings
 from needle_identification.bags.topics import OfferedQos, Topic
 from needle_identification.errors import RecordingError
-from needle_identification.recorder_node import class_of, is_hidden
-from needle_ros.base_node import BaseNode, run
+from needle_identification.recorder_node import is_hidden
+from needle_ros.base_node import BaseNode, message_class, run
 from needle_ros.errors import MessageError, NeedleError, ParameterError
 from needle_ros.timing import NANOSECONDS
 from rclpy.clock import Clock
@@ -146,8 +146,8 @@ class PlayerNode(BaseNode):
     def _imported(self, name: str, topics: list[Topic]) -> Any:
         """Return the class of the messages of a topic; None, with a warning, if there is none."""
         try:
-            return class_of([topic.type_name for topic in topics])
-        except (RecordingError, MessageError) as error:
+            return message_class(*(topic.type_name for topic in topics))
+        except MessageError as error:
             self._left_out[name] = str(error)
             self.get_logger().warning(f'{name} left out: {error}')
             return None

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 import sys
@@ -195,12 +194,12 @@ class RecorderNode(BaseNode):
         if recorded and recorded.best_effort >= best_effort and recorded.latched <= latched:
             return
         try:
-            kind = class_of(types)
+            kind = message_class(*types)
             if recorded:
                 self.destroy_subscription(recorded.subscription)
             else:
                 bag.add_topic(topic, types[0], [_described(qos) for qos in offered])
-        except (RecordingError, MessageError) as error:
+        except (MessageError, RecordingError) as error:
             self._left_out.add(topic)
             self.get_logger().warning(f'{topic} left out: {error}')
             return
@@ -237,33 +236,6 @@ def is_hidden(topic: str) -> bool:
 
     """
     return '/_' in topic or topic in _NOT_FOR_ALL
-
-
-def class_of(types: Sequence[str]) -> Any:
-    """
-    Import the class of the messages of a topic.
-
-    Parameters
-    ----------
-    types : sequence of str
-        Types of the topic, such as ``sensor_msgs/msg/JointState``.
-
-    Returns
-    -------
-    type
-        The class.
-
-    Raises
-    ------
-    RecordingError
-        If there are several types.
-    MessageError
-        If the package of the type is not installed.
-
-    """
-    if len(types) > 1:
-        raise RecordingError(f'it has several types: {", ".join(types)}')
-    return message_class(types[0])
 
 
 def _described(qos: QoSProfile) -> OfferedQos:

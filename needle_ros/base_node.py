@@ -69,14 +69,16 @@ def profile(qos: Qos) -> QoSProfile:
     )
 
 
-def message_class(type_name: str) -> Any:
+def message_class(*type_names: str) -> Any:
     """
-    Import the class of a message; rosidl_runtime_py, which does this, is not in the wheels.
+    Import the class of the messages of a topic.
+
+    rosidl_runtime_py does the same, but is not in the wheels.
 
     Parameters
     ----------
-    type_name : str
-        Type, such as ``sensor_msgs/msg/JointState``.
+    *type_names : str
+        Types of the topic, such as ``sensor_msgs/msg/JointState``: there must be one.
 
     Returns
     -------
@@ -86,14 +88,16 @@ def message_class(type_name: str) -> Any:
     Raises
     ------
     MessageError
-        If its package is not installed.
+        If there are several types, or the package of the type is not installed.
 
     """
-    package, _, name = type_name.partition('/msg/')
+    if len(type_names) != 1:
+        raise MessageError(f'it has several types: {", ".join(type_names)}')
+    package, _, name = type_names[0].partition('/msg/')
     try:
         return getattr(import_module(f'{package}.msg'), name)
     except (ImportError, AttributeError, TypeError) as error:
-        raise MessageError(f'{type_name} is not installed') from error
+        raise MessageError(f'{type_names[0]} is not installed') from error
 
 
 #: The qualities of service of the contract.
@@ -138,12 +142,8 @@ class BaseNode(LifecycleNode):
         self._descriptions: dict[str, Mapping[str, Any]] = {}
         self._configured = False
         self.declare_text('autostart', True, 'configure and activate at start')
-        self._configuration = self.create_publisher(
-            String, contract.CONFIGURATION.name, profile(contract.CONFIGURATION.qos)
-        )
-        self._diagnostics = self.create_publisher(
-            DiagnosticArray, contract.DIAGNOSTICS.name, profile(contract.DIAGNOSTICS.qos)
-        )
+        self._configuration = self.publisher(contract.CONFIGURATION, always=True)
+        self._diagnostics = self.publisher(contract.DIAGNOSTICS, always=True)
         self._last_level = DiagnosticStatus.OK
         # Not the node's clock: a paused simulation is reported too.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
@@ -228,14 +228,16 @@ class BaseNode(LifecycleNode):
         # Clock.now makes objects, which takes three times as long.
         return int(self.get_clock().handle.get_now().nanoseconds)
 
-    def publisher(self, topic: Topic) -> Publisher:
+    def publisher(self, topic: Topic, *, always: bool = False) -> Publisher:
         """
-        Offer a topic of the contract while the node is active.
+        Offer a topic of the contract.
 
         Parameters
         ----------
         topic : Topic
             The topic.
+        always : bool
+            Whether it is published also while the node is not active.
 
         Returns
         -------
@@ -243,8 +245,8 @@ class BaseNode(LifecycleNode):
             Takes messages, or their bytes.
 
         """
-        kind = message_class(topic.type_name)
-        offered: Publisher = self.create_lifecycle_publisher(kind, topic.name, profile(topic.qos))
+        create = self.create_publisher if always else self.create_lifecycle_publisher
+        offered: Publisher = create(message_class(topic.type_name), topic.name, profile(topic.qos))
         return offered
 
     def subscribe(self, topic: Topic, take: Callable[[Any], None]) -> Subscription:

@@ -27,6 +27,7 @@ from needle_identification.recordings.samples import (
 )
 from needle_identification.recordings.timebase import merge
 from needle_ros import wire
+from needle_ros.contract import BASE_WRENCH, END_EFFECTOR_POSE, JOINT_STATES
 from needle_ros.errors import MessageError
 
 
@@ -38,16 +39,16 @@ class _Wanted(NamedTuple):
     usual: tuple[str, ...]
 
 
-_WRENCH: Final = _Wanted('wrench_topic', (wire.WRENCH,), ('base_wrench',))
+_WRENCH: Final = _Wanted('wrench_topic', (wire.WRENCH,), (BASE_WRENCH.name,))
 _FRICTION_MOTION: Final = _Wanted(
     'motion_topic',
     (wire.JOINT_STATE, wire.POSE, wire.POINT, wire.TWIST, wire.ODOMETRY),
-    ('joint_states', 'end_effector_pose'),
+    (JOINT_STATES.name, END_EFFECTOR_POSE.name),
 )
 _INDENTATION_MOTION: Final = _Wanted(
     'motion_topic',
     (wire.POSE, wire.POINT, wire.ODOMETRY, wire.JOINT_STATE),
-    ('end_effector_pose', 'joint_states'),
+    (END_EFFECTOR_POSE.name, JOINT_STATES.name),
 )
 
 

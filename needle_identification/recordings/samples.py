@@ -14,6 +14,7 @@ from needle_identification.errors import RecordingError
 from needle_identification.recordings.recording import integrated
 from needle_identification.recordings.series import FINEST, Series
 from needle_ros import wire
+from needle_ros.contract import INSERTION
 import numpy as np
 from numpy.typing import NDArray
 
@@ -22,9 +23,6 @@ AXES: Final = ('x', 'y', 'z')
 
 #: A larger number is no measurement [SI].
 _LARGEST: Final = 1e100
-
-#: Joint of the plant that moves the needle.
-_INSERTION: Final = 'insertion'
 
 #: Names of joints that are kept, for messages.
 _MAX_NAMES: Final = 100
@@ -116,7 +114,7 @@ class _Joint(Source):
     def __call__(self, template: wire.Template) -> list[int] | None:
         if len(self._seen) < _MAX_NAMES:
             self._seen.update(template.names)
-        joint = self._joint or _INSERTION
+        joint = self._joint or INSERTION
         if self._joint is None and joint not in template.names and len(template.names) == 1:
             [joint] = template.names
         if joint not in template.names:
@@ -134,7 +132,7 @@ class _Joint(Source):
 
     def _complaint(self) -> str:
         if len(self._used) != 1:
-            what = 'several joints' if self._used else f'no joint {self._joint or _INSERTION!r}'
+            what = 'several joints' if self._used else f'no joint {self._joint or INSERTION!r}'
             names = f'motion_axis must name one of {_listing(self._seen)}'
             return f'has {what}; {names}' if self._seen else 'has joints without names'
         if not (self._has_position or self._has_speed):

@@ -8,9 +8,10 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 from needle_dynamics import NeedleModel, Trajectory
-from needle_identification import BagWriter, encode, message_type
+from needle_identification import BagWriter
 from needle_identification.result import write_whole
 from needle_insertion.report.content import png
+from needle_ros.contract import ground_truth, JOINT_STATES, TIP_DEFLECTION
 from needle_ros.timing import NANOSECONDS
 import numpy as np
 
@@ -100,45 +101,23 @@ def _figure(trajectory: Trajectory) -> Figure:
 
 def _write_bag(path: Path, trajectory: Trajectory) -> None:
     """Write the topics of the plant, stamped with the simulated time."""
-    model = NeedleModel(trajectory.parameters)
-    m = model.coordinates
-    kinds = {
-        '/joint_states': 'sensor_msgs/msg/JointState',
-        '/ground_truth': 'sensor_msgs/msg/JointState',
-        '/tip_deflection': 'geometry_msgs/msg/PointStamped',
-    }
-    header, stamp = map(message_type, ('std_msgs/msg/Header', 'builtin_interfaces/msg/Time'))
-    joint, pointed = (message_type(kinds[name]) for name in ('/joint_states', '/tip_deflection'))
-    point = message_type('geometry_msgs/msg/Point')
-    empty = np.zeros(0)
-    tips = trajectory.tip_deflection
+    states, depths, tips = trajectory.states, trajectory.depth, trajectory.tip_deflection
+    m = states.shape[1] // 2
     forces = np.append(trajectory.forces, trajectory.forces[-1])
+    truth = ground_truth(m - 2, commanded=False)
+    rows = {
+        JOINT_STATES: np.column_stack(
+            [depths, states[:, 1], -states[:, m], states[:, m + 1], forces, 0.0 * forces]
+        ),
+        truth: states,
+        TIP_DEFLECTION: np.column_stack([0.0 * depths, depths, tips]),
+    }
     with BagWriter(path) as bag:
-        for topic, kind in kinds.items():
-            bag.add_topic(topic, kind)
-        for k, state in enumerate(trajectory.states):
-            ns = round(trajectory.time[k] * NANOSECONDS)
-            at = stamp(sec=ns // NANOSECONDS, nanosec=ns % NANOSECONDS)
-            depth = trajectory.depth[k]
-            messages = {
-                '/joint_states': joint(
-                    header=header(stamp=at, frame_id=''),
-                    name=['insertion', 'rotation'],
-                    position=np.array([depth, state[1]]),
-                    velocity=np.array([-state[m], state[m + 1]]),
-                    effort=np.array([forces[k], 0.0]),
-                ),
-                '/ground_truth': joint(
-                    header=header(stamp=at, frame_id=''),
-                    name=list(model.coordinate_names),
-                    position=state[:m].copy(),
-                    velocity=state[m:].copy(),
-                    effort=empty,
-                ),
-                '/tip_deflection': pointed(
-                    header=header(stamp=at, frame_id='needle_entry'),
-                    point=point(x=0.0, y=float(depth), z=float(tips[k])),
-                ),
-            }
-            for topic, message in messages.items():
-                bag.write(topic, encode(message), ns)
+        for topic in rows:
+            bag.add_topic(f'/{topic.name}', topic.type_name)
+        templates = {topic: topic.template() for topic in rows}
+        for k, time in enumerate(trajectory.time):
+            stamp = round(time * NANOSECONDS)
+            for topic, values in rows.items():
+                data = templates[topic].serialize(stamp, *values[k].tolist())
+                bag.write(f'/{topic.name}', data, stamp)
