@@ -10,6 +10,7 @@ import sys
 from types import FrameType
 from typing import Any, Final, NoReturn
 
+from needle_insertion.commands.common import Command
 from needle_ros.errors import JobError, NeedleError
 
 #: Subcommands, each a module of `needle_insertion.commands`, and what the help says of them.
@@ -54,8 +55,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _run(words: list[str]) -> int:
     chosen = next((word for word in words if not word.startswith('-')), '')
-    command = import_module(f'needle_insertion.commands.{chosen}') if chosen in COMMANDS else None
-    options = _parser(chosen, command).parse_args(_joined(words, getattr(command, 'SIGNED', ())))
+    command: Command | None = None
+    if chosen in COMMANDS:
+        command = import_module(f'needle_insertion.commands.{chosen}').COMMAND
+        words = _joined(words, command.signed)
+    options = _parser(chosen, command).parse_args(words)
     if command is not None:
         from needle_dynamics.compiled.cache import announce_compilation
 
@@ -84,14 +88,14 @@ def _interrupt(_signal: int, _frame: FrameType | None) -> NoReturn:
     raise KeyboardInterrupt
 
 
-def _parser(chosen: str, command: Any) -> argparse.ArgumentParser:
+def _parser(chosen: str, command: Command | None) -> argparse.ArgumentParser:
     """Return a parser that has the options of the chosen command only: others cost imports."""
     parser = argparse.ArgumentParser(prog='needle', description='Robot-assisted needle insertion.')
     parser.add_argument('--version', action=_Version, nargs=0, help='show the version and exit')
     commands = parser.add_subparsers(required=True, metavar='COMMAND')
     for name, words in COMMANDS.items():
         subparser = commands.add_parser(name, help=words)
-        if name == chosen:
+        if command is not None and name == chosen:
             command.add_arguments(subparser)
     return parser
 

@@ -199,8 +199,8 @@ def test_commands_in_the_documentation_are_valid() -> None:
     assert len(lines) > 20
     for line in lines:
         words = shlex.split(line, comments=True)[1:]
-        command = import_module(f'needle_insertion.commands.{words[0]}')
-        joined = cli._joined(words, getattr(command, 'SIGNED', ()))
+        command = import_module(f'needle_insertion.commands.{words[0]}').COMMAND
+        joined = cli._joined(words, command.signed)
         cli._parser(words[0], command).parse_args(joined)
 
 

@@ -10,22 +10,14 @@ import sys
 
 from needle_dynamics import FORMULATIONS, NeedleModel, NeedleParameters, PRESETS
 from needle_dynamics.analysis import SLIDING
-from needle_insertion.commands.options import constants, make_folder
+from needle_insertion.commands.common import Command, constants, make_folder
 from needle_insertion.report import controllability as report
 from needle_insertion.report.text import table
 from needle_ros.errors import ParameterError
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """
-    Add the options of `needle analyze`.
-
-    Parameters
-    ----------
-    parser : ArgumentParser
-        Parser of the command.
-
-    """
+def _add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `needle analyze`."""
     parser.add_argument('--preset', choices=tuple(PRESETS), default='phantom')
     parser.add_argument('--formulation', choices=FORMULATIONS, default='complete')
     parser.add_argument('--modes', type=int, default=2, metavar='N', help='shape modes')
@@ -64,26 +56,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('-o', '--output', type=Path, metavar='DIR', help='folder for the map')
 
 
-def run(options: argparse.Namespace) -> int:
-    """
-    Analyze the operating points and print what was found.
-
-    Parameters
-    ----------
-    options : Namespace
-        As declared by `add_arguments`.
-
-    Returns
-    -------
-    int
-        0.
-
-    Raises
-    ------
-    NeedleError
-        If an option is not valid.
-
-    """
+def _run(options: argparse.Namespace) -> int:
+    """Analyze the operating points and print what was found."""
     if options.map and (options.output is None or len(options.speed) > 1):
         raise ParameterError('--map needs a folder, -o DIR, and a single --speed')
     if options.output is not None and not options.map:
@@ -132,3 +106,6 @@ def _write_map(parameters: NeedleParameters, options: argparse.Namespace) -> lis
         options.sliding,
     )
     return report.write_map(options.output, parameters, found, speed)
+
+
+COMMAND = Command(_add_arguments, _run)

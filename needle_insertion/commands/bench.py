@@ -7,19 +7,13 @@ from importlib import import_module
 from pathlib import Path
 import sys
 
+from needle_insertion.commands.common import Command
+
 _ROOT = Path(__file__).parents[2]
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """
-    Add the options of `needle bench`.
-
-    Parameters
-    ----------
-    parser : ArgumentParser
-        Parser of the command. It ends the process with status 2 if this is not a clone.
-
-    """
+def _add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `needle bench`."""
     if not (_ROOT / 'benchmarks').is_dir():
         parser.error('only a clone of the repository has the benchmarks; run it from there')
     # A clone is not on the path.
@@ -27,19 +21,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     import_module('benchmarks.run').add_arguments(parser)
 
 
-def run(options: argparse.Namespace) -> int:
-    """
-    Run a benchmark.
-
-    Parameters
-    ----------
-    options : Namespace
-        As declared by `add_arguments`.
-
-    Returns
-    -------
-    int
-        Exit status: 0 if no bar is missed, else 1.
-
-    """
+def _run(options: argparse.Namespace) -> int:
+    """Run a benchmark; return 1 if a bar is missed."""
     return int(import_module('benchmarks.run').run(options))
+
+
+COMMAND = Command(_add_arguments, _run)

@@ -5,19 +5,12 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from needle_insertion.commands.common import Command
 from needle_insertion.experiment.protocol import SHIPPED_BAGS
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """
-    Add the options of `needle demo`.
-
-    Parameters
-    ----------
-    parser : ArgumentParser
-        Parser of the command.
-
-    """
+def _add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `needle demo`."""
     parser.add_argument(
         '-o',
         '--output',
@@ -28,21 +21,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--bags', type=Path, default=SHIPPED_BAGS, help='shipped recordings')
 
 
-def run(options: argparse.Namespace) -> int:
-    """
-    Run the demo.
-
-    Parameters
-    ----------
-    options : Namespace
-        As declared by `add_arguments`.
-
-    Returns
-    -------
-    int
-        0 if every check passed, else 1.
-
-    """
+def _run(options: argparse.Namespace) -> int:
+    """Run the demo; return 1 if a check failed."""
     from needle_insertion.experiment import demo
 
     return demo.run(options.output, options.bags)
+
+
+COMMAND = Command(_add_arguments, _run)

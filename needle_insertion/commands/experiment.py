@@ -5,21 +5,14 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from needle_insertion.commands.common import Command
 from needle_insertion.experiment.campaign import Campaign
 from needle_insertion.experiment.protocol import FASTEST, PROTOCOLS, SPEED
 from needle_ros.errors import ParameterError
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """
-    Add the options of `needle experiment`.
-
-    Parameters
-    ----------
-    parser : ArgumentParser
-        Parser of the command.
-
-    """
+def _add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `needle experiment`."""
     parser.add_argument('which', choices=tuple(PROTOCOLS), help='what to identify from it')
     parser.add_argument('output', type=Path, metavar='DIR', help='folder for the bags')
     for name, kind, default, unit, words in (
@@ -48,26 +41,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def run(options: argparse.Namespace) -> int:
-    """
-    Record the bags that the folder does not hold yet.
-
-    Parameters
-    ----------
-    options : Namespace
-        As declared by `add_arguments`.
-
-    Returns
-    -------
-    int
-        0.
-
-    Raises
-    ------
-    NeedleError
-        If an option is not valid, or a run cannot be recorded.
-
-    """
+def _run(options: argparse.Namespace) -> int:
+    """Record the bags that the folder does not hold yet."""
     campaign = Campaign(
         protocol=PROTOCOLS[options.which],
         repeats=options.repeats,
@@ -82,3 +57,6 @@ def run(options: argparse.Namespace) -> int:
 
     record(campaign, options.output, options.speed)
     return 0
+
+
+COMMAND = Command(_add_arguments, _run)

@@ -30,30 +30,19 @@ from needle_identification import (
     write_result,
 )
 from needle_identification.recordings import TIMES
-from needle_insertion.commands.options import make_folder
+from needle_insertion.commands.common import Command, make_folder
 from needle_insertion.report.identify_text import friction_text, stiffness_text
 from needle_insertion.report.origin import digests, Origin, Source, with_name
 from needle_ros.errors import NeedleError, ParameterError
 import numpy as np
 from tqdm import tqdm
 
-#: Options that take an axis, which may begin with a minus sign.
-SIGNED: Final = ('--force-axis', '--motion-axis', '--axes')
-
 #: Arrays as long as the recording, for figures: they are not printed.
 _FOR_PICTURES: Final = (Fit, Presses)
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """
-    Declare `needle identify friction` and `needle identify stiffness`.
-
-    Parameters
-    ----------
-    parser : ArgumentParser
-        Parser of the command.
-
-    """
+def _add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `needle identify`."""
     what = parser.add_subparsers(required=True, metavar='WHAT')
     friction = what.add_parser(
         'friction',
@@ -112,26 +101,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     stiffness.set_defaults(identify=_run_stiffness)
 
 
-def run(options: argparse.Namespace) -> int:
-    """
-    Identify friction or stiffness.
-
-    Parameters
-    ----------
-    options : Namespace
-        As declared by `add_arguments`.
-
-    Returns
-    -------
-    int
-        0, or 2 if a recording cannot be used.
-
-    Raises
-    ------
-    NeedleError
-        If an option is not valid, or a file cannot be written.
-
-    """
+def _run(options: argparse.Namespace) -> int:
+    """Identify friction or stiffness; return 2 if a recording cannot be used."""
     status: int = options.identify(options)
     return status
 
@@ -357,3 +328,6 @@ def _plain(value: Any) -> Any:
     if isinstance(value, float) and not isfinite(value):
         return None
     return value
+
+
+COMMAND = Command(_add_arguments, _run, signed=('--force-axis', '--motion-axis', '--axes'))

@@ -8,7 +8,7 @@ from pathlib import Path
 import sys
 from typing import Any, Final
 
-from needle_insertion.commands.options import make_folder
+from needle_insertion.commands.common import Command, make_folder
 from needle_insertion.paper.results import (
     campaigns,
     RESULTS,
@@ -22,16 +22,8 @@ from needle_insertion.report.text import table
 _OUTPUT: Final = Path('reproduce_output')
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """
-    Add the options of `needle reproduce`.
-
-    Parameters
-    ----------
-    parser : ArgumentParser
-        Parser of the command.
-
-    """
+def _add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `needle reproduce`."""
     parser.add_argument('what', choices=RESULTS)
     parser.add_argument(
         '-o',
@@ -49,27 +41,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--json', action='store_true', help='print JSON instead of a table')
 
 
-def run(options: argparse.Namespace) -> int:
-    """
-    Print a result, and write its page.
-
-    Parameters
-    ----------
-    options : Namespace
-        As declared by `add_arguments`.
-
-    Returns
-    -------
-    int
-        0, or 1 if a table does not come out as the paper has it. A claim that does not hold is a
-        finding, not a failure.
-
-    Raises
-    ------
-    NeedleError
-        If an option is not valid, or a file cannot be written.
-
-    """
+def _run(options: argparse.Namespace) -> int:
+    """Print a result and write its page; return 1 if a table does not come out."""
     recorded = None
     if options.record is not None:
         wanted = campaigns(options.what)
@@ -102,3 +75,6 @@ def run(options: argparse.Namespace) -> int:
         if not options.json:
             sys.stdout.write(f'\nwrote {page}\n')
     return 0 if passed else 1
+
+
+COMMAND = Command(_add_arguments, _run)

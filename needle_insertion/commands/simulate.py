@@ -9,22 +9,14 @@ import sys
 
 from needle_dynamics import NeedleModel, NeedleParameters, PRESETS, simulate
 from needle_dynamics.simulated.integrators import DEFAULT_TOLERANCE
-from needle_insertion.commands.options import constants
+from needle_insertion.commands.common import Command, constants
 from needle_insertion.report import trajectory as report
 from needle_insertion.report.text import table
 from needle_ros.errors import ParameterError
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """
-    Add the options of `needle simulate`.
-
-    Parameters
-    ----------
-    parser : ArgumentParser
-        Parser of the command.
-
-    """
+def _add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `needle simulate`."""
     parser.add_argument('--preset', choices=tuple(PRESETS), default='paper_si')
     parser.add_argument(
         '--set',
@@ -59,26 +51,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--json', action='store_true', help='print JSON instead of a table')
 
 
-def run(options: argparse.Namespace) -> int:
-    """
-    Simulate, write the outputs, and print a summary.
-
-    Parameters
-    ----------
-    options : Namespace
-        As declared by `add_arguments`.
-
-    Returns
-    -------
-    int
-        0.
-
-    Raises
-    ------
-    NeedleError
-        If an option is not valid, or a file cannot be written.
-
-    """
+def _run(options: argparse.Namespace) -> int:
+    """Simulate, write the outputs, and print a summary."""
     for path in options.output:
         if path.suffix not in ('', '.csv', '.png'):
             raise ParameterError(f'{path}: output must be .csv, .png or a folder for a bag')
@@ -102,3 +76,6 @@ def run(options: argparse.Namespace) -> int:
         rows = [(name, f'{value:.6g}') for name, value in summary.items()]
         sys.stdout.write(f'{table(rows, ("quantity", "value"))}\n')
     return 0
+
+
+COMMAND = Command(_add_arguments, _run)

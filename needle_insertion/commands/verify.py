@@ -9,6 +9,7 @@ import json
 from pathlib import Path
 import sys
 
+from needle_insertion.commands.common import Command
 from needle_insertion.replay.rerun import Rerun, TOLERANCE, verify
 from needle_insertion.report.text import table
 from needle_ros.errors import ParameterError
@@ -16,16 +17,8 @@ from needle_ros.timing import NANOSECONDS
 from tqdm import tqdm
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """
-    Add the options of `needle verify`.
-
-    Parameters
-    ----------
-    parser : ArgumentParser
-        Parser of the command.
-
-    """
+def _add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `needle verify`."""
     parser.add_argument('bags', type=Path, nargs='+', metavar='BAG', help='recording of a plant')
     parser.add_argument(
         '--tolerance',
@@ -38,26 +31,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--json', action='store_true', help='print JSON instead of a table')
 
 
-def run(options: argparse.Namespace) -> int:
-    """
-    Verify each bag and print what was found.
-
-    Parameters
-    ----------
-    options : Namespace
-        As declared by `add_arguments`.
-
-    Returns
-    -------
-    int
-        1 if a run differs, else 0.
-
-    Raises
-    ------
-    NeedleError
-        If an option is not valid, or a bag cannot be verified.
-
-    """
+def _run(options: argparse.Namespace) -> int:
+    """Verify each bag and print what was found; return 1 if a run differs."""
     if not 0.0 <= options.tolerance < 1.0:
         raise ParameterError(f'--tolerance must be in [0, 1), got {options.tolerance}')
     results: list[Rerun] = []
@@ -109,3 +84,6 @@ def _remarks(results: Sequence[Rerun]) -> Iterator[str]:
     counts = Counter(result.verdict for result in results)
     total = ', '.join(f'{number} {verdict}' for verdict, number in sorted(counts.items()))
     yield f'{len(results)} runs: {total}'
+
+
+COMMAND = Command(_add_arguments, _run)

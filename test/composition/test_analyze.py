@@ -11,8 +11,7 @@ from typing import Any
 from matplotlib.image import imread
 from needle_dynamics import NeedleError, NeedleModel, NeedleParameters
 from needle_dynamics.analysis import analyze, linearize, operating_point
-from needle_insertion.commands import analyze as command
-from needle_insertion.commands.analyze import add_arguments
+from needle_insertion.commands.analyze import COMMAND
 from needle_insertion.report import controllability
 import numpy as np
 from numpy.testing import assert_array_equal
@@ -21,9 +20,9 @@ import pytest
 
 def run(*words: str) -> int:
     parser = argparse.ArgumentParser()
-    add_arguments(parser)
+    COMMAND.add_arguments(parser)
     options = parser.parse_args(words)
-    return command.run(options)
+    return COMMAND.run(options)
 
 
 def found_by(capsys: pytest.CaptureFixture[str], *words: str) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from typing import Any
 
 from needle_identification import ParameterEstimate, Statistic
 from needle_insertion.cli import main
-from needle_insertion.commands.reproduce import add_arguments
+from needle_insertion.commands.reproduce import COMMAND
 from needle_insertion.experiment.protocol import SHIPPED_BAGS
 from needle_insertion.experiment.truth import _stiffness, Comparison, Coverage
 from needle_insertion.paper import figures, identified, mismatch, results
@@ -181,7 +181,7 @@ def test_a_table_that_does_not_hold_ends_in_status_1(
 def test_every_result_can_be_asked_for(what: str) -> None:
     """Figures, tables, analysis, claims, mismatch, or all of them."""
     parser = ArgumentParser()
-    add_arguments(parser)
+    COMMAND.add_arguments(parser)
     assert parser.parse_args([what]).what == what
 
 

@@ -1,13 +1,35 @@
-"""Options that several commands share."""
+"""What the commands share: their form, model constants as words, folders for results."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from argparse import ArgumentParser, Namespace
+from collections.abc import Callable, Sequence
 import json
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from needle_ros.errors import ParameterError
+
+
+class Command(NamedTuple):
+    """
+    A subcommand of `needle`: ``COMMAND`` of the module of its name.
+
+    Attributes
+    ----------
+    add_arguments : callable
+        Declares its options on a parser.
+    run : callable
+        Does the work, given the options, and returns the exit status. Raises a `JobError` if the
+        job fails, and any other `NeedleError` if an option or an input is not valid.
+    signed : tuple of str
+        Options whose value may begin with a minus sign.
+
+    """
+
+    add_arguments: Callable[[ArgumentParser], None]
+    run: Callable[[Namespace], int]
+    signed: tuple[str, ...] = ()
 
 
 def constants(words: Sequence[str]) -> dict[str, Any]:
