@@ -4,25 +4,19 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
-from dataclasses import fields, is_dataclass, replace
+from dataclasses import fields
 import json
-from math import isfinite
 from pathlib import Path
 import sys
-from typing import Any, Final
+from typing import Any
 
 from needle_identification import (
-    check_distinct,
     ESTIMATORS,
-    Fit,
     FrictionSettings,
     identify_friction,
     identify_stiffness,
-    ParameterEstimate,
-    Presses,
     read_friction_recording,
     read_indentation_recording,
-    Statistic,
     StiffnessSettings,
     summarize,
     summarize_stiffness,
@@ -31,14 +25,13 @@ from needle_identification import (
 )
 from needle_identification.recordings import TIMES
 from needle_insertion.commands.common import Command, make_folder
-from needle_insertion.report.identify_text import friction_text, stiffness_text
-from needle_insertion.report.origin import digests, Origin, Source, with_name
-from needle_ros.errors import NeedleError, ParameterError
-import numpy as np
-from tqdm import tqdm
-
-#: Arrays as long as the recording, for figures: they are not printed.
-_FOR_PICTURES: Final = (Fit, Presses)
+from needle_insertion.report.identify_text import (
+    friction_text,
+    identified_document,
+    stiffness_text,
+)
+from needle_insertion.report.origin import identify_all, Origin
+from needle_ros.errors import ParameterError
 
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -190,12 +183,15 @@ def _run_friction(options: argparse.Namespace) -> int:
         'force_axis': options.force_axis,
         'motion_axis': options.motion_axis,
     }
-    estimates, origin = _identify(
-        options,
+    estimates, origin = identify_all(
+        options.bags,
         lambda bag: read_friction_recording(bag, **reading),
         lambda recording: identify_friction(recording, settings),
         Origin(settings=settings, reading=reading, result=options.output),
+        digest=options.json or options.report is not None,
     )
+    for line in origin.failed:
+        sys.stderr.write(f'error: {line}\n')
     if not estimates:
         return 2
     summary = summarize(estimates)
@@ -216,12 +212,15 @@ def _run_stiffness(options: argparse.Namespace) -> int:
     if len(options.axes) != 2:
         raise ParameterError(f'--axes must name two axes, got {",".join(options.axes)}')
     reading = {**_reading(options), 'axes': tuple(options.axes)}
-    estimates, origin = _identify(
-        options,
+    estimates, origin = identify_all(
+        options.bags,
         lambda bag: read_indentation_recording(bag, **reading),
         lambda recording: identify_stiffness(recording, settings),
         Origin(settings=settings, reading=reading, result=options.output),
+        digest=options.json or options.report is not None,
     )
+    for line in origin.failed:
+        sys.stderr.write(f'error: {line}\n')
     if not estimates:
         return 2
     summary = summarize_stiffness(
@@ -247,36 +246,6 @@ def _reading(options: argparse.Namespace) -> dict[str, Any]:
     }
 
 
-def _identify(
-    options: argparse.Namespace,
-    read: Callable[[Path], Any],
-    identify: Callable[[Any], Any],
-    origin: Origin,
-) -> tuple[list[Any], Origin]:
-    """Identify each recording; report those that fail and go on. Fill in the origin."""
-    check_distinct(options.bags)
-    estimates, sources, failures = [], [], []
-    for bag in tqdm(options.bags, desc='bags', disable=None, leave=False):
-        try:
-            recording = read(bag)
-            estimates.append(identify(recording))
-        except (NeedleError, OSError) as error:
-            failures.append((str(bag), str(error)))
-            continue
-        sources.append(
-            Source(
-                name=recording.name,
-                losses=recording.losses,
-                clock_offset=recording.clock_offset,
-                samples=len(recording.time),
-                files=digests(bag) if options.report or options.json else (),
-            )
-        )
-    for bag, reason in failures:
-        sys.stderr.write(f'error: {with_name(bag, reason)}\n')
-    return estimates, replace(origin, sources=tuple(sources), failures=tuple(failures))
-
-
 def _tell(
     options: argparse.Namespace,
     summary: Any,
@@ -293,41 +262,13 @@ def _tell(
         for words in (*source.losses, *estimate.warnings):
             sys.stderr.write(f'warning: {source.name}: {words}\n')
     if options.json:
-        result = {
-            **_plain(summary),
-            'settings': _plain(origin.settings),
-            'reading': _plain(origin.reading),
-            'recordings': [_plain(source) for source in origin.sources],
-            'failures': [{'name': name, 'reason': reason} for name, reason in origin.failures],
-            'files': [str(path) for path in written],
-        }
+        result = {**identified_document(summary, origin), 'files': [str(path) for path in written]}
         sys.stdout.write(f'{json.dumps(result, indent=2, allow_nan=False)}\n')
     else:
         sys.stdout.write(f'{text(summary)}\n')
         for path in written:
             sys.stdout.write(f'wrote {path}\n')
     return 2 if origin.failures else 0
-
-
-def _plain(value: Any) -> Any:
-    """Return a value as JSON can hold it: what is not finite is null."""
-    if is_dataclass(value):
-        named = {item.name: getattr(value, item.name) for item in fields(value)}
-        return {
-            name: _plain(one) for name, one in named.items() if not isinstance(one, _FOR_PICTURES)
-        }
-    if isinstance(value, dict):
-        return {str(key): _plain(one) for key, one in value.items()}
-    if isinstance(value, (list, tuple)):
-        # Parameters and statistics are found by their names.
-        if value and all(isinstance(one, (ParameterEstimate, Statistic)) for one in value):
-            return {one.name: _plain(one) for one in value}
-        return [_plain(one) for one in value]
-    if isinstance(value, np.generic):
-        return _plain(value.item())
-    if isinstance(value, float) and not isfinite(value):
-        return None
-    return value
 
 
 COMMAND = Command(_add_arguments, _run, signed=('--force-axis', '--motion-axis', '--axes'))

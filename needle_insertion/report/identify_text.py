@@ -1,22 +1,26 @@
-"""Identified parameters as text: how they are written, and tables for the terminal."""
+"""Identified parameters as text: how they are written, tables for the terminal, and JSON."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import fields, is_dataclass, replace
 from math import isfinite
-from typing import Final
+from typing import Any, Final
 
 from needle_identification import (
+    Fit,
     FrictionEstimate,
     FrictionSummary,
     ParameterEstimate,
+    Presses,
     Statistic,
     statistic,
     StiffnessSummary,
 )
 from needle_identification.estimation.formatting import between, measured, spread
+from needle_insertion.report.origin import Origin
 from needle_insertion.report.text import table
+import numpy as np
 
 #: Heads of the rows of `mean_row`.
 MEAN_HEADS: Final = ('parameter', 'mean ± SE', '95 % interval', 'STD over bags', 'bags')
@@ -214,3 +218,48 @@ def stiffness_text(summary: StiffnessSummary) -> str:
         f'{result.symbol} = {measured(result.mean, result.error, result.unit)}, '
         f'95 % interval {between(result.interval)}'
     )
+
+
+def identified_document(summary: object, origin: Origin) -> dict[str, Any]:
+    """
+    Return everything that was identified for JSON; what is not finite is null.
+
+    Parameters
+    ----------
+    summary : FrictionSummary or StiffnessSummary
+        All recordings.
+    origin : Origin
+        What it was identified from, and how.
+
+    Returns
+    -------
+    dict
+        Plain values.
+
+    """
+    return {
+        **_plain(summary),
+        'settings': _plain(origin.settings),
+        'reading': _plain(origin.reading),
+        'recordings': _plain(origin.sources),
+        'failures': [{'name': name, 'reason': reason} for name, reason in origin.failures],
+    }
+
+
+def _plain(value: Any) -> Any:
+    if is_dataclass(value):
+        named = {item.name: getattr(value, item.name) for item in fields(value)}
+        # Arrays as long as the recording are for figures.
+        return {
+            name: _plain(one) for name, one in named.items() if not isinstance(one, (Fit, Presses))
+        }
+    if isinstance(value, dict):
+        return {str(key): _plain(one) for key, one in value.items()}
+    if isinstance(value, (list, tuple)):
+        # Parameters and statistics are found by their names.
+        if value and all(isinstance(one, (ParameterEstimate, Statistic)) for one in value):
+            return {one.name: _plain(one) for one in value}
+        return [_plain(one) for one in value]
+    if isinstance(value, np.generic):
+        return _plain(value.item())
+    return None if isinstance(value, float) and not isfinite(value) else value

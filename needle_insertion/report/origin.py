@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
 from hashlib import sha256
 from pathlib import Path
 from typing import Any, Final
+
+from needle_identification import check_distinct
+from needle_ros.errors import NeedleError
+from tqdm import tqdm
 
 #: Bytes of a file that are read at once.
 _PIECE: Final = 1 << 20
@@ -68,7 +72,9 @@ class Origin:
     @property
     def failed(self) -> list[str]:
         """Recordings that could not be used, in words."""
-        return [with_name(name, reason) for name, reason in self.failures]
+        return [
+            reason if name in reason else f'{name}: {reason}' for name, reason in self.failures
+        ]
 
     @property
     def losses(self) -> list[str]:
@@ -105,24 +111,6 @@ class Origin:
         ]
 
 
-def with_name(name: str, reason: str) -> str:
-    """
-    Return why a recording could not be used, with its name.
-
-    Parameters
-    ----------
-    name, reason : str
-        The recording, and a message that may name it already.
-
-    Returns
-    -------
-    str
-        One line.
-
-    """
-    return reason if name in reason else f'{name}: {reason}'
-
-
 def _worded(value: Any, unit: str) -> str:
     if value is None:
         return 'found by type'
@@ -131,21 +119,64 @@ def _worded(value: Any, unit: str) -> str:
     return f'{value:g} {unit}'.removesuffix(' 1') if isinstance(value, float) else str(value)
 
 
-def digests(bag: Path) -> tuple[tuple[str, str], ...]:
+def identify_all(
+    bags: Sequence[Path],
+    read: Callable[[Path], Any],
+    identify: Callable[[Any], Any],
+    origin: Origin,
+    *,
+    digest: bool,
+) -> tuple[list[Any], Origin]:
     """
-    Return the files of a recording with their checksums.
+    Identify recordings one by one; those that cannot be used are left out.
 
     Parameters
     ----------
-    bag : Path
-        A file, or a folder of files.
+    bags : sequence of Path
+        The recordings.
+    read : callable
+        Reads one of them.
+    identify : callable
+        Identifies parameters from what was read.
+    origin : Origin
+        Settings, options and result.
+    digest : bool
+        Whether to take the checksums of the files, which reads them once more.
 
     Returns
     -------
-    tuple of (str, str)
-        Path and SHA-256 of each.
+    (list, Origin)
+        Estimates, and the origin with sources and failures.
+
+    Raises
+    ------
+    RecordingError
+        If a recording is given twice.
 
     """
+    check_distinct(bags)
+    estimates, sources, failures = [], [], []
+    for bag in tqdm(bags, desc='bags', disable=None, leave=False):
+        try:
+            recording = read(bag)
+            estimates.append(identify(recording))
+        except (NeedleError, OSError) as error:
+            failures.append((str(bag), str(error)))
+            continue
+        sources.append(
+            Source(
+                name=recording.name,
+                losses=recording.losses,
+                clock_offset=recording.clock_offset,
+                samples=len(recording.time),
+                files=_digests(bag) if digest else (),
+            )
+        )
+    return estimates, replace(origin, sources=tuple(sources), failures=tuple(failures))
+
+
+def _digests(bag: Path) -> tuple[tuple[str, str], ...]:
+    """Return the files of a recording with their SHA-256."""
     files = sorted(path for path in bag.iterdir() if path.is_file()) if bag.is_dir() else [bag]
     found = []
     for path in files:
