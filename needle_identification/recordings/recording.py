@@ -106,13 +106,13 @@ class Recording(_AnyRecording):
     depth: FloatArray = None  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
-        if self.speed is None:
-            self._freeze(depth=None, force=None)
-            return
-        self._freeze(speed=None, force=None)
-        if self.depth is None:
-            object.__setattr__(self, 'depth', integrated(self.time, self.speed))
-        self._freeze(depth=None)
+        if self.speed is not None:
+            self._freeze(speed=None)
+            if self.depth is None:
+                object.__setattr__(self, 'depth', integrated(self.time, self.speed))
+        elif self.depth is None:
+            raise ShapeError(f'{self.name}: speed or depth must be given')
+        self._freeze(depth=None, force=None)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)

@@ -1,4 +1,4 @@
-"""Bags come back as they were written, open in other tools, and break without a traceback."""
+"""Bags are read as they were written, open in other tools, and damaged ones cause no traceback."""
 
 from pathlib import Path
 import re
@@ -52,7 +52,7 @@ def recording() -> Recording:
 
 @pytest.fixture(scope='module')
 def bag(tmp_path_factory: pytest.TempPathFactory, recording: Recording) -> Path:
-    """Return a bag with all that our plant publishes; tests must not change it."""
+    """Return a bag with all topics of the plant; tests must not change it."""
     path = tmp_path_factory.mktemp('bags') / 'run'
     truth = {'/plant': {'ros__parameters': {'model.coulomb_friction': 0.56}}}
     write_bag(path, recording, yaml.safe_dump(truth))
@@ -89,7 +89,7 @@ def grid(
 # Round trip.
 
 
-def test_gives_back_every_byte_and_nanosecond(tmp_path: Path) -> None:
+def test_every_byte_and_nanosecond_is_kept(tmp_path: Path) -> None:
     written = [(EPOCH + 7 * i, wrench(EPOCH + i, i / 3.0)) for i in range(1000)]
     with BagWriter(tmp_path / 'bag') as writer:
         writer.add_topic('/a', WRENCH)
@@ -148,7 +148,7 @@ def test_stores_what_rosbag2_and_foxglove_look_for(bag: Path) -> None:
     assert (
         information['relative_file_paths'] == [information['files'][0]['path']] == ['run_0.mcap']
     )
-    # An alias would be an odd thing to hand to other parsers.
+    # Some parsers do not read YAML aliases.
     assert '&id' not in (bag / 'metadata.yaml').read_text()
 
 
@@ -184,7 +184,7 @@ def test_metadata_appears_only_with_close(tmp_path: Path) -> None:
     writer.write('/a', text('x'), EPOCH)
     writer.flush()
     assert [file.name for file in (tmp_path / 'bag').iterdir()] == ['bag_0.mcap']
-    # What was flushed is there for any other process.
+    # Another process can read what was flushed.
     assert message_counts(tmp_path / 'bag') == {'/a': 1}
     writer.close()
     assert sorted(file.name for file in (tmp_path / 'bag').iterdir()) == [
@@ -193,7 +193,7 @@ def test_metadata_appears_only_with_close(tmp_path: Path) -> None:
     ]
 
 
-def test_an_error_leaves_the_folder_unfinished_and_readable(tmp_path: Path) -> None:
+def test_an_error_leaves_an_incomplete_but_readable_bag(tmp_path: Path) -> None:
     def fail() -> None:
         with BagWriter(tmp_path / 'bag') as writer:
             writer.add_topic('/a', TEXT)
@@ -207,18 +207,18 @@ def test_an_error_leaves_the_folder_unfinished_and_readable(tmp_path: Path) -> N
     assert message_counts(tmp_path / 'bag') == {'/a': 1}
 
 
-def test_refuses_a_folder_that_exists(tmp_path: Path) -> None:
+def test_an_existing_folder_is_rejected(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match='exists; a recording must go to a new folder'):
         BagWriter(tmp_path)
 
 
-def test_refuses_a_place_that_cannot_be_written(tmp_path: Path) -> None:
+def test_a_folder_without_write_permission_is_rejected(tmp_path: Path) -> None:
     (tmp_path / 'file').touch()
     with pytest.raises(RecordingError, match=r'cannot record to .*/file/bag: Not a directory'):
         BagWriter(tmp_path / 'file' / 'bag')
 
 
-def test_refuses_a_type_it_cannot_describe(tmp_path: Path) -> None:
+def test_an_unknown_message_type_is_rejected(tmp_path: Path) -> None:
     with (
         BagWriter(tmp_path / 'bag') as writer,
         pytest.raises(RecordingError, match='no definition of lab_msgs/msg/Thing'),
@@ -226,7 +226,7 @@ def test_refuses_a_type_it_cannot_describe(tmp_path: Path) -> None:
         writer.add_topic('/a', 'lab_msgs/msg/Thing')
 
 
-def test_a_full_disk_is_an_error_of_the_system_and_loses_nothing_flushed(tmp_path: Path) -> None:
+def test_a_full_disk_loses_nothing_that_was_flushed(tmp_path: Path) -> None:
     noise = np.random.default_rng(0)
     writer = BagWriter(tmp_path / 'bag')
     writer.add_topic('/a', TEXT)
@@ -251,7 +251,7 @@ def test_a_full_disk_is_an_error_of_the_system_and_loses_nothing_flushed(tmp_pat
     assert message_counts(tmp_path / 'bag') == {'/a': flushed}
 
 
-# Broken and foreign bags.
+# Damaged bags, and bags of other writers.
 
 
 @pytest.fixture(scope='module')
@@ -283,7 +283,7 @@ def test_a_bag_cut_off_at_any_byte_gives_its_first_messages(
 
 @settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(data=strategies.data())
-def test_a_bag_with_a_wrong_byte_is_read_or_refused(cut: tuple[bytes, Path], data: Any) -> None:
+def test_a_bag_with_a_wrong_byte_is_read_or_rejected(cut: tuple[bytes, Path], data: Any) -> None:
     whole, part = cut
     at = data.draw(strategies.integers(0, len(whole) - 1))
     wrong = bytearray(whole)
@@ -293,14 +293,14 @@ def test_a_bag_with_a_wrong_byte_is_read_or_refused(cut: tuple[bytes, Path], dat
         messages = read_topic(part, '/a')
     except RecordingError:
         return
-    # The checksum of each chunk vouches for what is in it; a whole chunk may be lost.
+    # Each chunk has a checksum; a whole chunk may be lost.
     left = iter(f'message {i}' for i in range(60))
     assert all(message.data in left for _, message in messages)
 
 
 @pytest.fixture(scope='module')
 def unchecked(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, bytes], Path]:
-    """Return a small friction recording in forms that carry no checksums."""
+    """Return a small friction recording in files without checksums."""
     folder = tmp_path_factory.mktemp('unchecked')
     loose = folder / 'loose.mcap'
     with (
@@ -328,7 +328,7 @@ def unchecked(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, bytes
 @pytest.mark.parametrize('form', ['.mcap', '.db3'])
 @settings(max_examples=200, deadline=None)
 @given(data=strategies.data())
-def test_a_recording_with_wrong_bytes_is_read_or_refused(
+def test_a_recording_with_wrong_bytes_is_read_or_rejected(
     unchecked: tuple[dict[str, bytes], Path], form: str, data: Any
 ) -> None:
     wholes, part = unchecked
@@ -352,7 +352,7 @@ def test_a_recording_with_wrong_bytes_is_read_or_refused(
     assert not any('\n' in line for line in lines)
 
 
-def test_a_chunk_lost_in_the_middle_is_noticed(tmp_path: Path) -> None:
+def test_a_missing_chunk_is_reported(tmp_path: Path) -> None:
     with BagWriter(tmp_path / 'bag') as writer:
         writer.add_topic('/ft', WRENCH)
         writer.add_topic('/joints', MOTION)
@@ -377,7 +377,7 @@ def test_a_chunk_lost_in_the_middle_is_noticed(tmp_path: Path) -> None:
 
 @settings(max_examples=100, deadline=None)
 @given(strategies.binary(max_size=200))
-def test_any_bytes_are_refused_in_one_line(cut: tuple[bytes, Path], data: bytes) -> None:
+def test_arbitrary_bytes_are_rejected_in_one_line(cut: tuple[bytes, Path], data: bytes) -> None:
     _, part = cut
     part.write_bytes(data)
     with pytest.raises(RecordingError, match=r'is not an MCAP file|holds no messages') as caught:
@@ -385,23 +385,23 @@ def test_any_bytes_are_refused_in_one_line(cut: tuple[bytes, Path], data: bytes)
     assert '\n' not in str(caught.value)
 
 
-def test_says_what_a_cut_off_recording_lost(tmp_path: Path, bag: Path) -> None:
+def test_the_loss_of_a_cut_off_recording_is_reported(tmp_path: Path, bag: Path) -> None:
     part = tmp_path / 'run_0.mcap'
     whole = next(bag.glob('*.mcap')).read_bytes()
     part.write_bytes(whole[: len(whole) // 2])
     [loss] = read_friction_recording(part).losses
-    # Also what lies before the cut in the chunk that is cut through; the index takes some bytes.
+    # The messages before the cut within a chunk are read too; the index takes some bytes.
     count = int(re.fullmatch(r'run_0.mcap is cut off; (\d+) messages read', loss)[1])
     assert 0.4 < count / sum(message_counts(bag).values()) < 0.9
 
 
-def test_reads_a_folder_without_metadata_and_says_so(tmp_path: Path, bag: Path) -> None:
+def test_missing_metadata_is_reported(tmp_path: Path, bag: Path) -> None:
     shutil.copy(next(bag.glob('*.mcap')), tmp_path)
     [loss] = read_friction_recording(tmp_path).losses
     assert loss == 'no readable metadata.yaml: the recording was not closed'
 
 
-def test_reads_the_parts_of_a_split_bag_in_order_and_misses_one_by_name(tmp_path: Path) -> None:
+def test_parts_of_a_split_bag_are_read_in_order_and_a_missing_one_is_named(tmp_path: Path) -> None:
     names = [f'bag_{i}.mcap' for i in range(12)]
     for i, name in enumerate(names):
         with BagWriter(tmp_path / 'one') as writer:
@@ -428,7 +428,7 @@ def test_reads_the_parts_of_a_split_bag_in_order_and_misses_one_by_name(tmp_path
         (StoragePlugin.MCAP, CompressionMode.MESSAGE),
     ],
 )
-def test_reads_bags_of_another_writer(
+def test_bags_of_another_writer_are_read(
     tmp_path: Path, plugin: StoragePlugin, mode: CompressionMode
 ) -> None:
     writer = Writer(tmp_path / 'bag', version=9, storage_plugin=plugin)
@@ -448,7 +448,7 @@ def test_reads_bags_of_another_writer(
 
 @pytest.mark.parametrize('form', ['.mcap', '.db3'])
 @pytest.mark.parametrize('compression', ['', '.zstd', '.zst', '.lz4'])
-def test_reads_bare_and_compressed_files_and_what_is_left_of_them(
+def test_single_compressed_and_cut_off_files_are_read(
     tmp_path: Path, form: str, compression: str
 ) -> None:
     plugin = {'.mcap': StoragePlugin.MCAP, '.db3': StoragePlugin.SQLITE3}[form]
@@ -470,7 +470,7 @@ def test_reads_bare_and_compressed_files_and_what_is_left_of_them(
     assert read == list(noise[: len(read)])
 
 
-def test_reads_messages_compressed_with_lz4(tmp_path: Path) -> None:
+def test_messages_compressed_with_lz4_are_read(tmp_path: Path) -> None:
     with BagWriter(tmp_path / 'bag') as writer:
         writer.add_topic('/a', TEXT)
         for i in range(3):
@@ -478,7 +478,7 @@ def test_reads_messages_compressed_with_lz4(tmp_path: Path) -> None:
     assert [m.data for _, m in read_topic(tmp_path / 'bag', '/a')] == ['0', '1', '2']
 
 
-def test_reads_what_a_database_has_only_in_its_journal(tmp_path: Path) -> None:
+def test_the_journal_of_a_database_is_read(tmp_path: Path) -> None:
     with Writer(tmp_path / 'bag', version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
         force = writer.add_connection('/a', TEXT, typestore=STORE)
         writer.write(force, EPOCH, text('in the file'))
@@ -493,7 +493,7 @@ def test_reads_what_a_database_has_only_in_its_journal(tmp_path: Path) -> None:
         recorder.close()
 
 
-def test_reads_messages_outside_of_chunks(tmp_path: Path) -> None:
+def test_messages_outside_of_chunks_are_read(tmp_path: Path) -> None:
     path = tmp_path / 'loose.mcap'
     with path.open('wb') as stream:
         writer = McapWriter(stream, use_chunking=False)
@@ -503,14 +503,14 @@ def test_reads_messages_outside_of_chunks(tmp_path: Path) -> None:
         for i in range(1000):
             writer.add_message(channel, EPOCH + i, text(str(i)), EPOCH + i)
         writer.finish()
-    # The name of the type without its middle is that of ROS 1, and used by some writers.
+    # Some writers leave out the middle of the type name, as in ROS 1.
     assert [m.data for _, m in read_topic(path, '/a')] == [str(i) for i in range(1000)]
     whole = path.read_bytes()
     path.write_bytes(whole[: len(whole) // 2])
     assert 400 < len(read_topic(path, '/a')) < 600
 
 
-def test_a_broken_chunk_costs_its_own_messages_only(tmp_path: Path) -> None:
+def test_a_damaged_chunk_loses_only_its_own_messages(tmp_path: Path) -> None:
     with BagWriter(tmp_path / 'bag', 'none') as writer:
         writer.add_topic('/a', TEXT)
         for i in range(30):
@@ -529,14 +529,14 @@ def test_a_broken_chunk_costs_its_own_messages_only(tmp_path: Path) -> None:
     ]
 
 
-def test_what_metadata_does_not_list_is_not_part_of_the_bag(tmp_path: Path, bag: Path) -> None:
+def test_files_that_metadata_does_not_list_are_left_out(tmp_path: Path, bag: Path) -> None:
     shutil.copytree(bag, tmp_path / 'run')
     shutil.copy(tmp_path / 'run' / 'run_0.mcap', tmp_path / 'run' / 'copy.mcap')
     read = read_friction_recording(tmp_path / 'run')
     assert read.losses == ('copy.mcap is not part of the recording by metadata.yaml, left out',)
 
 
-def test_a_channel_of_another_encoding_is_none_of_ours(tmp_path: Path) -> None:
+def test_a_channel_of_another_encoding_is_not_used(tmp_path: Path) -> None:
     path = tmp_path / 'ros1.mcap'
     with path.open('wb') as stream:
         writer = McapWriter(stream)
@@ -549,7 +549,7 @@ def test_a_channel_of_another_encoding_is_none_of_ours(tmp_path: Path) -> None:
         read_friction_recording(path)
 
 
-def test_decodes_a_type_of_the_lab_by_the_definition_in_the_bag(tmp_path: Path) -> None:
+def test_an_own_message_type_is_read_by_its_definition_in_the_bag(tmp_path: Path) -> None:
     store = get_typestore(Stores.ROS2_JAZZY)
     store.register(get_types_from_msg('std_msgs/Header header\nint32 x', 'lab_msgs/msg/Thing'))
     with Writer(tmp_path / 'bag', version=9, storage_plugin=StoragePlugin.MCAP) as writer:
@@ -562,7 +562,7 @@ def test_decodes_a_type_of_the_lab_by_the_definition_in_the_bag(tmp_path: Path) 
 
 
 def damaged(tmp_path: Path, case: str) -> Path:
-    """Make what is not a recording."""
+    """Make something that is not a recording."""
     path = tmp_path / case
     if case == 'missing' or case.startswith('long'):
         return path
@@ -595,13 +595,13 @@ def damaged(tmp_path: Path, case: str) -> Path:
         ('silent', 'silent holds no messages'),
     ],
 )
-def test_says_what_is_not_a_recording(tmp_path: Path, case: str, complaint: str) -> None:
+def test_what_is_not_a_recording_is_rejected(tmp_path: Path, case: str, complaint: str) -> None:
     with pytest.raises(RecordingError, match=complaint) as caught:
         message_counts(damaged(tmp_path, case))
     assert '\n' not in str(caught.value)
 
 
-def test_a_message_that_is_not_of_its_type_is_named(tmp_path: Path) -> None:
+def test_an_invalid_message_is_named(tmp_path: Path) -> None:
     with BagWriter(tmp_path / 'bag') as writer:
         writer.add_topic('/a', WRENCH)
         writer.write('/a', wrench(EPOCH, 1.0), EPOCH)

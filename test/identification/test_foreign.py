@@ -1,4 +1,4 @@
-"""Recordings as other labs make them: the right result with what was lost, or one line, exit 2."""
+"""Recordings of other labs give the right result and warnings, or one line and exit status 2."""
 
 from collections.abc import Callable
 from functools import lru_cache
@@ -52,7 +52,7 @@ def triple(kind: str, **given: float) -> Any | Any:
 def joints(
     stamp: int, position: float | None, speed: float | None, names: tuple[str, ...] = ('slide',)
 ) -> bytes:
-    """Serialize a JointState of joints that all do the same; None leaves an array empty."""
+    """Serialize a JointState of joints with equal values; None leaves an array empty."""
     arrays = [
         np.array([] if value is None else [value] * len(names))
         for value in (position, speed, None)
@@ -130,7 +130,7 @@ def write_folder(
 
 
 def write_mcap(path: Path, rows: list[tuple[str, str, int, bytes]], **options: Any) -> Path:
-    """Write an MCAP file alone; a type that ROS does not have goes without a definition."""
+    """Write an MCAP file; a type that is not in ROS has no definition."""
     with path.open('wb') as stream:
         writer = McapWriter(stream, **options)
         writer.start('ros2')
@@ -149,7 +149,7 @@ def write_mcap(path: Path, rows: list[tuple[str, str, int, bytes]], **options: A
 
 @pytest.fixture
 def identified(capsys: pytest.CaptureFixture[str]) -> Callable[..., Any]:
-    """Return a function that runs the command, expects the truth, and returns the warnings."""
+    """Return a function that runs the command, checks the result, and returns the warnings."""
 
     def run(path: Path, *words: str) -> str:
         assert main(['identify', 'friction', str(path), '--json', *words]) == 0
@@ -158,7 +158,7 @@ def identified(capsys: pytest.CaptureFixture[str]) -> Callable[..., Any]:
         for name, truth in (('coulomb_friction', COULOMB), ('viscous_friction', VISCOUS)):
             low, high = found[name]['interval']
             assert low <= truth <= high
-            # Nothing was lost of the precision either: 2 % is some times the error of 1 s.
+            # Precise too: 2 % is some times the error of 1 s of motion.
             assert high - low < 0.04 * truth
         return said.err
 
@@ -185,7 +185,7 @@ def refused(capsys: pytest.CaptureFixture[str]) -> Callable[..., Any]:
 
 @pytest.mark.parametrize('plugin', ['mcap', 'sqlite3'])
 @pytest.mark.parametrize('mode', [None, CompressionMode.FILE, CompressionMode.MESSAGE])
-def test_containers_are_read_whole_without_metadata_bare_and_cut_off(
+def test_containers_are_read_complete_without_metadata_and_cut_off(
     tmp_path: Path, identified: Callable[..., Any], plugin: str, mode: CompressionMode | None
 ) -> None:
     file = write_folder(tmp_path / 'bag', recorded(), plugin, mode)
@@ -202,7 +202,7 @@ def test_containers_are_read_whole_without_metadata_bare_and_cut_off(
 
 @pytest.mark.parametrize('plugin', ['mcap', 'sqlite3'])
 @pytest.mark.parametrize('share', [0.0, 0.002, 0.03])
-def test_what_is_left_of_a_file_is_too_little(
+def test_a_file_that_is_cut_off_too_early_is_rejected(
     tmp_path: Path, refused: Callable[..., Any], plugin: str, share: float
 ) -> None:
     file = write_folder(tmp_path / 'bag', recorded(), plugin)
@@ -218,7 +218,7 @@ def test_what_is_left_of_a_file_is_too_little(
         {'use_chunking': False},
     ],
 )
-def test_bare_files_of_other_writers(
+def test_single_files_of_other_writers_are_read(
     tmp_path: Path, identified: Callable[..., Any], options: dict[str, Any]
 ) -> None:
     assert identified(write_mcap(tmp_path / 'run.mcap', recorded(), **options)) == ''
@@ -276,7 +276,7 @@ def at_position_zero(stamp: int, _depth: float, speed: float) -> bytes:
         (at_position_zero, 'has no position'),
     ],
 )
-def test_joints_of_which_half_is_missing(
+def test_joint_states_with_missing_fields_are_used_as_far_as_possible(
     tmp_path: Path, identified: Callable[..., Any], make: Callable[..., Any], said: str
 ) -> None:
     assert f'{MOTION} {said}' in identified(write_mcap(tmp_path / 'run.mcap', recorded(make=make)))
@@ -290,14 +290,14 @@ def test_joints_of_which_half_is_missing(
         (('roll', 'slide'), "no joint 'insertion'; motion_axis must name one of roll, slide"),
     ],
 )
-def test_joints_that_tell_nothing(
+def test_joint_states_without_position_and_velocity_are_rejected(
     tmp_path: Path, refused: Callable[..., Any], names: tuple[str, ...], said: str
 ) -> None:
     rows = recorded(make=lambda stamp, *_: joints(stamp, None, None, names))
     assert said in refused(write_mcap(tmp_path / 'run.mcap', rows))
 
 
-def test_a_joint_among_others_that_points_out_of_the_tissue(
+def test_a_joint_with_reversed_direction_is_found_among_others(
     tmp_path: Path, identified: Callable[..., Any]
 ) -> None:
     rows = recorded(make=lambda t, d, v: joints(t, -d, -v, ('rail', 'slide')), sign=-1.0)
@@ -315,7 +315,7 @@ def test_a_joint_among_others_that_points_out_of_the_tissue(
     ],
 )
 @pytest.mark.parametrize(('axis', 'sign'), [('y', 1.0), ('-z', -1.0)])
-def test_every_type_of_motion_along_any_axis(
+def test_every_type_of_motion_works_along_any_axis(
     tmp_path: Path,
     identified: Callable[..., Any],
     type_name: str,
@@ -330,7 +330,7 @@ def test_every_type_of_motion_along_any_axis(
     assert said in identified(path, '--motion-axis', axis)
 
 
-def test_topics_of_one_type_are_listed_and_named(
+def test_several_topics_of_one_type_are_listed(
     tmp_path: Path, identified: Callable[..., Any], refused: Callable[..., Any]
 ) -> None:
     rows = [*recorded(topics=('/l/ft', '/l/arm')), *recorded(topics=('/r/ft', '/r/arm'))]
@@ -341,9 +341,7 @@ def test_topics_of_one_type_are_listed_and_named(
     assert identified(path, *one, '--motion-topic', '/l/arm') == ''
 
 
-def test_what_is_recorded_beside_does_no_harm(
-    tmp_path: Path, identified: Callable[..., Any]
-) -> None:
+def test_other_topics_do_no_harm(tmp_path: Path, identified: Callable[..., Any]) -> None:
     rows = recorded()
     for k, (_, _, received, _) in enumerate(rows[::20]):
         rows += [
@@ -367,12 +365,14 @@ def test_what_is_recorded_beside_does_no_harm(
 
 
 @pytest.mark.parametrize('ahead', [5.0, -5.0, 3 * 3600.0])
-def test_clocks_that_differ(tmp_path: Path, identified: Callable[..., Any], ahead: float) -> None:
+def test_different_clocks_are_corrected(
+    tmp_path: Path, identified: Callable[..., Any], ahead: float
+) -> None:
     path = write_mcap(tmp_path / 'run.mcap', recorded(ahead=ahead))
     assert f'is stamped {ahead:.3f} s after {MOTION}: clocks differ, corrected' in identified(path)
 
 
-def test_a_tenth_of_a_second_may_be_latency_and_is_said(
+def test_a_latency_of_a_tenth_of_a_second_is_reported(
     tmp_path: Path, identified: Callable[..., Any], capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = write_mcap(tmp_path / 'run.mcap', recorded(ahead=0.1))
@@ -384,7 +384,7 @@ def test_a_tenth_of_a_second_may_be_latency_and_is_said(
 
 
 def damaged(kind: str) -> tuple[list[tuple[str, str, int, bytes]], str]:
-    """Return the messages of a recording that has a fault, and what must be said of it."""
+    """Return the messages of a recording with a fault, and the warning that is expected."""
     rows = recorded()
     rng = np.random.default_rng(1)
     if kind == 'gap':
@@ -411,7 +411,7 @@ def damaged(kind: str) -> tuple[list[tuple[str, str, int, bytes]], str]:
 
 
 @pytest.mark.parametrize('kind', ['gap', 'lost', 'twice', 'order', 'short', 'nan', 'inf', '1e300'])
-def test_faults_are_told_and_do_no_harm(
+def test_faults_are_reported_and_do_no_harm(
     tmp_path: Path, identified: Callable[..., Any], kind: str
 ) -> None:
     rows, said = damaged(kind)
@@ -429,14 +429,14 @@ def test_faults_are_told_and_do_no_harm(
         ([], 'holds no messages'),
     ],
 )
-def test_what_is_missing_is_named(
+def test_missing_topics_are_named(
     tmp_path: Path, refused: Callable[..., Any], kept: list[str], said: str
 ) -> None:
     rows = [row for row in recorded() if row[0] in kept]
     assert said in refused(write_mcap(tmp_path / 'run.mcap', rows))
 
 
-def test_what_is_not_one_recording_is_told_what_to_do(
+def test_the_message_says_what_to_do_with_other_files(
     tmp_path: Path, refused: Callable[..., Any]
 ) -> None:
     old = tmp_path / 'old.bag'
@@ -454,7 +454,7 @@ def test_what_is_not_one_recording_is_told_what_to_do(
 
 
 @pytest.mark.parametrize('type_name', [POSE, POINT, ODOMETRY, JOINTS])
-def test_stiffness_from_every_type_of_motion(
+def test_stiffness_comes_from_every_type_of_motion(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], type_name: str
 ) -> None:
     rows = []

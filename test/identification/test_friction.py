@@ -1,4 +1,4 @@
-"""Friction comes out as it went in, with an error bar that means what it says."""
+"""Friction is recovered, with valid standard errors and confidence intervals."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -16,25 +16,27 @@ from needle_identification import (
     Recording,
     summarize,
 )
+from needle_identification.friction.filtering import _smooth, filter_taps
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 import pytest
+from scipy.signal.windows import hann
 from support.strokes import COULOMB, SPEEDS, strokes, VISCOUS
 
 TRUTH = {'coulomb_friction': COULOMB, 'viscous_friction': VISCOUS}
 
 
 def law(
-    pace: Callable[..., Any] | Any,
+    size: Callable[..., Any] | Any,
     *,
     both_ways: bool = True,
     duration: float = 8.0,
     offset: float = 0.0,
 ) -> Recording:
-    """Make a recording of equation (15) itself at a given pace |s_dot| [m/s] over time [s]."""
+    """Make a recording of equation (15) with a given absolute speed [m/s] over time [s]."""
     time = np.arange(round(duration * 250)) / 250.0
     way = np.where(time < duration / 2.0, 1.0, -1.0) if both_ways else np.ones_like(time)
-    speed = way * pace(time)
+    speed = way * size(time)
     force = COULOMB * np.sign(speed) + VISCOUS * speed + offset
     return Recording(
         name='law', time=time, depth=np.cumsum(speed) / 250.0, speed=speed, force=force
@@ -58,32 +60,43 @@ def within(parameter: ParameterEstimate, truth: float, errors: float = 4.0) -> b
     return parameter.determined and abs(parameter.value - truth) < errors * parameter.error
 
 
+def test_the_filter_is_a_hann_window_at_zero_phase() -> None:
+    taps = filter_taps(30.0, 0.004)
+    window = hann(len(taps))
+    assert_allclose(taps, window / window.sum(), rtol=1e-12)
+    for length in (50, 5000):
+        signal = np.random.default_rng(0).normal(size=length)
+        padded = np.pad(signal, len(taps) // 2, mode='edge')
+        # 1e-12: rounding of the transforms.
+        assert_allclose(_smooth(signal, taps), np.convolve(padded, taps, 'valid'), atol=1e-12)
+
+
 @pytest.mark.parametrize('estimator', ESTIMATORS)
-def test_recovers_what_was_recorded(estimator: str) -> None:
+def test_exact_friction_is_recovered(estimator: str) -> None:
     found = identified(FrictionSettings(estimator=estimator))
     for name, truth in TRUTH.items():
         # 1e-6: the filter has finite length, and what it reaches of a change is left out.
         assert_allclose(found[name].value, truth, rtol=1e-6)
-    # The speed shows the start of motion to a sample, 4 ms, in which the push grows by 2.7 mN.
+    # The start of motion is known to a sample, 4 ms, in which the push increases by 2.7 mN.
     assert_allclose(found.breakaway.value, COULOMB, atol=2.7e-3)
     assert found.determination > 1.0 - 1e-9
     assert found.warnings == ()
 
 
 @pytest.mark.parametrize('estimator', ESTIMATORS)
-def test_recovers_the_truth_within_its_errors(estimator: str) -> None:
+def test_true_friction_is_within_the_standard_errors(estimator: str) -> None:
     found = identified(FrictionSettings(estimator=estimator), seed=1)
     assert all(within(found[name], truth) for name, truth in TRUTH.items())
     assert within(found.breakaway, COULOMB)
 
 
-def test_one_direction_is_enough() -> None:
+def test_strokes_in_one_direction_are_enough() -> None:
     found = identify_friction(law(varied, both_ways=False))
     assert_allclose(found['coulomb_friction'].value, COULOMB, rtol=1e-6)
 
 
 @pytest.mark.parametrize('recorded', [{'cutoff': 40.0}, {}], ids=['40 Hz', '125 Hz'])
-def test_error_bars_hold_the_truth_as_often_as_they_say(recorded: dict[str, float]) -> None:
+def test_confidence_intervals_have_their_coverage(recorded: dict[str, float]) -> None:
     runs = [identified(seed=seed, **recorded) for seed in range(100)]
     truths = {**TRUTH, 'breakaway_force': COULOMB}
     for name, truth in truths.items():
@@ -108,7 +121,7 @@ def test_friction_scales_with_the_force() -> None:
     assert_allclose(three.residual, 3.0 * one.residual, rtol=1e-6)
 
 
-def test_friction_is_the_same_seen_from_the_other_side() -> None:
+def test_reversed_axes_give_the_same_friction() -> None:
     recording = strokes(seed=2, offset=0.1)
     mirrored = replace(
         recording, force=-recording.force, speed=-recording.speed, depth=-recording.depth
@@ -122,7 +135,7 @@ def test_friction_is_the_same_seen_from_the_other_side() -> None:
     assert_allclose(other.breakaway.value, one.breakaway.value, rtol=1e-6)
 
 
-def test_the_paper_has_no_offset_and_one_that_is_there_is_named() -> None:
+def test_a_missing_offset_term_is_suggested() -> None:
     plain = identified(seed=3)
     assert [parameter.name for parameter in plain.parameters] == list(TRUTH)
     assert plain.warnings == ()
@@ -153,7 +166,7 @@ def test_the_paper_has_no_offset_and_one_that_is_there_is_named() -> None:
         ),
     ],
 )
-def test_a_term_that_is_there_is_found(
+def test_a_missing_term_is_suggested_and_identified(
     term: str, recorded: dict[str, float], truths: dict[str, float]
 ) -> None:
     without = identified(seed=4, **recorded)
@@ -165,7 +178,7 @@ def test_a_term_that_is_there_is_found(
     assert not any('add the term' in words for words in found.warnings)
 
 
-def test_only_tests_whose_words_speak_against_the_model_are_warnings() -> None:
+def test_only_failed_residual_tests_are_warnings() -> None:
     fine = ('show no', 'do not differ', 'do not depend', 'the same at', 'are not correlated')
     for found in [identified(seed=seed) for seed in range(40)]:
         assert all(t.failed != any(words in t.words for words in fine) for t in found.tests)
@@ -174,7 +187,7 @@ def test_only_tests_whose_words_speak_against_the_model_are_warnings() -> None:
             assert [words for words in found.warnings if 'residuals' in words] == failed
 
 
-def test_terms_that_are_not_there_are_not_found() -> None:
+def test_false_alarms_are_rare() -> None:
     found = [identified(seed=seed) for seed in range(40)]
     false = [any(c.supported for c in one.comparison) for one in found]
     # At most 5 % of 40 recordings, and three standard deviations of that.
@@ -188,7 +201,7 @@ def test_terms_that_are_not_there_are_not_found() -> None:
     assert not any(c.supported for c in needless if 'coulomb' not in c.terms)
 
 
-def test_an_inertia_is_found_as_well_as_the_stamps_agree() -> None:
+def test_the_error_of_the_mass_allows_for_wrong_stamps() -> None:
     time = np.arange(5000) / 250.0
     speed = 8e-3 * np.sin(2.0 * np.pi * 0.5 * time) + 6e-3 * np.sin(2.0 * np.pi * 0.31 * time)
     force = COULOMB * np.sign(speed) + 20.0 * np.gradient(speed, time) + 5.0 * speed
@@ -196,14 +209,14 @@ def test_an_inertia_is_found_as_well_as_the_stamps_agree() -> None:
     recording = Recording(name='shaken', time=time, depth=0.0 * time, speed=speed, force=force)
     found = identify_friction(recording, settings('inertia', largest_acceleration=1.0))
     assert within(found['moving_mass'], 20.0)
-    # A sample of 4 ms, evenly spread, times mu_v.
+    # A sampling period of 4 ms, uniformly distributed, times mu_v.
     assert found['moving_mass'].error >= 5.0 * 4e-3 / np.sqrt(3.0)
     assert found.lag is None
     assert any('looks like' in words for words in found.warnings)
 
 
 @pytest.mark.parametrize('lag', [0.008, -0.05, 0.1])
-def test_a_lag_is_found_and_corrected(lag: float) -> None:
+def test_a_lag_is_estimated_and_corrected(lag: float) -> None:
     time = np.arange(4000) / 250.0
     speed = 8e-3 * np.sin(2.0 * np.pi * 0.3 * time) + 5e-3 * np.sin(2.0 * np.pi * 0.47 * time)
     shown = np.interp(time - lag, time, speed)
@@ -219,7 +232,7 @@ def test_a_lag_is_found_and_corrected(lag: float) -> None:
 
 
 def steps(rate: float, lag: float) -> Recording:
-    """Make strokes of constant speed, without any acceleration, with a late force."""
+    """Make strokes of constant speed, without acceleration, with a delayed force."""
     legs = [leg for v in SPEEDS for leg in ((v, 1.0), (0.0, 0.2), (-v, 1.0), (0.0, 0.2))]
     speed = np.repeat([v for v, _ in legs], [round(rate * duration) for _, duration in legs])
     shown = np.roll(speed, round(lag * rate))
@@ -235,7 +248,7 @@ def steps(rate: float, lag: float) -> Recording:
 
 @pytest.mark.parametrize('rate', [50.0, 250.0, 1000.0])
 @pytest.mark.parametrize('lag', [0.02, 0.1, -0.1])
-def test_a_lag_that_steady_strokes_show_roughly_is_corrected(rate: float, lag: float) -> None:
+def test_a_large_lag_of_steady_strokes_is_corrected(rate: float, lag: float) -> None:
     found = identify_friction(steps(rate, lag))
     assert all(within(found[name], truth) for name, truth in TRUTH.items())
     # A thousand samples with noise of 0.01 N.
@@ -246,7 +259,7 @@ def test_a_lag_that_steady_strokes_show_roughly_is_corrected(rate: float, lag: f
 
 
 def eased(rate: float, lag: float, seed: int) -> Recording:
-    """Make strokes that gain and lose their speed in 0.05 s, sampled anywhere in between."""
+    """Make strokes with ramps of the speed of 0.05 s, sampled at arbitrary times."""
     corners = [(0.0, 0.0)]
     for speed in (way * v for v in SPEEDS for way in (1.0, -1.0)):
         start = corners[-1][0]
@@ -264,7 +277,7 @@ def eased(rate: float, lag: float, seed: int) -> Recording:
 
 
 @pytest.mark.parametrize(('rate', 'surest'), [(250.0, 0.0), (100.0, 5e-4)])
-def test_the_error_of_a_lag_knows_of_the_sample_period(rate: float, surest: float) -> None:
+def test_the_error_of_the_lag_includes_the_sampling_period(rate: float, surest: float) -> None:
     found = [identify_friction(eased(rate, 2.24e-3, seed)).lag for seed in range(60)]
     held = [lag.interval[0] <= 2.24e-3 <= lag.interval[1] for lag in found]
     # Three standard deviations of a binomial of 60 trials at 95 % are 8.4 %.
@@ -272,22 +285,22 @@ def test_the_error_of_a_lag_knows_of_the_sample_period(rate: float, surest: floa
     assert all(surest < lag.error < 2e-3 for lag in found)
 
 
-def test_jumps_of_the_speed_tell_no_lag() -> None:
-    # What the spline rings after a jump is no acceleration.
+def test_jumps_of_the_speed_do_not_determine_the_lag() -> None:
+    # The ringing of the spline after a jump is not an acceleration.
     lags = [identify_friction(steps(250.0, 0.0)).lag, identified(seed=14, push=0.0).lag]
     assert not any(lag.determined for lag in lags)
 
 
-def test_a_lag_is_not_told_from_positions() -> None:
+def test_positions_alone_give_no_lag() -> None:
     recording = strokes(seed=14, lag=0.02)
     found = identify_friction(replace(recording, speed=None))
     assert found.lag is None
-    # It is corrected all the same, and said.
+    # It is corrected and reported.
     assert all(within(found[name], truth) for name, truth in TRUTH.items())
     assert any(' behind the motion' in words for words in found.warnings)
 
 
-def test_a_force_that_does_not_change_with_the_speed_shows_no_lag() -> None:
+def test_a_force_independent_of_the_speed_does_not_determine_the_lag() -> None:
     recording = strokes(seed=14, speeds=SPEEDS[:3], push=0.0)
     dry = replace(recording, force=recording.force - (VISCOUS - 0.3) * recording.speed)
     found = identify_friction(dry)
@@ -296,7 +309,7 @@ def test_a_force_that_does_not_change_with_the_speed_shows_no_lag() -> None:
     assert within(found['coulomb_friction'], COULOMB)
 
 
-def test_positions_alone_give_the_same_within_the_errors() -> None:
+def test_positions_alone_give_the_same_friction() -> None:
     recording = strokes(seed=5)
     both = identify_friction(recording)
     counted = 1e-6 * np.round(recording.depth / 1e-6)
@@ -307,8 +320,8 @@ def test_positions_alone_give_the_same_within_the_errors() -> None:
         assert alone[name].error < 1.3 * both[name].error
 
 
-def test_noise_of_the_speed_is_named_and_total_takes_it() -> None:
-    """Speeds that differ little: noise then is much of what they differ by."""
+def test_total_corrects_for_noise_of_the_speed() -> None:
+    """Speeds that differ little, so that noise is a large part of their variation."""
     rng = np.random.default_rng(1)
     recording = law(lambda time: 3e-3 + varied(time), duration=80.0)
     noisy = replace(
@@ -324,7 +337,7 @@ def test_noise_of_the_speed_is_named_and_total_takes_it() -> None:
     assert not any('choose' in words for words in total.warnings)
 
 
-def test_outliers_move_huber_little() -> None:
+def test_huber_is_robust_against_outliers() -> None:
     recording = strokes(seed=6)
     rng = np.random.default_rng(6)
     struck = rng.random(len(recording.time)) < 0.01
@@ -352,7 +365,7 @@ def test_one_speed_does_not_determine_two_coefficients(both_ways: bool, seed: in
     assert any('do not determine coulomb_friction' in words for words in found.warnings)
 
 
-def test_offset_and_direction_cannot_be_told_apart_but_the_rest_can() -> None:
+def test_offset_and_direction_together_are_not_determined() -> None:
     found = identified(settings('offset', 'direction'), seed=7)
     known = {parameter.name: parameter.determined for parameter in found.parameters}
     assert known == {
@@ -366,21 +379,21 @@ def test_offset_and_direction_cannot_be_told_apart_but_the_rest_can() -> None:
     assert within(found['viscous_friction'], VISCOUS)
 
 
-def test_an_offset_is_not_told_from_friction_in_one_direction() -> None:
+def test_strokes_in_one_direction_do_not_determine_an_offset() -> None:
     found = identify_friction(law(varied, both_ways=False), settings('offset'))
     known = {parameter.name: parameter.determined for parameter in found.parameters}
     assert known == {'coulomb_friction': False, 'viscous_friction': True, 'offset': False}
 
 
-def test_only_a_rest_with_a_rising_force_shows_the_break_away() -> None:
+def test_the_breakaway_force_needs_a_rest_with_a_rising_force() -> None:
     assert identified(seed=8).breakaway is not None
     assert identified(seed=8, push=0.0).breakaway is None
     sticky = identified(settings('stribeck'), seed=8, breakaway=1.3)
-    # It creeps at once in this recording: from rest the force goes on rising to break-away.
+    # The needle creeps at once in this recording, while the force rises to the breakaway force.
     assert sticky.breakaway is None or sticky.breakaway.error < 0.02
 
 
-def test_time_may_begin_anywhere_and_samples_may_be_lost() -> None:
+def test_lost_samples_and_another_start_time_do_no_harm() -> None:
     recording = strokes(seed=9)
     whole = identify_friction(recording)
     rng = np.random.default_rng(3)
@@ -397,13 +410,13 @@ def test_time_may_begin_anywhere_and_samples_may_be_lost() -> None:
     )
     assert part.samples < whole.samples
     for name, truth in TRUTH.items():
-        # Samples put in between add misfit where the speed changes.
+        # Interpolated samples add misfit where the speed changes.
         assert abs(part[name].value - truth) < 5.0 * whole[name].error
 
 
 @pytest.mark.filterwarnings('error')
 @pytest.mark.parametrize('rate', [50.0, 1000.0])
-def test_the_rate_of_the_recording_may_be_any(rate: float) -> None:
+def test_any_sampling_rate_gives_the_same_friction(rate: float) -> None:
     recording = strokes(seed=10)
     time = np.arange(recording.time[0], recording.time[-1], 1.0 / rate)
     changed = Recording(
@@ -420,7 +433,7 @@ def test_the_rate_of_the_recording_may_be_any(rate: float) -> None:
     assert len(found.fit.time) <= 250 * 15
 
 
-def test_the_fit_is_what_the_pictures_show() -> None:
+def test_the_fit_has_the_reported_residual() -> None:
     found = identified(seed=11)
     fit = found.fit
     assert_array_equal(np.isfinite(fit.model), fit.used)
@@ -430,7 +443,7 @@ def test_the_fit_is_what_the_pictures_show() -> None:
 
 
 def jump(recording: Recording) -> Recording:
-    """Let the clock jump in the middle, as one with simulated and real stamps does."""
+    """Let the clock jump in the middle, as with simulated and real stamps."""
     return replace(recording, time=recording.time + np.where(recording.time < 4.0, 0.0, 1e9))
 
 
@@ -453,12 +466,14 @@ def jump(recording: Recording) -> Recording:
     ],
     ids=['rest', 'little motion', 'short', 'one sample', 'no force', 'noise', 'stamps'],
 )
-def test_says_what_a_recording_lacks(recording: Recording, complaint: str) -> None:
+def test_an_unusable_recording_is_rejected_with_a_reason(
+    recording: Recording, complaint: str
+) -> None:
     with pytest.raises(IdentificationError, match=f'^law: .*{complaint}'):
         identify_friction(recording)
 
 
-def test_refuses_friction_that_drives() -> None:
+def test_negative_friction_is_rejected() -> None:
     recording = law(varied)
     with pytest.raises(IdentificationError, match=r'negative, got mu_s = -0\.56 N.*wrong sign'):
         identify_friction(replace(recording, force=-recording.force))
@@ -468,7 +483,7 @@ def test_refuses_friction_that_drives() -> None:
     'name', ['cutoff', 'moving_speed', 'largest_acceleration', 'stribeck_speed']
 )
 @pytest.mark.parametrize('value', [0.0, -1.0, float('nan')])
-def test_refuses_settings_out_of_range(name: str, value: Any) -> None:
+def test_settings_out_of_range_are_rejected(name: str, value: Any) -> None:
     with pytest.raises(ParameterError, match=f'{name} must be'):
         FrictionSettings(**{name: value})
 
@@ -484,14 +499,14 @@ def test_refuses_settings_out_of_range(name: str, value: Any) -> None:
         ({'estimator': 'total', 'terms': ('coulomb',)}, 'total needs the term viscous'),
     ],
 )
-def test_refuses_terms_and_estimators_that_do_not_go(
+def test_invalid_terms_and_estimators_are_rejected(
     changes: dict[str, Any], complaint: str
 ) -> None:
     with pytest.raises(ParameterError, match=complaint):
         FrictionSettings(**changes)
 
 
-def test_a_parameter_that_was_not_fitted_is_named_with_those_that_were() -> None:
+def test_an_unknown_parameter_name_lists_the_valid_ones() -> None:
     with pytest.raises(KeyError, match=r'offset.*valid: coulomb_friction, viscous_friction'):
         identified()['offset']
 
@@ -512,6 +527,6 @@ def test_summary_holds_every_parameter_of_every_recording() -> None:
         summary['moving_mass']
 
 
-def test_nothing_cannot_be_summarized() -> None:
+def test_a_summary_needs_estimates() -> None:
     with pytest.raises(IdentificationError, match='no recordings'):
         summarize([])

@@ -1,4 +1,4 @@
-"""Friction from streams: pairing by stamp, whatever the streams do."""
+"""Friction from running topics: pairing by stamp, for any order of messages."""
 
 from math import inf, nan
 
@@ -26,14 +26,14 @@ def feed(
     shift: int = 0,
     speeds: bool = True,
 ) -> None:
-    """Feed the recording as two streams, the motion a little later on the way."""
+    """Feed the recording as two topics, the motion arriving a little later."""
     for stamp, depth, speed, force in samples:
         live.take_force(stamp, force)
         live.take_motion(stamp + shift, depth, speed if speeds else None)
 
 
 def make() -> LiveFriction:
-    """Return a live identification that forgets nothing within the recording."""
+    """Return a live identification without forgetting."""
     return LiveFriction(FrictionSettings(), 1e6)
 
 
@@ -50,7 +50,7 @@ def check(live: LiveFriction, tolerance: float) -> None:
         assert found[name].value == pytest.approx(getattr(TRUTH, name), rel=tolerance)
 
 
-def test_finds_the_friction_that_was_simulated() -> None:
+def test_simulated_friction_is_found() -> None:
     """Stamps that agree are paired one by one."""
     live = make()
     assert live.estimate() == ()
@@ -62,11 +62,11 @@ def test_finds_the_friction_that_was_simulated() -> None:
 
 
 def test_motion_between_the_stamps_of_the_force_is_interpolated() -> None:
-    """A motion sampled 1.3 ms beside the force gives the same friction."""
+    """A motion sampled 1.3 ms before the force gives the same friction."""
     live = make()
     feed(live, shift=-1_300_000)
     assert live.samples >= len(SAMPLES) - 2
-    # The interpolated speed is off by the ramps only, where nothing is used.
+    # The interpolated speed is wrong only in the ramps, where no sample is used.
     check(live, 0.02)
 
 
@@ -79,7 +79,7 @@ def test_positions_alone_are_differentiated() -> None:
 
 @pytest.mark.parametrize('value', [nan, inf])
 def test_what_is_not_finite_is_dropped_and_counted(value: float) -> None:
-    """A sensor that fails for a while does not spoil the estimate."""
+    """A temporary failure of a sensor does not change the estimate."""
     live = make()
     for k, (stamp, depth, speed, force) in enumerate(SAMPLES):
         live.take_force(stamp, value if k % 50 == 0 else force)
@@ -88,8 +88,8 @@ def test_what_is_not_finite_is_dropped_and_counted(value: float) -> None:
     check(live, 0.02)
 
 
-def test_stamps_that_go_back_a_little_are_dropped() -> None:
-    """Duplicates and messages overtaken on the way count once, or not at all."""
+def test_late_and_repeated_stamps_are_dropped() -> None:
+    """Repeated and late messages are not used twice."""
     live = make()
     for k, (stamp, depth, speed, force) in enumerate(SAMPLES):
         live.take_motion(stamp, depth, speed)
@@ -101,8 +101,8 @@ def test_stamps_that_go_back_a_little_are_dropped() -> None:
     check(live, 0.01)
 
 
-def test_a_clock_that_is_set_back_starts_anew() -> None:
-    """Estimation goes on with the new stamps as if it had begun with them."""
+def test_a_clock_that_is_set_back_restarts_the_estimation() -> None:
+    """Estimation continues with the new stamps as if it had begun with them."""
     live, fresh = make(), make()
     feed(live)
     earlier = [(stamp - 3600 * 10**9, *others) for stamp, *others in SAMPLES]
@@ -114,7 +114,7 @@ def test_a_clock_that_is_set_back_starts_anew() -> None:
 
 
 def test_force_within_a_gap_of_the_motion_is_not_paired() -> None:
-    """Nobody knows how the needle moved while the encoder was silent."""
+    """The motion of the needle is unknown while the encoder is silent."""
     live = make()
     gap = range(400, 500)
     for k, (stamp, depth, speed, force) in enumerate(SAMPLES):
@@ -125,8 +125,8 @@ def test_force_within_a_gap_of_the_motion_is_not_paired() -> None:
     check(live, 0.02)
 
 
-def test_one_stream_alone_takes_no_more_memory_than_its_share() -> None:
-    """Force without motion waits, but not for ever."""
+def test_memory_is_bounded_if_one_topic_is_missing() -> None:
+    """Samples of the force wait for the motion in a buffer of limited length."""
     live = make()
     for k in range(30_000):
         live.take_force(1_000_000 * (k + 1), 1.0)
@@ -142,7 +142,7 @@ def test_one_stream_alone_takes_no_more_memory_than_its_share() -> None:
         (FrictionSettings(estimator='huber'), 60.0, 'estimator ordinary'),
     ],
 )
-def test_what_cannot_be_done_is_refused_before_a_sample_comes(
+def test_invalid_settings_are_rejected_at_once(
     settings: FrictionSettings, forgetting: float, complaint: str
 ) -> None:
     """The settings are checked at once."""

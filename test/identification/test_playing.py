@@ -1,10 +1,12 @@
-"""What a player needs of a bag: its messages in the order of time, and how they were offered."""
+"""What a player needs of a bag: messages in order of time, their QoS, and when they are due."""
 
 from itertools import pairwise
 from pathlib import Path
+import time
 
 from needle_identification import Bag, BagWriter, OfferedQos, Topic
 from needle_identification.bags import bag as reading
+from needle_identification.bags.playback import Playback, PlaybackSettings
 import pytest
 from rosbags.interfaces import (
     Qos,
@@ -31,7 +33,7 @@ def everything(_topic: Topic) -> bool:
     return True
 
 
-def test_messages_come_in_the_order_of_time_across_topics(tmp_path: Path) -> None:
+def test_messages_are_in_order_of_time_across_topics(tmp_path: Path) -> None:
     """Batches come topic by topic; messages do not."""
     with BagWriter(tmp_path / 'bag') as writer:
         for name in ('/a', '/b'):
@@ -45,7 +47,7 @@ def test_messages_come_in_the_order_of_time_across_topics(tmp_path: Path) -> Non
 
 
 def test_equal_times_keep_the_order_of_the_file(tmp_path: Path) -> None:
-    """Of messages received at once the one written first comes first."""
+    """Messages with equal times come in the order in which they were written."""
     with BagWriter(tmp_path / 'bag') as writer:
         writer.add_topic('/a', TEXT)
         for k in range(100):
@@ -54,10 +56,10 @@ def test_equal_times_keep_the_order_of_the_file(tmp_path: Path) -> None:
     assert found == [text(str(k)) for k in range(100)]
 
 
-def test_a_long_recording_is_put_in_order_piece_by_piece(
+def test_a_long_recording_is_sorted_piece_by_piece(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """No more waits than the window and the piece that is read; only the wanted topics do."""
+    """Only messages of wanted topics wait, no more than the window and one piece."""
     monkeypatch.setattr(reading, '_WINDOW', 1000)
     with BagWriter(tmp_path / 'bag') as writer:
         for name in ('/a', '/b'):
@@ -77,9 +79,7 @@ def test_a_long_recording_is_put_in_order_piece_by_piece(
     assert times == [EPOCH + k for k in range(1000)]
 
 
-def test_a_message_behind_the_window_comes_when_it_is_met(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_very_late_message_is_not_lost(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing is lost, whatever the order."""
     monkeypatch.setattr(reading, '_WINDOW', 0)
     with BagWriter(tmp_path / 'bag') as writer:
@@ -92,8 +92,8 @@ def test_a_message_behind_the_window_comes_when_it_is_met(
     assert any(late < early for early, late in pairwise(times))
 
 
-def test_what_was_offered_comes_back(tmp_path: Path) -> None:
-    """Profiles are those that the recorder stored, in either form of storage."""
+def test_offered_qos_is_stored(tmp_path: Path) -> None:
+    """Profiles are read as they were stored, in both forms of storage."""
     weak = OfferedQos('best_effort', 'volatile', 'keep_last', 5)
     latched = OfferedQos('reliable', 'transient_local', 'keep_all', 1)
     with BagWriter(tmp_path / 'bag') as writer:
@@ -128,8 +128,83 @@ def test_what_was_offered_comes_back(tmp_path: Path) -> None:
         ('- [1]', ()),
     ],
 )
-def test_reads_what_any_version_of_rosbag2_stored(
+def test_offered_qos_of_any_version_of_rosbag2_is_read(
     stored: str, found: tuple[OfferedQos, ...]
 ) -> None:
-    """Numbers stand for the words in older recordings; what is not readable says nothing."""
+    """Older recordings have numbers instead of words; unreadable profiles give none."""
     assert Topic('/a', TEXT, profiles=stored).offered_qos() == found
+
+
+@pytest.fixture
+def bag(tmp_path: Path) -> Bag:
+    """Return a bag with a latched topic, and ten messages 10 ms apart."""
+    with BagWriter(tmp_path / 'bag') as writer:
+        for name in ('/latched', '/a'):
+            writer.add_topic(name, TEXT)
+        for k, word in enumerate(('old', 'new')):
+            writer.write('/latched', text(word), EPOCH + k)
+        for k in range(10):
+            writer.write('/a', text(str(k)), EPOCH + 10_000_000 * k)
+    return Bag(tmp_path / 'bag')
+
+
+def playback(bag: Bag, **settings: float) -> Playback:
+    """Return a running playback without delay."""
+    made = Playback(
+        bag, {'/a', '/latched'}, {'/latched': 1}, PlaybackSettings(delay=0.0, **settings)
+    )
+    made.start(paused=False)
+    return made
+
+
+def played(made: Playback) -> list[bytes]:
+    """Play to the end, as fast as possible."""
+    found: list[bytes] = []
+    while made.has_next:
+        if made.is_due():
+            found += [message.data for message in made.take()]
+    return found
+
+
+def test_playback_begins_with_the_last_latched_message(bag: Bag) -> None:
+    """The part from start to end is played; latched messages from before come first."""
+    made = playback(bag, rate=0.0, start=0.02, end=0.05)
+    assert played(made) == [text('new'), *(text(str(k)) for k in range(2, 6))]
+    assert made.take() == []
+
+
+def test_playback_at_a_rate_takes_the_time_of_the_recording(bag: Bag) -> None:
+    """Nothing is due before its time, and delays are measured."""
+    made = playback(bag, rate=2.0)
+    begin = time.monotonic()
+    assert len(played(made)) == 12
+    assert time.monotonic() - begin >= 0.045
+    assert 0.0 <= made.late <= made.latest
+
+
+def test_a_paused_playback_stands_still(bag: Bag) -> None:
+    """Messages can be taken one by one; the position is that of the last one."""
+    made = playback(bag, rate=1.0)
+    made.pause(True)
+    assert not made.is_running
+    made.take()
+    (message,) = made.take()
+    position = made.position
+    time.sleep(0.01)
+    assert made.position == position == message.received
+    made.pause(False)
+    assert made.is_running
+    time.sleep(0.01)
+    assert made.position > position
+
+
+def test_a_playback_loops_or_ends(bag: Bag) -> None:
+    """At the end it begins again, or stays at the last message."""
+    made = playback(bag, rate=0.0)
+    first = played(made)
+    made.finish(loop=True)
+    assert (made.loops, made.is_ended) == (1, False)
+    assert played(made) == first
+    made.finish(loop=False)
+    assert made.is_ended
+    assert made.seconds(made.position) == pytest.approx(0.09)

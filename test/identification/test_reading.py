@@ -1,4 +1,4 @@
-"""Recordings of any lab give force and motion as they were, or one line that says why not."""
+"""Recordings of any lab give force and motion, or one line with the reason why not."""
 
 from collections.abc import Sequence
 from contextlib import suppress
@@ -55,7 +55,7 @@ def twist(velocity: tuple[float, ...]) -> Any:
 def odometry(
     stamp: int, position: tuple[float, ...], velocity: tuple[float, ...], turn: float = 0.0
 ) -> bytes:
-    """Serialize an Odometry whose body is turned about z; the velocity is in the body."""
+    """Serialize an Odometry with a body rotated about z; the velocity is in the body frame."""
     zero = np.zeros(36)
     return serialized(
         ODOMETRY,
@@ -71,7 +71,7 @@ def serialized(type_name: str, stamp: int, *parts: Any) -> bytes:
 
 
 def moving(type_name: str, stamp: int, depth: float, speed: float) -> bytes:
-    """Serialize what a motion along y is in each type of message."""
+    """Serialize a motion along y in each type of message."""
     if type_name == MOTION:
         return joint_states(stamp, depth, speed)
     if type_name == ODOMETRY:
@@ -132,7 +132,7 @@ def grid(
 
 
 @pytest.mark.parametrize(('axis', 'sign'), [('y', 1.0), ('-y', -1.0), ('x', 0.0)])
-def test_takes_the_axis_asked_for(tmp_path: Path, axis: str, sign: float) -> None:
+def test_the_force_axis_can_be_chosen(tmp_path: Path, axis: str, sign: float) -> None:
     path = small_bag(tmp_path / 'bag', *grid())
     assert_array_equal(
         read_friction_recording(path, force_axis=axis).force, sign * np.arange(11.0)
@@ -140,12 +140,12 @@ def test_takes_the_axis_asked_for(tmp_path: Path, axis: str, sign: float) -> Non
 
 
 @pytest.mark.parametrize('axis', ['', '-', 'w', '--x', 'xy'])
-def test_refuses_an_axis_that_is_none(tmp_path: Path, axis: str) -> None:
+def test_an_invalid_axis_is_rejected(tmp_path: Path, axis: str) -> None:
     with pytest.raises(RecordingError, match='force axis must be'):
         read_friction_recording(tmp_path, force_axis=axis)
 
 
-def test_takes_the_joint_asked_for_and_lists_what_there_is(tmp_path: Path) -> None:
+def test_the_joint_can_be_chosen(tmp_path: Path) -> None:
     path = small_bag(tmp_path / 'bag', *grid(), joint_names=('slide', 'roll'))
     with pytest.raises(RecordingError, match=r"no joint 'insertion'; .* one of roll, slide"):
         read_friction_recording(path)
@@ -163,7 +163,7 @@ def test_motion_is_interpolated_to_the_stamps_of_the_force(tmp_path: Path) -> No
     assert_allclose(read.depth, 0.1005 + 0.001 * np.arange(10), rtol=1e-12)
 
 
-def test_speed_that_is_not_there_is_none_and_said(tmp_path: Path) -> None:
+def test_a_missing_speed_is_reported(tmp_path: Path) -> None:
     wrenches, motions = grid()
     for name, value in (('empty', None), ('nan', float('nan'))):
         path = small_bag(tmp_path / name, wrenches, [(t, d, value) for t, d, _ in motions])
@@ -176,7 +176,7 @@ def test_speed_that_is_not_there_is_none_and_said(tmp_path: Path) -> None:
     assert read.losses == ('/joints moves with the velocity 0, which is left out',)
 
 
-def test_a_speed_that_is_there_mostly_is_taken_where_it_is(tmp_path: Path) -> None:
+def test_samples_without_speed_are_left_out_if_most_have_one(tmp_path: Path) -> None:
     wrenches, motions = grid()
     motions[4] = (40, 0.104, None)
     read = read_friction_recording(small_bag(tmp_path / 'bag', wrenches, motions))
@@ -184,7 +184,7 @@ def test_a_speed_that_is_there_mostly_is_taken_where_it_is(tmp_path: Path) -> No
     assert read.losses == ('1 of /joints without velocity, left out',)
 
 
-def test_samples_that_say_nothing_are_left_out_and_counted(tmp_path: Path) -> None:
+def test_unusable_samples_are_left_out_and_counted(tmp_path: Path) -> None:
     wrenches, motions = grid()
     wrenches[3] = (30, float('nan'))
     wrenches[5], wrenches[6] = wrenches[6], wrenches[5]
@@ -214,7 +214,7 @@ def test_force_without_motion_is_left_out_and_counted(tmp_path: Path) -> None:
         read_friction_recording(later)
 
 
-def test_without_header_stamps_the_time_of_reception_counts(tmp_path: Path) -> None:
+def test_without_header_stamps_the_receive_time_is_used(tmp_path: Path) -> None:
     with BagWriter(tmp_path / 'bag') as writer:
         writer.add_topic('/ft', WRENCH)
         writer.add_topic('/joints', MOTION)
@@ -262,8 +262,8 @@ def test_motion_is_the_same_in_every_type_of_message(tmp_path: Path, type_name: 
     assert read.losses == said.get(type_name, ())
 
 
-def test_the_velocity_of_an_odometry_is_turned_from_the_body(tmp_path: Path) -> None:
-    # Turned by 90 degrees about z, the body moves along its x where the frame has y.
+def test_the_velocity_of_an_odometry_is_rotated_from_the_body_frame(tmp_path: Path) -> None:
+    # The body is rotated by 90 degrees about z: its x is y of the frame.
     motions = [
         (t, odometry(at(t), (0.0, d, 0.0), (v, 0.0, 0.0), np.pi / 2.0)) for t, d, v in grid()[1]
     ]
@@ -272,7 +272,7 @@ def test_the_velocity_of_an_odometry_is_turned_from_the_body(tmp_path: Path) -> 
     assert_allclose(read_friction_recording(path).speed, 0.1, rtol=1e-12)
 
 
-def test_joints_may_change_places_and_come_from_several_publishers(tmp_path: Path) -> None:
+def test_joints_may_change_order_and_publisher(tmp_path: Path) -> None:
     messages = []
     for i in range(11):
         names = ('insertion', 'rotation') if i % 2 else ('rotation', 'insertion')
@@ -300,7 +300,7 @@ def joints(
     )
 
 
-def test_arrays_shorter_than_the_names_are_samples_that_are_missing(tmp_path: Path) -> None:
+def test_arrays_shorter_than_the_names_are_missing_samples(tmp_path: Path) -> None:
     messages = [
         (10 * i, joints(at(10 * i), ('a', 'insertion'), (0.0, 0.1)[: 1 + (i != 4)], (0.0, 0.1)))
         for i in range(11)
@@ -309,7 +309,7 @@ def test_arrays_shorter_than_the_names_are_samples_that_are_missing(tmp_path: Pa
     assert read_friction_recording(path).losses == ('1 of /joints not finite, left out',)
 
 
-def test_messages_that_are_none_are_left_out_and_counted(tmp_path: Path) -> None:
+def test_invalid_messages_are_left_out_and_counted(tmp_path: Path) -> None:
     kind, wrenches = forces()
     wrenches[3] = (30, wrenches[3][1][:-5])
     wrenches[5] = (50, b'')
@@ -325,7 +325,7 @@ def test_messages_that_are_none_are_left_out_and_counted(tmp_path: Path) -> None
     assert read.losses == ('3 of /ft not readable, left out: the first one ends after 71 bytes',)
 
 
-def test_what_lies_beside_the_topics_does_no_harm(tmp_path: Path) -> None:
+def test_topics_of_other_types_do_no_harm(tmp_path: Path) -> None:
     path = small_bag(tmp_path / 'bag', *grid())
     file = path / 'bag_0.mcap'
     with file.open('rb') as stream:
@@ -352,7 +352,7 @@ def test_what_lies_beside_the_topics_does_no_harm(tmp_path: Path) -> None:
     assert read.losses == ()
 
 
-def test_prefers_the_usual_names_and_lists_candidates_otherwise(tmp_path: Path) -> None:
+def test_usual_topic_names_are_preferred(tmp_path: Path) -> None:
     motions = (MOTION, [(t, joint_states(at(t), d, v)) for t, d, v in grid()[1]])
     usual = write(
         tmp_path / 'usual',
@@ -374,7 +374,7 @@ def test_prefers_the_usual_names_and_lists_candidates_otherwise(tmp_path: Path) 
         read_friction_recording(two, wrench_topic='/left/ft')
 
 
-def test_the_last_configuration_of_the_plant_comes_along(tmp_path: Path) -> None:
+def test_the_last_configuration_of_the_plant_is_read(tmp_path: Path) -> None:
     wrenches, motions = grid()
     with BagWriter(tmp_path / 'bag') as writer:
         for topic, kind in (('/ft', WRENCH), ('/joints', MOTION), ('/plant/configuration', TEXT)):
@@ -393,7 +393,7 @@ def test_the_last_configuration_of_the_plant_comes_along(tmp_path: Path) -> None
 def two_clocks(
     path: Path, ahead: float, latency: tuple[float, ...] = (0.002, 0.002), count: int = 500
 ) -> Path:
-    """Write force and motion 4 ms apart, the force stamped by a clock that is ahead [s]."""
+    """Write force and motion every 4 ms, the force stamped by a clock that is ahead [s]."""
     rng = np.random.default_rng(0)
     with BagWriter(path) as writer:
         writer.add_topic('/ft', WRENCH)
@@ -408,10 +408,10 @@ def two_clocks(
 
 
 @pytest.mark.parametrize('ahead', [-3600.0, 0.5, 1e6])
-def test_clocks_that_differ_are_set_to_each_other(tmp_path: Path, ahead: float) -> None:
+def test_different_clocks_are_aligned(tmp_path: Path, ahead: float) -> None:
     read = read_friction_recording(two_clocks(tmp_path / 'bag', ahead))
-    # 2e-3: the 5 % quantiles of 500 latencies scatter by 5e-5 s, and the clock of 1e6 s is told
-    # to the nanosecond; this leaves room for what other generators draw.
+    # 2e-3: the 5 % quantiles of 500 latencies scatter by 5e-5 s, and a clock of 1e6 s is exact
+    # to the nanosecond; this allows for other random numbers.
     assert_allclose(read.clock_offset, ahead, rtol=0.0, atol=2e-3)
     assert_allclose(read.depth, 1e-3 * read.force, atol=2e-3 * 0.25)
     assert f'/ft is stamped {read.clock_offset:.3f} s after /joints: clocks' in read.losses[0]
@@ -421,7 +421,7 @@ def test_clocks_that_differ_are_set_to_each_other(tmp_path: Path, ahead: float) 
 
 
 @pytest.mark.parametrize(('latency', 'said'), [((0.002, 0.002), 0), ((0.002, 0.2), 1)])
-def test_latency_is_not_taken_for_a_clock(
+def test_latency_is_not_corrected_as_a_clock(
     tmp_path: Path, latency: tuple[float, ...], said: int
 ) -> None:
     read = read_friction_recording(two_clocks(tmp_path / 'bag', 0.0, latency))
@@ -430,7 +430,7 @@ def test_latency_is_not_taken_for_a_clock(
     assert len([loss for loss in read.losses if 'may be latency' in loss]) == said
 
 
-def test_receive_times_that_mean_nothing_move_no_stamps(tmp_path: Path) -> None:
+def test_meaningless_receive_times_change_no_stamps(tmp_path: Path) -> None:
     wrenches, motions = grid()
     with BagWriter(tmp_path / 'bag') as writer:
         writer.add_topic('/ft', WRENCH)
@@ -441,7 +441,7 @@ def test_receive_times_that_mean_nothing_move_no_stamps(tmp_path: Path) -> None:
     assert read_friction_recording(tmp_path / 'bag').clock_offset == 0.0
 
 
-def test_refuses_a_time_that_is_none(tmp_path: Path) -> None:
+def test_an_invalid_choice_of_stamps_is_rejected(tmp_path: Path) -> None:
     path = small_bag(tmp_path / 'bag', *grid())
     with pytest.raises(RecordingError, match="time must be one of header, receive, got 'now'"):
         read_friction_recording(path, time='now')
@@ -458,7 +458,7 @@ SECONDS = strategies.integers(-(2**31), 2**31 - 1)
     received=strategies.lists(strategies.integers(0, 2**64 - 1), min_size=8, max_size=8),
     value=strategies.floats(),
 )
-def test_any_stamps_and_values_are_read_or_refused(
+def test_any_stamps_and_values_are_read_or_rejected(
     tmp_path_factory: pytest.TempPathFactory,
     stamps: list[tuple[int, int]],
     received: list[int],
@@ -496,7 +496,7 @@ def test_dense_samples_are_averaged_without_delay(tmp_path: Path) -> None:
     read = read_friction_recording(tmp_path / 'bag')
     assert abs(len(read.time) - 800) <= 2
     begin = read.force[0] / (2.0 * np.pi * frequency)
-    # A mean over a bin of width h is off by (2 pi f h)^2 / 24 = 3e-4, and nothing else.
+    # The mean over a bin of width h has an error of (2 pi f h)^2 / 24 = 3e-4.
     wave = np.sin(2.0 * np.pi * frequency * (read.time + begin))
     assert_allclose(read.force, wave, rtol=0.0, atol=4e-4)
 
@@ -530,7 +530,7 @@ def pressed(path: Path, type_name: str) -> Path:
 
 
 @pytest.mark.parametrize('type_name', [POSE, POINT, ODOMETRY, MOTION])
-def test_reads_an_indentation_from_every_type_of_message(tmp_path: Path, type_name: str) -> None:
+def test_an_indentation_is_read_from_every_type_of_message(tmp_path: Path, type_name: str) -> None:
     path = pressed(tmp_path / 'bag', type_name)
     read = read_indentation_recording(path)
     i = np.arange(11)
@@ -543,7 +543,7 @@ def test_reads_an_indentation_from_every_type_of_message(tmp_path: Path, type_na
     assert_array_equal(turned.force, read.force[:, ::-1] * [-1.0, 1.0])
 
 
-def test_joints_of_an_indentation_may_lack_the_one_across(tmp_path: Path) -> None:
+def test_the_joint_out_of_the_plane_may_be_missing(tmp_path: Path) -> None:
     messages = [(10 * i, joints(at(10 * i), ('z', 'x'), (i, -i), ())) for i in range(11)]
     path = write(tmp_path / 'bag', {'/ft': forces(), '/joint_states': (MOTION, messages)})
     read = read_indentation_recording(path)
@@ -557,6 +557,6 @@ def test_joints_of_an_indentation_may_lack_the_one_across(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize('axes', [('x', 'x'), ('x', '-x'), ('x', 'w')])
-def test_refuses_a_plane_that_is_none(tmp_path: Path, axes: tuple[str, str]) -> None:
+def test_an_invalid_plane_is_rejected(tmp_path: Path, axes: tuple[str, str]) -> None:
     with pytest.raises(RecordingError, match=r'axes must be two different|axis of the plane must'):
         read_indentation_recording(tmp_path, axes=axes)

@@ -1,4 +1,4 @@
-"""The value that identification works on is what it claims to be."""
+"""Recordings are checked, and cannot be changed."""
 
 from typing import Any
 
@@ -23,12 +23,12 @@ def recording(**changes: Any) -> Recording:
         ({'time': np.array([0.0, 1.0, 1.0])}, 'time must increase strictly'),
     ],
 )
-def test_refuses_what_is_not_a_recording(changes: dict[str, FloatArray], complaint: str) -> None:
+def test_invalid_arrays_are_rejected(changes: dict[str, FloatArray], complaint: str) -> None:
     with pytest.raises(ShapeError, match=complaint):
         recording(**changes)
 
 
-def test_holds_a_copy_that_cannot_change() -> None:
+def test_a_recording_is_a_read_only_copy() -> None:
     force = np.zeros(3)
     made = recording(force=force)
     force[0] = 1.0
@@ -38,11 +38,11 @@ def test_holds_a_copy_that_cannot_change() -> None:
 
 
 @pytest.mark.parametrize('text', ['', 'a: [', 'just words', '{"/plant": 3}', '[1, 2]'])
-def test_knows_no_truth_without_a_parameter_file(text: str) -> None:
+def test_without_a_parameter_file_there_are_no_true_values(text: str) -> None:
     assert recording(configuration=text).truth is None
 
 
-def test_reads_the_truth_from_the_configuration_of_the_plant() -> None:
+def test_true_values_come_from_the_configuration_of_the_plant() -> None:
     text = '/lab/plant:\n  ros__parameters:\n    model.coulomb_friction: 0.56\n'
     assert recording(configuration=text).truth == {'model.coulomb_friction': 0.56}
 
@@ -51,6 +51,17 @@ def test_only_speed_may_be_missing() -> None:
     assert recording(speed=None).speed is None
     with pytest.raises(ShapeError, match='force must have the shape'):
         recording(force=None)
+
+
+def test_without_depth_the_speed_is_integrated() -> None:
+    made = Recording(time=[0.0, 1.0, 3.0], speed=[0.0, 1.0, 1.0], force=[0.0, 0.0, 0.0])  # type: ignore[arg-type]
+    assert made.depth.tolist() == [0.0, 0.5, 2.5]
+    with pytest.raises(ShapeError, match='speed or depth must be given'):
+        Recording(time=np.arange(3.0), force=np.zeros(3))
+
+
+def test_the_repr_is_one_short_line() -> None:
+    assert repr(recording()) == '<Recording it: 3 samples in 2 s>'
 
 
 def test_an_indentation_has_two_components_and_one_across() -> None:
@@ -67,3 +78,4 @@ def test_an_indentation_has_two_components_and_one_across() -> None:
     for name, wrong in (('force', np.zeros(3)), ('off_plane', np.zeros((3, 1)))):
         with pytest.raises(ShapeError, match=f'{name} must have the shape'):
             IndentationRecording(name='it', **{**fields, name: wrong})
+    assert IndentationRecording(**{**fields, 'off_plane': None}).off_plane.tolist() == [0.0] * 3

@@ -1,4 +1,4 @@
-"""Friction sample by sample: the same as all at once, and it follows what changes."""
+"""Recursive friction equals the estimate from all samples, and follows changes."""
 
 from dataclasses import replace
 from typing import Any
@@ -33,7 +33,7 @@ def joined(*recordings: Recording) -> Recording:
 
 
 class Weighed(RecursiveFriction):
-    """Keep what was learned, to solve it all at once."""
+    """Keep all samples that were used, to solve them at once."""
 
     def __init__(self, *args: Any) -> None:
         super().__init__(*args)
@@ -44,7 +44,7 @@ class Weighed(RecursiveFriction):
         super()._learn(speed, acceleration, force)
 
 
-def test_equals_weighted_least_squares_of_all_samples_at_once() -> None:
+def test_recursive_estimates_equal_weighted_least_squares() -> None:
     recording = strokes(seed=1)
     running = Weighed(FrictionSettings(), RATE, 3.0)
     for row in zip(recording.time, recording.speed, recording.force, strict=True):
@@ -54,19 +54,19 @@ def test_equals_weighted_least_squares_of_all_samples_at_once() -> None:
     solution = np.linalg.lstsq(root * rows[:, :3], root[:, 0] * rows[:, 3], rcond=None)[0]
     # 1e-7: the condition number of the products, in rounding errors.
     assert_allclose([p.value for p in running.estimate()], solution[:2], rtol=1e-7)
-    # Samples near changes of regime are left out, here as there.
+    # Both leave out the samples near changes of regime.
     assert 0.8 < len(rows) / identify_friction(recording).samples < 1.1
 
 
 @pytest.mark.parametrize('lag', [0.0, 0.004])
-def test_recovers_the_truth_without_noise(lag: float) -> None:
+def test_exact_friction_is_recovered_recursively(lag: float) -> None:
     coulomb, viscous = fed(strokes(lag=lag)).estimate()
     # 1e-4 of the force at the largest speed: the lag is taken up to first order.
     assert_allclose(coulomb.value, COULOMB, rtol=1e-3)
     assert_allclose(viscous.value, VISCOUS, rtol=1e-4)
 
 
-def test_follows_a_step_within_the_forgetting_time() -> None:
+def test_a_step_is_followed_within_the_forgetting_time() -> None:
     slippery = strokes(seed=2, push=0.0)
     rough = strokes(seed=3, push=0.0)
     rough = replace(rough, force=rough.force + 0.2 * np.sign(rough.speed))
@@ -80,7 +80,7 @@ def test_follows_a_step_within_the_forgetting_time() -> None:
     assert COULOMB + 0.05 < slow.value < COULOMB + 0.15
 
 
-def test_intervals_hold_the_truth_as_often_as_they_say() -> None:
+def test_intervals_have_their_coverage() -> None:
     estimates = [fed(strokes(seed=seed)).estimate() for seed in range(40)]
     for k, truth in enumerate((COULOMB, VISCOUS)):
         values, errors = np.array([(e[k].value, e[k].error) for e in estimates]).T
@@ -109,7 +109,7 @@ def test_nothing_is_determined_until_the_motion_determines_it() -> None:
     assert all(p.interval == (-np.inf, np.inf) for p in one_speed)
 
 
-def test_rest_forgets_nothing() -> None:
+def test_nothing_is_forgotten_at_rest() -> None:
     recording = strokes(seed=4)
     rest = replace(
         recording, speed=np.zeros_like(recording.speed), force=np.zeros_like(recording.force)
@@ -118,7 +118,7 @@ def test_rest_forgets_nothing() -> None:
     assert_allclose([p.value for p in other], [p.value for p in one], rtol=1e-9)
 
 
-def test_gaps_and_what_is_not_finite_do_no_harm() -> None:
+def test_gaps_and_values_that_are_not_finite_do_no_harm() -> None:
     recording = strokes(seed=5)
     kept = np.ones(len(recording.time), dtype=bool)
     kept[1500:1700] = False
@@ -130,7 +130,7 @@ def test_gaps_and_what_is_not_finite_do_no_harm() -> None:
         assert abs(found.value - truth) < 4.0 * found.error
 
 
-def test_takes_the_terms_that_were_chosen() -> None:
+def test_the_chosen_terms_are_estimated() -> None:
     settings = FrictionSettings(terms=('coulomb', 'viscous', 'offset', 'direction'))
     found = fed(strokes(seed=6), settings=settings).estimate()
     known = {p.name: p.determined for p in found}
@@ -150,7 +150,7 @@ def test_takes_the_terms_that_were_chosen() -> None:
         ((FrictionSettings(estimator='huber'), RATE, 8.0), "ordinary, got 'huber'"),
     ],
 )
-def test_refuses_what_it_cannot_run_with(
+def test_invalid_rate_forgetting_and_estimator_are_rejected(
     arguments: tuple[FrictionSettings, float, float], complaint: str
 ) -> None:
     with pytest.raises(ParameterError, match=complaint):

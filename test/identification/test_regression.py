@@ -1,4 +1,4 @@
-"""Regression finds what is there, says how well, and says what it cannot tell."""
+"""Regression recovers parameters with valid errors, and marks those it cannot determine."""
 
 from typing import Any
 
@@ -52,7 +52,9 @@ def test_recovers_exactly_without_noise(estimator: str) -> None:
 @pytest.mark.parametrize('estimator', ESTIMATORS)
 @given(scale=st.floats(1e-3, 1e3), column=st.floats(1e-3, 1e3), sign=st.sampled_from([-1.0, 1.0]))
 @settings(max_examples=10, deadline=None)
-def test_units_do_not_matter(estimator: str, scale: float, column: float, sign: float) -> None:
+def test_estimates_scale_with_the_units(
+    estimator: str, scale: float, column: float, sign: float
+) -> None:
     x, y, _ = problem(noise=0.1)
     one = regress(x, y, estimator=estimator, **extras(len(y), (0.0, 1e-3, 0.0)))
     units = np.array([1.0, sign * column, 1.0])
@@ -73,12 +75,12 @@ def test_ordinary_is_least_squares_with_its_textbook_errors() -> None:
     assert_allclose(found.errors, textbook, rtol=0.05)
 
 
-def test_gross_outliers_move_huber_little() -> None:
+def test_huber_is_robust_against_gross_outliers() -> None:
     x, y, rng = problem(noise=0.1)
     struck = rng.random(len(y)) < 0.1
     y = y + np.where(struck, 50.0, 0.0)
     huber, ordinary = regress(x, y, estimator='huber'), regress(x, y)
-    # Four errors: each of the three values stays with the truth.
+    # Each value is within four standard errors of the true one.
     assert (np.abs(huber.values - VALUES) < 4.0 * huber.errors).all()
     assert (huber.errors < 0.1 * ordinary.errors).all()
 
@@ -94,20 +96,20 @@ def test_total_is_not_attenuated_where_ordinary_is() -> None:
         ordinary.append(regress(x, y))
     means = [np.mean([f.values[1] for f in found]) for found in (total, ordinary)]
     errors = np.array([f.errors[1] for f in total])
-    # Variance 1 and noise 0.09, beside the part of the column the others stand for: 8 %.
+    # Variance 1 and noise 0.09, with 8 % of the column explained by the others.
     assert means[1] < 0.95 * VALUES[1]
     assert abs(means[0] - VALUES[1]) < 4.0 * errors.mean() / np.sqrt(50.0)
     # A standard deviation from 50 values is good to 10 %: three of these.
     assert_allclose(np.std([f.values[1] for f in total]), np.sqrt(np.mean(errors**2)), rtol=0.3)
 
 
-def test_total_refuses_columns_of_noise() -> None:
+def test_total_rejects_columns_of_noise() -> None:
     x, y, _ = problem()
     with pytest.raises(IdentificationError, match='noise of the regressors exceeds'):
         regress(x, y, estimator='total', **extras(len(y), (0.0, 1.0, 0.0)))
 
 
-def test_weights_of_the_noise_of_each_group_make_errors_smaller() -> None:
+def test_weighting_by_group_reduces_the_errors() -> None:
     values: dict[str, list[Regression]] = {'ordinary': [], 'weighted': []}
     for seed in range(100):
         x, y, rng = problem(seed)
@@ -123,8 +125,8 @@ def test_weights_of_the_noise_of_each_group_make_errors_smaller() -> None:
 
 
 @pytest.mark.parametrize('estimator', ESTIMATORS)
-def test_intervals_cover_under_correlated_noise(estimator: str) -> None:
-    """Noise of a first-order filter with a memory of 10 samples, regressors that are smooth."""
+def test_intervals_have_their_coverage_for_correlated_noise(estimator: str) -> None:
+    """Noise of a first-order filter with a time constant of 10 samples, and smooth regressors."""
     rng = np.random.default_rng(7)
     n, runs = 1500, 200
     x = np.column_stack([np.sign(np.sin(np.arange(n) / 40.0)), np.sin(np.arange(n) / 90.0)])
@@ -143,7 +145,7 @@ def test_intervals_cover_under_correlated_noise(estimator: str) -> None:
     assert (independent.errors < 0.5 * found.errors).all()
 
 
-def test_samples_that_are_not_used_do_not_matter_but_for_their_place() -> None:
+def test_unused_samples_have_no_influence() -> None:
     x, y, rng = problem(noise=0.1)
     used = rng.random(len(y)) < 0.7
     spoiled = np.where(used, y, 1e6)
@@ -156,7 +158,7 @@ def test_samples_that_are_not_used_do_not_matter_but_for_their_place() -> None:
 
 
 @pytest.mark.parametrize('estimator', ESTIMATORS)
-def test_what_stands_for_one_another_is_not_determined_and_the_rest_is(estimator: str) -> None:
+def test_only_collinear_parameters_are_not_determined(estimator: str) -> None:
     x, y, _ = problem(noise=0.1)
     x = np.column_stack([x, x[:, 0] - 3.0 * x[:, 2]])
     extra = extras(len(y)) | {'regressor_noise': np.zeros(4)}
@@ -172,7 +174,7 @@ def test_what_stands_for_one_another_is_not_determined_and_the_rest_is(estimator
 
 
 @pytest.mark.parametrize(('spread', 'determined'), [(0.05, False), (0.3, True)])
-def test_what_hardly_differs_is_not_determined(spread: float, determined: bool) -> None:
+def test_nearly_collinear_parameters_are_not_determined(spread: float, determined: bool) -> None:
     rng = np.random.default_rng(0)
     speed = 5e-3 * (1.0 + spread * rng.normal(size=1000))
     x = np.column_stack([np.ones(1000), speed])
@@ -186,7 +188,7 @@ def test_a_column_of_zeros_is_not_determined() -> None:
     assert_array_equal(found.determined, [True, True, True, False])
 
 
-def test_wald_test_of_what_is_not_there_is_as_rare_as_it_says() -> None:
+def test_the_p_value_of_the_wald_test_is_uniform_under_the_null_hypothesis() -> None:
     chances = []
     for seed in range(400):
         x, y, rng = problem(seed, n=60, noise=0.1)
@@ -208,7 +210,7 @@ def test_wald_test_of_what_is_not_there_is_as_rare_as_it_says() -> None:
         ({'correlation': 1000}, IdentificationError, 'independent samples, got 0.8'),
     ],
 )
-def test_refuses_what_it_cannot_solve(
+def test_invalid_arguments_are_rejected(
     changes: dict[str, Any],
     error: type[IdentificationError] | type[ParameterError] | type[ShapeError],
     complaint: str,
@@ -218,7 +220,7 @@ def test_refuses_what_it_cannot_solve(
         regress(x, y, **changes)
 
 
-def test_refuses_what_is_not_finite() -> None:
+def test_values_that_are_not_finite_are_rejected() -> None:
     x, y, _ = problem()
     y[7] = np.nan
     with pytest.raises(ShapeError, match='must be finite'):
@@ -241,7 +243,7 @@ def estimates(values: list[float], error: float) -> list[ParameterEstimate]:
     ]
 
 
-def test_statistic_is_the_mean_and_scatter_of_table_1() -> None:
+def test_the_statistic_is_mean_and_standard_deviation_as_in_table_1() -> None:
     found = statistic(estimates([0.5, 0.6, 0.7, 0.6], 0.01))
     assert_allclose(found.mean, 0.6, rtol=1e-12)
     assert_allclose(found.deviation, np.sqrt(0.02 / 3.0), rtol=1e-12)
@@ -251,13 +253,13 @@ def test_statistic_is_the_mean_and_scatter_of_table_1() -> None:
     assert (found.name, found.unit, found.count) == ('coulomb_friction', 'N', 4)
 
 
-def test_statistic_is_no_surer_than_its_recordings_allow() -> None:
+def test_the_standard_error_is_not_below_that_of_the_recordings() -> None:
     found = statistic(estimates([0.6, 0.6], 0.02))
     assert_allclose(found.error, 0.02 / np.sqrt(2.0), rtol=1e-12)
     assert_allclose(found.interval, [0.6 - 2.0 * found.error, 0.6 + 2.0 * found.error])
 
 
-def test_statistic_leaves_out_what_was_not_determined() -> None:
+def test_the_statistic_leaves_out_undetermined_parameters() -> None:
     unknown = ParameterEstimate(name='coulomb_friction', symbol='mu_s', unit='N')
     one = statistic([unknown, *estimates([0.6], 0.02)])
     assert (one.mean, one.deviation, one.error, one.count) == (0.6, None, 0.02, 1)
@@ -266,6 +268,6 @@ def test_statistic_leaves_out_what_was_not_determined() -> None:
     assert np.isnan(none.mean)
 
 
-def test_nothing_has_no_statistic() -> None:
+def test_a_statistic_needs_estimates() -> None:
     with pytest.raises(IdentificationError, match='no recordings'):
         statistic([])

@@ -1,4 +1,4 @@
-"""The result is a parameter file, whole or not there, and numbers are told to their errors."""
+"""The result is a complete parameter file, and numbers are rounded to their errors."""
 
 from math import inf, nan
 from pathlib import Path
@@ -43,7 +43,7 @@ STIFFNESS = StiffnessSummary(
 FRICTION = friction(found('coulomb_friction', 0.5604), found('viscous_friction', 300.014, 0.04))
 
 
-def test_holds_what_was_identified_for_plant_and_controller() -> None:
+def test_the_file_has_the_parameters_of_plant_and_controller() -> None:
     """Both sections hold the means under the names of the nodes' parameters."""
     document = yaml.safe_load(result_yaml(FRICTION, STIFFNESS))
     expected = {
@@ -63,15 +63,15 @@ def test_holds_what_was_identified_for_plant_and_controller() -> None:
         ((None, STIFFNESS), {'model.tissue_stiffness'}),
     ],
 )
-def test_holds_only_what_was_looked_for(
+def test_the_file_has_only_what_was_identified(
     given_: tuple[None, StiffnessSummary] | tuple[FrictionSummary, None], names: set[str]
 ) -> None:
     """Friction alone leaves the stiffness as it is, and the other way around."""
     assert set(yaml.safe_load(result_yaml(*given_))['/**/plant']['ros__parameters']) == names
 
 
-def test_what_the_data_do_not_determine_is_not_set() -> None:
-    """It is said in a comment, and the node keeps its value."""
+def test_undetermined_parameters_are_not_set() -> None:
+    """A comment says so, and the node keeps its value."""
     text = result_yaml(friction(found('coulomb_friction', 0.5), found('viscous_friction', nan)))
     assert list(yaml.safe_load(text)['/**/plant']['ros__parameters']) == ['model.coulomb_friction']
     assert f'# viscous_friction (viscous_friction) is {UNKNOWN}\n' in text
@@ -79,8 +79,8 @@ def test_what_the_data_do_not_determine_is_not_set() -> None:
         result_yaml(friction(found('viscous_friction', nan)))
 
 
-def test_a_mean_outside_the_range_is_moved_to_its_end() -> None:
-    """Negative friction, and a break-away below Coulomb friction, are refused by the model."""
+def test_a_mean_outside_the_range_is_moved_to_the_limit() -> None:
+    """The model rejects negative friction, and breakaway friction below Coulomb friction."""
     values = model_parameters(
         [
             found('coulomb_friction', -0.001),
@@ -91,7 +91,7 @@ def test_a_mean_outside_the_range_is_moved_to_its_end() -> None:
     assert values == {
         'model.coulomb_friction': 0.0,
         'model.breakaway_friction': 1.0,
-        # Break-away has a meaning in this law only.
+        # Only this law has breakaway friction.
         'model.friction_law': 'stribeck',
     }
     constants = {name.removeprefix('model.'): value for name, value in values.items()}
@@ -101,7 +101,7 @@ def test_a_mean_outside_the_range_is_moved_to_its_end() -> None:
 @settings(deadline=None)
 @given(st.floats(1e-12, 1e12))
 def test_a_value_survives_the_file(value: float) -> None:
-    """To seven digits, and as a number: YAML reads 5e-05 as a text."""
+    """Values have seven digits, and are numbers: YAML reads 5e-05 as text."""
     text = result_yaml(friction(found('viscous_friction', value)))
     read = yaml.safe_load(text)['/**/plant']['ros__parameters']['model.viscous_friction']
     assert isinstance(read, float)
@@ -109,8 +109,8 @@ def test_a_value_survives_the_file(value: float) -> None:
     assert abs(read - value) <= 5e-7 * value
 
 
-def test_replaces_the_file_at_once(tmp_path: Path) -> None:
-    """The new text is there whole, and no draft is left."""
+def test_the_file_is_replaced_at_once(tmp_path: Path) -> None:
+    """The file is complete, and no draft is left."""
     path = tmp_path / 'result.yaml'
     path.write_text('old')
     write_result(path, FRICTION)
@@ -126,8 +126,8 @@ def test_replaces_the_file_at_once(tmp_path: Path) -> None:
         ('', 'it is not the name of a file'),
     ],
 )
-def test_names_the_file_that_cannot_be_written(tmp_path: Path, name: str, complaint: str) -> None:
-    """One line that names it; nothing is left behind."""
+def test_a_file_that_cannot_be_written_is_named(tmp_path: Path, name: str, complaint: str) -> None:
+    """The message is one line, and no draft is left."""
     with pytest.raises(ParameterError, match=complaint):
         write_result(tmp_path / name, FRICTION)
     assert not list(tmp_path.iterdir())
@@ -135,8 +135,8 @@ def test_names_the_file_that_cannot_be_written(tmp_path: Path, name: str, compla
 
 @settings(deadline=None)
 @given(st.floats(-1e6, 1e6), st.floats(1e-6, 1e6))
-def test_a_number_is_told_to_two_digits_of_its_error(value: float, error: float) -> None:
-    """What is not told of the value is within a twentieth of its error."""
+def test_a_number_is_rounded_to_two_digits_of_its_error(value: float, error: float) -> None:
+    """The rounding error is at most a twentieth of the standard error."""
     told, reach = measured(value, error).split(' ± ')
     # Half of the second digit of the error, which is 1.0 at least, and rounding of the sum.
     assert abs(float(told) - value) <= max(0.0501 * error, 0.501 if error >= 10.0 else 0.0)
@@ -157,8 +157,8 @@ def test_a_number_is_told_to_two_digits_of_its_error(value: float, error: float)
         (nan, inf, UNKNOWN),
     ],
 )
-def test_a_number_is_told_with_its_unit(value: float, error: float, text: str) -> None:
-    """An error of zero is said, one that is not known is not, and a nan is told in words."""
+def test_a_number_is_written_with_its_unit(value: float, error: float, text: str) -> None:
+    """An error of zero is written, an unknown one is not, and nan is written in words."""
     assert measured(value, error, 'N') == text
 
 

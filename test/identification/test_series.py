@@ -1,4 +1,4 @@
-"""Samples keep their values and their means, in bounded memory."""
+"""A series keeps its samples or their means, in bounded memory."""
 
 from typing import Any
 
@@ -22,7 +22,7 @@ def gathered(stamps: NDArray[np.int64], values: FloatArray, batch: int = 7) -> S
 
 @settings(max_examples=100, deadline=None)
 @given(strategies.lists(strategies.integers(-(10**9), 10**9), min_size=1, max_size=50))
-def test_sparse_samples_are_kept_bit_for_bit_in_order_of_time(numbers: list[int]) -> None:
+def test_sparse_samples_are_kept_exactly(numbers: list[int]) -> None:
     stamps = np.array(numbers) * FINEST
     values = np.random.default_rng(0).normal(size=(len(stamps), 2))
     made = gathered(stamps, values)
@@ -34,13 +34,13 @@ def test_sparse_samples_are_kept_bit_for_bit_in_order_of_time(numbers: list[int]
     assert made.late == np.count_nonzero(np.diff(stamps) < 0)
 
 
-def test_dense_samples_become_means_of_stamps_and_of_values() -> None:
+def test_dense_samples_are_averaged() -> None:
     step = 125_000
     stamps = np.arange(100_000) * step
     made = gathered(stamps, np.asarray(stamps[:, None] * 1e-9, float), batch=1000)
     assert made.width == FINEST
     assert len(made.stamps) == 100_000 * step // FINEST
-    # The mean of a line lies on it, but for the rounding of a stamp to 1 ns.
+    # The mean of a line is on the line, except for rounding of the stamp to 1 ns.
     assert_allclose(made.values[:, 0], made.stamps * 1e-9, rtol=0.0, atol=1e-9)
 
 
@@ -50,7 +50,7 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(series, '_GATHERED', 100)
 
 
-def test_a_long_series_trades_resolution_for_length_and_keeps_the_mean(small: Any) -> None:
+def test_a_long_series_is_averaged_and_keeps_its_mean(small: Any) -> None:
     rng = np.random.default_rng(0)
     stamps = np.arange(5000) * 4_000_000
     values = rng.normal(size=(5000, 1))
@@ -60,12 +60,12 @@ def test_a_long_series_trades_resolution_for_length_and_keeps_the_mean(small: An
         assert len(made.stamps) <= 64
     made.compact()
     assert 20.0 / 64 < made.width * 1e-9 < 2.1 * 20.0 / 64
-    # A bin begins where a multiple of its width does, so that only the ends are not full.
+    # Bins begin at multiples of their width: only the first and the last are not full.
     full = made.values[1:-1, 0]
     assert abs(full.mean() - values.mean()) < 0.02
 
 
-def test_stamps_from_anywhere_take_no_more_memory(small: Any) -> None:
+def test_memory_is_bounded_for_any_stamps(small: Any) -> None:
     rng = np.random.default_rng(0)
     made = Series(1)
     for _ in range(50):

@@ -1,4 +1,4 @@
-"""The stiffness matrix comes out as it went in, and its errors mean what they say."""
+"""The stiffness matrix is recovered, with valid standard errors and confidence intervals."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -41,7 +41,7 @@ def grid(forces: tuple[float, ...] = (1.1, 1.3, 1.5), angles: ArrayLike = EIGHT)
 
 
 def ofs(table: dict[float, FloatArray]) -> Callable[..., Any]:
-    """Return the stiffness at a force as that of the nearest level."""
+    """Return a function that gives the stiffness of the nearest level."""
     return lambda force: table[min(table, key=lambda level: abs(level - force))]
 
 
@@ -61,7 +61,7 @@ def pressed(
     off_plane: float = 0.0,
     rests: bool = True,
 ) -> IndentationRecording:
-    """Press with force vectors in turn; stiffness is a matrix or gives one for a force."""
+    """Press with force vectors in turn; stiffness is a matrix or a function of the force."""
     matrix = stiffness if callable(stiffness) else lambda _force: stiffness
     legs = [(rest, (0.0, 0.0), 1.0)]
     for force in forces:
@@ -118,7 +118,7 @@ def expected(matrix: FloatArray) -> dict[str, float]:
 def turned(
     recording: IndentationRecording, angle: float
 ) -> tuple[IndentationRecording, FloatArray]:
-    """Return the same presses seen from axes turned by an angle, and the turn."""
+    """Return the same presses in rotated axes, and the rotation matrix."""
     c, s = np.cos(angle), np.sin(angle)
     turn = np.array([[c, -s], [s, c]])
     return (
@@ -139,7 +139,7 @@ def matrices(draw: Callable[..., Any]) -> FloatArray:
 
 @given(matrices())
 @hypothesis_settings(max_examples=20, deadline=None)
-def test_recovers_any_matrix_from_exact_presses(matrix: FloatArray) -> None:
+def test_any_matrix_is_recovered_from_exact_presses(matrix: FloatArray) -> None:
     (level,) = identify_stiffness(pressed(matrix, grid((1.2,)))).levels
     # 1e-8: noise below this part of a reading is taken as rounding.
     assert_allclose(level.matrix, matrix, atol=float(1e-8 * np.linalg.norm(matrix)))
@@ -151,7 +151,7 @@ def test_recovers_any_matrix_from_exact_presses(matrix: FloatArray) -> None:
 
 @given(matrices(), st.floats(0.0, 2.0 * np.pi))
 @hypothesis_settings(max_examples=10, deadline=None)
-def test_turning_the_axes_turns_the_matrix(matrix: FloatArray, angle: float) -> None:
+def test_rotating_the_axes_rotates_the_matrix(matrix: FloatArray, angle: float) -> None:
     recording = pressed(matrix, grid((1.2,)))
     (level,) = identify_stiffness(recording).levels
     other, turn = turned(recording, angle)
@@ -163,7 +163,7 @@ def test_turning_the_axes_turns_the_matrix(matrix: FloatArray, angle: float) -> 
     assert_allclose(seen.spring.value, level.spring.value, atol=1e-7)
 
 
-def test_a_quarter_turn_changes_no_error() -> None:
+def test_a_quarter_turn_keeps_the_errors() -> None:
     recording = pressed(TABLE[1.3], grid((1.3,)), noise=1.0)
     (level,) = identify_stiffness(recording).levels
     (seen,) = identify_stiffness(turned(recording, np.pi / 2.0)[0]).levels
@@ -174,25 +174,25 @@ def test_a_quarter_turn_changes_no_error() -> None:
         ('spring', 'spring'),
         ('principal_stiffness_1', 'principal_stiffness_1'),
     ):
-        # 1e-6: a quarter turn exchanges the axes but for rounding.
+        # 1e-6: a quarter turn exchanges the axes, except for rounding.
         assert_allclose(seen[name].value, level[other].value, rtol=1e-6)
         assert_allclose(seen[name].interval, level[other].interval, rtol=1e-6)
 
 
-def test_force_over_length_scales_the_matrix_and_its_errors() -> None:
+def test_units_scale_the_matrix_and_its_errors() -> None:
     recording = pressed(TABLE[1.3], grid((1.3,)), noise=1.0)
     (level,) = identify_stiffness(recording).levels
     larger = replace(recording, force=4.0 * recording.force, position=recording.position / 2.0)
     wide = StiffnessSettings(level_tolerance=0.2, rest_force=0.4)
     (other,) = identify_stiffness(larger, wide).levels
-    # 1e-9: scales by powers of two change no digit but those of rounding floors.
+    # 1e-9: powers of two change only what is rounding.
     assert_allclose(other.matrix, 8.0 * level.matrix, rtol=1e-9)
     assert_allclose(other.curl.interval, 8.0 * np.array(level.curl.interval), rtol=1e-9)
     assert_allclose(other.spring.interval, level.spring.interval, rtol=1e-9)
     assert_allclose(other.angle.interval, level.angle.interval, rtol=1e-9)
 
 
-def test_tissue_stiffness_is_per_length_of_contact() -> None:
+def test_tissue_stiffness_is_per_contact_length() -> None:
     recording = pressed(TABLE[1.5], grid((1.5,)), noise=1.0)
     (level,) = identify_stiffness(recording, StiffnessSettings(contact_length=0.02)).levels
     assert_allclose(level.tissue_stiffness.value, level['k_zz'].value / 0.02)
@@ -220,7 +220,7 @@ def repeats(
     ]
 
 
-def test_intervals_hold_the_truth_as_often_as_they_say(
+def test_intervals_have_their_coverage(
     repeats: tuple[dict[float, FloatArray], list[StiffnessEstimate]],
 ) -> None:
     table, estimates = repeats
@@ -231,16 +231,16 @@ def test_intervals_hold_the_truth_as_often_as_they_say(
             for level, matrix in zip(estimate.levels, table.values(), strict=True)
             for low, high in (level[name].interval,)
         ]
-        # One in 5,000 that 95 % intervals do worse by chance.
+        # Exact 95 % intervals fail this once in 5,000.
         assert sum(inside) >= binom.ppf(2e-4, len(inside), 0.95), name
         if table is TABLE:
             assert sum(inside) <= binom.ppf(1.0 - 2e-4, len(inside), 0.95), name
 
 
-def test_variance_is_near_the_least_possible(
+def test_the_variance_is_near_the_cramer_rao_bound(
     repeats: tuple[dict[float, FloatArray], list[StiffnessEstimate]],
 ) -> None:
-    """The Cramer-Rao bound of whole holds whose zero is known, without drift."""
+    """The bound is that of whole holds with known zero, without drift."""
     table, estimates = repeats
     samples = HOLD * RATE
     rng = np.random.default_rng(1)
@@ -258,7 +258,7 @@ def test_variance_is_near_the_least_possible(
     assert np.mean(ratios) < 1.3
 
 
-def test_zero_is_in_the_interval_of_the_figure_where_it_is_in_that_of_the_curl(
+def test_the_interval_of_the_asymmetry_holds_zero_where_that_of_the_curl_does(
     repeats: tuple[dict[float, FloatArray], list[StiffnessEstimate]],
 ) -> None:
     for estimate in repeats[1]:
@@ -268,7 +268,7 @@ def test_zero_is_in_the_interval_of_the_figure_where_it_is_in_that_of_the_curl(
             assert level.spring.interval[0] <= level.spring.value <= level.spring.interval[1]
 
 
-def test_a_round_tissue_has_no_principal_direction(
+def test_an_isotropic_tissue_has_no_principal_direction(
     repeats: tuple[dict[float, FloatArray], list[StiffnessEstimate]],
 ) -> None:
     table, estimates = repeats
@@ -276,11 +276,11 @@ def test_a_round_tissue_has_no_principal_direction(
     if table is TABLE:
         assert determined == len(estimates) * len(TABLE)
     elif table is ROUND:
-        # One in a hundred by chance; one in 10,000 that there are more than this.
+        # One in a hundred by chance; more than this happens once in 10,000.
         assert determined <= binom.ppf(1.0 - 1e-4, len(estimates) * len(TABLE), 0.01)
 
 
-def test_errors_of_presses_are_those_of_their_scatter() -> None:
+def test_the_errors_of_presses_are_their_scatter() -> None:
     """Also where a slow sensor leaves few independent samples in a hold."""
     forces = grid((1.3,))
     off, error = [], []
@@ -291,11 +291,11 @@ def test_errors_of_presses_are_those_of_their_scatter() -> None:
         presses = identify_stiffness(replace(exact, force=exact.force + 0.02 * noise)).presses
         off.append(presses.force - forces)
         error.append(presses.force_error)
-    # 15 %: 480 values scatter by 3 %, and 40 correlated samples tell their noise to 10 %.
+    # 15 %: 480 values scatter by 3 %, and 40 correlated samples give their noise to 10 %.
     assert_allclose(np.sqrt(np.mean(np.square(error))), np.std(off), rtol=0.15)
 
 
-def test_linear_drift_leaves_no_trace() -> None:
+def test_linear_drift_is_removed() -> None:
     forces = grid()
     still = identify_stiffness(pressed(ofs(TABLE), forces))
     moving = identify_stiffness(
@@ -336,7 +336,7 @@ STAIRS = np.array([[f * np.cos(a), f * np.sin(a)] for a in EIGHT for f in (0.5, 
     ],
     ids=['slow', 'fast', 'scattered', 'short rests and bias', 'stairs'],
 )
-def test_finds_the_presses_of_other_protocols(
+def test_presses_of_other_protocols_are_found(
     forces: FloatArray, options: dict[str, Any], levels: int
 ) -> None:
     matrix = TABLE[1.3]
@@ -367,7 +367,7 @@ def test_uneven_stamps_and_gaps_do_no_harm() -> None:
     assert_allclose(level.matrix, TABLE[1.3], atol=5.0)
 
 
-def test_begins_and_ends_anywhere() -> None:
+def test_a_recording_may_begin_and_end_anywhere() -> None:
     recording = pressed(TABLE[1.3], grid((1.3,)), noise=1.0)
     kept = (recording.time > 0.6) & (recording.time < 7.9)
     cut = IndentationRecording(
@@ -382,7 +382,7 @@ def test_begins_and_ends_anywhere() -> None:
     assert_allclose(level.matrix, TABLE[1.3], atol=5.0)
 
 
-def test_a_press_without_a_hold_is_left_out_and_said() -> None:
+def test_a_press_without_a_hold_is_left_out_and_reported() -> None:
     forces = grid((1.3,))
     exact = pressed(TABLE[1.3], forces)
     force, position = exact.force.copy(), exact.position.copy()
@@ -409,7 +409,7 @@ UNKNOWN_FROM_X = (
 
 
 @pytest.mark.parametrize('noise', [0.0, 1.0])
-def test_motion_along_x_tells_only_what_it_can(noise: float) -> None:
+def test_motion_along_x_determines_one_column(noise: float) -> None:
     along = TABLE[1.3] @ (1e-3, 0.0)
     estimate = identify_stiffness(pressed(TABLE[1.3], [along, -along] * 4, noise=noise))
     (level,) = estimate.levels
@@ -433,7 +433,7 @@ def test_motion_along_x_tells_only_what_it_can(noise: float) -> None:
     ids=['one oblique direction', 'a narrow fan', 'two presses'],
 )
 @pytest.mark.parametrize('noise', [0.0, 1.0])
-def test_too_few_directions_tell_nothing(
+def test_too_few_directions_determine_nothing(
     forces: FloatArray | list[tuple[float, float]], noise: float
 ) -> None:
     (level,) = identify_stiffness(pressed(TABLE[1.3], forces, noise=noise)).levels
@@ -456,7 +456,7 @@ def test_every_estimator_finds_the_matrix(estimator: str) -> None:
         assert errors.max() < 2.0
 
 
-def test_huber_is_not_led_astray_by_one_press() -> None:
+def test_huber_is_robust_against_one_press() -> None:
     exact = pressed(TABLE[1.3], grid((1.3,)), noise=1.0)
     position = exact.position.copy()
     position[np.abs(exact.time - 1.65) < 0.24] += (1e-4, 1e-4)
@@ -471,7 +471,7 @@ def test_huber_is_not_led_astray_by_one_press() -> None:
     assert off['huber'] < off['ordinary'] / 2.0
 
 
-def test_weighted_looks_less_at_noisy_presses() -> None:
+def test_weighted_gives_noisy_presses_less_weight() -> None:
     forces = grid((1.3,), np.tile(EIGHT, 2))
     off: dict[str, list[float]] = {'ordinary': [], 'weighted': []}
     for seed in range(12):
@@ -484,11 +484,11 @@ def test_weighted_looks_less_at_noisy_presses() -> None:
                 replace(exact, force=exact.force + noise), StiffnessSettings(estimator=estimator)
             ).levels
             found.append(level.matrix - TABLE[1.3])
-    # Half the presses have a hundred times the variance: weights leave a fiftieth of it at best.
+    # Half the presses have a hundred times the variance: a fiftieth of it is the best result.
     assert np.var(off['weighted']) < np.var(off['ordinary']) / 5.0
 
 
-def test_a_spring_is_told_from_what_is_none() -> None:
+def test_a_spring_is_distinguished_from_a_tissue_with_curl() -> None:
     skewed = TABLE[1.5] + np.array([[0.0, -150.0], [150.0, 0.0]])
     spring, other = (
         identify_stiffness(pressed(matrix, grid((1.5,)), noise=1.0)).levels[0]
@@ -505,7 +505,7 @@ def test_a_spring_is_told_from_what_is_none() -> None:
     assert loud.words.startswith('undecided')
 
 
-def test_warns_of_what_makes_the_numbers_doubtful() -> None:
+def test_doubtful_results_have_warnings() -> None:
     falling = {1.1: 500.0 * np.eye(2), 1.3: 900.0 * np.eye(2)}
     recording = pressed(ofs(falling), grid((1.1, 1.3), np.arange(3) * 2.0), off_plane=0.3)
     text = '\n'.join(identify_stiffness(recording).warnings)
@@ -519,7 +519,7 @@ def test_warns_of_what_makes_the_numbers_doubtful() -> None:
     assert identify_stiffness(pressed(ROUND[1.1], grid((1.1,)), noise=1.0)).warnings == ()
 
 
-def test_says_where_presses_do_not_follow_one_matrix() -> None:
+def test_presses_that_do_not_follow_one_matrix_are_reported() -> None:
     forces = grid((1.1,))
     stiffer = {1.08: 900.0 * np.eye(2), 1.12: 800.0 * np.eye(2)}
     forces[:4] *= 1.08 / 1.1
@@ -528,7 +528,7 @@ def test_says_where_presses_do_not_follow_one_matrix() -> None:
     assert 'scatter more than their noise' in text
 
 
-def test_tells_what_is_missing() -> None:
+def test_recordings_without_presses_are_rejected() -> None:
     flat = pressed(TABLE[1.1], [(0.05, 0.0)])
     with pytest.raises(IdentificationError, match=r'place: no hold: .* the largest is 0\.05 N'):
         identify_stiffness(flat)
@@ -555,7 +555,7 @@ def test_summary_is_a_column_of_table_2_per_level() -> None:
         for _ in range(4)
     ]
     estimates = [identify_stiffness(pressed(ofs(place), grid())) for place in places]
-    # A place where the robot pressed by a little less, and one level only.
+    # A place with a slightly smaller force, and one level only.
     estimates.append(identify_stiffness(pressed(places[0][1.3], grid((1.29,)))))
     summary = summarize_stiffness(estimates)
     assert_allclose([level.force for level in summary.levels], [1.1, 1.298, 1.5], rtol=1e-6)
@@ -575,7 +575,7 @@ def test_summary_is_a_column_of_table_2_per_level() -> None:
         summarize_stiffness([])
 
 
-def test_what_was_found_is_read_by_name() -> None:
+def test_parameters_are_read_by_name() -> None:
     (level,) = identify_stiffness(pressed(TABLE[1.1], grid((1.1,)))).levels
     assert level['principal_angle'] is level.angle
     assert level['curl'] is level.curl

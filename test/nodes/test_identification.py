@@ -1,4 +1,4 @@
-"""From bags and from running topics to results, parameter files and running nodes."""
+"""The node identifies from bags and running topics, and sets parameters of other nodes."""
 
 import math
 from pathlib import Path
@@ -51,7 +51,7 @@ def call(ros_graph: RosGraph, service: str) -> tuple[bool, str]:
     start = time.monotonic()
 
     def answered() -> bool:
-        # An answer to a client that the other side does not know yet is lost: ask again.
+        # An answer is lost if the server does not know the client yet: ask again.
         if time.monotonic() - start >= 6.0 * len(asked):
             asked.append(client.call_async(Trigger.Request()))
         return any(answer.done() for answer in asked)
@@ -80,7 +80,7 @@ def statuses(message: DiagnosticArray) -> dict[str, dict[str, str]]:
     return {s.name: {v.key: v.value for v in s.values} for s in message.status}
 
 
-def test_identifies_when_activated_and_tells_who_comes_late(
+def test_identifies_when_activated_and_latches_the_result(
     ros_graph: RosGraph, bags: list[str]
 ) -> None:
     """The latched result holds estimate, interval, unit, sample count and quality."""
@@ -101,7 +101,7 @@ def test_identifies_when_activated_and_tells_who_comes_late(
 
 
 def test_publishes_stiffness_by_force(ros_graph: RosGraph, place: str) -> None:
-    """The result at the force asked for, and each entry of the matrix at each, latched."""
+    """The result is latched: k_a at the chosen force, and each entry at each force."""
     parameters = {'bags': [place], 'what': 'stiffness', 'level': 1.5}
     ros_graph.add(IdentificationNode, parameters=parameters)
     late = ros_graph.listen(ros_graph.node('late'), DiagnosticArray, 'stiffness', LATCHED)
@@ -115,7 +115,7 @@ def test_publishes_stiffness_by_force(ros_graph: RosGraph, place: str) -> None:
 def test_its_result_is_a_parameter_file_for_nodes_in_any_namespace(
     ros_graph: RosGraph, bags: list[str], tmp_path: Path
 ) -> None:
-    """Rclpy applies the file to plant and controller wherever they are, and to no other node."""
+    """Rclpy applies the file to plant and controller in any namespace, and to no other node."""
     output = tmp_path / 'friction.yaml'
     ros_graph.add(IdentificationNode, parameters={'bags': bags, 'output': str(output)})
     for name, namespace, expected in (
@@ -137,17 +137,15 @@ def test_its_result_is_a_parameter_file_for_nodes_in_any_namespace(
             assert value == pytest.approx(TRUTH.viscous_friction, rel=0.01)
 
 
-def test_the_service_identifies_and_gives_the_reason_when_it_cannot(ros_graph: RosGraph) -> None:
-    """Failure is an answer of one line, and the node lives on."""
+def test_the_service_gives_the_reason_if_it_fails(ros_graph: RosGraph) -> None:
+    """The answer to a failure is one line, and the node stays active."""
     node = ros_graph.add(IdentificationNode)
     assert call(ros_graph, 'identify') == (False, 'no recordings to identify from')
     assert node.is_active
 
 
-def test_the_service_takes_the_bags_that_are_named_now(
-    ros_graph: RosGraph, bags: list[str]
-) -> None:
-    """A node that runs identifies from other recordings without a new start."""
+def test_the_service_uses_the_present_bags(ros_graph: RosGraph, bags: list[str]) -> None:
+    """A running node identifies from other recordings without a restart."""
     node = ros_graph.add(IdentificationNode, parameters={'bags': bags[:1]})
     assert node.set_parameters([Parameter('bags', value=bags)])[0].successful
     success, message = call(ros_graph, 'identify')
@@ -172,10 +170,10 @@ def test_the_service_takes_the_bags_that_are_named_now(
         ({'forgetting': 0.0}, 'forgetting must be finite, > 0'),
     ],
 )
-def test_refuses_to_start_and_says_why(
+def test_rejects_invalid_parameters_at_start(
     ros_graph: RosGraph, parameters: dict[str, Any], complaint: str
 ) -> None:
-    """A node that cannot do what it was asked to does not become active."""
+    """A node with invalid parameters does not become active."""
     node = ros_graph.add(IdentificationNode, start=False, parameters=parameters)
     assert not node.start()
     assert complaint in node.failure
@@ -184,8 +182,8 @@ def test_refuses_to_start_and_says_why(
 # Running topics.
 
 
-def test_finds_the_friction_of_a_plant_that_runs(ros_graph: RosGraph) -> None:
-    """Against a stand-in that moves, the intervals close around its friction."""
+def test_finds_the_friction_of_a_running_plant(ros_graph: RosGraph) -> None:
+    """With a moving simulated plant, the intervals shrink around its friction."""
     truth = {'coulomb_friction': 0.8, 'viscous_friction': 200.0}
     parameters = {f'model.{name}': value for name, value in truth.items()}
     plant = {'mode': 'robot', 'depth': 0.1, 'rate': 250.0, 'real_time_factor': 4.0}
@@ -211,7 +209,7 @@ def test_finds_the_friction_of_a_plant_that_runs(ros_graph: RosGraph) -> None:
             (float(status[name]['interval_low']), float(status[name]['interval_high']))
             for name, _ in COEFFICIENTS
         ]
-        # Two percent of the truth.
+        # Two percent of the true value.
         return all(
             high - low < 0.04 * truth[name]
             for (name, _), (low, high) in zip(COEFFICIENTS, intervals, strict=True)
@@ -221,7 +219,7 @@ def test_finds_the_friction_of_a_plant_that_runs(ros_graph: RosGraph) -> None:
     assert {status.hardware_id for status in found[-1].status} == {'live'}
     status = statuses(found[-1])
     for name, _ in COEFFICIENTS:
-        # The sensor noise is seeded, what is received is not: the interval, twice as wide.
+        # Which messages arrive is random: twice the interval.
         low, high = (float(status[name][f'interval_{end}']) for end in ('low', 'high'))
         assert abs(truth[name] - (low + high) / 2.0) < high - low
     assert int(status['coulomb_friction']['samples']) > 100
@@ -231,8 +229,8 @@ def test_finds_the_friction_of_a_plant_that_runs(ros_graph: RosGraph) -> None:
     )
 
 
-def test_lives_on_with_messages_that_make_no_sense(ros_graph: RosGraph) -> None:
-    """NaN, stamps that go back, joints that are missing: counted, and the node is active."""
+def test_invalid_messages_are_counted_and_the_node_stays_active(ros_graph: RosGraph) -> None:
+    """NaN, decreasing stamps and missing joints are counted, and the node stays active."""
     node = ros_graph.add(IdentificationNode, parameters={'live': True})
     probe = ros_graph.node('probe')
     joints = probe.create_publisher(JointState, 'joint_states', SENSOR)
@@ -256,11 +254,11 @@ def test_lives_on_with_messages_that_make_no_sense(ros_graph: RosGraph) -> None:
     assert node.is_active
 
 
-# Into running nodes.
+# Parameters of running nodes.
 
 
-def test_applies_what_it_found_to_a_plant_that_runs(ros_graph: RosGraph, bags: list[str]) -> None:
-    """The plant goes on with the identified friction, and the answer names it."""
+def test_applies_the_result_to_a_running_plant(ros_graph: RosGraph, bags: list[str]) -> None:
+    """The plant continues with the identified friction, and the answer names it."""
     plant = ros_graph.add(
         PlantNode, parameters={'rate': 200.0, 'model.coulomb_friction': 2.0, 'mode': 'robot'}
     )
@@ -274,15 +272,15 @@ def test_applies_what_it_found_to_a_plant_that_runs(ros_graph: RosGraph, bags: l
         assert value == pytest.approx(getattr(TRUTH, name), rel=0.01)
 
 
-def test_applies_it_from_process_to_process(ros_graph: RosGraph, bags: list[str]) -> None:
-    """A call that fails, then one that succeeds, with the executor that the nodes have."""
+def test_applies_the_result_to_another_process(ros_graph: RosGraph, bags: list[str]) -> None:
+    """A call fails, a later one succeeds, with the executor of the nodes."""
     ros_graph.start('identification', {'bags': bags, 'apply_to': ['plant']})
     assert call(ros_graph, 'apply') == (False, 'plant: no such node')
     ros_graph.start('plant', {'model.coulomb_friction': 2.0})
     asker = ros_graph.node('asker')
     parameters = asker.create_client(GetParameters, 'plant/get_parameters')
     ros_graph.wait_for(asker, 'plant')
-    # Not at once: the nodes may have yet to find each other.
+    # The nodes may not have found each other yet.
     ros_graph.spin_until(lambda: call(ros_graph, 'apply')[0], 'that the plant takes it')
     answer = parameters.call_async(GetParameters.Request(names=['model.coulomb_friction']))
     ros_graph.spin_until(answer.done, 'the parameter')
@@ -290,8 +288,8 @@ def test_applies_it_from_process_to_process(ros_graph: RosGraph, bags: list[str]
     assert value == pytest.approx(TRUTH.coulomb_friction, rel=0.01)
 
 
-def test_says_what_a_node_does_not_take(ros_graph: RosGraph, place: str) -> None:
-    """A plant that runs keeps its tissue: the answer gives the reason."""
+def test_reports_parameters_that_a_node_rejects(ros_graph: RosGraph, place: str) -> None:
+    """A running plant cannot change its tissue: the answer gives the reason."""
     ros_graph.add(PlantNode, parameters={'rate': 200.0})
     ros_graph.add(IdentificationNode, parameters={'bags': [place], 'what': 'stiffness'})
     success, message = apply(ros_graph, 'plant')
@@ -300,7 +298,7 @@ def test_says_what_a_node_does_not_take(ros_graph: RosGraph, place: str) -> None
     assert 'cannot change while configured' in message
 
 
-def test_has_nothing_to_apply_before_it_found_something(ros_graph: RosGraph) -> None:
+def test_there_is_nothing_to_apply_before_the_first_result(ros_graph: RosGraph) -> None:
     """The answer says so."""
     ros_graph.add(IdentificationNode)
     success, message = call(ros_graph, 'apply')
@@ -308,13 +306,13 @@ def test_has_nothing_to_apply_before_it_found_something(ros_graph: RosGraph) -> 
     assert message.startswith('nothing identified yet')
 
 
-def test_a_node_that_does_not_answer_does_not_keep_it_waiting(
+def test_waits_only_a_limited_time_for_an_answer(
     ros_graph: RosGraph, bags: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The call ends with the reason, and meanwhile the node is at work."""
+    """The call ends with the reason, and the node is not blocked."""
     monkeypatch.setattr('needle_identification.application.ANSWER_TIME', 0.3)
     ros_graph.add(IdentificationNode, parameters={'bags': bags, 'apply_to': ['deaf']})
-    # A node whose executor does not spin has the service, but answers nothing.
+    # A node that does not spin has the service, but does not answer.
     deaf = Node('deaf', context=ros_graph.context)
     try:
         assert apply(ros_graph, 'deaf') == (False, 'deaf: no answer within 0.3 s')

@@ -1,4 +1,4 @@
-"""What is in a bag goes into the graph: every byte, in order, at the pace that was asked for."""
+"""The player publishes every message of a bag, byte for byte, in order, at the right time."""
 
 from collections.abc import Callable
 from functools import cache
@@ -45,18 +45,18 @@ HELD = {'delay': 0.0, 'paused': True}
 
 
 def text(data: str) -> bytes:
-    # Three letters: the middleware fills the last word of a message up, here none is open.
+    # Three letters, so that the middleware adds no padding at the end.
     return serialize_message(String(data=data))
 
 
 @cache
 def joints(position: float) -> bytes:
-    # Once: its gaps hold what was in memory.
+    # Only once: its padding has arbitrary bytes.
     return serialize_message(JointState(name=['insertion'], position=[position]))
 
 
 def small_bag(path: Path, count: int = 20, step: int = 10, extra: str = '') -> Path:
-    """Write two topics, one message of each every ``step`` ms, and what was latched before."""
+    """Write two topics, one message of each every ``step`` ms, and a latched topic before."""
     with BagWriter(path) as bag:
         bag.add_topic('/text', 'std_msgs/msg/String', [OfferedQos(depth=1)])
         offered = OfferedQos('best_effort', 'volatile', 'unknown', 0)
@@ -78,7 +78,7 @@ def small_bag(path: Path, count: int = 20, step: int = 10, extra: str = '') -> P
 
 
 def bytes_of(bag: Path, topic: str) -> list[bytes]:
-    """Return what a bag holds of a topic."""
+    """Return the messages of a topic of a bag."""
     return [
         data
         for batch in Bag(bag).batches(lambda known: known.name == topic)
@@ -87,7 +87,7 @@ def bytes_of(bag: Path, topic: str) -> list[bytes]:
 
 
 class Listener:
-    """Hears topics as bytes, in order, with the time at which each came."""
+    """Receives topics as bytes, in order, with their receive times."""
 
     def __init__(self, ros_graph: RosGraph, **topics: tuple[Any, ...]) -> None:
         self._graph = ros_graph
@@ -119,7 +119,7 @@ def call(
 ) -> tuple[bool, str]:
     client = ros_graph.node('caller').create_client(kind, f'player/{service}')
     ros_graph.spin_until(client.service_is_ready, service)
-    # An answer to a client that the other side does not know yet is lost: a harmless question
+    # An answer is lost if the server does not know the client yet: a harmless request
     # first, until it is answered.
     probe = Trigger.Request() if kind is Trigger else SetBool.Request(data=True)
     if kind is SetBool:
@@ -149,7 +149,7 @@ BOTH = {'text': (String, EVERYTHING), 'joints': (JointState, WEAK)}
 
 @pytest.mark.parametrize('rate', [0.0, 1.0, 20.0])
 def test_plays_every_byte_in_order(ros_graph: RosGraph, tmp_path: Path, rate: float) -> None:
-    """What is heard is what was written, per topic and across topics, at any rate."""
+    """The messages arrive as they were written, in order within and across topics, at any rate."""
     bag = small_bag(tmp_path / 'bag')
     player = play(ros_graph, bag, rate=rate)
     listener = Listener(ros_graph, **BOTH)
@@ -161,7 +161,7 @@ def test_plays_every_byte_in_order(ros_graph: RosGraph, tmp_path: Path, rate: fl
     assert player.diagnose()[2]['messages'] == 42
 
 
-def test_what_is_recorded_of_a_replay_is_the_recording(
+def test_a_recording_of_the_playback_equals_the_recording(
     ros_graph: RosGraph, tmp_path: Path
 ) -> None:
     """Recorder, player, recorder: the second bag holds the bytes of the first."""
@@ -183,15 +183,17 @@ def test_what_is_recorded_of_a_replay_is_the_recording(
     for topic in ('/text', '/joints'):
         assert bytes_of(again, topic) == bytes_of(bag, topic)
     assert bytes_of(again, '/latched')[-1] == text('new')
-    # The player cannot be early: the second bag lasts as long as it must, but for the delivery
+    # The player is never early: the second bag lasts as long as expected, except for the delivery
     # of its first message.
     times = [received for received, _ in read_topic(again, '/text')]
     assert times[-1] - times[0] > 0.9 * 190 * MILLISECOND / 2.0
 
 
 @pytest.mark.parametrize('rate', [0.5, 10.0])
-def test_keeps_the_pace_of_the_recording(ros_graph: RosGraph, tmp_path: Path, rate: float) -> None:
-    """No message is early; the machine may make it late, which the player says."""
+def test_plays_at_the_speed_of_the_recording(
+    ros_graph: RosGraph, tmp_path: Path, rate: float
+) -> None:
+    """No message is early; the player reports delays."""
     step = 20 if rate < 1.0 else 200
     bag = small_bag(tmp_path / 'bag', step=step)
     player = play(ros_graph, bag, rate=rate)
@@ -210,8 +212,8 @@ def test_keeps_the_pace_of_the_recording(ros_graph: RosGraph, tmp_path: Path, ra
     )
 
 
-def test_a_latched_message_reaches_who_comes_late(ros_graph: RosGraph, tmp_path: Path) -> None:
-    """Readers that come after the end get the last latched message, as of the plant itself."""
+def test_a_latched_message_reaches_late_readers(ros_graph: RosGraph, tmp_path: Path) -> None:
+    """Late readers get the last latched message, as from the plant itself."""
     bag = small_bag(tmp_path / 'bag')
     player = ros_graph.add(PlayerNode, parameters={'path': str(bag), 'rate': 0.0, 'delay': 0.0})
     ros_graph.spin_until(lambda: player.diagnose()[2]['messages'] == 42, 'the end')
@@ -222,8 +224,8 @@ def test_a_latched_message_reaches_who_comes_late(ros_graph: RosGraph, tmp_path:
     assert player.diagnose()[1] == f'at the end of {bag}'
 
 
-def test_offers_what_was_offered(ros_graph: RosGraph, tmp_path: Path) -> None:
-    """Best effort, reliable and latched topics are offered as such."""
+def test_offers_the_qos_of_the_recording(ros_graph: RosGraph, tmp_path: Path) -> None:
+    """Topics are offered as best effort, reliable or latched, as in the recording."""
     play(ros_graph, small_bag(tmp_path / 'bag'))
     probe = ros_graph.node('probe')
 
@@ -240,8 +242,8 @@ def test_offers_what_was_offered(ros_graph: RosGraph, tmp_path: Path) -> None:
     assert latched.durability == DurabilityPolicy.TRANSIENT_LOCAL
 
 
-def test_begins_and_ends_where_it_is_told(ros_graph: RosGraph, tmp_path: Path) -> None:
-    """Only what lies between is played, but for what was latched before: it comes first."""
+def test_plays_from_start_to_end(ros_graph: RosGraph, tmp_path: Path) -> None:
+    """Only messages between start and end are played; latched ones from before come first."""
     play(ros_graph, small_bag(tmp_path / 'bag'), rate=0.0, start=0.05, end=0.1)
     listener = Listener(ros_graph, latched=(String, EVERYTHING), text=(String, EVERYTHING))
     listener.wait()
@@ -252,8 +254,8 @@ def test_begins_and_ends_where_it_is_told(ros_graph: RosGraph, tmp_path: Path) -
     assert listener.of('latched') == [text('new')]
 
 
-def test_begins_again_at_the_end(ros_graph: RosGraph, tmp_path: Path) -> None:
-    """With ``loop`` the messages come over and over, whole and in order."""
+def test_loops(ros_graph: RosGraph, tmp_path: Path) -> None:
+    """With ``loop`` all messages are repeated, in order."""
     player = play(ros_graph, small_bag(tmp_path / 'bag', step=1), rate=10.0, loop=True)
     listener = Listener(ros_graph, text=(String, EVERYTHING))
     listener.wait()
@@ -263,8 +265,8 @@ def test_begins_again_at_the_end(ros_graph: RosGraph, tmp_path: Path) -> None:
     assert int(str(player.diagnose()[2]['loops'])) >= 3
 
 
-def test_pauses_steps_and_goes_on(ros_graph: RosGraph, tmp_path: Path) -> None:
-    """A step plays one message and names it; nothing else comes while paused."""
+def test_pauses_steps_and_continues(ros_graph: RosGraph, tmp_path: Path) -> None:
+    """A step plays one message and names it; no other message comes while paused."""
     bag = small_bag(tmp_path / 'bag')
     play(ros_graph, bag, rate=0.0, publish_clock=True, topics=['/text', '/joints'])
     topics = {**BOTH, 'clock': (Clock, WEAK)}
@@ -305,10 +307,8 @@ def _time(since: int) -> Time:
     return clock.clock
 
 
-def test_the_recorded_time_is_the_clock_of_who_wants_it(
-    ros_graph: RosGraph, tmp_path: Path
-) -> None:
-    """With ``publish_clock`` a node with `use_sim_time` lives in the recording, not now."""
+def test_publishes_the_recorded_time_as_clock(ros_graph: RosGraph, tmp_path: Path) -> None:
+    """With ``publish_clock`` a node with `use_sim_time` has the time of the recording."""
     bag = small_bag(tmp_path / 'bag', extra='/clock')
     play(ros_graph, bag, rate=0.1, publish_clock=True)
     node = ros_graph.add(RosNode, 'follower', parameters={'use_sim_time': True})
@@ -321,17 +321,17 @@ def test_the_recorded_time_is_the_clock_of_who_wants_it(
         lambda: node.get_clock().now().nanoseconds >= last - 2 * MILLISECOND, 'the end'
     )
     assert node.get_clock().now().nanoseconds <= last
-    # The clock in the bag says zero; it is not played, and ours never runs back.
+    # The clock in the bag is zero and not played; the published one never goes back.
     times = [deserialize_message(data, Clock).clock for data in listener.of('clock')]
     stamps = [at.sec * 10**9 + at.nanosec for at in times]
     assert stamps[0] >= EPOCH
     assert all(late > early for early, late in pairwise(stamps))
-    # Beside the 20 times at which messages came, many between: two seconds are 2000 ticks.
+    # Many more than the 20 times of messages: two seconds are 2000 ticks.
     assert len(stamps) > 100
 
 
-def test_the_pace_changes_while_playing(ros_graph: RosGraph, tmp_path: Path) -> None:
-    """``rate`` is live, and refused when it is none."""
+def test_the_rate_can_change_while_playing(ros_graph: RosGraph, tmp_path: Path) -> None:
+    """``rate`` can change at run time; an invalid rate is rejected."""
     player = play(ros_graph, small_bag(tmp_path / 'bag', step=60_000), rate=1.0)
     listener = Listener(ros_graph, text=(String, EVERYTHING))
     listener.wait()
@@ -350,7 +350,7 @@ def test_the_pace_changes_while_playing(ros_graph: RosGraph, tmp_path: Path) -> 
 def test_a_recording_that_is_cut_off_is_played_as_far_as_it_goes(
     ros_graph: RosGraph, tmp_path: Path
 ) -> None:
-    """What can be read is played; what is missing is said in the end."""
+    """The readable part is played; the losses are reported at the end."""
     bag = small_bag(tmp_path / 'bag', count=600, step=1)
     file = bag / 'bag_0.mcap'
     content = file.read_bytes()
@@ -371,11 +371,11 @@ def test_a_recording_that_is_cut_off_is_played_as_far_as_it_goes(
 
 
 def test_plays_sqlite_and_bare_files(ros_graph: RosGraph, tmp_path: Path) -> None:
-    """Recordings of other tools are played, with what they know of the quality of service."""
+    """Recordings of other tools are played, with the QoS that they stored."""
     store = get_typestore(Stores.ROS2_JAZZY)
     with Writer(tmp_path / 'bag', version=8, storage_plugin=StoragePlugin.SQLITE3) as writer:
         connection = writer.add_connection('/text', 'std_msgs/msg/String', typestore=store)
-        # The later one first: it is played in the order of time.
+        # The later message first: messages are played in order of time.
         for k in (1, 0, 2):
             writer.write(connection, EPOCH + k * MILLISECOND, text(f'{k:03d}'))
     play(ros_graph, next((tmp_path / 'bag').glob('*.db3')), rate=0.0)
@@ -386,10 +386,10 @@ def test_plays_sqlite_and_bare_files(ros_graph: RosGraph, tmp_path: Path) -> Non
     assert listener.of('text') == [text('000'), text('001'), text('002')]
 
 
-def test_a_type_that_is_not_installed_is_left_out_and_said(
+def test_a_type_that_is_not_installed_is_left_out_and_reported(
     ros_graph: RosGraph, tmp_path: Path
 ) -> None:
-    """The rest is played."""
+    """The other topics are played."""
     path = tmp_path / 'bag'
     path.mkdir()
     foreign_bag(path / 'bag_0.mcap')
@@ -401,7 +401,7 @@ def test_a_type_that_is_not_installed_is_left_out_and_said(
 
 
 def foreign_bag(file: Path) -> None:
-    """Write a message of a type that is installed, and one of a type that is not."""
+    """Write a message of an installed type, and one of a type that is not installed."""
     with file.open('wb') as stream:
         writer = McapWriter(stream)
         writer.start('ros2')
@@ -412,8 +412,8 @@ def foreign_bag(file: Path) -> None:
         writer.finish()
 
 
-def test_another_publisher_of_a_topic_is_said(ros_graph: RosGraph, tmp_path: Path) -> None:
-    """Readers would get both: /diagnostics warns, and it is played all the same."""
+def test_another_publisher_of_a_topic_is_reported(ros_graph: RosGraph, tmp_path: Path) -> None:
+    """Readers get both: /diagnostics warns, and the topic is played."""
     probe = ros_graph.node('probe')
     probe.create_publisher(JointState, 'joints', SENSOR)
     player = play(ros_graph, small_bag(tmp_path / 'bag'))
@@ -439,14 +439,14 @@ def test_another_publisher_of_a_topic_is_said(ros_graph: RosGraph, tmp_path: Pat
         ({'publish_clock': True, 'use_sim_time': True}, 'cannot both be true'),
     ],
 )
-def test_refuses_to_start_and_says_why(
+def test_rejects_invalid_parameters_at_start(
     ros_graph: RosGraph,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     parameters: dict[str, Any],
     complaint: str,
 ) -> None:
-    """Bad input is named in one line, and nothing is played."""
+    """The reason is one line, and nothing is played."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / 'empty').mkdir()
     small_bag(Path('bag'))
@@ -456,7 +456,9 @@ def test_refuses_to_start_and_says_why(
     assert '\n' not in node.failure
 
 
-def test_a_recording_of_unknown_types_only_is_refused(ros_graph: RosGraph, tmp_path: Path) -> None:
+def test_a_recording_of_unknown_types_only_is_rejected(
+    ros_graph: RosGraph, tmp_path: Path
+) -> None:
     """There is nothing to play, and the reason is given."""
     foreign_bag(tmp_path / 'bag.mcap')
     parameters = {'path': str(tmp_path / 'bag.mcap'), 'topics': ['/foreign']}
@@ -477,9 +479,7 @@ def process(ros_graph: RosGraph, bag: Path, *settings: str) -> subprocess.Popen[
     )
 
 
-def test_the_process_ends_well_when_all_is_played_and_delivered(
-    ros_graph: RosGraph, tmp_path: Path
-) -> None:
+def test_the_process_ends_when_all_is_delivered(ros_graph: RosGraph, tmp_path: Path) -> None:
     """As `ros2 bag play`: exit status 0 at the end, and the reader has every message."""
     bag = small_bag(tmp_path / 'bag')
     listener = Listener(ros_graph, text=(String, EVERYTHING))
@@ -494,10 +494,8 @@ def test_the_process_ends_well_when_all_is_played_and_delivered(
     assert listener.of('text') == bytes_of(bag, '/text')
 
 
-def test_the_process_stays_if_it_shall_and_ends_with_ctrl_c(
-    ros_graph: RosGraph, tmp_path: Path
-) -> None:
-    """Without ``exit_at_end`` latched messages stay to be had; SIGINT ends it with status 0."""
+def test_the_process_stays_without_exit_at_end(ros_graph: RosGraph, tmp_path: Path) -> None:
+    """Without ``exit_at_end`` latched messages remain available; SIGINT ends it with status 0."""
     bag = small_bag(tmp_path / 'bag')
     probe = ros_graph.node('probe')
     with process(ros_graph, bag, 'rate:=0.0', 'delay:=0.0', 'exit_at_end:=false') as player:
@@ -510,7 +508,7 @@ def test_the_process_stays_if_it_shall_and_ends_with_ctrl_c(
     assert player.returncode == 0, said
 
 
-def test_the_process_says_why_it_does_not_start(ros_graph: RosGraph, tmp_path: Path) -> None:
+def test_the_process_reports_why_it_does_not_start(ros_graph: RosGraph, tmp_path: Path) -> None:
     """Exit status 2 and one line."""
     with process(ros_graph, tmp_path / 'none') as player:
         _, said = player.communicate(timeout=60.0)

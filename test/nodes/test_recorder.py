@@ -1,4 +1,4 @@
-"""What is on the wire is in the bag, whatever ends the recorder."""
+"""The bag holds the messages byte for byte, however the recorder ends."""
 
 from collections.abc import Callable, Iterator
 import errno
@@ -44,7 +44,7 @@ def call(ros_graph: RosGraph, service: str) -> tuple[bool, str]:
     return answer.result().success, answer.result().message
 
 
-def test_records_each_topic_as_it_is_offered(
+def test_records_each_topic_with_its_offered_qos(
     ros_graph: RosGraph, record: Callable[..., Any], tmp_path: Path
 ) -> None:
     """Best effort, reliable and latched topics are all complete, to the byte."""
@@ -94,7 +94,7 @@ def test_records_each_topic_as_it_is_offered(
     assert offered['/latched']['durability'] == 'transient_local'
 
 
-def test_stores_the_bytes_of_the_wire(
+def test_stores_messages_byte_for_byte(
     ros_graph: RosGraph,
     record: Callable[..., Any],
     tmp_path: Path,
@@ -111,10 +111,10 @@ def test_stores_the_bytes_of_the_wire(
     assert written[0][:2] == ('/text', serialize_message(String(data='as it is')))
 
 
-def test_a_publisher_that_offers_less_is_recorded_too(
+def test_a_publisher_with_weaker_qos_is_recorded_too(
     ros_graph: RosGraph, record: Callable[..., Any], tmp_path: Path
 ) -> None:
-    """A best-effort publisher that joins a reliable topic makes the recorder ask for less."""
+    """A best-effort publisher that joins a reliable topic makes the recorder request less."""
     probe = ros_graph.node('probe')
     reliable = probe.create_publisher(String, 'text', COMMAND)
     node = record(tmp_path / 'bag', topics=['text'])
@@ -123,7 +123,7 @@ def test_a_publisher_that_offers_less_is_recorded_too(
     ros_graph.spin_until(weak.get_subscription_count, 'the new subscription')
 
     def both_recorded() -> bool:
-        # Again and again: each publisher finds the new subscription in its own time.
+        # Repeatedly: each publisher finds the new subscription at another time.
         weak.publish(String(data='weak'))
         reliable.publish(String(data='strong'))
         if not node.diagnose()[2]['messages']:
@@ -135,10 +135,10 @@ def test_a_publisher_that_offers_less_is_recorded_too(
     node.stop()
 
 
-def test_a_topic_of_a_type_it_cannot_describe_is_left_out_and_named_once(
+def test_a_topic_of_an_unknown_type_is_left_out_and_named_once(
     ros_graph: RosGraph, record: Callable[..., Any], tmp_path: Path
 ) -> None:
-    """What cannot be recorded is said once, and the rest is recorded."""
+    """A topic that cannot be recorded is reported once; the others are recorded."""
     probe = ros_graph.node('probe')
     logs = ros_graph.listen(probe, Log, '/rosout', 100)
     goals = probe.create_publisher(Goals, 'goals', COMMAND)
@@ -146,7 +146,7 @@ def test_a_topic_of_a_type_it_cannot_describe_is_left_out_and_named_once(
     node = record(tmp_path / 'bag', topics=['goals', 'text'])
     ros_graph.spin_until(text.get_subscription_count, 'subscription')
     reports = ros_graph.listen(probe, DiagnosticArray, '/diagnostics', 10)
-    # Once a second: ten looks at the graph.
+    # The recorder checks the graph ten times a second.
     ros_graph.spin_until(lambda: len(reports) >= 2, 'a few more looks')
     assert set(node.diagnose()[2]) == {'messages', 'bytes', '/text'}
     assert goals.get_subscription_count() == 0
@@ -154,7 +154,7 @@ def test_a_topic_of_a_type_it_cannot_describe_is_left_out_and_named_once(
     assert said.startswith('/goals left out: no definition of nav_msgs/msg/Goals')
 
 
-def test_stops_and_starts_again_in_a_new_folder(
+def test_a_second_recording_goes_to_a_new_folder(
     ros_graph: RosGraph, record: Callable[..., Any], tmp_path: Path
 ) -> None:
     """Services end one recording, complete, and begin the next."""
@@ -182,14 +182,14 @@ def test_stops_and_starts_again_in_a_new_folder(
         ),
     ],
 )
-def test_refuses_to_start_and_says_why(
+def test_rejects_invalid_parameters_at_start(
     ros_graph: RosGraph,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     parameters: dict[str, str],
     complaint: str,
 ) -> None:
-    """A recorder that cannot record does not become active."""
+    """A recorder with invalid parameters does not become active."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / 'here').mkdir()
     node = ros_graph.add(RecorderNode, start=False, parameters=parameters)
@@ -197,13 +197,13 @@ def test_refuses_to_start_and_says_why(
     assert complaint in node.failure
 
 
-def test_an_error_of_the_disk_ends_the_recording_and_is_reported(
+def test_a_disk_error_ends_the_recording_and_is_reported(
     ros_graph: RosGraph,
     record: Callable[..., Any],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """A full disk stops the recording, not the node, and /diagnostics says so."""
+    """A full disk stops the recording, not the node, and /diagnostics reports it."""
     probe = ros_graph.node('probe')
     publisher = probe.create_publisher(String, 'text', COMMAND)
     reports = ros_graph.listen(probe, DiagnosticArray, '/diagnostics', 10)
@@ -233,8 +233,8 @@ def publish(ros_graph: RosGraph, node: Node, count: int) -> None:
         time.sleep(0.01)
 
 
-def test_what_was_recorded_survives_kill_9(ros_graph: RosGraph, tmp_path: Path) -> None:
-    """After SIGKILL all is there but the last half second, and the folder is not complete."""
+def test_recorded_messages_survive_kill_9(ros_graph: RosGraph, tmp_path: Path) -> None:
+    """After SIGKILL only the last half second is missing, and the folder is incomplete."""
     process = ros_graph.start('recorder', {'path': str(tmp_path / 'bag')}).process
     publish(ros_graph, ros_graph.node('probe'), 200)
     process.kill()
@@ -242,7 +242,7 @@ def test_what_was_recorded_survives_kill_9(ros_graph: RosGraph, tmp_path: Path) 
     assert not (tmp_path / 'bag' / 'metadata.yaml').exists()
     data = [message.data for _, message in read_topic(tmp_path / 'bag', '/text')]
     assert data == [str(i) for i in range(len(data))]
-    # Half a second is 50 messages; as much again for a machine that is busy.
+    # Half a second is 50 messages; twice that for a busy machine.
     assert len(data) >= 100
 
 

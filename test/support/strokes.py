@@ -1,4 +1,4 @@
-"""Recordings of strokes by the equations alone: friction, a base with limits, a sensor."""
+"""Recordings of strokes from the equations: friction, a base with limits, a sensor."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ NOISE = 0.02
 
 @lru_cache(maxsize=16)
 def motion(speeds: tuple[float, ...] = SPEEDS, push: float = 1.0) -> Any:
-    """Speed [m/s] and force of a push [N]: it rises to its end in 1.5 s, then strokes come."""
+    """Return speed [m/s] and force of a push [N] that rises for 1.5 s, before the strokes."""
     rise = np.maximum(np.arange(1, 1701) * STEP - 0.2, 0.0) / 1.5 * push
     rise = rise if push else rise[:0]
     pushed = np.maximum(rise - COULOMB, 0.0) / VISCOUS
@@ -32,7 +32,7 @@ def motion(speeds: tuple[float, ...] = SPEEDS, push: float = 1.0) -> Any:
         for _ in range(round(duration / STEP)):
             change = np.clip(target - speed, -ACCELERATION * STEP, ACCELERATION * STEP)
             speed = speed + change
-            # Speeds come to rest, not to rounding errors.
+            # No rounding errors at rest.
             speed = 0.0 if abs(speed) < 1e-12 else speed
             rows.append(speed)
     return np.concatenate([pushed, rows]), rise
@@ -51,20 +51,20 @@ def strokes(
     noise: float = NOISE,
     cutoff: float = 125.0,
 ) -> Recording:
-    """Record strokes; with a seed through a noisy sensor of second order, else as they are."""
+    """Record strokes; with a seed through a noisy sensor of second order, else exactly."""
     speed, rise = motion(speeds, push)
     time = np.asarray(STEP * np.arange(1, len(speed) + 1), float)
     more = 1.0 + (breakaway - 1.0) * np.exp(-((speed / 1e-3) ** 2))
     force = COULOMB * more * np.sign(speed) + VISCOUS * speed
     force = np.where(speed < 0.0, withdrawal, 1.0) * force + mass * np.gradient(speed, STEP)
-    # Until it moves, the push is what the sensor feels.
+    # Until the needle moves, the sensor measures the push.
     force[: len(rise)] = np.where(speed[: len(rise)] > 0.0, force[: len(rise)], rise)
     force = np.interp(time - lag, time, force) + offset
     if seed is not None:
         force = force + np.random.default_rng(seed).normal(scale=noise, size=len(force))
         b, a = butter(2, cutoff, fs=1.0 / STEP)
         force = np.round(lfilter(b, a, force) / 0.0025) * 0.0025
-    # The inserted length at the samples whose mean speed lies around them.
+    # The inserted length at the samples: half a step before the sum of speeds.
     depth = 0.1 + STEP * (np.cumsum(speed) - 0.5 * speed)
     kept = slice(EVERY - 1, None, EVERY)
     return Recording(
