@@ -25,8 +25,8 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
         type=float,
         default=TOLERANCE,
         metavar='PART',
-        help='of the largest value of a kind, that a difference may be; what is rounded to counts '
-        f'may be off by one, too (default {TOLERANCE:g})',
+        help='largest difference, relative to the largest value of its topic and unit; a value '
+        f'that is rounded to counts may also differ by one count (default {TOLERANCE:g})',
     )
     parser.add_argument('--json', action='store_true', help='print JSON instead of a table')
 

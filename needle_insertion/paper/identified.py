@@ -32,7 +32,7 @@ from tqdm import tqdm
 
 _HEADS: Final = (
     *('quantity', 'paper: mean ± STD', 'found: mean ± STD', '95 % of the mean'),
-    *('95 % of the STD', 'truth held', 'verdict'),
+    *('95 % of the STD', 'true value inside', 'verdict'),
 )
 
 #: The unit that each table does not print.
@@ -200,16 +200,16 @@ class IdentifiedTable:
 
     @property
     def holds(self) -> bool:
-        """Whether the recordings agree with the paper and with their own true values."""
+        """Whether the recordings agree with the paper and with their true values."""
         return self.truth.is_enough and all(line.holds for line in self.lines)
 
     @property
     def words(self) -> str:
-        """How many intervals hold their own true value."""
+        """How many intervals contain their true value."""
         truth = self.truth
         return (
-            f'95 % intervals of the {len(self.bags)} bags that hold their own true value: '
-            f'{truth.held} of {truth.known} (at least {truth.least} but for 1 % chance): '
+            f'{truth.held} of {truth.known} intervals (95 %) contain the true value of their bag; '
+            f'at least {truth.least} are expected with 99 % probability: '
             f'{verdict(truth.is_enough)}'
         )
 
