@@ -403,7 +403,7 @@ def test_a_flood_of_commands_does_not_stop_the_samples(ros_graph: RosGraph) -> N
 
     def warned() -> bool:
         flood()
-        return any('commands come per second' in m.status[0].message for m in health)
+        return any('commands per second for' in m.status[0].message for m in health)
 
     ros_graph.spin_until(warned, 'the warning')
     first = len(samples)

@@ -465,6 +465,8 @@ def test_a_trajectory_sent_before_the_activation_begins_with_it(ros_graph: RosGr
         # Only the newest command counts: this one, refused, tells that the first was taken.
         course.publish(trajectory(['insertion']))
         ros_graph.spin_until(partial(has_refused_one, plant), 'the refusal')
+        (sender,) = (p for p in plant.publishers if p.topic_name.endswith('base_wrench'))
+        ros_graph.spin_until(sender.get_subscription_count, 'the reader')
         plant.trigger_activate()
         ros_graph.spin_until(partial(has, wrenches, 150), 'readings')
         runs.append([message.wrench.force.y for message in wrenches[:150]])
