@@ -39,11 +39,11 @@ from needle_dynamics import (
 from needle_dynamics.compiled.cache import announce_compilation
 from needle_dynamics.model_node import ModelNode
 from needle_ros import contract
-from needle_ros.base_node import run
 from needle_ros.errors import (
     NeedleError,
     ParameterError,
 )
+from needle_ros.run_node import run
 from needle_ros.timing import NANOSECONDS, nanoseconds, seconds
 from needle_ros.trajectories import joint_values
 from needle_ros.wire import Reading

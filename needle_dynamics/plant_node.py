@@ -19,10 +19,10 @@ from needle_dynamics.model_node import ModelNode
 from needle_dynamics.simulated.assembly import MODES, SETTINGS
 from needle_dynamics.simulated.faults import Fault, FaultParameters, FAULTS, FAULTY
 from needle_dynamics.simulated.plant import Plant, Sample
-from needle_dynamics.simulated.run import Event, PlantRun
+from needle_dynamics.simulated.run import Event, PARAMETERS, PlantRun, RESET, TARE, TRAJECTORY
 from needle_ros import contract
-from needle_ros.base_node import run
 from needle_ros.errors import JobError, NeedleError, ParameterError
+from needle_ros.run_node import run
 from needle_ros.sample_clock import SampleClock
 from needle_ros.timing import NANOSECONDS, RateCounter, seconds
 from needle_ros.wire import Reading
@@ -225,7 +225,7 @@ class PlantNode(ModelNode):
 
         """
         if self._run is not None:
-            self._run.change(changes)
+            self._run.perform(Event(PARAMETERS, changes))
         if any(name.startswith('fault.') for name in changes):
             self._set_fault(changes)
 
@@ -267,10 +267,10 @@ class PlantNode(ModelNode):
         self._command_rate.add(monotonic_ns())
         _, force, _, torque, _, _ = reading.values[0]
         commands, now = self._run.commands, self._time.simulated(self.now())
-        answer = commands.offer(reading.stamp, reading.frame, force, torque, now)
-        if answer.complaint:
-            self.get_logger().error(answer.complaint, throttle_duration_sec=1.0)
-        if answer.counts and self._time.awaited is not None:
+        counts, complaint = commands.offer(reading.stamp, reading.frame, force, torque, now)
+        if complaint:
+            self.get_logger().error(complaint, throttle_duration_sec=1.0)
+        if counts and self._time.awaited is not None:
             self._time.answered(commands.newest.stamp)
             self._on_timer()
 
@@ -285,12 +285,13 @@ class PlantNode(ModelNode):
             if self._run is None:
                 raise ParameterError('the plant is not configured')
             points = message.points
-            self._run.follow(
-                list(message.joint_names),
-                [seconds(point.time_from_start) for point in points],
-                [list(point.positions) for point in points],
-                [list(point.effort) for point in points],
-            )
+            content = {
+                'joints': list(message.joint_names),
+                'times': [seconds(point.time_from_start) for point in points],
+                'positions': [list(point.positions) for point in points],
+                'efforts': [list(point.effort) for point in points],
+            }
+            self._run.perform(Event(TRAJECTORY, content))
         except ParameterError as error:
             self._refused_trajectories += 1
             self.get_logger().error(f'joint_trajectory: {error}')
@@ -311,7 +312,7 @@ class PlantNode(ModelNode):
 
     def _on_tare(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         def tare(plant_run: PlantRun) -> str:
-            plant_run.tare()
+            plant_run.perform(Event(TARE))
             return 'the force sensor is zeroed'
 
         return self._answer(response, 'tare', tare)
@@ -335,7 +336,7 @@ class PlantNode(ModelNode):
 
     def _on_reset(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         def reset(plant_run: PlantRun) -> str:
-            plant_run.reset()
+            plant_run.perform(Event(RESET))
             self._halted = None
             self._set_fault({})
             return 'needle and noise are reset; time continues'

@@ -28,8 +28,9 @@ from needle_identification.stiffness.identify import identify_stiffness
 from needle_identification.stiffness.settings import StiffnessSettings
 from needle_identification.stiffness.summary import StiffnessSummary, summarize_stiffness
 from needle_ros import contract
-from needle_ros.base_node import BaseNode, run
+from needle_ros.base_node import BaseNode
 from needle_ros.errors import NeedleError, ParameterError
+from needle_ros.run_node import run
 from needle_ros.settings import check_constants, constant
 from needle_ros.wire import Reading
 from rcl_interfaces.srv import SetParameters

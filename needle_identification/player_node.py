@@ -16,8 +16,9 @@ from needle_identification.bags.playback import Playback, PlaybackSettings
 from needle_identification.bags.topics import OfferedQos, Topic
 from needle_identification.errors import RecordingError
 from needle_identification.recorder_node import is_hidden
-from needle_ros.base_node import BaseNode, message_class, run
+from needle_ros.base_node import BaseNode, message_class
 from needle_ros.errors import MessageError, NeedleError, ParameterError
+from needle_ros.run_node import run
 from needle_ros.timing import NANOSECONDS
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType

@@ -12,8 +12,9 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from needle_identification.bags.topics import OfferedQos
 from needle_identification.bags.writer import BagWriter, COMPRESSIONS
 from needle_identification.errors import RecordingError
-from needle_ros.base_node import BaseNode, message_class, run
+from needle_ros.base_node import BaseNode, message_class
 from needle_ros.errors import MessageError
+from needle_ros.run_node import run
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.event_handler import SubscriptionEventCallbacks

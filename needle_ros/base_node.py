@@ -11,16 +11,9 @@ from __future__ import annotations
 from array import array
 from collections import Counter
 from collections.abc import Callable, Mapping
-import ctypes
 from dataclasses import fields
-import gc
 from importlib import import_module
-import os
-import signal
-import sys
-import time
 import traceback
-from types import FrameType
 from typing import Any, ClassVar, TypeVar
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -30,18 +23,13 @@ from needle_ros.errors import MessageError, NeedleError, ParameterError
 from needle_ros.settings import from_values, unknown_name
 from needle_ros.wire import Reader, Reading
 from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor, SetParametersResult
-import rclpy
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
-from rclpy.exceptions import ParameterException
-from rclpy.executors import Executor
-from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
-from rclpy.task import Future
 from std_msgs.msg import String
 import yaml
 
@@ -104,11 +92,6 @@ def message_class(*type_names: str) -> Any:
 LATCHED, COMMAND, SENSOR = (
     profile(qos) for qos in (contract.LATCHED, contract.COMMAND, contract.SENSOR)
 )
-
-#: Environment variable: if it is set, a node ends when the process that started it ends.
-END_WITH_PARENT = 'NEEDLE_END_WITH_PARENT'
-
-_PR_SET_PDEATHSIG = 1
 
 _Settings = TypeVar('_Settings')
 _SUCCESS = TransitionCallbackReturn.SUCCESS
@@ -511,20 +494,7 @@ class BaseNode(LifecycleNode):
             self.trigger_deactivate()
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """
-        Call `configure`, and publish the configuration.
-
-        Parameters
-        ----------
-        state : LifecycleState
-            State that the node leaves.
-
-        Returns
-        -------
-        TransitionCallbackReturn
-            Whether the transition is made.
-
-        """
+        """Call `configure`, and publish the configuration; rclpy calls this."""
 
         def configure() -> None:
             self._check_overrides()
@@ -542,72 +512,20 @@ class BaseNode(LifecycleNode):
         return self._attempt(configure, super().on_configure, state)
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """
-        Call `activate`.
-
-        Parameters
-        ----------
-        state : LifecycleState
-            State that the node leaves.
-
-        Returns
-        -------
-        TransitionCallbackReturn
-            Whether the transition is made.
-
-        """
+        """Call `activate`; rclpy calls this."""
         return self._attempt(self.activate, super().on_activate, state)
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """
-        Call `deactivate`.
-
-        Parameters
-        ----------
-        state : LifecycleState
-            State that the node leaves.
-
-        Returns
-        -------
-        TransitionCallbackReturn
-            Whether the transition is made.
-
-        """
+        """Call `deactivate`; rclpy calls this."""
         return self._attempt(self.deactivate, super().on_deactivate, state)
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """
-        Call `cleanup`; parameters may then change.
-
-        Parameters
-        ----------
-        state : LifecycleState
-            State that the node leaves.
-
-        Returns
-        -------
-        TransitionCallbackReturn
-            Whether the transition is made.
-
-        """
+        """Call `cleanup`, and let parameters change; rclpy calls this."""
         self._configured = False
         return self._attempt(self.cleanup, super().on_cleanup, state)
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """
-        Call `deactivate` if the node is active.
-
-        Parameters
-        ----------
-        state : LifecycleState
-            State that the node leaves.
-
-        Returns
-        -------
-        TransitionCallbackReturn
-            Whether the transition is made.
-
-        """
+        """Call `deactivate` if the node is active; rclpy calls this."""
 
         def leave() -> None:
             if state.label == 'active':
@@ -616,20 +534,7 @@ class BaseNode(LifecycleNode):
         return self._attempt(leave, super().on_shutdown, state)
 
     def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """
-        Return to unconfigured after an unforeseen error.
-
-        Parameters
-        ----------
-        state : LifecycleState
-            State that the node leaves.
-
-        Returns
-        -------
-        TransitionCallbackReturn
-            Whether the transition is made.
-
-        """
+        """Return to unconfigured after an unforeseen error; rclpy calls this."""
         self._configured = False
         self.cleanup()
         return super().on_error(state)
@@ -678,70 +583,3 @@ class BaseNode(LifecycleNode):
         """Publish diagnostics now if the level has changed."""
         if self.diagnose()[0] != self._last_level:
             self.publish_diagnostics()
-
-
-def run(kind: Callable[[], BaseNode], arguments: list[str] | None = None) -> int:
-    """
-    Run one node until SIGINT or SIGTERM, then deactivate it while it can still publish.
-
-    Parameters
-    ----------
-    kind : callable
-        Makes the node.
-    arguments : list of str, optional
-        Command line with ROS arguments; ``sys.argv`` if not given.
-
-    Returns
-    -------
-    int
-        Exit status: 0, or 2 if the node refused to start.
-
-    """
-    stopping = False
-
-    def stop(_signal: int, _frame: FrameType | None) -> None:
-        nonlocal stopping
-        stopping = True
-
-    if os.environ.get(END_WITH_PARENT):
-        # Linux sends the signal when the process that started this one ends, in whatever way.
-        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
-    try:
-        # Not rclpy's handlers: they end the context before the node can publish its last command.
-        rclpy.init(args=arguments, signal_handler_options=rclpy.signals.SignalHandlerOptions.NO)
-    except RuntimeError as error:
-        # rcl could not read the arguments or the parameter file.
-        sys.stderr.write(f'error: {" ".join(str(error).split())}\n')
-        return 2
-    previous = {name: signal.signal(name, stop) for name in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        try:
-            node = kind()
-        except (ParameterException, NeedleError, RuntimeError) as error:
-            # RuntimeError is rcl's, for a node that its security refuses.
-            sys.stderr.write(f'error: {" ".join(str(error).split())}\n')
-            return 2
-        executor: Executor = EventsExecutor()
-        executor.add_node(node)
-        status = 0
-        if node.get_parameter('autostart').value and not node.start():
-            # The reason, on /diagnostics.
-            node.publish_diagnostics()
-            status = 2
-        # A full collection takes 0.2 s: it shall not scan what was imported.
-        gc.freeze()
-        while not stopping and status == 0:
-            # Unlike spin_once it does not return to Python at each event.
-            executor.spin_until_future_complete(Future(), timeout_sec=0.1)
-        node.stop()
-        # The last messages (a zero force, a latched result) are still to be sent.
-        deadline = time.monotonic() + 0.1
-        while time.monotonic() < deadline:
-            executor.spin_once(timeout_sec=0.02)
-        executor.shutdown()
-        node.destroy_node()
-        return status
-    finally:
-        rclpy.utilities.try_shutdown()
-        for name, handler in previous.items():
-            signal.signal(name, handler)

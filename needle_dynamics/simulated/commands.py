@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 from needle_ros.contract import BASE
 from needle_ros.timing import NANOSECONDS
@@ -26,26 +26,6 @@ class Command(NamedTuple):
     stamp: int = 0
     force: float = 0.0
     torque: float = 0.0
-
-
-class Answer(NamedTuple):
-    """
-    What became of a command.
-
-    Attributes
-    ----------
-    counts : bool
-        Whether it counts; an invalid command counts as no force.
-    complaint : str
-        Why it does not act, '' if it acts or a newer one came before.
-
-    """
-
-    counts: bool
-    complaint: str = ''
-
-
-_COUNTS: Final = Answer(counts=True)
 
 
 class Commands:
@@ -98,7 +78,9 @@ class Commands:
         """Let no force act; commands older than the newest still do not count."""
         self.held = self.newest = Command(self.newest.stamp)
 
-    def offer(self, stamp: int, frame: str, force: float, torque: float, now: int) -> Answer:
+    def offer(
+        self, stamp: int, frame: str, force: float, torque: float, now: int
+    ) -> tuple[bool, str]:
         """
         Take in a command.
 
@@ -117,30 +99,31 @@ class Commands:
 
         Returns
         -------
-        Answer
-            Whether it counts, and what is wrong with it.
+        counts : bool
+            Whether it counts; an invalid command counts as no force.
+        complaint : str
+            What is wrong with it, '' for nothing.
 
         """
         stamp = stamp or now
         age = now - stamp
         if abs(age) > self._timeout:
             self.stale += 1
-            return Answer(
-                counts=False,
-                complaint=f'command ignored, it is {age / NANOSECONDS:.3f} s old: command_timeout '
-                f'is {self._timeout / NANOSECONDS:g} s',
+            return False, (
+                f'command ignored, it is {age / NANOSECONDS:.3f} s old: command_timeout is '
+                f'{self._timeout / NANOSECONDS:g} s'
             )
         # A newest one from the future is of the time before the clock was set back.
         if stamp < self.newest.stamp <= now + self._timeout:
             self.overtaken += 1
-            return Answer(counts=False)
+            return False, ''
         complaint = self._complaint(frame, force, torque)
         if complaint:
             self.refused += 1
         # While several nodes command none of them may.
         acts = not complaint and not self.rivals
         self.newest = Command(stamp, force, torque) if acts else Command(stamp)
-        return Answer(counts=True, complaint=complaint) if complaint else _COUNTS
+        return True, complaint
 
     def _complaint(self, frame: str, force: float, torque: float) -> str:
         """Return what is wrong with a command."""

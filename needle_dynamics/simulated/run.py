@@ -7,7 +7,7 @@ next sample on, and which a replay performs again.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, Final, NamedTuple
 
 from needle_dynamics.simulated.assembly import PlantConstants
@@ -45,9 +45,9 @@ class Event(NamedTuple):
     ----------
     kind : str
         ``configured``: the plant was made from the parameters in ``content``. ``time``: the
-        sample is not one period after the one before. ``trajectory``: it follows the one in
-        ``content``, the arguments of `PlantRun.follow`. ``parameters``: those in ``content``
-        changed. ``tare``: the force sensor was zeroed. ``reset``: the plant is at its start.
+        sample is not one period after the one before. ``trajectory``: ``content`` has the
+        arguments of `Plant.follow`. ``parameters``: those in ``content`` changed. ``tare``: the
+        force sensor was zeroed. ``reset``: state, sensor and noise are at their start.
     content : Mapping[str, Any]
         Values that JSON can hold.
 
@@ -134,102 +134,45 @@ class PlantRun:
 
     # Events.
 
-    def follow(
-        self,
-        joints: Sequence[str],
-        times: Sequence[float],
-        positions: Sequence[Sequence[float]],
-        efforts: Sequence[Sequence[float]],
-    ) -> None:
-        """
-        Have the plant follow a trajectory from now.
-
-        Parameters
-        ----------
-        joints : sequence of str
-            Names of the joints.
-        times : sequence of float
-            Time of each point from now [s].
-        positions : sequence of sequence of float
-            Position of each joint at each point, or none [m].
-        efforts : sequence of sequence of float
-            Force of each joint at each point, or none [N].
-
-        Raises
-        ------
-        ParameterError
-            If the plant cannot follow it.
-
-        """
-        self.plant.follow(joints, times, positions, efforts)
-        content = {'joints': joints, 'times': times, 'positions': positions, 'efforts': efforts}
-        self._events.append(Event(TRAJECTORY, content))
-
-    def change(self, changes: Mapping[str, Any]) -> None:
-        """
-        Go on with other friction; the state stays.
-
-        Parameters
-        ----------
-        changes : Mapping[str, Any]
-            Parameters that change, by name.
-
-        Raises
-        ------
-        ParameterError
-            If a value is not valid.
-
-        """
-        values = {**self._values, **changes}
-        constants = PlantConstants.of(values)
-        if constants.model != self.constants.model:
-            if isinstance(self.plant, Plant):
-                self.plant.integrator.change(constants.model)
-            self._events.append(Event(PARAMETERS, dict(changes)))
-        self._values, self.constants = values, constants
-
-    def tare(self) -> None:
-        """
-        Zero the force sensor.
-
-        Raises
-        ------
-        JobError
-            If the plant moves, or has not rested long enough.
-
-        """
-        self.plant.tare()
-        self._events.append(Event(TARE))
-
-    def reset(self) -> None:
-        """Put state, sensor and noise back to their start; time goes on."""
-        self.plant = self.constants.make()
-        self.commands.forget()
-        self._events.append(Event(RESET))
-
     def perform(self, event: Event) -> None:
         """
-        Do again what was done to a plant.
+        Do something to the plant, for the first time or as it was recorded.
 
         Parameters
         ----------
         event : Event
-            Any but ``configured``, which makes another run.
+            What to do.
 
         Raises
         ------
-        NeedleError
-            If this plant refuses it.
+        ParameterError
+            If the plant cannot follow the trajectory, or a parameter is not valid.
+        JobError
+            If the plant moves, or has not rested long enough, for a tare.
 
         """
         if event.kind == TRAJECTORY:
-            self.follow(**event.content)
+            self.plant.follow(**event.content)
         elif event.kind == PARAMETERS:
-            self.change(event.content)
+            if not self._change(event.content):
+                return
         elif event.kind == TARE:
-            self.tare()
+            self.plant.tare()
         elif event.kind == RESET:
-            self.reset()
+            self.plant = self.constants.make()
+            self.commands.forget()
+        self._events.append(event)
+
+    def _change(self, changes: Mapping[str, Any]) -> bool:
+        """Go on with other friction; return whether it is another."""
+        values = {**self._values, **changes}
+        before, self.constants = self.constants, PlantConstants.of(values)
+        self._values = values
+        if self.constants.model == before.model:
+            return False
+        if isinstance(self.plant, Plant):
+            self.plant.integrator.change(self.constants.model)
+        return True
 
     def events(self) -> list[Event]:
         """

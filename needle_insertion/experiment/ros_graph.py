@@ -20,7 +20,7 @@ from domain_coordinator import domain_id
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from needle_dynamics import JobError
-from needle_ros.base_node import END_WITH_PARENT
+from needle_ros.run_node import END_WITH_PARENT
 from rclpy.client import Client
 from rclpy.context import Context
 from rclpy.executors import Executor

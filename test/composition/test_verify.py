@@ -8,6 +8,7 @@ import json
 from math import sin
 from pathlib import Path
 import re
+import time
 from typing import Any
 
 from geometry_msgs.msg import WrenchStamped
@@ -753,6 +754,8 @@ def test_all_that_is_done_to_a_plant_is_done_again(tmp_path: Path) -> None:
         assert changed.results[0].successful
         further(40)
         assert call(SetBool, 'pause', SetBool.Request(data=True)).success
+        # Time goes on meanwhile, some periods.
+        time.sleep(0.05)
         assert call(SetBool, 'pause', SetBool.Request(data=False)).success
         further(40)
         assert call(Trigger, 'reset', Trigger.Request()).success
