@@ -7,6 +7,7 @@ holds, and a long file needs no more memory than a short one.
 
 from __future__ import annotations
 
+from array import array
 from collections.abc import Iterator
 from contextlib import suppress
 from io import BytesIO
@@ -31,6 +32,7 @@ from needle_identification.bags.compression import (
 from needle_identification.bags.topics import make_topic, Topic
 from needle_identification.errors import RecordingError
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 _MAGIC: Final = b'\x89MCAP0\r\n'
@@ -44,8 +46,11 @@ _CHUNK: Final = struct.Struct('<QQQII')
 #: The end of a file: a footer record and the magic bytes.
 _TAIL: Final = struct.Struct('<BQQQI8s')
 
-#: Channel, sequence number, log time and publish time come before the data of a message [bytes].
-_MESSAGE_HEAD: Final = 22
+#: What comes before the data of a message.
+_MESSAGE: Final = np.dtype(
+    [('channel', '<u2'), ('sequence', '<u4'), ('received', '<u8'), ('published', '<u8')]
+)
+_MESSAGE_HEAD: Final = _MESSAGE.itemsize
 
 #: What is raised at damaged bytes.
 DAMAGED_MCAP: Final = (*DAMAGED, McapError)
@@ -200,19 +205,21 @@ def _chunk_content(chunk: bytes, length: int, tally: Tally) -> bytes:
 
 def _records(content: bytes) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
     """Yield where the whole records begin and end after their heads, in groups."""
-    length_of = struct.Struct('<Q').unpack_from
+    length_of, head = struct.Struct('<Q').unpack_from, _HEAD.size
     position, size = 0, len(content)
-    ends = [0]
-    with suppress(struct.error):
-        while True:
-            position += _HEAD.size + length_of(content, position + 1)[0]
-            if position > size:
-                break
-            ends.append(position)
-            if len(ends) > LARGEST_BATCH:
-                yield np.array(ends[:-1]) + _HEAD.size, np.array(ends[1:])
-                ends = [position]
-    yield np.array(ends[:-1], dtype=np.int64) + _HEAD.size, np.array(ends[1:], dtype=np.int64)
+    is_more = True
+    while is_more:
+        ends, is_more = array('q', [position]), False
+        with suppress(struct.error):
+            for _ in range(LARGEST_BATCH):
+                position += head + length_of(content, position + 1)[0]
+                if position > size:
+                    break
+                ends.append(position)
+            else:
+                is_more = True
+        table = np.array(ends)
+        yield table[:-1] + head, table[1:]
 
 
 def _batches(content: bytes, channels: _Channels, tally: Tally) -> Iterator[Batch]:
@@ -226,18 +233,15 @@ def _batches(content: bytes, channels: _Channels, tally: Tally) -> Iterator[Batc
                 channels.define(opcodes[k], content[begin[k] : end[k]])
         tally.piece += 1
         is_message = (opcodes == Opcode.MESSAGE) & (end - begin >= _MESSAGE_HEAD)
+        if not is_message.any():
+            continue
         first, after = begin[is_message], end[is_message]
-        ids = _numbers(data, first, '<u2')
-        received = np.minimum(_numbers(data, first + 6, '<u8'), np.uint64(LATEST)).astype(np.int64)
-        for id_ in np.unique(ids):
+        heads = sliding_window_view(data, _MESSAGE_HEAD)[first].view(_MESSAGE)[:, 0]
+        ids = heads['channel']
+        received = np.minimum(heads['received'], np.uint64(LATEST)).astype(np.int64)
+        for id_ in np.flatnonzero(np.bincount(ids)):
             topic = channels.topics.get(int(id_))
             rows = np.flatnonzero(ids == id_)
             if tally.enter(topic, len(rows)) and topic is not None:
                 starts = first[rows] + _MESSAGE_HEAD
                 yield Batch(topic, received[rows], data, starts, after[rows]).decompressed()
-
-
-def _numbers(data: NDArray[np.uint8], at: NDArray[np.int64], kind: str) -> NDArray[np.uint64]:
-    """Return the numbers of a kind at positions in bytes."""
-    size = np.dtype(kind).itemsize
-    return np.ascontiguousarray(data[at[:, np.newaxis] + np.arange(size)]).view(kind)[:, 0]
