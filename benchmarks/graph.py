@@ -29,7 +29,8 @@ from benchmarks.measure import Bar
 from benchmarks.page import Answer, Section, Tick, version
 from benchmarks.pairs import Figures, Pair, PAIRS, TARGETS
 from geometry_msgs.msg import WrenchStamped
-from needle_insertion.experiment.ros_graph import Graph, GraphError
+from needle_insertion.experiment.node_process import GraphError
+from needle_insertion.experiment.ros_graph import Graph
 from needle_ros.base_node import COMMAND, SENSOR
 import numpy as np
 from sensor_msgs.msg import JointState

@@ -84,12 +84,12 @@ def _run(options: argparse.Namespace) -> int:
             'preset': options.preset,
             'parameters': asdict(parameters),
             'unit': 'SI',
-            'points': [point.document() for point in points],
+            'points': [point.document for point in points],
             'files': [str(path) for path in files],
         }
         sys.stdout.write(f'{json.dumps(found, indent=2)}\n')
     else:
-        sys.stdout.write(f'{table([point.row() for point in points], report.POINT_HEADS)}\n')
+        sys.stdout.write(f'{table([point.row for point in points], report.POINT_HEADS)}\n')
         for path in files:
             sys.stdout.write(f'wrote {path}\n')
     return 0

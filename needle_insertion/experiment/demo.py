@@ -111,12 +111,14 @@ def run(output: Path, bags: Path) -> int:
         for bag in (*shipped['friction'], output / 'friction'):
             recording = read_friction_recording(bag)
             friction.append(identify_friction(recording))
-            compared['friction'].append(known(bag, compare_friction(recording, friction[-1])))
+            compared['friction'].append(_known(bag, compare_friction(recording, friction[-1])))
             bar.update()
         for bag in (*shipped['stiffness'], output / 'stiffness'):
             indentation = read_indentation_recording(bag)
             stiffness.append(identify_stiffness(indentation))
-            compared['stiffness'].append(known(bag, compare_stiffness(indentation, stiffness[-1])))
+            compared['stiffness'].append(
+                _known(bag, compare_stiffness(indentation, stiffness[-1]))
+            )
             bar.update()
     write_result(
         output / 'result.yaml', summarize(friction[:-1]), summarize_stiffness(stiffness[:-1])
@@ -124,8 +126,8 @@ def run(output: Path, bags: Path) -> int:
 
     checks = [check for insertion in insertions for check in insertion_checks(insertion)]
     for *recorded, fresh in compared.values():
-        checks += shipped_checks(f'{len(recorded)} shipped bags', recorded)
-        checks += fresh_checks(fresh)
+        checks += _shipped_checks(f'{len(recorded)} shipped bags', recorded)
+        checks += _fresh_checks(fresh)
     page = output / 'report.html'
     write_page(
         page,
@@ -135,7 +137,7 @@ def run(output: Path, bags: Path) -> int:
         f'{TARGET_DEPTH * 100:g} cm at {SPEED * 1000:g} mm/s under each controller, recorded to '
         'MCAP; friction and tissue stiffness identified from the shipped recordings and from one '
         f'fresh recording each, made at {EXPERIMENT_SPEED:g} times real time.',
-        rows=[check.row() for check in checks],
+        rows=[check.row for check in checks],
         heads=CHECK_HEADS,
         pictures=_pictures(insertions, friction[-1], stiffness[-1]),
     )
@@ -200,28 +202,8 @@ def _pictures(
     ]
 
 
-def known(bag: Path, comparisons: list[Comparison]) -> list[Comparison]:
-    """
-    Require that the true values are known.
-
-    Parameters
-    ----------
-    bag : Path
-        The recording.
-    comparisons : list of Comparison
-        Estimates from it.
-
-    Returns
-    -------
-    list of Comparison
-        The same.
-
-    Raises
-    ------
-    DemoError
-        If a true value is not known.
-
-    """
+def _known(bag: Path, comparisons: list[Comparison]) -> list[Comparison]:
+    """Require that the true values are known."""
     if any(one.truth is None for one in comparisons):
         raise DemoError(f'{bag} does not hold the configuration of its plant')
     return comparisons
@@ -234,23 +216,8 @@ def _by_symbol(comparisons: Sequence[Comparison]) -> Mapping[str, list[Compariso
     return groups
 
 
-def shipped_checks(source: str, bags: Sequence[Sequence[Comparison]]) -> list[Check]:
-    """
-    Check how many of the 95 % intervals hold the true value of their own bag.
-
-    Parameters
-    ----------
-    source : str
-        What the recordings are.
-    bags : sequence of sequence of Comparison
-        Estimates of each bag.
-
-    Returns
-    -------
-    list of Check
-        One for each parameter.
-
-    """
+def _shipped_checks(source: str, bags: Sequence[Sequence[Comparison]]) -> list[Check]:
+    """Check how many of the 95 % intervals hold the true value of their own bag."""
     checks = []
     for symbol, group in _by_symbol([one for bag in bags for one in bag]).items():
         found = Coverage.of(group)
@@ -265,21 +232,8 @@ def shipped_checks(source: str, bags: Sequence[Sequence[Comparison]]) -> list[Ch
     return checks
 
 
-def fresh_checks(comparisons: Sequence[Comparison]) -> list[Check]:
-    """
-    Check the distance from the truth in 95 % intervals, at the force where it is largest.
-
-    Parameters
-    ----------
-    comparisons : sequence of Comparison
-        Estimates of one bag.
-
-    Returns
-    -------
-    list of Check
-        One for each parameter.
-
-    """
+def _fresh_checks(comparisons: Sequence[Comparison]) -> list[Check]:
+    """Check the distance from the truth in 95 % intervals, at the force where it is largest."""
     checks = []
     for symbol, group in _by_symbol(comparisons).items():
         worst = max(group, key=_distance)

@@ -9,9 +9,7 @@ from functools import partial
 import gc
 import os
 from pathlib import Path
-import signal
 import subprocess
-import sys
 import time
 from types import TracebackType
 from typing import Any, Final, IO
@@ -19,7 +17,7 @@ from typing import Any, Final, IO
 from domain_coordinator import domain_id
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
-from needle_dynamics import JobError
+from needle_insertion.experiment.node_process import GraphError, NodeProcess
 from needle_ros.run_node import END_WITH_PARENT
 from rclpy.client import Client
 from rclpy.context import Context
@@ -28,16 +26,6 @@ from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from rclpy.task import Future
-import yaml
-
-#: Modules of the nodes by name.
-MODULES: Mapping[str, str] = {
-    'plant': 'needle_dynamics.plant_node',
-    'controller': 'needle_controller.controller_node',
-    'identification': 'needle_identification.identification_node',
-    'player': 'needle_identification.player_node',
-    'recorder': 'needle_identification.recorder_node',
-}
 
 CONFIGURE = Transition.TRANSITION_CONFIGURE
 ACTIVATE = Transition.TRANSITION_ACTIVATE
@@ -50,101 +38,6 @@ _START: Final = 180.0
 
 #: Time in which the nodes may end by themselves at the end of a graph [s].
 _PATIENCE: Final = 3.0
-
-
-class GraphError(JobError):
-    """A node did not start, ended early, or did not do what was expected in time."""
-
-
-class NodeProcess:
-    """
-    One node of the suite as a process.
-
-    Parameters
-    ----------
-    name : str
-        A key of `MODULES`.
-    parameters : Mapping[str, object]
-        Parameters by name.
-    environment : Mapping[str, str]
-        Environment with the domain.
-    log : file
-        Receives what the node prints.
-
-    """
-
-    def __init__(
-        self,
-        name: str,
-        parameters: Mapping[str, object],
-        environment: Mapping[str, str],
-        log: IO[str],
-    ) -> None:
-        self.name = name
-        self.killed = False
-        self._log = log
-        settings = []
-        for key, value in parameters.items():
-            # One line of YAML, without the end-of-document mark of a bare scalar.
-            text = yaml.safe_dump(value, default_flow_style=True, width=10_000).splitlines()[0]
-            settings += ['-p', f'{key}:={text}']
-        self.process = subprocess.Popen(
-            [sys.executable, '-m', MODULES[name], '--ros-args', *settings],
-            env=dict(environment),
-            stdout=log,
-            stderr=subprocess.STDOUT,
-        )
-
-    def check(self) -> None:
-        """
-        Require that the node runs.
-
-        Raises
-        ------
-        GraphError
-            With its last line of output, if it has ended.
-
-        """
-        status = self.process.poll()
-        if status is not None:
-            raise GraphError(
-                f'{self.name} ended early with status {status}: {self.last_line() or "no output"}'
-            )
-
-    def last_line(self) -> str:
-        """Return the last line that the node has printed."""
-        self._log.flush()
-        lines = Path(self._log.name).read_text(encoding='utf-8', errors='replace').splitlines()
-        return lines[-1] if lines else ''
-
-    def kill(self) -> None:
-        """End the node at once, as a crash does, and wait for it."""
-        self.killed = True
-        self.process.kill()
-        self.process.wait()
-
-    def interrupt(self, timeout: float = 15.0) -> None:
-        """
-        End the node as Ctrl-C does, and wait for it.
-
-        Parameters
-        ----------
-        timeout : float
-            Longest time to wait [s].
-
-        Raises
-        ------
-        GraphError
-            If it does not end in time, or with an error.
-
-        """
-        self.process.send_signal(signal.SIGINT)
-        try:
-            status = self.process.wait(timeout)
-        except subprocess.TimeoutExpired as error:
-            raise GraphError(f'{self.name} did not end within {timeout:g} s') from error
-        if status != 0:
-            raise GraphError(f'{self.name} ended with status {status}: {self.last_line()}')
 
 
 @dataclass(slots=True)
@@ -389,7 +282,7 @@ class Graph:
             answer = client.call_async(ChangeState.Request(transition=Transition(id=transition)))
             self.spin_until(answer.done, f'the answer of {name}', _START)
             if not answer.result().success:
-                said = [p.last_line() for p in self._processes if p.name == name]
+                said = [p.last_line for p in self._processes if p.name == name]
                 raise GraphError(f'{name} refused to start: {"".join(said[-1:])}')
 
     def spin_until(self, condition: Callable[[], Any], what: str, timeout: float = 60.0) -> None:

@@ -48,7 +48,7 @@ def section() -> Section:
                 caption='States steered by f_y and tau, and seen in the tip deflection '
                 '(0.3 N s/m, complete equations)',
                 heads=report.POINT_HEADS,
-                rows=tuple(point.row() for point in (*straight, *bent)),
+                rows=tuple(point.row for point in (*straight, *bent)),
             ),
         ),
         pictures=(

@@ -108,8 +108,9 @@ class Line:
             )
         )
 
+    @property
     def row(self) -> tuple[str, ...]:
-        """Return the cells of a table."""
+        """Cells of a table."""
         return (
             self.quantity,
             _plus_minus(*self.paper),
@@ -120,8 +121,9 @@ class Line:
             verdict(self.holds),
         )
 
+    @property
     def document(self) -> dict[str, Any]:
-        """Return it for JSON."""
+        """For JSON."""
         mean, deviation = self.paper
         return {
             'quantity': self.quantity,
@@ -213,13 +215,14 @@ class IdentifiedTable:
             f'{verdict(truth.is_enough)}'
         )
 
+    @property
     def document(self) -> dict[str, Any]:
-        """Return it for JSON."""
+        """For JSON."""
         truth = self.truth
         return {
             'unit': 'SI',
             'bags': [str(bag) for bag in self.bags],
-            'lines': [line.document() for line in self.lines],
+            'lines': [line.document for line in self.lines],
             'truth': {
                 'held': truth.held,
                 'of': truth.known,
@@ -229,8 +232,9 @@ class IdentifiedTable:
             'holds': self.holds,
         }
 
+    @property
     def section(self) -> Section:
-        """Return it for the page."""
+        """For the page."""
         return Section(
             title=self.title,
             paragraphs=(
@@ -247,7 +251,7 @@ class IdentifiedTable:
                 Grid(
                     caption=f'{self.title} from {len(self.bags)} recordings',
                     heads=_HEADS,
-                    rows=tuple(line.row() for line in self.lines),
+                    rows=tuple(line.row for line in self.lines),
                 ),
             ),
         )

@@ -254,7 +254,7 @@ def section(found: Mismatch) -> Section:
         'Distribution of the errors over the runs (dotted: the needle is known exactly), and the '
         'final error against the error in mu_s. Inverse dynamics stops where Coulomb friction '
         f'holds the needle: its compensation fades within {fade:.2f} mm of the goal. The integral '
-        'of PID goes on to within its tolerance.'
+        'of PID continues until the error is within its tolerance.'
     )
     return Section(
         title='Needles that the controller does not know',

@@ -129,13 +129,13 @@ def results(what: str, recorded: Mapping[str, Sequence[Path]] | None = None) -> 
 
 
 def _of_table(found: IdentifiedTable) -> Result:
-    section = found.section()
+    section = found.section
     (grid,) = section.tables
     return Result(
         section=section,
         text=f'{table(grid.rows, grid.heads)}\n\n{found.words}',
         verdicts=((found.title, 'means and STD are those printed', verdict(found.holds)),),
-        document=found.document(),
+        document=found.document,
         holds=found.holds,
     )
 
@@ -188,26 +188,11 @@ def _study() -> mismatch.Mismatch:
 def _judged(tables: Mapping[str, IdentifiedTable], source: str) -> list[claims.Claim]:
     study = _study()
     with tqdm(unit=' claims', **_bar('claims')) as bar:
-        return claims.judge_claims(statistics(tables, source), study, bar.update)
+        return claims.judge_claims(_statistics(tables, source), study, bar.update)
 
 
-def statistics(tables: Mapping[str, IdentifiedTable], source: str) -> claims.Tables:
-    """
-    Return identified tables as claims are judged by them.
-
-    Parameters
-    ----------
-    tables : Mapping[str, IdentifiedTable]
-        All of `TABLES`.
-    source : str
-        Where they come from.
-
-    Returns
-    -------
-    claims.Tables
-        Means and standard deviations, SI.
-
-    """
+def _statistics(tables: Mapping[str, IdentifiedTable], source: str) -> claims.Tables:
+    """Return identified tables as claims are judged by them."""
     found: dict[str, list[tuple[float, float]]] = {}
     for line in (line for one in tables.values() for line in one.lines):
         mean, deviation = line.found.mean, line.found.deviation

@@ -72,8 +72,9 @@ class Point:
     system: LinearSystem
     result: Analysis
 
+    @property
     def row(self) -> tuple[str, ...]:
-        """Return the cells of a table with the heads `POINT_HEADS`."""
+        """Cells of a table with the heads `POINT_HEADS`."""
         found = self.result
         return (
             f'{1e2 * self.depth:g} cm, {1e3 * self.deflection:g} mm, {1e3 * self.speed:g} mm/s',
@@ -82,8 +83,9 @@ class Point:
             f'{found.output_gain:.2g}' if found.output_controllable else 'not steered',
         )
 
+    @property
     def document(self) -> dict[str, Any]:
-        """Return everything for JSON, in SI units."""
+        """Everything for JSON, in SI units."""
         system, found = self.system, self.result
         return {
             'depth': self.depth,

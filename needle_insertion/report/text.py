@@ -58,8 +58,9 @@ class Check:
     found: str
     passed: bool
 
+    @property
     def row(self) -> tuple[str, str, str, str]:
-        """Return the cells of a table, the verdict as a word."""
+        """Cells of a table, the verdict as a word."""
         return self.what, self.wanted, self.found, 'pass' if self.passed else 'FAIL'
 
 
@@ -78,4 +79,4 @@ def check_table(checks: Sequence[Check]) -> str:
         Lines without a final newline.
 
     """
-    return table([check.row() for check in checks], CHECK_HEADS)
+    return table([check.row for check in checks], CHECK_HEADS)

@@ -12,13 +12,8 @@ from needle_identification import (
     read_friction_recording,
     read_indentation_recording,
 )
-from needle_insertion.experiment.demo import (
-    DemoError,
-    fresh_checks,
-    known,
-    run,
-    shipped_checks,
-)
+from needle_insertion.experiment import demo
+from needle_insertion.experiment.demo import DemoError, run
 from needle_insertion.experiment.insertion import (
     COUNTED,
     Insertion,
@@ -85,7 +80,7 @@ def test_shipped_bags_are_checked_by_how_many_intervals_hold_the_truth(
         [comparison(111.0 if k < missed else 109.0), comparison(100.0, symbol='k_xx')]
         for k in range(20)
     ]
-    stiff, other = shipped_checks('bags', bags)
+    stiff, other = demo._shipped_checks('bags', bags)
     assert stiff.passed == passed
     assert stiff.found == f'in {20 - missed} of 20'
     assert other.passed
@@ -94,10 +89,10 @@ def test_shipped_bags_are_checked_by_how_many_intervals_hold_the_truth(
 @pytest.mark.parametrize(('value', 'passed'), [(119.0, True), (81.0, True), (121.0, False)])
 def test_a_fresh_recording_is_checked_at_its_worst_force(value: float, passed: bool) -> None:
     """The limit is twice the interval; an undetermined parameter fails."""
-    (check,) = fresh_checks([comparison(100.0), comparison(value), comparison(101.0)])
+    (check,) = demo._fresh_checks([comparison(100.0), comparison(value), comparison(101.0)])
     assert check.passed == passed
     assert check.found.startswith(f'{value:.5g} ')
-    (check,) = fresh_checks([comparison(nan, interval=(-inf, inf), determined=False)])
+    (check,) = demo._fresh_checks([comparison(nan, interval=(-inf, inf), determined=False)])
     assert not check.passed
 
 
@@ -124,7 +119,7 @@ def test_a_recording_without_true_values_cannot_be_checked() -> None:
     estimate = identify_friction(recording)
     compared = compare_friction(replace(recording, configuration=''), estimate)
     with pytest.raises(DemoError, match='friction_01 does not hold the configuration'):
-        known(SHIPPED_BAGS / 'friction_01', compared)
+        demo._known(SHIPPED_BAGS / 'friction_01', compared)
 
 
 def test_the_demo_removes_only_its_own_files(tmp_path: Path) -> None:

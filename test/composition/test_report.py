@@ -161,7 +161,7 @@ def test_the_page_needs_nothing_beside_it(tmp_path: Path) -> None:
         [picture()],
         title='title',
         introduction='text',
-        rows=[check.row() for check in checks],
+        rows=[check.row for check in checks],
         heads=CHECK_HEADS,
     )
     reader = Reader(path.read_text())

@@ -102,7 +102,7 @@ def test_a_line_holds_if_mean_and_std_are_in_their_intervals(
     """Each of the two can break it; of a single recording the STD is not known."""
     judged = line(mean, deviation)
     assert judged.holds == holds
-    assert ('DOES NOT HOLD' in judged.row()) == (not holds)
+    assert ('DOES NOT HOLD' in judged.row) == (not holds)
 
 
 def test_the_interval_of_the_std_is_that_of_chi_squared() -> None:

@@ -241,7 +241,7 @@ def test_unstable_gains_end_the_process(ros_graph: RosGraph) -> None:
     """Run on its own it says so in one line and exits with 2."""
     controller = ros_graph.start('controller', {'inverse_dynamics.insertion.kv': 3000.0})
     assert controller.process.wait(30) == 2
-    assert 'are unstable' in controller.last_line()
+    assert 'are unstable' in controller.last_line
 
 
 def test_parameters_cannot_change_while_configured(ros_graph: RosGraph) -> None:

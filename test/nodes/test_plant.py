@@ -15,7 +15,7 @@ from geometry_msgs.msg import PointStamped, PoseStamped, WrenchStamped
 from needle_controller.controller_node import ControllerNode
 from needle_dynamics import FloatArray, ForceSensorParameters, IndenterParameters
 from needle_dynamics.plant_node import PlantNode
-from needle_insertion.experiment.ros_graph import GraphError
+from needle_insertion.experiment.node_process import GraphError
 from needle_ros.base_node import COMMAND, LATCHED, SENSOR
 import numpy as np
 import pytest
@@ -257,7 +257,7 @@ def test_bad_parameters_end_the_process_with_one_line(
     """A process that cannot be configured says why in its last line and exits with 2."""
     plant = ros_graph.start('plant', parameters)
     assert plant.process.wait(30) == 2
-    assert complaint in plant.last_line()
+    assert complaint in plant.last_line
     with pytest.raises(GraphError, match='ended early with status 2'):
         plant.check()
 
@@ -337,7 +337,7 @@ def test_signals_end_it_well(ros_graph: RosGraph, name: Signals) -> None:
     ros_graph.spin_until(lambda: states, 'joint_states')
     plant.process.send_signal(name)
     assert plant.process.wait(30) == 0
-    assert 'Traceback' not in plant.last_line()
+    assert 'Traceback' not in plant.last_line
 
 
 @pytest.mark.parametrize(
