@@ -6,7 +6,6 @@ import argparse
 from pathlib import Path
 
 from needle_insertion.commands.common import Command
-from needle_insertion.experiment.campaign import Campaign
 from needle_insertion.experiment.protocol import FASTEST, PROTOCOLS, SPEED
 from needle_ros.errors import ParameterError
 
@@ -43,6 +42,9 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _run(options: argparse.Namespace) -> int:
     """Record the bags that the folder does not hold yet."""
+    # Takes a second to import; invalid options of the parser are reported without it.
+    from needle_insertion.experiment.campaign import Campaign
+
     campaign = Campaign(
         protocol=PROTOCOLS[options.which],
         repeats=options.repeats,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from functools import cache
+from functools import cache, partial
 from math import nan
 from pathlib import Path
 from typing import Any, Final
@@ -24,13 +24,6 @@ from needle_insertion.report.content import Section
 from needle_insertion.report.page import write_page
 from needle_insertion.report.text import table
 from tqdm import tqdm
-
-#: What there is to reproduce.
-RESULTS: Final = (
-    *figures.FIGURES,
-    *TABLES,
-    *('table-3', 'controllability', 'claims', 'mismatch', 'all'),
-)
 
 #: Tables that a result is judged by.
 _JUDGED_BY: Final[Mapping[str, tuple[str, ...]]] = {
@@ -77,7 +70,7 @@ def campaigns(what: str) -> dict[str, Campaign]:
     Parameters
     ----------
     what : str
-        One of `RESULTS`.
+        Such as ``figure-4``, ``table-1``, ``claims`` or ``all``.
 
     Returns
     -------
@@ -103,7 +96,7 @@ def results(what: str, recorded: Mapping[str, Sequence[Path]] | None = None) -> 
     Parameters
     ----------
     what : str
-        One of `RESULTS`.
+        Such as ``figure-4``, ``table-1``, ``claims`` or ``all``.
     recorded : Mapping[str, sequence of Path], optional
         Recordings by experiment; the shipped ones if not given.
 
@@ -115,17 +108,22 @@ def results(what: str, recorded: Mapping[str, Sequence[Path]] | None = None) -> 
     """
     tables = {name: identify_table(name, recorded) for name in _JUDGED_BY.get(what, ())}
     source = 'the shipped recordings' if recorded is None else 'the recordings'
-    jobs: dict[str, Callable[[], Result]] = {
+    jobs = _jobs(tables, source)
+    chosen = [name for name in jobs if name not in figures.FIGURES] if what == 'all' else [what]
+    return {name: jobs[name]() for name in tqdm(chosen, **_bar('results'))}
+
+
+def _jobs(tables: Mapping[str, IdentifiedTable], source: str) -> dict[str, Callable[[], Result]]:
+    """Return what computes each result; ``figures`` are all of them on one page."""
+    return {
         'claims': lambda: _of_claims(_judged(tables, source)),
-        **{name: lambda name=name: _of_table(tables[name]) for name in TABLES},  # type: ignore[misc]
+        **{name: partial(_of_table, one) for name, one in tables.items()},
         'table-3': lambda: _of_section(needle_constants.section()),
-        **{name: lambda name=name: _of_figure(name) for name in figures.FIGURES},  # type: ignore[misc]
+        **{name: partial(_of_figure, name) for name in figures.FIGURES},
         'figures': lambda: _of_section(figures.section()),
         'controllability': lambda: _of_section(controllability.section()),
         'mismatch': lambda: _of_section(mismatch.section(_study())),
     }
-    chosen = [name for name in jobs if name not in figures.FIGURES] if what == 'all' else [what]
-    return {name: jobs[name]() for name in tqdm(chosen, **_bar('results'))}
 
 
 def _of_table(found: IdentifiedTable) -> Result:

@@ -6,8 +6,11 @@ import base64
 from dataclasses import dataclass
 from functools import cached_property
 from io import BytesIO
+from typing import TYPE_CHECKING
 
-from matplotlib.figure import Figure
+if TYPE_CHECKING:
+    # Takes half a second to import; tables do without.
+    from matplotlib.figure import Figure
 
 
 def png(figure: Figure) -> bytes:

@@ -6,10 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TYPE_CHECKING
 
-from matplotlib.colors import LogNorm
-from matplotlib.figure import Figure
 from needle_dynamics import NeedleModel, NeedleParameters
 from needle_dynamics.analysis import (
     Analysis,
@@ -25,6 +23,10 @@ from needle_identification.result import write_whole
 from needle_insertion.report.content import png
 import numpy as np
 from tqdm import tqdm
+
+if TYPE_CHECKING:
+    # Takes half a second to import; only the map needs it.
+    from matplotlib.figure import Figure
 
 #: The map starts at this share of the needle's length, with this many depths and deflections.
 SHALLOWEST, DEPTHS, DEFLECTIONS = 0.05, 41, 31
@@ -235,6 +237,9 @@ def draw_map(parameters: NeedleParameters, found: ControllabilityMap, speed: flo
         Three panels, gray where the inputs do not move all of the state.
 
     """
+    from matplotlib.colors import LogNorm
+    from matplotlib.figure import Figure
+
     figure = Figure(figsize=(13.0, 4.6), layout='constrained')
     order = 2 * (2 + parameters.modes)
     lost = found.rank < order

@@ -5,8 +5,8 @@ from __future__ import annotations
 import csv
 from io import StringIO
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from matplotlib.figure import Figure
 from needle_dynamics import NeedleModel, Trajectory
 from needle_identification import BagWriter
 from needle_identification.result import write_whole
@@ -14,6 +14,10 @@ from needle_insertion.report.content import png
 from needle_ros.contract import ground_truth, JOINT_STATES, TIP_DEFLECTION
 from needle_ros.timing import NANOSECONDS
 import numpy as np
+
+if TYPE_CHECKING:
+    # Takes half a second to import; only the picture needs it.
+    from matplotlib.figure import Figure
 
 
 def summary(trajectory: Trajectory) -> dict[str, float]:
@@ -82,6 +86,8 @@ def _csv(trajectory: Trajectory) -> str:
 
 def _figure(trajectory: Trajectory) -> Figure:
     """Draw inserted length, modal coordinates and tip deflection over time."""
+    from matplotlib.figure import Figure
+
     result = Figure(figsize=(9.0, 7.0), layout='constrained')
     above, middle, below = result.subplots(3, 1, sharex=True)
     time = trajectory.time * 1e3
