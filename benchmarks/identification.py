@@ -20,7 +20,7 @@ from tempfile import TemporaryDirectory
 import time
 from typing import Any, Final
 
-from benchmarks.measure import Bar, NOT_INSTALLED, optional
+from benchmarks.measure import Bar, NOT_INSTALLED, number, optional
 from benchmarks.page import Answer, Section, Tick
 from needle_identification import (
     BagWriter,
@@ -338,18 +338,18 @@ def _told(
             (
                 name,
                 what,
-                f'{2 * messages / seconds:.3g}',
-                f'{seconds / best:.3g} x',
+                number(2 * messages / seconds),
+                f'{number(seconds / best)} x',
                 f'{memory / 1e6:.0f} MB',
             )
         )
     memories = [
         (
             f'{times} x',
-            f'{2 * times * messages:.3g}',
+            number(2 * times * messages),
             f'{sizes[times] / 1e6:.0f} MB',
             f'{one["seconds"]:.2f} s',
-            f'{2 * times * messages / one["seconds"]:.3g}',
+            number(2 * times * messages / one['seconds']),
             f'{one["memory"] / 1e6:.0f} MB',
             f'{(one["memory"] - one["before"]) / 1e6:.0f} MB',
         )

@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 
 #: Shown in place of the figures of a tool that is not installed.
-NOT_INSTALLED: Final = 'not installed: pip install needle-insertion[bench]'
+NOT_INSTALLED: Final = "not installed: pip install -e '.[bench]'"
 
 #: Duration of one turn of a short job [s]. The previous job slows down the first runs of a turn.
 _TURN: Final = 0.02
@@ -74,8 +74,27 @@ class Bar:
         """
         unit = f' {self.unit}' if self.unit else ''
         wanted = f'{">=" if self.at_least else "<="} {self.limit:g}{unit}'
-        found = '' if self.found is None else f'{self.found:.3g}{unit}'
+        found = '' if self.found is None else f'{number(self.found)}{unit}'
         return self.figure, wanted, found, self.verdict
+
+
+def number(value: float) -> str:
+    """
+    Return a number with three significant digits.
+
+    Parameters
+    ----------
+    value : float
+        Number.
+
+    Returns
+    -------
+    str
+        With an exponent only below 1e-4 and from 1e9.
+
+    """
+    rounded = float(f'{value:.3g}')
+    return f'{rounded:.0f}' if 1e3 <= abs(rounded) < 1e9 else f'{rounded:.3g}'
 
 
 def seconds(job: Callable[[], object]) -> float:

@@ -22,6 +22,7 @@ from benchmarks.measure import (
     geometric,
     least_times,
     NOT_INSTALLED,
+    number,
     optional,
     seconds,
 )
@@ -171,8 +172,8 @@ class Setting:
             f'{self.step:.3g}',
             f'{self.exact:.2f}',
             f'{self.error:+.2%}',
-            f'{per_second * 1e3:.3g}',
-            f'{per_second / ours:.3g} x',
+            number(per_second * 1e3),
+            f'{number(per_second / ours)} x',
         )
 
 

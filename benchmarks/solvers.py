@@ -16,7 +16,7 @@ from typing import Any, cast, Final, TypeVar
 from unittest import mock
 import warnings
 
-from benchmarks.measure import Bar, geometric, least_times, seconds
+from benchmarks.measure import Bar, geometric, least_times, number, seconds
 from benchmarks.page import Answer, Section, Tick
 from needle_dynamics import FloatArray, Integrator, NeedleModel, NeedleParameters
 from needle_dynamics.compiled.kernels import advance, evaluate, TERMS_PER_LENGTH
@@ -520,9 +520,9 @@ def compare(tick: Tick) -> Answer:
             item.setting,
             f'{item.error:.1e}',
             f'{item.evaluations}',
-            f'{spent * 1e3:.3g}',
-            f'{spent / DURATION:.3g}',
-            f'{spent / own:.3g} x',
+            number(spent * 1e3),
+            number(spent / DURATION),
+            f'{number(spent / own)} x',
         )
 
     rows = [row(ours, own, 'own'), row(uniform, compiled_times[uniform.name], 'own')]

@@ -91,6 +91,14 @@ def test_the_command_writes_the_page_and_ends_with_the_verdict(
     assert '- command: `needle bench calibration --seed 3`' in capsys.readouterr().out
 
 
+@pytest.mark.parametrize(
+    ('value', 'text'),
+    [(0.00012345, '0.000123'), (999.6, '1000'), (1234.5, '1230'), (-45_678.0, '-45700')],
+)
+def test_numbers_have_three_digits(value: float, text: str) -> None:
+    assert measure.number(value) == text
+
+
 def test_a_tool_that_is_not_installed_is_named() -> None:
     assert page.version('no-such-tool') == 'no-such-tool not installed'
     assert measure.optional('no_such_tool') is None
