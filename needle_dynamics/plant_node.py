@@ -187,6 +187,7 @@ class PlantNode(ModelNode):
         limits = constants.sensor.per_axis('range').tolist()
         # Rounding to counts may leave a saturated reading just below.
         self._full_scale = [limit * (1.0 - 1e-9) for limit in limits]
+        self._period = NANOSECONDS / own.rate
         self._run = plant_run
         if publishes:
             self._clock_topic = self.publisher(contract.CLOCK, always=True)
@@ -361,7 +362,7 @@ class PlantNode(ModelNode):
             self.get_logger().error(f'{commanders} nodes command; no force is applied')
         self._looks = self._looks + 1 if self._time.awaited is not None else 0
         if self._looks and self._looks % _REPEAT == 0 and not self._time.paused:
-            topic, stamp, values = self._last
+            stamp, (topic, _, values) = self._last
             self._publish[topic](stamp, values)
         self.report_change()
 
@@ -385,20 +386,20 @@ class PlantNode(ModelNode):
         events = plant_run.events()
         if events:
             self._tell(events, stamp, plant_run.number)
-        for value, limit in zip(measured[0].values, self._full_scale, strict=True):
+        for value, limit in zip(measured[0][2], self._full_scale, strict=True):
             if abs(value) >= limit:
                 self._saturated += 1
         if self._sampled % self._picture == 0:
             self._draw(plant_run, stamp)
-        period = NANOSECONDS / plant_run.constants.own.rate
+        self._last = stamp, measured[-1]
+        fault, faulty, publish = self._fault, self._faulty, self._publish
         for topic, age, values in measured:
-            self._last = topic, stamp, values
-            at = stamp - round(age * period) if age else stamp
-            if self._fault is None or topic != self._faulty:
-                self._publish[topic](at, values)
+            at = stamp - round(age * self._period) if age else stamp
+            if fault is None or topic != faulty:
+                publish[topic](at, values)
             else:
-                for late, left in self._fault.leaves(at, values, FAULTY[topic]):
-                    self._publish[topic](late, left)
+                for late, left in fault.leaves(at, values, FAULTY[topic]):
+                    publish[topic](late, left)
 
     def _tell(self, events: list[Event], stamp: int, number: int) -> None:
         """Publish what was done to the plant, with the sample from which it counts."""

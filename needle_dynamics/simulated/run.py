@@ -8,7 +8,7 @@ next sample on, and which a replay performs again.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, TypeAlias
 
 from needle_dynamics.simulated.assembly import PlantConstants
 from needle_dynamics.simulated.commands import Command, Commands
@@ -57,24 +57,9 @@ class Event(NamedTuple):
     content: Mapping[str, Any] = {}
 
 
-class Measurement(NamedTuple):
-    """
-    What the plant publishes of a sample on one topic.
-
-    Attributes
-    ----------
-    topic : str
-        Name of the topic.
-    age : int
-        Sample intervals since the time that the stamp says.
-    values : list of float
-        The numbers, in the order of the message.
-
-    """
-
-    topic: str
-    age: int
-    values: list[float]
+#: What the plant publishes of a sample on one topic: name of the topic, sample intervals since the
+#: time of the stamp, and the numbers in the order of the message.
+Measurement: TypeAlias = tuple[str, int, list[float]]
 
 
 class PlantRun:
@@ -129,7 +114,8 @@ class PlantRun:
             topics = [BASE_WRENCH, TIP_DEFLECTION, truth, JOINT_STATES]
         self.topics: dict[str, Topic] = {topic.name: topic for topic in topics}
         self._period = NANOSECONDS / own.rate
-        self._stamp: int | None = None
+        #: Time of the newest sample [ns].
+        self._stamp = -NANOSECONDS
         self._events = [Event(CONFIGURED, self._values)]
 
     # Events.
@@ -213,20 +199,19 @@ class PlantRun:
         """
         acting = self.commands.held if command is None else command
         self.sample = sample = self.plant.advance(acting.force, acting.torque)
-        if self._stamp is None or abs(stamp - self._stamp - self._period) > _ROUNDING:
+        # Whole nanoseconds first: a float has too few digits for a stamp.
+        if abs(stamp - self._stamp - self._period) > _ROUNDING:
             self._events.append(Event(TIME))
         self._stamp = stamp
         self.number += 1
         self.commands.hold(stamp)
-        measured = [Measurement(BASE_WRENCH.name, 0, sample.wrench.tolist())]
+        measured: list[Measurement] = [(BASE_WRENCH.name, 0, sample.wrench.tolist())]
         if isinstance(sample, Press):
             pose = [*sample.position.tolist(), 0.0, 0.0, 0.0, 1.0]
-            return [*measured, Measurement(END_EFFECTOR_POSE.name, 0, pose)]
+            return [*measured, (END_EFFECTOR_POSE.name, 0, pose)]
         tip = sample.tip
         if tip is not None:
-            measured.append(
-                Measurement(TIP_DEFLECTION.name, tip.age, [0.0, tip.depth, tip.deflection])
-            )
+            measured.append((TIP_DEFLECTION.name, tip.age, [0.0, tip.depth, tip.deflection]))
         state = sample.state.tolist()
         middle = len(state) // 2
         joints = [
@@ -236,6 +221,6 @@ class PlantRun:
         if self._commanded:
             # Insertion makes d smaller.
             state += [-acting.force, acting.torque, *self._free]
-        measured.append(Measurement(GROUND_TRUTH.name, 0, state))
-        measured.append(Measurement(JOINT_STATES.name, 0, joints))
+        measured.append((GROUND_TRUTH.name, 0, state))
+        measured.append((JOINT_STATES.name, 0, joints))
         return measured

@@ -1,0 +1,124 @@
+"""From when and how long a command acts."""
+
+from __future__ import annotations
+
+from math import inf, nan
+
+from needle_dynamics.simulated.commands import Command, Commands
+from needle_ros.timing import NANOSECONDS
+import pytest
+
+PERIOD = 1_000_000
+#: A stamp that a float could not hold to the nanosecond.
+NOW = 1_700_000_000 * NANOSECONDS + 1
+
+
+def made() -> Commands:
+    return Commands(timeout=0.1, force_limit=10.0, torque_limit=1.0)
+
+
+def test_a_command_acts_from_the_next_sample_to_the_one_after() -> None:
+    """A zero-order hold: whatever comes between two samples, the newest acts after the second."""
+    commands = made()
+    commands.hold(NOW)
+    assert commands.held == Command()
+    assert commands.offer(NOW, 'needle_base', 1.0, 0.1, NOW + 10) == (True, '')
+    assert commands.offer(NOW, '', 2.0, 0.2, NOW + 20) == (True, '')
+    assert commands.held == Command()
+    commands.hold(NOW + PERIOD)
+    assert commands.held == Command(NOW, 2.0, 0.2)
+    # Nothing newer has come: it goes on.
+    commands.hold(NOW + 2 * PERIOD)
+    assert commands.held == Command(NOW, 2.0, 0.2)
+
+
+def test_a_command_ends_at_the_timeout() -> None:
+    """It acts as long as a sample is within the timeout of its stamp, to the nanosecond."""
+    commands = made()
+    commands.offer(NOW, '', 2.0, 0.0, NOW)
+    commands.hold(NOW + 100 * PERIOD)
+    assert commands.held.force == 2.0
+    commands.hold(NOW + 100 * PERIOD + 1)
+    assert commands.held == Command(NOW)
+
+
+def test_an_empty_stamp_is_now() -> None:
+    """A node that has no clock may command too."""
+    commands = made()
+    commands.offer(0, '', 2.0, 0.0, NOW)
+    assert commands.newest == Command(NOW, 2.0)
+
+
+@pytest.mark.parametrize('age', [100 * PERIOD + 1, -100 * PERIOD - 1])
+def test_a_command_that_is_too_old_or_early_does_not_count(age: int) -> None:
+    """It is counted, and the age is said; what acts goes on."""
+    commands = made()
+    commands.offer(NOW, '', 1.0, 0.0, NOW)
+    counts, complaint = commands.offer(NOW - age, '', 2.0, 0.0, NOW)
+    assert not counts
+    assert complaint == (f'command ignored, it is {age / 1e9:.3f} s old: command_timeout is 0.1 s')
+    assert commands.newest == Command(NOW, 1.0)
+    assert (commands.stale, commands.refused, commands.overtaken) == (1, 0, 0)
+
+
+def test_a_command_that_was_overtaken_does_not_count() -> None:
+    """The order of stamps decides, not that of arrival; unless the newest is of the future."""
+    commands = made()
+    commands.offer(NOW, '', 1.0, 0.0, NOW)
+    assert commands.offer(NOW - PERIOD, '', 2.0, 0.0, NOW) == (False, '')
+    assert commands.newest == Command(NOW, 1.0)
+    assert commands.overtaken == 1
+    # The clock was set back by an hour.
+    back = NOW - 3600 * NANOSECONDS
+    assert commands.offer(back, '', 2.0, 0.0, back) == (True, '')
+    assert commands.newest == Command(back, 2.0)
+
+
+@pytest.mark.parametrize(
+    ('frame', 'force', 'torque', 'complaint'),
+    [
+        ('needle_entry', 1.0, 0.0, "must be in needle_base, got 'needle_entry'"),
+        ('', nan, 0.0, 'must be within 10 N and 1 N m, got force.y = nan, torque.x = 0.0'),
+        ('', 0.0, inf, 'must be within 10 N and 1 N m, got force.y = 0.0, torque.x = inf'),
+        ('', -10.1, 0.0, 'must be within 10 N and 1 N m, got force.y = -10.1, torque.x = 0.0'),
+    ],
+)
+def test_an_invalid_command_is_no_force(
+    frame: str, force: float, torque: float, complaint: str
+) -> None:
+    """It counts, so that an older one does not act any longer."""
+    commands = made()
+    commands.offer(NOW, '', 1.0, 0.0, NOW)
+    said = f'wrench_command {complaint}; no force is applied'
+    assert commands.offer(NOW + 1, frame, force, torque, NOW) == (True, said)
+    commands.hold(NOW + PERIOD)
+    assert commands.held == Command(NOW + 1)
+    assert commands.refused == 1
+
+
+def test_while_several_nodes_command_no_force_acts() -> None:
+    """From the time on that it is seen, until the next command of the last one."""
+    commands = made()
+    commands.offer(NOW, '', 1.0, 0.0, NOW)
+    assert not commands.count_commanders(1)
+    assert commands.count_commanders(3)
+    assert commands.rivals == 2
+    commands.hold(NOW + PERIOD)
+    assert commands.held == Command(NOW)
+    commands.offer(NOW + PERIOD, '', 1.0, 0.0, NOW + PERIOD)
+    assert commands.newest == Command(NOW + PERIOD)
+    assert commands.count_commanders(1)
+    commands.offer(NOW + 2 * PERIOD, '', 1.0, 0.0, NOW + 2 * PERIOD)
+    assert commands.newest.force == 1.0
+
+
+def test_what_was_commanded_is_forgotten() -> None:
+    """At a reset older commands still do not count; at an activation nothing is known."""
+    commands = made()
+    commands.offer(NOW, '', 1.0, 0.0, NOW)
+    commands.hold(NOW)
+    commands.forget()
+    assert commands.held == commands.newest == Command(NOW)
+    assert commands.offer(NOW - 1, '', 1.0, 0.0, NOW) == (False, '')
+    commands.begin()
+    assert commands.held == commands.newest == Command()

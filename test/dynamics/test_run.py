@@ -1,0 +1,163 @@
+"""A run of the plant: its samples, and the events that make it repeatable."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+from needle_dynamics import JobError, NeedleModel, NeedleParameters, ParameterError
+from needle_dynamics.simulated.assembly import PlantConstants
+from needle_dynamics.simulated.commands import Command
+from needle_dynamics.simulated.plant import Plant
+from needle_dynamics.simulated.run import (
+    CONFIGURED,
+    Event,
+    Measurement,
+    PARAMETERS,
+    PlantRun,
+    RESET,
+    TARE,
+    TIME,
+    TRAJECTORY,
+)
+import pytest
+
+#: A stamp that a float could not hold to the nanosecond.
+BEGIN = 1_700_000_000_123_456_789
+#: The period is not a whole number of nanoseconds.
+VALUES: dict[str, Any] = {
+    'model.preset': 'phantom',
+    'depth': 0.1,
+    'rate': 300.0,
+    'sensor.rate': 6000.0,
+}
+COURSE = Event(
+    TRAJECTORY,
+    {'joints': ['insertion'], 'times': [0.1], 'positions': [[0.101]], 'efforts': [[]]},
+)
+
+
+def stamp(k: int) -> int:
+    return BEGIN + round(k * 1e9 / 300.0)
+
+
+def truth(measured: list[Measurement]) -> list[float]:
+    """Return the numbers of `ground_truth`."""
+    return next(values for name, _, values in measured if name == 'ground_truth')
+
+
+def test_samples_say_what_the_contract_has() -> None:
+    """Each topic with as many numbers as it has quantities, joint_states last."""
+    for mode, last in (
+        ('simulation', 'joint_states'),
+        ('robot', 'joint_states'),
+        ('indenter', 'end_effector_pose'),
+    ):
+        plant = PlantRun({**VALUES, 'mode': mode})
+        measured = plant.take(stamp(1))
+        assert (measured[0][0], measured[-1][0]) == ('base_wrench', last)
+        assert {name for name, _, _ in measured} == plant.topics.keys()
+        for name, _, values in measured:
+            assert len(values) == len(plant.topics[name].quantities)
+
+
+def test_the_ground_truth_says_which_command_acted() -> None:
+    """To the last bit, though the needle feels its mean; insertion makes d smaller."""
+    plant = PlantRun(VALUES)
+    force, torque = 1.0 / 3.0, 1e-9 / 7.0
+    plant.commands.offer(stamp(0), '', force, torque, stamp(0))
+    plant.take(stamp(1))
+    plant.commands.offer(stamp(1), '', force, torque, stamp(1))
+    assert truth(plant.take(stamp(2)))[8:] == [-force, torque, 0.0, 0.0]
+    assert truth(plant.take(stamp(3), Command(0, 2.0)))[8:10] == [-2.0, 0.0]
+    robot = PlantRun({**VALUES, 'mode': 'robot'})
+    assert len(truth(robot.take(stamp(1)))) == 8
+
+
+def test_time_is_an_event_only_when_it_jumps() -> None:
+    """Stamps at multiples of the period are none, however they are rounded."""
+    plant = PlantRun(VALUES)
+    kinds = []
+    for k in range(1, 101):
+        plant.take(stamp(k if k <= 50 else k + 7))
+        kinds.append([event.kind for event in plant.events()])
+    assert kinds[0] == [CONFIGURED, TIME]
+    assert kinds[50] == [TIME]
+    assert not any(kinds[1:50] + kinds[51:])
+    assert plant.number == 100
+
+
+def test_events_can_be_written_and_done_again() -> None:
+    """What a run hands over makes the same samples, after a way through JSON."""
+    first = PlantRun({**VALUES, 'mode': 'robot', 'seed': 5})
+    done = {
+        40: [Event(TARE), COURSE],
+        60: [Event(PARAMETERS, {'model.coulomb_friction': 0.8})],
+        120: [Event(RESET), COURSE],
+    }
+    samples, said = [], []
+    for k in range(1, 151):
+        for event in done.get(k, []):
+            first.perform(event)
+        samples.append(first.take(stamp(k)))
+        said += [(k, event) for event in first.events()]
+    assert [(k, event.kind) for k, event in said] == [
+        (1, CONFIGURED), (1, TIME), (40, TARE), (40, TRAJECTORY), (60, PARAMETERS),
+        (120, RESET), (120, TRAJECTORY),
+    ]  # fmt: skip
+    texts = [(k, event.kind, json.dumps(event.content)) for k, event in said]
+    read = [(k, Event(kind, json.loads(text))) for k, kind, text in texts]
+    second = PlantRun(read[0][1].content)
+    for k, measured in enumerate(samples, 1):
+        for at, event in read[1:]:
+            if at == k:
+                second.perform(event)
+        assert second.take(stamp(k)) == measured
+
+
+def test_what_the_plant_refuses_is_no_event() -> None:
+    """The error is that of the plant, and nothing changes."""
+    plant = PlantRun({**VALUES, 'mode': 'robot'})
+    plant.take(stamp(1))
+    plant.events()
+    constants = plant.constants
+    for event, error in (
+        (Event(TRAJECTORY, {**COURSE.content, 'joints': ['x']}), ParameterError),
+        (Event(PARAMETERS, {'model.coulomb_friction': -1.0}), ParameterError),
+        (Event(TARE), JobError),
+    ):
+        with pytest.raises(error):
+            plant.perform(event)
+    # A fault alters measurements, not the plant.
+    plant.perform(Event(PARAMETERS, {'fault.kind': 'drop'}))
+    assert plant.events() == []
+    assert plant.constants is constants or plant.constants == constants
+
+
+def test_constants_are_those_of_the_parameters() -> None:
+    """What is not given has its default, in the preset if there is one."""
+    constants = PlantConstants.of({'model.preset': 'paper_mm', 'rate': 500, 'sensor.filter': 0})
+    assert constants.model == NeedleParameters.preset('paper_mm')
+    assert (constants.mode, constants.seed, constants.own.rate) == ('simulation', 1, 500.0)
+    assert constants.sensor.filter == 0
+    changed = PlantConstants.of({'model.preset': 'phantom', 'model.density': 7900})
+    assert changed.model == NeedleParameters.preset('phantom', density=7900.0)
+    start = changed.make()
+    assert isinstance(start, Plant)
+    assert list(start.integrator.state) == list(NeedleModel(changed.model).state_at(0.02, 0.0))
+
+
+@pytest.mark.parametrize(
+    ('values', 'complaint'),
+    [
+        ({'mode': 'dream'}, "mode must be one of simulation, robot, indenter, got 'dream'"),
+        ({'model.preset': 'steel'}, 'model.preset must be one of paper_si, paper_mm, phantom, g'),
+        ({'sensor.rate': -1.0}, 'sensor.rate must be finite, > 0 and <= 8000 Hz, got -1.0'),
+        ({'rate': 1e5}, 'rate must be finite, >= 1 and <= 8000 Hz, got 100000.0'),
+    ],
+)
+def test_a_parameter_that_is_not_valid_is_named(values: dict[str, Any], complaint: str) -> None:
+    """With its namespace."""
+    with pytest.raises(ParameterError) as caught:
+        PlantConstants.of(values)
+    assert str(caught.value).startswith(complaint)
