@@ -1,11 +1,16 @@
-"""How the tests are spread over processes (``pytest -n``, of pytest-xdist)."""
+"""What all tests share: settings, and how they are spread over processes (``pytest -n``)."""
 
 from __future__ import annotations
 
 import os
 from typing import Any
 
+from hypothesis import settings
 import pytest
+
+# An example may take long where other tests run beside it.
+settings.register_profile('tests', deadline=None)
+settings.load_profile('tests')
 
 #: Files whose tests share what takes long to make: each file runs in one process.
 WHOLE = {
