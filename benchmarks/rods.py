@@ -34,7 +34,7 @@ from needle_dynamics import (
     NeedleModel,
     NeedleParameters,
 )
-from needle_dynamics.simulated.integrators import DEFAULT_STEP
+from needle_dynamics.simulated.integrator import DEFAULT_STEP
 import numpy as np
 from scipy.optimize import brentq, minimize_scalar
 

@@ -19,7 +19,14 @@ import warnings
 from benchmarks.measure import Bar, geometric, least_times, number, seconds
 from benchmarks.page import Answer, Section, Tick
 from needle_dynamics import FloatArray, Integrator, NeedleModel, NeedleParameters
-from needle_dynamics.compiled.kernels import advance, evaluate, TERMS_PER_LENGTH
+from needle_dynamics.compiled import step as compiled_step
+from needle_dynamics.compiled.integrals import (
+    ModeIntegrals,
+    ModeTables,
+    TERMS_PER_LENGTH,
+    two_modes,
+)
+from needle_dynamics.compiled.modal_flow import rotate_two
 import numba
 import numpy as np
 from scipy.integrate import quad, solve_ivp
@@ -50,7 +57,7 @@ _Function = TypeVar('_Function', bound=Callable[..., object])
 
 
 def _compiled(function: _Function) -> _Function:
-    # Not cached on disk: Numba would not notice a change of `evaluate`.
+    # Not cached on disk: Numba would not notice a change of `two_modes`.
     return cast(_Function, numba.njit(error_model='numpy')(function))
 
 
@@ -62,45 +69,45 @@ def _derivative(
     series: FloatArray,
     terms: FloatArray,
     work: FloatArray,
-    at: FloatArray,
+    grids: FloatArray,
+    rows: FloatArray,
     out: FloatArray,
 ) -> None:
     """Write the time derivative of the state into ``out``, without torque."""
     length, rho, ei, ka, ca, mass, coulomb, viscous = constants
-    xi, reach = (length - x[0]) / length, (terms.shape[0] - 1) / TERMS_PER_LENGTH
+    depth, reach = length - x[0], length * (terms.shape[0] - 1) / TERMS_PER_LENGTH
     # A trial of a solver may be anywhere, and no number at all.
-    if not xi >= 0.0:
-        xi = 0.0
-    elif xi > reach:
-        xi = reach
-    evaluate(xi, series, terms, work, at)
+    if not depth >= 0.0:
+        depth = 0.0
+    elif depth > reach:
+        depth = reach
+    at = ModeIntegrals(grids[0], grids[1], rows[0], rows[1], rows[2], rows[3])
+    two_modes(ModeTables(length, series, terms, rows), depth, work, at)
+    phi, bend, g, h = at.value, at.curvature, at.gram, at.curvature_gram
     q1, q2, r1, r2 = x[2], x[3], x[6], x[7]
     speed = -x[4]
-    value = at[6] * q1 + at[7] * q2
-    rate = at[6] * r1 + at[7] * r2
-    curvature = at[8] * q1 + at[9] * q2
+    value = phi[0] * q1 + phi[1] * q2
+    rate = phi[0] * r1 + phi[1] * r2
+    curvature = bend[0] * q1 + bend[1] * q2
     drive = force + 0.5 * (rho * rate * rate - ei * curvature * curvature - ka * value * value)
     if speed == 0.0:
         friction = min(max(drive, -coulomb), coulomb)
     else:
         friction = (coulomb if speed > 0.0 else -coulomb) + viscous * speed
-    f1 = (
-        rho * x[4] * at[6] * rate - (ei * at[3] + ka * at[0]) * q1 - (ei * at[4] + ka * at[1]) * q2
-    )
-    f2 = (
-        rho * x[4] * at[7] * rate - (ei * at[4] + ka * at[1]) * q1 - (ei * at[5] + ka * at[2]) * q2
-    )
-    f1 -= ca * (at[0] * r1 + at[1] * r2)
-    f2 -= ca * (at[1] * r1 + at[2] * r2)
-    determinant = rho * (at[0] * at[2] - at[1] * at[1])
+    k12 = ei * h[0, 1] + ka * g[0, 1]
+    f1 = rho * x[4] * phi[0] * rate - (ei * h[0, 0] + ka * g[0, 0]) * q1 - k12 * q2
+    f2 = rho * x[4] * phi[1] * rate - k12 * q1 - (ei * h[1, 1] + ka * g[1, 1]) * q2
+    f1 -= ca * (g[0, 0] * r1 + g[0, 1] * r2)
+    f2 -= ca * (g[0, 1] * r1 + g[1, 1] * r2)
+    determinant = rho * (g[0, 0] * g[1, 1] - g[0, 1] * g[0, 1])
     out[0] = x[4]
     out[1] = x[5]
     out[2] = r1
     out[3] = r2
     out[4] = (friction - drive) / mass
     out[5] = 0.0
-    out[6] = (at[2] * f1 - at[1] * f2) / determinant
-    out[7] = (at[0] * f2 - at[1] * f1) / determinant
+    out[6] = (g[1, 1] * f1 - g[0, 1] * f2) / determinant
+    out[7] = (g[0, 0] * f2 - g[0, 1] * f1) / determinant
 
 
 def compiled_right_hand_side(model: NeedleModel, force: float) -> RightHandSide:
@@ -131,12 +138,12 @@ def compiled_right_hand_side(model: NeedleModel, force: float) -> RightHandSide:
         p.coulomb_friction,
         p.viscous_friction,
     )
-    series, terms = model.modes.series, model.modes.terms
-    work, at = np.empty(series.shape[1]), np.empty(14)
+    tables = model.modes.tables
+    work, grids, rows = np.empty(tables.series.shape[1]), np.empty((2, 2, 2)), np.empty((4, 2))
 
     def right_hand_side(_time: float, x: FloatArray) -> FloatArray:
         out = np.empty(8)
-        _derivative(x, force, constants, series, terms, work, at, out)
+        _derivative(x, force, constants, tables.series, tables.terms, work, grids, rows, out)
         return out
 
     return right_hand_side
@@ -389,10 +396,14 @@ class OpenLoop:
             Number of steps.
 
         """
-        source = cast(Any, advance).py_func
+        # Each step rotates the two modes once; the source of what is compiled can count that.
+        sources = {
+            name: cast(Any, getattr(compiled_step, name)).py_func for name in ('advance', '_steps')
+        }
         with (
-            mock.patch('needle_dynamics.simulated.integrators.advance', source),
-            mock.patch('needle_dynamics.compiled.kernels.evaluate', wraps=evaluate) as call,
+            mock.patch('needle_dynamics.simulated.integrator.advance', sources['advance']),
+            mock.patch.object(compiled_step, '_steps', sources['_steps']),
+            mock.patch.object(compiled_step, 'rotate_two', wraps=rotate_two) as call,
         ):
             self.integrate(step, DURATION, graded=graded)
         return call.call_count

@@ -22,7 +22,7 @@ from unittest import mock
 from benchmarks.measure import Bar, least_times
 from benchmarks.page import Answer, Section, Tick
 from needle_dynamics import FloatArray, Integrator, NeedleModel, NeedleParameters
-from needle_dynamics.compiled.kernels import advance
+from needle_dynamics.compiled.step import advance, Sums
 import numba
 import numpy as np
 
@@ -32,7 +32,7 @@ _DEPTH, _DEFLECTION, _FORCE, _STEP = 0.02, 5e-4, 3.0, 1e-5
 _STEPS: Final = 2800
 
 #: Kernel function whose sums and products are series side by side.
-SERIES: Final = 'evaluate'
+SERIES: Final = 'two_modes'
 
 _FUNCTIONS: Final = {
     'sqrt': 'square root',
@@ -131,29 +131,32 @@ def count_operations(function: Callable[..., object], arguments: tuple[Any, ...]
         result: _Counted = number(getattr(math, name)(value))
         return result
 
-    source = cast(Any, function).py_func
     # Scratch arrays hold these numbers too.
     scratch = SimpleNamespace(
         empty=partial(np.empty, dtype=object), zeros=partial(np.zeros, dtype=object)
     )
-    names = {**source.__globals__, 'np': scratch}
 
-    def plain(function: Any, *, series: bool) -> Callable[..., object]:
-        run = FunctionType(function.__code__, names, None, function.__defaults__)
-        if not series:
-            return run
+    made: dict[Any, Callable[..., object]] = {}
+
+    def plain(function: Any) -> Callable[..., object]:
+        """Return the Python source of a compiled function, in which operations are counted."""
+        if function in made:
+            return made[function]
+        source = function.py_func
+        names = {**source.__globals__, 'np': scratch}
+        run = FunctionType(source.__code__, names, None, source.__defaults__)
 
         def apart(*values: Any) -> object:
             with tally.within('series '):
                 return run(*values)
 
-        return apart
-
-    for name, value in source.__globals__.items():
-        if hasattr(value, 'py_func'):
-            names[name] = plain(value.py_func, series=name == SERIES)
-        elif name in _FUNCTIONS and value is getattr(math, name):
-            names[name] = partial(counting, name)
+        made[function] = apart if source.__name__ == SERIES else run
+        for name, value in source.__globals__.items():
+            if hasattr(value, 'py_func'):
+                names[name] = plain(value)
+            elif name in _FUNCTIONS and value is getattr(math, name):
+                names[name] = partial(counting, name)
+        return made[function]
 
     def counted(value: Any) -> Any:
         if isinstance(value, np.ndarray) and value.dtype == np.float64:
@@ -166,8 +169,7 @@ def count_operations(function: Callable[..., object], arguments: tuple[Any, ...]
             return value._make(items) if hasattr(value, '_make') else tuple(items)
         return number(value) if isinstance(value, float) else value
 
-    run = FunctionType(source.__code__, names, None, source.__defaults__)
-    run(*[counted(value) for value in arguments])
+    plain(function)(*[counted(value) for value in arguments])
     return tally.counts
 
 
@@ -193,11 +195,11 @@ def operations_of_a_step(steps: int = _STEPS) -> dict[str, float]:
     """
     counts: list[Counter[str]] = []
 
-    def count(*arguments: Any) -> float:
+    def count(*arguments: Any) -> tuple[float, Sums]:
         counts.append(count_operations(advance, arguments))
-        return 0.0
+        return 0.0, Sums(*[0.0] * len(Sums._fields))
 
-    with mock.patch('needle_dynamics.simulated.integrators.advance', count):
+    with mock.patch('needle_dynamics.simulated.integrator.advance', count):
         for taken in (1, steps + 1):
             Integrator(*_start(), _STEP).advance(taken * _STEP, _FORCE)
     # What is done once a call, and the step from rest, drop out.

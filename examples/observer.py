@@ -18,12 +18,12 @@ def main() -> None:
     parameters = NeedleParameters.preset('phantom')
     needle = Integrator(parameters, NeedleModel(parameters).state_at(0.1, tip_deflection=2e-3))
     observer = Observer(parameters, ObserverSettings(tip_noise=1e-4), PERIOD)
-    observer.update(0.0, needle.depth, needle.speed)
+    observer.update(0.0, needle.depth, needle.velocity)
     for sample in range(1, 1001):
         time = sample * PERIOD
         seen = needle.advance(PERIOD, force=4.0)
         # The third argument is the velocity; a fourth would be the wrench at the base.
-        observer.update(time, needle.depth, needle.speed)
+        observer.update(time, needle.depth, needle.velocity)
         if sample % 20 == 0:
             observer.add_tip(time, seen.tip_deflection + rng.normal(0.0, 1e-4))
         if sample in (20, 100, 1000):

@@ -9,33 +9,24 @@ from typing import TYPE_CHECKING
 from needle_ros.lazy import lazy_names
 
 if TYPE_CHECKING:
+    from needle_dynamics.analysis import Analysis, analyze
     from needle_dynamics.arrays import FloatArray
+    from needle_dynamics.compiled.friction import FRICTION_LAWS
     from needle_dynamics.compiled.integrals import ModeIntegrals
-    from needle_dynamics.errors import (
-        InsertedLengthError,
-        ToleranceError,
-    )
-    from needle_dynamics.friction import Friction, FRICTION_LAWS
+    from needle_dynamics.errors import InsertedLengthError, ToleranceError
+    from needle_dynamics.friction import Friction
+    from needle_dynamics.linearization import linearize, LinearSystem, operating_point
     from needle_dynamics.model import NeedleModel
     from needle_dynamics.modes import mode_shapes, ModeShapes
     from needle_dynamics.parameters import FORMULATIONS, NeedleParameters, PRESETS
+    from needle_dynamics.simulated.batch import Batch, simulate_batch
     from needle_dynamics.simulated.force_sensor import ForceSensor, ForceSensorParameters
     from needle_dynamics.simulated.indenter import Indenter, IndenterParameters
-    from needle_dynamics.simulated.integrators import (
-        Batch,
-        Integrator,
-        Interval,
-        simulate,
-        simulate_batch,
-        Trajectory,
-    )
+    from needle_dynamics.simulated.integrator import Integrator, Interval
+    from needle_dynamics.simulated.plant import Plant
+    from needle_dynamics.simulated.trajectory import simulate, Trajectory
     from needle_dynamics.tissue import Tissue
-    from needle_ros.errors import (
-        JobError,
-        NeedleError,
-        ParameterError,
-        ShapeError,
-    )
+    from needle_ros.errors import JobError, NeedleError, ParameterError, ShapeError
 else:
     __getattr__, __dir__ = lazy_names(__name__)
 
@@ -43,6 +34,7 @@ __all__ = [
     'FORMULATIONS',
     'FRICTION_LAWS',
     'PRESETS',
+    'Analysis',
     'Batch',
     'FloatArray',
     'ForceSensor',
@@ -54,17 +46,22 @@ __all__ = [
     'Integrator',
     'Interval',
     'JobError',
+    'LinearSystem',
     'ModeIntegrals',
     'ModeShapes',
     'NeedleError',
     'NeedleModel',
     'NeedleParameters',
     'ParameterError',
+    'Plant',
     'ShapeError',
     'Tissue',
     'ToleranceError',
     'Trajectory',
+    'analyze',
+    'linearize',
     'mode_shapes',
+    'operating_point',
     'simulate',
     'simulate_batch',
 ]

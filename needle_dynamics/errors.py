@@ -1,10 +1,10 @@
-"""What can go wrong in the model."""
+"""Errors of the model."""
 
 from needle_ros.errors import NeedleError
 
 
 class ToleranceError(NeedleError):
-    """An accuracy that was asked for cannot be reached."""
+    """The requested accuracy cannot be reached."""
 
 
 class InsertedLengthError(NeedleError):

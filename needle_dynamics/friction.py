@@ -3,38 +3,49 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import exp, inf, tanh
-from typing import Final
+from math import inf
 
-from needle_ros.errors import (
-    ParameterError,
+from needle_dynamics.compiled.friction import (
+    dry_friction,
+    friction_force,
+    FRICTION_LAWS,
+    FrictionConstants,
 )
-import numpy as np
-
-#: Laws by name, in the order of their numbers in `needle_dynamics.compiled.kernels`.
-FRICTION_LAWS: Final = ('coulomb', 'stribeck', 'tanh')
+from needle_ros.errors import ParameterError
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Friction:
     """
-    A friction law; the defaults of all but its two coefficients are those of (15).
+    A friction law with its constants; the defaults are those of (15).
+
+    Only the laws listed here exist: the step of the integrator is compiled, and a Python object
+    cannot be called from it. To add a law, add a branch to `dry_friction` in
+    ``needle_dynamics/compiled/friction.py``; that file says how.
 
     Attributes
     ----------
     law : str
-        ``coulomb``: dry friction mu_s, set-valued at rest. ``stribeck``: from the break-away
-        value at rest down to mu_s, set-valued at rest. ``tanh``: smooth through zero; it creeps.
-    coulomb, viscous : float
-        Coulomb friction mu_s [N] and viscous friction mu_v [N s/m].
+        ``coulomb``: dry friction mu_s, set-valued at rest. ``stribeck``: falls from the
+        break-away value at rest to mu_s, set-valued at rest. ``tanh``: smooth through zero; a
+        needle at rest creeps.
+    coulomb : float
+        Coulomb friction mu_s [N].
+    viscous : float
+        Viscous friction mu_v [N s/m].
     withdrawal : float
         Friction on withdrawal over that on insertion.
     breakaway : float
         Friction at rest over mu_s (``stribeck``).
     stribeck_speed : float
-        Speed over which it falls to mu_s [m/s].
+        Speed over which friction falls to mu_s [m/s] (``stribeck``).
     smoothing_speed : float
-        Speed over which ``tanh`` turns [m/s].
+        Speed over which friction changes its sign [m/s] (``tanh``).
+
+    Raises
+    ------
+    ParameterError
+        If the law is unknown or a constant is outside its range.
 
     """
 
@@ -61,14 +72,27 @@ class Friction:
             if not 0.0 < value < inf:
                 raise ParameterError(f'{name} must be finite and > 0 m/s, got {value!r}')
 
-    def force(self, speed: float, drive: float) -> float:
+    @property
+    def constants(self) -> FrictionConstants:
+        """The constants as compiled functions take them."""
+        return FrictionConstants(
+            FRICTION_LAWS.index(self.law),
+            float(self.coulomb),
+            float(self.viscous),
+            float(self.withdrawal),
+            float(self.breakaway),
+            float(self.stribeck_speed),
+            float(self.smoothing_speed),
+        )
+
+    def force(self, velocity: float, drive: float) -> float:
         """
         Friction force on the needle.
 
         Parameters
         ----------
-        speed : float
-            Insertion speed s_dot [m/s], positive into the tissue.
+        velocity : float
+            Insertion velocity s_dot [m/s], positive into the tissue.
         drive : float
             Sum of the other forces [N], positive into the tissue; it decides at rest.
 
@@ -78,15 +102,24 @@ class Friction:
             Force [N], positive against insertion.
 
         """
-        if speed == 0.0:
-            bearable = self.coulomb * (self.breakaway if self.law == 'stribeck' else 1.0)
-            if self.law == 'tanh':
-                return 0.0
-            return float(np.clip(drive, -self.withdrawal * bearable, bearable))
-        dry = self.coulomb
-        if self.law == 'stribeck':
-            dry *= 1.0 + (self.breakaway - 1.0) * exp(-((speed / self.stribeck_speed) ** 2))
-        elif self.law == 'tanh':
-            dry *= tanh(abs(speed) / self.smoothing_speed)
-        force = dry * np.sign(speed) + self.viscous * speed
-        return float(force if speed > 0.0 else self.withdrawal * force)
+        return friction_force(self.constants, float(velocity), float(drive))
+
+    def slope(self, velocity: float, direction: float) -> float:
+        """
+        Differentiate the friction force by the insertion velocity.
+
+        Parameters
+        ----------
+        velocity : float
+            Insertion velocity [m/s].
+        direction : float
+            Side of rest from which to differentiate: positive for insertion, else withdrawal.
+
+        Returns
+        -------
+        float
+            Derivative [N s/m].
+
+        """
+        _, dry = dry_friction(self.constants, float(self.coulomb), abs(float(velocity)))
+        return (1.0 if direction > 0.0 else self.withdrawal) * (self.viscous + dry)

@@ -4,33 +4,47 @@ Equations of motion of the needle in tissue, one method per equation.
 The generalized coordinates are q = [d, theta, q1, ..., qn] and the state is X = [q, q_dot]:
 eight numbers for n = 2. d is the length of needle outside the tissue, so that insertion
 decreases it; the insertion force f_y is positive into the tissue. The formulation `complete` has
-every term of Euler-Lagrange on T - V, equation (12); `as_printed` is the source's final form,
-which leaves out the row of d and what comes from dG/dt.
+every term of Euler-Lagrange on T - V, equation (12). The formulation `as_printed` is the source's
+final form, which leaves out the row of d and what comes from dG/dt.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import cached_property
 from math import isfinite
-from typing import Final
+from typing import Final, NamedTuple
 
 from needle_dynamics.arrays import FloatArray
-from needle_dynamics.errors import (
-    InsertedLengthError,
-)
+from needle_dynamics.compiled.integrals import ModeIntegrals, tip_deflections
+from needle_dynamics.compiled.normal_modes import coupling
+from needle_dynamics.compiled.step import Needle
+from needle_dynamics.errors import InsertedLengthError
 from needle_dynamics.friction import Friction
 from needle_dynamics.modes import mode_shapes, ModeShapes
 from needle_dynamics.parameters import NeedleParameters
 from needle_dynamics.tissue import Tissue
-from needle_ros.errors import (
-    ParameterError,
-    ShapeError,
-)
+from needle_ros.errors import ParameterError, ShapeError
 import numpy as np
 from numpy.typing import ArrayLike
 
 #: Rounding of an inserted length, relative to the needle's length.
 ROUNDING: Final = 1e-12
+
+
+class _Instant(NamedTuple):
+    """A checked state with what the equations need at it, evaluated once."""
+
+    state: FloatArray
+    depth: float
+    #: Velocity of d, deflections q1..qn and their rates.
+    d_rate: float
+    modal: FloatArray
+    rate: FloatArray
+    at: ModeIntegrals
+    #: Stiffness of the tissue at the tip [N/m^2], and modal stiffness.
+    tip_stiffness: float
+    stiffness: FloatArray
 
 
 @dataclass(frozen=True)
@@ -41,42 +55,77 @@ class NeedleModel:
     Attributes
     ----------
     parameters : NeedleParameters
-        Constants, SI units.
-    modes : ModeShapes
-        Shape modes of the needle.
-    tissue : Tissue
-        Elastic foundation.
-    friction : Friction
-        Friction along the insertion axis.
+        Constants, SI units. For friction or tissue as objects, see `NeedleParameters.using`.
+
+    Examples
+    --------
+    A needle at rest, 5 cm inserted, its tip deflected by 1 mm:
+
+    >>> from needle_dynamics import NeedleModel, NeedleParameters
+    >>> model = NeedleModel(NeedleParameters.preset('phantom'))
+    >>> state = model.state_at(0.05, tip_deflection=1e-3)
+    >>> print(f'{model.tip_deflection(state):.4f} m')
+    0.0010 m
+    >>> print(f'{model.energy(state):.2g} J')
+    0.0003 J
 
     """
 
     parameters: NeedleParameters
-    modes: ModeShapes = field(init=False, repr=False)
-    tissue: Tissue = field(init=False, repr=False)
-    friction: Friction = field(init=False, repr=False)
 
-    def __post_init__(self) -> None:
+    @cached_property
+    def modes(self) -> ModeShapes:
+        """Shape modes of the needle."""
         p = self.parameters
         # Without the stop the needle may overshoot the hub by as much as its length.
-        reach = 1.0 if p.hub_stop else 2.0
-        object.__setattr__(self, 'modes', mode_shapes(p.length, p.modes, reach))
-        object.__setattr__(self, 'tissue', p.tissue)
-        object.__setattr__(self, 'friction', p.friction)
+        return mode_shapes(p.length, p.modes, 1.0 if p.hub_stop else 2.0)
+
+    @cached_property
+    def tissue(self) -> Tissue:
+        """Tissue along the needle."""
+        return self.parameters.tissue
+
+    @cached_property
+    def friction(self) -> Friction:
+        """Friction along the insertion axis."""
+        return self.parameters.friction
+
+    @cached_property
+    def compiled(self) -> Needle:
+        """The needle as compiled functions take it."""
+        p = self.parameters
+        return Needle(
+            length=p.length,
+            linear_density=p.linear_density,
+            bending_stiffness=p.bending_stiffness,
+            tissue_damping=p.tissue_damping,
+            moving_mass=p.moving_mass,
+            carriage_mass=p.carriage_mass,
+            rotary_inertia=p.rotary_inertia,
+            minimum_depth=p.minimum_depth - ROUNDING * p.length,
+            maximum_depth=self.modes.reach * p.length,
+            hub_stop=p.hub_stop,
+            as_printed=p.formulation == 'as_printed',
+            swelling=p.swelling,
+            swelling_time=p.swelling_time,
+            friction=self.friction.constants,
+            modes=self.modes.tables,
+            layers=self.tissue.layers(self.modes),
+        )
 
     @property
     def coordinates(self) -> int:
         """Number of generalized coordinates, 2 + n."""
-        return 2 + self.modes.count
+        return 2 + self.parameters.modes
 
     @property
     def coordinate_names(self) -> tuple[str, ...]:
         """Names of the generalized coordinates, in order: d, theta, q1, ..., qn."""
-        return ('d', 'theta', *(f'q{i + 1}' for i in range(self.modes.count)))
+        return ('d', 'theta', *(f'q{i + 1}' for i in range(self.parameters.modes)))
 
     def checked_state(self, state: ArrayLike) -> FloatArray:
         """
-        Return the state as an array, or say what is wrong with it.
+        Return a state as an array, or say what is wrong with it.
 
         Parameters
         ----------
@@ -117,6 +166,21 @@ class NeedleModel:
             )
         return checked
 
+    def _instant(self, state: ArrayLike, time: float = 0.0) -> _Instant:
+        """Check a state and evaluate the modes at it."""
+        x, m = self.checked_state(state), self.coordinates
+        depth = self.parameters.length - x[0]
+        at = self.modes.integrals(depth)
+        tip_stiffness = self.tissue.stiffness(depth, time)
+        stiffness = self._stiffness(at, depth, time)
+        return _Instant(x, depth, x[m], x[2:m], x[m + 2 :], at, tip_stiffness, stiffness)
+
+    def _stiffness(self, at: ModeIntegrals, depth: float, time: float) -> FloatArray:
+        tissue, layer = self.tissue, self.tissue.layer(depth)
+        above = self.compiled.layers.gram[layer]
+        held = tissue.growth(time) * (tissue.stiffnesses[layer] * at.gram + above)
+        return np.asarray(self.parameters.bending_stiffness * at.curvature_gram + held)
+
     def state_at(self, depth: float, tip_deflection: float = 0.0) -> FloatArray:
         """
         Return the state at rest with a given inserted length and tip deflection.
@@ -147,9 +211,9 @@ class NeedleModel:
         state = np.zeros(2 * self.coordinates)
         state[0] = self.parameters.length - depth
         state = self.checked_state(state)
-        value = self.modes.integrals(depth).value
-        shape = np.linalg.solve(self.stiffness_matrix(depth), value)
-        state[2 : self.coordinates] = shape * (tip_deflection / (value @ shape))
+        at = self.modes.integrals(depth)
+        shape = np.linalg.solve(self._stiffness(at, depth, 0.0), at.value)
+        state[2 : self.coordinates] = shape * (tip_deflection / (at.value @ shape))
         return self.checked_state(state)
 
     def stiffness_matrix(self, depth: float, time: float = 0.0) -> FloatArray:
@@ -169,8 +233,7 @@ class NeedleModel:
             Stiffness [N/m] for modal coordinates in m^3/2.
 
         """
-        bending = self.parameters.bending_stiffness * self.modes.integrals(depth).curvature_gram
-        return np.asarray(bending + self.tissue.matrix(self.modes, depth, time))
+        return self._stiffness(self.modes.integrals(depth), depth, time)
 
     def mass_matrix(self, state: ArrayLike) -> FloatArray:
         """
@@ -187,11 +250,14 @@ class NeedleModel:
             Mass matrix.
 
         """
-        p, x = self.parameters, self.checked_state(state)
+        return self._mass(self._instant(state).at)
+
+    def _mass(self, at: ModeIntegrals) -> FloatArray:
+        p = self.parameters
         matrix = np.zeros((self.coordinates, self.coordinates))
         matrix[0, 0] = p.moving_mass
         matrix[1, 1] = 0.5 * p.rotary_inertia
-        matrix[2:, 2:] = p.linear_density * self.modes.integrals(p.length - x[0]).gram
+        matrix[2:, 2:] = p.linear_density * at.gram
         return matrix
 
     def bias_forces(self, state: ArrayLike, time: float = 0.0) -> FloatArray:
@@ -211,20 +277,19 @@ class NeedleModel:
             N in M q_ddot + N = F - F_f.
 
         """
-        p, x, m = self.parameters, self.checked_state(state), self.coordinates
-        depth = p.length - x[0]
-        at = self.modes.integrals(depth)
-        modal, rate, d_rate = x[2:m], x[m + 2 :], x[m]
-        bias = np.zeros(m)
-        bias[2:] = self.stiffness_matrix(depth, time) @ modal + p.tissue_damping * at.gram @ rate
+        return self._bias(self._instant(state, time))
+
+    def _bias(self, now: _Instant) -> FloatArray:
+        p, at = self.parameters, now.at
+        bias = np.zeros(self.coordinates)
+        bias[2:] = now.stiffness @ now.modal + p.tissue_damping * at.gram @ now.rate
         if p.formulation == 'complete':
-            tip_rate = at.value @ rate
-            bias[0] = 0.5 * (
-                p.linear_density * tip_rate**2
-                - p.bending_stiffness * (at.curvature @ modal) ** 2
-                - self.tissue.stiffness(depth, time) * (at.value @ modal) ** 2
+            tip_rate, tip = float(at.value @ now.rate), float(at.value @ now.modal)
+            bend = float(at.curvature @ now.modal)
+            bias[0] = -coupling(
+                p.linear_density, p.bending_stiffness, now.tip_stiffness, bend, tip, tip_rate
             )
-            bias[2:] -= p.linear_density * d_rate * at.value * tip_rate
+            bias[2:] -= p.linear_density * now.d_rate * at.value * tip_rate
         return bias
 
     def acceleration(
@@ -249,21 +314,25 @@ class NeedleModel:
         ndarray, shape (2 + n,)
             q_ddot.
 
+        Raises
+        ------
+        ParameterError
+            If an input is not finite.
+        ShapeError, InsertedLengthError
+            If the state is not valid.
+
         """
-        x = self.checked_state(state)
+        return self._acceleration(self._instant(state, time), force, torque)
+
+    def _acceleration(self, now: _Instant, force: float, torque: float) -> FloatArray:
         if not (isfinite(force) and isfinite(torque)):
             raise ParameterError(f'force and torque must be finite, got {force!r} and {torque!r}')
-        bias = self.bias_forces(x, time)
+        bias = self._bias(now)
+        applied = np.zeros(self.coordinates)
         # Q_d = -f_y: what pushes the needle in shortens d.
-        drive = force + bias[0]
-        applied = np.array(
-            [
-                self.friction.force(-x[self.coordinates], drive) - force,
-                torque,
-                *np.zeros(self.modes.count),
-            ]
-        )
-        return np.asarray(np.linalg.solve(self.mass_matrix(x), applied - bias))
+        applied[0] = self.friction.force(-now.d_rate, force + bias[0]) - force
+        applied[1] = torque
+        return np.asarray(np.linalg.solve(self._mass(now.at), applied - bias))
 
     def inverse_dynamics(
         self, state: ArrayLike, acceleration: ArrayLike, time: float = 0.0
@@ -276,7 +345,7 @@ class NeedleModel:
         state : array_like, shape (2 (2 + n),)
             State.
         acceleration : array_like, shape (2 + n,)
-            q_ddot. From rest friction acts against the motion that begins; held at rest it
+            q_ddot. From rest friction acts against the motion that begins. Held at rest, it
             takes the value within its bounds that asks for the least force.
         time : float
             Time [s], for tissue that swells.
@@ -293,15 +362,14 @@ class NeedleModel:
             If a shape is wrong or a number is not finite.
 
         """
-        x, m = self.checked_state(state), self.coordinates
+        now, m = self._instant(state, time), self.coordinates
         wanted = np.array(acceleration, dtype=float)
         if wanted.shape != (m,) or not np.isfinite(wanted).all():
             raise ShapeError(f'acceleration must be finite with shape ({m},), got {wanted}')
-        forces = self.mass_matrix(x) @ wanted + self.bias_forces(x, time)
-        speed = -x[m]
-        # At rest an endless drive decides: friction is what it can bear, in that direction.
+        forces = self._mass(now.at) @ wanted + self._bias(now)
+        # From rest an infinite drive gives the friction that opposes the motion which begins.
         drive = -np.sign(wanted[0]) * np.inf if wanted[0] != 0.0 else forces[0]
-        forces[0] = -forces[0] + self.friction.force(speed, drive)
+        forces[0] = -forces[0] + self.friction.force(-now.d_rate, drive)
         return np.asarray(forces)
 
     def friction_power(self, state: ArrayLike) -> float:
@@ -319,8 +387,8 @@ class NeedleModel:
             Power [W], never negative.
 
         """
-        speed = -self.checked_state(state)[self.coordinates]
-        return float(self.friction.force(speed, 0.0) * speed)
+        velocity = -self.checked_state(state)[self.coordinates]
+        return float(self.friction.force(velocity, 0.0) * velocity)
 
     def base_reaction(
         self, state: ArrayLike, force: float = 0.0, torque: float = 0.0, time: float = 0.0
@@ -332,8 +400,10 @@ class NeedleModel:
         ----------
         state : array_like, shape (2 (2 + n),)
             State.
-        force, torque : float
-            Insertion force [N], positive into the tissue, and torque [N m] on the carriage.
+        force : float
+            Insertion force on the carriage [N], positive into the tissue.
+        torque : float
+            Torque on the carriage [N m].
         time : float
             Time [s], for tissue that swells.
 
@@ -343,21 +413,18 @@ class NeedleModel:
             Axial force along y [N], lateral force along z [N], moment about x at the base [N m].
 
         """
-        p, x, m = self.parameters, self.checked_state(state), self.coordinates
-        n, depth, speed = self.modes.count, p.length - x[0], -x[m]
-        modal, rate = x[2:m], x[m + 2 :]
-        acceleration = self.acceleration(x, force, torque, time)
-        at, tissue = self.modes.integrals(depth), self.tissue
-        layer = max(int(np.searchsorted(tissue.starts, depth, side='right')) - 1, 0)
-        above = tissue.offsets(self.modes)[layer, -2 * n :].reshape(2, n)
-        integrals = np.array([at.area, at.moment])
+        p, tissue, now = self.parameters, self.tissue, self._instant(state, time)
+        acceleration = self._acceleration(now, force, torque)
+        layer, layers = tissue.layer(now.depth), self.compiled.layers
+        integrals = np.array([now.at.area, now.at.moment])
+        above = np.array([layers.area[layer], layers.moment[layer]])
         held = tissue.growth(time) * (tissue.stiffnesses[layer] * integrals + above)
         # The part that enters brings the momentum of the tip, at a lever of the depth.
-        entering = speed * (at.value @ rate) * np.array([1.0, depth])
+        entering = -now.d_rate * (now.at.value @ now.rate) * np.array([1.0, now.depth])
         inertia = p.linear_density * (integrals @ acceleration[2:] + entering)
-        lateral, about_entry = inertia + held @ modal + p.tissue_damping * integrals @ rate
+        lateral, about_entry = inertia + held @ now.modal + p.tissue_damping * integrals @ now.rate
         axial = force + p.carriage_mass * acceleration[0]
-        return np.array([axial, lateral, about_entry + x[0] * lateral + torque])
+        return np.array([axial, lateral, about_entry + now.state[0] * lateral + torque])
 
     def derivative(
         self, state: ArrayLike, force: float = 0.0, torque: float = 0.0, time: float = 0.0
@@ -400,8 +467,9 @@ class NeedleModel:
             Energy [J].
 
         """
-        rate = self.checked_state(state)[self.coordinates :]
-        return float(0.5 * rate @ self.mass_matrix(state) @ rate)
+        now = self._instant(state)
+        rate = now.state[self.coordinates :]
+        return float(0.5 * rate @ self._mass(now.at) @ rate)
 
     def potential_energy(self, state: ArrayLike, time: float = 0.0) -> float:
         """
@@ -411,6 +479,8 @@ class NeedleModel:
         ----------
         state : array_like, shape (2 (2 + n),)
             State.
+        time : float
+            Time [s], for tissue that swells.
 
         Returns
         -------
@@ -418,10 +488,8 @@ class NeedleModel:
             Energy [J].
 
         """
-        x = self.checked_state(state)
-        modal = x[2 : self.coordinates]
-        stiffness = self.stiffness_matrix(self.parameters.length - x[0], time)
-        return float(0.5 * modal @ stiffness @ modal)
+        now = self._instant(state, time)
+        return float(0.5 * now.modal @ now.stiffness @ now.modal)
 
     def energy(self, state: ArrayLike, time: float = 0.0) -> float:
         """
@@ -431,6 +499,8 @@ class NeedleModel:
         ----------
         state : array_like, shape (2 (2 + n),)
             State.
+        time : float
+            Time [s], for tissue that swells.
 
         Returns
         -------
@@ -455,9 +525,26 @@ class NeedleModel:
             Deflection [m] along z.
 
         """
-        x = self.checked_state(state)
-        value = self.modes.integrals(self.parameters.length - x[0]).value
-        return float(value @ x[2 : self.coordinates])
+        return float(self.tip_deflections(self.checked_state(state)[np.newaxis])[0])
+
+    def tip_deflections(self, states: ArrayLike) -> FloatArray:
+        """
+        Deflection of the tip for many states at once.
+
+        Parameters
+        ----------
+        states : array_like, shape (..., 2 (2 + n))
+            Valid states, or NaN.
+
+        Returns
+        -------
+        ndarray, shape (...)
+            Deflections [m] along z; NaN where a state is NaN.
+
+        """
+        x = np.ascontiguousarray(states, dtype=float)
+        rows = x.reshape(-1, 2 * self.coordinates)
+        return tip_deflections(self.modes.tables, rows).reshape(x.shape[:-1])
 
     def shape(self, state: ArrayLike, points: int = 50) -> FloatArray:
         """
@@ -474,6 +561,11 @@ class NeedleModel:
         -------
         ndarray, shape (points, 2)
             y and w(y) [m].
+
+        Raises
+        ------
+        ShapeError
+            If there are fewer than two points.
 
         """
         x = self.checked_state(state)

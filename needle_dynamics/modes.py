@@ -1,18 +1,16 @@
 r"""
 Shape modes of the needle, equations (10)-(11), and their integrals over the inserted part.
 
-Everything the equations of motion need of the modes at an inserted length s (their values and
-curvatures, G, H, and the first two moments) has a closed form. Where the arguments k_i s are small
-the antiderivatives in boundary values lose all their digits by cancellation; there the power
-series in s, held side by side in `ModeShapes.series`, gives the same without it. Two modes are
-small enough at any s: one Horner pass gives all of them.
+Everything that the equations of motion need of the modes at an inserted length s has a closed
+form: values, curvatures, G, H and the first two moments. `needle_dynamics.compiled.integrals`
+evaluates them; the constants and series that it needs are made here.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from math import cos, cosh, factorial, pi
+from math import cos, cosh, factorial, pi, sin, tanh
 from typing import Final
 
 from needle_dynamics.arrays import FloatArray
@@ -23,13 +21,9 @@ from needle_dynamics.compiled.integrals import (
     SERIES_END,
     TERMS_PER_LENGTH,
 )
-from needle_dynamics.compiled.kernels import evaluate, evaluate_many
-from needle_ros.errors import (
-    ParameterError,
-)
+from needle_ros.errors import ParameterError
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.optimize import brentq
 
 #: The first term that a series leaves out is below this part of the sum.
 _TRUNCATION: Final = 1e-17
@@ -59,14 +53,7 @@ class ModeShapes:
     @cached_property
     def arguments(self) -> FloatArray:
         """Arguments k_i l, the roots of cos(x) cosh(x) + 1 = 0; shape (n,)."""
-        return np.array(
-            [
-                brentq(
-                    lambda x: cos(x) + 1.0 / cosh(x), i * pi, (i + 1) * pi, xtol=1e-15, rtol=1e-15
-                )
-                for i in range(self.count)
-            ]
-        )
+        return np.array([_root(i) for i in range(self.count)])
 
     @cached_property
     def wavenumbers(self) -> FloatArray:
@@ -74,7 +61,7 @@ class ModeShapes:
         return np.asarray(self.arguments / self.length)
 
     @cached_property
-    def rests(self) -> FloatArray:
+    def _rests(self) -> FloatArray:
         """What the growing exponentials leave, (mu_i - 1) exp(k_i l); shape (n,)."""
         x = self.arguments
         fall = np.exp(-x)
@@ -86,43 +73,12 @@ class ModeShapes:
     @cached_property
     def ratios(self) -> FloatArray:
         """Ratios mu_i of (11); shape (n,)."""
-        return np.asarray(1.0 + self.rests * np.exp(-self.arguments))
+        return np.asarray(1.0 + self._rests * np.exp(-self.arguments))
 
     @cached_property
     def scales(self) -> FloatArray:
         """Normalizing constants c_i of (11) [m^-1/2]: 1/c_i^2 = mu_i^2 l; shape (n,)."""
         return np.asarray(1.0 / (self.ratios * np.sqrt(self.length)))
-
-    def derivatives(self, y: ArrayLike, order: int) -> FloatArray:
-        """
-        Differentiate the modes, without cancellation for high ones.
-
-        Parameters
-        ----------
-        y : array_like, shape (...)
-            Distance from the entry point [m].
-        order : int
-            Order of the derivative, at least 0.
-
-        Returns
-        -------
-        ndarray, shape (..., n)
-            Derivatives [m^(-1/2 - order)].
-
-        """
-        x = self.wavenumbers * np.asarray(y, dtype=float)[..., np.newaxis]
-        sine, cosine = np.sin(x), np.cos(x)
-        mu = self.ratios
-        # d/dx takes sin to cos and cos to -sin; exp(x) stays and exp(-x) changes sign.
-        turned = (
-            sine - mu * cosine,
-            cosine + mu * sine,
-            -sine + mu * cosine,
-            -cosine - mu * sine,
-        )[order % 4]
-        grow = 0.5 * self.rests * np.exp(x - self.arguments)
-        fall = 0.5 * (mu + 1.0) * np.exp(-x) * (-1.0) ** order
-        return np.asarray(self.scales * self.wavenumbers**order * (turned + grow + fall))
 
     def values(self, y: ArrayLike) -> FloatArray:
         """
@@ -141,37 +97,115 @@ class ModeShapes:
         """
         x = self.wavenumbers * np.asarray(y, dtype=float)[..., np.newaxis]
         # `derivatives` of order 0, arranged so that it is exactly zero at the clamped end.
-        mu, rest, end = self.ratios, self.rests, self.arguments
+        mu, rest, end = self.ratios, self._rests, self.arguments
         grow = 0.5 * rest * (np.exp(x - end) - np.exp(-end))
         fall = 0.5 * (mu + 1.0) * np.expm1(-x)
         shape = np.sin(x) + 2.0 * mu * np.sin(0.5 * x) ** 2 + grow + fall
         return np.asarray(self.scales * shape)
 
-    def curvatures(self, y: ArrayLike) -> FloatArray:
+    def derivatives(self, y: ArrayLike, order: int) -> FloatArray:
         """
-        Second derivatives phi_i''(y).
+        Differentiate the modes by y, without cancellation for high modes.
 
         Parameters
         ----------
         y : array_like, shape (...)
             Distance from the entry point [m].
+        order : int
+            Order of the derivative, at least 0; 2 for the curvatures phi_i''.
 
         Returns
         -------
         ndarray, shape (..., n)
-            phi_i'' [m^-5/2].
+            Derivatives [m^(-1/2 - order)].
 
         """
-        return self.derivatives(y, 2)
+        x = self.wavenumbers * np.asarray(y, dtype=float)[..., np.newaxis]
+        sine, cosine = np.sin(x), np.cos(x)
+        mu = self.ratios
+        # d/dx takes sin to cos and cos to -sin; exp(x) stays and exp(-x) changes sign.
+        turned = (
+            sine - mu * cosine,
+            cosine + mu * sine,
+            -sine + mu * cosine,
+            -cosine - mu * sine,
+        )[order % 4]
+        grow = 0.5 * self._rests * np.exp(x - self.arguments)
+        fall = 0.5 * (mu + 1.0) * np.exp(-x) * (-1.0) ** order
+        return np.asarray(self.scales * self.wavenumbers**order * (turned + grow + fall))
+
+    def integrals(self, depth: float) -> ModeIntegrals:
+        """
+        Evaluate the modes at the tip and their integrals over the inserted part.
+
+        Parameters
+        ----------
+        depth : float
+            Inserted length s [m], in [0, reach l].
+
+        Returns
+        -------
+        ModeIntegrals
+            Values at s.
+
+        Raises
+        ------
+        ParameterError
+            If ``depth`` is outside that range.
+
+        """
+        high = self.reach * self.length
+        if not 0.0 <= depth <= high:
+            raise ParameterError(f'inserted length must be in [0, {high:g}] m, got {depth!r}')
+        n, tables = self.count, self.tables
+        grams, rows = np.empty((2, n, n)), np.empty((4, n))
+        at = ModeIntegrals(grams[0], grams[1], rows[0], rows[1], rows[2], rows[3])
+        mode_integrals(tables, float(depth), np.empty(tables.series.shape[1] + 4 * n), at)
+        return at
+
+    def condition(self, depth: float) -> float:
+        """
+        Return the condition number of G: how hard the modes are to tell apart.
+
+        Parameters
+        ----------
+        depth : float
+            Inserted length s [m].
+
+        Returns
+        -------
+        float
+            cond(G), 1 for a fully inserted needle.
+
+        """
+        return float(np.linalg.cond(self.integrals(depth).gram))
 
     @cached_property
-    def series(self) -> FloatArray:
-        """
-        Coefficients of all integrals in powers of (y/l)^4; shape (terms, columns).
+    def tables(self) -> ModeTables:
+        """What the compiled evaluation of the integrals takes."""
+        constants = np.array([self.arguments, self.ratios, self._rests, self.scales])
+        tables = ModeTables(self.length, self._series(), self._needed(), constants)
+        for table in tables[1:]:
+            table.setflags(write=False)
+        return tables
 
-        Columns: G and H of each pair (three powers each), then phi, phi'', the integral of phi
-        and that of y phi of each mode (two powers each).
-        """
+    @property
+    def series(self) -> FloatArray:
+        """Series of `tables`."""
+        return self.tables.series
+
+    @property
+    def terms(self) -> FloatArray:
+        """Terms of `tables`."""
+        return self.tables.terms
+
+    @property
+    def constants(self) -> FloatArray:
+        """Constants of `tables`."""
+        return self.tables.modes
+
+    def _series(self) -> FloatArray:
+        """Return the coefficients of all integrals in powers of (s/l)^4, see `ModeTables`."""
         # Products of two modes grow as (2 k y)^m / m!; beyond SERIES_END the series is not used.
         growth = 2.0 * self.reach * self.arguments[-1] if self.count == 2 else 2.0 * SERIES_END
         terms = _terms(growth)
@@ -215,110 +249,16 @@ class ModeShapes:
             put(integral(phi[i]), 3, 2)
         for i in range(n):
             put(integral(phi[i], 1), 4, 2)
-        table = np.ascontiguousarray(np.array(columns).T)
-        table.setflags(write=False)
-        return table
+        return np.ascontiguousarray(np.array(columns).T)
 
-    @cached_property
-    def terms(self) -> FloatArray:
-        """Terms of `series` that two modes need at a relative inserted length, by its 32nds."""
+    def _needed(self) -> FloatArray:
+        """Return how many terms two modes need, by the relative inserted length."""
         if self.count != 2:
             return np.zeros(1)
-        steps = round(self.reach * TERMS_PER_LENGTH) + 1
-        needed = np.empty(steps)
-        for k in range(steps):
-            growth = 2.0 * self.arguments[-1] * (k + 1) / TERMS_PER_LENGTH
-            needed[k] = _terms(growth)
-        needed = np.minimum(needed, len(self.series))
-        needed.setflags(write=False)
-        return needed
-
-    def condition(self, depth: float) -> float:
-        """Return cond(G) at an inserted length [m]: how far the modes can be told apart."""
-        return float(np.linalg.cond(self.integrals(depth).gram))
-
-    def least_depth(self, condition: float) -> float:
-        """Return the inserted length [m] from which on cond(G) does not exceed a value."""
-        low, high = 0.0, self.length
-        for _ in range(50):
-            middle = 0.5 * (low + high)
-            low, high = (low, middle) if self.condition(middle) <= condition else (middle, high)
-        return high
-
-    def packed(self, depth: float) -> FloatArray:
-        """
-        Evaluate the modes and their integrals as the compiled step does.
-
-        Parameters
-        ----------
-        depth : float
-            Inserted length s [m], in [0, reach l].
-
-        Returns
-        -------
-        ndarray, shape (n (n + 1) + 4 n,)
-            G and H (upper triangles by rows), phi, phi'', integrals of phi and of y phi.
-
-        Raises
-        ------
-        ParameterError
-            If ``depth`` is outside that range.
-
-        """
-        self._check(depth)
-        n = self.count
-        out = np.empty(n * (n + 1) + 4 * n)
-        work = np.empty(self.series.shape[1] + 4 * n)
-        xi = depth / self.length
-        if n == 2:
-            evaluate(xi, self.series, self.terms, work, out)
-        else:
-            evaluate_many(xi, self.length, self.constants, self.series, work, out)
-        return out
-
-    @cached_property
-    def constants(self) -> FloatArray:
-        """Rows k_i l, mu_i, (mu_i - 1) exp(k_i l) and c_i for the compiled step; shape (4, n)."""
-        table = np.array([self.arguments, self.ratios, self.rests, self.scales])
-        table.setflags(write=False)
-        return table
-
-    def integrals(self, depth: float) -> ModeIntegrals:
-        """
-        Evaluate the modes and their integrals over the inserted part.
-
-        Parameters
-        ----------
-        depth : float
-            Inserted length s [m], in [0, reach l].
-
-        Returns
-        -------
-        ModeIntegrals
-            Values at s.
-
-        Raises
-        ------
-        ParameterError
-            If ``depth`` is outside that range.
-
-        """
-        n, tables = self.count, self.tables
-        self._check(depth)
-        grams, rows = np.empty((2, n, n)), np.empty((4, n))
-        at = ModeIntegrals(grams[0], grams[1], rows[0], rows[1], rows[2], rows[3])
-        mode_integrals(tables, float(depth), np.empty(self.series.shape[1] + 4 * n), at)
-        return at
-
-    @cached_property
-    def tables(self) -> ModeTables:
-        """What the compiled evaluation of the modes takes."""
-        return ModeTables(self.length, self.series, self.terms, self.constants)
-
-    def _check(self, depth: float) -> None:
-        high = self.reach * self.length
-        if not 0.0 <= depth <= high:
-            raise ParameterError(f'inserted length must be in [0, {high:g}] m, got {depth!r}')
+        steps = np.arange(1, round(self.reach * TERMS_PER_LENGTH) + 2)
+        growths = 2.0 * self.arguments[-1] * steps / TERMS_PER_LENGTH
+        longest = _terms(2.0 * self.reach * self.arguments[-1])
+        return np.array([float(min(_terms(growth), longest)) for growth in growths])
 
 
 @lru_cache(maxsize=32)
@@ -342,6 +282,14 @@ def mode_shapes(length: float, count: int = 2, reach: float = 1.0) -> ModeShapes
 
     """
     return ModeShapes(length, count, reach)
+
+
+def _root(i: int) -> float:
+    """Return the root i = 0, 1, ... of cos(x) cosh(x) + 1 = 0, by Newton's method."""
+    x = (i + 0.5) * pi + (0.3 if i == 0 else 0.0)
+    for _ in range(10):
+        x += (cos(x) + 1.0 / cosh(x)) / (sin(x) + tanh(x) / cosh(x))
+    return x
 
 
 def _terms(growth: float) -> int:

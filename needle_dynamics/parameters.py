@@ -8,22 +8,27 @@ from itertools import pairwise
 from math import ceil, isfinite
 from typing import Any, Final
 
-from needle_dynamics.friction import Friction, FRICTION_LAWS
-from needle_dynamics.modes import mode_shapes
+from needle_dynamics.compiled.friction import FRICTION_LAWS
+from needle_dynamics.friction import Friction
 from needle_dynamics.tissue import Tissue
-from needle_ros.errors import (
-    ParameterError,
-)
+from needle_ros.errors import ParameterError
 from needle_ros.settings import check_constants, constant, from_values
 
 #: Formulations by name: every term of Euler-Lagrange, or the source's final form.
 FORMULATIONS: Final = ('complete', 'as_printed')
 
-#: Most modes: beyond it cond(G) is too large at any useful depth.
-MOST_MODES: Final = 12
-
 #: Largest condition number of G: beyond it the modal state carries less than five digits.
 LARGEST_CONDITION: Final = 1e11
+
+#: Inserted length over l from which on cond(G) is at most that, for 1, 2, ... modes. G depends on
+#: this ratio alone. They are tabulated so that parameters can be checked without compiled code.
+_LEAST_RATIOS: Final = (
+    0.0, 1.27099e-4, 0.0943411, 0.228479, 0.332967, 0.410300, 0.474010, 0.526876, 0.571028,
+    0.608223, 0.639854, 0.667005,
+)  # fmt: skip
+
+#: Most modes: more of them can be told apart at large depths only.
+MOST_MODES: Final = len(_LEAST_RATIOS)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -33,6 +38,12 @@ class NeedleParameters:
 
     The defaults are Table 3 and section 3.2.8 of [Boroomand2014]_ with Table 1 read as
     0.3 N s/m (the preset `paper_si`).
+
+    Raises
+    ------
+    ParameterError
+        If a constant is not a number or is outside its range. The message names the constant, the
+        value found and the valid range.
 
     References
     ----------
@@ -100,7 +111,7 @@ class NeedleParameters:
         check_constants(self)
         for item in fields(self):
             if 'unit' in item.metadata:
-                # An integer would have the kernel compiled anew for it.
+                # An integer would have compiled functions compiled anew for it.
                 object.__setattr__(self, item.name, float(getattr(self, item.name)))
         if not isinstance(self.hub_stop, bool):
             raise ParameterError(f'hub_stop must be true or false, got {self.hub_stop!r}')
@@ -144,19 +155,17 @@ class NeedleParameters:
         n = self.modes
         if isinstance(n, bool) or not isinstance(n, int) or not 1 <= n <= MOST_MODES:
             raise ParameterError(f'modes must be an integer from 1 to {MOST_MODES}, got {n!r}')
-        shapes = mode_shapes(self.length, n)
-        found = shapes.condition(self.minimum_depth)
-        if found > LARGEST_CONDITION:
+        least = _LEAST_RATIOS[n - 1] * self.length
+        if self.minimum_depth < least:
             raise ParameterError(
-                f'{n} modes cannot be told apart at minimum_depth = {self.minimum_depth:g} m: '
-                f'cond(G) = {found:.1e} must be <= {LARGEST_CONDITION:.0e}; minimum_depth >= '
-                f'{ceil(1e4 * shapes.least_depth(LARGEST_CONDITION)) / 1e4:g} m or fewer modes '
-                'would do'
+                f'{n} modes cannot be told apart at minimum_depth = {self.minimum_depth:g} m, '
+                f'where cond(G) > {LARGEST_CONDITION:.0e}; valid: minimum_depth >= '
+                f'{ceil(1e4 * least) / 1e4:g} m, or fewer modes'
             )
 
     @property
     def tissue(self) -> Tissue:
-        """The tissue along the needle."""
+        """The tissue along the needle, as one value."""
         return Tissue(
             starts=(0.0, *self.layer_depths),
             stiffnesses=(self.tissue_stiffness, *self.layer_stiffnesses),
@@ -167,16 +176,8 @@ class NeedleParameters:
 
     @property
     def friction(self) -> Friction:
-        """The friction law."""
-        return Friction(
-            law=self.friction_law,
-            coulomb=self.coulomb_friction,
-            viscous=self.viscous_friction,
-            withdrawal=self.withdrawal_friction,
-            breakaway=self.breakaway_friction,
-            stribeck_speed=self.stribeck_speed,
-            smoothing_speed=self.smoothing_speed,
-        )
+        """The friction along the insertion axis, as one value."""
+        return Friction(**{of: getattr(self, name) for of, name in _FRICTION_FIELDS.items()})
 
     @property
     def linear_density(self) -> float:
@@ -215,11 +216,90 @@ class NeedleParameters:
         ParameterError
             If the preset or a field is unknown, or a value is not valid.
 
+        Examples
+        --------
+        >>> parameters = NeedleParameters.preset('phantom', tissue_stiffness=600.0)
+        >>> parameters.tissue_stiffness, parameters.viscous_friction
+        (600.0, 300.0)
+
+        A value that is not valid is rejected:
+
+        >>> NeedleParameters.preset('phantom', length=-0.2)
+        Traceback (most recent call last):
+            ...
+        needle_ros.errors.ParameterError: length must be finite, > 0 m, got -0.2
+
         """
         if name not in PRESETS:
             raise ParameterError(f'unknown preset {name!r}; valid: {", ".join(PRESETS)}')
         return from_values(cls, {**asdict(PRESETS[name]), **changes})
 
+    def using(
+        self, *, friction: Friction | None = None, tissue: Tissue | None = None
+    ) -> NeedleParameters:
+        """
+        Return these constants with the friction or the tissue of another object.
+
+        Parameters
+        ----------
+        friction : Friction, optional
+            Friction along the insertion axis.
+        tissue : Tissue, optional
+            Tissue along the needle.
+
+        Returns
+        -------
+        NeedleParameters
+            The constants. `friction` and `tissue` of them are equal to the objects given.
+
+        Raises
+        ------
+        ParameterError
+            If an object is of another class. The step of the integrator is compiled: it knows the
+            laws of `Friction` and the layers of `Tissue`, and cannot call an object of your own.
+
+        Examples
+        --------
+        >>> from needle_dynamics import Friction
+        >>> measured = Friction(law='stribeck', coulomb=0.4, viscous=120.0, breakaway=1.5)
+        >>> NeedleParameters.preset('phantom').using(friction=measured).breakaway_friction
+        1.5
+
+        """
+        changes: dict[str, Any] = {}
+        if friction is not None:
+            if not isinstance(friction, Friction):
+                raise ParameterError(
+                    f'friction must be a Friction, since only its laws '
+                    f'({", ".join(FRICTION_LAWS)}) are compiled, got {friction!r}'
+                )
+            changes = {name: getattr(friction, of) for of, name in _FRICTION_FIELDS.items()}
+        if tissue is not None:
+            if not isinstance(tissue, Tissue):
+                raise ParameterError(
+                    f'tissue must be a Tissue, since only its layers are compiled, got {tissue!r}'
+                )
+            changes |= {
+                'tissue_stiffness': tissue.stiffnesses[0],
+                'layer_depths': tissue.starts[1:],
+                'layer_stiffnesses': tissue.stiffnesses[1:],
+                'tissue_damping': tissue.damping,
+                'swelling': tissue.swelling,
+                'swelling_time': tissue.swelling_time,
+            }
+        return replace(self, **changes)
+
+
+#: Field of the parameters by field of `Friction`.
+_FRICTION_FIELDS: Final = {
+    'law': 'friction_law',
+    'coulomb': 'coulomb_friction',
+    'viscous': 'viscous_friction',
+    'withdrawal': 'withdrawal_friction',
+    'breakaway': 'breakaway_friction',
+    'stribeck_speed': 'stribeck_speed',
+    'smoothing_speed': 'smoothing_speed',
+}
 
 _PAPER_SI = NeedleParameters()
 _PAPER_MM = replace(_PAPER_SI, viscous_friction=300.0)

@@ -9,9 +9,7 @@ from math import expm1, inf
 from needle_dynamics.arrays import FloatArray
 from needle_dynamics.compiled.tissue import Layers
 from needle_dynamics.modes import ModeShapes
-from needle_ros.errors import (
-    ParameterError,
-)
+from needle_ros.errors import ParameterError
 import numpy as np
 
 
@@ -27,13 +25,18 @@ class Tissue:
     starts : tuple of float
         Depths at which the layers begin [m]; the first is 0.
     stiffnesses : tuple of float
-        Stiffness of each layer [N/m^2].
+        Stiffness of each layer per length [N/m^2].
     damping : float
         Damping c_a per length (Kelvin-Voigt) [N s/m^2].
     swelling : float
-        Growth of the stiffness in the long run, as a part of it.
+        Growth of the stiffness in the long run, relative to its value at time 0.
     swelling_time : float
         Time constant of the growth [s].
+
+    Raises
+    ------
+    ParameterError
+        If the layers do not go down from 0, or a constant is outside its range.
 
     """
 
@@ -63,10 +66,45 @@ class Tissue:
             )
 
     def growth(self, time: float) -> float:
-        """Return the factor by which the stiffness has grown at a time >= 0 [s]."""
+        """
+        Return the factor by which the tissue has grown stiffer.
+
+        Parameters
+        ----------
+        time : float
+            Time [s], at least 0.
+
+        Returns
+        -------
+        float
+            Stiffness over that at time 0.
+
+        Raises
+        ------
+        ParameterError
+            If the time is negative or not finite.
+
+        """
         if not 0.0 <= time < inf:
             raise ParameterError(f'time must be finite and >= 0 s, got {time!r}')
         return 1.0 - self.swelling * expm1(-time / self.swelling_time)
+
+    def layer(self, depth: float) -> int:
+        """
+        Return the number of the layer that holds a depth; at a border the lower one.
+
+        Parameters
+        ----------
+        depth : float
+            Distance y from the entry point [m].
+
+        Returns
+        -------
+        int
+            Place in `starts`.
+
+        """
+        return max(int(np.searchsorted(self.starts, depth, side='right')) - 1, 0)
 
     def stiffness(self, depth: float, time: float = 0.0) -> float:
         """
@@ -85,37 +123,11 @@ class Tissue:
             Stiffness per length [N/m^2].
 
         """
-        layer = int(np.searchsorted(self.starts, depth, side='right')) - 1
-        return self.stiffnesses[max(layer, 0)] * self.growth(time)
-
-    def offsets(self, modes: ModeShapes) -> FloatArray:
-        """
-        Return what the layers above add to integrals that take k as that of the tip's layer.
-
-        Parameters
-        ----------
-        modes : ModeShapes
-            Shape modes.
-
-        Returns
-        -------
-        ndarray, shape (layers, pairs + 2 n)
-            For k phi phi^T (upper triangle by rows), k phi and k y phi.
-
-        """
-        n = modes.count
-        pairs = n * (n + 1) // 2
-        offsets = np.zeros((len(self.starts), pairs + 2 * n))
-        for m in range(1, len(self.starts)):
-            packed = modes.packed(min(self.starts[m], modes.reach * modes.length))
-            above = np.concatenate([packed[:pairs], packed[2 * pairs + 2 * n :]])
-            step = self.stiffnesses[m - 1] - self.stiffnesses[m]
-            offsets[m] = offsets[m - 1] + step * above
-        return offsets
+        return self.stiffnesses[self.layer(depth)] * self.growth(time)
 
     def layers(self, modes: ModeShapes) -> Layers:
         """
-        Return the layers with what those above each of them add, for compiled functions.
+        Return the layers with what those above each of them add to the integrals of the modes.
 
         Parameters
         ----------
@@ -125,7 +137,7 @@ class Tissue:
         Returns
         -------
         Layers
-            Arrays of the layers.
+            Arrays as compiled functions take them.
 
         """
         n, m = modes.count, len(self.starts)
@@ -136,32 +148,11 @@ class Tissue:
             gram[i] = gram[i - 1] + step * at.gram
             area[i] = area[i - 1] + step * at.area
             moment[i] = moment[i - 1] + step * at.moment
-        return Layers(np.array(self.starts), np.array(self.stiffnesses), gram, area, moment)
+        starts, stiffnesses = np.array(self.starts), np.array(self.stiffnesses)
+        return Layers(starts, stiffnesses, gram, area, moment)
 
-    def matrix(self, modes: ModeShapes, depth: float, time: float = 0.0) -> FloatArray:
-        """
-        Modal stiffness of the tissue, the integral of k phi phi^T over the inserted part.
-
-        Parameters
-        ----------
-        modes : ModeShapes
-            Shape modes.
-        depth : float
-            Inserted length s [m].
-        time : float
-            Time [s].
-
-        Returns
-        -------
-        ndarray, shape (n, n)
-            Stiffness; k_a G(s) in homogeneous tissue.
-
-        """
-        n = modes.count
-        layer = max(int(np.searchsorted(self.starts, depth, side='right')) - 1, 0)
-        upper = np.triu_indices(n)
-        offset = np.empty((n, n))
-        offset[upper] = self.offsets(modes)[layer, : n * (n + 1) // 2]
-        offset.T[upper] = offset[upper]
-        gram = modes.integrals(depth).gram
-        return np.asarray(self.growth(time) * (self.stiffnesses[layer] * gram + offset))
+    def offsets(self, modes: ModeShapes) -> FloatArray:
+        """Return gram (upper triangle), area and moment of `layers` side by side."""
+        layers, upper = self.layers(modes), np.triu_indices(modes.count)
+        gram = layers.gram[:, upper[0], upper[1]]
+        return np.concatenate([gram, layers.area, layers.moment], axis=1)

@@ -5,14 +5,14 @@ from __future__ import annotations
 from needle_controller.compiled.laws import law_step, LawConstants, MEMORY
 from needle_dynamics.arrays import FloatArray
 from needle_dynamics.compiled.cache import compiled
-from needle_dynamics.compiled.kernels import advance, Constants, slide, SUMS, Tables
+from needle_dynamics.compiled.friction import slide
+from needle_dynamics.compiled.step import advance, Inputs, Needle
 import numpy as np
 
 
 @compiled
 def run_loop(
-    c: Constants,
-    tables: Tables,
+    c: Needle,
     state: FloatArray,
     law: tuple[float, ...],
     axis: tuple[float, float, float],
@@ -29,7 +29,7 @@ def run_loop(
 
     Parameters
     ----------
-    c, tables : Constants, Tables
+    c : Needle
         The needle.
     state : ndarray, shape (2 (2 + n),)
         Initial state; overwritten with the state at the end.
@@ -61,7 +61,7 @@ def run_loop(
 
     """
     inertia, coulomb, viscous = axis
-    memory, sums = np.zeros(MEMORY), np.zeros(SUMS)
+    memory = np.zeros(MEMORY)
     period, delay, m = LawConstants(*law).period, pending.shape[0], state.shape[0] // 2
     count = setpoints.shape[0]
     largest, squares = 0.0, 0.0
@@ -87,9 +87,8 @@ def run_loop(
             for i in range(1, delay):
                 pending[i - 1] = pending[i]
             pending[delay - 1] = command
-        left = advance(
-            c, tables, state, k * period, force, 0.0, 0.0, False, longest, False, period, sums
-        )
+        inputs = Inputs(force, 0.0, 0.0, False)
+        left, _ = advance(c, state, k * period, inputs, longest, False, period)
         if left != 0.0:
             return k
     return int(count)

@@ -16,7 +16,7 @@ from needle_controller.in_loop.run import LoopRun
 from needle_controller.laws.law import Law
 from needle_controller.reference.setpoint import Reference
 from needle_dynamics import FloatArray, Integrator, NeedleModel, NeedleParameters
-from needle_dynamics.simulated.integrators import DEFAULT_STEP, kernel_constants, kernel_tables
+from needle_dynamics.simulated.integrator import DEFAULT_STEP
 from needle_ros.errors import ParameterError, ShapeError
 import numpy as np
 from numpy.typing import ArrayLike
@@ -137,7 +137,7 @@ def run_controller(
         measured = Measurement(
             time=float(time[k]),
             depth=integrator.depth,
-            speed=integrator.speed,
+            speed=integrator.velocity,
             angle=float(x[1]),
             angular_speed=float(x[m + 1]),
         )
@@ -260,7 +260,7 @@ def run_batch(
     setpoints = np.array([reference.at(k * period + delay * period) for k in range(count)])
     goal = np.array([reference.at(k * period).position for k in range(count + 1)])
     models = [NeedleModel(p) for p in each]
-    needles = [(kernel_constants(model), kernel_tables(model)) for model in models]
+    needles = [model.compiled for model in models]
     ends = np.array(
         [models[i % len(models)].checked_state(starts[i % len(starts)]) for i in range(runs)]
     )
@@ -272,7 +272,7 @@ def run_batch(
             law = each_law[i % len(each_law)]
             axis = law.axis.inertia, law.axis.coulomb, law.axis.viscous
             completed[i] = run_loop(
-                *needles[i % len(needles)], ends[i], law.packed, axis, float(limit), setpoints,
+                needles[i % len(needles)], ends[i], law.packed, axis, float(limit), setpoints,
                 goal, np.zeros(delay), float(step), depths[i], errors[i],
             )  # fmt: skip
             if progress is not None:

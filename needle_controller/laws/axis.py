@@ -7,7 +7,7 @@ from math import isfinite
 from typing import NamedTuple
 
 from needle_dynamics import NeedleParameters
-from needle_dynamics.compiled.kernels import slide
+from needle_dynamics.compiled.friction import slide
 from needle_dynamics.compiled.oscillator import decay_means
 from needle_ros.errors import ParameterError
 

@@ -15,6 +15,7 @@ from collections.abc import Callable
 from functools import cache, cached_property, update_wrapper
 from hashlib import sha256
 from pathlib import Path
+from pickle import UnpicklingError
 import sys
 from typing import Any, cast, TypeVar
 
@@ -26,10 +27,13 @@ _FOLDER = Path(__file__).parent
 class _Compiled:
     """A function that Numba compiles at its first call; other compiled functions may call it."""
 
-    def __init__(self, function: Callable[..., object]) -> None:
+    def __init__(self, function: Callable[..., object], **options: bool) -> None:
         #: The Python source, as Numba's own dispatchers call it.
         self.py_func = function
         update_wrapper(self, function)
+        # error_model: divide as C does; every divisor is positive by construction.
+        # nogil: batches run in threads.
+        self._options = {'error_model': 'numpy', 'nogil': True, **options}
 
     def __call__(self, *arguments: object) -> object:
         return self.dispatcher(*arguments)
@@ -39,21 +43,14 @@ class _Compiled:
         """Numba's dispatcher of the function."""
         import numba
 
-        # error_model: divide as C does; every divisor is positive by construction.
-        # nogil: batches run in threads.
-        options = {'error_model': 'numpy', 'nogil': True}
-        stamp = _stamp(Path(self.py_func.__code__.co_filename).parent)
         _listen()
         try:
-            kept = numba.njit(cache=True, **options)(self.py_func)
-            cache_file = kept._cache._cache_file
-            if not isinstance(cache_file._source_stamp, (bytes, str, tuple)):
-                raise AttributeError('_source_stamp')
-        except (AttributeError, RuntimeError):
-            # This Numba cannot be given a stamp, or no folder is writable: compile each time
-            # rather than run old code.
-            return numba.njit(**options)(self.py_func)
-        cache_file._source_stamp = stamp
+            kept = numba.njit(cache=True, **self._options)(self.py_func)
+            _set_stamp(kept, _stamp(Path(self.py_func.__code__.co_filename).parent))
+        except (AttributeError, ImportError, RuntimeError, TypeError):
+            # This Numba takes no stamp, or no folder is writable: compile each time rather than
+            # run old code.
+            return numba.njit(**self._options)(self.py_func)
         return kept
 
     @property
@@ -81,6 +78,47 @@ def compiled(function: _Function) -> _Function:
 
     """
     return cast(_Function, _Compiled(function))
+
+
+def inlined(function: _Function) -> _Function:
+    """
+    Do what `compiled` does for a part of a hot loop: its code becomes part of its callers'.
+
+    A call that is not inlined passes every number of its arguments, an array being seven.
+
+    Parameters
+    ----------
+    function : callable
+        As for `compiled`.
+
+    Returns
+    -------
+    callable
+        The compiled function.
+
+    """
+    return cast(_Function, _Compiled(function, forceinline=True))
+
+
+def _set_stamp(dispatcher: Any, stamp: str) -> None:
+    """Have the cache of a dispatcher hold for sources with this digest only."""
+    from numba.core.caching import IndexDataCacheFile
+
+    class Index(IndexDataCacheFile):  # type: ignore[misc]
+        def _load_index(self) -> object:
+            try:
+                return super()._load_index()
+            except (AttributeError, EOFError, ImportError, TypeError, ValueError, UnpicklingError):
+                # It names a class that is there no more, or is damaged: all of it is old.
+                return {}
+
+    known = dispatcher._cache
+    if (
+        not isinstance(known._cache_file, IndexDataCacheFile)
+        or not known._cache_file._source_stamp
+    ):
+        raise AttributeError('Numba keeps its cache in another way')
+    known._cache_file = Index(known._cache_path, known._impl.filename_base, stamp)
 
 
 @cache

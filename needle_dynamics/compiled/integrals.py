@@ -8,11 +8,12 @@ two modes are small enough at any s, so that one Horner pass gives all of them.
 
 from __future__ import annotations
 
-from math import cos, exp, sin
+from math import cos, exp, isfinite, nan, sin
 from typing import Final, NamedTuple
 
 from needle_dynamics.arrays import FloatArray
-from needle_dynamics.compiled.cache import compiled
+from needle_dynamics.compiled.cache import compiled, inlined
+import numpy as np
 
 #: Below this argument k_i s the series of a mode is used, above it the closed form.
 SERIES_END: Final = 2.0
@@ -106,7 +107,7 @@ def mode_derivatives(
     )
 
 
-@compiled
+@inlined
 def two_modes(tables: ModeTables, depth: float, work: FloatArray, out: ModeIntegrals) -> None:
     """
     Evaluate the series of two modes; parameters as in `mode_integrals`.
@@ -232,7 +233,7 @@ def many_modes(tables: ModeTables, depth: float, work: FloatArray, out: ModeInte
             pair += 1
 
 
-@compiled
+@inlined
 def mode_integrals(tables: ModeTables, depth: float, work: FloatArray, out: ModeIntegrals) -> None:
     """
     Evaluate the modes and their integrals at an inserted length.
@@ -253,3 +254,36 @@ def mode_integrals(tables: ModeTables, depth: float, work: FloatArray, out: Mode
         two_modes(tables, depth, work, out)
     else:
         many_modes(tables, depth, work, out)
+
+
+@compiled
+def tip_deflections(tables: ModeTables, states: FloatArray) -> FloatArray:
+    """
+    Return the deflection of the tip w(s) = phi(s) q for many states.
+
+    Parameters
+    ----------
+    tables : ModeTables
+        Tables of n modes.
+    states : ndarray, shape (k, 2 (2 + n))
+        States with inserted lengths in the range of the tables, or NaN.
+
+    Returns
+    -------
+    ndarray, shape (k,)
+        Deflections [m]; NaN where the state is NaN.
+
+    """
+    n = tables.modes.shape[1]
+    grids, rows = np.empty((2, n, n)), np.empty((4, n))
+    at = ModeIntegrals(grids[0], grids[1], rows[0], rows[1], rows[2], rows[3])
+    work, found = np.empty(tables.series.shape[1] + 4 * n), np.empty(states.shape[0])
+    for k in range(states.shape[0]):
+        depth = tables.length - states[k, 0]
+        found[k] = nan
+        if isfinite(depth):
+            mode_integrals(tables, depth, work, at)
+            found[k] = 0.0
+            for i in range(n):
+                found[k] += at.value[i] * states[k, 2 + i]
+    return found

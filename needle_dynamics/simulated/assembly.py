@@ -15,7 +15,7 @@ from needle_dynamics.simulated.force_sensor import (
     HIGHEST_RATE,
 )
 from needle_dynamics.simulated.indenter import Indenter, IndenterParameters
-from needle_dynamics.simulated.integrators import Integrator
+from needle_dynamics.simulated.integrator import Integrator
 from needle_dynamics.simulated.plant import Plant
 from needle_dynamics.simulated.tip_sensor import TipParameters, TipSensor
 from needle_ros.errors import ParameterError

@@ -7,15 +7,10 @@ from dataclasses import dataclass, field, fields
 from typing import Final
 
 from needle_dynamics.arrays import FloatArray
-from needle_dynamics.compiled.kernels import sense, straight
-from needle_ros.errors import (
-    JobError,
-    ParameterError,
-    ShapeError,
-)
+from needle_dynamics.compiled.force_sensor import sense, straight
+from needle_ros.errors import JobError, ParameterError, ShapeError
 from needle_ros.settings import check_constants, constant
 import numpy as np
-from scipy.signal import butter
 
 #: Filters of the sensor; each is fed by the one before.
 MOST_FILTERS: Final = 6
@@ -101,18 +96,31 @@ class ForceSensorParameters:
         return tuple(self.rate / (16.0 * 4.0**k) for k in range(self.filter))
 
     def per_axis(self, name: str) -> FloatArray:
-        """Return a constant of the forces x y z and of the torques x y z, shape (6,)."""
+        """
+        Return a constant for each axis.
+
+        Parameters
+        ----------
+        name : str
+            Field without ``force_`` or ``torque_``, for example ``noise``.
+
+        Returns
+        -------
+        ndarray, shape (6,)
+            Its value for the forces x y z and the torques x y z.
+
+        """
         pair = (getattr(self, f'{kind}_{name}') for kind in ('force', 'torque'))
         return np.concatenate([np.broadcast_to(value, 3) for value in pair], dtype=np.float64)
 
 
 class ForceSensor:
     """
-    Turns true wrenches into what the sensor reports.
+    A force-torque sensor at the needle base: turns true wrenches into readings.
 
-    The sensor samples faster than it is read. Each sample takes offset and noise, saturates, and
-    passes the filters, second-order Butterworth in a cascade; what is read is zeroed and rounded
-    to counts.
+    The sensor samples faster than it is read. Offset and noise are added to each sample, which
+    then saturates and passes a cascade of second-order Butterworth filters. A reading is the last
+    sample, less the value on which the sensor was zeroed, rounded to counts.
 
     Parameters
     ----------
@@ -131,7 +139,7 @@ class ForceSensor:
     Raises
     ------
     ParameterError
-        If the sensor's rate is not a whole multiple of that of the readings.
+        If the sensor's rate is not a whole multiple of the rate of the readings.
 
     """
 
@@ -139,6 +147,9 @@ class ForceSensor:
     _DRAWN = 16384
 
     def __init__(self, parameters: ForceSensorParameters, rate: float, seed: int) -> None:
+        # Takes a third of a second to import.
+        from scipy.signal import butter
+
         p = parameters
         samples = round(p.rate / rate)
         if samples < 1 or abs(samples * rate - p.rate) > 1e-9 * p.rate:
@@ -179,23 +190,23 @@ class ForceSensor:
         Parameters
         ----------
         wrench : ndarray, shape (samples, 6) or (6,)
-            True force [N] and torque [N m], x y z each: what each sample feels, its mean over
-            the sample; or only what the last one does, to which the wrench then goes in a
-            straight line.
+            True force [N] and torque [N m], x y z each. With two dimensions: the mean wrench of
+            each sample. With one: the wrench of the last sample; the wrench then goes from that
+            of the reading before to it in a straight line.
         start : ndarray, shape (6,), optional
-            That just after the reading before, if the wrench jumped there; for a straight line.
+            Wrench just after the reading before, if it jumped there; for a straight line.
         moving : bool
-            Whether what it feels moves; such a reading is not used to zero it.
+            Whether the needle moves; such a reading is not used to zero the sensor.
 
         Returns
         -------
         ndarray, shape (6,)
-            What the sensor reports.
+            The reading.
 
         Raises
         ------
         ShapeError
-            If what each sample feels is not given for all of them.
+            If the number of samples is wrong.
 
         """
         felt = np.array(wrench, dtype=np.float64)
@@ -207,7 +218,7 @@ class ForceSensor:
             self._drawn = self._rng.standard_normal(self._block)
             self._next = 0
         if self._before is None:
-            # The filters start in the steady state of the first value.
+            # The filters start in the steady state of the first sample.
             limit = self._constants[2]
             first = felt if felt.ndim == 1 else felt[0]
             value = np.clip(first + self._offset, -limit, limit)

@@ -11,7 +11,7 @@ from needle_dynamics.arrays import FloatArray
 from needle_dynamics.friction import Friction
 from needle_dynamics.simulated.base import BaseMotion, on_grid
 from needle_dynamics.simulated.force_sensor import ForceSensor
-from needle_dynamics.simulated.integrators import Integrator, Interval
+from needle_dynamics.simulated.integrator import Integrator, Interval
 from needle_dynamics.simulated.tip_sensor import TipParameters, TipReading, TipSensor
 from needle_ros.contract import INSERTION
 from needle_ros.errors import JobError, ParameterError
@@ -157,7 +157,7 @@ class Plant:
             If the needle moves, or has not rested long enough.
 
         """
-        speed = self.integrator.speed
+        speed = self.integrator.velocity
         if abs(speed) > AT_REST:
             raise JobError(f'the needle moves at {1e3 * speed:.3g} mm/s; it must rest')
         self._sensor.tare()
@@ -192,10 +192,10 @@ class Plant:
             resolution = base.limits.encoder_resolution
             push = base.push(self.time, needle.depth, interval / _PUSHES)
             if push is None:
-                before = needle.speed
+                before = needle.velocity
                 speed = base.speed(self.time, needle.depth, before, interval)
                 seen = needle.advance_moved(interval, speed)
-                late = _friction_gained(needle.model.friction, before, needle.speed)
+                late = _friction_gained(needle.model.friction, before, needle.velocity)
             else:
                 seen, late = self._pushed(base, push)
         self._count += 1
@@ -210,7 +210,7 @@ class Plant:
             wrench, start = np.zeros((2, 6))
             wrench[1:4] = start[1:4] = axial, seen.lateral_force, seen.moment
             start[1] -= 2.0 * late
-        depth, speed = needle.depth, needle.speed
+        depth, speed = needle.depth, needle.velocity
         return Sample(
             state=needle.state,
             depth=depth,

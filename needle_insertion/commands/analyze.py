@@ -9,7 +9,7 @@ from pathlib import Path
 import sys
 
 from needle_dynamics import FORMULATIONS, NeedleModel, NeedleParameters, PRESETS
-from needle_dynamics.analysis import SLIDING
+from needle_dynamics.linearization import SLIDING
 from needle_insertion.commands.common import Command, constants, make_folder
 from needle_insertion.report import controllability as report
 from needle_insertion.report.text import table

@@ -8,7 +8,7 @@ from pathlib import Path
 import sys
 
 from needle_dynamics import NeedleModel, NeedleParameters, PRESETS, simulate
-from needle_dynamics.simulated.integrators import DEFAULT_TOLERANCE
+from needle_dynamics.simulated.integrator import DEFAULT_TOLERANCE
 from needle_insertion.commands.common import Command, constants
 from needle_insertion.report import trajectory as report
 from needle_insertion.report.text import table

@@ -292,7 +292,7 @@ def base_alone(law: str, reading: str) -> LoopRun:
             # Held over 5 ms: 5e-4 of the time constant k_v / k_p.
             force = PID_KP * float(states[-1][0])
             integrator.advance(period, force)
-            forces[k, 0] = force - PID_KV * integrator.speed
+            forces[k, 0] = force - PID_KV * integrator.velocity
         else:
             speed = 0.0 if states[-1][0] <= 0.0 else _error_speed((k + 1) * period)
             forces[k, 0] = integrator.advance_moved(period, speed).axial_force

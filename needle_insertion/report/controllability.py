@@ -8,17 +8,16 @@ from itertools import product
 from pathlib import Path
 from typing import Any, Final, TYPE_CHECKING
 
-from needle_dynamics import NeedleModel, NeedleParameters
-from needle_dynamics.analysis import (
+from needle_dynamics import (
     Analysis,
     analyze,
-    controllability_map,
-    ControllabilityMap,
     linearize,
     LinearSystem,
+    NeedleModel,
+    NeedleParameters,
     operating_point,
-    Structure,
 )
+from needle_dynamics.analysis import controllability_map, ControllabilityMap, Structure
 from needle_identification.result import write_whole
 from needle_insertion.report.content import png
 import numpy as np
@@ -145,7 +144,7 @@ def analyze_points(
     force : float
         Insertion force [N].
     sliding : str, optional
-        Branch of dry friction at speed 0, a key of `needle_dynamics.analysis.SLIDING`.
+        Branch of dry friction at speed 0, a key of `needle_dynamics.linearization.SLIDING`.
 
     Returns
     -------

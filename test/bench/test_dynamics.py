@@ -152,7 +152,7 @@ def _helper(x: Any) -> Any:
 
 
 @numba.njit
-def evaluate(x: Any) -> Any:
+def two_modes(x: Any) -> Any:
     return x * x + 1.0
 
 
@@ -162,7 +162,7 @@ def _arithmetic(x: Any, values: Any, n: Any) -> Any:
     for i in range(n):
         total += values[i] * x
     if total > 0.0:
-        values[0] = -abs(sqrt(evaluate(x)) / x)
+        values[0] = -abs(sqrt(two_modes(x)) / x)
     scratch = np.empty(2)
     scratch[:] = x
     rest = scratch[1:].copy()

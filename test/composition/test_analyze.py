@@ -9,8 +9,14 @@ from pathlib import Path
 from typing import Any
 
 from matplotlib.image import imread
-from needle_dynamics import NeedleError, NeedleModel, NeedleParameters
-from needle_dynamics.analysis import analyze, linearize, operating_point
+from needle_dynamics import (
+    analyze,
+    linearize,
+    NeedleError,
+    NeedleModel,
+    NeedleParameters,
+    operating_point,
+)
 from needle_insertion.commands.analyze import COMMAND
 from needle_insertion.report import controllability
 import numpy as np

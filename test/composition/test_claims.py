@@ -169,7 +169,7 @@ def bias_terms() -> tuple[FloatArray, FloatArray, FloatArray]:
     rows = []
     for d, _, q1, q2, d_dot, _, p1, p2 in trajectory.states:
         at, q, rates = LENGTH - d, np.array([q1, q2]), np.array([p1, p2])
-        phi, bent = of.modes.values(at), of.modes.curvatures(at)
+        phi, bent = of.modes.values(at), of.modes.derivatives(at, 2)
         speed, curvature, tip = phi @ rates, bent @ q, phi @ q
         row_d = 0.5 * (LINEAR * speed**2 - BENDING * curvature**2 - K_A * tip**2)
         parts = of.modes.integrals(at)

@@ -164,7 +164,7 @@ def sampled_end(
     for i in range(count):
         x = needle.state
         load = -float(MODEL.bias_forces(x)[0])
-        force = loops[0].command(needle.depth, needle.speed, aim(i * period), load)
+        force = loops[0].command(needle.depth, needle.velocity, aim(i * period), load)
         torque = loops[1].command(float(x[1]), float(x[5]), Setpoint(0.0))
         needle.advance(period, force, torque)
     return needle.state

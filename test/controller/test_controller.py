@@ -36,7 +36,7 @@ def insert(
     waiting = [0.0] * late
     depths, aims = [], []
     for i in range(round(duration / PERIOD)):
-        measured = Measurement(time=i * PERIOD, depth=needle.depth, speed=needle.speed)
+        measured = Measurement(time=i * PERIOD, depth=needle.depth, speed=needle.velocity)
         command = steering.command(measured)
         depths.append(needle.depth)
         aims.append(command.setpoint.position)
@@ -227,7 +227,7 @@ def test_a_switch_in_motion_goes_on_with_the_last_force(switch: str) -> None:
         elif i == 2000:
             stiff = InverseDynamicsGains(kp=2500.0, kv=100.0)
             steering.change(gains={'inverse_dynamics': {'insertion': stiff}})
-        measured = Measurement(time=i * PERIOD, depth=needle.depth, speed=needle.speed)
+        measured = Measurement(time=i * PERIOD, depth=needle.depth, speed=needle.velocity)
         forces.append(steering.command(measured).force)
         waiting.append(forces[-1])
         needle.advance(PERIOD, waiting.pop(0))

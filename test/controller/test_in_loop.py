@@ -153,7 +153,7 @@ def test_agrees_with_the_sampled_law_inside_the_integrator() -> None:
         loop, integrator = SampledLoop(sampled, 0, 100.0), Integrator(p, state, period)
         for _ in range(round(0.1 / period)):
             integrator.advance(
-                period, loop.command(integrator.depth, integrator.speed, Setpoint(0.19))
+                period, loop.command(integrator.depth, integrator.velocity, Setpoint(0.19))
             )
         errors.append(abs(integrator.depth - run.depth[-1]))
     orders = np.log2(np.array(errors[:-1]) / errors[1:])

@@ -24,7 +24,8 @@ from needle_dynamics import (
     ParameterError,
     ShapeError,
 )
-from needle_dynamics.analysis import linearize, observability, operating_point
+from needle_dynamics.analysis import observability
+from needle_dynamics.linearization import linearize, operating_point
 from needle_dynamics.simulated.plant import Plant, Sample
 from needle_dynamics.simulated.tip_sensor import TipParameters, TipSensor
 import numpy as np
@@ -476,7 +477,7 @@ def watch_plant(observer: Observer, simulated: Plant, force: float, count: int) 
     """Let the observer see what the plant's sensors report."""
     needle = simulated.integrator
     observer.reset()
-    observer.update(0.0, needle.depth, needle.speed)
+    observer.update(0.0, needle.depth, needle.velocity)
     samples = []
     for k in range(1, count + 1):
         shown = simulated.advance(force)
@@ -580,7 +581,7 @@ def simulate(
     simulated, force = plant(seed, carried, depth, beliefs)
     needle = simulated.integrator
     observer = Observer(believed or parameters, beliefs, PERIOD)
-    observer.update(0.0, needle.depth, needle.speed)
+    observer.update(0.0, needle.depth, needle.velocity)
     late: list[tuple[int, float]] = []
     rows, raw = [], 0.0
     for k in range(1, count + 1):

@@ -149,7 +149,7 @@ def test_whatever_is_accepted_is_stable_at_every_depth(
     loop, waiting = SampledLoop(law, delay, np.inf), [0.0] * (delay + unmodeled)
     errors = []
     for _ in range(periods):
-        measured = needle.depth, needle.speed
+        measured = needle.depth, needle.velocity
         errors.append(depth + error - measured[0])
         waiting.append(loop.command(*measured, Setpoint(depth + error)))
         needle.advance(PERIOD, waiting.pop(0))

@@ -18,12 +18,9 @@ from needle_dynamics.analysis import (
     analyze,
     controllability,
     controllability_map,
-    linearize,
-    LinearSystem,
     observability,
-    operating_point,
-    StuckError,
 )
+from needle_dynamics.linearization import linearize, LinearSystem, operating_point, StuckError
 import numpy as np
 from numpy.testing import assert_allclose
 from numpy.typing import NDArray

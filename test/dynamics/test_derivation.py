@@ -117,11 +117,11 @@ def shapes(depth: float) -> FloatArray:
     modes = MODEL.modes
 
     def products(y: FloatArray) -> FloatArray:
-        phi, bend = modes.values(y).T, modes.curvatures(y).T
+        phi, bend = modes.values(y).T, modes.derivatives(y, 2).T
         return np.array([f[i] * f[j] for f in (phi, bend) for i, j in PAIRS])
 
     integrals = fixed_quad(products, 0.0, depth, n=40)[0]
-    return np.concatenate([integrals, modes.values(depth), modes.curvatures(depth)])
+    return np.concatenate([integrals, modes.values(depth), modes.derivatives(depth, 2)])
 
 
 def states() -> list[FloatArray]:

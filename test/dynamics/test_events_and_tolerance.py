@@ -53,7 +53,7 @@ def test_contact_of_a_straight_needle_has_its_closed_form() -> None:
     assert_allclose(total.contact_time, np.sqrt(2.0 * p.moving_mass * 0.05 / force), rtol=1e-10)
     assert_allclose(total.impact_loss, force * 0.05, rtol=1e-10)
     assert it.depth == LENGTH
-    assert it.speed == 0.0
+    assert it.velocity == 0.0
 
 
 @pytest.mark.parametrize('law', FRICTION_LAWS)
@@ -157,7 +157,7 @@ def test_a_needle_that_starts_on_the_hub_loses_its_speed_there() -> None:
         it = Integrator(p, moving(p, LENGTH, 0.0, 1.0))
         total = it.advance_moved(1e-3, 1.0) if moved else it.advance(1e-3, PUSH)
         assert it.depth == LENGTH
-        assert it.speed == 0.0
+        assert it.velocity == 0.0
         assert total.contact_time == 0.0
         assert_allclose(total.impact_loss, 0.5 * p.moving_mass, rtol=1e-15)
         assert total.friction_work == total.input_work == 0.0

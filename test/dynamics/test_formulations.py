@@ -12,7 +12,7 @@ from needle_dynamics import (
     NeedleParameters,
     ParameterError,
 )
-from needle_dynamics.simulated.integrators import DEFAULT_TOLERANCE
+from needle_dynamics.simulated.integrator import DEFAULT_TOLERANCE
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest

@@ -20,8 +20,9 @@ from needle_dynamics import (
     ShapeError,
     simulate,
 )
-from needle_dynamics.compiled.kernels import decay_means, slide
-from needle_dynamics.simulated.integrators import DEFAULT_STEP
+from needle_dynamics.compiled.friction import slide
+from needle_dynamics.compiled.oscillator import decay_means
+from needle_dynamics.simulated.integrator import DEFAULT_STEP
 import numpy as np
 from numpy.testing import assert_allclose
 from numpy.typing import ArrayLike
@@ -247,7 +248,7 @@ def test_order_two_on_the_open_loop_run_of_the_paper() -> None:
         it = needle('paper_si', **SECTION_328, step=step)
         it.advance(0.02, PUSH)
         assert it.depth < 0.19
-        return np.array([it.depth, it.speed, it.model.tip_deflection(it.state)])
+        return np.array([it.depth, it.velocity, it.model.tip_deflection(it.state)])
 
     steps = 1e-5 / 2.0 ** np.arange(4)
     reference = end(1e-7)
@@ -362,7 +363,7 @@ def test_a_straight_needle_sticks_up_to_the_friction_bound(push: float) -> None:
     depth = it.depth
     total = it.advance(1e5 * DEFAULT_STEP, push)
     assert it.depth == depth
-    assert it.speed == 0.0
+    assert it.velocity == 0.0
     assert total.friction_work == total.input_work == 0.0
 
 
@@ -380,7 +381,7 @@ def test_a_vibrating_needle_sticks_while_its_force_stays_within_the_bound(
     assert 0.3 < np.max(np.abs(drives)) < 0.56
     it.advance(1e5 * DEFAULT_STEP, push)
     assert it.depth == depth
-    assert it.speed == 0.0
+    assert it.velocity == 0.0
 
 
 @pytest.mark.parametrize('sign', [-1.0, 1.0])
@@ -391,14 +392,14 @@ def test_needle_breaks_away_just_above_the_bound(sign: float) -> None:
     travel = sign * 0.5 * 0.56e-9 / it.model.parameters.moving_mass * 0.1**2
     # 1e-6: the excess has 7 digits left; the depth near 0.1 m has 1e-17 m of rounding a step.
     assert_allclose(it.depth - 0.1, travel, rtol=1e-6, atol=1e-12)
-    assert it.speed * sign > 0.0
+    assert it.velocity * sign > 0.0
 
 
 def test_a_moving_needle_comes_to_rest_and_stays() -> None:
     """Coulomb friction alone stops the needle after m u^2 / (2 mu_s)."""
     it = needle(depth=0.05, speed=1.0, viscous_friction=0.0)
     it.advance(0.05)
-    assert it.speed == 0.0
+    assert it.velocity == 0.0
     # Sums over 364 steps.
     assert_allclose(it.depth - 0.05, it.model.parameters.moving_mass / (2.0 * 0.56), rtol=1e-11)
 
@@ -408,7 +409,7 @@ def test_steady_speed_under_viscous_friction() -> None:
     it = needle('paper_mm')
     it.advance(1e-3, PUSH)
     # 1 ms is 148 time constants.
-    assert_allclose(it.speed, (PUSH - 0.56) / 300.0, rtol=1e-12)
+    assert_allclose(it.velocity, (PUSH - 0.56) / 300.0, rtol=1e-12)
     depth = it.depth
     it.advance(0.1, PUSH)
     # 1e4 sums near 0.02 m, each with a rounding of 2e-18 m.
@@ -540,9 +541,9 @@ def test_hub_stops_the_needle_without_rebound_and_holds_it() -> None:
         it.advance(0.01, push)
         assert it.depth == 0.2
         assert it.state[0] == 0.0
-        assert it.speed == 0.0
+        assert it.velocity == 0.0
     it.advance(1e-3, -1.0)
-    assert it.speed < 0.0
+    assert it.velocity < 0.0
     assert it.depth < 0.2
 
 
@@ -601,7 +602,7 @@ def test_hub_also_stops_a_moved_base() -> None:
     it = needle('paper_si', depth=0.19, speed=0.1)
     it.advance_moved(0.2, 0.1)
     assert it.depth == 0.2
-    assert it.speed == 0.0
+    assert it.velocity == 0.0
     seen = it.advance_moved(0.01, 0.1)
     assert it.depth == 0.2
     assert seen.friction_work == seen.input_work == 0.0
@@ -613,7 +614,7 @@ def test_withdrawal_below_the_minimum_raises_and_leaves_the_last_valid_state(mov
 
     def go(it: Integrator, duration: float) -> Interval:
         if moved:
-            return it.advance_moved(duration, it.speed - 20.0 * duration)
+            return it.advance_moved(duration, it.velocity - 20.0 * duration)
         return it.advance(duration, -1.0, 1e-9)
 
     it, single = (needle(depth=4e-3, tip_deflection=1e-5) for _ in range(2))
@@ -631,7 +632,7 @@ def test_withdrawal_below_the_minimum_raises_and_leaves_the_last_valid_state(mov
     go(ended, taken * DEFAULT_STEP)
     assert_allclose(it.state, ended.state, rtol=1e-6)
     # One more step would have crossed the limit.
-    assert 1e-3 <= it.depth < 1e-3 - 1.1 * it.speed * DEFAULT_STEP
+    assert 1e-3 <= it.depth < 1e-3 - 1.1 * it.velocity * DEFAULT_STEP
     assert np.isfinite(it.model.acceleration(it.state)).all()
     last = it.state
     with pytest.raises(InsertedLengthError):
@@ -642,7 +643,7 @@ def test_withdrawal_below_the_minimum_raises_and_leaves_the_last_valid_state(mov
     last[4:] = 0.0
     halted = Integrator(it.model.parameters, last)
     halted.advance(2e-3, PUSH)
-    assert halted.speed > 0.0
+    assert halted.velocity > 0.0
 
 
 def test_withdrawal_never_ends_below_the_minimum() -> None:
@@ -700,7 +701,7 @@ def test_what_the_base_feels_in_parts_is_what_parts_by_themselves_tell(
     parameters = preset('paper_si', modes=modes, formulation=formulation, **changes)
     state = NeedleModel(parameters).state_at(0.04, 1e-4)
     state[2 + modes] = -0.5
-    inputs = 3.0, 1e-7, np.full(modes, 1e-3)
+    inputs = 3.0, 1e-7
     whole, single = (Integrator(parameters, state, 2e-5) for _ in range(2))
     total = whole.advance(2e-3, *inputs, 5)
     parts = [single.advance(4e-4, *inputs) for _ in range(5)]
@@ -738,7 +739,7 @@ def test_means_agree_with_fine_samples_of_the_motion(moved: bool, damping: float
 
     def go(it: Integrator, duration: float = step) -> Interval:
         if moved:
-            return it.advance_moved(duration, it.speed + 30.0 * duration)
+            return it.advance_moved(duration, it.velocity + 30.0 * duration)
         return it.advance(duration, PUSH, 1e-7)
 
     total = go(make(), steps * step)
@@ -798,7 +799,7 @@ def test_axial_force_leaves_out_what_accelerates_the_carriage() -> None:
     seen = it.advance(0.01, PUSH)
     p = it.model.parameters
     acceleration = (PUSH - 0.56) / p.moving_mass
-    assert_allclose(it.speed, acceleration * 0.01, rtol=1e-12)
+    assert_allclose(it.velocity, acceleration * 0.01, rtol=1e-12)
     assert_allclose(seen.axial_force, PUSH - 0.5 * acceleration, rtol=1e-11)
     # The same by the needle alone.
     needle_mass = p.linear_density * p.length
@@ -816,14 +817,14 @@ def test_moved_base_has_exact_kinematics(start: float, end: float, tip: float) -
     it.advance_moved(0.01, end)
     # Sums over 1000 steps of numbers up to 0.1 m.
     assert_allclose(it.depth - 0.08, 0.5 * (start + end) * 0.01, atol=1e-14)
-    assert it.speed == end
+    assert it.velocity == end
 
 
 def test_a_moved_base_that_shall_rest_does_so_exactly() -> None:
     """Brought to rest, the base stays where it is bit for bit."""
     it = needle(depth=0.08, speed=0.0731, tip_deflection=5e-4)
     it.advance_moved(0.0123, 0.0)
-    assert it.speed == 0.0
+    assert it.velocity == 0.0
     depth = it.depth
     for _ in range(10):
         it.advance_moved(1e-3, 0.0)
@@ -939,7 +940,7 @@ def test_state_is_a_copy() -> None:
     assert np.array_equal(given_state, kept)
     assert np.array_equal(first, kept)
     assert it.depth == 0.2 - it.state[0]
-    assert it.speed == -it.state[4]
+    assert it.velocity == -it.state[4]
 
 
 @pytest.mark.parametrize('step', [0.0, -1e-5, np.nan, np.inf])
@@ -990,95 +991,3 @@ def test_speed_that_is_not_finite_is_refused_and_leaves_the_state(speed: float) 
     with pytest.raises(ParameterError):
         it.advance_moved(1e-3, speed)
     assert np.array_equal(it.state, before)
-
-
-def driven(model: NeedleModel, forces: FloatArray, push: float) -> Callable[..., FloatArray]:
-    """Return the right-hand side of the motion under generalized forces and a push."""
-    m = model.coordinates
-
-    def derivative(time: float, x: FloatArray) -> FloatArray:
-        result = model.acceleration(x, push, 0.0, time)
-        result[2:] += np.linalg.solve(model.mass_matrix(x)[2:, 2:], forces)
-        return np.concatenate([x[m:], result])
-
-    return derivative
-
-
-@pytest.mark.parametrize('modes', [1, 2, 3])
-@pytest.mark.parametrize('formulation', ['complete', 'as_printed'])
-def test_generalized_forces_act_as_in_the_equations_of_motion(
-    formulation: str, modes: int
-) -> None:
-    """With them a sliding needle goes as an ODE solver has it, and converges with order two."""
-    it = needle('paper_si', 0.1, 5e-4, formulation=formulation, modes=modes, minimum_depth=0.05,
-                tissue_damping=1.6, coulomb_friction=0.0)  # fmt: skip
-    forces, state = np.array([0.2, -0.3, 0.2])[:modes], it.state
-    state[2 + modes] = -0.05
-    exact = solve_ivp(
-        driven(it.model, forces, 0.1), (0.0, 4e-3), state, rtol=1e-10, atol=1e-14, method='DOP853'
-    ).y[:, -1]
-    # For its size only.
-    free = solve_ivp(
-        driven(it.model, 0.0 * forces, 0.1), (0.0, 4e-3), state, rtol=1e-5, atol=1e-9
-    ).y[:, -1]
-    scale = np.abs(exact - free)[2 : 2 + modes].max()
-    steps, errors = 2e-5 / 2.0 ** np.arange(4), []
-    for step in steps:
-        it = Integrator(it.model.parameters, state, float(step))
-        it.advance(4e-3, 0.1, 0.0, forces)
-        errors.append(np.abs(it.state - exact)[2 : 2 + modes].max())
-    # Modes up to 1.8 kHz (three of them): (omega h)^2 / 12 = 4e-3 at the longest step.
-    assert errors[0] < 4e-3 * scale
-    assert_allclose(order(steps, np.array(errors)), 2.0, atol=0.15)
-
-
-@given(
-    st.floats(0.02, 0.2),
-    st.lists(st.floats(-5.0, 5.0), min_size=2, max_size=2),
-    st.floats(1e-6, 1e-3),
-)
-@settings(deadline=None, max_examples=25)
-def test_generalized_forces_hold_the_deflections_of_their_statics(
-    depth: float, forces: list[float], step: float
-) -> None:
-    """At K q = Q a needle that sticks rests, at any depth and step; its tip mean tells that."""
-    it = needle('phantom', depth, coulomb_friction=1e6, step=step)
-    state = it.state
-    state[2:4] = np.linalg.solve(it.model.stiffness_matrix(depth), forces)
-    it = Integrator(it.model.parameters, state, step)
-    seen = it.advance(5e-3, 0.0, 0.0, np.array(forces))
-    # Rounding, larger by the condition of K: 1e5 at 2 cm.
-    scale = np.abs(state[2:4]).max() + 1e-300
-    assert_allclose(it.state[2:4], state[2:4], rtol=1e-9, atol=1e-9 * scale)
-    tip = it.model.tip_deflection(state)
-    assert seen.tip_deflection == pytest.approx(tip, rel=1e-8, abs=1e-9 * scale)
-    assert seen.input_work == pytest.approx(0.0, abs=1e-8 * abs(np.dot(forces, state[2:4])))
-
-
-def test_work_of_generalized_forces_belongs_to_the_balance_of_energy() -> None:
-    """E_end - E_start = input - friction - damping work, at the order of the integrator."""
-    steps, forces = 2.5e-6 / 2.0 ** np.arange(4), np.array([0.5, -0.5])
-    gaps: list[float] = []
-    for step in steps:
-        it = needle('paper_mm', **SECTION_328, step=step, tissue_damping=1.6)
-        before = energy(it)
-        total = it.advance(0.02, PUSH, 1e-9, forces)
-        spent = total.friction_work + total.damping_work
-        gaps.append(abs(energy(it) - before + spent - total.input_work))
-    pushed = needle('paper_mm', **SECTION_328, step=1e-6, tissue_damping=1.6)
-    without = pushed.advance(0.02, PUSH, 1e-9)
-    # What the generalized forces do is not a small part of it.
-    assert abs(total.input_work - without.input_work) > 0.01 * without.input_work
-    # They shake the 22 kHz mode, which these steps resolve: (omega h)^2 / 12 is 0.01.
-    assert gaps[0] < 0.01 * total.damping_work
-    assert_allclose(order(steps, np.array(gaps)), 2.0, atol=0.1)
-
-
-@pytest.mark.parametrize('forces', [[1.0], [1.0, 2.0, 3.0], [1.0, np.nan], ['a', 'b']])
-def test_generalized_forces_that_do_not_fit_are_refused(forces: list[Any]) -> None:
-    """One finite number for each mode, else an error, and the state stays."""
-    it = needle()
-    before = it.state
-    with pytest.raises(ShapeError, match='modal must be'):
-        it.advance(1e-3, 0.0, 0.0, forces)  # type: ignore[arg-type]
-    assert_allclose(it.state, before, rtol=0.0)

@@ -75,7 +75,7 @@ def test_energies_are_the_integrals_of_equation_12() -> None:
         depth = p.length - x[0]
 
         def field(y: FloatArray, x: FloatArray = x) -> FloatArray:
-            shapes, bends = of.modes.values(y), of.modes.curvatures(y)
+            shapes, bends = of.modes.values(y), of.modes.derivatives(y, 2)
             return np.array([shapes @ x[2:4], bends @ x[2:4], shapes @ x[6:8]]) ** 2
 
         w, bend, rate = fixed_quad(field, 0.0, depth, n=40)[0]

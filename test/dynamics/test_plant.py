@@ -251,7 +251,7 @@ def test_constants_change_without_a_jump(law: str) -> None:
     assert one.advance(0.05, 3.0) == other.advance(0.05, 3.0)
     assert np.array_equal(one.state, other.state)
     if law != 'tanh':
-        assert one.speed == pytest.approx((3.0 - 0.8) / 200.0, rel=1e-3)
+        assert one.velocity == pytest.approx((3.0 - 0.8) / 200.0, rel=1e-3)
 
 
 def test_constants_that_do_not_suit_the_state_are_refused() -> None:

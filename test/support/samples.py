@@ -67,11 +67,11 @@ def motion(
     integrator = Integrator(TRUTH, [0.17, 0, 0, 0, 0, 0, 0, 0], step=1e-3)
     rows = []
     for speed, duration in legs:
-        ramp = max(1, round(abs(speed - integrator.speed) / acceleration * rate))
-        rise = np.linspace(integrator.speed, speed, ramp + 1)[1:]
+        ramp = max(1, round(abs(speed - integrator.velocity) / acceleration * rate))
+        rise = np.linspace(integrator.velocity, speed, ramp + 1)[1:]
         for target in [*rise, *[speed] * round(duration * rate)]:
             force = integrator.advance_moved(1.0 / rate, target).axial_force
-            rows.append((integrator.depth, integrator.speed, force))
+            rows.append((integrator.depth, integrator.velocity, force))
     depth, speeds, force = np.array(rows).T
     return depth, speeds, force
 

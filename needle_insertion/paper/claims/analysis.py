@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from functools import cache
 
-from needle_dynamics.analysis import Analysis
+from needle_dynamics import Analysis
 from needle_insertion.paper.claims.claim import Finding, finding
 from needle_insertion.paper.controllability import DEFLECTIONS, DEPTHS, SPEED
 from needle_insertion.paper.runs import CASES, needle

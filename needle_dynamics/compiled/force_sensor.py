@@ -1,0 +1,70 @@
+"""Samples of the force sensor: offset, noise, saturation, filters, counts."""
+
+from __future__ import annotations
+
+from needle_dynamics.arrays import FloatArray
+from needle_dynamics.compiled.cache import compiled
+import numpy as np
+
+
+@compiled
+def straight(before: FloatArray, now: FloatArray, felt: FloatArray) -> None:
+    """Fill ``felt``, shape (k, 6), with a straight line that ends with ``now``."""
+    samples = felt.shape[0]
+    for j in range(samples):
+        # The last sample is the wrench now, to the bit.
+        back = (samples - 1.0 - j) / samples
+        for i in range(6):
+            felt[j, i] = now[i] + back * (before[i] - now[i])
+
+
+@compiled
+def sense(
+    felt: FloatArray,
+    drawn: FloatArray,
+    constants: FloatArray,
+    sections: FloatArray,
+    memory: FloatArray,
+    offset: FloatArray,
+    zero: FloatArray,
+    reading: FloatArray,
+) -> None:
+    """
+    Take the samples of a force sensor since its last reading; read the last of them.
+
+    Parameters
+    ----------
+    felt : ndarray, shape (k, 6)
+        True wrench of each of the k samples.
+    drawn : ndarray, shape (k + 1, 6)
+        Standard normal numbers: noise of each sample, then the step of the offset.
+    constants : ndarray, shape (4, 6)
+        Standard deviations of noise and step, range, and resolution (0 for none) of each axis.
+    sections : ndarray, shape (filters, 6)
+        Second-order sections of the cascade, as SciPy has them.
+    memory : ndarray, shape (filters, 2, 6)
+        Their memory in transposed direct form II; renewed.
+    offset : ndarray, shape (6,)
+        Offset of the sensor; renewed.
+    zero : ndarray, shape (6,)
+        What the reading is zeroed on.
+    reading : ndarray, shape (6,)
+        Overwritten with the reading.
+
+    """
+    samples = felt.shape[0]
+    for i in range(6):
+        noise, limit, count = constants[0, i], constants[2, i], constants[3, i]
+        offset[i] += constants[1, i] * drawn[samples, i]
+        value = 0.0
+        for j in range(samples):
+            value = felt[j, i] + offset[i] + noise * drawn[j, i]
+            value = min(max(value, -limit), limit)
+            for k in range(sections.shape[0]):
+                x = value
+                value = sections[k, 0] * x + memory[k, 0, i]
+                memory[k, 0, i] = sections[k, 1] * x - sections[k, 4] * value + memory[k, 1, i]
+                memory[k, 1, i] = sections[k, 2] * x - sections[k, 5] * value
+        value -= zero[i]
+        # Counts know no negative zero.
+        reading[i] = np.rint(value / count) * count + 0.0 if count > 0.0 else value

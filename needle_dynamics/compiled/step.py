@@ -1,0 +1,482 @@
+"""
+The step of the integrator, and runs of steps under constant inputs.
+
+One step of length h from (s, u, q, p) is a symmetric splitting, see `needle_dynamics.simulated`:
+drift the depth to the middle of the step, take the modes through it at that depth
+(`modal_flow`), and move the insertion axis under the force, the mean force of the modes and
+friction (`friction`). Steps end where a layer of tissue does, and the motion stops at the hub.
+"""
+
+from __future__ import annotations
+
+from math import ceil, exp, expm1, inf, nan
+from typing import Final, NamedTuple
+
+from needle_dynamics.arrays import FloatArray
+from needle_dynamics.compiled.cache import compiled, inlined
+from needle_dynamics.compiled.friction import dry_friction, friction_flow, FrictionConstants
+from needle_dynamics.compiled.integrals import mode_integrals, ModeIntegrals, ModeTables
+from needle_dynamics.compiled.matrices import backward, cholesky, forward
+from needle_dynamics.compiled.modal_flow import Elasticity, rotate_many, rotate_two
+from needle_dynamics.compiled.tissue import layer_at, Layers, time_to_layer
+import numpy as np
+
+#: Relative inserted length from which on graded steps grow in proportion to it.
+GRADED_FROM: Final = 0.1
+
+
+class Needle(NamedTuple):
+    """
+    One needle in its tissue, as `needle_dynamics.model.NeedleModel.compiled` makes it; SI units.
+
+    Attributes
+    ----------
+    minimum_depth, maximum_depth : float
+        Range of the inserted length [m].
+    as_printed : bool
+        Formulation `as_printed` instead of `complete`.
+    friction : FrictionConstants
+        Friction along the insertion axis.
+    modes : ModeTables
+        Tables of the shape modes.
+    layers : Layers
+        Layers of tissue.
+
+    """
+
+    length: float
+    linear_density: float
+    bending_stiffness: float
+    tissue_damping: float
+    moving_mass: float
+    carriage_mass: float
+    rotary_inertia: float
+    minimum_depth: float
+    maximum_depth: float
+    hub_stop: bool
+    as_printed: bool
+    swelling: float
+    swelling_time: float
+    friction: FrictionConstants
+    modes: ModeTables
+    layers: Layers
+
+
+class Inputs(NamedTuple):
+    """
+    What the base does over a time.
+
+    Attributes
+    ----------
+    force : float
+        Insertion force [N], positive into the tissue; not used if the base is moved.
+    torque : float
+        Torque about x [N m].
+    velocity : float
+        Insertion velocity of a moved base at the end [m/s].
+    moved : bool
+        Whether the base is moved: its velocity goes evenly to ``velocity``, whatever force that
+        takes.
+
+    """
+
+    force: float
+    torque: float
+    velocity: float
+    moved: bool
+
+
+class Sums(NamedTuple):
+    """
+    Sums over steps.
+
+    Attributes
+    ----------
+    tip : float
+        Integral of the tip deflection [m s].
+    reaction, moment : float
+        Impulse of the tissue's reaction along z [N s] and of its moment about the entry point
+        [N m s].
+    resistance : float
+        Impulse of the base that moves the needle, without that of inertia [N s].
+    friction_work, damping_work, input_work : float
+        Energy lost to friction and to tissue damping, and work of the inputs [J].
+    impact_loss : float
+        Energy lost on the hub [J].
+    contact_time : float
+        Time of the last contact with the hub [s]; -1 if there is none.
+
+    """
+
+    tip: float
+    reaction: float
+    moment: float
+    resistance: float
+    friction_work: float
+    damping_work: float
+    input_work: float
+    impact_loss: float
+    contact_time: float
+
+
+class _Motion(NamedTuple):
+    """Inserted length, its velocity, and how fast that changed in the last step."""
+
+    depth: float
+    velocity: float
+    acceleration: float
+
+
+class _Border(NamedTuple):
+    """Motion and sums with the needle's momentum along z and its moment about the entry point."""
+
+    motion: _Motion
+    sums: Sums
+    momentum: float
+    angular: float
+
+
+@inlined
+def _rates(c: Needle, at: ModeIntegrals, z: FloatArray) -> FloatArray:
+    """Return the rates that belong to ``z``, momenta unless `as_printed`."""
+    rates = z.copy()
+    if not c.as_printed:
+        factor = c.linear_density * at.gram
+        cholesky(factor, factor)
+        forward(factor, rates)
+        backward(factor, rates)
+    return rates
+
+
+@inlined
+def _border(c: Needle, at: ModeIntegrals, z: FloatArray, motion: _Motion, sums: Sums) -> _Border:
+    """Return what the balance of momentum needs where a part of the time begins or ends."""
+    rates = _rates(c, at, z)
+    momentum, angular = 0.0, 0.0
+    for i in range(rates.shape[0]):
+        momentum += at.area[i] * rates[i]
+        angular += at.moment[i] * rates[i]
+    return _Border(motion, sums, c.linear_density * momentum, c.linear_density * angular)
+
+
+@compiled
+def _hub_contact(
+    c: Needle, u: float, drive: float, gain: float, moved: bool, room: float, h: float
+) -> tuple[float, float]:
+    """Return when in a step the needle reaches the hub, -1 if it rests there, and how fast."""
+    if room <= 0.0:
+        # It started on the hub: all its velocity is lost at once.
+        return (0.0, u) if u > 0.0 else (-1.0, 0.0)
+    early, late = 0.0, h
+    for _ in range(60):
+        trial = 0.5 * (early + late)
+        if moved:
+            gone = trial * (u + 0.5 * trial * gain)
+        else:
+            _, gone = friction_flow(c.friction, c.moving_mass, u, drive, trial)
+        if gone < room:
+            early = trial
+        else:
+            late = trial
+    if moved:
+        return late, u + late * gain
+    return late, friction_flow(c.friction, c.moving_mass, u, drive, late)[0]
+
+
+@compiled
+def _resistance(
+    c: Needle, u: float, new_u: float, travel: float, impulse: float, h: float
+) -> tuple[float, float]:
+    """Return the energy that friction takes from a needle that is moved, and what that takes."""
+    f, mean = c.friction, 0.5 * (u + new_u)
+    factor = 1.0 if mean >= 0.0 else f.withdrawal
+    path = abs(u) + abs(new_u)
+    if path > 0.0:
+        # Dry friction counts for the time spent in each direction.
+        dry = dry_friction(f, factor * f.coulomb, abs(mean))[0] * (u + new_u) / path
+    else:
+        # At rest it holds what it can of the pull of the modes.
+        bearable = dry_friction(f, f.coulomb, 0.0)[0]
+        dry = min(max(-impulse / h, -f.withdrawal * bearable), bearable)
+    viscous = f.viscous * factor
+    return (dry + viscous * mean) * travel, (impulse / h + dry) * h + viscous * travel
+
+
+@inlined
+def _write_felt(
+    c: Needle, inputs: Inputs, before: _Border, now: _Border, span: float, felt: FloatArray
+) -> None:
+    """Write what the base felt in a part of the time, by balance of momentum."""
+    gained = now.motion.velocity - before.motion.velocity
+    if inputs.moved:
+        axial = c.linear_density * c.length * gained
+        felt[0] = (axial + now.sums.resistance - before.sums.resistance) / span
+    else:
+        felt[0] = inputs.force - c.carriage_mass * gained / span
+    lateral = (now.momentum - before.momentum + now.sums.reaction - before.sums.reaction) / span
+    about_entry = (now.angular - before.angular + now.sums.moment - before.sums.moment) / span
+    lever = c.length - 0.5 * (before.motion.depth + now.motion.depth)
+    felt[1], felt[2] = lateral, about_entry + lever * lateral + inputs.torque
+
+
+@compiled
+def _steps(  # noqa: C901
+    c: Needle,
+    at: ModeIntegrals,
+    work: FloatArray,
+    modal: FloatArray,
+    inputs: Inputs,
+    gain: float,
+    motion: _Motion,
+    sums: Sums,
+    span: float,
+    end: float,
+    later: float,
+    longest: float,
+    graded: bool,
+) -> tuple[_Motion, Sums, float]:
+    """
+    Take steps through a time; return motion, sums and the time left undone.
+
+    ``gain`` is the acceleration of a moved base. The time ends at ``end`` - ``later``.
+    """
+    q, z, q_before, z_before = modal[0], modal[1], modal[2], modal[3]
+    layers, two = c.layers, q.shape[0] == 2
+    layered = layers.starts.shape[0] > 1
+    rho, f = c.linear_density, c.friction
+    s, u, acceleration = motion
+    tip, reaction, moment, resistance, friction, damping, done, impact, contact = sums
+    growth, decay, layer = 1.0, 1.0, 0
+    left, count, even, whole, renew = span, 0, 0.0, longest, True
+    while left > 0.0:
+        if renew:
+            if graded:
+                whole = longest * max(1.0, s / (GRADED_FROM * c.length))
+            # A time of a whole number of steps is not rounded up.
+            count = ceil(left / whole * (1.0 - 1e-9))
+            even = left / count
+            renew = graded
+        h = even
+        count -= 1
+        rest = left - h if count > 0 else 0.0
+        if layered:
+            border = time_to_layer(layers, s, u)
+            if 1e-3 * h < border < h:
+                # A step ends where a layer does: its stiffness is that of one layer.
+                h, rest, renew = border, left - border, True
+        middle = s + 0.5 * h * u
+        if graded:
+            # Mean depth of the step if it accelerates as the last one did: a steadier phase.
+            middle += h * h * acceleration / 6.0
+        if c.hub_stop and middle > c.length:
+            middle = c.length
+        if not c.minimum_depth <= middle <= c.maximum_depth:
+            break
+        mode_integrals(c.modes, middle, work, at)
+        if layered:
+            layer = layer_at(layers.starts, middle, layer)
+        if c.swelling != 0.0:
+            growth = 1.0 - c.swelling * expm1(-(end - (left + later) + 0.5 * h) / c.swelling_time)
+        if c.tissue_damping != 0.0:
+            decay = exp(-0.5 * h * c.tissue_damping / rho)
+        elasticity = Elasticity(
+            rho, c.bending_stiffness, c.tissue_damping, c.as_printed,
+            layer, growth * layers.stiffnesses[layer], growth, decay,
+        )  # fmt: skip
+        for i in range(q.shape[0]):
+            q_before[i], z_before[i] = q[i], z[i]
+        if two:
+            turned = rotate_two(elasticity, layers, at, q, z, h)
+        else:
+            turned = rotate_many(elasticity, layers, at, q, z, h)
+        drive = inputs.force - turned.impulse / h
+        if inputs.moved:
+            # Counted from the end, so that a base that shall rest does so exactly.
+            new_u = inputs.velocity - (rest + later) * gain
+            travel = 0.5 * h * (u + new_u)
+        else:
+            new_u, travel = friction_flow(f, c.moving_mass, u, drive, h)
+        stopped = c.hub_stop and s + travel >= c.length
+        if s + travel < c.minimum_depth or (s + travel > c.maximum_depth and not stopped):
+            # The last valid state is the one before this step.
+            q[:], z[:] = q_before, z_before
+            break
+        if stopped:
+            travel = c.length - s
+            late, new_u = _hub_contact(c, u, drive, gain, inputs.moved, travel, h)
+            if late >= 0.0:
+                contact = end - (left + later) + late
+                impact += 0.5 * c.moving_mass * new_u * new_u
+        gained = 0.5 * c.moving_mass * (new_u * new_u - u * u)
+        if inputs.moved:
+            lost, resisted = _resistance(c, u, new_u, travel, turned.impulse, h)
+            done += lost + turned.impulse / h * travel + gained
+            resistance += resisted
+        else:
+            lost = drive * travel - gained
+            done += inputs.force * travel
+        tip += turned.tip
+        reaction += turned.reaction
+        moment += turned.moment
+        damping += turned.lost
+        friction += lost
+        acceleration = (new_u - u) / h
+        s, u, left = s + travel, new_u, rest
+        if stopped:
+            s, u = c.length, 0.0
+    sums = Sums(tip, reaction, moment, resistance, friction, damping, done, impact, contact)
+    return _Motion(s, u, acceleration), sums, left
+
+
+@compiled
+def advance(
+    c: Needle,
+    state: FloatArray,
+    time: float,
+    inputs: Inputs,
+    longest: float,
+    graded: bool,
+    duration: float,
+    felt: FloatArray | None = None,
+) -> tuple[float, Sums]:
+    """
+    Advance a state under constant inputs, in place.
+
+    Parameters
+    ----------
+    c : Needle
+        The needle.
+    state : ndarray, shape (2 (2 + n),)
+        State X = [q, q_dot], SI units; overwritten.
+    time : float
+        Time at the beginning [s], for tissue that swells.
+    inputs : Inputs
+        What the base does.
+    longest : float
+        Longest step [s].
+    graded : bool
+        Let steps grow with the inserted length once it exceeds a tenth of the needle's, since the
+        modes slow down.
+    duration : float
+        Time to advance [s].
+    felt : ndarray, shape (parts, 3), optional
+        Takes what the base feels in equal parts of the duration, where steps then end: the mean
+        force of the base on the needle along y and along z [N], and the mean moment about x at
+        the base [N m]. That is by balance of momentum, exact whatever the modes do.
+
+    Returns
+    -------
+    left : float
+        Time left undone [s], if the inserted length would leave its range. NaN if the state
+        became non-finite.
+    sums : Sums
+        Sums over the steps.
+
+    """
+    n = c.modes.modes.shape[1]
+    # Few blocks: an allocation takes a sixth of a step.
+    grids, rows = np.empty((2, n, n)), np.empty((8, n))
+    work = np.empty(c.modes.series.shape[1] + 4 * n)
+    at = ModeIntegrals(grids[0], grids[1], rows[0], rows[1], rows[2], rows[3])
+    q, z = rows[4], rows[5]
+    for i in range(n):
+        q[i], z[i] = state[2 + i], state[4 + n + i]
+    mode_integrals(c.modes, c.length - state[0], work, at)
+    if not c.as_printed:
+        # From rates to momenta p = rho A G q_dot, in which dG/dt needs no term.
+        for i in range(n):
+            z[i] = 0.0
+            for j in range(n):
+                z[i] += c.linear_density * at.gram[i, j] * state[4 + n + j]
+    parts = 1 if felt is None else felt.shape[0]
+    motion = _Motion(c.length - state[0], -state[2 + n], 0.0)
+    sums = Sums(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0)
+    gain = (inputs.velocity - motion.velocity) / duration
+    span, left, later = duration / parts, 0.0, 0.0
+    if felt is not None:
+        border = _border(c, at, z, motion, sums)
+    for part in range(parts):
+        later = (parts - 1 - part) * span
+        motion, sums, left = _steps(
+            c, at, work, rows[4:], inputs, gain, motion, sums, span, time + duration, later,
+            longest, graded,
+        )  # fmt: skip
+        if left > 0.0:
+            break
+        if felt is not None:
+            mode_integrals(c.modes, motion.depth, work, at)
+            now = _border(c, at, z, motion, sums)
+            _write_felt(c, inputs, border, now, span, felt[part])
+            border = now
+    mode_integrals(c.modes, motion.depth, work, at)
+    left += later
+    done = duration - left
+    turn = 2.0 * inputs.torque / c.rotary_inertia
+    turned = (state[3 + n] + 0.5 * turn * done) * done
+    state[0] = c.length - motion.depth
+    state[1] += turned
+    state[2 + n] = -motion.velocity
+    state[3 + n] += turn * done
+    rates = _rates(c, at, z)
+    for i in range(n):
+        state[2 + i], state[4 + n + i] = q[i], rates[i]
+    input_work = sums.input_work + inputs.torque * turned
+    sums = Sums(
+        sums.tip, sums.reaction, sums.moment, sums.resistance, sums.friction_work,
+        sums.damping_work, input_work, sums.impact_loss, sums.contact_time,
+    )  # fmt: skip
+    size = 0.0
+    for value in state:
+        size += abs(value)
+    for value in sums:
+        size += abs(value)
+    return (left if size < inf else nan), sums
+
+
+@compiled
+def run(
+    c: Needle,
+    state: FloatArray,
+    forces: FloatArray,
+    torques: FloatArray,
+    interval: float,
+    longest: float,
+    graded: bool,
+    states: FloatArray,
+) -> int:
+    """
+    Advance a state through intervals of constant inputs, in place.
+
+    Parameters
+    ----------
+    c : Needle
+        The needle.
+    state : ndarray, shape (2 (2 + n),)
+        State; overwritten.
+    forces, torques : ndarray, shape (k,)
+        Insertion force [N] and torque [N m] of each interval.
+    interval, longest : float
+        Length of an interval and of the longest step [s].
+    graded : bool
+        As in `advance`.
+    states : ndarray, shape (k + 1, 2 (2 + n)) or (1, 2 (2 + n))
+        Filled with the states at the ends of the intervals; with a single row it is left alone,
+        and only ``state`` is the result.
+
+    Returns
+    -------
+    int
+        Number of intervals that were completed.
+
+    """
+    keep = states.shape[0] > 1
+    if keep:
+        states[0] = state
+    for k in range(forces.shape[0]):
+        inputs = Inputs(forces[k], torques[k], 0.0, False)
+        left, _ = advance(c, state, k * interval, inputs, longest, graded, interval)
+        if left != 0.0:
+            return k
+        if keep:
+            states[k + 1] = state
+    return len(forces)

@@ -1,0 +1,409 @@
+r"""
+Structure-preserving integrator of the needle: frozen-depth modal flow, exact friction flow.
+
+One step of length h from (s, u, q, p), u = s_dot and p = rho A G q_dot, is a symmetric
+splitting of the Hamiltonian system:
+
+1. drift the depth to the middle of the step with the velocity at its start;
+2. with the depth frozen there, the modal part is linear: tissue damping and the rotation in the
+   eigenbasis of (E I_y H + k_a G, rho A G) are exact, whatever their frequency. With the
+   momenta as variables dG/dt needs no term. The impulse -dH/ds that the modes exert on the
+   insertion axis along that rotation is an exact integral too;
+3. insertion force and mean modal force being constant over the step, the insertion axis under
+   viscous and set-valued Coulomb friction has an exact flow, including stops and sticking.
+
+It is of second order, symplectic without friction and damping (the total displacement then
+equals that of drift-kick-drift), sticks exactly, and has no stability limit from the modes nor
+from viscous friction. Source of the idea: E. Hairer, C. Lubich, G. Wanner, "Geometric Numerical
+Integration", 2nd ed., 2006, sections II.5 and XIII (splitting, highly oscillatory problems).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from math import copysign, inf, isfinite, isnan, sqrt
+from typing import Final
+
+from needle_dynamics.arrays import FloatArray
+from needle_dynamics.compiled.step import advance, Inputs, Sums
+from needle_dynamics.errors import InsertedLengthError, ToleranceError
+from needle_dynamics.model import NeedleModel
+from needle_dynamics.parameters import NeedleParameters
+from needle_ros.errors import NeedleError, ParameterError
+import numpy as np
+from numpy.typing import ArrayLike
+
+#: Default step [s]. The tip deflection of the source's open-loop run is then good to 2e-4.
+DEFAULT_STEP: Final = 1e-5
+
+#: Tolerance of `needle simulate`: a coast over the whole needle then keeps its energy to 1e-8.
+DEFAULT_TOLERANCE: Final = 1e-8
+
+#: Step at which a tolerance is given up, and shortest step taken [s]: rounding has taken over
+#: long before.
+_SHORTEST_STEP: Final = 1e-9
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Interval:
+    """
+    Means and works over an interval, as sensors that average over it have them.
+
+    Attributes
+    ----------
+    tip_deflection : float
+        Mean deflection of the tip [m].
+    axial_force : float
+        Mean force of the base on the needle along y [N], positive into the tissue.
+    lateral_force : float
+        Mean force of the base on the needle along z [N], by balance of momentum.
+    moment : float
+        Mean moment of the base on the needle about x at the base [N m], with the torque.
+    felt : ndarray, shape (parts, 3)
+        These three over each of the equal parts of the interval. Not compared by ``==``.
+    friction_work, damping_work : float
+        Energy lost to friction and to tissue damping [J].
+    input_work : float
+        Work done by force and torque [J].
+    impact_loss : float
+        Energy lost on the hub [J].
+    contact_time : float or None
+        Time of the last contact with the hub [s], on the integrator's clock.
+
+    """
+
+    tip_deflection: float
+    axial_force: float
+    lateral_force: float
+    moment: float
+    felt: FloatArray = field(compare=False)
+    friction_work: float
+    damping_work: float
+    input_work: float
+    impact_loss: float
+    contact_time: float | None
+
+
+class Integrator:
+    """
+    Advances one needle in time.
+
+    Parameters
+    ----------
+    parameters : NeedleParameters
+        Constants. For friction or tissue as objects, see `NeedleParameters.using`.
+    state : array_like, shape (2 (2 + n),)
+        Initial state, see `NeedleModel.state_at`.
+    step : float
+        Longest step [s].
+    tolerance : float, optional
+        If given, the step is halved until the estimated error of each call to `advance` is less
+        than this part of the state in the norm of energy, and of the needle's length.
+    graded : bool
+        Let the step grow with the inserted length once that exceeds a tenth of the needle's: the
+        modes slow down as its square.
+
+    Attributes
+    ----------
+    model : NeedleModel
+        The needle.
+    time : float
+        Time [s], 0 at first; it matters for tissue that swells.
+
+    Raises
+    ------
+    ParameterError
+        If ``step`` or ``tolerance`` is not positive and finite.
+    ShapeError, InsertedLengthError
+        If the state is not valid.
+    ToleranceError
+        By `advance`, if the tolerance cannot be met.
+
+    Examples
+    --------
+    >>> from needle_dynamics import Integrator, NeedleModel, NeedleParameters
+    >>> parameters = NeedleParameters.preset('phantom')
+    >>> needle = Integrator(parameters, NeedleModel(parameters).state_at(0.05))
+    >>> seen = needle.advance(0.1, force=3.0)
+    >>> print(f'{needle.depth:.4f} m, {needle.velocity:.4f} m/s, {seen.axial_force:.1f} N')
+    0.0508 m, 0.0081 m/s, 3.0 N
+
+    """
+
+    def __init__(
+        self,
+        parameters: NeedleParameters,
+        state: ArrayLike,
+        step: float = DEFAULT_STEP,
+        tolerance: float | None = None,
+        *,
+        graded: bool = False,
+    ) -> None:
+        self.step = checked_step(step)
+        if tolerance is not None and not 0.0 < tolerance < inf:
+            raise ParameterError(f'tolerance must be positive and finite, got {tolerance!r}')
+        self.tolerance = tolerance
+        self.graded = graded
+        self.time = 0.0
+        self._refinement = 1.0
+        self._state = np.array(state)
+        self.change(parameters)
+
+    def change(self, parameters: NeedleParameters) -> None:
+        """
+        Go on with other constants from the present state.
+
+        Parameters
+        ----------
+        parameters : NeedleParameters
+            Constants.
+
+        Raises
+        ------
+        ShapeError, InsertedLengthError
+            If the state does not suit them; the old constants then stay.
+
+        """
+        model = NeedleModel(parameters)
+        self._state = model.checked_state(self._state)
+        self.model = model
+        self._needle = model.compiled
+
+    @property
+    def state(self) -> FloatArray:
+        """Present state, a copy; shape (2 (2 + n),)."""
+        return self._state.copy()
+
+    @property
+    def depth(self) -> float:
+        """Inserted length s [m]."""
+        return float(self._needle.length - self._state[0])
+
+    @property
+    def velocity(self) -> float:
+        """Insertion velocity s_dot [m/s]."""
+        return float(-self._state[self.model.coordinates])
+
+    def advance(
+        self, duration: float, force: float = 0.0, torque: float = 0.0, parts: int = 1
+    ) -> Interval:
+        """
+        Advance under a constant force and torque at the base.
+
+        Parameters
+        ----------
+        duration : float
+            Time to advance [s], taken in steps no longer than the step.
+        force : float
+            Insertion force f_y [N], positive into the tissue.
+        torque : float
+            Torque tau about x [N m].
+        parts : int
+            Number of equal parts of the interval for which to return what the base feels. Steps
+            end where these do.
+
+        Returns
+        -------
+        Interval
+            Means and works over the interval.
+
+        Raises
+        ------
+        ParameterError
+            If the duration is not positive, or an input is not finite.
+        InsertedLengthError
+            If the inserted length left its range; the state is the last valid one.
+        ToleranceError
+            If the tolerance cannot be met.
+
+        """
+        return self._run(duration, Inputs(float(force), float(torque), 0.0, False), parts)
+
+    def advance_moved(self, duration: float, velocity: float) -> Interval:
+        """
+        Advance with the base brought evenly to a velocity, whatever force that takes.
+
+        Parameters
+        ----------
+        duration : float
+            Time to advance [s].
+        velocity : float
+            Insertion velocity at the end [m/s], positive into the tissue.
+
+        Returns
+        -------
+        Interval
+            Means over the interval; the axial force is what the motion took. While the base
+            rests, friction takes the value within its bounds that asks for the least force.
+
+        Raises
+        ------
+        ParameterError, InsertedLengthError, ToleranceError
+            As `advance`.
+
+        """
+        return self._run(duration, Inputs(0.0, 0.0, float(velocity), True), 1)
+
+    def advance_pushed(self, duration: float, force: float, speed_limit: float) -> Interval:
+        """
+        Advance under a constant force of a base that goes no faster than a limit.
+
+        Parameters
+        ----------
+        duration : float
+            Time to advance [s].
+        force : float
+            Insertion force that the base applies while it is slow enough [N].
+        speed_limit : float
+            Highest speed of the base at the end [m/s].
+
+        Returns
+        -------
+        Interval
+            Means over the interval; at the limit the axial force is what that motion took.
+
+        Raises
+        ------
+        ParameterError, InsertedLengthError, ToleranceError
+            As `advance`.
+
+        """
+        before, clock, depth = self._state.copy(), self.time, self.depth
+        way = force
+        try:
+            seen = self.advance(duration, force)
+        except InsertedLengthError:
+            # At the limit it may stay within.
+            too_fast = True
+        else:
+            # The hub may have stopped what went too fast.
+            gone = abs(self.depth - depth)
+            too_fast = max(abs(self.velocity), gone / duration) > speed_limit
+            way = self.velocity or force
+        if too_fast:
+            self._state[:], self.time = before, clock
+            seen = self.advance_moved(duration, copysign(speed_limit, way))
+        return seen
+
+    def _run(self, duration: float, inputs: Inputs, parts: int) -> Interval:
+        if not 0.0 < duration < inf:
+            raise ParameterError(f'duration must be positive and finite, got {duration!r} s')
+        for name in ('force', 'torque', 'velocity'):
+            if not isfinite(getattr(inputs, name)):
+                raise ParameterError(f'{name} must be finite, got {getattr(inputs, name)!r}')
+        # An integer would have the step compiled anew for it.
+        duration, felt = float(duration), np.empty((parts, 3))
+        if self.tolerance is None:
+            sums = self._take(duration, inputs, self.step, felt)
+        else:
+            sums = self._refine(duration, inputs, felt, self.tolerance)
+        self.time += duration
+        axial, lateral, moment = (np.add.reduce(felt) / parts).tolist()
+        return Interval(
+            tip_deflection=sums.tip / duration,
+            axial_force=axial,
+            lateral_force=lateral,
+            moment=moment,
+            felt=felt,
+            friction_work=sums.friction_work,
+            damping_work=sums.damping_work,
+            input_work=sums.input_work,
+            impact_loss=sums.impact_loss,
+            contact_time=sums.contact_time if sums.contact_time >= 0.0 else None,
+        )
+
+    def _take(self, duration: float, inputs: Inputs, longest: float, felt: FloatArray) -> Sums:
+        """Take steps under constant inputs."""
+        left, sums = advance(
+            self._needle, self._state, self.time, inputs, longest, self.graded, duration, felt
+        )
+        if isnan(left):
+            raise NeedleError(
+                'the motion is not finite: constants, state or inputs are out of proportion'
+            )
+        if left > 0.0:
+            self.time += duration - left
+            p, far = self.model.parameters, self._needle.maximum_depth
+            limit = (
+                f'minimum_depth = {p.minimum_depth:g} m while withdrawing'
+                if self.depth - p.minimum_depth < far - self.depth
+                else f'the largest inserted length, {far:g} m'
+            )
+            raise InsertedLengthError(f'inserted length {self.depth:.6g} m reached {limit}')
+        return sums
+
+    def _refine(self, duration: float, inputs: Inputs, felt: FloatArray, tolerance: float) -> Sums:
+        """Halve the step until the end of the interval no longer depends on it."""
+        start, clock = self._state.copy(), self.time
+        longest = min(duration, self.step / self._refinement)
+
+        def attempt(longest: float) -> Sums | InsertedLengthError:
+            self._state[:], self.time = start, clock
+            try:
+                return self._take(duration, inputs, longest, felt)
+            except InsertedLengthError as error:
+                return error
+
+        outcome = attempt(longest)
+        while True:
+            coarse, before = self._state.copy(), outcome
+            longest *= 0.5
+            if longest < _SHORTEST_STEP:
+                self._state[:], self.time = start, clock
+                raise ToleranceError(f'tolerance {tolerance:g} cannot be met at any step')
+            outcome = attempt(longest)
+            # The finer run is kept; second order makes its error a third of the difference.
+            change = self._distance(coarse, self._state) / 3.0
+            if change <= tolerance and isinstance(outcome, Sums) == isinstance(before, Sums):
+                break
+        if isinstance(outcome, InsertedLengthError):
+            raise outcome
+        # The next interval begins with the step before the last one, or one more before where
+        # the error allows it: a step twice as long has four times the error.
+        growth = 4.0 if change < tolerance / 32.0 else 2.0
+        self._refinement = max(1.0, self.step / (growth * longest))
+        return outcome
+
+    def _distance(self, one: FloatArray, two: FloatArray) -> float:
+        """Return how far apart two states are: energy of the difference, and depth."""
+        model, m = self.model, self.model.coordinates
+        depth = model.parameters.length - two[0]
+        gram = model.parameters.linear_density * model.modes.integrals(depth).gram
+        stiffness = model.stiffness_matrix(depth, self.time)
+        mass = model.parameters.moving_mass
+
+        def energy(x: FloatArray) -> float:
+            rate = x[m + 2 :]
+            elastic = x[2:m] @ stiffness @ x[2:m]
+            return float(0.5 * (elastic + rate @ gram @ rate + mass * x[m] ** 2))
+
+        scale = max(energy(one), energy(two))
+        part = sqrt(energy(two - one) / scale) if scale > 0.0 else 0.0
+        return max(part, float(abs(two[0] - one[0])) / model.parameters.length)
+
+
+def checked_step(step: float) -> float:
+    """
+    Return a longest step as a float, or say what is wrong with it.
+
+    Parameters
+    ----------
+    step : float
+        Longest step [s].
+
+    Returns
+    -------
+    float
+        The step [s].
+
+    Raises
+    ------
+    ParameterError
+        If it is not a number, not finite, or too short.
+
+    """
+    if isinstance(step, bool) or not isinstance(step, (int, float)):
+        raise ParameterError(f'step must be a number, got {step!r}')
+    if not _SHORTEST_STEP <= step < inf:
+        raise ParameterError(f'step must be finite and >= {_SHORTEST_STEP:g} s, got {step!r} s')
+    return float(step)
