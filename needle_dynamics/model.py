@@ -67,7 +67,7 @@ class NeedleModel:
     >>> print(f'{model.tip_deflection(state):.4f} m')
     0.0010 m
     >>> print(f'{model.energy(state):.2g} J')
-    0.0003 J
+    0.00031 J
 
     """
 
