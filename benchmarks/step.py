@@ -88,6 +88,9 @@ class _Counted(float):
         return self._is('add', float(other) - float(self))
 
     def __mul__(self, other: float) -> _Counted:
+        if isinstance(other, np.ndarray):
+            # NumPy then multiplies each element.
+            return NotImplemented
         return self._is('multiply', float(self) * float(other))
 
     def __truediv__(self, other: float) -> _Counted:

@@ -194,7 +194,8 @@ def test_operations_are_grouped_as_they_are_timed() -> None:
     assert groups['expm1'] == 1
     assert 'log1p' not in groups
     assert groups['multiply-add, series'] == counts['series multiply']
-    assert groups['division'] == counts['divide']
+    # One of them is in the function that holds the series.
+    assert groups['division'] == counts['divide'] + counts['series divide']
 
 
 def test_what_is_not_installed_is_said_and_the_rest_runs(monkeypatch: pytest.MonkeyPatch) -> None:
