@@ -372,24 +372,6 @@ class NeedleModel:
         forces[0] = -forces[0] + self.friction.force(-now.d_rate, drive)
         return np.asarray(forces)
 
-    def friction_power(self, state: ArrayLike) -> float:
-        """
-        Power that friction takes, f_f s_dot with (15).
-
-        Parameters
-        ----------
-        state : array_like, shape (2 (2 + n),)
-            State.
-
-        Returns
-        -------
-        float
-            Power [W], never negative.
-
-        """
-        velocity = -self.checked_state(state)[self.coordinates]
-        return float(self.friction.force(velocity, 0.0) * velocity)
-
     def base_reaction(
         self, state: ArrayLike, force: float = 0.0, torque: float = 0.0, time: float = 0.0
     ) -> FloatArray:

@@ -1,8 +1,6 @@
 """What can go wrong with recordings and with identification, as types."""
 
-from needle_ros.errors import (
-    NeedleError,
-)
+from needle_ros.errors import NeedleError
 
 
 class RecordingError(NeedleError):

@@ -20,9 +20,6 @@ BASE: Final = 'needle_base'
 INSERTION: Final = 'insertion'
 ROTATION: Final = 'rotation'
 
-#: Axes of the indenter's plane, which are its joints.
-PLANE: Final = ('x', 'z')
-
 EVERY_NODE: Final = 'every node'
 USER: Final = 'user'
 
@@ -117,7 +114,7 @@ _QUANTITIES: Final = {
 }
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class Topic:
     """
     A topic.
@@ -180,45 +177,36 @@ class Topic:
 
 
 JOINT_STATES: Final = Topic(
-    name='joint_states',
-    type_name=JOINT_STATE,
-    publisher='plant',
-    meaning='encoders of the robot: inserted length and rotation; effort: axial force and torque '
+    'joint_states',
+    JOINT_STATE,
+    'plant',
+    'encoders of the robot: inserted length and rotation; effort: axial force and torque '
     'on the needle',
     joints=(Joint(INSERTION, 'm', 'N'), Joint(ROTATION, 'rad', 'N m')),
 )
 
 BASE_WRENCH: Final = Topic(
-    name='base_wrench',
-    type_name=WRENCH,
-    publisher='plant',
-    meaning='force sensor, what the base exerts on the needle: `force.y` axial, `force.z` lateral '
+    'base_wrench',
+    WRENCH,
+    'plant',
+    'force sensor, what the base exerts on the needle: `force.y` axial, `force.z` lateral '
     '[N], `torque.x` [N m]; mode `indenter`: force of the end-effector on the tissue',
     frame=BASE,
 )
 
 TIP_DEFLECTION: Final = Topic(
-    name='tip_deflection',
-    type_name=POINT,
-    publisher='plant',
-    meaning='tracker or imager: `point.y` inserted length, `point.z` deflection of the tip [m]',
+    'tip_deflection',
+    POINT,
+    'plant',
+    'tracker or imager: `point.y` inserted length, `point.z` deflection of the tip [m]',
     frame=ENTRY,
 )
-
-END_EFFECTOR_POSE: Final = Topic(
-    name='end_effector_pose',
-    type_name=POSE,
-    publisher='plant',
-    meaning='mode `indenter`: position of the end-effector [m]',
-    frame=ENTRY,
-)
-
 
 GROUND_TRUTH: Final = Topic(
-    name='ground_truth',
-    type_name=JOINT_STATE,
-    publisher='plant',
-    meaning='simulation only: d (length outside the tissue), theta and q1..qn, the whole state; '
+    'ground_truth',
+    JOINT_STATE,
+    'plant',
+    'simulation only: d (length outside the tissue), theta and q1..qn, the whole state; '
     'effort, in mode `simulation`: generalized forces that were applied since the sample before',
     joints=(Joint('d', 'm'), Joint('theta', 'rad'), Joint('q1', 'm^1.5'), Joint('q2', 'm^1.5')),
 )
@@ -248,128 +236,112 @@ def ground_truth(modes: int, *, commanded: bool) -> Topic:
     return replace(GROUND_TRUTH, joints=joints)
 
 
+END_EFFECTOR_POSE: Final = Topic(
+    'end_effector_pose',
+    POSE,
+    'plant',
+    'mode `indenter`: position of the end-effector [m]',
+    frame=ENTRY,
+)
+
 NEEDLE_SHAPE: Final = Topic(
-    name='needle_shape',
-    type_name='visualization_msgs/msg/Marker',
-    publisher='plant',
-    meaning='the needle as a line, 30 Hz while there is a subscriber',
+    'needle_shape',
+    'visualization_msgs/msg/Marker',
+    'plant',
+    'the needle as a line, 30 Hz while there is a subscriber',
     frame=ENTRY,
 )
 
 NEEDLE_POSES: Final = Topic(
-    name='needle_poses',
-    type_name='geometry_msgs/msg/PoseArray',
-    publisher='plant',
-    meaning='poses along the needle, y along it, 30 Hz while there is a subscriber',
+    'needle_poses',
+    'geometry_msgs/msg/PoseArray',
+    'plant',
+    'poses along the needle, y along it, 30 Hz while there is a subscriber',
     frame=ENTRY,
 )
 
 CLOCK: Final = Topic(
-    name='/clock',
-    type_name='rosgraph_msgs/msg/Clock',
-    publisher='plant',
-    meaning='simulated time, with `publish_clock` or `lockstep`',
+    '/clock',
+    'rosgraph_msgs/msg/Clock',
+    'plant',
+    'simulated time, with `publish_clock` or `lockstep`',
     qos=CLOCK_QOS,
 )
 
 EVENTS: Final = Topic(
-    name='~/events',
-    type_name='diagnostic_msgs/msg/DiagnosticArray',
-    publisher='plant',
-    meaning='what the plant began to apply beside commands, and the number of the sample from '
+    '~/events',
+    'diagnostic_msgs/msg/DiagnosticArray',
+    'plant',
+    'what the plant began to apply beside commands, and the number of the sample from '
     'which it counts: [replay.md](replay.md)',
     qos=LOG,
 )
 
 WRENCH_COMMAND: Final = Topic(
-    name='wrench_command',
-    type_name=WRENCH,
-    publisher='controller',
-    meaning='force and torque on the needle: `force.y` [N], `torque.x` [N m]; the stamp is that '
+    'wrench_command',
+    WRENCH,
+    'controller',
+    'force and torque on the needle: `force.y` [N], `torque.x` [N m]; the stamp is that '
     'of the sample it answers',
     qos=COMMAND,
     frame=BASE,
 )
 
 REFERENCE: Final = Topic(
-    name='reference',
-    type_name=JOINT_STATE,
-    publisher='controller',
-    meaning='inserted length and velocity that the controller aims at',
+    'reference',
+    JOINT_STATE,
+    'controller',
+    'inserted length and velocity that the controller aims at',
     joints=(Joint(INSERTION, 'm'),),
 )
 
 TRACKING_ERROR: Final = Topic(
-    name='tracking_error',
-    type_name=JOINT_STATE,
-    publisher='controller',
-    meaning='reference less measurement',
+    'tracking_error',
+    JOINT_STATE,
+    'controller',
+    'reference less measurement',
     joints=(Joint(INSERTION, 'm'),),
 )
 
 TARGET: Final = Topic(
-    name='target',
-    type_name=POINT,
-    publisher=USER,
-    meaning='`point.y`: inserted length to reach [m]',
-    qos=COMMAND,
-    frame=ENTRY,
+    'target', POINT, USER, '`point.y`: inserted length to reach [m]', qos=COMMAND, frame=ENTRY
 )
 
 JOINT_TRAJECTORY: Final = Topic(
-    name='joint_trajectory',
-    type_name='trajectory_msgs/msg/JointTrajectory',
-    publisher=USER,
-    meaning='to the controller: `insertion`, positions [m] to follow, and velocities [m/s] or '
+    'joint_trajectory',
+    'trajectory_msgs/msg/JointTrajectory',
+    USER,
+    'to the controller: `insertion`, positions [m] to follow, and velocities [m/s] or '
     'none; to a plant in mode `robot`: `insertion`, positions [m], or efforts [N] of a push; in '
     'mode `indenter`: efforts of `x` and `z` [N]',
     qos=COMMAND,
 )
 
 FRICTION: Final = Topic(
-    name='friction',
-    type_name='diagnostic_msgs/msg/DiagnosticArray',
-    publisher='identification',
-    meaning='estimate, interval, unit and number of samples of each coefficient',
+    'friction',
+    'diagnostic_msgs/msg/DiagnosticArray',
+    'identification',
+    'estimate, interval, unit and number of samples of each coefficient',
     qos=LATCHED,
 )
 
 STIFFNESS: Final = replace(FRICTION, name='stiffness')
 
 CONFIGURATION: Final = Topic(
-    name='~/configuration',
-    type_name='std_msgs/msg/String',
-    publisher=EVERY_NODE,
-    meaning='all parameters of the node as a parameter file',
+    '~/configuration',
+    'std_msgs/msg/String',
+    EVERY_NODE,
+    'all parameters of the node as a parameter file',
     qos=LATCHED,
 )
 
 DIAGNOSTICS: Final = Topic(
-    name='/diagnostics',
-    type_name='diagnostic_msgs/msg/DiagnosticArray',
-    publisher=EVERY_NODE,
-    meaning='state of the node, 1 Hz and on change',
+    '/diagnostics',
+    'diagnostic_msgs/msg/DiagnosticArray',
+    EVERY_NODE,
+    'state of the node, 1 Hz and on change',
     qos=DIAGNOSTICS_QOS,
 )
 
-#: All topics.
-TOPICS: Final = (
-    JOINT_STATES,
-    BASE_WRENCH,
-    TIP_DEFLECTION,
-    GROUND_TRUTH,
-    END_EFFECTOR_POSE,
-    NEEDLE_SHAPE,
-    NEEDLE_POSES,
-    CLOCK,
-    EVENTS,
-    WRENCH_COMMAND,
-    REFERENCE,
-    TRACKING_ERROR,
-    TARGET,
-    JOINT_TRAJECTORY,
-    FRICTION,
-    STIFFNESS,
-    CONFIGURATION,
-    DIAGNOSTICS,
-)
+#: All topics, in this order.
+TOPICS: Final = tuple(value for value in [*globals().values()] if isinstance(value, Topic))

@@ -138,31 +138,17 @@ def from_values(
         if several and value is None:
             continue
         taken = tuple(value) if several and isinstance(value, (list, array)) else value
-        given[name] = as_number(taken) if 'unit' in known[name].metadata else taken
+        given[name] = _as_number(taken) if 'unit' in known[name].metadata else taken
     try:
         return kind(**given)
     except ParameterError as error:
         raise ParameterError(f'{prefix}{error}') from error
 
 
-def as_number(value: Any) -> Any:
-    """
-    Convert integers to float.
-
-    Parameters
-    ----------
-    value : Any
-        A value, or a tuple of values.
-
-    Returns
-    -------
-    Any
-        The same with floats instead of integers; what is not an integer, or too large, is as it
-        was.
-
-    """
+def _as_number(value: Any) -> Any:
+    """Convert integers to float, also within a tuple; other values stay as they are."""
     if isinstance(value, tuple):
-        return tuple(as_number(number) for number in value)
+        return tuple(_as_number(number) for number in value)
     is_integer = isinstance(value, int) and not isinstance(value, bool)
     return float(value) if is_integer and abs(value) <= _LARGEST_INTEGER else value
 

@@ -44,10 +44,10 @@ class Comparison:
     """
 
     terms: tuple[str, ...]
-    criterion: str
-    difference: float
-    p_value: float
-    supported: bool
+    criterion: str = 'BIC'
+    difference: float = nan
+    p_value: float = 1.0
+    supported: bool = False
     words: str
 
 
@@ -141,7 +141,7 @@ def _added(
     term = terms[-1]
     if not other.determined[which].all():
         words = f'the data do not distinguish the term {term} from the others'
-        return _comparison(terms, nan, 1.0, False, words)
+        return Comparison(terms=terms, words=words)
     supported = p_value < _SIGNIFICANCE and difference < 0.0
     verdict = 'support' if supported else 'do not support'
     sizes = ' and '.join(
@@ -149,7 +149,9 @@ def _added(
         for k, column in zip(which, columns_of([term]), strict=True)
     )
     words = f'the data {verdict} {term}: {sizes} (p = {p_value:.2g})'
-    return _comparison(terms, difference, p_value, supported, words)
+    return Comparison(
+        terms=terms, difference=difference, p_value=p_value, supported=supported, words=words
+    )
 
 
 def _removed(
@@ -157,21 +159,10 @@ def _removed(
 ) -> Comparison:
     if not fit.determined[which].all():
         words = f'the data do not distinguish the term {term} from the others: leave one out'
-        return _comparison(terms, nan, 1.0, False, words)
+        return Comparison(terms=terms, words=words)
     p_value = fit.wald(which)[1]
     supported = p_value >= _SIGNIFICANCE and difference < 0.0
     words = f'the data {"do not need" if supported else "need"} {term} (p = {p_value:.2g})'
-    return _comparison(terms, difference, p_value, supported, words)
-
-
-def _comparison(
-    terms: tuple[str, ...], difference: float, p_value: float, supported: bool, words: str
-) -> Comparison:
     return Comparison(
-        terms=terms,
-        criterion='BIC',
-        difference=difference,
-        p_value=p_value,
-        supported=supported,
-        words=words,
+        terms=terms, difference=difference, p_value=p_value, supported=supported, words=words
     )

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import ceil, e, sqrt
-from typing import Final
+from typing import Final, TYPE_CHECKING
 
 from needle_dynamics.arrays import BoolArray, FloatArray
 from needle_identification.errors import IdentificationError
@@ -18,9 +18,12 @@ from needle_identification.friction.settings import FrictionSettings
 from needle_identification.recordings.recording import Recording
 import numpy as np
 from scipy.fft import next_fast_len
-from scipy.interpolate import BSpline, make_interp_spline
 from scipy.ndimage import maximum_filter1d
 from scipy.special import lambertw
+
+if TYPE_CHECKING:
+    # Takes a fifth of a second to import; only filtering a recording needs it.
+    from scipy.interpolate import BSpline
 
 #: Half the length of a Hann window that halves the power at its cutoff [periods of the cutoff].
 HALF_LENGTH: Final = 0.36
@@ -195,6 +198,8 @@ def _filtered_speed(
     time: FloatArray, raw: FloatArray, taps: FloatArray, step: int, derivative: int
 ) -> BSpline:
     """Return the filtered speed as a function of time, from speeds or (derivative 1) depths."""
+    from scipy.interpolate import make_interp_spline
+
     start = raw[0] if derivative else 0.0
     smooth = _smooth(raw - start, taps)
     spline = make_interp_spline(time, smooth, k=5 if derivative else 3)

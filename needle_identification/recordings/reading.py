@@ -108,16 +108,17 @@ def read_friction_recording(
         moved = position_and_speed(moved, bag)
     else:
         bag.losses.append(f'{motion.name} has no velocity')
-    merged = merge(bag, force, moved._replace(values=direction * moved.values))
+    moved = moved._replace(values=direction * moved.values)
+    times, forces, motions, clock_offset = merge(bag, force, moved)
     return Recording(
         name=str(path),
-        time=merged.time,
-        depth=merged.motion[:, 0],
-        speed=merged.motion[:, 1] if merged.motion.shape[1] > 1 else None,
-        force=sign * merged.force[:, 0],
+        time=times,
+        depth=motions[:, 0],
+        speed=motions[:, 1] if motions.shape[1] > 1 else None,
+        force=sign * forces[:, 0],
         losses=tuple(bag.losses),
         configuration=configuration,
-        clock_offset=merged.clock_offset,
+        clock_offset=clock_offset,
     )
 
 
@@ -166,16 +167,18 @@ def read_indentation_recording(
         motion: source_of(motion.type_name, (*plane, across)),
     }
     gathered, configuration = _read(bag, sources, time)
-    merged = merge(bag, gathered[wrench].samples(bag), gathered[motion].samples(bag))
+    times, forces, positions, clock_offset = merge(
+        bag, gathered[wrench].samples(bag), gathered[motion].samples(bag)
+    )
     return IndentationRecording(
         name=str(path),
-        time=merged.time,
-        position=merged.motion[:, :2] * signs,
-        off_plane=merged.motion[:, 2],
-        force=merged.force * signs,
+        time=times,
+        position=positions[:, :2] * signs,
+        off_plane=positions[:, 2],
+        force=forces * signs,
         losses=tuple(bag.losses),
         configuration=configuration,
-        clock_offset=merged.clock_offset,
+        clock_offset=clock_offset,
     )
 
 

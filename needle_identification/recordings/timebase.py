@@ -10,7 +10,7 @@ the force are shifted. A smaller difference may be one of latency, and the stamp
 
 from __future__ import annotations
 
-from typing import Final, NamedTuple
+from typing import Final
 
 from needle_dynamics.arrays import BoolArray, FloatArray
 from needle_identification.bags.bag import Bag
@@ -30,32 +30,11 @@ _NOTABLE_LATENCY: Final = 0.05
 _CERTAINTY: Final = 3.0
 
 
-class Merged(NamedTuple):
+def merge(
+    bag: Bag, force: Samples, motion: Samples
+) -> tuple[FloatArray, FloatArray, FloatArray, float]:
     """
-    Force and motion on one time base.
-
-    Attributes
-    ----------
-    time : ndarray, shape (n,)
-        Time from the first sample [s].
-    force : ndarray, shape (n, k)
-        Values of the force.
-    motion : ndarray, shape (n, m)
-        Values of the motion, interpolated.
-    clock_offset : float
-        Clock of the force minus clock of the motion [s].
-
-    """
-
-    time: FloatArray
-    force: FloatArray
-    motion: FloatArray
-    clock_offset: float
-
-
-def merge(bag: Bag, force: Samples, motion: Samples) -> Merged:
-    """
-    Put force and motion on the time base of the force.
+    Put force and motion on the time base of the force, where the motion is known.
 
     Parameters
     ----------
@@ -66,8 +45,14 @@ def merge(bag: Bag, force: Samples, motion: Samples) -> Merged:
 
     Returns
     -------
-    Merged
-        Samples of the force at which the motion is known.
+    time : ndarray, shape (n,)
+        Time from the first sample [s].
+    force : ndarray, shape (n, k)
+        Values of the force.
+    motion : ndarray, shape (n, m)
+        Values of the motion, interpolated.
+    clock_offset : float
+        Clock of the force minus clock of the motion [s].
 
     Raises
     ------
@@ -98,7 +83,7 @@ def merge(bag: Bag, force: Samples, motion: Samples) -> Merged:
     time = time[distinct]
     motion_time = (motion.stamps - start) * 1e-9
     columns = [np.interp(time, motion_time, column) for column in motion.values.T]
-    return Merged(time, force.values[covered][distinct], np.column_stack(columns), offset * 1e-9)
+    return time, force.values[covered][distinct], np.column_stack(columns), offset * 1e-9
 
 
 def _clock_offset(bag: Bag, force: Samples, motion: Samples) -> int:

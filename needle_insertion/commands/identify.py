@@ -3,34 +3,16 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import fields
 import json
 from pathlib import Path
 import sys
 from typing import Any
 
-from needle_identification import (
-    ESTIMATORS,
-    FrictionSettings,
-    identify_friction,
-    identify_stiffness,
-    read_friction_recording,
-    read_indentation_recording,
-    StiffnessSettings,
-    summarize,
-    summarize_stiffness,
-    TERMS,
-    write_result,
-)
+from needle_identification import ESTIMATORS, FrictionSettings, StiffnessSettings, TERMS
 from needle_identification.recordings import TIMES
 from needle_insertion.commands.common import Command, make_folder
-from needle_insertion.report.identify_text import (
-    friction_text,
-    identified_document,
-    stiffness_text,
-)
-from needle_insertion.report.origin import identify_all, Origin
 from needle_ros.errors import ParameterError
 
 
@@ -177,16 +159,75 @@ def _settings(kind: Callable[..., Any], options: argparse.Namespace) -> Any:
 
 
 def _run_friction(options: argparse.Namespace) -> int:
+    # Takes a third of a second to import; the help does without.
+    from needle_identification import (
+        identify_friction,
+        read_friction_recording,
+        summarize,
+        write_result,
+    )
+    from needle_insertion.report.identify_text import friction_text
+
     settings = _settings(FrictionSettings, options)
-    reading = {
-        **_reading(options),
-        'force_axis': options.force_axis,
-        'motion_axis': options.motion_axis,
-    }
+    axes = {'force_axis': options.force_axis, 'motion_axis': options.motion_axis}
+    return _identify(
+        options,
+        settings,
+        axes,
+        read_friction_recording,
+        lambda recording: identify_friction(recording, settings),
+        summarize,
+        write_result,
+        friction_text,
+    )
+
+
+def _run_stiffness(options: argparse.Namespace) -> int:
+    from needle_identification import (
+        identify_stiffness,
+        read_indentation_recording,
+        summarize_stiffness,
+        write_result,
+    )
+    from needle_insertion.report.identify_text import stiffness_text
+
+    settings = _settings(StiffnessSettings, options)
+    if len(options.axes) != 2:
+        raise ParameterError(f'--axes must name two axes, got {",".join(options.axes)}')
+    return _identify(
+        options,
+        settings,
+        {'axes': tuple(options.axes)},
+        read_indentation_recording,
+        lambda recording: identify_stiffness(recording, settings),
+        lambda estimates: summarize_stiffness(
+            estimates, force=options.level, level_tolerance=settings.level_tolerance
+        ),
+        lambda path, summary: write_result(path, None, summary),
+        stiffness_text,
+    )
+
+
+def _identify(
+    options: argparse.Namespace,
+    settings: Any,
+    axes: Mapping[str, Any],
+    read: Callable[..., Any],
+    identify: Callable[[Any], Any],
+    summarize: Callable[[list[Any]], Any],
+    write: Callable[[Path, Any], None],
+    text: Callable[[Any], str],
+) -> int:
+    """Identify all bags, write the results, warn and print; return the exit status."""
+    from needle_insertion.report.identify_text import identified_document
+    from needle_insertion.report.origin import identify_all, Origin
+
+    reading = {name: getattr(options, name) for name in ('wrench_topic', 'motion_topic', 'time')}
+    reading |= axes
     estimates, origin = identify_all(
         options.bags,
-        lambda bag: read_friction_recording(bag, **reading),
-        lambda recording: identify_friction(recording, settings),
+        lambda bag: read(bag, **reading),
+        identify,
         Origin(settings=settings, reading=reading, result=options.output),
         digest=options.json or options.report is not None,
     )
@@ -195,69 +236,16 @@ def _run_friction(options: argparse.Namespace) -> int:
     if not estimates:
         return 2
     summary = summarize(estimates)
+    written = []
     if options.output is not None:
-        write_result(options.output, summary)
-
-    def write_page(folder: Path) -> Path:
-        # Draws: not wanted for tables.
-        from needle_insertion.report.identify_page import write_friction_page
-
-        return write_friction_page(folder, summary, origin)
-
-    return _tell(options, summary, origin, friction_text, write_page)
-
-
-def _run_stiffness(options: argparse.Namespace) -> int:
-    settings = _settings(StiffnessSettings, options)
-    if len(options.axes) != 2:
-        raise ParameterError(f'--axes must name two axes, got {",".join(options.axes)}')
-    reading = {**_reading(options), 'axes': tuple(options.axes)}
-    estimates, origin = identify_all(
-        options.bags,
-        lambda bag: read_indentation_recording(bag, **reading),
-        lambda recording: identify_stiffness(recording, settings),
-        Origin(settings=settings, reading=reading, result=options.output),
-        digest=options.json or options.report is not None,
-    )
-    for line in origin.failed:
-        sys.stderr.write(f'error: {line}\n')
-    if not estimates:
-        return 2
-    summary = summarize_stiffness(
-        estimates, force=options.level, level_tolerance=settings.level_tolerance
-    )
-    if options.output is not None:
-        write_result(options.output, None, summary)
-
-    def write_page(folder: Path) -> Path:
-        # Draws: not wanted for tables.
-        from needle_insertion.report.identify_page import write_stiffness_page
-
-        return write_stiffness_page(folder, summary, origin)
-
-    return _tell(options, summary, origin, stiffness_text, write_page)
-
-
-def _reading(options: argparse.Namespace) -> dict[str, Any]:
-    return {
-        'wrench_topic': options.wrench_topic,
-        'motion_topic': options.motion_topic,
-        'time': options.time,
-    }
-
-
-def _tell(
-    options: argparse.Namespace,
-    summary: Any,
-    origin: Origin,
-    text: Callable[[Any], str],
-    write_page: Callable[[Path], Path],
-) -> int:
-    """Write the page, warn and print; return the exit status."""
-    written = [] if options.output is None else [options.output]
+        write(options.output, summary)
+        written.append(options.output)
     if options.report is not None:
+        # Draws: not wanted for tables.
+        from needle_insertion.report.identify_page import write_identified_page
+
         make_folder(options.report)
-        written.append(write_page(options.report))
+        written.append(write_identified_page(options.report, summary, origin))
     for estimate, source in zip(summary.estimates, origin.sources, strict=True):
         for words in (*source.losses, *estimate.warnings):
             sys.stderr.write(f'warning: {source.name}: {words}\n')

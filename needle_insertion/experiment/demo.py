@@ -48,7 +48,7 @@ from needle_insertion.report.identify_figures import (
     stiffness_presses,
 )
 from needle_insertion.report.page import write_page
-from needle_insertion.report.text import Check, CHECK_HEADS, check_table
+from needle_insertion.report.text import Check, CHECK_HEADS, table
 from needle_ros.errors import NeedleError
 from tqdm import tqdm
 
@@ -128,6 +128,7 @@ def run(output: Path, bags: Path) -> int:
     for *recorded, fresh in compared.values():
         checks += _shipped_checks(f'{len(recorded)} shipped bags', recorded)
         checks += _fresh_checks(fresh)
+    rows = [check.row for check in checks]
     page = output / 'report.html'
     write_page(
         page,
@@ -137,11 +138,11 @@ def run(output: Path, bags: Path) -> int:
         f'{TARGET_DEPTH * 100:g} cm at {SPEED * 1000:g} mm/s under each controller, recorded to '
         'MCAP; friction and tissue stiffness identified from the shipped recordings and from one '
         f'fresh recording each, made at {EXPERIMENT_SPEED:g} times real time.',
-        rows=[check.row for check in checks],
+        rows=rows,
         heads=CHECK_HEADS,
         pictures=_pictures(insertions, friction[-1], stiffness[-1]),
     )
-    sys.stdout.write(f'{check_table(checks)}\n\nreport: {page}\n')
+    sys.stdout.write(f'{table(rows, CHECK_HEADS)}\n\nreport: {page}\n')
     return 0 if all(check.passed for check in checks) else 1
 
 

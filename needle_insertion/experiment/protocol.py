@@ -90,19 +90,13 @@ class Protocol:
         return *self.sampled, '/joint_trajectory', '/plant/configuration'
 
 
-def friction_points() -> tuple[Point, ...]:
+def _friction_points() -> tuple[Point, ...]:
     """
     Return the protocol of section 3.2.2.2, the tip past the tissue.
 
     A force that rises from zero pushes the base until the needle has moved. Then the base moves
     back, and makes one stroke in and one out at each of `SPEEDS`, with rests. Strokes begin and
     end with an acceleration within the limits of the base.
-
-    Returns
-    -------
-    tuple of Point
-        Times [s], inserted lengths [m] and forces [N].
-
     """
     points = [Point(REST_TIME, effort=(0.0,)), Point(REST_TIME + PUSH_TIME, effort=(PUSH,))]
     for time in (RETURN_TIME, REST_TIME):
@@ -126,17 +120,11 @@ def _travel(time: float, speed: float) -> float:
     return speed * (steady + (begun**2 + EASE_TIME**2 - left**2) / (2.0 * EASE_TIME))
 
 
-def stiffness_points() -> tuple[Point, ...]:
+def _stiffness_points() -> tuple[Point, ...]:
     """
     Return the protocol of section 3.2.2.3: at each force level one press in each direction.
 
     A press is a force in the plane (x, z) that rises, is held, falls to zero and stays there.
-
-    Returns
-    -------
-    tuple of Point
-        Times [s] and forces along x and z [N].
-
     """
     points = [Point(RELEASED_TIME, effort=(0.0, 0.0))]
     for level in FORCE_LEVELS:
@@ -158,14 +146,14 @@ PROTOCOLS: Final[Mapping[str, Protocol]] = {
     'friction': Protocol(
         name='friction',
         joints=('insertion',),
-        points=friction_points(),
+        points=_friction_points(),
         motion='/joint_states',
         plant={'mode': 'robot', 'depth': START_DEPTH},
     ),
     'stiffness': Protocol(
         name='stiffness',
         joints=('x', 'z'),
-        points=stiffness_points(),
+        points=_stiffness_points(),
         motion='/end_effector_pose',
         plant={'mode': 'indenter', 'indenter.force_rate': 10.0},
     ),

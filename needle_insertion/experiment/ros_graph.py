@@ -11,7 +11,6 @@ import os
 from pathlib import Path
 import subprocess
 import time
-from types import TracebackType
 from typing import Any, Final, IO
 
 from domain_coordinator import domain_id
@@ -31,7 +30,6 @@ CONFIGURE = Transition.TRANSITION_CONFIGURE
 ACTIVATE = Transition.TRANSITION_ACTIVATE
 DEACTIVATE = Transition.TRANSITION_DEACTIVATE
 CLEANUP = Transition.TRANSITION_CLEANUP
-
 
 #: Longest start of a node, with everything to compile on a busy machine [s].
 _START: Final = 180.0
@@ -93,12 +91,7 @@ class Graph:
         self.executor = self._executor_kind(context=self.context)
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *raised: Any) -> None:
         try:
             # Before the processes: Fast DDS 2.14 may crash where one that shared its memory with
             # this one has been killed.
@@ -130,7 +123,7 @@ class Graph:
                 started.process.wait()
             for file in self._files:
                 file.close()
-            self._domain.__exit__(kind, error, trace)
+            self._domain.__exit__(*raised)
 
     def add(self, kind: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
         """

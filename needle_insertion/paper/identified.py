@@ -48,26 +48,12 @@ _UNITS: Final[Mapping[str, str]] = {
 }
 
 
+#: Verdict on a table by whether it comes out as the paper has it.
+VERDICTS: Final = {True: 'holds', False: 'DOES NOT HOLD'}
+
+
 class ReproduceError(NeedleError):
     """There is nothing to reproduce a result from."""
-
-
-def verdict(holds: bool) -> str:
-    """
-    Return a verdict on a table as words.
-
-    Parameters
-    ----------
-    holds : bool
-        Whether the table comes out as the paper has it.
-
-    Returns
-    -------
-    str
-        The words.
-
-    """
-    return 'holds' if holds else 'DOES NOT HOLD'
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -118,7 +104,7 @@ class Line:
             _interval(self.found.interval),
             _interval(self.deviation_interval),
             f'{self.truth.held}/{self.truth.known}' if self.truth.known else '',
-            verdict(self.holds),
+            VERDICTS[self.holds],
         )
 
     @property
@@ -212,7 +198,7 @@ class IdentifiedTable:
         return (
             f'{truth.held} of {truth.known} intervals (95 %) contain the true value of their bag; '
             f'at least {truth.least} are expected with 99 % probability: '
-            f'{verdict(truth.is_enough)}'
+            f'{VERDICTS[truth.is_enough]}'
         )
 
     @property

@@ -17,7 +17,7 @@ from needle_insertion.paper.identified import (
     identify_table,
     ReproduceError,
     TABLES,
-    verdict,
+    VERDICTS,
 )
 from needle_insertion.paper.tables import TABLE_1, TABLE_2
 from needle_insertion.report.content import Section
@@ -132,7 +132,7 @@ def _of_table(found: IdentifiedTable) -> Result:
     return Result(
         section=section,
         text=f'{table(grid.rows, grid.heads)}\n\n{found.words}',
-        verdicts=((found.title, 'means and STD are those printed', verdict(found.holds)),),
+        verdicts=((found.title, 'means and STD are those printed', VERDICTS[found.holds]),),
         document=found.document,
         holds=found.holds,
     )
@@ -245,7 +245,7 @@ def write_results(folder: Path, found: Mapping[str, Result]) -> Path:
     for one in (found[name] for name in TABLES if name in found):
         lines, bags = (len(one.document[name]) for name in ('lines', 'bags'))
         note = f'{lines} quantities, means and STD, from {bags} recordings'
-        cards.append((one.section.title, verdict(one.holds), note))
+        cards.append((one.section.title, VERDICTS[one.holds], note))
     sections = [one.section for one in found.values()]
     path = folder / 'reproduce.html'
     write_page(

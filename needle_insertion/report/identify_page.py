@@ -44,15 +44,17 @@ _QUALITY_HEADS: Final = ('residual [mN]', 'R²', 'condition')
 _NUMBERS: Final = re.compile(r'[-+]?\d[\d.e+-]*')
 
 
-def write_friction_page(folder: Path, summary: FrictionSummary, origin: Origin) -> Path:
+def write_identified_page(
+    folder: Path, summary: FrictionSummary | StiffnessSummary, origin: Origin
+) -> Path:
     """
-    Write ``friction.html`` and its pictures.
+    Write ``friction.html`` or ``stiffness.html``, and its pictures.
 
     Parameters
     ----------
     folder : Path
         Where to write.
-    summary : FrictionSummary
+    summary : FrictionSummary or StiffnessSummary
         What was identified.
     origin : Origin
         What it was identified from, and how.
@@ -70,37 +72,47 @@ def write_friction_page(folder: Path, summary: FrictionSummary, origin: Origin) 
     """
     estimates = summary.estimates
     label = _short_names([estimate.name for estimate in estimates])
+    if isinstance(summary, FrictionSummary):
+        name, content = 'friction.html', _friction_content(summary, label)
+    else:
+        name, content = 'stiffness.html', _stiffness_content(summary, label)
+    write_page(
+        folder / name,
+        name,
+        origin=origin,
+        warnings=_warnings(estimates, label),
+        name=label[content['shown'].name],
+        **content,
+    )
+    return folder / name
+
+
+def _friction_content(summary: FrictionSummary, label: Mapping[str, str]) -> dict[str, Any]:
+    estimates = summary.estimates
     means = friction_statistics(summary)
     main = [one for one in summary.statistics if one.name in TABLE_1]
     shown = estimates[_typical(one[summary.statistics[0].name].value for one in estimates)]
     values = model_parameters(summary.statistics)
-    path = folder / 'friction.html'
-    write_page(
-        path,
-        'friction.html',
-        title='Friction between needle and tissue',
-        introduction=f'Identified from {_counted(len(estimates), "recording")} of force and '
+    return {
+        'title': 'Friction between needle and tissue',
+        'introduction': f'Identified from {_counted(len(estimates), "recording")} of force and '
         'motion of the needle base by regression on equation (15).',
-        pictures=_friction_pictures(label, means, shown, estimates),
-        cards=[_card(one) for one in main or summary.statistics[:2]],
-        origin=origin,
-        warnings=_warnings(estimates, label),
-        mean_rows=[(*mean_row(one), _published(one)) for one in means],
-        mean_heads=(*MEAN_HEADS, 'Table 1, mean ± STD'),
-        shown=shown,
-        name=label[shown.name],
-        term_rows=_term_rows(shown, estimates),
-        rows=[
+        'pictures': _friction_pictures(label, means, shown, estimates),
+        'cards': [_card(one) for one in main or summary.statistics[:2]],
+        'mean_rows': [(*mean_row(one), _published(one)) for one in means],
+        'mean_heads': (*MEAN_HEADS, 'Table 1, mean ± STD'),
+        'shown': shown,
+        'term_rows': _term_rows(shown, estimates),
+        'rows': [
             (label[one.name], *parameter_cells(one, means), f'{one.samples}', *_quality(one))
             for one in estimates
         ],
-        heads=('recording', *map(label_of, means), 'samples used', *_QUALITY_HEADS),
-        values=values,
-        live=[
+        'heads': ('recording', *map(label_of, means), 'samples used', *_QUALITY_HEADS),
+        'values': values,
+        'live': [
             f'ros2 param set /plant {name} {values[name]:.6g}' for name in _LIVE if name in values
         ],
-    )
-    return path
+    }
 
 
 def _published(one: Statistic) -> str:
@@ -164,46 +176,19 @@ def _friction_pictures(
     ]
 
 
-def write_stiffness_page(folder: Path, summary: StiffnessSummary, origin: Origin) -> Path:
-    """
-    Write ``stiffness.html`` and its pictures.
-
-    Parameters
-    ----------
-    folder : Path
-        Where to write.
-    summary : StiffnessSummary
-        What was identified.
-    origin : Origin
-        What it was identified from, and how.
-
-    Returns
-    -------
-    Path
-        The page.
-
-    Raises
-    ------
-    ParameterError
-        If a file cannot be written.
-
-    """
+def _stiffness_content(summary: StiffnessSummary, label: Mapping[str, str]) -> dict[str, Any]:
     estimates, levels, result = summary.estimates, summary.levels, summary.tissue_stiffness
-    label = _short_names([estimate.name for estimate in estimates])
     force = next(level.force for level in levels if level[result.name] is result)
     found = [_tissue_stiffness(one, force) for one in estimates]
     shown = estimates[_typical(one.value for one in found)]
     springs = [level.is_spring for estimate in estimates for level in estimate.levels]
     rows = [(label[one.name], {result.name: k}) for one, k in zip(estimates, found, strict=True)]
-    path = folder / 'stiffness.html'
-    write_page(
-        path,
-        'stiffness.html',
-        title='Stiffness of the tissue',
-        introduction=f'Identified from {_counted(len(estimates), "recording")} of presses in the '
-        'plane of deflection, as in Table 2 of the paper.',
-        pictures=_stiffness_pictures(summary, force, rows, shown, label[shown.name]),
-        cards=[
+    return {
+        'title': 'Stiffness of the tissue',
+        'introduction': f'Identified from {_counted(len(estimates), "recording")} of presses in '
+        'the plane of deflection, as in Table 2 of the paper.',
+        'pictures': _stiffness_pictures(summary, force, rows, shown, label[shown.name]),
+        'cards': [
             _card(result),
             (
                 'Is it a spring?',
@@ -211,29 +196,26 @@ def write_stiffness_page(folder: Path, summary: StiffnessSummary, origin: Origin
                 'by the curl of the force, within its uncertainty',
             ),
         ],
-        origin=origin,
-        warnings=_warnings(estimates, label),
-        places=_counted(len(estimates), 'place'),
-        heads=('force', *_ENTRY_HEADS),
-        mean_rows=[
+        'places': _counted(len(estimates), 'place'),
+        'heads': ('force', *_ENTRY_HEADS),
+        'mean_rows': [
             (f'{level.force:.2f} N', *(with_deviation(level[name]) for name in TABLE_2))
             for level in levels
         ],
-        published_rows=[
+        'published_rows': [
             (f'{level:g} N', *(f'{means[k]:g} ({stds[k]:g})' for means, stds in TABLE_2.values()))
             for k, level in enumerate(FORCE_LEVELS)
         ],
-        result_heads=('force', *MEAN_HEADS[1:]),
-        result_rows=[
+        'result_heads': ('force', *MEAN_HEADS[1:]),
+        'result_rows': [
             (f'{level.force:.2f} N', *mean_row(level[result.name])[1:]) for level in levels
         ],
-        shown=shown,
-        name=label[shown.name],
-        spring_rows=[_spring_row(level) for level in shown.levels],
-        place_heads=(
+        'shown': shown,
+        'spring_rows': [_spring_row(level) for level in shown.levels],
+        'place_heads': (
             *('recording', 'force [N]', *_ENTRY_HEADS, 'presses, directions', *_QUALITY_HEADS),
         ),
-        place_rows=[
+        'place_rows': [
             (
                 *(label[one.name], f'{level.force:.2f}', *map(_cell, level.parameters)),
                 *(f'{level.presses} in {level.directions}', *_quality(level)),
@@ -241,9 +223,10 @@ def write_stiffness_page(folder: Path, summary: StiffnessSummary, origin: Origin
             for one in estimates
             for level in one.levels
         ],
-        values=model_parameters([result]),
-    )
-    return path
+        'values': model_parameters([result]),
+        # A running plant takes no stiffness.
+        'live': [],
+    }
 
 
 def _tissue_stiffness(estimate: StiffnessEstimate, force: float) -> ParameterEstimate:

@@ -62,21 +62,3 @@ class Check:
     def row(self) -> tuple[str, str, str, str]:
         """Cells of a table, the verdict as a word."""
         return self.what, self.wanted, self.found, 'pass' if self.passed else 'FAIL'
-
-
-def check_table(checks: Sequence[Check]) -> str:
-    """
-    Return checks as aligned text.
-
-    Parameters
-    ----------
-    checks : sequence of Check
-        One for each row.
-
-    Returns
-    -------
-    str
-        Lines without a final newline.
-
-    """
-    return table([check.row for check in checks], CHECK_HEADS)
