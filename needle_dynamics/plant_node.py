@@ -211,20 +211,7 @@ class PlantNode(ModelNode):
             self._clock_topic = None
 
     def change(self, changes: Mapping[str, Any]) -> None:
-        """
-        Go on with other friction, or another fault; the state stays.
-
-        Parameters
-        ----------
-        changes : Mapping[str, Any]
-            The new values by parameter name.
-
-        Raises
-        ------
-        ParameterError
-            If one is not valid.
-
-        """
+        """Go on with other friction, or another fault; the state stays."""
         if self._run is not None:
             self._run.perform(Event(PARAMETERS, changes))
         if any(name.startswith('fault.') for name in changes):
@@ -443,19 +430,7 @@ class PlantNode(ModelNode):
         self._needle_poses.publish(poses)
 
     def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
-        """
-        Say where the needle is, how time goes, and what went wrong.
-
-        Returns
-        -------
-        level : bytes
-            A level of DiagnosticStatus.
-        message : str
-            The state in one line.
-        values : dict
-            Values by name.
-
-        """
+        """Say where the needle is, how time goes, and what went wrong."""
         if self._run is None:
             return super().diagnose()
         clock, rate, given = self._time, self._run.constants.own.rate, self._run.commands
@@ -496,15 +471,7 @@ class PlantNode(ModelNode):
 
 
 def main() -> int:
-    """
-    Run the node.
-
-    Returns
-    -------
-    int
-        Exit status: 0, or 2 if the node refused to start.
-
-    """
+    """Run the node; return its exit status."""
     announce_compilation()
     return run(PlantNode)
 

@@ -4,6 +4,9 @@ Friction and stiffness identified from recordings of the needle base, without RO
 A `Recording` comes from a bag (`read_friction_recording`) or from NumPy arrays.
 `identify_friction` and `identify_stiffness` give parameters with confidence intervals;
 `summarize` and `summarize_stiffness` combine several recordings. Nodes are in ``*_node.py``.
+
+"The paper" is A. Boroomand, M. Tavakoli, R. Sloboda, N. Usmani, "Dynamical modeling and
+controllability analysis of a flexible needle in soft tissue", 2014.
 """
 
 from typing import TYPE_CHECKING

@@ -69,33 +69,14 @@ class Fault:
         if kind not in FAULTS:
             raise ParameterError(f'must be one of {", ".join(FAULTS)}, got {kind!r}')
         self._act = FAULTS[kind]
-        self.parameters = parameters
+        self._parameters = parameters
         self._random = np.random.default_rng([seed, 2])
         #: Calls until a delayed measurement leaves.
-        self.late = ceil(parameters.delay * rate * (1.0 - 1e-9))
-        self.frozen: list[float] | None = None
+        self._late = ceil(parameters.delay * rate * (1.0 - 1e-9))
+        self._frozen: list[float] | None = None
         self._calls = 0
         #: What leaves later, and at which call.
         self._waiting: deque[tuple[int, Reading]] = deque()
-
-    @property
-    def has_waiting(self) -> bool:
-        """Whether a measurement waits to leave."""
-        return bool(self._waiting)
-
-    def later(self, calls: int, reading: Reading) -> None:
-        """
-        Hold a measurement back.
-
-        Parameters
-        ----------
-        calls : int
-            Number of calls of `leaves` after which it leaves.
-        reading : (int, list of float)
-            Its stamp [ns] and values.
-
-        """
-        self._waiting.append((self._calls + calls, reading))
 
     def leaves(self, stamp: int, values: Sequence[float], biased: Sequence[int]) -> list[Reading]:
         """
@@ -118,51 +99,43 @@ class Fault:
         """
         self._calls += 1
         reading = stamp, list(values)
-        hit = self._random.random() < self.parameters.probability
+        hit = self._random.random() < self._parameters.probability
         now = self._act(self, reading, biased) if hit else [reading]
         while self._waiting and self._waiting[0][0] <= self._calls:
             now.append(self._waiting.popleft()[1])
         return now
 
+    def _drop(self, _reading: Reading, _biased: Sequence[int]) -> list[Reading]:
+        return []
 
-def _drop(_fault: Fault, _reading: Reading, _biased: Sequence[int]) -> list[Reading]:
-    return []
+    def _delay(self, reading: Reading, _biased: Sequence[int]) -> list[Reading]:
+        self._waiting.append((self._calls + self._late, reading))
+        return []
 
+    def _duplicate(self, reading: Reading, _biased: Sequence[int]) -> list[Reading]:
+        return [reading, reading]
 
-def _delay(fault: Fault, reading: Reading, _biased: Sequence[int]) -> list[Reading]:
-    fault.later(fault.late, reading)
-    return []
+    def _reorder(self, reading: Reading, _biased: Sequence[int]) -> list[Reading]:
+        # What waits leaves after the next one, which then does not wait.
+        if self._waiting:
+            return [reading]
+        self._waiting.append((self._calls + 1, reading))
+        return []
 
+    def _freeze(self, reading: Reading, _biased: Sequence[int]) -> list[Reading]:
+        if self._frozen is None:
+            self._frozen = reading[1]
+        return [(reading[0], list(self._frozen))]
 
-def _duplicate(_fault: Fault, reading: Reading, _biased: Sequence[int]) -> list[Reading]:
-    return [reading, reading]
+    def _bias(self, reading: Reading, biased: Sequence[int]) -> list[Reading]:
+        return [_changed(reading, biased, lambda value: value + self._parameters.size)]
 
+    def _nan(self, reading: Reading, _biased: Sequence[int]) -> list[Reading]:
+        return [(reading[0], [nan] * len(reading[1]))]
 
-def _reorder(fault: Fault, reading: Reading, _biased: Sequence[int]) -> list[Reading]:
-    # What waits leaves after the next one, which then does not wait.
-    if fault.has_waiting:
-        return [reading]
-    fault.later(1, reading)
-    return []
-
-
-def _freeze(fault: Fault, reading: Reading, _biased: Sequence[int]) -> list[Reading]:
-    if fault.frozen is None:
-        fault.frozen = reading[1]
-    return [(reading[0], list(fault.frozen))]
-
-
-def _bias(fault: Fault, reading: Reading, biased: Sequence[int]) -> list[Reading]:
-    return [_changed(reading, biased, lambda value: value + fault.parameters.size)]
-
-
-def _nan(_fault: Fault, reading: Reading, _biased: Sequence[int]) -> list[Reading]:
-    return [(reading[0], [nan] * len(reading[1]))]
-
-
-def _saturate(fault: Fault, reading: Reading, biased: Sequence[int]) -> list[Reading]:
-    bound = abs(fault.parameters.size)
-    return [_changed(reading, biased, lambda value: min(max(value, -bound), bound))]
+    def _saturate(self, reading: Reading, biased: Sequence[int]) -> list[Reading]:
+        bound = abs(self._parameters.size)
+        return [_changed(reading, biased, lambda value: min(max(value, -bound), bound))]
 
 
 def _changed(reading: Reading, which: Sequence[int], change: Callable[[float], float]) -> Reading:
@@ -172,12 +145,12 @@ def _changed(reading: Reading, which: Sequence[int], change: Callable[[float], f
 
 #: What a fault does to a measurement that it hits, by name.
 FAULTS: Final[Mapping[str, Callable[[Fault, Reading, Sequence[int]], list[Reading]]]] = {
-    'drop': _drop,
-    'delay': _delay,
-    'duplicate': _duplicate,
-    'reorder': _reorder,
-    'freeze': _freeze,
-    'bias': _bias,
-    'nan': _nan,
-    'saturate': _saturate,
+    'drop': Fault._drop,
+    'delay': Fault._delay,
+    'duplicate': Fault._duplicate,
+    'reorder': Fault._reorder,
+    'freeze': Fault._freeze,
+    'bias': Fault._bias,
+    'nan': Fault._nan,
+    'saturate': Fault._saturate,
 }

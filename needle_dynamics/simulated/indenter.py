@@ -1,4 +1,4 @@
-"""The end-effector that presses the tissue in the plane: section 3.2.2.3 as a stand-in."""
+"""The end-effector that presses the tissue in the plane: section 3.2.2.3, simulated."""
 
 from __future__ import annotations
 
@@ -11,10 +11,7 @@ from needle_dynamics.arrays import FloatArray
 from needle_dynamics.simulated.base import on_grid
 from needle_dynamics.simulated.force_sensor import ForceSensor
 from needle_dynamics.simulated.plant import AT_REST
-from needle_ros.errors import (
-    JobError,
-    ParameterError,
-)
+from needle_ros.errors import JobError, ParameterError
 from needle_ros.settings import check_constants, constant
 from needle_ros.trajectories import check_times, joint_values
 import numpy as np

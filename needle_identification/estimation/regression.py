@@ -6,7 +6,7 @@ With the regressors :math:`x_i` of sample i and its response :math:`y_i`, the es
 .. math:: \sum_i w_i \, x_i (y_i - x_i^T \beta) + n \Sigma \beta = 0
 
 ``ordinary``: w = 1. ``weighted``: w = 1 / (noise variance measured in the group of the sample),
-the matrix W of section 3.2.2.1 of [Boroomand2014]_. ``huber``: w falls with the size of the
+the matrix W of section 3.2.2.1 of the paper. ``huber``: w falls with the size of the
 residual [Huber1981]_. ``total``: Sigma is the covariance of the noise of the regressors, which
 ordinary least squares takes for signal; this is total least squares with exact and noisy columns
 and free noise of the response, which has a closed solution [VanHuffel1991]_.
@@ -17,8 +17,6 @@ of Student's t, with the degrees of freedom of Satterthwaite.
 
 References
 ----------
-.. [Boroomand2014] A. Boroomand, M. Tavakoli, R. Sloboda, N. Usmani, "Dynamical modeling
-   and controllability analysis of a flexible needle in soft tissue", 2014, section 3.2.2.1.
 .. [Huber1981] P. J. Huber, "Robust Statistics", Wiley, 1981.
 .. [VanHuffel1991] S. Van Huffel, J. Vandewalle, "The Total Least Squares Problem", SIAM, 1991.
 .. [NeweyWest1987] W. K. Newey, K. D. West, "A simple, positive semi-definite,

@@ -1,7 +1,7 @@
 r"""
 Friction of a needle from force and motion of its base, by linear regression.
 
-With the tip past the tissue, the axial row of equation (16) of [Boroomand2014]_ is friction (15),
+With the tip past the tissue, the axial row of equation (16) of the paper is friction (15),
 with optional further terms:
 
 .. math:: f_y(t + \tau) = \mu_s \operatorname{sgn}(\dot s) + \mu_v \dot s + ...
@@ -17,12 +17,6 @@ The steps, each in a file of its own:
 `comparison`      other sets of terms
 `checks`          errors and warnings
 ================  =================================================================================
-
-References
-----------
-.. [Boroomand2014] A. Boroomand, M. Tavakoli, R. Sloboda, N. Usmani, "Dynamical modeling
-   and controllability analysis of a flexible needle in soft tissue", 2014, section 3.2.2.2.
-
 """
 
 from __future__ import annotations

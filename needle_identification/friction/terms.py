@@ -1,7 +1,7 @@
 r"""
 Terms of the friction force and their regressors.
 
-Equation (15) of [Boroomand2014]_ has the first two; the others are optional:
+Equation (15) of the paper has the first two; the others are optional:
 
 .. math::
 
@@ -10,12 +10,6 @@ Equation (15) of [Boroomand2014]_ has the first two; the others are optional:
    + (\mu_b - \mu_s) \operatorname{sgn}(\dot s) \, e^{-(\dot s / v_s)^2}
 
 To add a friction law, add a term to `TERMS` and its columns here.
-
-References
-----------
-.. [Boroomand2014] A. Boroomand, M. Tavakoli, R. Sloboda, N. Usmani, "Dynamical modeling
-   and controllability analysis of a flexible needle in soft tissue", 2014, section 3.2.2.2.
-
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
 r"""
-Stiffness of the tissue in the plane of deflection, section 3.2.2.3 of [Boroomand2014]_.
+Stiffness of the tissue in the plane of deflection, section 3.2.2.3 of the paper.
 
 The end-effector presses the tissue with force F and moves it by d. The tissue answers with -F.
 For each force level the stiffness matrix K of F = K d is fitted to the presses of that level.
@@ -12,12 +12,6 @@ The steps, each in a file of its own:
 `spring`      whether the tissue is a spring
 `principal`   principal stiffnesses
 ============  =====================================================================================
-
-References
-----------
-.. [Boroomand2014] A. Boroomand, M. Tavakoli, R. Sloboda, N. Usmani, "Dynamical modeling
-   and controllability analysis of a flexible needle in soft tissue", 2014, section 3.2.2.3.
-
 """
 
 from __future__ import annotations

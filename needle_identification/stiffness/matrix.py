@@ -4,13 +4,7 @@ The stiffness matrix of one force level, by least squares over its presses.
 .. math:: F = K d, \qquad K = \begin{bmatrix} k_{xx} & k_{xz} \\ k_{zx} & k_{zz} \end{bmatrix}
 
 F is the force on the tissue and d the displacement of the end-effector, section 3.2.2.3 of
-[Boroomand2014]_.
-
-References
-----------
-.. [Boroomand2014] A. Boroomand, M. Tavakoli, R. Sloboda, N. Usmani, "Dynamical modeling
-   and controllability analysis of a flexible needle in soft tissue", 2014, section 3.2.2.3.
-
+the paper.
 """
 
 from __future__ import annotations

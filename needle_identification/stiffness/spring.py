@@ -1,5 +1,5 @@
 r"""
-Whether the tissue is a spring, section 3.2.2.3 of [Boroomand2014]_.
+Whether the tissue is a spring, section 3.2.2.3 of the paper.
 
 The force of the tissue is -K d. It is that of a spring where its curl
 
@@ -8,12 +8,6 @@ The force of the tissue is -K d. It is that of a spring where its curl
 is zero, that is, where K is symmetric. The measure used here has no unit: the Frobenius norm of
 the antisymmetric part of K over that of its symmetric part. The largest value that still counts
 as a spring is `StiffnessSettings.largest_asymmetry`.
-
-References
-----------
-.. [Boroomand2014] A. Boroomand, M. Tavakoli, R. Sloboda, N. Usmani, "Dynamical modeling
-   and controllability analysis of a flexible needle in soft tissue", 2014, section 3.2.2.3.
-
 """
 
 from __future__ import annotations

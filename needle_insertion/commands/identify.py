@@ -10,9 +10,27 @@ from pathlib import Path
 import sys
 from typing import Any
 
-from needle_identification import ESTIMATORS, FrictionSettings, StiffnessSettings, TERMS
+from needle_identification import (
+    ESTIMATORS,
+    FrictionSettings,
+    identify_friction,
+    identify_stiffness,
+    read_friction_recording,
+    read_indentation_recording,
+    StiffnessSettings,
+    summarize,
+    summarize_stiffness,
+    TERMS,
+    write_result,
+)
 from needle_identification.recordings import TIMES
 from needle_insertion.commands.common import Command, make_folder
+from needle_insertion.report.identify_text import (
+    friction_text,
+    identified_document,
+    stiffness_text,
+)
+from needle_insertion.report.origin import identify_all, Origin
 from needle_ros.errors import ParameterError
 
 
@@ -159,15 +177,6 @@ def _settings(kind: Callable[..., Any], options: argparse.Namespace) -> Any:
 
 
 def _run_friction(options: argparse.Namespace) -> int:
-    # Takes a third of a second to import; the help does without.
-    from needle_identification import (
-        identify_friction,
-        read_friction_recording,
-        summarize,
-        write_result,
-    )
-    from needle_insertion.report.identify_text import friction_text
-
     settings = _settings(FrictionSettings, options)
     axes = {'force_axis': options.force_axis, 'motion_axis': options.motion_axis}
     return _identify(
@@ -183,14 +192,6 @@ def _run_friction(options: argparse.Namespace) -> int:
 
 
 def _run_stiffness(options: argparse.Namespace) -> int:
-    from needle_identification import (
-        identify_stiffness,
-        read_indentation_recording,
-        summarize_stiffness,
-        write_result,
-    )
-    from needle_insertion.report.identify_text import stiffness_text
-
     settings = _settings(StiffnessSettings, options)
     if len(options.axes) != 2:
         raise ParameterError(f'--axes must name two axes, got {",".join(options.axes)}')
@@ -219,9 +220,6 @@ def _identify(
     text: Callable[[Any], str],
 ) -> int:
     """Identify all bags, write the results, warn and print; return the exit status."""
-    from needle_insertion.report.identify_text import identified_document
-    from needle_insertion.report.origin import identify_all, Origin
-
     reading = {name: getattr(options, name) for name in ('wrench_topic', 'motion_topic', 'time')}
     reading |= axes
     estimates, origin = identify_all(

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
 from functools import partial
 import gc
 import os
 from pathlib import Path
 import subprocess
 import time
+from types import SimpleNamespace
 from typing import Any, Final, IO
 
 from domain_coordinator import domain_id
@@ -36,21 +36,6 @@ _START: Final = 180.0
 
 #: Time in which the nodes may end by themselves at the end of a graph [s].
 _PATIENCE: Final = 3.0
-
-
-@dataclass(slots=True)
-class Latest:
-    """
-    The newest message of a topic.
-
-    Attributes
-    ----------
-    message : message or None
-        None before the first.
-
-    """
-
-    message: Any = None
 
 
 class Graph:
@@ -165,7 +150,7 @@ class Graph:
         node: Node = self.add(Node, name)
         return node
 
-    def latest(self, node: Node, kind: type, topic: str, qos: QoSProfile) -> Latest:
+    def latest(self, node: Node, kind: type, topic: str, qos: QoSProfile) -> SimpleNamespace:
         """
         Watch a topic for its newest message.
 
@@ -182,11 +167,11 @@ class Graph:
 
         Returns
         -------
-        Latest
-            Holds the newest message.
+        SimpleNamespace
+            Its ``message`` is the newest one; None before the first.
 
         """
-        latest = Latest()
+        latest = SimpleNamespace(message=None)
         node.create_subscription(kind, topic, partial(setattr, latest, 'message'), qos)
         return latest
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from math import sqrt
+from math import inf, sqrt
 from pathlib import Path
 from typing import Any, Final
 
@@ -81,8 +81,15 @@ class Line:
 
     @property
     def deviation_interval(self) -> tuple[float, float]:
-        """95 % confidence interval of the standard deviation of a normal population."""
-        return deviation_interval(self.found.deviation, self.found.count)
+        """95 % interval of the standard deviation of a normal population (chi-squared)."""
+        deviation, freedom = self.found.deviation, self.found.count - 1
+        if deviation is None:
+            return 0.0, inf
+        low, high = (
+            deviation * sqrt(freedom / chdtri(freedom, tail))
+            for tail in ((1.0 - LEVEL) / 2.0, (1.0 + LEVEL) / 2.0)
+        )
+        return float(low), float(high)
 
     @property
     def holds(self) -> bool:
@@ -127,32 +134,6 @@ def _plus_minus(mean: float, deviation: float | None) -> str:
 
 def _interval(interval: tuple[float, float]) -> str:
     return '{:.4g} to {:.4g}'.format(*interval)
-
-
-def deviation_interval(deviation: float | None, count: int) -> tuple[float, float]:
-    """
-    Return the confidence interval of a standard deviation, by the chi-squared distribution.
-
-    Parameters
-    ----------
-    deviation : float or None
-        Standard deviation of a sample; None if there is none.
-    count : int
-        Size of the sample.
-
-    Returns
-    -------
-    (float, float)
-        95 % interval for a normal population.
-
-    """
-    if deviation is None:
-        return 0.0, float('inf')
-    low, high = (
-        deviation * sqrt((count - 1) / chdtri(count - 1, tail))
-        for tail in ((1.0 - LEVEL) / 2.0, (1.0 + LEVEL) / 2.0)
-    )
-    return float(low), float(high)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -13,7 +13,6 @@ from needle_insertion.experiment.truth import _stiffness, Comparison, Coverage
 from needle_insertion.paper import figures, identified, mismatch, results
 from needle_insertion.paper.claims import judge
 from needle_insertion.paper.identified import (
-    deviation_interval,
     IdentifiedTable,
     identify_table,
     Line,
@@ -108,13 +107,13 @@ def test_the_interval_of_the_std_is_that_of_chi_squared() -> None:
     """It holds the STD of the population in 95 of 100 samples of it."""
     rng = np.random.default_rng(0)
     samples = rng.normal(size=(4000, 20)).std(axis=1, ddof=1)
-    bounds = np.array([deviation_interval(float(s), 20) for s in samples])
+    bounds = np.array([line(10.0, float(s)).deviation_interval for s in samples])
     held = np.mean((bounds[:, 0] <= 1.0) & (bounds[:, 1] >= 1.0))
     # Four standard errors of a share of 0.95 in 4000.
     assert held == pytest.approx(0.95, abs=4.0 * np.sqrt(0.95 * 0.05 / 4000))
     # Published factors for 20: the square roots of 19/32.852 and of 19/8.907.
-    assert deviation_interval(1.0, 20) == pytest.approx((0.76049, 1.46057), abs=1e-4)
-    assert deviation_interval(None, 1) == (0.0, np.inf)
+    assert line(10.0, 1.0).deviation_interval == pytest.approx((0.76049, 1.46057), abs=1e-4)
+    assert line(10.0, None, 1).deviation_interval == (0.0, np.inf)
 
 
 @pytest.mark.parametrize('trials', [1, 20, 40, 400])

@@ -6,9 +6,7 @@ from typing import Any
 from hypothesis import given
 from hypothesis import strategies as st
 from needle_dynamics.simulated.faults import Fault, FaultParameters, FAULTS
-from needle_ros.errors import (
-    ParameterError,
-)
+from needle_ros.errors import ParameterError
 import numpy as np
 import pytest
 

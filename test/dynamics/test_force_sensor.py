@@ -11,9 +11,7 @@ from needle_dynamics import (
     ParameterError,
     ShapeError,
 )
-from needle_ros.errors import (
-    JobError,
-)
+from needle_ros.errors import JobError
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest

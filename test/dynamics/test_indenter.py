@@ -14,9 +14,7 @@ from needle_dynamics import (
     IndenterParameters,
     ParameterError,
 )
-from needle_ros.errors import (
-    JobError,
-)
+from needle_ros.errors import JobError
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest

@@ -21,9 +21,7 @@ from needle_dynamics import (
 from needle_dynamics.simulated.base import BaseMotion, BaseParameters
 from needle_dynamics.simulated.plant import Plant, Sample
 from needle_dynamics.simulated.tip_sensor import TipParameters, TipReading, TipSensor
-from needle_ros.errors import (
-    JobError,
-)
+from needle_ros.errors import JobError
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest

@@ -4,9 +4,7 @@ from itertools import pairwise
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from needle_ros.errors import (
-    JobError,
-)
+from needle_ros.errors import JobError
 from needle_ros.sample_clock import SampleClock
 from needle_ros.timing import NANOSECONDS
 import pytest
