@@ -29,7 +29,10 @@ from needle_controller.reference.guide import REFERENCES
 from needle_controller.reference.quintic import MinimumJerk
 from needle_controller.reference.setpoint import Reference, ReferenceLimits, Setpoint
 from needle_controller.reference.trapezoid import Trapezoid
-from needle_controller.safety import Guard, Safety, SafetyLimits, Stream
+from needle_controller.safety.guard import Guard
+from needle_controller.safety.limits import SafetyLimits
+from needle_controller.safety.safety import Safety
+from needle_controller.safety.stream import Stream
 from needle_controller.stability import (
     check_stability,
     Limit,
@@ -37,11 +40,13 @@ from needle_controller.stability import (
     stability_limit,
     transition_matrix,
 )
+from needle_controller.supervisor import Answer, Supervisor
 
 __all__ = [
     'DEFAULT_GAINS',
     'LAWS',
     'REFERENCES',
+    'Answer',
     'Axis',
     'Command',
     'Commander',
@@ -71,6 +76,7 @@ __all__ = [
     'SampledLoop',
     'Setpoint',
     'Stream',
+    'Supervisor',
     'Trapezoid',
     'check_stability',
     'no_memory',

@@ -203,8 +203,8 @@ class Controller:
 
     Attributes
     ----------
-    law : str
-        Control law.
+    parameters, law, settings
+        As given.
     guide : Guide
         The reference: targets, paths, pauses.
     limits : dict of str to Limit
@@ -243,10 +243,10 @@ class Controller:
         reference: str = 'trapezoid',
         limits: ReferenceLimits | None = None,
     ) -> None:
-        self._settings = settings = settings or ControllerSettings()
+        self.settings = settings = settings or ControllerSettings()
         self.period, self.delay = 1.0 / settings.rate, int(settings.delay)
         self.guide = Guide(reference, limits or ReferenceLimits(), settings.depths(parameters))
-        self.law, self._parameters, self._gains = law, parameters, _completed(gains or {})
+        self.law, self.parameters, self._gains = law, parameters, _completed(gains or {})
         (insertion, rotation), self.limits = self._checked(law, parameters, self._gains)
         self._insertion = SampledLoop(insertion, self.delay, settings.force_limit)
         self._rotation = SampledLoop(rotation, self.delay, settings.torque_limit)
@@ -270,7 +270,7 @@ class Controller:
             else:
                 law = InverseDynamics(axis=axis, gains=chosen, period=self.period)
             limits[where] = check_stability(
-                law, self.delay, f'{name}.{where} gains', margin=self._settings.stability_margin
+                law, self.delay, f'{name}.{where} gains', margin=self.settings.stability_margin
             )
             laws.append(law)
         return laws, limits
@@ -302,11 +302,11 @@ class Controller:
             If the gains are unstable with the changes. Nothing is changed then.
 
         """
-        parameters, name = parameters or self._parameters, law or self.law
+        parameters, name = parameters or self.parameters, law or self.law
         completed = _completed(gains or {}, self._gains)
         (insertion, rotation), limits = self._checked(name, parameters, completed)
         steady = (name, completed[name]) == (self.law, self._gains[self.law])
-        self.law, self._parameters, self._gains = name, parameters, completed
+        self.law, self.parameters, self._gains = name, parameters, completed
         self.limits = limits
         if steady or not self.guide.moves:
             self._insertion.law, self._rotation.law = insertion, rotation
@@ -381,7 +381,7 @@ class Controller:
     def _gap(self, before: Measurement | None, measured: Measurement) -> float:
         """Return the time between measurements [s] if it is too long or negative; else zero."""
         elapsed = measured.time - before.time if before is not None else 0.0
-        most = self._settings.measurement_timeout + self.period
+        most = self.settings.measurement_timeout + self.period
         return 0.0 if 0.0 <= elapsed <= most else elapsed
 
     def _fault(self, measured: Measurement) -> str | None:
@@ -393,7 +393,7 @@ class Controller:
             elapsed = measured.time - before.time
             moved = measured.depth - before.depth
             explained = 0.5 * (before.speed + measured.speed) * elapsed
-            if not abs(moved - explained) <= self._settings.jump:
+            if not abs(moved - explained) <= self.settings.jump:
                 return (
                     f'insertion moved by {moved:.6g} m in {elapsed:.6g} s at speeds of '
                     f'{before.speed:.6g} and {measured.speed:.6g} m/s'
@@ -447,7 +447,7 @@ class Controller:
         """Clear the target if the needle has moved during a fault; return a message then."""
         last, self._last_depth = self._last_depth, measured.depth
         moved = abs(measured.depth - last) if last is not None else 0.0
-        elsewhere = self._stopped and moved > self._settings.jump and self.target is not None
+        elsewhere = self._stopped and moved > self.settings.jump and self.target is not None
         if elsewhere:
             seen = self._seen
             self.forget()

@@ -518,7 +518,7 @@ def test_the_integral_is_frozen_while_it_is_stopped(ros_graph: RosGraph) -> None
     """What PID has learned of the friction is there again after the stop."""
     bench = Bench(ros_graph, law='pid')
     bench.aim(0.1)
-    memory = bench.controller._controller._insertion.memory
+    memory = bench.controller._supervisor.controller._insertion.memory
     bench.push()
     ros_graph.spin_until(lambda: bench.measure(0.02) and memory[INTEGRAL], 'the integral')
     assert bench.call('emergency_stop').success
@@ -567,7 +567,7 @@ def test_beyond_a_limit_it_stops_until_it_is_cleared(ros_graph: RosGraph, limit:
     )
     assert [bench.measure(0.02) for _ in range(3)] == [0.0] * 3
     exceed(bench)
-    ros_graph.spin_until(lambda: bench.controller._safety.guard.violated, 'one more')
+    ros_graph.spin_until(lambda: bench.controller._supervisor.safety.guard.violated, 'one more')
     refused = bench.call('clear_stop')
     assert not refused.success
     assert reason in refused.message
@@ -576,7 +576,9 @@ def test_beyond_a_limit_it_stops_until_it_is_cleared(ros_graph: RosGraph, limit:
         bench.wrench()
         bench.tip(0.0)
         bench.measure(0.02)
-    ros_graph.spin_until(lambda: not bench.controller._safety.guard.violated, 'what is well')
+    ros_graph.spin_until(
+        lambda: not bench.controller._supervisor.safety.guard.violated, 'what is well'
+    )
     assert bench.call('clear_stop').success
     assert bench.value('stops latched') == '1'
     if limit == 'depth':
@@ -631,7 +633,7 @@ def test_a_reading_that_does_not_count_is_not_taken_in(
     send(bench)
     ros_graph.spin_until(lambda: f'1 {kind}' in bench.value(f'input {topic}'), 'the refusal')
     assert '0 taken' in bench.value(f'input {topic}')
-    assert bench.controller._observer.refused == 0
+    assert bench.controller._supervisor.bending.observer.refused == 0
     assert bench.push() > 0.5
 
 
@@ -893,7 +895,7 @@ def test_no_ground_truth_raises(ros_graph: RosGraph, message: JointState) -> Non
     message.header.stamp = bench.now()
     truths.publish(message)
     ros_graph.spin_until(lambda: bench.value('input ground_truth'), 'the truth')
-    assert bench.controller._load == 0.0
+    assert bench.controller._supervisor.bending.load == 0.0
     assert bench.push() > 0.5
 
 

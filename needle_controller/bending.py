@@ -1,0 +1,104 @@
+"""What is known of the bending of the needle, and the load that it adds to the insertion."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import isfinite
+
+from needle_controller.controller import Measurement
+from needle_controller.observer.observer import Observer
+from needle_dynamics import NeedleModel, NeedleParameters
+from needle_ros.errors import ParameterError
+from needle_ros.timing import NANOSECONDS
+import numpy as np
+
+
+class Bending:
+    """
+    The load of the bent needle: from an observer, from the simulation, or zero.
+
+    Stamps are integers in ns.
+
+    Parameters
+    ----------
+    parameters : NeedleParameters
+        Needle and tissue.
+    observer : Observer, optional
+        Estimates the bending from tip and wrench.
+
+    Attributes
+    ----------
+    load : float
+        Force against insertion [N]; zero where it is not known.
+    model : NeedleModel
+        The needle, for the load of a true state.
+    observer : Observer or None
+        As given.
+
+    """
+
+    def __init__(self, parameters: NeedleParameters, observer: Observer | None = None) -> None:
+        self.model = NeedleModel(parameters)
+        self.observer = observer
+        self.forget()
+
+    def forget(self) -> None:
+        """Know nothing of what was measured."""
+        self.load = 0.0
+        #: Stamp, lateral force and moment of the last wrench that no measurement has taken.
+        self._waiting: tuple[int, float, float] | None = None
+        if self.observer is not None:
+            self.observer.reset()
+
+    def take_tip(self, stamp: int, deflection: float) -> None:
+        """Take in the deflection of the tip [m]."""
+        if self.observer is not None:
+            self.observer.add_tip(stamp / NANOSECONDS, deflection)
+
+    def take_wrench(self, stamp: int, lateral: float, moment: float, measured: int) -> None:
+        """Take in force [N] and moment [N m]; one newer than the encoders waits for them."""
+        if self.observer is None:
+            return
+        if stamp > measured:
+            self._waiting = stamp, lateral, moment
+        else:
+            self.observer.add_wrench(stamp / NANOSECONDS, lateral, moment)
+
+    def take_truth(self, state: Sequence[float]) -> None:
+        """Take the load from a true state, or raise NeedleError if it has none."""
+        self.load = 0.0
+        # What is finite may be too large all the same.
+        with np.errstate(over='ignore', invalid='ignore'):
+            load = -float(self.model.bias_forces(state)[0])
+        if not isfinite(load):
+            raise ParameterError('the forces of such a needle are not finite')
+        self.load = load
+
+    def update(self, stamp: int, measured: Measurement) -> None:
+        """Take in the encoders and the wrench of the same stamp, or raise NeedleError."""
+        observer, wrench = self.observer, self._waiting
+        if observer is None:
+            return
+        own = wrench[1:] if wrench is not None and wrench[0] == stamp else None
+        if wrench is not None and wrench[0] <= stamp:
+            self._waiting = None
+        self.load = 0.0
+        observer.update(stamp / NANOSECONDS, measured.depth, measured.speed, own)
+        self.load = observer.load
+
+    def describe(self) -> dict[str, object]:
+        """Return what diagnostics say of the observer, if there is one that has begun."""
+        observer = self.observer
+        if observer is None or not observer.ready:
+            return {}
+        consistency, (tip, spread) = observer.nis, observer.tip_deflection
+        return {
+            'tip deflection [m]': f'{tip:.6f} +- {spread:.6f}',
+            'load of the bent needle [N]': f'{observer.load:.4f}',
+            'observer consistency (NIS)': (
+                f'{consistency.ratio:.3f} in [{consistency.low:.3f}, {consistency.high:.3f}]'
+            ),
+            'observer samples refused': observer.refused,
+            'observer restarts': observer.restarts,
+            'observer warning': observer.warning or '',
+        }

@@ -1,0 +1,99 @@
+"""What a controller has to say: lines for the log, and when /diagnostics have changed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from enum import IntEnum
+from math import inf
+from time import monotonic
+from typing import Final
+
+#: Shortest time between two lines of one kind [s].
+_PAUSE: Final = 1.0
+
+
+class Severity(IntEnum):
+    """How bad a state is; the numbers are the levels of DiagnosticStatus."""
+
+    INFO = 0
+    WARNING = 1
+    ERROR = 2
+
+
+class Journal:
+    """
+    Collects what there is to say until somebody takes it.
+
+    Parameters
+    ----------
+    steady : callable
+        Returns the time of a clock that never jumps [s].
+
+    Attributes
+    ----------
+    refused : int
+        Number of inputs refused.
+    complaint : str
+        Why the last one was, or what was last wrong with the motion.
+    changed : bool
+        Whether there is anything to take.
+
+    """
+
+    def __init__(self, steady: Callable[[], float] = monotonic) -> None:
+        self.refused = 0
+        self.complaint = ''
+        self.changed = False
+        self._steady = steady
+        self._lines: list[tuple[Severity, str]] = []
+        self._told: dict[str, float] = {}
+
+    def say(self, severity: Severity, line: str = '', kind: str = '') -> None:
+        """
+        Say a line, and that /diagnostics have changed.
+
+        Parameters
+        ----------
+        severity : Severity
+            How bad it is.
+        line : str
+            What to say; nothing if only /diagnostics are to tell.
+        kind : str
+            Lines of one kind are said at most once a second. Empty: always.
+
+        """
+        if kind:
+            now = self._steady()
+            if now - self._told.get(kind, -inf) < _PAUSE:
+                return
+            self._told[kind] = now
+        if line:
+            self._lines.append((severity, line))
+        self.changed = True
+
+    def refuse(self, complaint: str) -> None:
+        """
+        Say what was not taken, and count it.
+
+        Parameters
+        ----------
+        complaint : str
+            What, and why.
+
+        """
+        self.refused += 1
+        self.complaint = complaint
+        self.say(Severity.ERROR, complaint)
+
+    def take(self) -> list[tuple[Severity, str]]:
+        """
+        Take what was said since the last call.
+
+        Returns
+        -------
+        list of (Severity, str)
+            The lines, in order.
+
+        """
+        lines, self._lines, self.changed = self._lines, [], False
+        return lines

@@ -1,0 +1,50 @@
+"""The encoders of the robot: what a joint state says of the needle."""
+
+from __future__ import annotations
+
+from needle_controller.controller import Measurement
+from needle_ros.errors import ParameterError
+from needle_ros.timing import NANOSECONDS
+from needle_ros.wire import Reading
+
+
+def read_encoders(reading: Reading) -> Measurement:
+    """
+    Read a joint state; `rotation` may be missing.
+
+    Parameters
+    ----------
+    reading : Reading
+        Content of the message.
+
+    Returns
+    -------
+    Measurement
+        What it says, finite or not.
+
+    Raises
+    ------
+    ParameterError
+        If `insertion` is missing, or a joint has no position or velocity.
+
+    """
+    names, (positions, velocities, _) = reading.names, reading.values
+    try:
+        i = names.index('insertion')
+        depth, velocity = positions[i], velocities[i]
+        angle = angular_velocity = 0.0
+        if 'rotation' in names:
+            j = names.index('rotation')
+            angle, angular_velocity = positions[j], velocities[j]
+    except (ValueError, IndexError):
+        raise ParameterError(
+            f"joint_states needs position and velocity of 'insertion', got names {list(names)}, "
+            f'{len(positions)} positions, {len(velocities)} velocities'
+        ) from None
+    return Measurement(
+        time=reading.stamp / NANOSECONDS,
+        depth=depth,
+        speed=velocity,
+        angle=angle,
+        angular_speed=angular_velocity,
+    )

@@ -1,0 +1,71 @@
+"""The limits of what is measured, as parameters."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from needle_ros.errors import ParameterError
+from needle_ros.settings import check_constants, constant
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SafetyLimits:
+    """
+    Limits of what is measured; beyond them the controller stops until ``~/clear_stop``.
+
+    The force sensor of the paper ends at 100 N and 5 N m. Friction keeps the needle of the
+    presets `phantom` and `paper_mm` below 0.05 m/s at 15 N; `paper_si` has next to none.
+    """
+
+    speed: float = constant(
+        0.1, 'm/s', 'largest insertion speed, in both directions', open_low=True
+    )
+    tracking_error: float = constant(
+        0.01, 'm', 'largest distance of the needle from the reference', open_low=True
+    )
+    depth_tolerance: float = constant(
+        2e-3, 'm', 'how far beyond lowest_depth and highest_depth the needle may be'
+    )
+    tip_deflection: float = constant(
+        0.05, 'm', 'largest deflection of the tip, in both directions', open_low=True
+    )
+    axial_load: float = constant(
+        30.0, 'N', 'largest axial force on the force sensor, in both directions', open_low=True
+    )
+    lateral_load: float = constant(
+        10.0, 'N', 'largest lateral force on the force sensor, in both directions', open_low=True
+    )
+    moment_load: float = constant(
+        1.0, 'N m', 'largest moment on the force sensor, in both directions', open_low=True
+    )
+    tip_jump: float = constant(
+        0.02, 'm', 'change of tip_deflection from one sample to the next that is a fault of '
+        'its sensor', open_low=True,
+    )  # fmt: skip
+    lateral_jump: float = constant(
+        5.0, 'N', 'change of the lateral force from one sample to the next that is a fault of '
+        'its sensor', open_low=True,
+    )  # fmt: skip
+    moment_jump: float = constant(
+        0.5, 'N m', 'change of the moment from one sample to the next that is a fault of its '
+        'sensor', open_low=True,
+    )  # fmt: skip
+    sensor_timeout: float = constant(
+        1.0, 's', 'age at which base_wrench, tip_deflection and stamped targets no longer count; '
+        'time without a reading, or without a change of a noisy one, that is reported',
+        open_low=True, high=3600.0,
+    )  # fmt: skip
+    sensors_required: bool = field(
+        default=False,
+        metadata={
+            'description': 'stop when base_wrench or tip_deflection, which the observer expects, '
+            'are stale; else the observer goes on without them'
+        },
+    )
+
+    def __post_init__(self) -> None:
+        check_constants(self)
+        if not isinstance(self.sensors_required, bool):
+            raise ParameterError(
+                f'sensors_required must be true or false, got {self.sensors_required!r}'
+            )

@@ -1,0 +1,175 @@
+"""All inputs of a controller, the stop that latches, and who else commands."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from needle_controller.controller import ControllerSettings
+from needle_controller.safety.guard import Guard
+from needle_controller.safety.limits import SafetyLimits
+from needle_controller.safety.stream import Stream
+from needle_dynamics import NeedleParameters
+from needle_ros.timing import NANOSECONDS, RateCounter
+
+
+class Safety:
+    """
+    Everything that has to be well before a force may be commanded.
+
+    Parameters
+    ----------
+    limits : SafetyLimits
+        Limits.
+    settings : ControllerSettings
+        Timeout and range of depths.
+    parameters : NeedleParameters
+        Needle.
+    expected : sequence of str
+        Topics that should come all the time.
+    noise : Mapping[str, Sequence[float]]
+        Noise of what the sensors report, by topic.
+
+    Attributes
+    ----------
+    stop : str or None
+        Why nothing is commanded until it is cleared.
+    stops : int
+        How often it was latched.
+    rivals : str or None
+        Who else commands.
+    streams : dict of str to Stream
+        Inputs by topic.
+    saturation : RateCounter
+        Commands, those at their limit marked.
+
+    """
+
+    def __init__(
+        self,
+        limits: SafetyLimits,
+        settings: ControllerSettings,
+        parameters: NeedleParameters,
+        *,
+        expected: Sequence[str] = (),
+        noise: Mapping[str, Sequence[float]] | None = None,
+    ) -> None:
+        self.limits = limits
+        self.stop: str | None = None
+        self.stops = 0
+        self.rivals: str | None = None
+        self.guard = Guard(limits, settings.depths(parameters))
+        self.saturation = RateCounter()
+        noise = noise or {}
+        timeout, base = limits.sensor_timeout, ('', 'needle_entry')
+        self.streams = {
+            stream.name: stream
+            for stream in (
+                Stream('joint_states', settings.measurement_timeout),
+                Stream('ground_truth', settings.measurement_timeout),
+                Stream(
+                    'base_wrench', timeout, frames=('needle_base',),
+                    jumps=(limits.lateral_jump, limits.moment_jump),
+                    noise=noise.get('base_wrench', ()),
+                ),
+                Stream(
+                    'tip_deflection', timeout, frames=('needle_entry',),
+                    jumps=(limits.tip_jump,), noise=noise.get('tip_deflection', ()),
+                ),
+                Stream('target', timeout, frames=base, stamped=False),
+                Stream('joint_trajectory', timeout, frames=base, stamped=False),
+            )
+        }  # fmt: skip
+        self._expected = expected
+        self._back = round(settings.measurement_timeout * NANOSECONDS)
+        self._seen = self._begun = 0
+        self._stale: set[str] = set()
+
+    def begin(self, now: int) -> None:
+        """Forget all readings, and expect new ones from a time [ns] on; a stop stays."""
+        self._seen = self._begun = now
+        self._stale.clear()
+        for stream in self.streams.values():
+            stream.forget()
+            self.guard.forget(stream.name)
+        self.guard.forget('reference')
+
+    def clock_went_back(self, now: int) -> float:
+        """Return by how much the clock was set back since the last call [s], or zero."""
+        back, self._seen = self._seen - now, now
+        return back / NANOSECONDS if back > self._back else 0.0
+
+    def latch(self, reason: str | None) -> bool:
+        """Stop for a reason, if there is one; return whether it begins with this."""
+        if reason is None or self.stop is not None:
+            return False
+        self.stop = reason
+        self.stops += 1
+        # There is no reference any more, so the distance from it no longer counts.
+        self.guard.forget('reference')
+        return True
+
+    def clear(self, now: int) -> str | None:
+        """Release the stop, or return why not."""
+        for stream in self.streams.values():
+            # Readings from before the silence say nothing about the present.
+            if stream.silence(now) * NANOSECONDS > stream.timeout:
+                self.guard.forget(stream.name)
+        required = self.warning(now) if self.limits.sensors_required else None
+        reason = self.guard.violated or required
+        if reason is None:
+            self.stop = None
+        return reason
+
+    def count_commanders(self, publishers: Mapping[str, int]) -> None:
+        """Take in how many publish each topic of commands, this controller included."""
+        several = [(count, topic) for topic, count in publishers.items() if count > 1]
+        self.rivals = ', '.join(f'{n} nodes publish {t}' for n, t in several) or None
+
+    def _silent(self, now: int) -> dict[str, str]:
+        """Return a line for each expected topic that is silent while the encoders are not."""
+        joints = self.streams['joint_states']
+        if joints.counted is None or now - joints.counted > joints.timeout:
+            self._begun = now
+            return {}
+        silences = {
+            name: (now - max(self.streams[name].counted or 0, self._begun)) / NANOSECONDS
+            for name in self._expected
+        }
+        return {
+            name: f'{name} is stale: none that counts for {silence:.1f} s'
+            for name, silence in silences.items()
+            if silence > self.limits.sensor_timeout
+        }
+
+    def news(self, now: int) -> list[str]:
+        """Return a line for each expected topic that has become stale since the last call."""
+        silent = self._silent(now)
+        lines = [line for name, line in silent.items() if name not in self._stale]
+        self._stale = set(silent)
+        return lines
+
+    def warning(self, now: int) -> str | None:
+        """Return which expected topics are stale or frozen."""
+        frozen = (
+            f'{name} has not changed for {self.limits.sensor_timeout:g} s'
+            for name in self._expected
+            if self.streams[name].frozen
+        )
+        silent = {
+            name: line for name, line in self._silent(now).items() if not self.streams[name].frozen
+        }
+        return '; '.join((*frozen, *silent.values())) or None
+
+    def describe(self, now: int) -> dict[str, object]:
+        """Return what diagnostics say of inputs, stops and saturation."""
+        return {
+            **{
+                f'input {name}': stream.describe(now)
+                for name, stream in self.streams.items()
+                if stream.counts
+            },
+            'stop': self.stop or '',
+            'stops latched': self.stops,
+            'commands per second': f'{self.saturation.rate(now):.1f}',
+            'share of commands at their limit': f'{self.saturation.share(now):.3f}',
+        }

@@ -1,0 +1,182 @@
+"""One input, and what a message of it must be to count."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from math import isfinite
+from typing import Final, NamedTuple
+
+from needle_ros.timing import NANOSECONDS, RateCounter
+
+#: Kinds of messages that do not count and do no harm.
+REPEATED: Final = 'repeated'
+DROPPED: Final = 'dropped'
+
+#: Steps beyond noise that make a sensor a noisy one, of which identical readings are suspicious.
+_LIVELY: Final = 10
+
+
+class Refusal(NamedTuple):
+    """Why a message does not count: a kind to count by, and a line for people."""
+
+    kind: str
+    line: str
+
+    @property
+    def harmless(self) -> bool:
+        """Whether the message is counted only, and nobody needs to hear of it."""
+        return self.kind in (REPEATED, DROPPED)
+
+
+class Stream:
+    """
+    Judges the messages of one topic.
+
+    Parameters
+    ----------
+    name : str
+        Topic.
+    timeout : float
+        Age from which a message no longer counts [s]; also how far its stamp may be ahead.
+    frames : sequence of str
+        Valid frames; none: any.
+    stamped : bool
+        False if a stamp of zero means now.
+    jumps : sequence of float
+        Change of each value from one message to the next that is not believed.
+    noise : sequence of float
+        Noise of each value: a stream that had it and is frozen is not believed. None: it may
+        be as still as it likes.
+
+    Attributes
+    ----------
+    last : int
+        Stamp of the newest message that was in time [ns], -1 before the first.
+    counted : int or None
+        When the last message came that counts [ns].
+    counts : Counter
+        Messages by what became of them.
+    frozen : bool
+        Whether a noisy stream has had the same values for longer than the timeout.
+
+    """
+
+    def __init__(
+        self,
+        name: str,
+        timeout: float,
+        *,
+        frames: Sequence[str] = (),
+        stamped: bool = True,
+        jumps: Sequence[float] = (),
+        noise: Sequence[float] = (),
+    ) -> None:
+        self.name = name
+        self.timeout = round(timeout * NANOSECONDS)
+        self._frames = frames
+        self._stamped = stamped
+        self._jumps, self._noise = jumps, noise
+        self.counts: Counter[str] = Counter()
+        self.window = RateCounter()
+        self.forget()
+
+    def forget(self) -> None:
+        """Forget what came before, but for the counts: a first message is the next one."""
+        self.last = -1
+        self.counted: int | None = None
+        self._values: Sequence[float] | None = None
+        self._lively, self._changed = 0, 0
+        self.frozen = False
+
+    def check(
+        self, stamp: int, now: int, frame: str = '', values: Sequence[float] = ()
+    ) -> Refusal | None:
+        """
+        Judge a message.
+
+        Parameters
+        ----------
+        stamp, now : int
+            Its stamp, and the time now [ns].
+        frame : str
+            Its frame.
+        values : sequence of float
+            Its numbers, always as many.
+
+        Returns
+        -------
+        Refusal or None
+            None for a message that counts.
+
+        """
+        self.window.add(now)
+        refusal = self._judge(stamp, now, frame, values)
+        if refusal is None:
+            self.counts['taken'] += 1
+            self.counted = now
+        else:
+            self.counts[refusal.kind] += 1
+        return refusal
+
+    def _judge(self, stamp: int, now: int, frame: str, values: Sequence[float]) -> Refusal | None:
+        if self._stamped or stamp != 0:
+            refusal = self._judge_stamp(stamp, now)
+            if refusal is not None:
+                return refusal
+        if self._frames and frame not in self._frames:
+            valid = ' or '.join(map(repr, self._frames))
+            return Refusal('frame', f'{self.name} must be in frame {valid}, got {frame!r}')
+        if not all(map(isfinite, values)):
+            return Refusal('not finite', f'{self.name} must be finite, got {list(values)}')
+        return self._judge_change(stamp, values)
+
+    def _judge_stamp(self, stamp: int, now: int) -> Refusal | None:
+        age = now - stamp
+        if abs(age) > self.timeout:
+            if stamp == 0:
+                return Refusal('not stamped', f'{self.name} is stale: it is not stamped')
+            when = f'{abs(age) / NANOSECONDS:.3f} s {"old" if age > 0 else "ahead"}'
+            return Refusal('stale', f'{self.name} is stale: its stamp is {when}')
+        if stamp == self.last:
+            return Refusal(REPEATED, f'{self.name} came twice')
+        if stamp < self.last:
+            return Refusal(DROPPED, f'{self.name} came after a later one')
+        self.last = stamp
+        return None
+
+    def _judge_change(self, stamp: int, values: Sequence[float]) -> Refusal | None:
+        before, self._values = self._values, values
+        if before is None or (not self._jumps and not self._noise):
+            self._changed = stamp
+            return None
+        steps = [abs(value - old) for value, old in zip(values, before, strict=True)]
+        if any(steps):
+            noisy = any(step > 0.1 * one for step, one in zip(steps, self._noise, strict=False))
+            self._lively = min(max(self._lively + (1 if noisy else -1), 0), _LIVELY)
+            self._changed, self.frozen = stamp, False
+        elif self._lively == _LIVELY and stamp - self._changed > self.timeout:
+            self.frozen = True
+            since = self.timeout / NANOSECONDS
+            return Refusal('frozen', f'{self.name} has not changed for {since:g} s')
+        for step, jump in zip(steps, self._jumps, strict=False):
+            if step > jump:
+                return Refusal('jump', f'{self.name} jumped by {step:.6g}, more than {jump:g}')
+        return None
+
+    def silence(self, now: int) -> float:
+        """Return for how long nothing that counts has come [s]; zero before the first."""
+        return (now - self.counted) / NANOSECONDS if self.counted is not None else 0.0
+
+    def describe(self, now: int) -> str:
+        """Return rate and counts in one line."""
+        refused = {
+            kind: count
+            for kind, count in self.counts.items()
+            if kind not in ('taken', REPEATED, DROPPED)
+        }
+        return (
+            f'{self.window.rate(now):.1f} Hz; {self.counts["taken"]} taken, '
+            f'{self.counts[REPEATED]} repeated, {self.counts[DROPPED]} dropped; refused: '
+            f'{", ".join(f"{count} {kind}" for kind, count in refused.items()) or "none"}'
+        )
