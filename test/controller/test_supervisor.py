@@ -1,0 +1,284 @@
+"""What a control loop commands, whatever happens to it: laws, without a graph."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from math import inf, isfinite, nan
+
+from hypothesis import given
+from hypothesis import strategies as st
+from needle_controller import Answer, Controller, ObserverSettings, SafetyLimits, Supervisor
+from needle_controller.journal import Journal, Severity
+from needle_dynamics import NeedleModel, NeedleParameters
+from needle_ros.wire import Reading
+import pytest
+
+PERIOD = 1_000_000
+SECOND = 1000 * PERIOD
+PHANTOM = NeedleParameters.preset('phantom')
+TOPIC = '/wrench_command'
+
+
+class Loop:
+    """A supervisor with a target, its time, and all that it has commanded."""
+
+    def __init__(
+        self, target: float | None = 0.1, observed: ObserverSettings | None = None
+    ) -> None:
+        self.seconds = 0.0
+        self.supervisor = Supervisor(steady=lambda: self.seconds)
+        self.now = 100 * SECOND
+        self.supervisor.configure(Controller(PHANTOM), SafetyLimits(tracking_error=0.1), observed)
+        self.supervisor.retract_depth = 0.01
+        self.supervisor.activate(self.now, {TOPIC: 1})
+        self.depth = 0.02
+        if target is not None:
+            self.aim(target)
+
+    def aim(self, depth: float) -> Answer | None:
+        return self.supervisor.target(0, '', depth, 0.0, self.now)
+
+    def measure(self, move: float = 0.0, velocity: float = 0.0, late: int = 0) -> Answer | None:
+        """Measure a period later."""
+        self.now += PERIOD
+        self.depth += move
+        return self.encoders(self.now - late, self.depth, velocity)
+
+    def encoders(self, stamp: int, depth: float, velocity: float) -> Answer | None:
+        values = ((depth,), (velocity,), ())
+        return self.supervisor.encoders(Reading(stamp, '', ('insertion',), values), self.now)
+
+    def wrench(self, axial: float = 0.0, moment: float = 0.0) -> Answer | None:
+        values = ((0.0, axial, 0.0, moment, 0.0, 0.0),)
+        return self.supervisor.wrench(Reading(self.now, 'needle_base', (), values), self.now)
+
+    def tip(self, deflection: float = 0.0) -> Answer | None:
+        values = ((0.0, self.depth, deflection),)
+        return self.supervisor.tip(Reading(self.now, 'needle_entry', (), values), self.now)
+
+    def watch(self, nodes: int = 1) -> Answer | None:
+        return self.supervisor.watch(self.now, {TOPIC: nodes})
+
+    def passes(self, time: int) -> Answer | None:
+        self.now += time
+        return self.watch()
+
+    def stop(self) -> Answer | None:
+        return self.supervisor.emergency_stop(self.now).answer
+
+    def clear(self) -> Answer | None:
+        return self.supervisor.clear_stop(self.now).answer
+
+    def pushes(self) -> Answer:
+        """Measure until a force comes."""
+        answers = (self.measure() for _ in range(50))
+        return next(answer for answer in answers if answer is not None and answer.force > 0.5)
+
+    def said(self) -> list[str]:
+        return [line for _, line in self.supervisor.journal.take()]
+
+
+#: What may happen to a loop, but a release of the stop.
+EVENTS: list[Callable[[Loop], Answer | None]] = [
+    Loop.measure,
+    lambda loop: loop.measure(1e-6, 1e-3),
+    lambda loop: loop.measure(5e-3),
+    lambda loop: loop.measure(0.0, 0.5),
+    lambda loop: loop.measure(nan),
+    lambda loop: loop.measure(0.0, inf),
+    lambda loop: loop.measure(late=SECOND),
+    lambda loop: loop.measure(late=-SECOND),
+    lambda loop: loop.measure(late=3 * PERIOD),
+    lambda loop: loop.encoders(loop.now, 0.02, 0.0),
+    lambda loop: loop.supervisor.encoders(Reading(loop.now, '', (), ((), (), ())), loop.now),
+    lambda loop: setattr(loop, 'depth', 0.02),
+    Loop.wrench,
+    lambda loop: loop.wrench(axial=50.0),
+    lambda loop: loop.wrench(moment=nan),
+    Loop.tip,
+    lambda loop: loop.tip(0.06),
+    Loop.watch,
+    lambda loop: loop.watch(2),
+    lambda loop: loop.passes(SECOND),
+    lambda loop: loop.passes(-SECOND),
+    lambda loop: loop.aim(0.05),
+    lambda loop: loop.aim(nan),
+    lambda loop: loop.supervisor.pause(True).answer,
+    lambda loop: loop.supervisor.pause(False).answer,
+    lambda loop: loop.supervisor.retract().answer,
+    Loop.stop,
+]
+events = st.lists(st.sampled_from(EVENTS), max_size=40)
+
+
+@given(events, events)
+def test_a_stop_gives_no_force_until_it_is_cleared(
+    before: list[Callable[[Loop], Answer | None]], after: list[Callable[[Loop], Answer | None]]
+) -> None:
+    """Whatever happened before and happens after, no command has a force or a motion."""
+    loop = Loop()
+    for event in before:
+        event(loop)
+    loop.stop()
+    stop = loop.supervisor.safety.stop
+    answers = [event(loop) for event in after]
+    answers.append(loop.measure())
+    assert all(answer[1:] == (0.0, 0.0, (), ()) for answer in answers if answer is not None)
+    assert loop.supervisor.safety.stop == stop
+
+
+@given(st.lists(st.sampled_from([*EVENTS, Loop.clear]), max_size=60))
+def test_every_command_is_of_a_measurement_or_of_now(
+    happens: list[Callable[[Loop], Answer | None]],
+) -> None:
+    """Its stamp is that of what it answers; a force is finite, within its limit, and answers."""
+    loop = Loop()
+    measured = set()
+    encoders = loop.supervisor.encoders
+
+    def remember(reading: Reading, now: int) -> Answer | None:
+        measured.add(reading.stamp)
+        return encoders(reading, now)
+
+    loop.supervisor.encoders = remember  # type: ignore[method-assign]
+    limits = loop.supervisor.controller.settings
+    for event in happens:
+        answer = event(loop)
+        if answer is None:
+            continue
+        assert answer.stamp in measured or (answer.stamp == loop.now and answer.force == 0.0)
+        assert isfinite(answer.force)
+        assert abs(answer.force) <= limits.force_limit
+        assert abs(answer.torque) <= limits.torque_limit
+        assert loop.supervisor.fault is None or answer.force == 0.0
+
+
+@given(events)
+def test_good_measurements_bring_the_motion_back(
+    happens: list[Callable[[Loop], Answer | None]],
+) -> None:
+    """After any faults, a second of good inputs, a release and a target, the needle is pushed."""
+    loop = Loop()
+    for event in happens:
+        event(loop)
+    loop.depth = 0.02
+    loop.passes(2 * SECOND)
+    loop.supervisor.pause(False)
+    for _ in range(10):
+        loop.measure()
+        loop.wrench()
+        loop.tip()
+    loop.clear()
+    # A needle that was elsewhere meanwhile needs a new target.
+    loop.measure()
+    loop.aim(0.1)
+    answer = loop.pushes()
+    assert answer.reference
+    assert answer.error[0] == answer.reference[0] - loop.depth
+    assert loop.supervisor.diagnose(loop.now)[:2] == (Severity.INFO, None)
+
+
+@given(st.lists(st.sampled_from(EVENTS[:21]), max_size=30))
+def test_without_a_target_there_is_no_force(
+    happens: list[Callable[[Loop], Answer | None]],
+) -> None:
+    """Nothing but a wish of the user moves the needle."""
+    loop = Loop(target=None)
+    assert all(answer.force == 0.0 for event in happens if (answer := event(loop)) is not None)
+
+
+def test_a_measurement_that_comes_again_has_the_same_answer() -> None:
+    """Its reference is not said again; after a stop the answer is zero."""
+    loop = Loop()
+    answer = loop.pushes()
+    assert loop.encoders(loop.now, loop.depth, 0.0) == Answer(*answer[:3])
+    loop.stop()
+    assert loop.encoders(loop.now, loop.depth, 0.0) == Answer(loop.now)
+    # One that is late is not answered at all.
+    assert loop.encoders(loop.now - PERIOD, loop.depth, 0.0) is None
+
+
+def test_a_measurement_beyond_a_limit_is_answered_once_and_with_its_stamp() -> None:
+    """The stop is the answer: two readings in a row, and no third command."""
+    loop = Loop()
+    loop.pushes()
+    loop.supervisor.safety.guard.encoders(0.02, 0.2)
+    answer = loop.measure(0.0, 0.2)
+    assert answer == Answer(loop.now)
+    assert loop.said()[-1] == (
+        'stopped: insertion speed 0.2 m/s is beyond the limit of 0.1 m/s (safety.speed); '
+        'no force until ~/clear_stop'
+    )
+
+
+def test_before_activation_only_the_stop_is_heard() -> None:
+    """It survives configuration, and measurements are not answered."""
+    supervisor = Supervisor()
+    reading = Reading(SECOND, '', ('insertion',), ((0.02,), (0.0,), ()))
+    assert supervisor.emergency_stop(SECOND).answer == Answer(SECOND)
+    assert supervisor.encoders(reading, SECOND) is None
+    assert supervisor.target(0, '', 0.1, 0.0, SECOND) is None
+    assert supervisor.journal.complaint == 'target refused: the controller is not active'
+    assert supervisor.pause(True).message == 'pause refused: the controller is not active'
+    supervisor.configure(Controller(PHANTOM), SafetyLimits())
+    supervisor.activate(SECOND, {})
+    assert supervisor.encoders(reading, SECOND) == Answer(SECOND)
+    assert supervisor.diagnose(SECOND)[:2] == (
+        Severity.ERROR,
+        'emergency stop; ~/clear_stop releases',
+    )
+
+
+def test_the_load_of_a_true_state_is_compensated() -> None:
+    """It adds to the force of the law; a state without forces adds nothing."""
+    straight, bent = Loop(), Loop()
+    state = [PHANTOM.length - 0.02, 0.0, 3e-4, 0.0]
+    rest = (0.0,) * 4
+    for loop, positions in ((straight, [*state[:2], 0.0, 0.0]), (bent, state)):
+        reading = Reading(loop.now, '', (), (tuple(positions), rest, ()))
+        assert loop.supervisor.truth(reading, loop.now) is None
+    load = -NeedleModel(PHANTOM).bias_forces([*state, *rest])[0]
+    forces = [[loop.measure().force for _ in range(20)] for loop in (straight, bent)]
+    assert bent.supervisor.bending.load == pytest.approx(load)
+    assert forces[1][-1] != forces[0][-1]
+    wild = Reading(bent.now, '', (), ((0.18, 0.0, 1e308, 0.0), rest, ()))
+    bent.supervisor.truth(wild, bent.now)
+    assert bent.supervisor.bending.load == 0.0
+    assert 'not taken in' in bent.said()[-1]
+
+
+def test_the_wrench_of_a_measurement_waits_for_it() -> None:
+    """A wrench that comes before the encoders of its stamp is taken in with them."""
+    loop = Loop(observed=ObserverSettings())
+    taken: list[tuple[float, float] | None] = []
+    observer = loop.supervisor.bending.observer
+    observer.update = lambda *values: taken.append(values[3])  # type: ignore[method-assign]
+    loop.measure()
+    loop.now += PERIOD
+    loop.wrench(moment=0.25)
+    loop.encoders(loop.now, loop.depth, 0.0)
+    loop.measure()
+    assert taken == [None, (0.0, 0.25), None]
+
+
+def test_settings_that_an_observer_cannot_have_are_named() -> None:
+    """As the parameter that holds them."""
+    with pytest.raises(ValueError, match=r'^observer\.filter_rate must be a whole multiple'):
+        Supervisor().configure(
+            Controller(PHANTOM), SafetyLimits(), ObserverSettings(filter_rate=1234.5)
+        )
+
+
+def test_nothing_is_said_twice_in_a_second() -> None:
+    """Each kind of complaint has its own second; a line without a kind is always said."""
+    times = iter([0.0, 0.5, 1.0, 1.9, 2.1, 2.1])
+    journal = Journal(steady=lambda: next(times))
+    for number in range(5):
+        journal.say(Severity.WARNING, f'line {number}', 'stale')
+    journal.say(Severity.WARNING, 'another', 'jump')
+    journal.say(Severity.INFO, 'always')
+    assert journal.changed
+    said = [line for _, line in journal.take()]
+    assert said == ['line 0', 'line 2', 'line 4', 'another', 'always']
+    assert not journal.changed
+    assert journal.take() == []
