@@ -73,25 +73,7 @@ class ControllerSettings:
             raise ParameterError(f'delay must be a whole number of periods, got {self.delay!r}')
 
     def depths(self, parameters: NeedleParameters) -> tuple[float, float]:
-        """
-        Return the range of inserted lengths to control a needle.
-
-        Parameters
-        ----------
-        parameters : NeedleParameters
-            Needle.
-
-        Returns
-        -------
-        tuple of float
-            Least and largest inserted length [m].
-
-        Raises
-        ------
-        ParameterError
-            If the range is empty.
-
-        """
+        """Return the least and largest inserted length to control a needle [m]."""
         low = max(self.lowest_depth, parameters.minimum_depth)
         high = min(self.highest_depth, parameters.length)
         if not low < high:
@@ -126,15 +108,7 @@ class Measurement:
     angular_speed: float = 0.0
 
     def is_finite(self) -> bool:
-        """
-        Return whether the readings are finite.
-
-        Returns
-        -------
-        bool
-            Whether every number is.
-
-        """
+        """Return whether every number is finite."""
         return all(map(isfinite, (self.depth, self.speed, self.angle, self.angular_speed)))
 
 
@@ -169,15 +143,7 @@ class Command:
     notice: str | None = None
 
     def is_finite(self) -> bool:
-        """
-        Return whether the command is finite.
-
-        Returns
-        -------
-        bool
-            Whether force and torque are.
-
-        """
+        """Return whether force and torque are finite."""
         return isfinite(self.force) and isfinite(self.torque)
 
 
@@ -320,20 +286,7 @@ class Controller:
         return self.guide.target
 
     def set_target(self, depth: float) -> None:
-        """
-        Go to an inserted length; see `Guide.aim`.
-
-        Parameters
-        ----------
-        depth : float
-            Inserted length [m].
-
-        Raises
-        ------
-        ParameterError
-            If it is not finite or out of range.
-
-        """
+        """Go to an inserted length [m]; see `Guide.aim`."""
         self.guide.aim(depth)
 
     def follow(
@@ -342,20 +295,7 @@ class Controller:
         positions: Sequence[float],
         speeds: Sequence[float] | None = None,
     ) -> None:
-        """
-        Follow a path of inserted lengths from now on; see `Path`.
-
-        Parameters
-        ----------
-        times, positions, speeds : sequence of float
-            Times from now [s], inserted lengths [m] and insertion speeds [m/s].
-
-        Raises
-        ------
-        ParameterError
-            If the path is invalid.
-
-        """
+        """Follow a path of inserted lengths from now on; see `Guide.follow`."""
         self.guide.follow(times, positions, speeds)
 
     def forget(self) -> None:
@@ -406,10 +346,8 @@ class Controller:
 
         Parameters
         ----------
-        measured : Measurement
-            Readings of the encoders.
-        load : float
-            Force of the bent needle against insertion [N], if it is known.
+        measured, load
+            As for `Commander.command`.
 
         Returns
         -------

@@ -49,19 +49,7 @@ class Journal:
         self._told: dict[str, float] = {}
 
     def say(self, severity: Severity, line: str = '', kind: str = '') -> None:
-        """
-        Say a line, and that /diagnostics have changed.
-
-        Parameters
-        ----------
-        severity : Severity
-            How bad it is.
-        line : str
-            What to say; nothing if only /diagnostics are to tell.
-        kind : str
-            Lines of one kind are said at most once a second. Empty: always.
-
-        """
+        """Say a line, if any: at most once a second of a kind. Tell that /diagnostics changed."""
         if kind:
             now = self._steady()
             if now - self._told.get(kind, -inf) < _PAUSE:
@@ -72,28 +60,12 @@ class Journal:
         self.changed = True
 
     def refuse(self, complaint: str) -> None:
-        """
-        Say what was not taken, and count it.
-
-        Parameters
-        ----------
-        complaint : str
-            What, and why.
-
-        """
+        """Say what was not taken, and why; count it."""
         self.refused += 1
         self.complaint = complaint
         self.say(Severity.ERROR, complaint)
 
     def take(self) -> list[tuple[Severity, str]]:
-        """
-        Take what was said since the last call.
-
-        Returns
-        -------
-        list of (Severity, str)
-            The lines, in order.
-
-        """
+        """Return what was said since the last call."""
         lines, self._lines, self.changed = self._lines, [], False
         return lines

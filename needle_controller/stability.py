@@ -169,14 +169,10 @@ def check_stability(law: Law, delay: int, name: str, *, margin: float = MARGIN) 
 
     Parameters
     ----------
-    law : Law
-        Control law.
-    delay : int
-        Periods from measurement to effect.
+    law, delay, margin
+        As for `stability_limit`.
     name : str
         Name of the gains for the message.
-    margin : float
-        Required distance of the spectral radius from one, in [0, 1).
 
     Returns
     -------

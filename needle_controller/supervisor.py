@@ -158,24 +158,7 @@ class Supervisor:
     def change(
         self, parameters: NeedleParameters, law: str, gains: Mapping[str, Mapping[str, Gains]]
     ) -> None:
-        """
-        Go on with other constants, gains or law; see `Controller.change`.
-
-        Parameters
-        ----------
-        parameters : NeedleParameters
-            Needle and tissue.
-        law : str
-            Control law.
-        gains : Mapping[str, Mapping[str, Gains]]
-            Gains by law and axis.
-
-        Raises
-        ------
-        ParameterError
-            If the gains are unstable with the changes. Nothing is changed then.
-
-        """
+        """Go on with other constants, gains or law; see `Controller.change`."""
         if self.controller is not None:
             self.controller.change(parameters, law=law, gains=gains)
             self.bending.model = NeedleModel(parameters)
@@ -425,22 +408,7 @@ class Supervisor:
         return self._command(Answer(stamp, force, torque, (position, velocity), error))
 
     def watch(self, now: int, commanders: Mapping[str, int]) -> Answer | None:
-        """
-        Look for what does not come, and for who should not be there.
-
-        Parameters
-        ----------
-        now : int
-            Time [ns].
-        commanders : Mapping[str, int]
-            How many publish each topic of commands, this controller included.
-
-        Returns
-        -------
-        Answer or None
-            No force, if something is wrong.
-
-        """
+        """Look for what does not come, and for who else publishes a topic of commands."""
         answer, safety = self._check_clock(now), self.safety
         safety.count_commanders(commanders)
         timeout = safety.streams['joint_states'].timeout / NANOSECONDS
@@ -488,24 +456,7 @@ class Supervisor:
     # What /diagnostics say.
 
     def diagnose(self, now: int) -> tuple[Severity, str | None, dict[str, object]]:
-        """
-        Say what it aims at and what holds it back.
-
-        Parameters
-        ----------
-        now : int
-            Time [ns].
-
-        Returns
-        -------
-        severity : Severity
-            How bad it is.
-        message : str or None
-            What is wrong; None if all is well.
-        values : dict
-            Values by name.
-
-        """
+        """Return how bad it is, what holds it back if anything, and values by name."""
         values: dict[str, object] = {}
         if self.controller is not None:
             control = self.controller

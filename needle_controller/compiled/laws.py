@@ -212,14 +212,8 @@ def law_match(
 
     Parameters
     ----------
-    constants : tuple of float
-        Fields of `LawConstants`.
-    memory : ndarray, shape (MEMORY,)
-        Memory of the law; overwritten.
-    instant : tuple of float
-        Fields of `Instant`.
-    load : float
-        Known force against the motion [N].
+    constants, memory, instant, load
+        As for `law_force`.
     force : float
         Force that the law shall return [N].
 
@@ -249,14 +243,8 @@ def law_step(
 
     Parameters
     ----------
-    constants : tuple of float
-        Fields of `LawConstants`.
-    memory : ndarray, shape (MEMORY,)
-        Memory of the law; updated.
-    instant : tuple of float
-        Fields of `Instant`.
-    load : float
-        Known force against the motion [N].
+    constants, memory, instant, load
+        As for `law_force`.
     limit : float
         Largest force [N].
 

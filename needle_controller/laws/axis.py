@@ -13,20 +13,7 @@ from needle_ros.errors import ParameterError
 
 
 def require_complete(parameters: NeedleParameters) -> None:
-    """
-    Reject the formulation ``as_printed``, which is for the model and the integrator only.
-
-    Parameters
-    ----------
-    parameters : NeedleParameters
-        Needle and tissue.
-
-    Raises
-    ------
-    ParameterError
-        If the formulation is not ``complete``.
-
-    """
+    """Reject the formulation `as_printed`, which is for the model and the integrator only."""
     if parameters.formulation != 'complete':
         raise ParameterError(
             "formulation must be 'complete' for controller and observer, got "
@@ -85,20 +72,7 @@ class Axis:
 
     @classmethod
     def insertion(cls, parameters: NeedleParameters) -> Axis:
-        """
-        Return the insertion axis, first row of (16).
-
-        Parameters
-        ----------
-        parameters : NeedleParameters
-            Needle and tissue.
-
-        Returns
-        -------
-        Axis
-            The moving mass with its friction.
-
-        """
+        """Return the insertion axis of a needle, first row of (16)."""
         return cls(
             inertia=parameters.moving_mass,
             coulomb=parameters.coulomb_friction,
@@ -107,32 +81,11 @@ class Axis:
 
     @classmethod
     def rotation(cls, parameters: NeedleParameters) -> Axis:
-        """
-        Return the rotation axis, second row of (16).
-
-        Parameters
-        ----------
-        parameters : NeedleParameters
-            Needle and tissue.
-
-        Returns
-        -------
-        Axis
-            The rotary inertia of the needle, without friction.
-
-        """
+        """Return the rotation axis of a needle, second row of (16), without friction."""
         return cls(inertia=0.5 * parameters.rotary_inertia)
 
     def without_coulomb(self) -> Axis:
-        """
-        Return the linear part of the axis.
-
-        Returns
-        -------
-        Axis
-            The axis without Coulomb friction.
-
-        """
+        """Return the axis without Coulomb friction."""
         return replace(self, coulomb=0.0)
 
     def propagate(
@@ -160,20 +113,7 @@ class Axis:
         return position + moved, end
 
     def response(self, t: float) -> Response:
-        """
-        Return the linear response over a time, exactly.
-
-        Parameters
-        ----------
-        t : float
-            Time [s].
-
-        Returns
-        -------
-        Response
-            Response of the axis without Coulomb friction.
-
-        """
+        """Return the linear response over a time [s], exactly."""
         x = self.viscous * t / self.inertia
         mean, ramp = decay_means(x)
         push = t / self.inertia

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from needle_controller.compiled.laws import INVERSE_DYNAMICS
-from needle_controller.laws.law import Law
+from needle_controller.laws.law import Law, LawGains
 from needle_ros.settings import check_constants, constant
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class InverseDynamicsGains:
+class InverseDynamicsGains(LawGains):
     """Gains of the closed loop e_ddot + kv e_dot + kp e = 0 on one axis."""
 
     kp: float = constant(900.0, '1/s^2', 'position gain k_p')
@@ -22,23 +22,6 @@ class InverseDynamicsGains:
 
     def __post_init__(self) -> None:
         check_constants(self)
-
-    def scaled(self, factor: float) -> InverseDynamicsGains:
-        """
-        Return all gains multiplied by a factor.
-
-        Parameters
-        ----------
-        factor : float
-            Factor.
-
-        Returns
-        -------
-        InverseDynamicsGains
-            Other gains.
-
-        """
-        return replace(self, kp=factor * self.kp, kv=factor * self.kv)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -68,7 +51,3 @@ class InverseDynamics(Law):
     def __post_init__(self) -> None:
         gains = self.gains
         self._set_constants(gains.breakaway_speed, kind=INVERSE_DYNAMICS, kp=gains.kp, kd=gains.kv)
-
-    def scaled(self, factor: float) -> InverseDynamics:
-        """Return the law with all gains multiplied by a factor; see `Law.scaled`."""
-        return replace(self, gains=self.gains.scaled(factor))

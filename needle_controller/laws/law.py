@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections import deque
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from math import exp
 from typing import Any, Final
 
@@ -30,20 +29,22 @@ HANDOVER_TIME: Final = 0.1
 
 
 def no_memory() -> FloatArray:
-    """
-    Return the memory of a law at the beginning.
-
-    Returns
-    -------
-    ndarray, shape (3,)
-        Integral of the error, filtered rate of the error, and force offset after a switch; zeros.
-
-    """
+    """Return the memory of a law at the beginning: `MEMORY` zeros."""
     return np.zeros(MEMORY)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Law(ABC):
+class LawGains:
+    """Gains of a law on one axis."""
+
+    def scaled(self, factor: float) -> LawGains:
+        """Return all gains multiplied by a factor."""
+        gains = [item.name for item in fields(self) if item.name in ('kp', 'ki', 'kd', 'kv')]
+        return replace(self, **{name: factor * getattr(self, name) for name in gains})
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Law:
     """
     A sampled control law on one axis. Its memory is kept by its loop.
 
@@ -51,6 +52,8 @@ class Law(ABC):
     ----------
     axis : Axis
         Axis as the law believes it to be.
+    gains : LawGains
+        Gains.
     period : float
         Sample period h [s].
     constants : LawConstants
@@ -59,6 +62,7 @@ class Law(ABC):
     """
 
     axis: Axis
+    gains: LawGains
     period: float
     constants: LawConstants = field(init=False, repr=False, compare=False)
     #: The same as a plain tuple.
@@ -98,7 +102,7 @@ class Law(ABC):
             State of the axis.
         setpoint : Setpoint
             Reference.
-        memory : ndarray, shape (3,)
+        memory : ndarray, shape (MEMORY,)
             As from `no_memory`.
         load : float
             Known force against the motion [N].
@@ -121,18 +125,12 @@ class Law(ABC):
         limit: float,
     ) -> float:
         """
-        Return the force within a limit and update the memory.
+        Return the force within a limit and update the memory; see `force`.
 
         Parameters
         ----------
-        position, speed : float
-            State of the axis.
-        setpoint : Setpoint
-            Reference.
-        memory : ndarray, shape (3,)
-            As from `no_memory`; updated.
-        load : float
-            Known force against the motion [N].
+        position, speed, setpoint, memory, load
+            As for `force`.
         limit : float
             Largest force [N].
 
@@ -159,14 +157,8 @@ class Law(ABC):
 
         Parameters
         ----------
-        position, speed : float
-            State of the axis.
-        setpoint : Setpoint
-            Reference.
-        memory : ndarray, shape (3,)
-            As from `no_memory`; overwritten.
-        load : float
-            Known force against the motion [N].
+        position, speed, setpoint, memory, load
+            As for `force`.
         force : float
             Force that the law shall return next [N].
 
@@ -175,33 +167,12 @@ class Law(ABC):
         law_match(self.packed, memory, instant, float(load), float(force))
 
     def linear(self) -> Law:
-        """
-        Return the law without Coulomb friction, for its poles.
-
-        Returns
-        -------
-        Law
-            A linear law.
-
-        """
+        """Return the law without Coulomb friction, for its poles."""
         return replace(self, axis=self.axis.without_coulomb())
 
-    @abstractmethod
     def scaled(self, factor: float) -> Law:
-        """
-        Return the law with all gains multiplied by a factor.
-
-        Parameters
-        ----------
-        factor : float
-            Factor.
-
-        Returns
-        -------
-        Law
-            The law with other gains.
-
-        """
+        """Return the law with all gains multiplied by a factor."""
+        return replace(self, gains=self.gains.scaled(factor))
 
 
 def _instant(position: float, speed: float, setpoint: Setpoint) -> tuple[float, ...]:
@@ -231,7 +202,7 @@ class SampledLoop:
         As given.
     pending : deque of float
         Commands that have not yet taken effect [N].
-    memory : ndarray, shape (3,)
+    memory : ndarray, shape (MEMORY,)
         Memory of the law.
     last : float
         Last command [N].

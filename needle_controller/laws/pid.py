@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 from typing import Final
 
 from needle_controller.compiled.laws import PID
-from needle_controller.laws.law import Law
+from needle_controller.laws.law import Law, LawGains
 from needle_ros.errors import ParameterError
 from needle_ros.settings import check_constants, constant
 
@@ -15,7 +15,7 @@ ANTI_WINDUP: Final = ('conditional', 'back_calculation')
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class PidGains:
+class PidGains(LawGains):
     """Gains of f = kp e + ki int e dt + kd e_dot on one axis, with anti-windup and filter."""
 
     kp: float = constant(6000.0, 'N/m or N m/rad', 'proportional gain')
@@ -48,23 +48,6 @@ class PidGains:
             )
         if not isinstance(self.feed_forward, bool):
             raise ParameterError(f'feed_forward must be true or false, got {self.feed_forward!r}')
-
-    def scaled(self, factor: float) -> PidGains:
-        """
-        Return all gains multiplied by a factor.
-
-        Parameters
-        ----------
-        factor : float
-            Factor.
-
-        Returns
-        -------
-        PidGains
-            Other gains.
-
-        """
-        return replace(self, kp=factor * self.kp, ki=factor * self.ki, kd=factor * self.kd)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -113,7 +96,3 @@ class Pid(Law):
         return replace(
             self, axis=self.axis.without_coulomb(), gains=replace(self.gains, tolerance=0.0)
         )
-
-    def scaled(self, factor: float) -> Pid:
-        """Return the law with all gains multiplied by a factor; see `Law.scaled`."""
-        return replace(self, gains=self.gains.scaled(factor))

@@ -115,8 +115,8 @@ class Guide:
 
         Parameters
         ----------
-        times, positions, speeds : sequence of float
-            Points of the path, as for `Path`; times count from now [s].
+        times, positions, speeds
+            As for `Path`; times count from now [s].
 
         Raises
         ------
@@ -173,20 +173,7 @@ class Guide:
         return self.ahead(time)
 
     def ahead(self, time: float) -> Setpoint:
-        """
-        Return the setpoint at a later time if nothing changes.
-
-        Parameters
-        ----------
-        time : float
-            Time [s].
-
-        Returns
-        -------
-        Setpoint
-            Setpoint at that time.
-
-        """
+        """Return the setpoint at a later time [s] if nothing changes."""
         return self._motion.at(time - self._start) if self._motion else Setpoint(0.0)
 
     def _plan(self, now: Setpoint) -> Reference:

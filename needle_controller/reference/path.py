@@ -18,6 +18,7 @@ from needle_controller.reference.setpoint import (
 )
 from needle_controller.reference.trapezoid import Trapezoid
 from needle_ros.errors import ParameterError
+from needle_ros.trajectories import check_times
 import numpy as np
 
 
@@ -158,20 +159,7 @@ class Path:
                     )
 
     def at(self, time: float) -> Setpoint:
-        """
-        Return the setpoint at a time.
-
-        Parameters
-        ----------
-        time : float
-            Time [s]; before the first point the path is at that point.
-
-        Returns
-        -------
-        Setpoint
-            Desired inserted length, speed and acceleration.
-
-        """
+        """Return the setpoint at a time [s]; before the first point, that point."""
         k = max(int(np.searchsorted(self._starts, time, side='right')) - 1, 0)
         start, p, v, a, jerk = self._pieces[k]
         t = max(time - start, 0.0)
@@ -200,8 +188,7 @@ def _check(
         )
     if not all(map(isfinite, (*times, *positions, *(speeds or ())))):
         raise ParameterError('times, positions and speeds must be finite')
-    if times[0] < 0.0 or any(late <= early for early, late in pairwise(times)):
-        raise ParameterError(f'times must be >= 0 and increasing, got {list(times)} s')
+    check_times(times)
     low, high = depths
     if not all(low <= at <= high for at in positions):
         raise ParameterError(

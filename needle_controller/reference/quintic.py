@@ -59,20 +59,7 @@ class Quintic:
         )
 
     def within(self, limits: ReferenceLimits) -> bool:
-        """
-        Return whether the motion is within limits.
-
-        Parameters
-        ----------
-        limits : ReferenceLimits
-            Limits. Where an end exceeds one, the value of that end is the limit.
-
-        Returns
-        -------
-        bool
-            Whether speed and acceleration are within them, up to rounding.
-
-        """
+        """Return whether it is within limits, or within the values of its ends beyond them."""
         ends = self.start, self.end
         top = max(limits.speed, *(abs(end.speed) for end in ends)) * (1.0 + ROUNDING)
         ramp = max(limits.acceleration, *(abs(end.acceleration) for end in ends))
@@ -81,20 +68,7 @@ class Quintic:
         return bool(np.abs(acceleration).max() <= ramp and np.abs(speed).max() <= top)
 
     def stays(self, depths: tuple[float, float]) -> bool:
-        """
-        Return whether the motion stays in a range of positions.
-
-        Parameters
-        ----------
-        depths : tuple of float
-            Least and largest position [m].
-
-        Returns
-        -------
-        bool
-            Whether all positions are in the range, up to rounding.
-
-        """
+        """Return whether all positions are in a range [m], up to rounding."""
         low, high = depths
         least, largest = self.extremes[0]
         slack = ROUNDING * (high - low) if high - low < inf else 0.0
@@ -108,22 +82,8 @@ class Quintic:
 
 
 def shortest(distance: float, limits: ReferenceLimits) -> float:
-    """
-    Return the duration of the fastest quintic from rest to rest.
-
-    Parameters
-    ----------
-    distance : float
-        Distance [m], not negative.
-    limits : ReferenceLimits
-        Limits.
-
-    Returns
-    -------
-    float
-        Duration [s]: the peaks of the quintic are 15/8 D/T and 10/sqrt(3) D/T^2.
-
-    """
+    """Return the duration [s] of the fastest quintic from rest to rest over a distance [m]."""
+    # The peaks of the quintic are 15/8 D/T and 10/sqrt(3) D/T^2.
     return max(
         1.875 * distance / limits.speed,
         sqrt(10.0 / sqrt(3.0) * distance / limits.acceleration),

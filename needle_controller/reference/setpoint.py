@@ -73,20 +73,5 @@ class Reference(Protocol):
 
 
 def around(depths: tuple[float, float], start: Setpoint) -> tuple[float, float]:
-    """
-    Widen a range of depths to include the start: a needle outside has to come back.
-
-    Parameters
-    ----------
-    depths : tuple of float
-        Least and largest position [m].
-    start : Setpoint
-        Start of a motion.
-
-    Returns
-    -------
-    tuple of float
-        Least and largest position, the start included [m].
-
-    """
+    """Widen a range of depths to include the start: a needle outside has to come back."""
     return min(depths[0], start.position), max(depths[1], start.position)

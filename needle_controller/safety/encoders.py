@@ -9,25 +9,7 @@ from needle_ros.wire import Reading
 
 
 def read_encoders(reading: Reading) -> Measurement:
-    """
-    Read a joint state; `rotation` may be missing.
-
-    Parameters
-    ----------
-    reading : Reading
-        Content of the message.
-
-    Returns
-    -------
-    Measurement
-        What it says, finite or not.
-
-    Raises
-    ------
-    ParameterError
-        If `insertion` is missing, or a joint has no position or velocity.
-
-    """
+    """Read a joint state; `rotation` may be missing, an incomplete one is a ParameterError."""
     names, (positions, velocities, _) = reading.names, reading.values
     try:
         i = names.index('insertion')
