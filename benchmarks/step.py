@@ -374,7 +374,7 @@ def compare(tick: Tick) -> Answer:
     counts = operations_of_a_step()
     groups = grouped(counts)
     parameters, start = _start()
-    series = NeedleModel(parameters).modes.series
+    series = NeedleModel(parameters).modes.tables.series
     work, columns_loop = np.zeros(series.shape[1]), _columns_loop(series.shape[1])
     rounds = 20000
 

@@ -24,7 +24,9 @@ from needle_controller.laws.continuous import (
 from needle_controller.laws.inverse_dynamics import InverseDynamics, InverseDynamicsGains
 from needle_controller.laws.law import Law, no_memory, SampledLoop
 from needle_controller.laws.pid import Pid, PidGains
-from needle_controller.observer.observer import Consistency, Observer, ObserverSettings
+from needle_controller.observer.consistency import Consistency
+from needle_controller.observer.observer import Observer
+from needle_controller.observer.settings import ObserverSettings
 from needle_controller.reference.guide import REFERENCES
 from needle_controller.reference.quintic import MinimumJerk
 from needle_controller.reference.setpoint import Reference, ReferenceLimits, Setpoint

@@ -17,7 +17,7 @@ from needle_controller.controller import (
     LAWS,
 )
 from needle_controller.journal import Severity
-from needle_controller.observer.observer import ObserverSettings
+from needle_controller.observer.settings import ObserverSettings
 from needle_controller.reference.guide import REFERENCES
 from needle_controller.reference.setpoint import ReferenceLimits
 from needle_controller.safety.limits import SafetyLimits

@@ -9,7 +9,8 @@ from typing import Final, NamedTuple
 from needle_controller.bending import Bending
 from needle_controller.controller import Controller, ControllerSettings, Gains, Measurement
 from needle_controller.journal import Journal, Severity
-from needle_controller.observer.observer import Observer, ObserverSettings
+from needle_controller.observer.observer import Observer
+from needle_controller.observer.settings import ObserverSettings
 from needle_controller.safety.encoders import read_encoders
 from needle_controller.safety.limits import SafetyLimits
 from needle_controller.safety.safety import Safety

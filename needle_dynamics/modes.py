@@ -189,21 +189,6 @@ class ModeShapes:
             table.setflags(write=False)
         return tables
 
-    @property
-    def series(self) -> FloatArray:
-        """Series of `tables`."""
-        return self.tables.series
-
-    @property
-    def terms(self) -> FloatArray:
-        """Terms of `tables`."""
-        return self.tables.terms
-
-    @property
-    def constants(self) -> FloatArray:
-        """Constants of `tables`."""
-        return self.tables.modes
-
     def _series(self) -> FloatArray:
         """Return the coefficients of all integrals in powers of (s/l)^4, see `ModeTables`."""
         # Products of two modes grow as (2 k y)^m / m!; beyond SERIES_END the series is not used.

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from itertools import pairwise
 from math import expm1, inf
 
-from needle_dynamics.arrays import FloatArray
 from needle_dynamics.compiled.tissue import Layers
 from needle_dynamics.modes import ModeShapes
 from needle_ros.errors import ParameterError
@@ -150,9 +149,3 @@ class Tissue:
             moment[i] = moment[i - 1] + step * at.moment
         starts, stiffnesses = np.array(self.starts), np.array(self.stiffnesses)
         return Layers(starts, stiffnesses, gram, area, moment)
-
-    def offsets(self, modes: ModeShapes) -> FloatArray:
-        """Return gram (upper triangle), area and moment of `layers` side by side."""
-        layers, upper = self.layers(modes), np.triu_indices(modes.count)
-        gram = layers.gram[:, upper[0], upper[1]]
-        return np.concatenate([gram, layers.area, layers.moment], axis=1)

@@ -1,835 +1,487 @@
 """
-What the observer compiles: normal modes, their transition over a sample, the filter's step.
+The observer's filter: its past, one sample of it, and the estimate at the present depth.
 
-The state of the filter is, in this order,
-
-- c = omega a and b = a_dot of each normal mode of the inserted part, in the norm of energy: both
-  in sqrt(J), so that without damping the transition is a rotation,
-- the memory of the low-pass of each channel of the wrench (lateral force, moment about the base),
-  and as its last entry the reading,
-- the running mean of the tip deflection over the exposure that is going on.
-
-Every measurement is thus a single entry of the state.
+Over one sample the depth is frozen at its mean. The past of the filter is kept sample by sample,
+so that a measurement that comes late is taken in where it belongs.
 """
 
 from __future__ import annotations
 
-from math import cos, exp, pi, sin, sqrt
+from math import pi, sqrt
+from typing import NamedTuple, TYPE_CHECKING
 
+from needle_controller.compiled.bending import base_impulse, change_basis, freeze, Frozen, turn
+from needle_controller.compiled.kalman import add_to_mean, clear_mean, measure, propagate
 from needle_dynamics.arrays import FloatArray
-from needle_dynamics.compiled.cache import compiled
+from needle_dynamics.compiled.cache import compiled, inlined
+from needle_dynamics.compiled.normal_modes import coupling, empty_normal_modes, NormalModes
+from needle_dynamics.compiled.step import Needle
+from needle_dynamics.compiled.tissue import growth_at
+import numpy as np
+from numpy.typing import NDArray
 
-# Slots of `fixed`.
-DENSITY, BENDING, DAMPING, PRINTED, LENGTH = 0, 1, 2, 3, 4
-#: Power of the noise force, and variances of the readings of force, moment and tip.
-NOISE, FORCE_VARIANCE, MOMENT_VARIANCE, TIP_VARIANCE = 5, 6, 7, 8
-#: Ticks of the force sensor in a sample, and variance of the tip deflection at the start.
-TICKS, TIP_PRIOR = 9, 10
-#: Variances of the white noise of force and moment before the low-pass.
-FORCE_INPUT, MOMENT_INPUT = 11, 12
-FIXED = 13
+if TYPE_CHECKING:
+    from needle_dynamics.compiled.held import Held
 
-# Slots of `sensor`: transition over a sample, noise of both channels over a sample; as rows what
-# an input of one leaves so many ticks later; and as first row what it leaves in the long run.
-WHOLE, FORCE_NOISE, MOMENT_NOISE, RESPONSE, STEADY = 0, 1, 2, 3, 4
-SENSOR = 5
+#: What is kept of each sample beside arrays: its time and length [s], mean inserted length [m],
+#: growth of the tissue by swelling, the readings of the wrench [N, N m], and the sum and the
+#: number of the squared normalized innovations.
+SAMPLE = np.dtype(
+    [
+        (name, float)
+        for name in ('time', 'span', 'depth', 'growth', 'lateral', 'moment', 'nis', 'degrees')
+    ]
+)
 
-# Slots of a row of `book` after the state; then g, omega (n each) and two changes of basis.
-TIME, SPAN, LATERAL, MOMENT, NIS, DEGREES = 0, 1, 2, 3, 4, 5
-HEADER = 6
 
-# Columns of `tips`.
-START, END, VALUE = 0, 1, 2
+class LowPass(NamedTuple):
+    """
+    The low-pass of a channel of the wrench: f entries, its memory and its reading.
 
-# Slots of the outputs after q and q_dot.
-TIP, TIP_SPREAD, LOAD = 0, 1, 2
-OUTPUTS = 3
+    Attributes
+    ----------
+    ticks : int
+        Samples of the force sensor in a sample of the filter.
+    transition : ndarray, shape (f, f)
+        Transition over a sample of the filter.
+    noise : ndarray, shape (2, f, f)
+        Covariance of what noise adds over it, for the force and for the moment.
+    response : ndarray, shape (ticks, f)
+        What an input of one leaves so many ticks later.
+    steady : ndarray, shape (f,)
+        What a constant input of one leaves in the long run.
+
+    """
+
+    ticks: int
+    transition: FloatArray
+    noise: FloatArray
+    response: FloatArray
+    steady: FloatArray
+
+
+class Noise(NamedTuple):
+    """
+    What is uncertain.
+
+    Attributes
+    ----------
+    force : float
+        Spectral density of the distributed lateral force [N^2 s/m].
+    prior : float
+        Variance of the tip deflection at the start [m^2].
+    tip : float
+        Variance of a sample of the tip deflection [m^2].
+    reading : tuple of float
+        Variances of the readings of lateral force [N^2] and moment [N^2 m^2], behind the low-pass.
+    wrench : tuple of float
+        Variances of their white noise before it.
+
+    """
+
+    force: float
+    prior: float
+    tip: float
+    reading: tuple[float, float]
+    wrench: tuple[float, float]
+
+
+class Filter(NamedTuple):
+    """
+    The filter and its past: arrays with one row for each of the samples that are kept.
+
+    Attributes
+    ----------
+    needle : Needle
+        Needle and tissue as the observer believes them to be.
+    noise : Noise
+        What is uncertain.
+    low_pass : LowPass
+        The low-pass of the wrench.
+    samples : ndarray of `SAMPLE`, shape (slots,)
+        What is kept of each sample.
+    states : ndarray, shape (slots, N)
+        State after it, see `kalman`.
+    covariances, transitions : ndarray, shape (slots, N, N)
+        Its covariance, and the transition over the sample.
+    shapes, inverses : ndarray, shape (slots, n, n)
+        Normal modes at the mean depth, as in `NormalModes`.
+    squares, tips : ndarray, shape (slots, n)
+        Squares of their frequencies, and their values at the tip.
+    changes : ndarray, shape (slots, 2 n, 2 n)
+        Change of basis from the sample before.
+    exposures : ndarray, shape (m, 3)
+        Samples of the tip deflection in order: start and end of the exposure [s], mean [m].
+
+    """
+
+    needle: Needle
+    noise: Noise
+    low_pass: LowPass
+    samples: NDArray[np.void]
+    states: FloatArray
+    covariances: FloatArray
+    transitions: FloatArray
+    shapes: FloatArray
+    inverses: FloatArray
+    squares: FloatArray
+    tips: FloatArray
+    changes: FloatArray
+    exposures: FloatArray
+
+
+@inlined
+def _modes(f: Filter, slot: int) -> NormalModes:
+    """Return the normal modes of a sample."""
+    return NormalModes(f.shapes[slot], f.inverses[slot], f.squares[slot])
+
+
+@inlined
+def _growth(needle: Needle, time: float) -> float:
+    return growth_at(needle.swelling, needle.swelling_time, max(time, 0.0))
 
 
 @compiled
-def _cholesky(density: float, at: FloatArray, n: int, factor: FloatArray) -> None:
-    """Write the lower Cholesky factor of the modal mass rho A G."""
-    for j in range(n):
-        for i in range(j, n):
-            value = density * at[j * n - j * (j - 1) // 2 + i - j]
-            for k in range(j):
-                value -= factor[i, k] * factor[j, k]
-            factor[i, j] = sqrt(value) if i == j else value / factor[j, j]
-
-
-@compiled
-def _diagonalize(matrix: FloatArray, basis: FloatArray, n: int) -> None:
-    """Diagonalize a positive definite matrix in place by Jacobi rotations; vectors in basis."""
-    for i in range(n):
-        for j in range(n):
-            basis[i, j] = 1.0 if i == j else 0.0
-    for _ in range(30):
-        largest = 0.0
-        for i in range(n):
-            for j in range(i + 1, n):
-                off = matrix[i, j]
-                scale = sqrt(matrix[i, i] * matrix[j, j])
-                largest = max(largest, abs(off) / scale)
-                if abs(off) <= 1e-17 * scale:
-                    continue
-                tau = (matrix[j, j] - matrix[i, i]) / (2.0 * off)
-                t = (1.0 if tau >= 0.0 else -1.0) / (abs(tau) + sqrt(1.0 + tau * tau))
-                cj = 1.0 / sqrt(1.0 + t * t)
-                sj = t * cj
-                for k in range(n):
-                    x, y = matrix[k, i], matrix[k, j]
-                    matrix[k, i], matrix[k, j] = cj * x - sj * y, sj * x + cj * y
-                for k in range(n):
-                    x, y = matrix[i, k], matrix[j, k]
-                    matrix[i, k], matrix[j, k] = cj * x - sj * y, sj * x + cj * y
-                for k in range(n):
-                    x, y = basis[k, i], basis[k, j]
-                    basis[k, i], basis[k, j] = cj * x - sj * y, sj * x + cj * y
-        if largest <= 1e-16:
-            break
-
-
-@compiled
-def _layer(tissue: FloatArray, depth: float) -> int:
-    """Return the row of ``tissue`` that holds a depth."""
-    layer = 0
-    while layer + 1 < tissue.shape[0] and depth >= tissue[layer + 1, 0]:
-        layer += 1
-    return layer
-
-
-@compiled
-def _normal_modes(  # noqa: C901
-    fixed: FloatArray,
-    tissue: FloatArray,
-    at: FloatArray,
-    depth: float,
-    growth: float,
-    basis: FloatArray,
-    work: FloatArray,
-) -> None:
+def begin(held: Held[Filter], time: float, span: float, depth: float) -> None:
     """
-    Write the normal modes of the inserted part: q = N a with N^T rho A G N = 1.
-
-    ``basis``, shape (2 n + 1, n), takes N, rho A G and the frequencies omega.
-    """
-    n = basis.shape[1]
-    pairs = n * (n + 1) // 2
-    layer = _layer(tissue, depth)
-    ka = growth * tissue[layer, 1]
-    factor, stiff, vectors = work[0], work[1], work[2]
-    _cholesky(fixed[DENSITY], at, n, factor)
-    pair = 0
-    for i in range(n):
-        for j in range(i, n):
-            basis[n + i, j] = basis[n + j, i] = fixed[DENSITY] * at[pair]
-            stiff[i, j] = stiff[j, i] = (
-                fixed[BENDING] * at[pairs + pair]
-                + ka * at[pair]
-                + growth * tissue[layer, 2 + pair]
-            )
-            pair += 1
-    # L^-1 K L^-T, by columns and then by rows.
-    for k in range(n):
-        for i in range(n):
-            value = stiff[i, k]
-            for j in range(i):
-                value -= factor[i, j] * stiff[j, k]
-            stiff[i, k] = value / factor[i, i]
-    for k in range(n):
-        for i in range(n):
-            value = stiff[k, i]
-            for j in range(i):
-                value -= factor[i, j] * stiff[k, j]
-            stiff[k, i] = value / factor[i, i]
-    for i in range(n):
-        for j in range(i):
-            stiff[i, j] = stiff[j, i] = 0.5 * (stiff[i, j] + stiff[j, i])
-    _diagonalize(stiff, vectors, n)
-    for i in range(n):
-        # Ascending, so that a mode keeps its place while the depth changes.
-        least = i
-        for k in range(i + 1, n):
-            if stiff[k, k] < stiff[least, least]:
-                least = k
-        if least != i:
-            stiff[i, i], stiff[least, least] = stiff[least, least], stiff[i, i]
-            for k in range(n):
-                vectors[k, i], vectors[k, least] = vectors[k, least], vectors[k, i]
-    for k in range(n):
-        basis[2 * n, k] = sqrt(stiff[k, k])
-        for i in range(n - 1, -1, -1):
-            value = vectors[i, k]
-            for j in range(i + 1, n):
-                value -= factor[j, i] * basis[j, k]
-            basis[i, k] = value / factor[i, i]
-
-
-@compiled
-def _change(
-    fixed: FloatArray, old: FloatArray, new: FloatArray, by_c: FloatArray, by_b: FloatArray
-) -> None:
-    """
-    Write how c and b change from one basis to another at once; turn the new modes the old way.
-
-    q and the momenta rho A G q_dot (as printed, the rates) go on as they are.
-    """
-    n = new.shape[1]
-    for i in range(n):
-        for attempt in range(2):
-            for k in range(n):
-                same_q, same_p = 0.0, 0.0
-                for j in range(n):
-                    new_m, old_m = 0.0, 0.0
-                    for m in range(n):
-                        new_m += new[m, i] * new[n + m, j]
-                        old_m += new[m, i] * old[n + m, j]
-                    same_q += new_m * old[j, k]
-                    same_p += old_m * old[j, k]
-                by_c[i, k] = same_q * new[2 * n, i] / old[2 * n, k]
-                by_b[i, k] = same_q if fixed[PRINTED] != 0.0 else same_p
-            if attempt == 1 or by_c[i, i] >= 0.0:
-                break
-            for m in range(n):
-                new[m, i] = -new[m, i]
-
-
-@compiled
-def _means(rate: float, since: float, until: float) -> tuple[float, float]:
-    """Return the means of cos(rate t) and sin(rate t) over a time."""
-    middle, half = 0.5 * rate * (since + until), 0.5 * rate * (until - since)
-    # The next term is below 1e-18.
-    mean = sin(half) / half if abs(half) > 1e-4 else 1.0 - half * half / 6.0
-    return mean * cos(middle), mean * sin(middle)
-
-
-@compiled
-def _settle(
-    by_c: float, by_b: float, one: float, other: float, since: float, until: float
-) -> tuple[float, float, float, float]:
-    """
-    Spread a small change diag(by_c, by_b) of basis over a time in which the modes turn.
-
-    Depth changes evenly, not at once: what mode ``other`` gives to ``one``, of these
-    frequencies, is the mean over the rotation in between. Slow modes do not turn and take the
-    change as it is; of fast ones only the part remains that keeps the action energy / omega.
-    Returned as (c by c, c by b, b by c, b by b).
-    """
-    turn, mirror = 0.5 * (by_c + by_b), 0.5 * (by_c - by_b)
-    cos_d, sin_d = _means(other - one, since, until)
-    cos_s, sin_s = _means(other + one, since, until)
-    return (
-        turn * cos_d + mirror * cos_s,
-        turn * sin_d + mirror * sin_s,
-        mirror * sin_s - turn * sin_d,
-        turn * cos_d - mirror * cos_s,
-    )
-
-
-@compiled
-def _swing(omega: float, rate: float, t: float) -> tuple[float, float, float, float]:
-    """
-    Return the transition of c_dot = omega b, b_dot = -omega c - rate b over a time t.
-
-    Returned as (c by c, c by b, b by c, b by b).
-    """
-    half = 0.5 * rate
-    square = omega * omega - half * half
-    reach = square * t * t
-    if abs(reach) < 1e-6:
-        # Near critical damping, or a short time: the next terms are below 1e-14.
-        even = (1.0 - 0.5 * reach) * exp(-half * t)
-        odd = t * (1.0 - reach / 6.0) * exp(-half * t)
-    elif square > 0.0:
-        turn = sqrt(square)
-        fall = exp(-half * t)
-        even, odd = fall * cos(turn * t), fall * sin(turn * t) / turn
-    else:
-        turn = sqrt(-square)
-        # omega^2 / (half + turn) is half - turn without cancellation.
-        slow, fast = exp(-omega * omega / (half + turn) * t), exp(-(half + turn) * t)
-        even, odd = 0.5 * (slow + fast), 0.5 * (slow - fast) / turn
-    return even + half * odd, omega * odd, -omega * odd, even - half * odd
-
-
-@compiled
-def _reaction(
-    fixed: FloatArray,
-    tissue: FloatArray,
-    at: FloatArray,
-    basis: FloatArray,
-    depth: float,
-    speed: float,
-    growth: float,
-    rows: FloatArray,
-) -> None:
-    """
-    Write the impulse of the base's lateral force and moment per change of c and b.
-
-    Balance of momentum over the inserted part, as in `NeedleModel.base_reaction`: the integral
-    of the state over a time is what its change over that time says. ``rows`` is (2, 2 n).
-    """
-    n = basis.shape[1]
-    pairs = n * (n + 1) // 2
-    layer = _layer(tissue, depth)
-    ka, rho, damping = growth * tissue[layer, 1], fixed[DENSITY], fixed[DAMPING]
-    rate = damping / rho
-    for channel in range(2):
-        first = 2 * pairs + 2 * n + channel * n
-        above = 2 + pairs + channel * n
-        # What enters brings the momentum of the tip, and the inserted part is slowed by it.
-        entering = rho * speed * (1.0 if channel == 0 else depth)
-        if fixed[PRINTED] == 0.0:
-            for k in range(n):
-                area, tip = 0.0, 0.0
-                for i in range(n):
-                    area += at[first + i] * basis[i, k]
-                    tip += at[2 * pairs + i] * basis[i, k]
-                entering -= rho * rho * speed * area * tip
-        for k in range(n):
-            inertia, held, carried = 0.0, 0.0, 0.0
-            for i in range(n):
-                shape = basis[i, k]
-                inertia += rho * at[first + i] * shape
-                held += (ka * at[first + i] + growth * tissue[layer, above + i]) * shape
-                carried += (damping * at[first + i] + entering * at[2 * pairs + i]) * shape
-            omega = basis[2 * n, k]
-            compliance = held / (omega * omega)
-            rows[channel, k] = (carried - compliance * rate) / omega
-            rows[channel, n + k] = inertia - compliance
-    outside = fixed[LENGTH] - depth
-    for k in range(2 * n):
-        rows[1, k] += outside * rows[0, k]
-
-
-@compiled
-def begin(
-    fixed: FloatArray,
-    sensor: FloatArray,
-    tissue: FloatArray,
-    at: FloatArray,
-    basis: FloatArray,
-    pairs: FloatArray,
-    book: FloatArray,
-    work: FloatArray,
-    slot: int,
-    time: float,
-    span: float,
-    depth: float,
-    growth: float,
-) -> None:
-    """
-    Write the state before any measurement into a slot.
+    Write the state before any measurement into the first slot.
 
     Every c and b has the same variance: the one that gives the tip its variance. What the memory
     of the low-pass holds is a constant and a white wrench as large as such a needle exerts.
+
+    Parameters
+    ----------
+    held : Held of Filter
+        The filter; overwritten.
+    time, span : float
+        Time of the first sample and length of a sample [s].
+    depth : float
+        Inserted length [m].
+
     """
-    n, filters = basis.shape[1], sensor.shape[2]
-    modal, tip = 2 * n, n * (n + 1)
-    _normal_modes(fixed, tissue, at, depth, growth, basis, work)
-    _reaction(fixed, tissue, at, basis, depth, 0.0, growth, work[3])
+    f = held.value
+    needle, low_pass = f.needle, f.low_pass
+    n, filters = f.squares.shape[1], low_pass.steady.shape[0]
+    frozen = freeze(needle, depth, _growth(needle, time), _modes(f, 0))
+    impulse = np.empty((2, 2 * n))
+    base_impulse(needle, frozen, 0.0, impulse)
     share = 0.0
     for k in range(n):
-        value = 0.0
+        tip = 0.0
         for i in range(n):
-            value += at[tip + i] * basis[i, k]
-        share += (value / basis[2 * n, k]) ** 2
-    variance = fixed[TIP_PRIOR] / share
-    book[slot] = 0.0
-    size = pairs.shape[2]
-    book[slot, size + TIME] = time
-    covariance = pairs[slot, 0]
+            tip += frozen.at.value[i] * frozen.modes.shapes[i, k]
+        share += tip * tip / frozen.modes.squares[k]
+    variance = f.noise.prior / share
+    sample = f.samples[0]
+    sample['time'], sample['depth'], sample['growth'] = time, depth, frozen.growth
+    sample['nis'] = sample['degrees'] = 0.0
+    f.states[0] = 0.0
+    covariance = f.covariances[0]
     covariance[:] = 0.0
-    for i in range(modal):
+    for i in range(2 * n):
         covariance[i, i] = variance
-    tick = span / fixed[TICKS]
+    tick, rate = span / low_pass.ticks, needle.tissue_damping / needle.linear_density
     for channel in range(2):
         reaction = 0.0
         for k in range(n):
-            omega = basis[2 * n, k]
-            cc, cb, bc, bb = _swing(omega, fixed[DAMPING] / fixed[DENSITY], tick)
-            c, b = work[3, channel, k], work[3, channel, n + k]
-            reaction += (c * (cc - 1.0) + b * bc) ** 2 + (c * cb + b * (bb - 1.0)) ** 2
-        reaction *= variance / (tick * tick)
-        first = modal + channel * filters
-        noise = fixed[FORCE_INPUT + channel]
+            by_c, by_b = _over(rate, frozen.modes.squares[k], impulse[channel], k, tick)
+            reaction += by_c * by_c + by_b * by_b
+        reaction *= variance
+        first = 2 * n + channel * filters
         for i in range(filters):
-            covariance[first + i, first + i] += noise + reaction
+            covariance[first + i, first + i] += f.noise.wrench[channel] + reaction
             for j in range(filters):
-                held = sensor[STEADY, 0, i] * sensor[STEADY, 0, j]
+                held = low_pass.steady[i] * low_pass.steady[j]
                 covariance[first + i, first + j] += reaction * held
 
 
-@compiled
-def _prepare(  # noqa: C901
-    fixed: FloatArray,
-    sensor: FloatArray,
-    tissue: FloatArray,
-    at: FloatArray,
-    basis: FloatArray,
-    transition: FloatArray,
-    page: FloatArray,
-    work: FloatArray,
-    span: float,
-    depth: float,
-    speed: float,
-    growth: float,
-    moved: bool,
+@inlined
+def _over(
+    rate: float, square: float, impulse: FloatArray, k: int, tick: float
+) -> tuple[float, float]:
+    """Return the mean force over the next tick per c and b of a mode."""
+    cc, cb, bc, bb = turn(rate, square, tick)
+    c, b = impulse[k] / tick, impulse[impulse.shape[0] // 2 + k] / tick
+    return c * (cc - 1.0) + b * bc, c * cb + b * (bb - 1.0)
+
+
+@inlined
+def _write_transition(
+    f: Filter, frozen: Frozen, change: FloatArray, span: float, velocity: float, out: FloatArray
 ) -> None:
-    """
-    Write the transition over one sample, frozen at its mean depth, and renew the basis.
-
-    ``page`` takes the tip's share in c, the frequencies, and the changes of basis of c and b.
-    """
-    n, filters = basis.shape[1], sensor.shape[2]
-    modal, tip, square = 2 * n, n * (n + 1), n * n
-    rate = fixed[DAMPING] / fixed[DENSITY]
-    to_c, to_b = work[4], work[5]
-    if moved:
-        old = work[6, :, :n]
-        for i in range(modal + 1):
-            for k in range(n):
-                old[i, k] = basis[i, k]
-        _normal_modes(fixed, tissue, at, depth, growth, basis, work)
-        _change(fixed, old, basis, to_c, to_b)
-        for i in range(n):
-            for k in range(n):
-                same = 1.0 if i == k else 0.0
-                cc, _, _, bb = _settle(
-                    to_c[i, k] - same, to_b[i, k] - same, basis[modal, i], basis[modal, k],
-                    -0.5 * span, 0.5 * span,
-                )  # fmt: skip
-                to_c[i, k], to_b[i, k] = same + cc, same + bb
-    else:
-        for i in range(n):
-            for k in range(n):
-                to_c[i, k] = to_b[i, k] = 1.0 if i == k else 0.0
+    """Write the transition over a sample: change of basis, then modes that drive the low-pass."""
+    needle, low_pass = f.needle, f.low_pass
+    n, filters, ticks = f.squares.shape[1], low_pass.steady.shape[0], low_pass.ticks
+    modal, tick, rate = 2 * n, span / ticks, needle.tissue_damping / needle.linear_density
+    impulse, drive = np.empty((2, modal)), np.zeros((2 * filters, modal))
+    base_impulse(needle, frozen, velocity, impulse)
+    out[:] = 0.0
     for k in range(n):
-        value = 0.0
-        for i in range(n):
-            value += at[tip + i] * basis[i, k]
-        page[k] = value / basis[modal, k]
-        page[n + k] = basis[modal, k]
-        for i in range(n):
-            page[modal + i * n + k] = to_c[i, k]
-            page[modal + square + i * n + k] = to_b[i, k]
-
-    transition[:] = 0.0
-    for i in range(n):
-        cc, cb, bc, bb = _swing(basis[modal, i], rate, span)
-        for k in range(n):
-            transition[i, k] = cc * to_c[i, k]
-            transition[i, n + k] = cb * to_b[i, k]
-            transition[n + i, k] = bc * to_c[i, k]
-            transition[n + i, n + k] = bb * to_b[i, k]
-    rows, drive = work[3], work[0]
-    _reaction(fixed, tissue, at, basis, depth, speed, growth, rows)
-    ticks = int(fixed[TICKS])
-    tick = span / ticks
-    for i in range(2 * filters):
-        for k in range(modal):
-            drive[i, k] = 0.0
-    for k in range(n):
-        cc, cb, bc, bb = _swing(basis[modal, k], rate, tick)
+        square = frozen.modes.squares[k]
+        cc, cb, bc, bb = turn(rate, square, span)
+        for j in range(modal):
+            out[k, j] = cc * change[k, j] + cb * change[n + k, j]
+            out[n + k, j] = bc * change[k, j] + bb * change[n + k, j]
+        cc, cb, bc, bb = turn(rate, square, tick)
         for channel in range(2):
-            # The mean over a tick is what the change of the state over it makes of it.
-            c, b = rows[channel, k] / tick, rows[channel, n + k] / tick
-            by_c, by_b = c * (cc - 1.0) + b * bc, c * cb + b * (bb - 1.0)
+            by_c, by_b = _over(rate, square, impulse[channel], k, tick)
             for count in range(ticks):
                 for i in range(filters):
-                    left = sensor[RESPONSE, ticks - 1 - count, i]
+                    left = low_pass.response[ticks - 1 - count, i]
                     drive[channel * filters + i, k] += left * by_c
                     drive[channel * filters + i, n + k] += left * by_b
                 by_c, by_b = by_c * cc + by_b * bc, by_c * cb + by_b * bb
     for channel in range(2):
-        own, first = channel * filters, modal + channel * filters
+        first = modal + channel * filters
         for i in range(filters):
-            for k in range(n):
-                by_c, by_b = 0.0, 0.0
-                for j in range(n):
-                    by_c += drive[own + i, j] * to_c[j, k]
-                    by_b += drive[own + i, n + j] * to_b[j, k]
-                transition[first + i, k] = by_c
-                transition[first + i, n + k] = by_b
+            for k in range(modal):
+                part = drive[channel * filters + i, k]
+                for j in range(modal):
+                    out[first + i, j] += part * change[k, j]
             for j in range(filters):
-                transition[first + i, first + j] = sensor[WHOLE, i, j]
+                out[first + i, first + j] = low_pass.transition[i, j]
 
 
-@compiled
-def _measure(
-    x: FloatArray,
-    covariance: FloatArray,
-    index: int,
-    value: float,
-    variance: float,
-    size: int,
-    work: FloatArray,
-) -> float:
-    """Take in a reading of one entry of the state, in Joseph's form; return its NIS."""
-    spread: float = covariance[index, index] + variance
-    if spread <= 0.0:
-        return 0.0
-    column, gain = work[0], work[1]
-    own = covariance[index, index]
-    innovation: float = value - x[index]
-    for i in range(size):
-        column[i] = covariance[i, index]
-        gain[i] = column[i] / spread
-        x[i] += gain[i] * innovation
-    for i in range(size):
-        left = column[i] - gain[i] * own
-        for j in range(i + 1):
-            reduced = covariance[i, j] - gain[i] * column[j]
-            reduced += (variance * gain[i] - left) * gain[j]
-            covariance[i, j] = covariance[j, i] = reduced
-    return innovation * innovation / spread
-
-
-@compiled
+@inlined
 def _expose(
-    fixed: FloatArray,
-    x: FloatArray,
-    covariance: FloatArray,
-    page: FloatArray,
-    n: int,
+    f: Filter,
+    slot: int,
     start: float,
     end: float,
     exposure: float,
+    x: FloatArray,
+    covariance: FloatArray,
     work: FloatArray,
 ) -> None:
     """Add a part of the sample, times from its start, to the running mean of the tip."""
-    modal, square = 2 * n, n * n
-    last = x.shape[0] - 1
-    rate = fixed[DAMPING] / fixed[DENSITY]
-    row, shared, fresh = work[0], work[1], work[2]
+    n = f.squares.shape[1]
+    change, fresh, row = f.changes[slot], work[0], work[1, : 2 * n]
+    rate = f.needle.tissue_damping / f.needle.linear_density
     for k in range(n):
-        omega = page[n + k]
-        c1, c2, c3, c4 = _swing(omega, rate, start)
-        e1, e2, e3, e4 = _swing(omega, rate, end)
-        share = -page[k] / (omega * exposure)
+        square = f.squares[slot, k]
+        omega = sqrt(square)
+        c1, c2, c3, c4 = turn(rate, square, start)
+        e1, e2, e3, e4 = turn(rate, square, end)
+        # Integral of c over the time, from the change of the state over it.
+        share = -f.tips[slot, k] / (square * exposure)
         fresh[k] = share * (e3 - c3 + rate / omega * (e1 - c1))
         fresh[n + k] = share * (e4 - c4 + rate / omega * (e2 - c2))
-    for k in range(n):
-        row[k], row[n + k] = 0.0, 0.0
-        for i in range(n):
-            row[k] += fresh[i] * page[modal + i * n + k]
-            row[n + k] += fresh[n + i] * page[modal + square + i * n + k]
-    for j in range(last + 1):
-        shared[j] = 0.0
-        for i in range(modal):
-            shared[j] += row[i] * covariance[i, j]
-    own = 2.0 * shared[last]
-    for i in range(modal):
-        x[last] += row[i] * x[i]
-        own += row[i] * shared[i]
-    for j in range(last):
-        covariance[last, j] += shared[j]
-        covariance[j, last] = covariance[last, j]
-    covariance[last, last] += own
+    for k in range(2 * n):
+        row[k] = 0.0
+        for i in range(2 * n):
+            row[k] += fresh[i] * change[i, k]
+    add_to_mean(x, covariance, row, work[2])
 
 
 @compiled
-def _forget(x: FloatArray, covariance: FloatArray) -> None:
-    """Start the running mean of the tip anew."""
-    last = x.shape[0] - 1
-    x[last] = 0.0
-    for j in range(last + 1):
-        covariance[last, j] = covariance[j, last] = 0.0
-
-
-@compiled
-def _propagate(  # noqa: C901
-    x: FloatArray,
-    covariance: FloatArray,
-    transition: FloatArray,
-    modal: int,
-    filters: int,
-    size: int,
-    work: FloatArray,
-) -> None:
-    """Take state and covariance through the transition, in place; the last entry stays."""
-    # Rows of both are added up, which the processor does several entries at a time.
-    turned, fresh = work[0], work[1, 0]
-    end = modal + 2 * filters
-    for i in range(end):
-        # Modes drive the low-pass of both channels; its reading is not remembered.
-        low = modal + (i - modal) // filters * filters if i >= modal else 0
-        high = low + filters - 1 if i >= modal else 0
-        value = 0.0
-        row = work[2, 0]
-        for k in range(size):
-            row[k] = 0.0
-        for m in range(modal):
-            part = transition[i, m]
-            value += part * x[m]
-            for k in range(size):
-                row[k] += part * covariance[m, k]
-        for m in range(low, high):
-            part = transition[i, m]
-            value += part * x[m]
-            for k in range(size):
-                row[k] += part * covariance[m, k]
-        fresh[i] = value
-        for k in range(size):
-            turned[k, i] = row[k]
-    for i in range(end):
-        x[i] = fresh[i]
-        low = modal + (i - modal) // filters * filters if i >= modal else 0
-        high = low + filters - 1 if i >= modal else 0
-        row = covariance[i]
-        for k in range(i, end):
-            row[k] = 0.0
-        for m in range(modal):
-            part = transition[i, m]
-            for k in range(i, end):
-                row[k] += part * turned[m, k]
-        for m in range(low, high):
-            part = transition[i, m]
-            for k in range(i, end):
-                row[k] += part * turned[m, k]
-        for k in range(i, end):
-            covariance[k, i] = row[k]
-        for k in range(end, size):
-            covariance[i, k] = covariance[k, i] = turned[k, i]
-
-
-@compiled
-def _advance(  # noqa: C901
-    fixed: FloatArray,
-    sensor: FloatArray,
-    pairs: FloatArray,
-    book: FloatArray,
-    tips: FloatArray,
-    count: int,
-    work: FloatArray,
-    old: int,
-    new: int,
-) -> None:
+def _advance(f: Filter, count: int, old: int, new: int) -> None:  # noqa: C901
     """Fill the slot ``new`` from the slot ``old``, with what was measured in between."""
-    size, filters = pairs.shape[2], sensor.shape[2]
-    modal = size - 1 - 2 * filters
-    n = modal // 2
-    last = size - 1
-    x, covariance = book[new, :size], pairs[new, 0]
-    for i in range(size):
-        x[i] = book[old, i]
-        for j in range(size):
-            covariance[i, j] = pairs[old, 0, i, j]
-    header = book[new, size:]
-    t0, t1, span = book[old, size + TIME], header[TIME], header[SPAN]
+    n, filters, size = f.squares.shape[1], f.low_pass.steady.shape[0], f.states.shape[1]
+    modal, last = 2 * n, size - 1
+    work = np.empty((size + 2, size))
+    x, covariance = f.states[new], f.covariances[new]
+    x[:] = f.states[old]
+    covariance[:] = f.covariances[old]
+    sample = f.samples[new]
+    t0, t1, span = f.samples[old]['time'], sample['time'], sample['span']
     # White noise of the sample, half of it at either end: the trapezoidal rule.
-    kick = 0.5 * span * fixed[NOISE] / fixed[DENSITY]
+    kick = 0.5 * span * f.noise.force / f.needle.linear_density
     for k in range(n, modal):
         covariance[k, k] += kick
     nis, degrees = 0.0, 0.0
     for w in range(count):
-        start, end = tips[w, START], tips[w, END]
+        start, end, value = f.exposures[w]
         if end <= t0:
             continue
         if start >= t1:
             break
         if start >= t0:
-            _forget(x, covariance)
-        pace = span / (t1 - t0)
-        since, until = max(start - t0, 0.0) * pace, min(end - t0, t1 - t0) * pace
-        _expose(
-            fixed, x, covariance, header[HEADER:], n, since, until, (end - start) * pace, work[0]
-        )
+            clear_mean(x, covariance)
+        # Spans of irregular stamps are stretched to whole periods.
+        stretch = span / (t1 - t0)
+        since, until = max(start - t0, 0.0) * stretch, min(end - t0, t1 - t0) * stretch
+        _expose(f, new, since, until, (end - start) * stretch, x, covariance, work)
         if end <= t1:
-            nis += _measure(
-                x, covariance, last, tips[w, VALUE], fixed[TIP_VARIANCE], size, work[0]
-            )
+            nis += measure(x, covariance, last, value, f.noise.tip, size, work)
             degrees += 1.0
-            _forget(x, covariance)
+            clear_mean(x, covariance)
     used = size if covariance[last, last] > 0.0 else last
-    _propagate(x, covariance, pairs[new, 1], modal, filters, used, work)
+    propagate(x, covariance, f.transitions[new], modal, filters, used, work)
+    readings = (sample['lateral'], sample['moment'])
     for channel in range(2):
         first = modal + channel * filters
         for i in range(filters):
             for j in range(filters):
-                covariance[first + i, first + j] += sensor[FORCE_NOISE + channel, i, j]
+                covariance[first + i, first + j] += f.low_pass.noise[channel, i, j]
     for channel in range(2):
-        reading = header[LATERAL + channel]
-        # A reading that is missing is not a number.
+        reading, variance = readings[channel], f.noise.reading[channel]
+        # A reading that is missing is NaN.
         if reading == reading:
             index = modal + (channel + 1) * filters - 1
-            variance = fixed[FORCE_VARIANCE + channel]
-            nis += _measure(x, covariance, index, reading, variance, used, work[0])
+            nis += measure(x, covariance, index, reading, variance, used, work)
             degrees += 1.0
     for k in range(n, modal):
         covariance[k, k] += kick
-    header[NIS], header[DEGREES] = nis, degrees
+    sample['nis'], sample['degrees'] = nis, degrees
 
 
 @compiled
 def observe(
-    fixed: FloatArray,
-    sensor: FloatArray,
-    tissue: FloatArray,
-    at: FloatArray,
-    basis: FloatArray,
-    pairs: FloatArray,
-    book: FloatArray,
-    tips: FloatArray,
-    work: FloatArray,
+    held: Held[Filter],
     count: int,
     old: int,
     new: int,
     time: float,
     span: float,
     depth: float,
-    speed: float,
-    growth: float,
-    moved: bool,
+    velocity: float,
     lateral: float,
     moment: float,
 ) -> None:
     """
-    Take in one sample: from the slot ``old`` to ``new``, at mean depth and speed between them.
+    Take in one sample.
 
     Parameters
     ----------
-    fixed : ndarray, shape (FIXED,)
-        Constants.
-    sensor : ndarray, shape (SENSOR, f, f)
-        Low-pass of the wrench.
-    tissue : ndarray, shape (layers, 2 + pairs + 2 n)
-        Start and stiffness of each layer, and what those above add.
-    at : ndarray, shape (n (n + 1) + 4 n,)
-        `ModeShapes.packed` at ``depth``.
-    basis : ndarray, shape (2 n + 1, n)
-        Normal modes of the last sample; renewed if the depth has ``moved``.
-    pairs : ndarray, shape (slots, 2, N, N)
-        Covariance, and transition from the slot before.
-    book : ndarray, shape (slots, N + HEADER + 2 n + 2 n^2)
-        State and what goes with it.
-    tips : ndarray, shape (m, 3)
-        Exposures of the tip in order: start, end, mean. ``count`` of them are valid.
-    work : ndarray, shape (7, N, N)
-        Scratch.
-    count, old, new : int
-        As above.
+    held : Held of Filter
+        The filter; overwritten.
+    count : int
+        Number of valid exposures.
+    old, new : int
+        Slots of the sample before and of this one.
     time, span : float
-        Time of the new slot and length of the sample [s].
-    depth, speed, growth : float
-        Means over the sample; growth of the tissue's stiffness.
-    moved : bool
-        Whether the depth or the growth differs from that of the basis.
+        Time of the sample, and its length [s].
+    depth, velocity : float
+        Means of the inserted length [m] and of the insertion velocity [m/s] over the sample.
     lateral, moment : float
-        Readings, not a number where missing.
+        Readings of the wrench [N, N m], NaN where missing.
 
     """
-    header = book[new, pairs.shape[2] :]
-    header[TIME], header[SPAN] = time, span
-    header[LATERAL], header[MOMENT] = lateral, moment
-    _prepare(
-        fixed, sensor, tissue, at, basis, pairs[new, 1], header[HEADER:], work, span, depth,
-        speed, growth, moved,
-    )  # fmt: skip
-    _advance(fixed, sensor, pairs, book, tips, count, work, old, new)
+    f = held.value
+    n = f.squares.shape[1]
+    before, sample, change = f.samples[old], f.samples[new], f.changes[new]
+    growth = _growth(f.needle, time)
+    sample['time'], sample['span'] = time, span
+    sample['depth'], sample['growth'] = depth, growth
+    sample['lateral'], sample['moment'] = lateral, moment
+    frozen = freeze(f.needle, depth, growth, _modes(f, new))
+    change_basis(f.needle, _modes(f, old), frozen.modes, -0.5 * span, 0.5 * span, change)
+    if depth == before['depth'] and growth == before['growth']:
+        # Rounding must not add up while the needle rests.
+        for i in range(2 * n):
+            for k in range(2 * n):
+                change[i, k] = 1.0 if i == k else 0.0
+    for k in range(n):
+        f.tips[new, k] = 0.0
+        for i in range(n):
+            f.tips[new, k] += frozen.at.value[i] * frozen.modes.shapes[i, k]
+    _write_transition(f, frozen, change, span, velocity, f.transitions[new])
+    _advance(f, count, old, new)
 
 
 @compiled
-def replay(
-    fixed: FloatArray,
-    sensor: FloatArray,
-    pairs: FloatArray,
-    book: FloatArray,
-    tips: FloatArray,
-    work: FloatArray,
-    count: int,
-    oldest: int,
-    newest: int,
-    since: float,
-) -> None:
-    """Fill the slots after the last one that is not later than ``since`` once more."""
-    slots, size = pairs.shape[0], pairs.shape[2]
-    slot = newest
-    while slot != oldest and book[slot, size + TIME] > since:
+def replay(held: Held[Filter], count: int, oldest: int, newest: int, since: float) -> None:
+    """
+    Fill the slots after the last one that is not later than a time once more.
+
+    Parameters
+    ----------
+    held : Held of Filter
+        The filter; overwritten.
+    count : int
+        Number of valid exposures.
+    oldest, newest : int
+        First and last slot.
+    since : float
+        Time from which on measurements have changed [s].
+
+    """
+    f = held.value
+    slots, slot = f.samples.shape[0], newest
+    while slot != oldest and f.samples[slot]['time'] > since:
         slot = slot - 1 if slot > 0 else slots - 1
     while slot != newest:
         following = slot + 1 if slot + 1 < slots else 0
-        _advance(fixed, sensor, pairs, book, tips, count, work, slot, following)
+        _advance(f, count, slot, following)
         slot = following
 
 
 @compiled
-def outputs(  # noqa: C901
-    fixed: FloatArray,
-    tissue: FloatArray,
-    at: FloatArray,
-    basis: FloatArray,
-    x: FloatArray,
-    covariance: FloatArray,
-    work: FloatArray,
+def estimate(  # noqa: C901
+    held: Held[Filter],
+    slot: int,
     depth: float,
-    growth: float,
     span: float,
-    present: FloatArray,
+    modal: FloatArray,
     jacobian: FloatArray,
-    out: FloatArray,
-) -> None:
+) -> tuple[float, float, float]:
     """
-    Return to the source's coordinates at the present depth, half a sample after the mean one.
+    Return to the coordinates of the model at the present depth, half a sample after the mean one.
 
-    ``present`` takes the normal modes there and ``jacobian``, shape (2 n, 2 n), the derivatives
-    of q and q_dot by c and b; ``out`` takes q, q_dot, the tip deflection, its standard deviation
-    and the load against insertion, the row of d of the bias forces (13) with its sign turned, of
-    the modes below half the sample rate.
+    Parameters
+    ----------
+    held : Held of Filter
+        The filter.
+    slot : int
+        The newest slot.
+    depth : float
+        Present inserted length [m].
+    span : float
+        Length of a sample [s].
+    modal : ndarray, shape (2 n,)
+        Overwritten with q [m^3/2] and q_dot [m^3/2 / s].
+    jacobian : ndarray, shape (2 n, 2 n)
+        Overwritten with their derivatives by c and b of the slot.
+
+    Returns
+    -------
+    tip, spread : float
+        Tip deflection and its standard deviation [m].
+    load : float
+        Force of the bent needle against insertion [N] by the modes below half the sample rate: of
+        faster ones, samples cannot tell the rate, and the square of it would be that of noise.
+
     """
-    n = basis.shape[1]
-    modal, tip = 2 * n, n * (n + 1)
-    _normal_modes(fixed, tissue, at, depth, growth, present, work)
-    to_c, to_b, turned = work[4], work[5], work[3]
-    _change(fixed, basis, present, to_c, to_b)
+    f = held.value
+    needle, x, covariance = f.needle, f.states[slot], f.covariances[slot]
+    n = f.squares.shape[1]
+    frozen = freeze(needle, depth, f.samples[slot]['growth'], empty_normal_modes(n))
+    at, modes = frozen.at, frozen.modes
+    change, now = np.empty((2 * n, 2 * n)), np.zeros(2 * n)
+    change_basis(needle, _modes(f, slot), modes, -0.5 * span, 0.0, change)
+    for i in range(2 * n):
+        modal[i] = 0.0
+        for k in range(2 * n):
+            now[i] += change[i, k] * x[k]
+            jacobian[i, k] = 0.0
     for i in range(n):
-        for k in range(n):
-            same = 1.0 if i == k else 0.0
-            cc, cb, bc, bb = _settle(
-                to_c[i, k] - same, to_b[i, k] - same, present[modal, i], present[modal, k],
-                -0.5 * span, 0.0,
-            )  # fmt: skip
-            turned[i, k], turned[i, n + k] = same + cc, cb
-            turned[n + i, k], turned[n + i, n + k] = bc, same + bb
+        for j in range(n):
+            shape, omega = modes.shapes[i, j], sqrt(modes.squares[j])
+            modal[i] += shape / omega * now[j]
+            modal[n + i] += shape * now[n + j]
+            for k in range(2 * n):
+                jacobian[i, k] += shape / omega * change[j, k]
+                jacobian[n + i, k] += shape * change[n + j, k]
+    deflection, variance = 0.0, 0.0
+    row = np.zeros(2 * n)
     for i in range(n):
-        for k in range(modal):
-            jacobian[i, k], jacobian[n + i, k] = 0.0, 0.0
-            for j in range(n):
-                jacobian[i, k] += present[i, j] / present[modal, j] * turned[j, k]
-                jacobian[n + i, k] += present[i, j] * turned[n + j, k]
-    for i in range(modal):
-        out[i] = 0.0
-        for k in range(modal):
-            out[i] += jacobian[i, k] * x[k]
-    bend, slow, rate, deflection, variance = 0.0, 0.0, 0.0, 0.0, 0.0
-    for i in range(n):
-        deflection += at[tip + i] * out[i]
+        deflection += at.value[i] * modal[i]
+        for k in range(2 * n):
+            row[k] += at.value[i] * jacobian[i, k]
+    for i in range(2 * n):
+        for k in range(2 * n):
+            variance += row[i] * covariance[i, k] * row[k]
+    spread = sqrt(max(variance, 0.0))
+    if needle.as_printed:
+        return deflection, spread, 0.0
+    bend, tip, rate = 0.0, 0.0, 0.0
     for j in range(n):
-        omega = present[modal, j]
-        if omega * span >= pi:
-            # Samples do not tell it from a slower one: its square would be that of noise.
-            continue
-        c, b = 0.0, 0.0
-        for k in range(modal):
-            c += turned[j, k] * x[k]
-            b += turned[n + j, k] * x[k]
-        for i in range(n):
-            slow += at[tip + i] * present[i, j] * c / omega
-            bend += at[tip + n + i] * present[i, j] * c / omega
-            rate += at[tip + i] * present[i, j] * b
-    row = work[1, 0]
-    for k in range(modal):
-        row[k] = 0.0
-        for i in range(n):
-            row[k] += at[tip + i] * jacobian[i, k]
-    for k in range(modal):
-        for m in range(modal):
-            variance += row[k] * covariance[k, m] * row[m]
-    out[modal + TIP] = deflection
-    out[modal + TIP_SPREAD] = sqrt(max(variance, 0.0))
-    out[modal + LOAD] = 0.0
-    if fixed[PRINTED] == 0.0:
-        ka = growth * tissue[_layer(tissue, depth), 1]
-        out[modal + LOAD] = 0.5 * (
-            fixed[BENDING] * bend * bend + ka * slow * slow - fixed[DENSITY] * rate * rate
-        )
+        omega = sqrt(modes.squares[j])
+        if omega * span < pi:
+            for i in range(n):
+                bend += at.curvature[i] * modes.shapes[i, j] * now[j] / omega
+                tip += at.value[i] * modes.shapes[i, j] * now[j] / omega
+                rate += at.value[i] * modes.shapes[i, j] * now[n + j]
+    density, stiffness = needle.linear_density, frozen.stiffness
+    load = coupling(density, needle.bending_stiffness, stiffness, bend, tip, rate)
+    return deflection, spread, load

@@ -3,6 +3,7 @@ Compiled functions, one concept a file.
 
 ====================  ============================================================================
 `cache`               the decorator of every compiled function; its machine code on disk
+`held`                arguments that are converted once, not at each call
 `matrices`            Cholesky factor, triangular solutions, eigenvalues of small matrices
 `integrals`           the shape modes at the tip and their integrals over the inserted part
 `tissue`              layers of tissue

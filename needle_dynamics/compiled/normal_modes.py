@@ -30,15 +30,12 @@ class NormalModes(NamedTuple):
         N^-1: a = N^-1 q. Momenta are p = N^-T a_dot.
     squares : ndarray, shape (n,)
         Squares of the natural frequencies [1/s^2], ascending.
-    factor : ndarray, shape (n, n)
-        Lower Cholesky factor of the modal mass rho A G.
 
     """
 
     shapes: FloatArray
     inverse: FloatArray
     squares: FloatArray
-    factor: FloatArray
 
 
 @compiled
@@ -57,7 +54,7 @@ def empty_normal_modes(n: int) -> NormalModes:
         Arrays of zeros.
 
     """
-    return NormalModes(np.zeros((n, n)), np.zeros((n, n)), np.zeros(n), np.zeros((n, n)))
+    return NormalModes(np.zeros((n, n)), np.zeros((n, n)), np.zeros(n))
 
 
 @compiled
@@ -118,11 +115,12 @@ def normal_modes(
 
     """
     n = stiffness.shape[0]
-    factor, mass = modes.factor, modes.inverse
+    # The Cholesky factor takes the place of the mass, and that of the inverse until the end.
+    factor = modes.inverse
     for i in range(n):
         for j in range(n):
-            mass[i, j] = density * at.gram[i, j]
-    cholesky(mass, factor)
+            factor[i, j] = density * at.gram[i, j]
+    cholesky(factor, factor)
     # L^-1 K L^-T, by columns and then by rows.
     for i in range(n):
         forward(factor, stiffness[:, i])
@@ -134,13 +132,14 @@ def normal_modes(
     diagonalize(stiffness, modes.shapes)
     for k in range(n):
         modes.squares[k] = stiffness[k, k]
+    for k in range(n):
         for i in range(n):
-            value = 0.0
+            stiffness[k, i] = 0.0
             for j in range(i + 1):
-                value += modes.shapes[j, k] * factor[i, j]
-            modes.inverse[k, i] = value
+                stiffness[k, i] += modes.shapes[j, k] * factor[i, j]
     for k in range(n):
         backward(factor, modes.shapes[:, k])
+    modes.inverse[:] = stiffness
 
 
 @compiled

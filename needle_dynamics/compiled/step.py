@@ -9,7 +9,7 @@ friction (`friction`). Steps end where a layer of tissue does, and the motion st
 
 from __future__ import annotations
 
-from math import ceil, exp, expm1, inf, nan
+from math import ceil, exp, inf, nan
 from typing import Final, NamedTuple
 
 from needle_dynamics.arrays import FloatArray
@@ -18,7 +18,7 @@ from needle_dynamics.compiled.friction import dry_friction, friction_flow, Frict
 from needle_dynamics.compiled.integrals import mode_integrals, ModeIntegrals, ModeTables
 from needle_dynamics.compiled.matrices import backward, cholesky, forward
 from needle_dynamics.compiled.modal_flow import Elasticity, rotate_many, rotate_two
-from needle_dynamics.compiled.tissue import layer_at, Layers, time_to_layer
+from needle_dynamics.compiled.tissue import growth_at, layer_at, Layers, time_to_layer
 import numpy as np
 
 #: Relative inserted length from which on graded steps grow in proportion to it.
@@ -276,7 +276,7 @@ def _steps(  # noqa: C901
         if layered:
             layer = layer_at(layers.starts, middle, layer)
         if c.swelling != 0.0:
-            growth = 1.0 - c.swelling * expm1(-(end - (left + later) + 0.5 * h) / c.swelling_time)
+            growth = growth_at(c.swelling, c.swelling_time, end - (left + later) + 0.5 * h)
         if c.tissue_damping != 0.0:
             decay = exp(-0.5 * h * c.tissue_damping / rho)
         elasticity = Elasticity(

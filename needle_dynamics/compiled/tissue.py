@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from math import inf
+from math import expm1, inf
 from typing import NamedTuple
 
 from needle_dynamics.arrays import FloatArray
@@ -92,3 +92,26 @@ def time_to_layer(layers: Layers, depth: float, velocity: float) -> float:
         if 0.0 < ahead < soonest and stiffnesses[i] != stiffnesses[i - 1]:
             soonest = ahead
     return soonest
+
+
+@compiled
+def growth_at(swelling: float, swelling_time: float, time: float) -> float:
+    """
+    Return the factor by which swelling has made the tissue stiffer.
+
+    Parameters
+    ----------
+    swelling : float
+        Relative growth of the stiffness in the long run.
+    swelling_time : float
+        Time constant of the swelling [s].
+    time : float
+        Time since the swelling began [s].
+
+    Returns
+    -------
+    float
+        1 without swelling.
+
+    """
+    return 1.0 - swelling * expm1(-time / swelling_time) if swelling != 0.0 else 1.0

@@ -95,7 +95,8 @@ class Reference:
         accel_q = np.linalg.solve(mass, force_q)
         accel_p = np.linalg.solve(mass, force_p - convected @ to_rate if not printed else force_p)
         layer = int(np.searchsorted(model.tissue.starts, depth, side='right')) - 1
-        above = model.tissue.offsets(model.modes)[layer, -2 * n :].reshape(2, n)
+        layers = model.tissue.layers(model.modes)
+        above = layers.area[layer], layers.moment[layer]
         a = np.zeros((2 * n + 3, 2 * n + 3))
         a[:n, n : 2 * n] = to_rate
         a[n : 2 * n, :n] = accel_q if printed else force_q

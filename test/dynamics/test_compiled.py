@@ -15,7 +15,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 #: What a compiled function may use besides compiled functions: nothing that changes its code
 #: without a change of the sources that its cache is stamped with.
-FREE = {'__future__', 'collections', 'math', 'needle_dynamics.arrays', 'numpy', 'typing'}
+FREE = {'__future__', 'collections', 'math', 'needle_dynamics.arrays', 'numba', 'numpy', 'typing'}
 
 CALLEE = """
 from needle_dynamics.compiled.cache import compiled

@@ -1,0 +1,164 @@
+"""What the observer takes sensors and tissue to be."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import lru_cache
+from math import nan
+from typing import Final
+
+from needle_controller.compiled.filter import LowPass, Noise
+from needle_dynamics import FloatArray, ForceSensorParameters
+from needle_dynamics.simulated.tip_sensor import TipParameters
+from needle_ros.errors import ParameterError
+from needle_ros.settings import check_constants, constant
+import numpy as np
+from scipy.linalg import cholesky, solve_discrete_lyapunov, solve_triangular
+from scipy.signal import butter
+
+#: What the plant feels with as it is by default, and hence what the observer believes in.
+_SENSOR: Final = ForceSensorParameters()
+
+
+@lru_cache(maxsize=32)
+def _low_pass(
+    cutoffs: tuple[float, ...], rate: float
+) -> tuple[FloatArray, FloatArray, FloatArray, float]:
+    """
+    Return the low-pass as transition, input and steady state of memory and reading, and its gain.
+
+    The memory is scaled so that white noise of one before the filter makes it white, of one.
+    """
+    a: FloatArray = np.zeros((0, 0))
+    b: FloatArray = np.zeros(0)
+    c: FloatArray = np.zeros(0)
+    d = 1.0
+    for cutoff in cutoffs:
+        over, under = butter(2, cutoff, fs=rate)
+        # Transposed direct form II behind what there is.
+        own = np.array([[-under[1], 1.0], [-under[2], 0.0]])
+        drive = over[1:] - under[1:] * over[0]
+        order = len(b)
+        a = np.block([[a, np.zeros((order, 2))], [np.outer(drive, c), own]])
+        b = np.concatenate([b, drive * d])
+        c, d = np.concatenate([over[0] * c, [1.0, 0.0]]), over[0] * d
+    order = len(b)
+    if order:
+        root = cholesky(solve_discrete_lyapunov(a, np.outer(b, b)), lower=True)
+        a, b = (solve_triangular(root, value, lower=True) for value in (a @ root, b))
+        c = c @ root
+    transition, drive = np.zeros((order + 1, order + 1)), np.append(b, d)
+    transition[:order, :order], transition[order, :order] = a, c
+    steady = np.linalg.solve(np.eye(order + 1) - transition, drive)
+    return transition, drive, steady, float(np.sqrt(c @ c + d * d))
+
+
+def _of_sensor(name: str, channel: int) -> float:
+    """Return a constant of the plant's force sensor as it is by default."""
+    return float(_SENSOR.per_axis(name)[channel])
+
+
+def _read_noise(channel: int, digits: int) -> float:
+    """Return the noise with which that sensor is read, behind its filters."""
+    gain = _low_pass(_SENSOR.cutoffs, _SENSOR.rate)[3]
+    return round(_of_sensor('noise', channel) * gain, digits)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ObserverSettings:
+    """
+    What the observer believes of sensors and tissue beside `NeedleParameters`.
+
+    The defaults are those of the plant's sensors as they are by default.
+    """
+
+    irregularity: float = constant(
+        1e-3, 'N s^(1/2) m^(-1/2)',
+        'root of the spectral density of a distributed lateral force, white in time and depth, '
+        'by which the tissue differs from the model (the default covers a stiffness 30 % off '
+        'down to half the needle)',
+    )  # fmt: skip
+    initial_deflection: float = constant(
+        1e-3, 'm', 'standard deviation of the tip deflection at the start', open_low=True
+    )
+    tip_noise: float = constant(
+        TipParameters().noise, 'm', 'standard deviation of a sample of the tip deflection',
+        open_low=True,
+    )  # fmt: skip
+    tip_exposure: float = constant(
+        1e-3, 's', 'time before its stamp over which a tip sample is the mean', open_low=True
+    )
+    force_noise: float = constant(
+        _read_noise(2, 6), 'N', 'standard deviation of the lateral force as it is read',
+        open_low=True,
+    )  # fmt: skip
+    torque_noise: float = constant(
+        _read_noise(3, 8), 'N m', 'standard deviation of the moment as it is read', open_low=True
+    )
+    force_resolution: float = constant(_of_sensor('resolution', 2), 'N', 'force per count')
+    torque_resolution: float = constant(_of_sensor('resolution', 3), 'N m', 'torque per count')
+    cutoffs: tuple[float, ...] = field(
+        default=_SENSOR.cutoffs,
+        metadata={
+            'description': 'low-pass filters of the wrench one after the other '
+            '(Butterworth, second order) [Hz]'
+        },
+    )
+    filter_rate: float = constant(
+        _SENSOR.rate, 'Hz', 'rate at which these filters run, each on means over its samples',
+        open_low=True,
+    )  # fmt: skip
+    history: float = constant(
+        0.25, 's', 'how far back a late tip sample may begin; longer gaps start anew',
+        open_low=True, high=10.0,
+    )  # fmt: skip
+    jump: float = constant(
+        5e-3, 'm', 'change of depth from one sample to the next that starts anew', open_low=True
+    )
+
+    def __post_init__(self) -> None:
+        check_constants(self)
+        try:
+            cutoffs = tuple(float(value) for value in self.cutoffs)
+        except (TypeError, ValueError):
+            cutoffs = (nan,)
+        if not all(0.0 < value < self.filter_rate / 2.0 for value in cutoffs):
+            raise ParameterError(
+                f'cutoffs must be > 0 and below half the filter_rate = '
+                f'{self.filter_rate / 2.0:g} Hz each, got {self.cutoffs!r}'
+            )
+        object.__setattr__(self, 'cutoffs', cutoffs)
+
+    def noise(self) -> Noise:
+        """Return the variances that the filter starts from."""
+        gain = _low_pass(self.cutoffs, self.filter_rate)[3]
+        # A count of the reading is uniform rounding.
+        counts = self.force_resolution**2 / 12.0, self.torque_resolution**2 / 12.0
+        white = (self.force_noise / gain) ** 2, (self.torque_noise / gain) ** 2
+        return Noise(
+            self.irregularity**2, self.initial_deflection**2, self.tip_noise**2, counts, white
+        )
+
+    def low_pass(self, ticks: int) -> LowPass:
+        """
+        Return the low-pass of the wrench.
+
+        Parameters
+        ----------
+        ticks : int
+            Samples of the force sensor in a sample of the observer.
+
+        Returns
+        -------
+        LowPass
+            Its transition, noise and responses over that many samples.
+
+        """
+        transition, drive, steady, _ = _low_pass(self.cutoffs, self.filter_rate)
+        response = np.empty((ticks, len(drive)))
+        response[0] = drive
+        for tick in range(1, ticks):
+            response[tick] = transition @ response[tick - 1]
+        noise = np.multiply.outer(self.noise().wrench, response.T @ response)
+        whole = np.linalg.matrix_power(transition, ticks)
+        return LowPass(ticks, whole, noise, response, steady)

@@ -1,0 +1,58 @@
+"""
+Arguments that are kept as machine code has them.
+
+At each call Numba converts every number and array of a named tuple: 6 us for fifty. What is held
+is converted once. This file imports Numba: import it where it is first needed.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Generic, TypeVar
+
+from needle_dynamics.compiled.cache import compiled
+from numba.core import types
+from numba.experimental import structref
+
+_Value = TypeVar('_Value')
+
+
+@structref.register
+class _HeldType(types.StructRef):  # type: ignore[misc]
+    """Numba's type of `Held`."""
+
+    def preprocess_fields(self, fields: Any) -> Any:
+        """Take the general type of each field."""
+        return tuple((name, types.unliteral(kind)) for name, kind in fields)
+
+
+class Held(structref.StructRefProxy, Generic[_Value]):  # type: ignore[misc]
+    """
+    A value that compiled functions take without converting it.
+
+    Its arrays are those of the value, not copies.
+
+    Parameters
+    ----------
+    value : tuple
+        Named tuple of numbers, arrays and named tuples.
+
+    Attributes
+    ----------
+    value : tuple
+        The value; for compiled functions only.
+
+    """
+
+    value: _Value
+
+    def __new__(cls, value: _Value) -> Held[_Value]:
+        """Convert the value."""
+        return _hold(value)
+
+
+structref.define_proxy(Held, _HeldType, ['value'])
+
+
+@compiled
+def _hold(value: _Value) -> Held[_Value]:
+    return Held(value)
