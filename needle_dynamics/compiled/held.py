@@ -17,12 +17,12 @@ _Value = TypeVar('_Value')
 
 
 @structref.register
-class _HeldType(types.StructRef):  # type: ignore[misc]
+class _HeldType(types.StructRef):  # type: ignore[misc, name-defined]
     """Numba's type of `Held`."""
 
     def preprocess_fields(self, fields: Any) -> Any:
         """Take the general type of each field."""
-        return tuple((name, types.unliteral(kind)) for name, kind in fields)
+        return tuple((name, types.unliteral(kind)) for name, kind in fields)  # type: ignore[attr-defined]
 
 
 class Held(structref.StructRefProxy, Generic[_Value]):  # type: ignore[misc]
