@@ -10,6 +10,7 @@ that is from being lost.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -283,6 +284,10 @@ class ControllabilityMap:
 
     Attributes
     ----------
+    parameters : NeedleParameters
+        Constants.
+    velocity : float
+        Insertion velocity [m/s].
     depths, deflections : ndarray
         Inserted lengths and tip deflections [m].
     rank, distance : ndarray
@@ -294,6 +299,8 @@ class ControllabilityMap:
 
     """
 
+    parameters: NeedleParameters
+    velocity: float
     depths: FloatArray
     deflections: FloatArray
     rank: FloatArray
@@ -310,6 +317,7 @@ def controllability_map(
     velocity: float,
     sliding: str | None = None,
     force: float = 0.0,
+    progress: Callable[[], object] | None = None,
 ) -> ControllabilityMap:
     """
     Analyze every pair of a depth and a tip deflection.
@@ -326,6 +334,8 @@ def controllability_map(
         As in `linearize`.
     force : float
         Insertion force [N].
+    progress : callable, optional
+        Called after each depth.
 
     Returns
     -------
@@ -357,7 +367,11 @@ def controllability_map(
                 found.observed.margin,
                 found.output_gain,
             )
+        if progress is not None:
+            progress()
     return ControllabilityMap(
+        parameters=parameters,
+        velocity=velocity,
         depths=depths,
         deflections=deflections,
         rank=results[0].astype(int),

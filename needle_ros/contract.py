@@ -56,14 +56,6 @@ COMMAND: Final = Qos('reliable', reliable=True, latched=False, depth=1)
 #: The last message reaches readers that come late.
 LATCHED: Final = Qos('latched', reliable=True, latched=True, depth=1)
 
-#: Every message reaches every reader, also one that comes late.
-LOG: Final = Qos('latched', reliable=True, latched=True, depth=1000)
-
-#: As rclpy listens to /clock.
-CLOCK_QOS: Final = Qos('best effort', reliable=False, latched=False, depth=1)
-
-DIAGNOSTICS_QOS: Final = Qos('reliable', reliable=True, latched=False, depth=10)
-
 
 class Joint(NamedTuple):
     """
@@ -265,7 +257,8 @@ CLOCK: Final = Topic(
     'rosgraph_msgs/msg/Clock',
     'plant',
     'simulated time, with `publish_clock` or `lockstep`',
-    qos=CLOCK_QOS,
+    # As rclpy listens to it.
+    qos=SENSOR._replace(depth=1),
 )
 
 EVENTS: Final = Topic(
@@ -274,7 +267,8 @@ EVENTS: Final = Topic(
     'plant',
     'what the plant began to apply beside commands, and the number of the sample from '
     'which it counts: [replay.md](replay.md)',
-    qos=LOG,
+    # All of them, also for a reader that comes late.
+    qos=LATCHED._replace(depth=1000),
 )
 
 WRENCH_COMMAND: Final = Topic(
@@ -340,7 +334,7 @@ DIAGNOSTICS: Final = Topic(
     'diagnostic_msgs/msg/DiagnosticArray',
     EVERY_NODE,
     'state of the node, 1 Hz and on change',
-    qos=DIAGNOSTICS_QOS,
+    qos=COMMAND._replace(depth=10),
 )
 
 #: All topics, in this order.

@@ -122,18 +122,14 @@ class IndentationRecording(_AnyRecording):
 
     Attributes
     ----------
-    name : str
-        Name of the recording, for messages.
-    time : ndarray, shape (n,)
-        Time [s], strictly increasing.
+    name, time, losses, configuration, clock_offset
+        As those of a `Recording`.
     force : ndarray, shape (n, 2)
         Force of the end-effector on the tissue, x and z [N].
     position : ndarray, shape (n, 2)
         Position of the end-effector in the plane, x and z [m].
     off_plane : ndarray, shape (n,)
         Position of the end-effector along the third axis [m]; default zero.
-    losses, configuration, clock_offset
-        As those of a `Recording`.
 
     Raises
     ------

@@ -105,7 +105,7 @@ def _write_map(parameters: NeedleParameters, options: argparse.Namespace) -> lis
         options.force,
         options.sliding,
     )
-    return report.write_map(options.output, parameters, found, speed)
+    return report.write_map(options.output, found)
 
 
 COMMAND = Command(_add_arguments, _run)

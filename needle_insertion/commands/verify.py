@@ -39,7 +39,7 @@ def _run(options: argparse.Namespace) -> int:
     for path in tqdm(options.bags, desc='bags', disable=None, delay=2.0):
         results += verify(path, options.tolerance)
     if options.json:
-        document = [result.as_mapping() for result in results]
+        document = [result.document for result in results]
         sys.stdout.write(f'{json.dumps(document, indent=2)}\n')
     else:
         sys.stdout.write('\n'.join([_table(results), *_remarks(results), '']))

@@ -30,7 +30,7 @@ def section() -> Section:
         report.analyze_points(model, DEPTHS, (deflection,), (SPEED,)) for deflection in DEFLECTIONS
     )
     first, last = straight[0].result, bent[0].result
-    figure = report.draw_map(parameters, report.map_needle(parameters, SPEED), SPEED)
+    figure = report.draw_map(report.map_needle(parameters, SPEED))
     return Section(
         title='Controllability and observability',
         paragraphs=(

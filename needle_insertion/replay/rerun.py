@@ -138,16 +138,9 @@ class Rerun:
         verdicts = {topic.verdict for topic in self.topics.values()}
         return next((v for v in ('differs', 'within tolerance') if v in verdicts), 'identical')
 
-    def as_mapping(self) -> dict[str, Any]:
-        """
-        Return the result for JSON.
-
-        Returns
-        -------
-        dict
-            All of it, by name.
-
-        """
+    @property
+    def document(self) -> dict[str, Any]:
+        """Everything for JSON, by name."""
         recorded = self.recorded
         return {
             'bag': str(recorded.path),

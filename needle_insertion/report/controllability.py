@@ -206,29 +206,20 @@ def map_needle(
     length = parameters.length
     deflections = np.linspace(0.0, largest, DEFLECTIONS)
     depths = np.linspace(max(SHALLOWEST * length, parameters.minimum_depth), length, DEPTHS)
-    rows = [
-        controllability_map(parameters, [depth], deflections, speed, sliding, force)
-        for depth in tqdm(depths, desc='depths', disable=None, leave=False)
-    ]
-    return ControllabilityMap(
-        depths=np.concatenate([row.depths for row in rows]),
-        deflections=rows[0].deflections,
-        **{name: np.concatenate([getattr(row, name) for row in rows]) for name in _MAPPED},
-    )
+    with tqdm(total=DEPTHS, desc='depths', disable=None, leave=False) as bar:
+        return controllability_map(
+            parameters, depths, deflections, speed, sliding, force, bar.update
+        )
 
 
-def draw_map(parameters: NeedleParameters, found: ControllabilityMap, speed: float) -> Figure:
+def draw_map(found: ControllabilityMap) -> Figure:
     """
     Draw a map.
 
     Parameters
     ----------
-    parameters : NeedleParameters
-        The needle.
     found : ControllabilityMap
         The map.
-    speed : float
-        Insertion speed [m/s].
 
     Returns
     -------
@@ -239,6 +230,7 @@ def draw_map(parameters: NeedleParameters, found: ControllabilityMap, speed: flo
     from matplotlib.colors import LogNorm
     from matplotlib.figure import Figure
 
+    parameters = found.parameters
     figure = Figure(figsize=(13.0, 4.6), layout='constrained')
     order = 2 * (2 + parameters.modes)
     lost = found.rank < order
@@ -257,15 +249,13 @@ def draw_map(parameters: NeedleParameters, found: ControllabilityMap, speed: flo
         axes.title.set_fontsize('medium')
     figure.axes[0].set_ylabel('tip deflection [mm]')
     figure.suptitle(
-        f'{parameters.formulation}, {parameters.modes} modes, {1e3 * speed:g} mm/s; '
+        f'{parameters.formulation}, {parameters.modes} modes, {1e3 * found.velocity:g} mm/s; '
         'dimensionless; gray: the inputs do not move all of the state'
     )
     return figure
 
 
-def write_map(
-    folder: Path, parameters: NeedleParameters, found: ControllabilityMap, speed: float
-) -> list[Path]:
+def write_map(folder: Path, found: ControllabilityMap) -> list[Path]:
     """
     Write a map as a CSV and a PNG.
 
@@ -273,12 +263,8 @@ def write_map(
     ----------
     folder : Path
         Where to write.
-    parameters : NeedleParameters
-        The needle.
     found : ControllabilityMap
         The map.
-    speed : float
-        Insertion speed [m/s].
 
     Returns
     -------
@@ -300,7 +286,7 @@ def write_map(
     ]
     contents = {
         'controllability.csv': '\n'.join([*lines, '']).encode(),
-        'controllability.png': png(draw_map(parameters, found, speed)),
+        'controllability.png': png(draw_map(found)),
     }
     for name, content in contents.items():
         write_whole(folder / name, content)
