@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 import sys
 from typing import Any, ClassVar, Final
 
@@ -14,7 +15,7 @@ from needle_identification.estimation.estimate import Statistic, statistic
 from needle_identification.friction.identify import identify_friction
 from needle_identification.friction.live import LiveFriction
 from needle_identification.friction.settings import FrictionSettings
-from needle_identification.friction.summary import FrictionSummary, summarize
+from needle_identification.friction.summary import summarize
 from needle_identification.recordings import TIMES
 from needle_identification.recordings.reading import (
     read_friction_recording,
@@ -26,7 +27,7 @@ from needle_identification.result import model_parameters, NODES, write_result
 from needle_identification.status import live_statuses, sentence, Status, summary_statuses
 from needle_identification.stiffness.identify import identify_stiffness
 from needle_identification.stiffness.settings import StiffnessSettings
-from needle_identification.stiffness.summary import StiffnessSummary, summarize_stiffness
+from needle_identification.stiffness.summary import summarize_stiffness
 from needle_ros import contract
 from needle_ros.base_node import BaseNode
 from needle_ros.errors import NeedleError, ParameterError
@@ -199,42 +200,34 @@ class IdentificationNode(BaseNode):
         }
         output = self.text('output')
         if self._what == 'friction':
-            friction = self._identify_friction(reading)
+            reading['force_axis'] = self.text('force_axis')
+            reading['motion_axis'] = self.text('motion_axis') or None
+            friction = summarize(
+                self._estimates(
+                    partial(read_friction_recording, **reading),
+                    partial(identify_friction, settings=self._friction_settings),
+                )
+            )
             if output:
                 write_result(output, friction)
             self._found = friction.statistics
             self._publish(self._friction, summary_statuses(friction))
         else:
-            stiffness = self._identify_stiffness(reading)
+            reading['axes'] = tuple(self.get_parameter('axes').value)
+            stiffness = summarize_stiffness(
+                self._estimates(
+                    partial(read_indentation_recording, **reading),
+                    partial(identify_stiffness, settings=self._stiffness_settings),
+                ),
+                force=self._own.level or None,
+                level_tolerance=self._stiffness_settings.level_tolerance,
+            )
             if output:
                 write_result(output, None, stiffness)
             self._found = (stiffness.tissue_stiffness,)
             self._publish(self._stiffness, summary_statuses(stiffness))
         self._words = f'{sentence(self._found)} from {len(self._bags)} recordings'
         self.get_logger().info(self._words)
-
-    def _identify_friction(self, reading: Mapping[str, Any]) -> FrictionSummary:
-        axes: dict[str, Any] = {
-            'force_axis': self.text('force_axis'),
-            'motion_axis': self.text('motion_axis') or None,
-        }
-        return summarize(
-            self._estimates(
-                lambda bag: read_friction_recording(bag, **axes, **reading),
-                lambda recording: identify_friction(recording, self._friction_settings),
-            )
-        )
-
-    def _identify_stiffness(self, reading: Mapping[str, Any]) -> StiffnessSummary:
-        axes = tuple(self.get_parameter('axes').value)
-        return summarize_stiffness(
-            self._estimates(
-                lambda bag: read_indentation_recording(bag, axes=axes, **reading),
-                lambda recording: identify_stiffness(recording, self._stiffness_settings),
-            ),
-            force=self._own.level or None,
-            level_tolerance=self._stiffness_settings.level_tolerance,
-        )
 
     def _estimates(self, read: Callable[[str], Any], identify: Callable[[Any], Any]) -> list[Any]:
         """Identify each recording and log what to know of it."""

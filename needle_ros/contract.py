@@ -337,5 +337,5 @@ DIAGNOSTICS: Final = Topic(
     qos=COMMAND._replace(depth=10),
 )
 
-#: All topics, in this order.
+#: All topics, in the order above.
 TOPICS: Final = tuple(value for value in [*globals().values()] if isinstance(value, Topic))
