@@ -120,7 +120,6 @@ def _means(rate: float, since: float, until: float) -> tuple[float, float]:
 
 @inlined
 def change_basis(
-    needle: Needle,
     old: NormalModes,
     new: NormalModes,
     since: float,
@@ -130,15 +129,13 @@ def change_basis(
     """
     Write how c and b change from the normal modes of one depth to those of another.
 
-    q and the momenta rho A G q_dot (as printed, the rates) go on as they are. The depth changes
-    evenly, not at once: what one mode gives to another is the mean over the rotation in between.
-    Slow modes do not turn and take the change as it is. Of fast ones only the part remains that
-    keeps the action energy / omega.
+    q and the momenta rho A G q_dot go on as they are. The depth changes evenly, not at once: what
+    one mode gives to another is the mean over the rotation in between. Slow modes do not turn and
+    take the change as it is. Of fast ones only the part remains that keeps the action
+    energy / omega.
 
     Parameters
     ----------
-    needle : Needle
-        The needle.
     old, new : NormalModes
         Normal modes at both depths. The new ones take the signs of the old ones.
     since, until : float
@@ -164,7 +161,7 @@ def change_basis(
                 momenta += new.shapes[j, i] * old.inverse[k, j]
             same = 1.0 if i == k else 0.0
             by_c = positions * one / sqrt(old.squares[k]) - same
-            by_b = (positions if needle.as_printed else momenta) - same
+            by_b = momenta - same
             # The small change diag(by_c, by_b) is a rotation and a reflection.
             rotation, reflection = 0.5 * (by_c + by_b), 0.5 * (by_c - by_b)
             cos_d, sin_d = _means(other - one, since, until)
@@ -206,13 +203,12 @@ def base_impulse(needle: Needle, f: Frozen, velocity: float, rows: FloatArray) -
         weight, extra = integrals[channel], above[channel]
         # What enters brings the momentum of the tip, and the inserted part is slowed by it.
         entering = rho * velocity * (1.0 if channel == 0 else f.depth)
-        if not needle.as_printed:
-            for k in range(n):
-                area, tip = 0.0, 0.0
-                for i in range(n):
-                    area += weight[i] * f.modes.shapes[i, k]
-                    tip += f.at.value[i] * f.modes.shapes[i, k]
-                entering -= rho * rho * velocity * area * tip
+        for k in range(n):
+            area, tip = 0.0, 0.0
+            for i in range(n):
+                area += weight[i] * f.modes.shapes[i, k]
+                tip += f.at.value[i] * f.modes.shapes[i, k]
+            entering -= rho * rho * velocity * area * tip
         for k in range(n):
             inertia, held, carried = 0.0, 0.0, 0.0
             for i in range(n):

@@ -365,7 +365,7 @@ def observe(
     sample['depth'], sample['growth'] = depth, growth
     sample['lateral'], sample['moment'] = lateral, moment
     frozen = freeze(f.needle, depth, growth, _modes(f, new))
-    change_basis(f.needle, _modes(f, old), frozen.modes, -0.5 * span, 0.5 * span, change)
+    change_basis(_modes(f, old), frozen.modes, -0.5 * span, 0.5 * span, change)
     if depth == before['depth'] and growth == before['growth']:
         # Rounding must not add up while the needle rests.
         for i in range(2 * n):
@@ -448,7 +448,7 @@ def estimate(  # noqa: C901
     frozen = freeze(needle, depth, f.samples[slot]['growth'], empty_normal_modes(n))
     at, modes = frozen.at, frozen.modes
     change, now = np.empty((2 * n, 2 * n)), np.zeros(2 * n)
-    change_basis(needle, _modes(f, slot), modes, -0.5 * span, 0.0, change)
+    change_basis(_modes(f, slot), modes, -0.5 * span, 0.0, change)
     for i in range(2 * n):
         modal[i] = 0.0
         for k in range(2 * n):
@@ -472,8 +472,6 @@ def estimate(  # noqa: C901
         for k in range(2 * n):
             variance += row[i] * covariance[i, k] * row[k]
     spread = sqrt(max(variance, 0.0))
-    if needle.as_printed:
-        return deflection, spread, 0.0
     bend, tip, rate = 0.0, 0.0, 0.0
     for j in range(n):
         omega = sqrt(modes.squares[j])

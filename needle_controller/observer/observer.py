@@ -17,6 +17,7 @@ from math import ceil, inf, isfinite, nan
 from typing import Final
 
 from needle_controller.compiled.filter import begin, estimate, Filter, observe, replay, SAMPLE
+from needle_controller.laws.axis import require_complete
 from needle_controller.observer.consistency import Consistency
 from needle_controller.observer.settings import ObserverSettings
 from needle_dynamics import FloatArray, InsertedLengthError, NeedleModel, NeedleParameters
@@ -65,7 +66,7 @@ class Observer:
     Raises
     ------
     ParameterError
-        If the period is not positive, not shorter than the history, or not a whole number of
+        If the formulation is `as_printed`, or the period is not positive, not shorter than the history, or not a whole number of
         samples of the force sensor's filter.
 
     """
@@ -73,6 +74,7 @@ class Observer:
     def __init__(
         self, parameters: NeedleParameters, settings: ObserverSettings, period: float
     ) -> None:
+        require_complete(parameters)
         if not 0.0 < period < settings.history:
             raise ParameterError(
                 f'period must be > 0 and < history = {settings.history:g} s, got {period!r}'

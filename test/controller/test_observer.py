@@ -53,7 +53,7 @@ class Reference:
     """
     The linear model that the observer stands on, written densely with matrix exponentials.
 
-    The state is q, p = rho A G q_dot (q_dot as printed), the impulses of lateral force and moment
+    The state is q, p = rho A G q_dot, the impulses of lateral force and moment
     and the integral of the tip deflection; depth is frozen at its mean over a sample.
     """
 
@@ -86,21 +86,20 @@ class Reference:
         model, n, p = self.model, self.n, self.model.parameters
         at, rho = model.modes.integrals(depth), p.linear_density
         mass, stiff = rho * at.gram, model.stiffness_matrix(depth, time)
-        printed = p.formulation == 'as_printed'
         growth = model.tissue.growth(time)
-        to_rate = np.eye(n) if printed else np.linalg.inv(mass)
+        to_rate = np.linalg.inv(mass)
         force_q, force_p = -stiff, -p.tissue_damping * at.gram @ to_rate
         # Acceleration of the moving needle, with the momentum that dG/dt takes.
-        convected = 0.0 if printed else rho * speed * np.outer(at.value, at.value)
+        convected = rho * speed * np.outer(at.value, at.value)
         accel_q = np.linalg.solve(mass, force_q)
-        accel_p = np.linalg.solve(mass, force_p - convected @ to_rate if not printed else force_p)
+        accel_p = np.linalg.solve(mass, force_p - convected @ to_rate)
         layer = int(np.searchsorted(model.tissue.starts, depth, side='right')) - 1
         layers = model.tissue.layers(model.modes)
         above = layers.area[layer], layers.moment[layer]
         a = np.zeros((2 * n + 3, 2 * n + 3))
         a[:n, n : 2 * n] = to_rate
-        a[n : 2 * n, :n] = accel_q if printed else force_q
-        a[n : 2 * n, n : 2 * n] = accel_p if printed else force_p
+        a[n : 2 * n, :n] = force_q
+        a[n : 2 * n, n : 2 * n] = force_p
         for row, shape, lever in ((0, at.area, 1.0), (1, at.moment, depth)):
             held = growth * (model.tissue.stiffnesses[layer] * shape + above[row])
             a[2 * n + row, :n] = rho * shape @ accel_q + held
@@ -115,10 +114,7 @@ class Reference:
     def noise_root(self, depth: float) -> FloatArray:
         """Root of the density of the noise on p."""
         gram = self.model.modes.integrals(depth).gram
-        root = np.asarray(self.options.irregularity * cholesky(gram, lower=True), float)
-        if self.model.parameters.formulation == 'as_printed':
-            root = np.linalg.solve(self.model.parameters.linear_density * gram, root)
-        return root
+        return np.asarray(self.options.irregularity * cholesky(gram, lower=True), float)
 
     def prior(self, depth: float) -> tuple[FloatArray, FloatArray]:
         """Root of the covariance of (q, p), and of the memories of the low-pass, at the start."""
@@ -127,7 +123,7 @@ class Reference:
         squares, normal = eigh(self.model.stiffness_matrix(depth), p.linear_density * at.gram)
         tip = at.value @ normal / np.sqrt(squares)
         size = self.options.initial_deflection / np.sqrt(tip @ tip)
-        rates = normal if p.formulation == 'as_printed' else np.linalg.inv(normal).T
+        rates = np.linalg.inv(normal).T
         root = np.zeros((2 * n, 2 * n))
         root[:n, :n], root[n:, n:] = size * normal / np.sqrt(squares), size * rates
         order = 2 * len(self.sections)
@@ -217,7 +213,7 @@ class Reference:
         squares, normal = eigh(self.model.stiffness_matrix(depth, time), mass)
         matrix = np.zeros((2 * n, 2 * n))
         matrix[:n, :n] = normal / np.sqrt(squares)
-        matrix[n:, n:] = normal if p.formulation == 'as_printed' else mass @ normal
+        matrix[n:, n:] = mass @ normal
         return np.sqrt(squares), matrix
 
     def carry(
@@ -249,9 +245,8 @@ class Reference:
         end, time = depths[-1], PERIOD * (len(depths) - 1)
         middle = 0.5 * (depths[-2] + end) + PERIOD * (speeds[-2] - speeds[-1]) / 12.0
         x = self.carry((middle, time), (end, time), -0.5 * PERIOD, 0.0) @ x
-        if self.model.parameters.formulation != 'as_printed':
-            gram = self.model.modes.integrals(end).gram
-            x[self.n :] = np.linalg.solve(self.model.parameters.linear_density * gram, x[self.n :])
+        gram = self.model.modes.integrals(end).gram
+        x[self.n :] = np.linalg.solve(self.model.parameters.linear_density * gram, x[self.n :])
         return x
 
 
@@ -272,7 +267,6 @@ BATCH_CASES: dict[str, tuple[int, dict[str, Any], dict[str, Any]]] = {
     'three modes': (3, {}, {}),
     'undamped': (2, {'tissue_damping': 0.0}, {'irregularity': 0.0}),
     'beyond critical damping': (2, {'tissue_damping': 60.0}, {}),
-    'as printed': (2, {'formulation': 'as_printed'}, {}),
     'layers that swell': (
         2,
         {
@@ -720,10 +714,9 @@ def exact(depth: float, modes: int, **changes: Any) -> tuple[Observer, Integrato
 
 @pytest.mark.parametrize('modes', [1, 2, 3])
 @pytest.mark.parametrize('depth', [0.03, 0.1])
-@pytest.mark.parametrize('formulation', ['complete', 'as_printed'])
-def test_agrees_with_the_simulated_needle(depth: float, modes: int, formulation: str) -> None:
+def test_agrees_with_the_simulated_needle(depth: float, modes: int) -> None:
     """What modal state, tip deflection and load mean is what the model means by them."""
-    observer, needle = exact(depth, modes, formulation=formulation, tissue_damping=0.0)
+    observer, needle = exact(depth, modes, tissue_damping=0.0)
     model, state = needle.model, needle.state
     modal, rates = observer.modal
     # 1e-4 of the largest: with a minute noise of 1e-6 and thirty samples.
@@ -965,6 +958,11 @@ def test_consistency_bands_are_those_of_chi_squared() -> None:
 def test_bad_settings_are_named(options: dict[str, Any], period: float, match: str) -> None:
     with pytest.raises(ParameterError, match=match):
         Observer(phantom(), ObserverSettings(**options), period)
+
+
+def test_the_formulation_as_printed_is_rejected() -> None:
+    with pytest.raises(ParameterError, match="formulation must be 'complete'"):
+        Observer(phantom(formulation='as_printed'), ObserverSettings(), PERIOD)
 
 
 def test_nees_wants_the_right_shape() -> None:
