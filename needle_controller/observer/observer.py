@@ -66,8 +66,8 @@ class Observer:
     Raises
     ------
     ParameterError
-        If the formulation is `as_printed`, or the period is not positive, not shorter than the history, or not a whole number of
-        samples of the force sensor's filter.
+        If the formulation is `as_printed`, or the period is not positive, not shorter than the
+        history, or not a whole number of samples of the force sensor's filter.
 
     """
 
