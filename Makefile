@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 SOURCES := needle_ros needle_dynamics needle_controller needle_identification needle_insertion benchmarks examples test launch docs setup.py
 
-.PHONY: demo test check docs format setup lock bags results clean
+.PHONY: demo test check docs format setup lock bags results bench clean
 
 demo: setup
 	$(BIN)/needle demo
@@ -53,7 +53,7 @@ bags: setup
 	$(BIN)/needle experiment stiffness --rate 40 --speed 40 bags
 	cd bags && sha256sum friction_*/* stiffness_*/* > SHA256SUMS
 
-# What the shipped recordings give. The other pages of results: needle bench NAME -o docs/results/NAME.md
+# What the shipped recordings give.
 results: setup
 	set -e; { printf '# Tables 1 and 2 from the shipped recordings\n\n'; \
 	printf 'This page is generated. Do not edit it, but run `make results` again.\n\n'; \
@@ -61,6 +61,16 @@ results: setup
 	for table in table-1 table-2; do \
 	printf '\n```bash\nneedle reproduce %s\n```\n\n```text\n' $$table; $(BIN)/needle reproduce $$table; printf '```\n'; \
 	done; } > docs/results/tables.md
+
+# The figures of docs/benchmarks.md, on a machine that does nothing else. A missed bar does not end it.
+bench: $(VENV)/.bench
+	status=0; for name in control dynamics identification 'graph --full' calibration; do \
+	$(BIN)/needle bench $$name -o docs/results/$${name%% *}.md || status=1; \
+	done; exit $$status
+
+$(VENV)/.bench: setup.py $(VENV)/.complete
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-build-isolation -e '.[bench]'
+	touch $@
 
 clean:
 	rm -rf $(VENV) build install log demo_output docs/_build docs/api docs/repository

@@ -26,7 +26,7 @@ from typing import Final
 from benchmarks.bare import PERIOD, RATE, Sender, STREAMS
 from benchmarks.endurance import record, watch_memory
 from benchmarks.measure import Bar
-from benchmarks.page import Answer, Section, Tick, version
+from benchmarks.page import Answer, Section, Tick
 from benchmarks.pairs import Figures, Pair, PAIRS, TARGETS
 from geometry_msgs.msg import WrenchStamped
 from needle_insertion.experiment.node_process import GraphError
@@ -306,12 +306,18 @@ def side_by_side(found: Mapping[str, list[Figures]], plan: Plan) -> tuple[Sectio
         'Nodes beside bare nodes',
         (f'{RATE} Hz', PAIRS[0], PAIRS[1], 'ratio', PAIRS[2], 'ratio'),
         rows,
-        f'{version("ros-jazzy-rclpy")}; {plan.rounds} rounds of {plan.turn:g} s; medians over the '
-        'rounds, also of the ratios; the largest of the worst values.\n\n'
-        '- round trip: from `joint_states` to `wrench_command`, seen by a probe in the place of '
-        'the plant\n'
-        '- sample to command: from the time of a sample of the plant to the arrival of the '
-        'command that answers it, in a third process\n'
-        '- period: between arrivals of `joint_states` in the third process',
+        f'{plan.rounds} rounds of {plan.turn:g} s. Each figure is the median over the rounds, '
+        'and each ratio the median of the ratios within the rounds. A worst value is the largest '
+        'of all rounds. The rows mean:\n\n'
+        '- **CPU:** user and system time of all threads of a process, as a share of one core.\n'
+        '- **No commands:** the plant publishes and nothing answers.\n'
+        '- **Sample to command:** from the time of a sample of the plant to the arrival of the '
+        'command that answers it, in a third process.\n'
+        '- **Sample to `joint_states`:** from the time of a sample to its arrival in the third '
+        'process.\n'
+        '- **Period:** between arrivals of `joint_states` in the third process.\n'
+        '- **Late by a period:** arrived more than a period after the time of the sample.\n'
+        '- **Round trip:** from `joint_states` to `wrench_command`, seen by a probe in the place '
+        'of the plant.',
     )
     return section, bars

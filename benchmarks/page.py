@@ -13,8 +13,13 @@ from typing import Final, TypeAlias
 
 from benchmarks.measure import Bar
 
-#: Distributions whose versions a page names.
-_TOOLS: Final = ('needle_insertion', 'numpy', 'scipy', 'numba', 'mujoco', 'pyelastica')
+#: Distributions whose versions every page names, and those of the tools of one benchmark.
+_COMMON: Final = ('needle_insertion', 'numpy', 'scipy', 'numba')
+_TOOLS: Final = {
+    'dynamics': ('mujoco', 'pyelastica'),
+    'identification': ('mcap', 'rosbags', 'mcap-ros2-support'),
+    'graph': ('rclpy',),
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,7 +129,7 @@ def header(name: str, command: str) -> str:
                 processor = line.partition(':')[2].strip()
                 break
     system = f'{platform.system()} {platform.machine()}'
-    python = f'Python {platform.python_version()}'
+    tools = map(version, (*_COMMON, *_TOOLS.get(name, ())))
     return '\n'.join(
         [
             f'# Benchmark: {name}',
@@ -134,7 +139,7 @@ def header(name: str, command: str) -> str:
             f'- command: `{command}`',
             f'- date: {datetime.now(timezone.utc):%Y-%m-%d %H:%M} UTC',
             f'- machine: {processor}, {os.cpu_count()} cores, {system}',
-            f'- versions: {", ".join((python, *map(version, _TOOLS)))}',
+            f'- versions: Python {platform.python_version()}, {", ".join(tools)}',
         ]
     )
 

@@ -410,11 +410,10 @@ def compare(tick: Tick) -> Answer:
         'Cost of a step',
         ('operation', 'in a step', 'ns each', 'ns in a step'),
         rows,
-        f'Two modes, one core, sliding: mean of {_STEPS} steps of {_STEP:g} s from '
-        f'{_DEPTH * 100:g} cm. The bound is the sum of the costs of the operations. Counted: '
-        f'{sum(counts.values()):.0f} operations, '
-        + ', '.join(f'{number:.4g} {name}' for name, number in sorted(counts.items()))
-        + '.',
+        f'Two modes, one core, sliding: mean of {_STEPS} steps of {_STEP * 1e6:g} us from '
+        f'{_DEPTH * 100:g} cm. A step has {sum(counts.values()):.0f} operations. In the table a '
+        f'product and a sum count as one, and so do a sine and a cosine. The bound is the sum of '
+        f'the costs, as if no operation overlapped with one of another kind.',
     )
     bars = [
         Bar('cost of a step, two modes', step * 1e9, 600.0, 'ns'),

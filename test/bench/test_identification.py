@@ -84,6 +84,7 @@ def test_what_is_not_installed_is_said_and_the_rest_is_compared(
     assert bench_measure.NOT_INSTALLED in str(sections[0])
     assert asked == [
         ('needle_identification', 'times_1'),
+        ('needle_identification, reading', 'times_1'),
         ('rosbags AnyReader', 'times_1'),
         ('needle_identification', 'times_1'),
         ('needle_identification', 'times_2'),
