@@ -36,6 +36,8 @@ nitpick_ignore_regex = [('py:.*', r'(?!(needle_|benchmarks)).*')]
 default_role = 'py:obj'
 suppress_warnings = ['config.cache']
 
+# Every name is documented in the module that defines it.
+viewcode_follow_imported_members = False
 autodoc_member_order = 'bysource'
 autodoc_typehints = 'none'
 # numpydoc loads it; our own pages are those of docs/_ext/api.py.

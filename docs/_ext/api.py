@@ -3,16 +3,20 @@
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from importlib import import_module
+from itertools import chain
 from math import inf
 from pathlib import Path
 from pkgutil import iter_modules
+import re
 import sys
 from typing import Any
 
-from docutils.nodes import Element
+from docutils.nodes import Element, entry, literal, raw, Text
+from sphinx.addnodes import pending_xref
 from sphinx.application import Sphinx
 from sphinx.environment import BuildEnvironment
 from sphinx.pycode import ModuleAnalyzer
+from sphinx.transforms.post_transforms import SphinxPostTransform
 
 PACKAGES = (
     'needle_ros',
@@ -61,7 +65,8 @@ def _public_names(name: str) -> str:
 def _page(name: str, folder: Path) -> None:
     """Write the page of a module and the pages of what is in it."""
     children = _children(name)
-    text = _title(name) + f'.. automodule:: {name}\n'
+    # A long name is broken at its dots, by spaces of no width.
+    text = _title(name.replace('.', '.\u200b')) + f'.. automodule:: {name}\n'
     if children:
         text += '\n' + _public_names(name)
         text += '.. toctree::\n   :maxdepth: 1\n\n'
@@ -126,9 +131,45 @@ def resolve(app: Sphinx, env: BuildEnvironment, node: Element, content: Element)
     return python.resolve_xref(env, node['refdoc'], app.builder, 'obj', target, node, content)
 
 
+def skip_aliases(
+    _app: Sphinx, _what: str, _name: str, value: object, _skip: object, _options: object
+) -> bool | None:
+    """Leave out the fields of named tuples: their class has them in its signature."""
+    return True if type(value).__name__ == '_tuplegetter' else None
+
+
+class Names(SphinxPostTransform):
+    """Leads from the dotted names of a page to where they are documented."""
+
+    default_priority = 5
+
+    def run(self, **_arguments: object) -> None:
+        """Wrap the names, and let a column of a table break them at dots and underscores."""
+        documented = self.env.get_domain('py').data['objects']
+        for node in list(self.document.findall(literal)):
+            name = node.astext()
+            package, _, public = name.rpartition('.')
+            if package in PACKAGES and public in getattr(import_module(package), '__all__', ()):
+                name = f'{_home(package, public)}.{public}'
+            if name in documented and 'py' not in node['classes']:
+                link = pending_xref(
+                    '', refdomain='py', reftype='obj', reftarget=name, refexplicit=False,
+                    refdoc=self.env.docname,
+                )  # fmt: skip
+                node.replace_self(link)
+                link += node
+        cells = self.document.findall(entry)
+        for text in [t for cell in cells for node in cell.findall(literal) for t in node.children]:
+            first, *others = re.split(r'(?<=[._])', text.astext())
+            parts = [[raw('', '<wbr>', format='html'), Text(part)] for part in others if part]
+            text.parent.replace(text, [Text(first), *chain.from_iterable(parts)])
+
+
 def setup(app: Sphinx) -> dict[str, Any]:
     """Write the pages before Sphinx looks for them, and find what they refer to."""
     app.connect('builder-inited', write_pages)
     app.connect('autodoc-process-docstring', list_fields)
+    app.connect('autodoc-skip-member', skip_aliases)
+    app.add_post_transform(Names)
     app.connect('missing-reference', resolve)
     return {'parallel_read_safe': True, 'parallel_write_safe': True}

@@ -1,5 +1,6 @@
 """Equations as MathML, which every browser shows by itself: no script and no network."""
 
+import re
 from typing import Any
 
 from docutils import nodes
@@ -10,14 +11,20 @@ from sphinx.errors import ExtensionError
 from sphinx.util.math import get_node_equation_number
 from sphinx.writers.html5 import HTML5Translator
 
+#: docutils sets the index of a dotted letter below the letter.
+DOTTED = re.compile(
+    r'<munderover>\s*(<mi>.*</mi>)\s*(<m[in]>.*</m[in]>)\s*(<mo[^>]*>[˙¨]</mo>)\s*</munderover>'
+)
+
 
 def _mathml(node: nodes.Element, *, block: bool) -> str:
     text = node.astext()
     try:
         # Fonts without mathematics set what is marked as an accent into the letter below.
-        return tex2mathml(text, as_block=block).replace(' accent="true"', '')
+        equation = tex2mathml(text, as_block=block).replace(' accent="true"', '')
     except MathError as error:
         raise ExtensionError(f'no MathML for {text!r}: {error}') from None
+    return DOTTED.sub(r'<msub><mover>\1\3</mover>\2</msub>', equation)
 
 
 def visit_inline(translator: HTML5Translator, node: nodes.math) -> None:
