@@ -260,6 +260,17 @@ def analyze(system: LinearSystem) -> Analysis:
     Analysis
         The results; eigenvalues in rad/s.
 
+    Examples
+    --------
+    The two inputs move depth and rotation. Neither bends a straight needle.
+
+    >>> from needle_dynamics import analyze, linearize, NeedleModel, NeedleParameters
+    >>> from needle_dynamics import operating_point
+    >>> model = NeedleModel(NeedleParameters.preset('phantom'))
+    >>> found = analyze(linearize(model, operating_point(model, 0.05, velocity=5e-3)))
+    >>> found.state.rank, found.observed.rank
+    (4, 4)
+
     """
     a, b, c = system.scaled()
     labels = (system.names, system.transform, system.scaled_names)

@@ -81,6 +81,19 @@ def result_yaml(
     IdentificationError
         If the data determine no parameter.
 
+    Examples
+    --------
+    >>> from needle_identification import identify_friction, read_friction_recording
+    >>> from needle_identification import result_yaml, summarize
+    >>> estimate = identify_friction(read_friction_recording('bags/friction_01'))
+    >>> text = result_yaml(summarize([estimate]))
+    >>> print(text.partition('/**/controller')[2])
+    :
+      ros__parameters:
+        model.coulomb_friction: 0.561...
+        model.viscous_friction: 238.18...
+    <BLANKLINE>
+
     """
     found = [
         *(friction.statistics if friction else ()),

@@ -141,6 +141,18 @@ class ForceSensor:
     ParameterError
         If the sensor's rate is not a whole multiple of the rate of the readings.
 
+    Examples
+    --------
+    The mean of a thousand readings of 2 N along y:
+
+    >>> import numpy as np
+    >>> from needle_dynamics import ForceSensor, ForceSensorParameters
+    >>> sensor = ForceSensor(ForceSensorParameters(), rate=1000.0, seed=1)
+    >>> wrench = np.array([0.0, 2.0, 0.0, 0.0, 0.0, 0.0])
+    >>> readings = [sensor.measure(wrench) for _ in range(1000)]
+    >>> print(f'{np.mean(readings, axis=0)[1]:.2f} N')
+    2.00 N
+
     """
 
     #: Random numbers drawn at once.

@@ -56,6 +56,17 @@ class RecursiveFriction:
     ParameterError
         If rate or forgetting time are not positive, or the estimator is another.
 
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from needle_identification import FrictionSettings, RecursiveFriction
+    >>> live = RecursiveFriction(FrictionSettings(), rate=250.0, forgetting=30.0)
+    >>> for time in np.arange(0.0, 20.0, 0.004):
+    ...     speed = 0.008 * np.sin(2.0 * time) + 0.006 * np.sin(3.1 * time)
+    ...     live.update(time, speed, force=0.56 * np.sign(speed) + 300.0 * speed)
+    >>> {found.name: round(found.value, 3) for found in live.estimate()}
+    {'coulomb_friction': 0.56, 'viscous_friction': 300.0}
+
     """
 
     def __init__(self, settings: FrictionSettings, rate: float, forgetting: float) -> None:

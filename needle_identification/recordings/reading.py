@@ -93,6 +93,15 @@ def read_friction_recording(
     RecordingError
         If the bag is not readable or lacks a topic.
 
+    Examples
+    --------
+    >>> from needle_identification import read_friction_recording
+    >>> recording = read_friction_recording('bags/friction_01')
+    >>> recording
+    <Recording bags/friction_01: 1110 samples in 11.09 s>
+    >>> recording.losses
+    ()
+
     """
     sign, axis = signed_axis(force_axis, 'force axis')
     bag = Bag(path)
