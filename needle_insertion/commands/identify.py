@@ -25,11 +25,7 @@ from needle_identification import (
 )
 from needle_identification.recordings import TIMES
 from needle_insertion.commands.common import Command, make_folder
-from needle_insertion.report.identify_text import (
-    friction_text,
-    identified_document,
-    stiffness_text,
-)
+from needle_insertion.report.identify_text import identified_document, identified_text
 from needle_insertion.report.origin import identify_all, Origin
 from needle_ros.errors import ParameterError
 
@@ -187,7 +183,6 @@ def _run_friction(options: argparse.Namespace) -> int:
         lambda recording: identify_friction(recording, settings),
         summarize,
         write_result,
-        friction_text,
     )
 
 
@@ -205,7 +200,6 @@ def _run_stiffness(options: argparse.Namespace) -> int:
             estimates, force=options.level, level_tolerance=settings.level_tolerance
         ),
         lambda path, summary: write_result(path, None, summary),
-        stiffness_text,
     )
 
 
@@ -217,7 +211,6 @@ def _identify(
     identify: Callable[[Any], Any],
     summarize: Callable[[list[Any]], Any],
     write: Callable[[Path, Any], None],
-    text: Callable[[Any], str],
 ) -> int:
     """Identify all bags, write the results, warn and print; return the exit status."""
     reading = {name: getattr(options, name) for name in ('wrench_topic', 'motion_topic', 'time')}
@@ -251,7 +244,7 @@ def _identify(
         result = {**identified_document(summary, origin), 'files': [str(path) for path in written]}
         sys.stdout.write(f'{json.dumps(result, indent=2, allow_nan=False)}\n')
     else:
-        sys.stdout.write(f'{text(summary)}\n')
+        sys.stdout.write(f'{identified_text(summary)}\n')
         for path in written:
             sys.stdout.write(f'wrote {path}\n')
     return 2 if origin.failures else 0

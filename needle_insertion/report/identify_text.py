@@ -158,21 +158,28 @@ def parameter_cells(estimate: FrictionEstimate, means: Sequence[Statistic]) -> l
     return ['' if one is None else measured(one.value, one.error) for one in found]
 
 
-def friction_text(summary: FrictionSummary) -> str:
+def identified_text(summary: FrictionSummary | StiffnessSummary) -> str:
     """
-    Return identified friction for the terminal.
+    Return what was identified for the terminal.
 
     Parameters
     ----------
-    summary : FrictionSummary
+    summary : FrictionSummary or StiffnessSummary
         All recordings.
 
     Returns
     -------
     str
-        A table of the means, and one of the recordings.
+        Friction: a table of the means, and one of the recordings. Stiffness: Table 2 with a row
+        for each entry and a column for each force, the intervals, and k_a.
 
     """
+    if isinstance(summary, FrictionSummary):
+        return _friction_text(summary)
+    return _stiffness_text(summary)
+
+
+def _friction_text(summary: FrictionSummary) -> str:
     means = friction_statistics(summary)
     rows = [
         (one.name, *parameter_cells(one, means), f'{one.samples}', f'{one.residual:.4f}')
@@ -182,21 +189,7 @@ def friction_text(summary: FrictionSummary) -> str:
     return f'{table([mean_row(one) for one in means], MEAN_HEADS)}\n\n{table(rows, heads)}'
 
 
-def stiffness_text(summary: StiffnessSummary) -> str:
-    """
-    Return identified stiffness for the terminal, as Table 2.
-
-    Parameters
-    ----------
-    summary : StiffnessSummary
-        All recordings.
-
-    Returns
-    -------
-    str
-        A row for each entry and a column for each force, the intervals, and k_a.
-
-    """
+def _stiffness_text(summary: StiffnessSummary) -> str:
     levels, result = summary.levels, summary.tissue_stiffness
     entries = levels[0].statistics
     forces = [f'{level.force:.2f} N' for level in levels]
