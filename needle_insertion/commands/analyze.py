@@ -10,7 +10,7 @@ import sys
 
 from needle_dynamics import FORMULATIONS, NeedleModel, NeedleParameters, PRESETS
 from needle_dynamics.linearization import SLIDING
-from needle_insertion.commands.common import Command, constants, make_folder
+from needle_insertion.commands.common import add_needle, Command, constants, make_folder
 from needle_insertion.report import controllability as report
 from needle_insertion.report.text import table
 from needle_ros.errors import ParameterError
@@ -18,16 +18,9 @@ from needle_ros.errors import ParameterError
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of `needle analyze`."""
-    parser.add_argument('--preset', choices=tuple(PRESETS), default='phantom')
+    add_needle(parser, PRESETS, 'phantom')
     parser.add_argument('--formulation', choices=FORMULATIONS, default='complete')
     parser.add_argument('--modes', type=int, default=2, metavar='N', help='shape modes')
-    parser.add_argument(
-        '--set',
-        action='append',
-        default=[],
-        metavar='NAME=VALUE',
-        help='any other constant of the model, SI units; repeatable',
-    )
     points = parser.add_argument_group(
         'operating points', 'every combination of the values given; SI units'
     )

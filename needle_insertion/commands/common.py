@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 import json
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -30,6 +30,30 @@ class Command(NamedTuple):
     add_arguments: Callable[[ArgumentParser], None]
     run: Callable[[Namespace], int]
     signed: tuple[str, ...] = ()
+
+
+def add_needle(parser: ArgumentParser, presets: Iterable[str], default: str) -> None:
+    """
+    Add the options that choose the constants of the model, ``--preset`` and ``--set``.
+
+    Parameters
+    ----------
+    parser : ArgumentParser
+        Parser of a command.
+    presets : iterable of str
+        Names of the presets.
+    default : str
+        The preset if none is given.
+
+    """
+    parser.add_argument('--preset', choices=tuple(presets), default=default)
+    parser.add_argument(
+        '--set',
+        action='append',
+        default=[],
+        metavar='NAME=VALUE',
+        help='any other constant of the model, SI units; repeatable',
+    )
 
 
 def constants(words: Sequence[str]) -> dict[str, Any]:

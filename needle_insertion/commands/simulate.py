@@ -9,7 +9,7 @@ import sys
 
 from needle_dynamics import NeedleModel, NeedleParameters, PRESETS, simulate
 from needle_dynamics.simulated.integrator import DEFAULT_TOLERANCE
-from needle_insertion.commands.common import Command, constants
+from needle_insertion.commands.common import add_needle, Command, constants
 from needle_insertion.report import trajectory as report
 from needle_insertion.report.text import table
 from needle_ros.errors import ParameterError
@@ -17,14 +17,7 @@ from needle_ros.errors import ParameterError
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of `needle simulate`."""
-    parser.add_argument('--preset', choices=tuple(PRESETS), default='paper_si')
-    parser.add_argument(
-        '--set',
-        action='append',
-        default=[],
-        metavar='NAME=VALUE',
-        help='any other constant of the model, SI units; repeatable',
-    )
+    add_needle(parser, PRESETS, 'paper_si')
     for name, default, unit, words in (
         ('depth', 0.02, 'm', 'inserted length at the start'),
         ('tip-deflection', 5e-4, 'm', 'at the start'),
