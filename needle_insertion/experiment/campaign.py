@@ -58,16 +58,9 @@ class Campaign:
                 f'--rate must be in [{RATES[0]:g}, {RATES[1]:g}] Hz, got {self.rate}'
             )
 
+    @property
     def runs(self) -> dict[str, dict[str, object]]:
-        """
-        Return the parameters of each run.
-
-        Returns
-        -------
-        dict
-            Parameters of the plant by name, by the name of the bag.
-
-        """
+        """Parameters of the plant in each run, by the name of the bag."""
         digits = max(2, len(str(self.repeats)))
         common = {
             **self.protocol.plant,

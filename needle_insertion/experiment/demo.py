@@ -100,7 +100,7 @@ def run(output: Path, bags: Path) -> int:
     for name, protocol in PROTOCOLS.items():
         # The same noise in each demo: the verdict does not depend on luck.
         campaign = Campaign(protocol=protocol, repeats=1, seed=1, fixed=True)
-        (parameters,) = campaign.runs().values()
+        (parameters,) = campaign.runs.values()
         with _progress(f'{name} experiment') as show, rig(output, protocol) as running:
             running.record(output / name, parameters, EXPERIMENT_SPEED, show)
 

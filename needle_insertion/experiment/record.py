@@ -60,7 +60,7 @@ def record(campaign: Campaign, folder: Path, speed: float = SPEED) -> list[Path]
         If a node fails, or samples are lost at half the speed too. Finished bags are kept.
 
     """
-    runs, protocol = campaign.runs(), campaign.protocol
+    runs, protocol = campaign.runs, campaign.protocol
     missing = [
         name
         for name, parameters in runs.items()

@@ -8,7 +8,6 @@ content gives the same bytes. Templates escape all text that they are given.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from functools import cache
 from pathlib import Path
 import re
 from typing import Any, Final
@@ -32,32 +31,21 @@ _VERDICTS: Final = {
 }
 
 
-@cache
-def templates() -> Environment:
-    """
-    Return the templates of this folder.
-
-    Returns
-    -------
-    Environment
-        With autoescape, and the filters ``symbols`` and ``kind``.
-
-    """
-    found = Environment(
-        loader=PackageLoader('needle_insertion.report'),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    found.filters.update(symbols=symbols, kind=_kind)
-    return found
-
-
 def _kind(cell: str) -> str:
     """Return the style class of a table cell, '' if it needs none."""
     is_number = _NUMBER.match(cell) and len(cell) < _LONGEST_NUMBER
     return _VERDICTS.get(cell, 'number' if is_number else '')
+
+
+#: Templates of this folder.
+TEMPLATES: Final = Environment(
+    loader=PackageLoader('needle_insertion.report'),
+    autoescape=True,
+    undefined=StrictUndefined,
+    trim_blocks=True,
+    lstrip_blocks=True,
+)
+TEMPLATES.filters.update(symbols=symbols, kind=_kind)
 
 
 def write_page(
@@ -84,7 +72,7 @@ def write_page(
 
     """
     shown = {one.name: one for one in pictures}
-    page = templates().get_template(template).render(pictures=shown, **content)
+    page = TEMPLATES.get_template(template).render(pictures=shown, **content)
     for name, one in shown.items():
         write_whole(path.parent / f'{name}.png', one.image)
     write_whole(path, page.encode())

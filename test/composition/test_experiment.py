@@ -99,26 +99,26 @@ def test_each_level_is_pressed_in_eight_directions_from_rest() -> None:
 
 def test_a_campaign_draws_around_the_tables_or_takes_their_means() -> None:
     """Runs have the drawn values and a seed each; ``fixed`` gives every run the means."""
-    runs = Campaign(protocol=FRICTION, repeats=3, seed=5).runs()
+    runs = Campaign(protocol=FRICTION, repeats=3, seed=5).runs
     assert list(runs) == ['friction_01', 'friction_02', 'friction_03']
     assert [run['seed'] for run in runs.values()] == [5, 6, 7]
     assert [run['model.coulomb_friction'] for run in runs.values()] == [
         drawn['coulomb_friction'] for drawn in draw_friction(3, 5)
     ]
-    runs = Campaign(protocol=STIFFNESS, repeats=2, seed=5).runs()
+    runs = Campaign(protocol=STIFFNESS, repeats=2, seed=5).runs
     assert [run['indenter.stiffness_zz'] for run in runs.values()] == [
         list(drawn['k_zz']) for drawn in draw_stiffness(2, 5)
     ]
-    (fixed,) = Campaign(protocol=FRICTION, repeats=1, fixed=True).runs().values()
+    (fixed,) = Campaign(protocol=FRICTION, repeats=1, fixed=True).runs.values()
     assert fixed['model.viscous_friction'] == TABLE_1['viscous_friction'][0]
-    (fixed,) = Campaign(protocol=STIFFNESS, repeats=1, fixed=True).runs().values()
+    (fixed,) = Campaign(protocol=STIFFNESS, repeats=1, fixed=True).runs.values()
     assert fixed['indenter.stiffness_xz'] == list(TABLE_2['k_xz'][0])
 
 
 @pytest.mark.parametrize('seed', [0, 2014])
 def test_the_indenter_takes_every_place_that_is_drawn(seed: int) -> None:
     """The simulated indenter rejects no draw."""
-    for run in Campaign(protocol=STIFFNESS, repeats=40, seed=seed).runs().values():
+    for run in Campaign(protocol=STIFFNESS, repeats=40, seed=seed).runs.values():
         drawn: dict[str, Any] = {
             name.removeprefix('indenter.'): tuple(value)
             for name, value in run.items()
@@ -130,7 +130,7 @@ def test_the_indenter_takes_every_place_that_is_drawn(seed: int) -> None:
 @pytest.mark.parametrize('rate', [40.0, 100.0, 333.0, 5000.0])
 def test_the_sensor_suits_any_rate(rate: float) -> None:
     """The sensor's own rate is a whole multiple of that of the samples."""
-    (run,) = Campaign(protocol=FRICTION, repeats=1, rate=rate).runs().values()
+    (run,) = Campaign(protocol=FRICTION, repeats=1, rate=rate).runs.values()
     own = float(str(run['sensor.rate']))
     assert own % rate == 0.0
     assert rate <= own <= 8000.0
@@ -141,7 +141,7 @@ def test_the_sensor_suits_any_rate(rate: float) -> None:
 
 def pretended(folder: Path, configuration: str = '', **changes: object) -> None:
     """Write a bag that claims to be the only run of the friction experiment, with changes."""
-    (parameters,) = Campaign(protocol=FRICTION, repeats=1).runs().values()
+    (parameters,) = Campaign(protocol=FRICTION, repeats=1).runs.values()
     text = message_type('std_msgs/msg/String')
     kinds = {
         '/plant/configuration': 'std_msgs/msg/String',
@@ -261,7 +261,7 @@ def stand(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Rig]:
 def place() -> dict[str, Any]:
     """Return the only place of a campaign of presses."""
     campaign = Campaign(protocol=STIFFNESS, repeats=1, rate=RATE)
-    (parameters,) = campaign.runs().values()
+    (parameters,) = campaign.runs.values()
     return parameters
 
 

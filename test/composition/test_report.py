@@ -12,16 +12,16 @@ from markupsafe import Markup
 from matplotlib.figure import Figure
 from needle_dynamics import ParameterError
 from needle_insertion.report.content import Picture
-from needle_insertion.report.page import templates, write_page
+from needle_insertion.report.page import TEMPLATES, write_page
 from needle_insertion.report.text import Check, CHECK_HEADS, table
 import pytest
 from support.pages import look_at
 
 #: The blocks of pages, by name.
-BLOCKS: Any = templates().get_template('blocks.html').module
+BLOCKS: Any = TEMPLATES.get_template('blocks.html').module
 
 #: A page with pieces of HTML and pictures.
-PAGE = templates().from_string(
+PAGE = TEMPLATES.from_string(
     "{% extends 'page.html' %}{% from 'blocks.html' import picture %}{% block content %}"
     '{% for one in blocks %}{{ one }}{% endfor %}'
     '{% for one in pictures.values() %}{{ picture(one) }}{% endfor %}{% endblock %}'
