@@ -35,7 +35,7 @@ def no_memory() -> FloatArray:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LawGains:
-    """Gains of a law on one axis."""
+    """Gains of a law on one axis: some of kp, ki, kd and kv, and what does not scale."""
 
     def scaled(self, factor: float) -> LawGains:
         """Return all gains multiplied by a factor."""
@@ -115,57 +115,6 @@ class Law:
         """
         return law_force(self.packed, memory, _instant(position, speed, setpoint), float(load))
 
-    def step(
-        self,
-        position: float,
-        speed: float,
-        setpoint: Setpoint,
-        memory: FloatArray,
-        load: float,
-        limit: float,
-    ) -> float:
-        """
-        Return the force within a limit and update the memory; see `force`.
-
-        Parameters
-        ----------
-        position, speed, setpoint, memory, load
-            As for `force`.
-        limit : float
-            Largest force [N].
-
-        Returns
-        -------
-        float
-            Force for the next period [N].
-
-        """
-        instant = _instant(position, speed, setpoint)
-        return law_step(self.packed, memory, instant, float(load), float(limit))
-
-    def match(
-        self,
-        position: float,
-        speed: float,
-        setpoint: Setpoint,
-        memory: FloatArray,
-        load: float,
-        force: float,
-    ) -> None:
-        """
-        Set the memory such that the next force is a given one: a switch without a jump.
-
-        Parameters
-        ----------
-        position, speed, setpoint, memory, load
-            As for `force`.
-        force : float
-            Force that the law shall return next [N].
-
-        """
-        instant = _instant(position, speed, setpoint)
-        law_match(self.packed, memory, instant, float(load), float(force))
-
     def linear(self) -> Law:
         """Return the law without Coulomb friction, for its poles."""
         return replace(self, axis=self.axis.without_coulomb())
@@ -211,7 +160,7 @@ class SampledLoop:
 
     def __init__(self, law: Law, delay: int, limit: float) -> None:
         self.law = law
-        self.limit = limit
+        self.limit = float(limit)
         self.pending: deque[float] = deque([0.0] * delay, maxlen=delay)
         self.memory = no_memory()
         self.last = 0.0
@@ -272,12 +221,13 @@ class SampledLoop:
             Force within the limit [N].
 
         """
-        law = self.law
+        law, load = self.law, float(load)
         for force in self.pending:
             position, speed = law.axis.propagate(position, speed, force - load, law.period)
+        instant = _instant(position, speed, setpoint)
         if self._take_over:
             self._take_over = False
-            law.match(position, speed, setpoint, self.memory, load, self.last)
-        self.last = force = law.step(position, speed, setpoint, self.memory, load, self.limit)
+            law_match(law.packed, self.memory, instant, load, self.last)
+        self.last = force = law_step(law.packed, self.memory, instant, load, self.limit)
         self.pending.append(force)
         return force

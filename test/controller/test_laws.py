@@ -95,8 +95,10 @@ def test_pid_is_evaluated_at_the_end_of_the_period(
     # Rounding of terms of the size of the gains.
     scale = 100.0
     assert abs(force - expected) < 1e-11 * scale
-    assert law.step(position, speed, aim, memory, 0.0, inf) == force
-    assert abs(memory[RATE] - low) < 1e-11 * scale
+    loop = SampledLoop(law, 0, inf)
+    loop.memory[:] = memory
+    assert loop.command(position, speed, aim) == force
+    assert abs(loop.memory[RATE] - low) < 1e-11 * scale
 
 
 @settings(deadline=None, derandomize=True, max_examples=200)
