@@ -109,7 +109,8 @@ class Measurement:
 
     def is_finite(self) -> bool:
         """Return whether every number is finite."""
-        return all(map(isfinite, (self.depth, self.speed, self.angle, self.angular_speed)))
+        insertion = isfinite(self.depth) and isfinite(self.speed)
+        return insertion and isfinite(self.angle) and isfinite(self.angular_speed)
 
 
 #: Setpoint of a command without a reference.
@@ -318,18 +319,18 @@ class Controller:
         self._rotation.stop()
         self._stopped = True
 
-    def _gap(self, before: Measurement | None, measured: Measurement) -> float:
+    def _gap(self, measured: Measurement) -> float:
         """Return the time between measurements [s] if it is too long or negative; else zero."""
-        elapsed = measured.time - before.time if before is not None else 0.0
+        elapsed = measured.time - self._seen.time if self._seen is not None else 0.0
         most = self.settings.measurement_timeout + self.period
         return 0.0 if 0.0 <= elapsed <= most else elapsed
 
-    def _fault(self, measured: Measurement) -> str | None:
-        """Return why a measurement cannot be answered."""
+    def _fault(self, measured: Measurement, gap: float) -> str | None:
+        """Return why a measurement that comes after a gap [s], or none, cannot be answered."""
         if not measured.is_finite():
             return f'joint_states must be finite, got {measured}'
         before, self._seen = self._seen, measured
-        if before is not None and not self._gap(before, measured):
+        if before is not None and not gap:
             elapsed = measured.time - before.time
             moved = measured.depth - before.depth
             explained = 0.5 * (before.speed + measured.speed) * elapsed
@@ -358,12 +359,12 @@ class Controller:
 
         """
         notice = None
-        gap = self._gap(self._seen, measured)
+        gap = self._gap(measured)
         if gap:
             if self.guide.moves:
                 notice = f'measurements continued after {gap:.3f} s; the motion starts again'
             self.release()
-        fault = self._fault(measured)
+        fault = self._fault(measured, gap)
         if fault is not None:
             self.release()
         else:

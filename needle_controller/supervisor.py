@@ -395,8 +395,8 @@ class Supervisor:
         if command.notice is not None:
             self.journal.complaint = command.notice
             self.journal.say(Severity.ERROR, command.notice)
-        position, velocity, _ = command.setpoint
-        error = position - measured.depth, velocity - measured.speed
+        aim = command.setpoint
+        error = aim.position - measured.depth, aim.speed - measured.speed
         stopped = self._stop_for(safety.guard.tracking(error[0]), stamp)
         if stopped is not None:
             return stopped
@@ -406,7 +406,7 @@ class Supervisor:
         force, torque, limits = command.force, command.torque, controller.settings
         full = abs(force) >= limits.force_limit or abs(torque) >= limits.torque_limit
         safety.saturation.add(stamp, full)
-        return self._command(Answer(stamp, force, torque, (position, velocity), error))
+        return self._command(Answer(stamp, force, torque, aim[:2], error))
 
     def watch(self, now: int, commanders: Mapping[str, int]) -> Answer | None:
         """Look for what does not come, and for who else publishes a topic of commands."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from typing import Final
 
 from needle_controller.safety.limits import SafetyLimits
@@ -31,9 +30,7 @@ class Guard:
         #: What each topic is beyond, and for how many readings in a row.
         self._beyond: dict[str, tuple[str, int]] = {}
 
-    def _hold(
-        self, topic: str, readings: Iterable[tuple[str, float, float, str, str]]
-    ) -> str | None:
+    def _hold(self, topic: str, *readings: tuple[str, float, float, str, str]) -> str | None:
         """Compare readings: quantity, value, limit, unit, name of the limit."""
         for quantity, value, limit, unit, name in readings:
             # Written so that what is not a number is beyond every limit.
@@ -61,30 +58,28 @@ class Guard:
                 '(lowest_depth, highest_depth, safety.depth_tolerance)',
             )
         return self._hold(
-            'joint_states', [('insertion speed', speed, self.limits.speed, 'm/s', 'speed')]
+            'joint_states', ('insertion speed', speed, self.limits.speed, 'm/s', 'speed')
         )
 
     def tracking(self, error: float) -> str | None:
         """Return the limit that the distance from the reference [m] violates."""
         limit = self.limits.tracking_error
-        return self._hold('reference', [('tracking error', error, limit, 'm', 'tracking_error')])
+        return self._hold('reference', ('tracking error', error, limit, 'm', 'tracking_error'))
 
     def wrench(self, axial: float, lateral: float, moment: float) -> str | None:
         """Return the limit that forces [N] or the moment [N m] on the sensor violate."""
         return self._hold(
             'base_wrench',
-            [
-                ('axial force', axial, self.limits.axial_load, 'N', 'axial_load'),
-                ('lateral force', lateral, self.limits.lateral_load, 'N', 'lateral_load'),
-                ('moment', moment, self.limits.moment_load, 'N m', 'moment_load'),
-            ],
+            ('axial force', axial, self.limits.axial_load, 'N', 'axial_load'),
+            ('lateral force', lateral, self.limits.lateral_load, 'N', 'lateral_load'),
+            ('moment', moment, self.limits.moment_load, 'N m', 'moment_load'),
         )
 
     def tip(self, deflection: float) -> str | None:
         """Return the limit that the deflection of the tip [m] violates."""
         limit = self.limits.tip_deflection
         return self._hold(
-            'tip_deflection', [('tip deflection', deflection, limit, 'm', 'tip_deflection')]
+            'tip_deflection', ('tip deflection', deflection, limit, 'm', 'tip_deflection')
         )
 
     def forget(self, topic: str) -> None:

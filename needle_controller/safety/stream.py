@@ -127,6 +127,8 @@ class Stream:
         if self._frames and frame not in self._frames:
             valid = ' or '.join(map(repr, self._frames))
             return Refusal('frame', f'{self.name} must be in frame {valid}, got {frame!r}')
+        if not values:
+            return None
         if not all(map(isfinite, values)):
             return Refusal('not finite', f'{self.name} must be finite, got {list(values)}')
         return self._judge_change(stamp, values)
