@@ -71,7 +71,7 @@ class Supervisor:
     Parameters
     ----------
     steady : callable
-        Returns the time of a clock that never jumps [s].
+        As for `Journal`.
 
     Attributes
     ----------
