@@ -102,22 +102,7 @@ def transition_matrix(law: Law, delay: int, unmodeled: int = 0) -> FloatArray:
 
 
 def spectral_radius(law: Law, delay: int, unmodeled: int = 0) -> float:
-    """
-    Largest modulus of the poles of the sampled loop. The loop is stable if it is below 1.
-
-    Parameters
-    ----------
-    law : Law
-        Control law.
-    delay, unmodeled : int
-        As in `transition_matrix`.
-
-    Returns
-    -------
-    float
-        Spectral radius.
-
-    """
+    """Return the largest modulus of the poles; see `transition_matrix`. Below 1 is stable."""
     return float(np.abs(np.linalg.eigvals(transition_matrix(law, delay, unmodeled))).max())
 
 

@@ -27,14 +27,6 @@ class Commander(Protocol):
     What `run_controller` runs: a `Controller`, or any object of your own like it.
 
     It is called from Python once in every period; nothing of it needs to be compiled.
-
-    Attributes
-    ----------
-    period : float
-        Sample period [s].
-    delay : int
-        Periods from a measurement to the effect of its command.
-
     """
 
     @property

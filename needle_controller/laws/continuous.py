@@ -272,12 +272,10 @@ def acceleration(
     ----------
     model : NeedleModel
         The model.
-    state : array_like, shape (2 (2 + n),)
-        State.
+    state, time
+        As for `NeedleModel.acceleration`.
     forces : array_like, shape (2 + n,)
         f_y [N], positive into the tissue, tau [N m], and the generalized force on each q_i.
-    time : float
-        Time [s], for tissue that swells.
 
     Returns
     -------

@@ -179,20 +179,7 @@ class SampledLoop:
         self.memory[:] = 0.0
 
     def switch(self, law: Law) -> None:
-        """
-        Continue with another law, or other gains. Its first force is the last one again.
-
-        Parameters
-        ----------
-        law : Law
-            The new law.
-
-        Raises
-        ------
-        ParameterError
-            If it has another period.
-
-        """
+        """Continue with another law of this period; its first force is the last one again."""
         if law.period != self.law.period:
             raise ParameterError(
                 f'the period must stay {self.law.period:g} s, got {law.period!r} s'
@@ -204,22 +191,9 @@ class SampledLoop:
         self, position: float, speed: float, setpoint: Setpoint, load: float = 0.0
     ) -> float:
         """
-        Return the force to apply.
+        Return the force to apply, within the limit [N]; see `Law.force`.
 
-        Parameters
-        ----------
-        position, speed : float
-            Measured now.
-        setpoint : Setpoint
-            Reference at the time when the command takes effect.
-        load : float
-            Known force against the motion [N].
-
-        Returns
-        -------
-        float
-            Force within the limit [N].
-
+        The state is measured now, the setpoint is for the time when the command takes effect.
         """
         law, load = self.law, float(load)
         for force in self.pending:

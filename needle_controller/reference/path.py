@@ -261,12 +261,8 @@ def brake(start: Setpoint, limits: ReferenceLimits, depths: tuple[float, float])
 
     Parameters
     ----------
-    start : Setpoint
-        Start of the motion.
-    limits : ReferenceLimits
-        Limits.
-    depths : tuple of float
-        Least and largest position on the way [m].
+    start, limits, depths
+        As for `halt`.
 
     Returns
     -------

@@ -9,19 +9,7 @@ from needle_controller.reference.setpoint import ReferenceLimits, Setpoint
 
 
 class Step:
-    """
-    The target at once, as the paper regulates.
-
-    Parameters
-    ----------
-    start : Setpoint
-        Not used; a step has the parameters of every reference.
-    target : float
-        Target [m].
-    limits : ReferenceLimits
-        Not used.
-
-    """
+    """The target [m] at once, as the paper regulates; start and limits do not matter."""
 
     duration: Final = 0.0
 
