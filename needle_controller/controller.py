@@ -98,6 +98,8 @@ class Measurement:
         Inserted length [m] and insertion speed [m/s], positive into the tissue.
     angle, angular_speed : float
         Rotation of the base about x [rad], [rad/s].
+    force : float
+        Axial force on the needle as the robot reports it [N]; NaN if it does not.
 
     """
 
@@ -106,9 +108,10 @@ class Measurement:
     speed: float
     angle: float = 0.0
     angular_speed: float = 0.0
+    force: float = nan
 
     def is_finite(self) -> bool:
-        """Return whether every number is finite."""
+        """Return whether every number is finite; the force may be missing."""
         insertion = isfinite(self.depth) and isfinite(self.speed)
         return insertion and isfinite(self.angle) and isfinite(self.angular_speed)
 

@@ -25,6 +25,7 @@ from needle_controller.supervisor import Answer, Reply, Supervisor
 from needle_dynamics.compiled.cache import announce_compilation
 from needle_dynamics.model_node import ModelNode
 from needle_ros import contract
+from needle_ros.commanders import Commanders
 from needle_ros.errors import ParameterError
 from needle_ros.run_node import run
 from needle_ros.timing import nanoseconds, seconds
@@ -113,6 +114,8 @@ class ControllerNode(ModelNode):
 
         self._supervisor = supervisor = Supervisor()
         self._truths: Subscription | None = None
+        self._commanders = Commanders(self)
+        self._commanders.join()
         self._wrench_command = self.publisher(contract.WRENCH_COMMAND)
         self._reference = self.publisher(contract.REFERENCE)
         self._tracking_error = self.publisher(contract.TRACKING_ERROR)
@@ -193,7 +196,7 @@ class ControllerNode(ModelNode):
 
     def activate(self) -> None:
         """Begin to answer measurements and to watch for their absence."""
-        self._supervisor.activate(self.now(), self._commanders())
+        self._supervisor.activate(self.now(), self._who_commands())
         self._watchdog = self.create_timer(
             self._supervisor.watch_period, self._on_watchdog, clock=self._steady
         )
@@ -202,11 +205,6 @@ class ControllerNode(ModelNode):
         """Let go: zero force, and no memory of the motion nor of its target."""
         self._act(self._supervisor.deactivate(self.now()))
         self.destroy_timer(self._watchdog)
-
-    def _commanders(self) -> dict[str, int]:
-        """Count who commands; those that are not active count too."""
-        topic = self._wrench_command.topic_name
-        return {topic: self.count_publishers(topic)}
 
     # What comes in.
 
@@ -250,8 +248,12 @@ class ControllerNode(ModelNode):
             )
         )
 
+    def _who_commands(self) -> dict[str, int]:
+        """Count who commands; those that are not active count too."""
+        return {self._commanders.topic: self._commanders.count()}
+
     def _on_watchdog(self) -> None:
-        self._act(self._supervisor.watch(self.now(), self._commanders()))
+        self._act(self._supervisor.watch(self.now(), self._who_commands()))
 
     # What goes out.
 

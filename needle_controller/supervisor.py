@@ -12,6 +12,7 @@ from needle_controller.journal import Journal, Severity
 from needle_controller.observer.observer import Observer
 from needle_controller.observer.settings import ObserverSettings
 from needle_controller.safety.encoders import read_encoders
+from needle_controller.safety.following import Following
 from needle_controller.safety.limits import SafetyLimits
 from needle_controller.safety.safety import Safety
 from needle_controller.safety.stream import REPEATED
@@ -100,6 +101,7 @@ class Supervisor:
         self._oldest = 0.0
         self._deflection_ignored = False
         self._last = Answer(0)
+        self._following = Following()
         self.controller: Controller | None = None
         self.cleanup()
 
@@ -400,7 +402,18 @@ class Supervisor:
         stopped = self._stop_for(safety.guard.tracking(error[0]), stamp)
         if stopped is not None:
             return stopped
-        if self.fault is not None:
+        lost = self._following.update(
+            stamp, measured.depth, position, self._last.force, measured.force
+        )
+        if lost != controller.guide.waits:
+            controller.guide.wait(lost)
+        if lost:
+            self._say_fault(
+                'the plant does not follow: it reports '
+                f'{measured.force:.3g} N, {self._last.force:.3g} N is commanded',
+                'the reference waits',
+            )
+        elif self.fault is not None:
             self.fault = None
             self.journal.say(Severity.INFO, kind='recovery')
         force, torque, limits = command.force, command.torque, controller.settings
@@ -438,15 +451,21 @@ class Supervisor:
 
     def _let_go(self, fault: str, stamp: int) -> Answer:
         """Command zero force for a reason, said when it begins."""
+        self._say_fault(fault, 'no force is commanded')
+        return self._release(stamp)
+
+    def _say_fault(self, fault: str, consequence: str) -> None:
+        """Take note of a fault, said when it begins."""
         # Those of one kind begin alike, whatever their numbers.
         kind = fault.partition(' ')[0]
         if self.fault is None or not self.fault.startswith(kind):
-            self.journal.say(Severity.ERROR, f'{fault}; no force is commanded', kind)
+            self.journal.say(Severity.ERROR, f'{fault}; {consequence}', kind)
         self.fault = fault
-        return self._release(stamp)
 
     def _release(self, stamp: int) -> Answer:
+        self._following.forget()
         if self.controller is not None:
+            self.controller.guide.wait(False)
             self.controller.release()
         return self._command(Answer(stamp))
 

@@ -21,6 +21,7 @@ from needle_dynamics.simulated.faults import Fault, FaultParameters, FAULTS, FAU
 from needle_dynamics.simulated.plant import Plant, Sample
 from needle_dynamics.simulated.run import Event, PARAMETERS, PlantRun, RESET, TARE, TRAJECTORY
 from needle_ros import contract
+from needle_ros.commanders import Commanders
 from needle_ros.errors import JobError, NeedleError, ParameterError
 from needle_ros.run_node import run
 from needle_ros.sample_clock import SampleClock
@@ -134,6 +135,7 @@ class PlantNode(ModelNode):
         self._needle_poses = self.publisher(contract.NEEDLE_POSES)
         self._events = self.publisher(contract.EVENTS)
         self._clock_topic: Publisher | None = None
+        self._commanders = Commanders(self)
         self.listen(contract.WRENCH_COMMAND, self._on_command)
         self.subscribe(contract.JOINT_TRAJECTORY, self._on_trajectory)
         self.create_service(Trigger, '~/tare', self._on_tare)
@@ -344,7 +346,7 @@ class PlantNode(ModelNode):
         """Look who commands, and ask again for an answer that does not come."""
         if self._run is None:
             return
-        commanders = self.count_publishers(contract.WRENCH_COMMAND.name)
+        commanders = self._commanders.count()
         if self._run.commands.count_commanders(commanders) and self._run.commands.rivals:
             self.get_logger().error(f'{commanders} nodes command; no force is applied')
         self._looks = self._looks + 1 if self._time.awaited is not None else 0

@@ -38,6 +38,9 @@ class Qos(NamedTuple):
         Whether readers that come late get the messages of before.
     depth : int
         Messages kept for a reader that is busy or comes late.
+    lease : float
+        Time after which a publisher that has died counts as dead [s]; 0 leaves it to DDS, which
+        takes 20 s.
 
     """
 
@@ -45,6 +48,7 @@ class Qos(NamedTuple):
     reliable: bool
     latched: bool
     depth: int
+    lease: float = 0.0
 
 
 #: A burst after a stall of the reader is not lost.
@@ -52,6 +56,9 @@ SENSOR: Final = Qos('best effort', reliable=False, latched=False, depth=50)
 
 #: Only the newest counts, and it must arrive.
 COMMAND: Final = Qos('reliable', reliable=True, latched=False, depth=1)
+
+#: No messages: who publishes it is alive.
+ALIVE: Final = Qos('lease of 0.5 s', reliable=True, latched=False, depth=1, lease=0.5)
 
 #: The last message reaches readers that come late.
 LATCHED: Final = Qos('latched', reliable=True, latched=True, depth=1)
@@ -279,6 +286,14 @@ WRENCH_COMMAND: Final = Topic(
     'of the sample it answers',
     qos=COMMAND,
     frame=BASE,
+)
+
+COMMANDER: Final = Topic(
+    'wrench_command/alive',
+    'std_msgs/msg/Empty',
+    'controller',
+    'no messages: its lease tells the others when a controller has died',
+    qos=ALIVE,
 )
 
 REFERENCE: Final = Topic(

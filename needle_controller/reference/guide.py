@@ -38,6 +38,8 @@ class Guide:
     ----------
     paused : bool
         Whether it is paused.
+    waits : bool
+        Whether it waits for a plant that does not follow.
     target : float or None
         Inserted length where the motion ends [m]; None without a target or path.
 
@@ -64,7 +66,7 @@ class Guide:
         """Forget target, path and pause."""
         self.target: float | None = None
         self._path: Path | None = None
-        self.paused = False
+        self.paused = self.waits = False
         self.release()
 
     def release(self) -> None:
@@ -130,19 +132,25 @@ class Guide:
 
     def pause(self) -> None:
         """Brake to rest within the limits and stay there."""
-        if not self.paused:
-            self.paused = True
-            self._change = self._brake
+        self._still(True, self.waits)
 
     def resume(self) -> None:
         """Continue to the target, or along the path from where it was left."""
-        if self.paused:
-            self.paused = False
-            self._change = self._plan
+        self._still(False, self.waits)
+
+    def wait(self, waits: bool) -> None:
+        """Brake and hold while the plant does not follow, or continue."""
+        self._still(self.paused, waits)
+
+    def _still(self, paused: bool, waits: bool) -> None:
+        before = self.paused or self.waits
+        self.paused, self.waits = paused, waits
+        if before != (paused or waits):
+            self._change = self._plan if before else self._brake
 
     def _replan(self) -> None:
         # A new target does not end a pause.
-        if not self.paused:
+        if not (self.paused or self.waits):
             self._change = self._plan
 
     def at(self, time: float, depth: float) -> Setpoint:
@@ -177,7 +185,7 @@ class Guide:
         return self._motion.at(time - self._start) if self._motion else Setpoint(0.0)
 
     def _plan(self, now: Setpoint) -> Reference:
-        if self.paused:
+        if self.paused or self.waits:
             return self._brake(now)
         if self._path is not None:
             if self._kind is not MinimumJerk:

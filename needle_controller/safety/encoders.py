@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from math import nan
+
 from needle_controller.controller import Measurement
 from needle_ros.errors import ParameterError
 from needle_ros.timing import NANOSECONDS
@@ -9,8 +11,8 @@ from needle_ros.wire import Reading
 
 
 def read_encoders(reading: Reading) -> Measurement:
-    """Read a joint state; `rotation` may be missing, an incomplete one is a ParameterError."""
-    names, (positions, velocities, _) = reading.names, reading.values
+    """Read a joint state; `rotation` and efforts may be missing, or raise a ParameterError."""
+    names, (positions, velocities, efforts) = reading.names, reading.values
     try:
         i = names.index('insertion')
         depth, velocity = positions[i], velocities[i]
@@ -29,4 +31,5 @@ def read_encoders(reading: Reading) -> Measurement:
         speed=velocity,
         angle=angle,
         angular_speed=angular_velocity,
+        force=efforts[i] if i < len(efforts) else nan,
     )

@@ -44,8 +44,10 @@ class Loop:
         self.depth += move
         return self.encoders(self.now - late, self.depth, velocity)
 
-    def encoders(self, stamp: int, depth: float, velocity: float) -> Answer | None:
-        values = ((depth,), (velocity,), ())
+    def encoders(
+        self, stamp: int, depth: float, velocity: float, *efforts: float
+    ) -> Answer | None:
+        values = ((depth,), (velocity,), efforts)
         return self.supervisor.encoders(Reading(stamp, '', ('insertion',), values), self.now)
 
     def wrench(self, axial: float = 0.0, moment: float = 0.0) -> Answer | None:
@@ -185,6 +187,60 @@ def test_without_a_target_there_is_no_force(
     """Nothing but a wish of the user moves the needle."""
     loop = Loop(target=None)
     assert all(answer.force == 0.0 for event in happens if (answer := event(loop)) is not None)
+
+
+class Robot:
+    """A loop around a robot that does as it is told, or nothing; it may report its force."""
+
+    def __init__(self, reports: bool = True) -> None:
+        self.loop, self.reports = Loop(), reports
+        self.velocity = 0.0
+
+    def runs(self, periods: int, *, obeys: bool) -> None:
+        for _ in range(periods):
+            answer = self.loop.supervisor._last  # noqa: SLF001
+            self.velocity = answer.reference[1] if obeys and answer.reference else 0.0
+            self.loop.now += PERIOD
+            self.loop.depth += self.velocity * 1e-9 * PERIOD
+            effort = [answer.force if obeys else 0.0] if self.reports else []
+            self.loop.encoders(self.loop.now, self.loop.depth, self.velocity, *effort)
+            self.loop.supervisor.journal.take()
+
+    @property
+    def aim(self) -> float:
+        return self.loop.supervisor._last.reference[0]  # noqa: SLF001
+
+
+def test_the_reference_waits_for_a_plant_that_does_not_follow() -> None:
+    """No stop is latched, the force stays, and the motion goes on when the plant follows."""
+    robot = Robot()
+    supervisor = robot.loop.supervisor
+    robot.runs(200, obeys=True)
+    assert supervisor.fault is None
+    start = robot.loop.depth
+    robot.runs(300, obeys=False)
+    assert 'the plant does not follow: it reports 0 N' in str(supervisor.fault)
+    waits = robot.aim
+    robot.runs(5000, obeys=False)
+    assert robot.aim == waits
+    assert supervisor.safety.stop is None
+    # A tenth of a second at the velocity of the reference, and its brake.
+    assert 0.0 < waits - start < 0.01
+    robot.runs(3000, obeys=True)
+    assert supervisor.fault is None
+    assert robot.aim > waits + 0.02
+
+
+@pytest.mark.parametrize('moves', [False, True])
+def test_a_robot_that_reports_no_force_or_moves_is_not_judged(moves: bool) -> None:
+    """Without efforts nothing is known; where the needle moves, reported zeros do not count."""
+    robot = Robot(reports=False)
+    robot.runs(500, obeys=moves)
+    if moves:
+        for _ in range(500):
+            robot.runs(1, obeys=True)
+            robot.loop.encoders(robot.loop.now, robot.loop.depth, robot.velocity, 0.0)
+    assert not robot.loop.supervisor.controller.guide.waits
 
 
 def test_a_measurement_that_comes_again_has_the_same_answer() -> None:
