@@ -403,7 +403,7 @@ class Supervisor:
         if stopped is not None:
             return stopped
         lost = self._following.update(
-            stamp, measured.depth, position, self._last.force, measured.force
+            stamp, measured.depth, aim.position, self._last.force, measured.force
         )
         if lost != controller.guide.waits:
             controller.guide.wait(lost)

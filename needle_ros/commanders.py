@@ -13,9 +13,9 @@ class Commanders:
     """
     Counts the nodes that command.
 
-    A node that was killed stays in the graph for 20 s. One that also offers the topic
-    `COMMANDER` of the contract counts only as long as it is alive: its lease ends after 0.5 s.
-    Others, such as ``ros2 topic pub``, count as long as the graph has them.
+    A node that was killed stays in the graph for 20 s. If it has joined the topic `COMMANDER` of
+    the contract, it no longer counts when its lease of 0.5 s is over. Others, such as
+    ``ros2 topic pub``, count as long as the graph has them.
 
     Parameters
     ----------
@@ -32,7 +32,7 @@ class Commanders:
             contract.WRENCH_COMMAND.name
         )
         self._kind = message_class(contract.COMMANDER.type_name)
-        self._alive = 0
+        self._dead = 0
         node.create_subscription(
             self._kind,
             self._lease,
@@ -42,7 +42,7 @@ class Commanders:
         )
 
     def _on_change(self, event: Any) -> None:
-        self._alive = event.alive_count
+        self._dead = event.not_alive_count
 
     def join(self) -> None:
         """Offer the lease, before the commands: a commander without one never counts as dead."""
@@ -55,9 +55,7 @@ class Commanders:
         Returns
         -------
         int
-            Publishers without a lease, and publishers whose lease runs.
+            Publishers of commands, but those whose lease is over.
 
         """
-        published = self._node.count_publishers(self.topic)
-        leased = self._node.count_publishers(self._lease)
-        return max(0, published - leased) + self._alive
+        return self._node.count_publishers(self.topic) - self._dead
