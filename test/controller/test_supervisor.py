@@ -198,7 +198,7 @@ class Robot:
 
     def runs(self, periods: int, *, obeys: bool) -> None:
         for _ in range(periods):
-            answer = self.loop.supervisor._last  # noqa: SLF001
+            answer = self.loop.supervisor._last
             self.velocity = answer.reference[1] if obeys and answer.reference else 0.0
             self.loop.now += PERIOD
             self.loop.depth += self.velocity * 1e-9 * PERIOD
@@ -208,7 +208,7 @@ class Robot:
 
     @property
     def aim(self) -> float:
-        return self.loop.supervisor._last.reference[0]  # noqa: SLF001
+        return self.loop.supervisor._last.reference[0]
 
 
 def test_the_reference_waits_for_a_plant_that_does_not_follow() -> None:
