@@ -25,7 +25,7 @@ from needle_controller.supervisor import Answer, Reply, Supervisor
 from needle_dynamics.compiled.cache import announce_compilation
 from needle_dynamics.model_node import ModelNode
 from needle_ros import contract
-from needle_ros.commanders import Commanders
+from needle_ros.commanders_node import Commanders
 from needle_ros.errors import ParameterError
 from needle_ros.run_node import run
 from needle_ros.timing import nanoseconds, seconds

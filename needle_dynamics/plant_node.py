@@ -21,7 +21,7 @@ from needle_dynamics.simulated.faults import Fault, FaultParameters, FAULTS, FAU
 from needle_dynamics.simulated.plant import Plant, Sample
 from needle_dynamics.simulated.run import Event, PARAMETERS, PlantRun, RESET, TARE, TRAJECTORY
 from needle_ros import contract
-from needle_ros.commanders import Commanders
+from needle_ros.commanders_node import Commanders
 from needle_ros.errors import JobError, NeedleError, ParameterError
 from needle_ros.run_node import run
 from needle_ros.sample_clock import SampleClock
