@@ -11,6 +11,7 @@ from __future__ import annotations
 from array import array
 from collections import Counter
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import fields
 from importlib import import_module
 import traceback
@@ -97,8 +98,38 @@ LATCHED, COMMAND, SENSOR = (
     profile(qos) for qos in (contract.LATCHED, contract.COMMAND, contract.SENSOR)
 )
 
+#: Text that rcl takes for true and false in a parameter file.
+_READ_AS_BOOL = ('y', 'n')
+
+
+class _Dumper(yaml.SafeDumper):  # type: ignore[misc]
+    """Quotes what rcl would not take for text, but PyYAML would."""
+
+
+_Dumper.add_representer(
+    str,
+    lambda dumper, text: dumper.represent_scalar(
+        'tag:yaml.org,2002:str', text, style="'" if text.lower() in _READ_AS_BOOL else None
+    ),
+)
+
 _Settings = TypeVar('_Settings')
 _SUCCESS = TransitionCallbackReturn.SUCCESS
+
+
+def _same(new: Any, old: Any) -> bool:
+    """Return whether a parameter stays as it is; a number may come as text."""
+    if isinstance(new, (list, tuple, array)):
+        return list(new) == old
+    return bool((_number(new) if isinstance(old, float) else new) == old)
+
+
+def _number(value: Any) -> Any:
+    """Return the number that a text stands for; other values stay as they are."""
+    if isinstance(value, str):
+        with suppress(ValueError):
+            return float(value)
+    return value
 
 
 class BaseNode(LifecycleNode):
@@ -116,6 +147,9 @@ class BaseNode(LifecycleNode):
         Why the last transition was refused.
     invalid : Counter
         Number of invalid messages by topic.
+    shared : frozenset of str
+        Names of parameters that a file gives to several nodes: what this one does not have, others
+        do.
 
     """
 
@@ -127,6 +161,7 @@ class BaseNode(LifecycleNode):
         self.failure: str | None = None
         self.invalid: Counter[str] = Counter()
         self._descriptions: dict[str, Mapping[str, Any]] = {}
+        self.shared: frozenset[str] = frozenset()
         self._configured = False
         self.declare_text('autostart', True, 'configure and activate at start')
         self._configuration = self.publisher(contract.CONFIGURATION, always=True)
@@ -306,7 +341,10 @@ class BaseNode(LifecycleNode):
             What it is.
 
         """
-        self.declare_parameter(name, default, ParameterDescriptor(description=description))
+        # YAML 1.1 reads y as true: `text` understands it.
+        dynamic = default in _READ_AS_BOOL
+        descriptor = ParameterDescriptor(description=description, dynamic_typing=dynamic)
+        self.declare_parameter(name, default, descriptor)
 
     def declare_settings(self, prefix: str, defaults: object) -> None:
         """
@@ -366,10 +404,12 @@ class BaseNode(LifecycleNode):
             If a value is not valid; the message names the parameter.
 
         """
-        values = {
-            item.name: (changes or {}).get(f'{prefix}{item.name}', self._value(prefix + item.name))
-            for item in fields(kind)  # type: ignore[arg-type]
-        }
+        values = {}
+        for item in fields(kind):  # type: ignore[arg-type]
+            name = f'{prefix}{item.name}'
+            value = (changes or {}).get(name, self._value(name))
+            # PyYAML, and so `ros2 param load`, reads 1e-3 as text.
+            values[item.name] = _number(value) if 'unit' in item.metadata else value
         return from_values(kind, values, prefix)
 
     def _value(self, name: str) -> Any:
@@ -405,6 +445,8 @@ class BaseNode(LifecycleNode):
 
         """
         value = (changes or {}).get(name, self._value(name))
+        if isinstance(value, bool):
+            value = _READ_AS_BOOL[not value]
         if not isinstance(value, str) or (valid and value not in valid):
             raise ParameterError(f'{name} must be one of {", ".join(valid)}, got {value!r}')
         return value
@@ -421,7 +463,7 @@ class BaseNode(LifecycleNode):
         """
         values = self.values()
         document = {self.get_fully_qualified_name(): {'ros__parameters': values}}
-        return str(yaml.safe_dump(document, sort_keys=False))
+        return str(yaml.dump(document, Dumper=_Dumper, sort_keys=False))
 
     def values(self) -> dict[str, Any]:
         """
@@ -430,22 +472,27 @@ class BaseNode(LifecycleNode):
         Returns
         -------
         dict
-            Values by name; an empty list is left out, as a parameter file cannot hold one.
+            Values by name.
 
         """
         values = {}
         for name, parameter in sorted(self._parameters.items()):
             value = parameter.value
-            if isinstance(value, (list, tuple, array)):
-                value = list(value)
-            # Where an empty list is valid it is the default.
-            if not name.startswith(('qos_overrides', 'start_type')) and value not in ([], None):
+            if value is None or isinstance(value, (list, tuple, array)):
+                # rcl has an empty list of a parameter file as None.
+                value = list(value or ())
+            if not name.startswith(('qos_overrides', 'start_type')):
                 values[name] = value
         return values
 
     def _check_overrides(self) -> None:
         known = sorted(self._parameters)
-        unknown = sorted(set(self._parameter_overrides) - set(known))
+        others = sorted(self.shared - set(known))
+        if others:
+            self.get_logger().warning(
+                f'parameters for several nodes that this one does not have: {", ".join(others)}'
+            )
+        unknown = sorted(set(self._parameter_overrides) - set(known) - self.shared)
         if unknown:
             count = len(self._parameter_overrides)
             complaints = '; '.join(unknown_name(name, known) for name in unknown)
@@ -456,6 +503,9 @@ class BaseNode(LifecycleNode):
     def _check_change(self, parameters: list[Parameter]) -> SetParametersResult:
         if not self._configured:
             return SetParametersResult(successful=True)
+        # What stays as it is does not change: a whole parameter file can be loaded again.
+        now = self.values()
+        parameters = [one for one in parameters if not _same(one.value, now.get(one.name))]
         fixed = [parameter.name for parameter in parameters if parameter.name not in self.LIVE]
         if fixed:
             return SetParametersResult(
@@ -464,7 +514,8 @@ class BaseNode(LifecycleNode):
                 'first',
             )
         try:
-            self.change({parameter.name: parameter.value for parameter in parameters})
+            if parameters:
+                self.change({parameter.name: parameter.value for parameter in parameters})
         except NeedleError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)

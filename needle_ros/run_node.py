@@ -13,6 +13,7 @@ from types import FrameType
 
 from needle_ros.base_node import BaseNode
 from needle_ros.errors import NeedleError
+from needle_ros.parameter_files import sections, shared_names, strangers
 import rclpy
 from rclpy.exceptions import ParameterException
 from rclpy.executors import Executor
@@ -58,7 +59,7 @@ def run(kind: Callable[[], BaseNode], arguments: list[str] | None = None) -> int
         # rcl could not read the arguments or the parameter file.
         sys.stderr.write(f'error: {" ".join(str(error).split())}\n')
         return 2
-    previous = {name: signal.signal(name, stop) for name in (signal.SIGINT, signal.SIGTERM)}
+    previous = {one: signal.signal(one, stop) for one in (signal.SIGINT, signal.SIGTERM)}
     try:
         try:
             node = kind()
@@ -66,6 +67,10 @@ def run(kind: Callable[[], BaseNode], arguments: list[str] | None = None) -> int
             # RuntimeError is rcl's, for a node that its security refuses.
             sys.stderr.write(f'error: {" ".join(str(error).split())}\n')
             return 2
+        found, name = sections(arguments or sys.argv), node.get_fully_qualified_name()
+        for line in strangers(found, name):
+            node.get_logger().warning(line)
+        node.shared = shared_names(found, name)
         executor: Executor = EventsExecutor()
         executor.add_node(node)
         status = 0
@@ -88,5 +93,5 @@ def run(kind: Callable[[], BaseNode], arguments: list[str] | None = None) -> int
         return status
     finally:
         rclpy.utilities.try_shutdown()
-        for name, handler in previous.items():
-            signal.signal(name, handler)
+        for one, handler in previous.items():
+            signal.signal(one, handler)

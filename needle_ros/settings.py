@@ -13,6 +13,9 @@ from needle_ros.errors import ParameterError
 
 _Settings = TypeVar('_Settings')
 
+#: What may stand for a tuple.
+_LISTS: Final = (list, array, type(None))
+
 #: Larger integers cannot be converted to float.
 _LARGEST_INTEGER: Final = 10**300
 
@@ -111,8 +114,8 @@ def from_values(
         The dataclass.
     values : Mapping[str, Any]
         Values by field name; integers are accepted where a float is meant, lists and arrays where
-        a tuple is meant. A field without a value has its default, and so has a tuple given as
-        None: so an empty list in a parameter file arrives.
+        a tuple is meant. None stands for an empty tuple: so an empty list in a parameter file
+        arrives.
     prefix : str
         Namespace of the names in messages, such as ``model.``.
 
@@ -135,9 +138,7 @@ def from_values(
                 unknown_name(f'{prefix}{name}', (f'{prefix}{item}' for item in known))
             )
         several = isinstance(known[name].default, tuple)
-        if several and value is None:
-            continue
-        taken = tuple(value) if several and isinstance(value, (list, array)) else value
+        taken = tuple(value or ()) if several and isinstance(value, _LISTS) else value
         given[name] = _as_number(taken) if 'unit' in known[name].metadata else taken
     try:
         return kind(**given)

@@ -137,21 +137,33 @@ class _Border(NamedTuple):
 
 
 @inlined
-def _rates(c: Needle, at: ModeIntegrals, z: FloatArray) -> FloatArray:
-    """Return the rates that belong to ``z``, momenta unless `as_printed`."""
-    rates = z.copy()
+def _rates(
+    c: Needle, at: ModeIntegrals, z: FloatArray, factor: FloatArray, rates: FloatArray
+) -> None:
+    """Write the rates that belong to ``z``, momenta unless `as_printed`."""
+    n = z.shape[0]
+    for i in range(n):
+        rates[i] = z[i]
+        for j in range(n):
+            factor[i, j] = c.linear_density * at.gram[i, j]
     if not c.as_printed:
-        factor = c.linear_density * at.gram
         cholesky(factor, factor)
         forward(factor, rates)
         backward(factor, rates)
-    return rates
 
 
 @inlined
-def _border(c: Needle, at: ModeIntegrals, z: FloatArray, motion: _Motion, sums: Sums) -> _Border:
+def _border(
+    c: Needle,
+    at: ModeIntegrals,
+    z: FloatArray,
+    factor: FloatArray,
+    rates: FloatArray,
+    motion: _Motion,
+    sums: Sums,
+) -> _Border:
     """Return what the balance of momentum needs where a part of the time begins or ends."""
-    rates = _rates(c, at, z)
+    _rates(c, at, z, factor, rates)
     momentum, angular = 0.0, 0.0
     for i in range(rates.shape[0]):
         momentum += at.area[i] * rates[i]
@@ -219,7 +231,7 @@ def _write_felt(
     felt[1], felt[2] = lateral, about_entry + lever * lateral + inputs.torque
 
 
-@compiled
+@inlined
 def _steps(  # noqa: C901
     c: Needle,
     at: ModeIntegrals,
@@ -375,10 +387,10 @@ def advance(
     """
     n = c.modes.modes.shape[1]
     # Few blocks: an allocation takes a sixth of a step.
-    grids, rows = np.empty((2, n, n)), np.empty((8, n))
+    grids, rows = np.empty((3, n, n)), np.empty((9, n))
     work = np.empty(c.modes.series.shape[1] + 4 * n)
     at = ModeIntegrals(grids[0], grids[1], rows[0], rows[1], rows[2], rows[3])
-    q, z = rows[4], rows[5]
+    q, z, rates, factor = rows[4], rows[5], rows[8], grids[2]
     for i in range(n):
         q[i], z[i] = state[2 + i], state[4 + n + i]
     mode_integrals(c.modes, c.length - state[0], work, at)
@@ -394,7 +406,7 @@ def advance(
     gain = (inputs.velocity - motion.velocity) / duration
     span, left, later = duration / parts, 0.0, 0.0
     if felt is not None:
-        border = _border(c, at, z, motion, sums)
+        border = _border(c, at, z, factor, rates, motion, sums)
     for part in range(parts):
         later = (parts - 1 - part) * span
         motion, sums, left = _steps(
@@ -405,7 +417,7 @@ def advance(
             break
         if felt is not None:
             mode_integrals(c.modes, motion.depth, work, at)
-            now = _border(c, at, z, motion, sums)
+            now = _border(c, at, z, factor, rates, motion, sums)
             _write_felt(c, inputs, border, now, span, felt[part])
             border = now
     mode_integrals(c.modes, motion.depth, work, at)
@@ -417,7 +429,7 @@ def advance(
     state[1] += turned
     state[2 + n] = -motion.velocity
     state[3 + n] += turn * done
-    rates = _rates(c, at, z)
+    _rates(c, at, z, factor, rates)
     for i in range(n):
         state[2 + i], state[4 + n + i] = q[i], rates[i]
     input_work = sums.input_work + inputs.torque * turned

@@ -34,9 +34,9 @@ def test_values_are_taken_as_they_are_meant() -> None:
     assert from_values(Robot, {}) == Robot()
 
 
-def test_an_empty_list_is_the_default() -> None:
-    """A parameter file cannot hold one: it arrives as None."""
-    assert from_values(Robot, {'levels': None, 'joints': None}) == Robot()
+def test_an_empty_list_arrives_as_none() -> None:
+    """So rcl reads it from a parameter file; the default is not what the file says."""
+    assert from_values(Robot, {'levels': None, 'joints': None}) == Robot(levels=(), joints=())
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,144 @@
+"""Which nodes a ROS parameter file is for; rcl itself says nothing of it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import pairwise
+from pathlib import Path
+import re
+from typing import Any, NamedTuple
+
+import yaml
+
+_MARK = 'ros__parameters'
+
+
+class Section(NamedTuple):
+    """
+    Parameters for some nodes.
+
+    Attributes
+    ----------
+    file : str
+        The file.
+    nodes : str
+        Full name of the nodes, in which ``*`` stands for one name and ``**`` for any number.
+    names : frozenset of str
+        Names of the parameters.
+
+    """
+
+    file: str
+    nodes: str
+    names: frozenset[str]
+
+    def is_for(self, node: str) -> bool:
+        """
+        Return whether it is for a node.
+
+        Parameters
+        ----------
+        node : str
+            Full name of the node, such as ``/plant``.
+
+        Returns
+        -------
+        bool
+            Whether it is.
+
+        """
+        parts = [part for part in self.nodes.split('/') if part]
+        pattern = ''.join(
+            '(/[^/]+)*' if part == '**' else '/[^/]+' if part == '*' else '/' + re.escape(part)
+            for part in parts
+        )
+        return re.fullmatch(pattern, node) is not None
+
+
+def sections(arguments: Sequence[str]) -> list[Section]:
+    """
+    Read the parameter files of a command line.
+
+    Parameters
+    ----------
+    arguments : sequence of str
+        The command line, of which rcl has read the same files.
+
+    Returns
+    -------
+    list of Section
+        All sections, in their order.
+
+    """
+    files = [file for flag, file in pairwise(arguments) if flag == '--params-file']
+    return [
+        Section(file, f'/{name}', frozenset(_flat(values)))
+        for file in files
+        for name, values in _nodes(yaml.safe_load(Path(file).read_text(encoding='utf-8')))
+    ]
+
+
+def strangers(found: Sequence[Section], node: str) -> list[str]:
+    """
+    Return a line for each file that has nothing for a node.
+
+    Parameters
+    ----------
+    found : sequence of Section
+        What `sections` returned.
+    node : str
+        Full name of the node.
+
+    Returns
+    -------
+    list of str
+        The lines.
+
+    """
+    lines = []
+    for file in dict.fromkeys(section.file for section in found):
+        own = [section for section in found if section.file == file]
+        if not any(section.is_for(node) for section in own):
+            others = ', '.join(section.nodes for section in own)
+            lines.append(f'{file} has no parameters for {node}, only for {others}')
+    return lines
+
+
+def shared_names(found: Sequence[Section], node: str) -> frozenset[str]:
+    """
+    Return the parameters that files give to a node and to others of any name, by ``/**``.
+
+    Parameters
+    ----------
+    found : sequence of Section
+        What `sections` returned.
+    node : str
+        Full name of the node.
+
+    Returns
+    -------
+    frozenset of str
+        Names of the parameters.
+
+    """
+    shared = (one for one in found if '*' in one.nodes.rpartition('/')[2] and one.is_for(node))
+    return frozenset(name for section in shared for name in section.names)
+
+
+def _nodes(content: Any, namespace: str = '') -> Iterator[tuple[str, Mapping[str, Any]]]:
+    """Yield the nodes of a file, which may be nested in namespaces, and their parameters."""
+    for name, below in content.items() if isinstance(content, Mapping) else ():
+        path = f'{namespace}/{name}'.strip('/')
+        if isinstance(below, Mapping) and _MARK in below:
+            yield path, below[_MARK] or {}
+        else:
+            yield from _nodes(below, path)
+
+
+def _flat(values: Mapping[str, Any], prefix: str = '') -> Iterator[str]:
+    """Yield the names of parameters that may be nested."""
+    for name, value in values.items():
+        if isinstance(value, Mapping):
+            yield from _flat(value, f'{prefix}{name}.')
+        else:
+            yield f'{prefix}{name}'
