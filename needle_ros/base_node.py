@@ -118,18 +118,10 @@ _SUCCESS = TransitionCallbackReturn.SUCCESS
 
 
 def _same(new: Any, old: Any) -> bool:
-    """Return whether a parameter stays as it is; a number may come as text."""
+    """Return whether a parameter stays as it is."""
     if isinstance(new, (list, tuple, array)):
-        return list(new) == old
-    return bool((_number(new) if isinstance(old, float) else new) == old)
-
-
-def _number(value: Any) -> Any:
-    """Return the number that a text stands for; other values stay as they are."""
-    if isinstance(value, str):
-        with suppress(ValueError):
-            return float(value)
-    return value
+        new = list(new)
+    return bool(new == old)
 
 
 class BaseNode(LifecycleNode):
@@ -160,7 +152,8 @@ class BaseNode(LifecycleNode):
         super().__init__(name, **node_options)
         self.failure: str | None = None
         self.invalid: Counter[str] = Counter()
-        self._descriptions: dict[str, Mapping[str, Any]] = {}
+        #: Names of the parameters that are numbers.
+        self._numbers: set[str] = set()
         self.shared: frozenset[str] = frozenset()
         self._configured = False
         self.declare_text('autostart', True, 'configure and activate at start')
@@ -370,6 +363,8 @@ class BaseNode(LifecycleNode):
                 descriptor.floating_point_range = [
                     FloatingPointRange(from_value=meta['low'], to_value=meta['high'])
                 ]
+            if 'unit' in meta:
+                self._numbers.add(prefix + item.name)
             default = getattr(defaults, item.name)
             if isinstance(default, tuple):
                 default = list(default)
@@ -407,10 +402,15 @@ class BaseNode(LifecycleNode):
         values = {}
         for item in fields(kind):  # type: ignore[arg-type]
             name = f'{prefix}{item.name}'
-            value = (changes or {}).get(name, self._value(name))
-            # PyYAML, and so `ros2 param load`, reads 1e-3 as text.
-            values[item.name] = _number(value) if 'unit' in item.metadata else value
+            values[item.name] = self._meant(name, (changes or {}).get(name, self._value(name)))
         return from_values(kind, values, prefix)
+
+    def _meant(self, name: str, value: Any) -> Any:
+        """Return the number where a text stands for one: PyYAML reads 1e-3 as text."""
+        if name in self._numbers and isinstance(value, str):
+            with suppress(ValueError):
+                return float(value)
+        return value
 
     def _value(self, name: str) -> Any:
         return self.get_parameter(name).value
@@ -482,7 +482,7 @@ class BaseNode(LifecycleNode):
                 # rcl has an empty list of a parameter file as None.
                 value = list(value or ())
             if not name.startswith(('qos_overrides', 'start_type')):
-                values[name] = value
+                values[name] = self._meant(name, value)
         return values
 
     def _check_overrides(self) -> None:
@@ -505,7 +505,11 @@ class BaseNode(LifecycleNode):
             return SetParametersResult(successful=True)
         # What stays as it is does not change: a whole parameter file can be loaded again.
         now = self.values()
-        parameters = [one for one in parameters if not _same(one.value, now.get(one.name))]
+        parameters = [
+            one
+            for one in parameters
+            if not _same(self._meant(one.name, one.value), now.get(one.name))
+        ]
         fixed = [parameter.name for parameter in parameters if parameter.name not in self.LIVE]
         if fixed:
             return SetParametersResult(
