@@ -5,7 +5,8 @@ import xml.etree.ElementTree as ET
 
 from setuptools import find_packages, setup
 
-ROOT = Path(__file__).parent
+# colcon --symlink-install runs a link to this file, in a folder without README.md.
+ROOT = Path(__file__).resolve().parent
 MANIFEST = ET.parse(ROOT / 'package.xml').getroot()  # noqa: S314
 NAME = MANIFEST.findtext('name')
 NODES = {

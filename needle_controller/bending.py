@@ -51,12 +51,34 @@ class Bending:
             self.observer.reset()
 
     def take_tip(self, stamp: int, deflection: float) -> None:
-        """Take in the deflection of the tip [m]."""
+        """
+        Take in the deflection of the tip [m].
+
+        Parameters
+        ----------
+        stamp : int
+            Its stamp [ns].
+        deflection : float
+            Deflection of the tip [m].
+
+        """
         if self.observer is not None:
             self.observer.add_tip(stamp / NANOSECONDS, deflection)
 
     def take_wrench(self, stamp: int, lateral: float, moment: float, measured: int) -> None:
-        """Take in force [N] and moment [N m]; one newer than the encoders waits for them."""
+        """
+        Take in force [N] and moment [N m]; one newer than the encoders waits for them.
+
+        Parameters
+        ----------
+        stamp : int
+            Its stamp [ns].
+        lateral, moment : float
+            Force along z [N], and moment about x at the base [N m] without the torque.
+        measured : int
+            Stamp of the newest encoder sample [ns].
+
+        """
         if self.observer is None:
             return
         if stamp > measured:
@@ -65,7 +87,20 @@ class Bending:
             self.observer.add_wrench(stamp / NANOSECONDS, lateral, moment)
 
     def take_truth(self, state: Sequence[float]) -> None:
-        """Take the load from a true state, or raise NeedleError if it has none."""
+        """
+        Take the load from a true state, or raise NeedleError if it has none.
+
+        Parameters
+        ----------
+        state : sequence of float, shape (2 (2 + n),)
+            State of the simulation, SI units.
+
+        Raises
+        ------
+        NeedleError
+            If the state has no load.
+
+        """
         self.load = 0.0
         # What is finite may be too large all the same.
         with np.errstate(over='ignore', invalid='ignore'):
@@ -75,7 +110,22 @@ class Bending:
         self.load = load
 
     def update(self, stamp: int, measured: Measurement) -> None:
-        """Take in the encoders and the wrench of the same stamp, or raise NeedleError."""
+        """
+        Take in the encoders and the wrench of the same stamp, or raise NeedleError.
+
+        Parameters
+        ----------
+        stamp : int
+            Stamp of the encoder sample [ns].
+        measured : Measurement
+            The encoders.
+
+        Raises
+        ------
+        NeedleError
+            If the observer cannot take it.
+
+        """
         observer, wrench = self.observer, self._waiting
         if observer is None:
             return

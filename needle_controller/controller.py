@@ -73,7 +73,25 @@ class ControllerSettings:
             raise ParameterError(f'delay must be a whole number of periods, got {self.delay!r}')
 
     def depths(self, parameters: NeedleParameters) -> tuple[float, float]:
-        """Return the least and largest inserted length to control a needle [m]."""
+        """
+        Return the least and largest inserted length to control a needle [m].
+
+        Parameters
+        ----------
+        parameters : NeedleParameters
+            The needle.
+
+        Returns
+        -------
+        tuple of float
+            Both lengths [m].
+
+        Raises
+        ------
+        ParameterError
+            If the settings leave no range for this needle.
+
+        """
         low = max(self.lowest_depth, parameters.minimum_depth)
         high = min(self.highest_depth, parameters.length)
         if not low < high:
@@ -290,7 +308,20 @@ class Controller:
         return self.guide.target
 
     def set_target(self, depth: float) -> None:
-        """Go to an inserted length [m]; see `Guide.aim`."""
+        """
+        Go to an inserted length [m]; see `Guide.aim`.
+
+        Parameters
+        ----------
+        depth : float
+            Inserted length [m].
+
+        Raises
+        ------
+        ParameterError
+            If it is not finite or out of range.
+
+        """
         self.guide.aim(depth)
 
     def follow(
@@ -299,7 +330,20 @@ class Controller:
         positions: Sequence[float],
         speeds: Sequence[float] | None = None,
     ) -> None:
-        """Follow a path of inserted lengths from now on; see `Guide.follow`."""
+        """
+        Follow a path of inserted lengths from now on; see `Guide.follow`.
+
+        Parameters
+        ----------
+        times, positions, speeds
+            As for `Guide.follow`.
+
+        Raises
+        ------
+        ParameterError
+            If the path is not valid.
+
+        """
         self.guide.follow(times, positions, speeds)
 
     def forget(self) -> None:

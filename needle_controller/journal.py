@@ -49,7 +49,19 @@ class Journal:
         self._told: dict[str, float] = {}
 
     def say(self, severity: Severity, line: str = '', kind: str = '') -> None:
-        """Say a line, if any: at most once a second of a kind. Tell that /diagnostics changed."""
+        """
+        Say a line, if any: at most once a second of a kind. Tell that /diagnostics changed.
+
+        Parameters
+        ----------
+        severity : Severity
+            How bad it is.
+        line : str
+            The line; '' only tells of the change.
+        kind : str
+            What is said at most once a second; '' for what is always said.
+
+        """
         if kind:
             now = self._steady()
             if now - self._told.get(kind, -inf) < _PAUSE:
@@ -60,7 +72,15 @@ class Journal:
         self.changed = True
 
     def refuse(self, complaint: str) -> None:
-        """Say what was not taken, and why; count it."""
+        """
+        Say what was not taken, and why; count it.
+
+        Parameters
+        ----------
+        complaint : str
+            What was not taken, and why.
+
+        """
         self.refused += 1
         self.complaint = complaint
         self.say(Severity.ERROR, complaint)

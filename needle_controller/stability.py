@@ -102,7 +102,20 @@ def transition_matrix(law: Law, delay: int, unmodeled: int = 0) -> FloatArray:
 
 
 def spectral_radius(law: Law, delay: int, unmodeled: int = 0) -> float:
-    """Return the largest modulus of the poles; see `transition_matrix`. Below 1 is stable."""
+    """
+    Return the largest modulus of the poles; see `transition_matrix`. Below 1 is stable.
+
+    Parameters
+    ----------
+    law, delay, unmodeled
+        As for `transition_matrix`.
+
+    Returns
+    -------
+    float
+        The modulus.
+
+    """
     return float(np.abs(np.linalg.eigvals(transition_matrix(law, delay, unmodeled))).max())
 
 

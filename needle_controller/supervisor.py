@@ -161,7 +161,24 @@ class Supervisor:
     def change(
         self, parameters: NeedleParameters, law: str, gains: Mapping[str, Mapping[str, Gains]]
     ) -> None:
-        """Go on with other constants, gains or law; see `Controller.change`."""
+        """
+        Go on with other constants, gains or law; see `Controller.change`.
+
+        Parameters
+        ----------
+        parameters : NeedleParameters
+            Needle and tissue.
+        law : str
+            Name of the law.
+        gains : Mapping
+            Gains by law and axis.
+
+        Raises
+        ------
+        ParameterError
+            If the gains are unstable. Nothing is changed then.
+
+        """
         if self.controller is not None:
             self.controller.change(parameters, law=law, gains=gains)
             self.bending.model = NeedleModel(parameters)
@@ -173,7 +190,15 @@ class Supervisor:
         return min(0.1, 0.5 * timeout)
 
     def activate(self, now: int, commanders: Mapping[str, int]) -> None:
-        """Begin to answer measurements; see `watch`."""
+        """
+        Begin to answer measurements; see `watch`.
+
+        Parameters
+        ----------
+        now, commanders
+            As for `watch`.
+
+        """
         self.fault = _WAITING
         self._answered = self._late = 0
         self._oldest = 0.0
@@ -182,7 +207,20 @@ class Supervisor:
         self._active = self.controller
 
     def deactivate(self, now: int) -> Answer:
-        """Let go, without memory of the motion nor of its target."""
+        """
+        Let go, without memory of the motion nor of its target.
+
+        Parameters
+        ----------
+        now : int
+            Time [ns].
+
+        Returns
+        -------
+        Answer
+            Zero force.
+
+        """
         if self.controller is not None:
             self.controller.forget()
         self._active = None
@@ -206,7 +244,26 @@ class Supervisor:
     def target(
         self, stamp: int, frame: str, depth: float, deflection: float, now: int
     ) -> Answer | None:
-        """Take an inserted length to reach [m]; a wanted deflection [m] is ignored."""
+        """
+        Take an inserted length to reach [m]; a wanted deflection [m] is ignored.
+
+        Parameters
+        ----------
+        stamp : int
+            Stamp of the message [ns]; 0 if it has none.
+        frame : str
+            Its frame.
+        depth, deflection : float
+            Inserted length and deflection that are wanted [m].
+        now : int
+            Time [ns].
+
+        Returns
+        -------
+        Answer or None
+            What to command, if anything.
+
+        """
 
         def aim(controller: Controller) -> None:
             controller.set_target(depth)
@@ -230,7 +287,26 @@ class Supervisor:
         velocities: Sequence[Sequence[float]],
         now: int,
     ) -> Answer | None:
-        """Take a path: times from now [s], positions [m] of the joints, velocities or none."""
+        """
+        Take a path: times from now [s], positions [m] of the joints, velocities or none.
+
+        Parameters
+        ----------
+        stamp, frame, now
+            As for `target`.
+        joints : sequence of str
+            Names of the joints.
+        times : sequence of float
+            Times of the points [s].
+        positions, velocities : sequence of sequence of float
+            Of each point, by joint [m, m/s].
+
+        Returns
+        -------
+        Answer or None
+            What to command, if anything.
+
+        """
 
         def follow(controller: Controller) -> None:
             lengths, rates = (
@@ -260,12 +336,38 @@ class Supervisor:
         return answer
 
     def emergency_stop(self, now: int) -> Reply:
-        """Stop until it is cleared."""
+        """
+        Stop until it is cleared.
+
+        Parameters
+        ----------
+        now : int
+            Time [ns].
+
+        Returns
+        -------
+        Reply
+            Success, and zero force.
+
+        """
         answer = self._stop_for('emergency stop', now)
         return Reply(True, 'stopped; ~/clear_stop releases', answer)
 
     def clear_stop(self, now: int) -> Reply:
-        """Release the stop, unless something is still beyond a limit."""
+        """
+        Release the stop, unless something is still beyond a limit.
+
+        Parameters
+        ----------
+        now : int
+            Time [ns].
+
+        Returns
+        -------
+        Reply
+            Whether it is released, or why not.
+
+        """
         if self.safety.stop is None:
             return Reply(True, 'there was no stop')
         answer = self._check_clock(now)
@@ -279,7 +381,20 @@ class Supervisor:
         return Reply(True, 'cleared; the motion starts anew', answer)
 
     def pause(self, hold: bool) -> Reply:
-        """Brake the reference to rest and hold it, or let it continue."""
+        """
+        Brake the reference to rest and hold it, or let it continue.
+
+        Parameters
+        ----------
+        hold : bool
+            Whether to hold.
+
+        Returns
+        -------
+        Reply
+            Refused unless the controller is active.
+
+        """
         if self._active is None:
             return Reply(False, 'pause refused: the controller is not active')
         guide = self._active.guide
@@ -299,7 +414,22 @@ class Supervisor:
     # Sensors.
 
     def tip(self, reading: Reading, now: int) -> Answer | None:
-        """Take in `tip_deflection`."""
+        """
+        Take in `tip_deflection`.
+
+        Parameters
+        ----------
+        reading : Reading
+            The message.
+        now : int
+            Time [ns].
+
+        Returns
+        -------
+        Answer or None
+            What to command, if anything.
+
+        """
         if self._active is None:
             return None
         answer, deflection = self._check_clock(now), reading.values[0][2]
@@ -309,7 +439,20 @@ class Supervisor:
         return answer
 
     def wrench(self, reading: Reading, now: int) -> Answer | None:
-        """Take in `base_wrench`."""
+        """
+        Take in `base_wrench`.
+
+        Parameters
+        ----------
+        reading, now
+            As for `tip`.
+
+        Returns
+        -------
+        Answer or None
+            What to command, if anything.
+
+        """
         if self._active is None:
             return None
         answer, (_, axial, lateral, moment, _, _) = self._check_clock(now), reading.values[0]
@@ -324,7 +467,20 @@ class Supervisor:
         return answer
 
     def truth(self, reading: Reading, now: int) -> Answer | None:
-        """Take the load of the bent needle from `ground_truth` of the simulation."""
+        """
+        Take the load of the bent needle from `ground_truth` of the simulation.
+
+        Parameters
+        ----------
+        reading, now
+            As for `tip`.
+
+        Returns
+        -------
+        Answer or None
+            What to command, if anything.
+
+        """
         if self._active is None:
             return None
         answer, (positions, velocities, _) = self._check_clock(now), reading.values
@@ -347,7 +503,20 @@ class Supervisor:
         self.journal.say(Severity.WARNING, line, kind)
 
     def encoders(self, reading: Reading, now: int) -> Answer | None:
-        """Answer `joint_states`: a repeated one as before, one that is late not at all."""
+        """
+        Answer `joint_states`: a repeated one as before, one that is late not at all.
+
+        Parameters
+        ----------
+        reading, now
+            As for `tip`.
+
+        Returns
+        -------
+        Answer or None
+            The command, with the stamp of the reading.
+
+        """
         controller = self._active
         if controller is None:
             return None
@@ -422,7 +591,22 @@ class Supervisor:
         return self._command(Answer(stamp, force, torque, aim[:2], error))
 
     def watch(self, now: int, commanders: Mapping[str, int]) -> Answer | None:
-        """Look for what does not come, and for who else publishes a topic of commands."""
+        """
+        Look for what does not come, and for who else publishes a topic of commands.
+
+        Parameters
+        ----------
+        now : int
+            Time [ns].
+        commanders : Mapping[str, int]
+            How many nodes command, this one included, by topic.
+
+        Returns
+        -------
+        Answer or None
+            What to command, if anything.
+
+        """
         answer, safety = self._check_clock(now), self.safety
         safety.count_commanders(commanders)
         timeout = safety.streams['joint_states'].timeout / NANOSECONDS
@@ -476,7 +660,24 @@ class Supervisor:
     # What /diagnostics say.
 
     def diagnose(self, now: int) -> tuple[Severity, str | None, dict[str, object]]:
-        """Return how bad it is, what holds it back if anything, and values by name."""
+        """
+        Return how bad it is, what holds it back if anything, and values by name.
+
+        Parameters
+        ----------
+        now : int
+            Time [ns].
+
+        Returns
+        -------
+        severity : Severity
+            How bad it is.
+        held : str or None
+            What holds it back.
+        values : dict
+            Values by name.
+
+        """
         values: dict[str, object] = {}
         if self.controller is not None:
             control = self.controller

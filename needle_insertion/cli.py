@@ -110,15 +110,25 @@ class _Version(argparse.Action):
 
 
 def _joined(words: list[str], signed: Sequence[str]) -> list[str]:
-    """Join ``--force-axis -y``, which argparse would take for two options."""
+    """Join ``--force-axis -y`` and ``--speed -5e-3``, which argparse takes for two options."""
     joined: list[str] = []
     for word in words:
         has_sign = word.startswith('-') and not word.startswith('--')
-        if joined and joined[-1] in signed and has_sign:
+        option = joined[-1] if joined else ''
+        is_value = option in signed or (option.startswith('--') and _is_number(word))
+        if has_sign and is_value and '=' not in option:
             joined[-1] += f'={word}'
         else:
             joined.append(word)
     return joined
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
 
 
 if __name__ == '__main__':

@@ -25,10 +25,13 @@ END_WITH_PARENT = 'NEEDLE_END_WITH_PARENT'
 
 _PR_SET_PDEATHSIG = 1
 
+#: What ends a node; SIGHUP comes when its terminal is closed.
+_ENDINGS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
 
 def run(kind: Callable[[], BaseNode], arguments: list[str] | None = None) -> int:
     """
-    Run one node until SIGINT or SIGTERM, then deactivate it while it can still publish.
+    Run one node until SIGINT, SIGTERM or SIGHUP, then deactivate it while it can still publish.
 
     Parameters
     ----------
@@ -59,7 +62,7 @@ def run(kind: Callable[[], BaseNode], arguments: list[str] | None = None) -> int
         # rcl could not read the arguments or the parameter file.
         sys.stderr.write(f'error: {" ".join(str(error).split())}\n')
         return 2
-    previous = {one: signal.signal(one, stop) for one in (signal.SIGINT, signal.SIGTERM)}
+    previous = {one: signal.signal(one, stop) for one in _ENDINGS}
     try:
         try:
             node = kind()

@@ -250,3 +250,37 @@ def test_page_runs_as_printed(name: str, tmp_path: Path) -> None:
         assert shown in done.stdout
     for made in re.findall(r'^- `(\w+[\w/]*\.\w+)`,', text, flags=re.MULTILINE):
         assert (tmp_path / made).is_file(), made
+
+
+def undocumented(source: str) -> list[str]:
+    """Return the public functions of a file whose docstring has no section for parameters."""
+    found = []
+
+    def visit(body: list[ast.stmt]) -> None:
+        for item in body:
+            if isinstance(item, ast.ClassDef) and not item.name.startswith('_'):
+                visit(item.body)
+            # What rclpy or the common node calls is documented there.
+            if not isinstance(item, ast.FunctionDef) or re.match('_|on_|change$', item.name):
+                continue
+            names = {
+                part.arg
+                for part in ast.walk(item.args)
+                if isinstance(part, ast.arg) and part.arg not in {'self', 'cls'}
+            }
+            setter = any(ast.unparse(one).endswith('.setter') for one in item.decorator_list)
+            if names and not setter and 'Parameters\n---' not in (ast.get_docstring(item) or ''):
+                found.append(item.name)
+
+    visit(ast.parse(source).body)
+    return found
+
+
+def test_every_public_function_describes_its_parameters() -> None:
+    """Each of the packages; a function without the section is named."""
+    files = sorted(ROOT.glob('needle_*/**/*.py'))
+    found = {str(file.relative_to(ROOT)): undocumented(file.read_text('utf-8')) for file in files}
+    assert {file: names for file, names in found.items() if names} == {}
+    assert undocumented('def f(x):\n    """Return x."""') == ['f']
+    assert undocumented('class A:\n    def f(self, *, x):\n        pass') == ['f']
+    assert undocumented('def f():\n    pass\nclass _B:\n    def f(self, x):\n        pass') == []

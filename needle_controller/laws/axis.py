@@ -13,7 +13,20 @@ from needle_ros.errors import ParameterError
 
 
 def require_complete(parameters: NeedleParameters) -> None:
-    """Reject the formulation `as_printed`, which is for the model and the integrator only."""
+    """
+    Reject the formulation `as_printed`, which is for the model and the integrator only.
+
+    Parameters
+    ----------
+    parameters : NeedleParameters
+        The needle.
+
+    Raises
+    ------
+    ParameterError
+        If its formulation is not `complete`.
+
+    """
     if parameters.formulation != 'complete':
         raise ParameterError(
             "formulation must be 'complete' for controller and observer, got "
@@ -72,7 +85,20 @@ class Axis:
 
     @classmethod
     def insertion(cls, parameters: NeedleParameters) -> Axis:
-        """Return the insertion axis of a needle, first row of (16)."""
+        """
+        Return the insertion axis of a needle, first row of (16).
+
+        Parameters
+        ----------
+        parameters : NeedleParameters
+            The needle.
+
+        Returns
+        -------
+        Axis
+            Its moving mass [kg] and friction.
+
+        """
         return cls(
             inertia=parameters.moving_mass,
             coulomb=parameters.coulomb_friction,
@@ -81,7 +107,20 @@ class Axis:
 
     @classmethod
     def rotation(cls, parameters: NeedleParameters) -> Axis:
-        """Return the rotation axis of a needle, second row of (16), without friction."""
+        """
+        Return the rotation axis of a needle, second row of (16), without friction.
+
+        Parameters
+        ----------
+        parameters : NeedleParameters
+            The needle.
+
+        Returns
+        -------
+        Axis
+            Its rotary inertia [kg m^2].
+
+        """
         return cls(inertia=0.5 * parameters.rotary_inertia)
 
     def without_coulomb(self) -> Axis:
@@ -113,7 +152,20 @@ class Axis:
         return position + moved, end
 
     def response(self, t: float) -> Response:
-        """Return the linear response over a time [s], exactly."""
+        """
+        Return the linear response over a time [s], exactly.
+
+        Parameters
+        ----------
+        t : float
+            Time [s].
+
+        Returns
+        -------
+        Response
+            The response to a speed and to a constant force.
+
+        """
         x = self.viscous * t / self.inertia
         mean, ramp = decay_means(x)
         push = t / self.inertia

@@ -179,7 +179,20 @@ class ContinuousInverseDynamics(ContinuousLaw):
     def forces(
         self, state: ArrayLike, goal: ArrayLike, integral: ArrayLike = (), time: float = 0.0
     ) -> FloatArray:
-        """Return the forces; see `ContinuousLaw.forces`. There is no integral."""
+        """
+        Return the forces; see `ContinuousLaw.forces`. There is no integral.
+
+        Parameters
+        ----------
+        state, goal, integral, time
+            As for `ContinuousLaw.forces`.
+
+        Returns
+        -------
+        ndarray
+            As from `ContinuousLaw.forces`.
+
+        """
         del integral
         model, k, m = self.model, self.driven, self.model.coordinates
         x = model.checked_state(state)
@@ -244,7 +257,20 @@ class ContinuousPid(ContinuousLaw):
     def forces(
         self, state: ArrayLike, goal: ArrayLike, integral: ArrayLike = (), time: float = 0.0
     ) -> FloatArray:
-        """Return the forces; see `ContinuousLaw.forces`. They do not depend on time."""
+        """
+        Return the forces; see `ContinuousLaw.forces`. They do not depend on time.
+
+        Parameters
+        ----------
+        state, goal, integral, time
+            As for `ContinuousLaw.forces`.
+
+        Returns
+        -------
+        ndarray
+            As from `ContinuousLaw.forces`.
+
+        """
         del time
         x, k = self.model.checked_state(state), self.driven
         error, rate, _ = self.errors(x, goal)

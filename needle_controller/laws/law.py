@@ -38,7 +38,20 @@ class LawGains:
     """Gains of a law on one axis: some of kp, ki, kd and kv, and what does not scale."""
 
     def scaled(self, factor: float) -> LawGains:
-        """Return all gains multiplied by a factor."""
+        """
+        Return all gains multiplied by a factor.
+
+        Parameters
+        ----------
+        factor : float
+            The factor, positive.
+
+        Returns
+        -------
+        LawGains
+            The gains, of the same class.
+
+        """
         gains = [item.name for item in fields(self) if item.name in ('kp', 'ki', 'kd', 'kv')]
         return replace(self, **{name: factor * getattr(self, name) for name in gains})
 
@@ -120,7 +133,20 @@ class Law:
         return replace(self, axis=self.axis.without_coulomb())
 
     def scaled(self, factor: float) -> Law:
-        """Return the law with all gains multiplied by a factor."""
+        """
+        Return the law with all gains multiplied by a factor.
+
+        Parameters
+        ----------
+        factor : float
+            The factor, positive.
+
+        Returns
+        -------
+        Law
+            The law, of the same class.
+
+        """
         return replace(self, gains=self.gains.scaled(factor))
 
 
@@ -179,7 +205,20 @@ class SampledLoop:
         self.memory[:] = 0.0
 
     def switch(self, law: Law) -> None:
-        """Continue with another law of this period; its first force is the last one again."""
+        """
+        Continue with another law of this period; its first force is the last one again.
+
+        Parameters
+        ----------
+        law : Law
+            The other law.
+
+        Raises
+        ------
+        ParameterError
+            If its period is another one.
+
+        """
         if law.period != self.law.period:
             raise ParameterError(
                 f'the period must stay {self.law.period:g} s, got {law.period!r} s'
@@ -194,6 +233,21 @@ class SampledLoop:
         Return the force to apply, within the limit [N]; see `Law.force`.
 
         The state is measured now, the setpoint is for the time when the command takes effect.
+
+        Parameters
+        ----------
+        position, speed : float
+            Measured position and speed of the axis [m, m/s] or [rad, rad/s].
+        setpoint : Setpoint
+            Setpoint for the time when the command takes effect.
+        load : float
+            Force against the motion that the law has to add [N] or [N m].
+
+        Returns
+        -------
+        float
+            Force [N] or torque [N m].
+
         """
         law, load = self.law, float(load)
         for force in self.pending:

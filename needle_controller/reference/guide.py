@@ -139,7 +139,15 @@ class Guide:
         self._still(False, self.waits)
 
     def wait(self, waits: bool) -> None:
-        """Brake and hold while the plant does not follow, or continue."""
+        """
+        Brake and hold while the plant does not follow, or continue.
+
+        Parameters
+        ----------
+        waits : bool
+            Whether the plant does not follow.
+
+        """
         self._still(self.paused, waits)
 
     def _still(self, paused: bool, waits: bool) -> None:
@@ -181,7 +189,20 @@ class Guide:
         return self.ahead(time)
 
     def ahead(self, time: float) -> Setpoint:
-        """Return the setpoint at a later time [s] if nothing changes."""
+        """
+        Return the setpoint at a later time [s] if nothing changes.
+
+        Parameters
+        ----------
+        time : float
+            Time [s].
+
+        Returns
+        -------
+        Setpoint
+            The setpoint; zero without a motion.
+
+        """
         return self._motion.at(time - self._start) if self._motion else Setpoint(0.0)
 
     def _plan(self, now: Setpoint) -> Reference:

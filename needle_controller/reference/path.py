@@ -159,7 +159,20 @@ class Path:
                     )
 
     def at(self, time: float) -> Setpoint:
-        """Return the setpoint at a time [s]; before the first point, that point."""
+        """
+        Return the setpoint at a time [s]; before the first point, that point.
+
+        Parameters
+        ----------
+        time : float
+            Time since the path began [s].
+
+        Returns
+        -------
+        Setpoint
+            Position [m], speed [m/s] and acceleration [m/s^2].
+
+        """
         k = max(int(np.searchsorted(self._starts, time, side='right')) - 1, 0)
         start, p, v, a, jerk = self._pieces[k]
         t = max(time - start, 0.0)
@@ -245,7 +258,20 @@ class Joined:
         self.duration = max(path.end + self.offset, self._joined)
 
     def at(self, time: float) -> Setpoint:
-        """Return the setpoint at a time [s]; see `Reference.at`."""
+        """
+        Return the setpoint at a time [s]; see `Reference.at`.
+
+        Parameters
+        ----------
+        time : float
+            As for `Reference.at`.
+
+        Returns
+        -------
+        Setpoint
+            As from `Reference.at`.
+
+        """
         if time >= self.duration:
             return Setpoint(self._path.last)
         if self._halt is not None and time < self._halting:

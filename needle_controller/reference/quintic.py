@@ -44,7 +44,20 @@ class Quintic:
         self._c = start.position, v0, 0.5 * a0, c3, c4, c5
 
     def at(self, time: float) -> Setpoint:
-        """Return the setpoint at a time [s]; outside the motion that of the nearer end."""
+        """
+        Return the setpoint at a time [s]; outside the motion that of the nearer end.
+
+        Parameters
+        ----------
+        time : float
+            Time since the motion began [s].
+
+        Returns
+        -------
+        Setpoint
+            Position [m], speed [m/s] and acceleration [m/s^2].
+
+        """
         if time >= self.duration:
             return self.end
         if time <= 0.0:
@@ -59,7 +72,20 @@ class Quintic:
         )
 
     def within(self, limits: ReferenceLimits) -> bool:
-        """Return whether it is within limits, or within the values of its ends beyond them."""
+        """
+        Return whether it is within limits, or within the values of its ends beyond them.
+
+        Parameters
+        ----------
+        limits : ReferenceLimits
+            Largest speed [m/s] and acceleration [m/s^2].
+
+        Returns
+        -------
+        bool
+            Whether it is.
+
+        """
         ends = self.start, self.end
         top = max(limits.speed, *(abs(end.speed) for end in ends)) * (1.0 + ROUNDING)
         ramp = max(limits.acceleration, *(abs(end.acceleration) for end in ends))
@@ -68,7 +94,20 @@ class Quintic:
         return bool(np.abs(acceleration).max() <= ramp and np.abs(speed).max() <= top)
 
     def stays(self, depths: tuple[float, float]) -> bool:
-        """Return whether all positions are in a range [m], up to rounding."""
+        """
+        Return whether all positions are in a range [m], up to rounding.
+
+        Parameters
+        ----------
+        depths : tuple of float
+            Least and largest position [m].
+
+        Returns
+        -------
+        bool
+            Whether they are.
+
+        """
         low, high = depths
         least, largest = self.extremes[0]
         slack = ROUNDING * (high - low) if high - low < inf else 0.0
@@ -82,7 +121,22 @@ class Quintic:
 
 
 def shortest(distance: float, limits: ReferenceLimits) -> float:
-    """Return the duration [s] of the fastest quintic from rest to rest over a distance [m]."""
+    """
+    Return the duration [s] of the fastest quintic from rest to rest over a distance [m].
+
+    Parameters
+    ----------
+    distance : float
+        Distance [m], not negative.
+    limits : ReferenceLimits
+        Largest speed [m/s] and acceleration [m/s^2].
+
+    Returns
+    -------
+    float
+        Duration [s].
+
+    """
     # The peaks of the quintic are 15/8 D/T and 10/sqrt(3) D/T^2.
     return max(
         1.875 * distance / limits.speed,
@@ -144,7 +198,20 @@ class MinimumJerk:
         self.duration = self._motion.duration + (self._halt.duration if self._halt else 0.0)
 
     def at(self, time: float) -> Setpoint:
-        """Return the setpoint at a time [s]; see `Reference.at`."""
+        """
+        Return the setpoint at a time [s]; see `Reference.at`.
+
+        Parameters
+        ----------
+        time : float
+            As for `Reference.at`.
+
+        Returns
+        -------
+        Setpoint
+            As from `Reference.at`.
+
+        """
         if self._halt is not None:
             if time < self._halt.duration:
                 return self._halt.at(time)

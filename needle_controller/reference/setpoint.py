@@ -73,5 +73,20 @@ class Reference(Protocol):
 
 
 def around(depths: tuple[float, float], start: Setpoint) -> tuple[float, float]:
-    """Widen a range of depths to include the start: a needle outside has to come back."""
+    """
+    Widen a range of depths to include the start: a needle outside has to come back.
+
+    Parameters
+    ----------
+    depths : tuple of float
+        Least and largest inserted length [m].
+    start : Setpoint
+        Where the motion starts.
+
+    Returns
+    -------
+    tuple of float
+        The wider range [m].
+
+    """
     return min(depths[0], start.position), max(depths[1], start.position)

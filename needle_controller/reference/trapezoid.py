@@ -18,7 +18,20 @@ class Step:
         self._target = target
 
     def at(self, time: float) -> Setpoint:
-        """Return the setpoint at a time [s]; see `Reference.at`."""
+        """
+        Return the setpoint at a time [s]; see `Reference.at`.
+
+        Parameters
+        ----------
+        time : float
+            As for `Reference.at`.
+
+        Returns
+        -------
+        Setpoint
+            As from `Reference.at`.
+
+        """
         del time
         return Setpoint(self._target)
 
@@ -83,7 +96,20 @@ class Trapezoid:
         self.duration = sum(part[0] for part in parts)
 
     def at(self, time: float) -> Setpoint:
-        """Return the setpoint at a time [s]; see `Reference.at`."""
+        """
+        Return the setpoint at a time [s]; see `Reference.at`.
+
+        Parameters
+        ----------
+        time : float
+            As for `Reference.at`.
+
+        Returns
+        -------
+        Setpoint
+            As from `Reference.at`.
+
+        """
         if time >= self.duration:
             return Setpoint(self._target)
         position, speed = self._start.position, self._start.speed

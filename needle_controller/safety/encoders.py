@@ -11,7 +11,25 @@ from needle_ros.wire import Reading
 
 
 def read_encoders(reading: Reading) -> Measurement:
-    """Read a joint state; `rotation` and efforts may be missing, or raise a ParameterError."""
+    """
+    Read a joint state; `rotation` and efforts may be missing, or raise a ParameterError.
+
+    Parameters
+    ----------
+    reading : Reading
+        The joint state.
+
+    Returns
+    -------
+    Measurement
+        What it says of the needle.
+
+    Raises
+    ------
+    ParameterError
+        If `insertion` is missing, or a joint has no position or velocity.
+
+    """
     names, (positions, velocities, efforts) = reading.names, reading.values
     try:
         i = names.index('insertion')

@@ -49,7 +49,20 @@ class Guard:
         return line if count >= _IN_A_ROW else None
 
     def encoders(self, depth: float, speed: float) -> str | None:
-        """Return the limit that inserted length [m] or insertion speed [m/s] violate."""
+        """
+        Return the limit that inserted length [m] or insertion speed [m/s] violate.
+
+        Parameters
+        ----------
+        depth, speed : float
+            Inserted length [m] and insertion velocity [m/s].
+
+        Returns
+        -------
+        str or None
+            The line; None within the limits.
+
+        """
         low, high = self._depths
         if not low <= depth <= high:
             return self._count(
@@ -62,12 +75,38 @@ class Guard:
         )
 
     def tracking(self, error: float) -> str | None:
-        """Return the limit that the distance from the reference [m] violates."""
+        """
+        Return the limit that the distance from the reference [m] violates.
+
+        Parameters
+        ----------
+        error : float
+            Distance [m].
+
+        Returns
+        -------
+        str or None
+            The line; None within the limit.
+
+        """
         limit = self.limits.tracking_error
         return self._hold('reference', ('tracking error', error, limit, 'm', 'tracking_error'))
 
     def wrench(self, axial: float, lateral: float, moment: float) -> str | None:
-        """Return the limit that forces [N] or the moment [N m] on the sensor violate."""
+        """
+        Return the limit that forces [N] or the moment [N m] on the sensor violate.
+
+        Parameters
+        ----------
+        axial, lateral, moment : float
+            Forces along y and z [N], and moment about x [N m].
+
+        Returns
+        -------
+        str or None
+            The line; None within the limits.
+
+        """
         return self._hold(
             'base_wrench',
             ('axial force', axial, self.limits.axial_load, 'N', 'axial_load'),
@@ -76,14 +115,35 @@ class Guard:
         )
 
     def tip(self, deflection: float) -> str | None:
-        """Return the limit that the deflection of the tip [m] violates."""
+        """
+        Return the limit that the deflection of the tip [m] violates.
+
+        Parameters
+        ----------
+        deflection : float
+            Deflection [m].
+
+        Returns
+        -------
+        str or None
+            The line; None within the limit.
+
+        """
         limit = self.limits.tip_deflection
         return self._hold(
             'tip_deflection', ('tip deflection', deflection, limit, 'm', 'tip_deflection')
         )
 
     def forget(self, topic: str) -> None:
-        """Forget what a topic said last."""
+        """
+        Forget what a topic said last.
+
+        Parameters
+        ----------
+        topic : str
+            The topic.
+
+        """
         self._beyond.pop(topic, None)
 
     @property

@@ -85,7 +85,15 @@ class Safety:
         self._stale: set[str] = set()
 
     def begin(self, now: int) -> None:
-        """Forget all readings, and expect new ones from a time [ns] on; a stop stays."""
+        """
+        Forget all readings, and expect new ones from a time [ns] on; a stop stays.
+
+        Parameters
+        ----------
+        now : int
+            Time [ns].
+
+        """
         self._seen = self._begun = now
         self._stale.clear()
         for stream in self.streams.values():
@@ -94,12 +102,38 @@ class Safety:
         self.guard.forget('reference')
 
     def clock_went_back(self, now: int) -> float:
-        """Return by how much the clock was set back since the last call [s], or zero."""
+        """
+        Return by how much the clock was set back since the last call [s], or zero.
+
+        Parameters
+        ----------
+        now : int
+            Time now [ns].
+
+        Returns
+        -------
+        float
+            Step back [s].
+
+        """
         back, self._seen = self._seen - now, now
         return back / NANOSECONDS if back > self._back else 0.0
 
     def latch(self, reason: str | None) -> bool:
-        """Stop for a reason, if there is one; return whether it begins with this."""
+        """
+        Stop for a reason, if there is one; return whether it begins with this.
+
+        Parameters
+        ----------
+        reason : str or None
+            The reason.
+
+        Returns
+        -------
+        bool
+            Whether the stop begins now.
+
+        """
         if reason is None or self.stop is not None:
             return False
         self.stop = reason
@@ -109,7 +143,20 @@ class Safety:
         return True
 
     def clear(self, now: int) -> str | None:
-        """Release the stop, or return why not."""
+        """
+        Release the stop, or return why not.
+
+        Parameters
+        ----------
+        now : int
+            Time [ns].
+
+        Returns
+        -------
+        str or None
+            Why the stop stays; None if it is released.
+
+        """
         for stream in self.streams.values():
             # Readings from before the silence say nothing about the present.
             if stream.silence(now) * NANOSECONDS > stream.timeout:
@@ -121,7 +168,15 @@ class Safety:
         return reason
 
     def count_commanders(self, publishers: Mapping[str, int]) -> None:
-        """Take in how many publish each topic of commands, this controller included."""
+        """
+        Take in how many publish each topic of commands, this controller included.
+
+        Parameters
+        ----------
+        publishers : Mapping[str, int]
+            Number of publishers by topic.
+
+        """
         several = [(count, topic) for topic, count in publishers.items() if count > 1]
         self.rivals = ', '.join(f'{n} nodes publish {t}' for n, t in several) or None
 
@@ -142,14 +197,40 @@ class Safety:
         }
 
     def news(self, now: int) -> list[str]:
-        """Return a line for each expected topic that has become stale since the last call."""
+        """
+        Return a line for each expected topic that has become stale since the last call.
+
+        Parameters
+        ----------
+        now : int
+            Time [ns].
+
+        Returns
+        -------
+        list of str
+            The lines.
+
+        """
         silent = self._silent(now)
         lines = [line for name, line in silent.items() if name not in self._stale]
         self._stale = set(silent)
         return lines
 
     def warning(self, now: int) -> str | None:
-        """Return which expected topics are stale or frozen."""
+        """
+        Return which expected topics are stale or frozen.
+
+        Parameters
+        ----------
+        now : int
+            Time [ns].
+
+        Returns
+        -------
+        str or None
+            The topics and since when; None if all are well.
+
+        """
         frozen = (
             f'{name} has not changed for {self.limits.sensor_timeout:g} s'
             for name in self._expected
@@ -161,7 +242,20 @@ class Safety:
         return '; '.join((*frozen, *silent.values())) or None
 
     def describe(self, now: int) -> dict[str, object]:
-        """Return what diagnostics say of inputs, stops and saturation."""
+        """
+        Return what diagnostics say of inputs, stops and saturation.
+
+        Parameters
+        ----------
+        now : int
+            Time [ns].
+
+        Returns
+        -------
+        dict
+            Values by name.
+
+        """
         return {
             **{
                 f'input {name}': stream.describe(now)

@@ -167,11 +167,37 @@ class Stream:
         return None
 
     def silence(self, now: int) -> float:
-        """Return for how long nothing that counts has come [s]; zero before the first."""
+        """
+        Return for how long nothing that counts has come [s]; zero before the first.
+
+        Parameters
+        ----------
+        now : int
+            Time [ns].
+
+        Returns
+        -------
+        float
+            Silence [s].
+
+        """
         return (now - self.counted) / NANOSECONDS if self.counted is not None else 0.0
 
     def describe(self, now: int) -> str:
-        """Return rate and counts in one line."""
+        """
+        Return rate and counts in one line.
+
+        Parameters
+        ----------
+        now : int
+            Time [ns].
+
+        Returns
+        -------
+        str
+            The line.
+
+        """
         refused = {
             kind: count
             for kind, count in self.counts.items()

@@ -9,7 +9,17 @@ import numpy as np
 
 @compiled
 def straight(before: FloatArray, now: FloatArray, felt: FloatArray) -> None:
-    """Fill ``felt``, shape (k, 6), with a straight line that ends with ``now``."""
+    """
+    Fill ``felt``, shape (k, 6), with a straight line that ends with ``now``.
+
+    Parameters
+    ----------
+    before, now : ndarray, shape (6,)
+        The wrench at both ends [N, N m].
+    felt : ndarray, shape (k, 6)
+        Overwritten.
+
+    """
     samples = felt.shape[0]
     for j in range(samples):
         # The last sample is the wrench now, to the bit.

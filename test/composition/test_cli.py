@@ -179,3 +179,10 @@ main(['identify', 'friction', 'nowhere'])
         [sys.executable, '-c', code], capture_output=True, text=True, timeout=300, check=False
     )
     assert (done.returncode, done.stderr) == (-signal.SIGINT, '')
+
+
+@pytest.mark.parametrize('speed', ['-5e-3', '-0.005', '-.5E-2'])
+def test_a_negative_number_is_a_value(speed: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """Also in scientific notation, which argparse takes for an option."""
+    assert main(['analyze', '--speed', speed]) == 0
+    assert '-5 mm/s' in capsys.readouterr().out

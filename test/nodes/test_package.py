@@ -143,7 +143,6 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name in (
         'README.md',
         'package.xml',
-        'setup.cfg',
         'setup.py',
         'pyproject.toml',
         'colcon.pkg',
@@ -168,6 +167,9 @@ def shell(folder: Path, *words: object) -> subprocess.CompletedProcess[str]:
 def workspace(source: Path) -> Path:
     """Return the colcon workspace, built."""
     folder = source.parent.parent
+    linked = ('--build-base', 'linked/build', '--install-base', 'linked/install')
+    built = shell(folder, 'colcon', 'build', '--symlink-install', *linked)
+    assert built.returncode == 0, built.stdout + built.stderr
     built = shell(folder, 'colcon', 'build')
     assert built.returncode == 0, built.stdout + built.stderr
     return folder
@@ -179,7 +181,19 @@ def test_ros2_run_finds_every_node(workspace: Path) -> None:
     command = f'source install/setup.bash && exec {sys.executable} -c "{look}"'
     found = shell(workspace, 'bash', '-c', command)
     folder = Path(found.stdout.strip()) / 'lib/needle_insertion'
-    assert set(NODES) <= {path.name for path in folder.iterdir() if os.access(path, os.X_OK)}
+    # Each once, and nothing else.
+    assert set(NODES) == {path.name for path in folder.iterdir() if os.access(path, os.X_OK)}
+
+
+@pytest.mark.parametrize('install', ['install', 'linked/install'])
+def test_the_command_is_found_in_a_sourced_workspace(workspace: Path, install: str) -> None:
+    """`needle` and the nodes by their own names are on the path."""
+    script = f'source {install}/setup.bash && command -v needle needle-plant && needle --version'
+    found = shell(workspace, 'bash', '-c', script)
+    assert found.returncode == 0, found.stderr
+    *places, version = found.stdout.split()
+    assert all(str(workspace / install) in place for place in places)
+    assert version.count('.') == 2
 
 
 @pytest.mark.parametrize('name', NODES)

@@ -328,9 +328,9 @@ def test_a_value_out_of_its_range_is_refused(ros_graph: RosGraph, name: str, val
         ros_graph.add(PlantNode, parameters={name: value})
 
 
-@pytest.mark.parametrize('name', [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize('name', [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_signals_end_it_well(ros_graph: RosGraph, name: Signals) -> None:
-    """SIGINT and SIGTERM end the process with 0 and without a traceback."""
+    """Ctrl-C, a kill and a closed terminal end the process with 0 and without a traceback."""
     probe = ros_graph.node('probe')
     states = ros_graph.listen(probe, JointState, 'joint_states', SENSOR)
     plant = ros_graph.start('plant')
