@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from importlib import import_module
+from io import TextIOWrapper
+import re
 import signal
 import sys
 from types import FrameType
@@ -44,6 +46,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
+    if isinstance(sys.stdout, TextIOWrapper):
+        # A terminal may not know a character such as that of plus or minus.
+        sys.stdout.reconfigure(errors='replace')
     # Imports take up to a second and leave nothing to clean up: until then a signal just ends it.
     previous = {name: signal.signal(name, signal.SIG_DFL) for name in _SIGNALS}
     try:
@@ -59,7 +64,7 @@ def _run(words: list[str]) -> int:
     if chosen in COMMANDS:
         command = import_module(f'needle_insertion.commands.{chosen}').COMMAND
         words = _joined(words, command.signed)
-    options = _parser(chosen, command).parse_args(words)
+    options = _parser(chosen, command).parse_args([_as_value(word) for word in words])
     if command is not None:
         from needle_dynamics.compiled.cache import announce_compilation
 
@@ -90,7 +95,7 @@ def _interrupt(_signal: int, _frame: FrameType | None) -> NoReturn:
 
 def _parser(chosen: str, command: Command | None) -> argparse.ArgumentParser:
     """Return a parser that has the options of the chosen command only: others cost imports."""
-    parser = argparse.ArgumentParser(prog='needle', description='Robot-assisted needle insertion.')
+    parser = _Parser(prog='needle', description='Robot-assisted needle insertion.')
     parser.add_argument('--version', action=_Version, nargs=0, help='show the version and exit')
     commands = parser.add_subparsers(required=True, metavar='COMMAND')
     for name, words in COMMANDS.items():
@@ -98,6 +103,35 @@ def _parser(chosen: str, command: Command | None) -> argparse.ArgumentParser:
         if command is not None and name == chosen:
             command.add_arguments(subparser)
     return parser
+
+
+class _Parser(argparse.ArgumentParser):
+    """A parser that names the nearest valid word when one is mistyped."""
+
+    def error(self, message: str) -> NoReturn:
+        # Imported here: the help does not need it.
+        from difflib import get_close_matches
+
+        if wrong := re.search(r"invalid choice: '([^']*)'", message):
+            known = [str(choice) for action in self._actions for choice in action.choices or ()]
+            near = get_close_matches(wrong[1], known, 1)
+        else:
+            _, _, words = message.partition('unrecognized arguments: ')
+            options = list(self._options())
+            near = [
+                name
+                for word in words.split()
+                if word.startswith('-')
+                for name in get_close_matches(word.partition('=')[0], options, 1)
+            ]
+        super().error(f'{message}; did you mean {", ".join(near)}?' if near else message)
+
+    def _options(self) -> Iterator[str]:
+        yield from self._option_string_actions
+        for action in self._actions:
+            for parser in action.choices or ():
+                if isinstance(action.choices, Mapping):
+                    yield from action.choices[parser]._options()
 
 
 class _Version(argparse.Action):
@@ -109,26 +143,25 @@ class _Version(argparse.Action):
         parser.exit()
 
 
+def _as_value(word: str) -> str:
+    """Shield ``-5e-3``, which argparse would take for an option, by a space before it."""
+    try:
+        float(word)
+    except ValueError:
+        return word
+    return f' {word}' if word.startswith('-') else word
+
+
 def _joined(words: list[str], signed: Sequence[str]) -> list[str]:
-    """Join ``--force-axis -y`` and ``--speed -5e-3``, which argparse takes for two options."""
+    """Join ``--force-axis -y``, which argparse would take for two options."""
     joined: list[str] = []
     for word in words:
         has_sign = word.startswith('-') and not word.startswith('--')
-        option = joined[-1] if joined else ''
-        is_value = option in signed or (option.startswith('--') and _is_number(word))
-        if has_sign and is_value and '=' not in option:
+        if joined and joined[-1] in signed and has_sign:
             joined[-1] += f'={word}'
         else:
             joined.append(word)
     return joined
-
-
-def _is_number(word: str) -> bool:
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True
 
 
 if __name__ == '__main__':

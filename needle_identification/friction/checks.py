@@ -80,6 +80,12 @@ def fit_warnings(
     unknown = [parameter.name for parameter in parameters if not parameter.determined]
     if unknown:
         yield f'the data do not determine {", ".join(unknown)}: use more speeds, or fewer terms'
+    cutoff, rate = design.signals.settings.cutoff, 1.0 / design.signals.period
+    if cutoff > 0.5 * rate:
+        yield (
+            f'not filtered: the cutoff of {cutoff:g} Hz is beyond half the sampling rate, '
+            f'{0.5 * rate:.4g} Hz'
+        )
     yield from _of_lag(lag, coarse, design.signals.period)
     yield from _of_noise(design, fit)
     known = {parameter.name: parameter for parameter in parameters if parameter.determined}

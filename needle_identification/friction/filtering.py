@@ -125,13 +125,15 @@ def filter_signals(recording: Recording, settings: FrictionSettings) -> Filtered
         )
     grid = time[0] + period * np.arange(int(duration / period + 1e-6) + 1)
     lost = steps[np.clip(np.searchsorted(time, grid), 1, len(steps)) - 1] > GAP * period
-    taps = filter_taps(settings.cutoff, period)
-    half = len(taps) // 2
+    # A filter longer than the recording may not even fit into memory.
+    half = ceil(min(HALF_LENGTH / settings.cutoff / period, len(grid)))
     if len(grid) <= 4 * half:
         raise IdentificationError(
-            f'must last > {4 * half * period:.3g} s for a filter of {settings.cutoff:g} Hz, '
-            f'lasts {duration:.3g} s'
+            f'must last > {4.0 * HALF_LENGTH / settings.cutoff:.3g} s for a filter of '
+            f'{settings.cutoff:g} Hz, lasts {duration:.3g} s: the cutoff must be above '
+            f'{4.0 * HALF_LENGTH / duration:.3g} Hz'
         )
+    taps = filter_taps(settings.cutoff, period)
     step = max(1, int(1.0 / (_KEPT * settings.cutoff * period)))
     derivative = 1 if recording.speed is None else 0
     measured = recording.depth if recording.speed is None else recording.speed

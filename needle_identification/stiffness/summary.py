@@ -104,7 +104,7 @@ def summarize_stiffness(
     chosen = summaries[-1]
     if force is not None:
         chosen = min(summaries, key=lambda summary: abs(summary.force - force))
-        if abs(chosen.force - force) > level_tolerance:
+        if not abs(chosen.force - force) <= level_tolerance:
             raise IdentificationError(
                 f'no level at {force:g} N; there are '
                 f'{", ".join(f"{summary.force:.3g}" for summary in summaries)} N'

@@ -10,7 +10,13 @@ import sys
 
 from needle_dynamics import FORMULATIONS, NeedleModel, NeedleParameters, PRESETS
 from needle_dynamics.linearization import SLIDING
-from needle_insertion.commands.common import add_needle, Command, constants, make_folder
+from needle_insertion.commands.common import (
+    add_needle,
+    check_folder,
+    Command,
+    constants,
+    make_folder,
+)
 from needle_insertion.report import controllability as report
 from needle_insertion.report.text import table
 from needle_ros.errors import ParameterError
@@ -55,6 +61,8 @@ def _run(options: argparse.Namespace) -> int:
         raise ParameterError('--map needs a folder, -o DIR, and a single --speed')
     if options.output is not None and not options.map:
         raise ParameterError('-o DIR is the folder of the map: it needs --map')
+    if options.output is not None:
+        check_folder(options.output)
     changes = constants(options.set)
     for name in ('formulation', 'modes'):
         if name in changes:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from argparse import ArgumentParser, Namespace
 from collections.abc import Callable, Iterable, Sequence
 import json
+import os
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -88,6 +89,52 @@ def constants(words: Sequence[str]) -> dict[str, Any]:
     return values
 
 
+def check_file(path: Path) -> None:
+    """
+    Check that a file can be written, before the work that gives its content.
+
+    Parameters
+    ----------
+    path : Path
+        The file; its folder must exist.
+
+    Raises
+    ------
+    ParameterError
+        If it cannot be written.
+
+    """
+    if not path.name or path.is_dir():
+        raise ParameterError(f'{path} cannot be written: it is not the name of a file')
+    if not path.absolute().parent.is_dir():
+        raise ParameterError(f'{path} cannot be written: the folder it is in does not exist')
+    check_folder(path.absolute().parent)
+
+
+def check_folder(folder: Path) -> None:
+    """
+    Check that a folder can be made and written to, before the work for it; nothing is made.
+
+    Parameters
+    ----------
+    folder : Path
+        May exist, or lack some of the folders that it is in.
+
+    Raises
+    ------
+    ParameterError
+        If it cannot be made or written to.
+
+    """
+    there = folder.absolute()
+    while not there.exists():
+        there = there.parent
+    if not there.is_dir():
+        raise ParameterError(f'{folder} cannot be written: {there} is not a folder')
+    if not os.access(there, os.W_OK | os.X_OK):
+        raise ParameterError(f'{folder} cannot be written: no permission to write in {there}')
+
+
 def make_folder(folder: Path) -> None:
     """
     Make a folder for results, with those that it is in.
@@ -103,6 +150,7 @@ def make_folder(folder: Path) -> None:
         If it cannot be made.
 
     """
+    check_folder(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from needle_insertion.commands.common import Command
+from needle_insertion.commands.common import check_folder, Command
 from needle_insertion.experiment.protocol import SHIPPED_BAGS
 
 
@@ -23,6 +23,7 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _run(options: argparse.Namespace) -> int:
     """Run the demo; return 1 if a check failed."""
+    check_folder(options.output)
     from needle_insertion.experiment import demo
 
     return demo.run(options.output, options.bags)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from needle_insertion.commands.common import Command
+from needle_insertion.commands.common import check_folder, Command
 from needle_insertion.experiment.protocol import FASTEST, PROTOCOLS, SPEED
 from needle_ros.errors import ParameterError
 
@@ -54,6 +54,7 @@ def _run(options: argparse.Namespace) -> int:
     )
     if not 0.0 < options.speed <= FASTEST:
         raise ParameterError(f'--speed must be in (0, {FASTEST:g}], got {options.speed}')
+    check_folder(options.output)
     # Needs ROS; invalid options are reported without it.
     from needle_insertion.experiment.record import record
 

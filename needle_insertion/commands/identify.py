@@ -24,10 +24,10 @@ from needle_identification import (
     write_result,
 )
 from needle_identification.recordings import TIMES
-from needle_insertion.commands.common import Command, make_folder
+from needle_insertion.commands.common import check_file, check_folder, Command, make_folder
 from needle_insertion.report.identify_text import identified_document, identified_text
 from needle_insertion.report.origin import identify_all, Origin
-from needle_ros.errors import ParameterError
+from needle_ros.errors import NeedleError, ParameterError
 
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -183,6 +183,7 @@ def _run_friction(options: argparse.Namespace) -> int:
         lambda recording: identify_friction(recording, settings),
         summarize,
         write_result,
+        ('stiffness', lambda bag: identify_stiffness(read_indentation_recording(bag))),
     )
 
 
@@ -200,6 +201,7 @@ def _run_stiffness(options: argparse.Namespace) -> int:
             estimates, force=options.level, level_tolerance=settings.level_tolerance
         ),
         lambda path, summary: write_result(path, None, summary),
+        ('friction', lambda bag: identify_friction(read_friction_recording(bag))),
     )
 
 
@@ -211,8 +213,13 @@ def _identify(
     identify: Callable[[Any], Any],
     summarize: Callable[[list[Any]], Any],
     write: Callable[[Path, Any], None],
+    other: tuple[str, Callable[[Path], Any]],
 ) -> int:
     """Identify all bags, write the results, warn and print; return the exit status."""
+    if options.output is not None:
+        check_file(options.output)
+    if options.report is not None:
+        check_folder(options.report)
     reading = {name: getattr(options, name) for name in ('wrench_topic', 'motion_topic', 'time')}
     reading |= axes
     estimates, origin = identify_all(
@@ -222,8 +229,7 @@ def _identify(
         Origin(settings=settings, reading=reading, result=options.output),
         digest=options.json or options.report is not None,
     )
-    for line in origin.failed:
-        sys.stderr.write(f'error: {line}\n')
+    _report_failures(origin, *other)
     if not estimates:
         return 2
     summary = summarize(estimates)
@@ -248,6 +254,23 @@ def _identify(
         for path in written:
             sys.stdout.write(f'wrote {path}\n')
     return 2 if origin.failures else 0
+
+
+def _report_failures(origin: Origin, other: str, identify: Callable[[Path], Any]) -> None:
+    """Name the recordings that cannot be used, and the other subcommand if that can use them."""
+    for line in origin.failed:
+        sys.stderr.write(f'error: {line}\n')
+    for name, _reason in origin.failures:
+        if _can(identify, Path(name)):
+            sys.stderr.write(f'{name}: try needle identify {other}\n')
+
+
+def _can(identify: Callable[[Path], Any], bag: Path) -> bool:
+    try:
+        identify(bag)
+    except (NeedleError, OSError):
+        return False
+    return True
 
 
 COMMAND = Command(_add_arguments, _run, signed=('--force-axis', '--motion-axis', '--axes'))

@@ -8,7 +8,7 @@ from pathlib import Path
 import sys
 from typing import Any, Final
 
-from needle_insertion.commands.common import Command, make_folder
+from needle_insertion.commands.common import check_folder, Command, make_folder
 from needle_insertion.report.text import table
 
 #: What there is to reproduce.
@@ -46,6 +46,10 @@ def _run(options: argparse.Namespace) -> int:
     # Takes two seconds to import; invalid options are reported without it.
     from needle_insertion.paper.results import campaigns, results, VERDICT_HEADS, write_results
 
+    folder = options.output or (_OUTPUT if options.what == 'all' else None)
+    for path in (folder, options.record):
+        if path is not None:
+            check_folder(path)
     recorded = None
     if options.record is not None:
         wanted = campaigns(options.what)
@@ -53,7 +57,6 @@ def _run(options: argparse.Namespace) -> int:
         from needle_insertion.experiment.record import record
 
         recorded = {name: record(one, options.record) for name, one in wanted.items()}
-    folder = options.output or (_OUTPUT if options.what == 'all' else None)
     if folder is not None:
         make_folder(folder)
     found = results(options.what, recorded)

@@ -9,7 +9,7 @@ import sys
 
 from needle_dynamics import NeedleModel, NeedleParameters, PRESETS, simulate
 from needle_dynamics.simulated.integrator import DEFAULT_TOLERANCE
-from needle_insertion.commands.common import add_needle, Command, constants
+from needle_insertion.commands.common import add_needle, check_file, Command, constants
 from needle_insertion.report import trajectory as report
 from needle_insertion.report.text import table
 from needle_ros.errors import ParameterError
@@ -49,8 +49,9 @@ def _run(options: argparse.Namespace) -> int:
     for path in options.output:
         if path.suffix not in ('', '.csv', '.png'):
             raise ParameterError(f'{path}: output must be .csv, .png or a folder for a bag')
-        if not path.absolute().parent.is_dir() or (not path.suffix and path.exists()):
-            raise ParameterError(f'{path}: the folder it is in must exist, a bag must not')
+        if not path.suffix and path.exists():
+            raise ParameterError(f'{path}: a bag must not exist')
+        check_file(path)
     parameters = NeedleParameters.preset(options.preset, **constants(options.set))
     trajectory = simulate(
         parameters,
@@ -63,11 +64,19 @@ def _run(options: argparse.Namespace) -> int:
     for path in options.output:
         report.write(path, trajectory)
     summary = report.summary(trajectory)
+    for words in report.warnings(trajectory):
+        sys.stderr.write(f'warning: {words}\n')
     if options.json:
         sys.stdout.write(f'{json.dumps(summary, indent=2)}\n')
     else:
         rows = [(name, f'{value:.6g}') for name, value in summary.items()]
-        sys.stdout.write(f'{table(rows, ("quantity", "value"))}\n')
+        sys.stdout.write(
+            f'{options.preset}: inserted {options.depth:g} m at the start, force '
+            f'{options.force:g} N, for {options.duration:g} s\n\n'
+            f'{table(rows, ("quantity", "value"))}\n'
+        )
+        for path in options.output:
+            sys.stdout.write(f'wrote {path}\n')
     return 0
 
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 import csv
 from io import StringIO
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Final, TYPE_CHECKING
 
-from needle_dynamics import NeedleModel, Trajectory
+from needle_dynamics import linearize, NeedleModel, Trajectory
 from needle_identification import BagWriter
 from needle_identification.result import write_whole
 from needle_insertion.report.content import png
@@ -18,6 +19,9 @@ import numpy as np
 if TYPE_CHECKING:
     # Takes half a second to import; only the picture needs it.
     from matplotlib.figure import Figure
+
+#: Deflection up to which a linear beam is valid, as a part of the inserted length.
+_LINEAR: Final = 0.1
 
 
 def summary(trajectory: Trajectory) -> dict[str, float]:
@@ -46,6 +50,44 @@ def summary(trajectory: Trajectory) -> dict[str, float]:
         'energy at the start [J]': model.energy(states[0]),
         'energy at the end [J]': model.energy(states[-1], float(trajectory.time[-1])),
     }
+
+
+def warnings(trajectory: Trajectory) -> Iterator[str]:
+    """
+    Warn of what the trajectory cannot show.
+
+    Parameters
+    ----------
+    trajectory : Trajectory
+        The trajectory.
+
+    Yields
+    ------
+    str
+        A warning.
+
+    """
+    model = NeedleModel(trajectory.parameters)
+    tips, depths = np.abs(trajectory.tip_deflection), trajectory.depth
+    worst = int(np.argmax(tips - _LINEAR * depths))
+    if tips[worst] > _LINEAR * depths[worst]:
+        yield (
+            f'the tip deflects {1e3 * tips[worst]:.3g} mm at {1e3 * depths[worst]:.3g} mm '
+            'inserted: a linear beam is valid up to about a tenth of the inserted length'
+        )
+    # The frequencies depend on the inserted length.
+    ends = [
+        linearize(model, trajectory.states[k], time=float(trajectory.time[k]), sliding='insertion')
+        for k in (0, -1)
+    ]
+    fastest = float(max(system.frequencies[-1] for system in ends)) / (2.0 * np.pi)
+    interval = float(trajectory.time[1] - trajectory.time[0])
+    if fastest > 0.5 / interval:
+        yield (
+            f'the fastest mode, {1e-3 * fastest:.3g} kHz, is beyond half the sampling rate, '
+            f'{0.5e-3 / interval:.3g} kHz: samples show it at a wrong frequency; '
+            f'an interval below {0.5 / fastest:.2g} s shows it'
+        )
 
 
 def write(path: Path, trajectory: Trajectory) -> None:

@@ -1,6 +1,7 @@
 """The command line: what it accepts and rejects, and how it ends."""
 
 from hashlib import sha256
+import os
 from pathlib import Path
 import signal
 import subprocess
@@ -186,3 +187,131 @@ def test_a_negative_number_is_a_value(speed: str, capsys: pytest.CaptureFixture[
     """Also in scientific notation, which argparse takes for an option."""
     assert main(['analyze', '--speed', speed]) == 0
     assert '-5 mm/s' in capsys.readouterr().out
+
+
+def run(*words: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    """Run the command as a user does."""
+    return subprocess.run(
+        [sys.executable, '-m', 'needle_insertion.cli', *words],
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+        env={**os.environ, **environment},
+    )
+
+
+def test_negative_numbers_may_be_in_scientific_notation(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """They are values, not options; also several of them."""
+    assert main(['analyze', '--speed', '-5e-3', '-1e-2', '--tip-deflection', '-5e-4']) == 0
+    out = capsys.readouterr().out
+    assert '10 cm, -0.5 mm, -5 mm/s' in out
+    assert '10 cm, -0.5 mm, -10 mm/s' in out
+    assert main(['identify', 'friction', BAGS[0], '--cutoff', '-1e-3']) == 2
+    assert 'cutoff must be' in capsys.readouterr().err
+
+
+@pytest.mark.parametrize('value', ['nan', 'inf', '-inf'])
+@pytest.mark.parametrize(
+    'words',
+    [
+        ['identify', 'stiffness', str(SHIPPED_BAGS / 'stiffness_01'), '--level'],
+        ['identify', 'friction', BAGS[0], '--cutoff'],
+        ['analyze', '--speed'],
+        ['simulate', '--duration', '0.002', '--force'],
+        ['simulate', '--duration'],
+    ],
+)
+def test_numbers_must_be_finite(
+    words: list[str], value: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """NaN and infinity end in one line."""
+    assert main([*words, value]) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ''
+    assert captured.err.count('\n') == 1
+
+
+def test_a_cutoff_that_the_recording_cannot_have_is_named(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """Too low for its length is rejected; too high for its rate is no filter, and said."""
+    for cutoff in ('1e-9', '1e-310'):
+        assert main(['identify', 'friction', BAGS[0], '--cutoff', cutoff]) == 2
+        err = capsys.readouterr().err
+        assert err.count('\n') == 1
+        assert 'the cutoff must be above 0.' in err
+    assert main(['identify', 'friction', BAGS[0], '--cutoff', '1e300']) == 0
+    assert 'beyond half the sampling rate, 50 Hz' in capsys.readouterr().err
+
+
+def test_a_terminal_without_unicode_gets_a_result() -> None:
+    """Characters that it does not know are replaced."""
+    done = run('identify', 'friction', BAGS[0], PYTHONIOENCODING='ascii')
+    assert (done.returncode, done.stderr) == (0, '')
+    assert 'mean ? SE' in done.stdout
+
+
+def test_the_wrong_kind_of_recording_names_the_right_subcommand(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """Friction from presses, and stiffness from strokes."""
+    stiffness = str(SHIPPED_BAGS / 'stiffness_01')
+    for wrong, right, bag in (
+        ('friction', 'stiffness', stiffness),
+        ('stiffness', 'friction', BAGS[0]),
+    ):
+        assert main(['identify', wrong, bag]) == 2
+        assert f'{bag}: try needle identify {right}\n' in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ('words', 'meant'),
+    [
+        (['identfy', 'friction', 'x'], 'identify'),
+        (['identify', 'frction', 'x'], 'friction'),
+        (['identify', 'friction', 'x', '--repot', 'y'], '--report'),
+        (['analyze', '--preset', 'phantm'], 'phantom'),
+    ],
+)
+def test_a_mistyped_word_names_the_nearest(
+    words: list[str], meant: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Of subcommands, options and choices."""
+    with pytest.raises(SystemExit):
+        main(words)
+    assert capsys.readouterr().err.endswith(f'did you mean {meant}?\n')
+
+
+@pytest.mark.parametrize(
+    'words',
+    [
+        ['identify', 'friction', BAGS[0], '-o', 'missing/result.yaml'],
+        ['identify', 'friction', BAGS[0], '--report', 'file/report'],
+        ['identify', 'stiffness', BAGS[0], '--report', 'locked/report'],
+        ['simulate', '-o', 'missing/run.csv'],
+        ['simulate', '-o', 'locked/run.csv'],
+        ['reproduce', 'figure-4', '-o', 'locked'],
+        ['demo', '-o', 'locked/demo'],
+        ['experiment', 'friction', 'locked/bags'],
+    ],
+)
+def test_places_are_checked_before_the_work_starts(
+    words: list[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """A folder that is missing, is a file, or may not be written to."""
+    monkeypatch.chdir(tmp_path)
+    Path('file').touch()
+    Path('locked').mkdir()
+    # Nobody can lock out the user root.
+    monkeypatch.setattr(os, 'access', lambda path, _mode: Path(path).name != 'locked')
+    assert main(words) == 2
+    err = capsys.readouterr().err
+    assert 'cannot be written: ' in err
+    assert err.count('\n') == 1
+    assert sorted(path.name for path in tmp_path.rglob('*')) == ['file', 'locked']

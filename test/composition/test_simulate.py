@@ -71,3 +71,25 @@ def test_bad_input_ends_in_one_line(
     captured = capsys.readouterr()
     assert complaint in captured.err
     assert captured.err.count('\n') == 1
+
+
+def test_the_run_is_named_and_so_are_its_files(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Defaults that nobody typed are printed."""
+    file = tmp_path / 'run.csv'
+    assert main([*SHORT, '-o', str(file)]) == 0
+    out = capsys.readouterr().out
+    assert out.startswith('paper_si: inserted 0.02 m at the start, force 3 N, for 0.005 s\n')
+    assert out.endswith(f'wrote {file}\n')
+
+
+def test_what_the_samples_cannot_show_is_said(capsys: pytest.CaptureFixture[str]) -> None:
+    """A mode beyond half the sampling rate, and a deflection beyond a linear beam."""
+    few = ['simulate', '--duration', '0.002', '--interval', '1e-3', '--depth', '0.05']
+    assert main([*few, '--tip-deflection', '0.02']) == 0
+    err = capsys.readouterr().err
+    assert 'a linear beam is valid up to' in err
+    assert 'is beyond half the sampling rate, 0.5 kHz' in err
+    assert main([*few[:4], '1e-5', *few[5:]]) == 0
+    assert capsys.readouterr().err == ''
