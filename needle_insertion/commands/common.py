@@ -47,7 +47,12 @@ def add_needle(parser: ArgumentParser, presets: Iterable[str], default: str) -> 
         The preset if none is given.
 
     """
-    parser.add_argument('--preset', choices=tuple(presets), default=default)
+    parser.add_argument(
+        '--preset',
+        choices=tuple(presets),
+        default=default,
+        help=f'constants of needle and tissue (default {default})',
+    )
     parser.add_argument(
         '--set',
         action='append',

@@ -41,8 +41,10 @@ def summary(trajectory: Trajectory) -> dict[str, float]:
     """
     model = NeedleModel(trajectory.parameters)
     states, tips = trajectory.states, trajectory.tip_deflection
+    at_hub = trajectory.time[trajectory.depth >= trajectory.parameters.length]
     return {
         'duration [s]': float(trajectory.time[-1]),
+        **({'hub at the skin after [s]': float(at_hub[0])} if at_hub.size else {}),
         'inserted length at the end [m]': float(trajectory.depth[-1]),
         'insertion speed at the end [m/s]': float(-states[-1, model.coordinates]),
         'largest tip deflection [m]': float(np.abs(tips).max()),
@@ -138,12 +140,15 @@ def _figure(trajectory: Trajectory) -> Figure:
     for i in range(trajectory.parameters.modes):
         middle.plot(time, trajectory.states[:, 2 + i] * 1e3, label=f'q{i + 1}')
     middle.set_ylabel('modal coordinates [1e-3 m^3/2]')
-    middle.legend()
     below.plot(time, trajectory.tip_deflection * 1e3)
     below.set_ylabel('tip deflection [mm]')
     below.set_xlabel('time [ms]')
+    at_hub = time[trajectory.depth >= trajectory.parameters.length]
     for axis in (above, middle, below):
+        if at_hub.size:
+            axis.axvline(at_hub[0], color='0.5', linestyle='--', label='hub at the skin')
         axis.grid(visible=True, alpha=0.3)
+    middle.legend()
     return result
 
 

@@ -93,3 +93,12 @@ def test_what_the_samples_cannot_show_is_said(capsys: pytest.CaptureFixture[str]
     assert 'is beyond half the sampling rate, 0.5 kHz' in err
     assert main([*few[:4], '1e-5', *few[5:]]) == 0
     assert capsys.readouterr().err == ''
+
+
+def test_the_contact_of_the_hub_is_named(capsys: pytest.CaptureFixture[str]) -> None:
+    """Only when the needle is in up to the hub."""
+    name = 'hub at the skin after [s]'
+    assert main(['simulate', '--json']) == 0
+    assert 0.0 < json.loads(capsys.readouterr().out)[name] < 0.05
+    assert main([*SHORT, '--json']) == 0
+    assert name not in json.loads(capsys.readouterr().out)
