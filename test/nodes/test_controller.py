@@ -247,7 +247,7 @@ def test_unstable_gains_end_the_process(ros_graph: RosGraph) -> None:
 def test_parameters_cannot_change_while_configured(ros_graph: RosGraph) -> None:
     """A change that would not take effect is refused, with the way to make it."""
     controller = ros_graph.add(ControllerNode, parameters=SLOW)
-    parameter = controller.get_parameter('reference.kind')
+    parameter = Parameter('reference.kind', value='minimum_jerk')
     result = controller.set_parameters([parameter])[0]
     assert not result.successful
     assert 'clean up the node first' in result.reason
