@@ -65,9 +65,8 @@ class Following:
             Whether the plant does not follow.
 
         """
-        if commanded == 0.0:
-            return self.lost
-        if not abs(reported) < _NOTHING * abs(commanded):
+        # Where nothing is commanded there is nothing to follow.
+        if commanded == 0.0 or not abs(reported) < _NOTHING * abs(commanded):
             self.forget()
             return False
         if self._mark is None:

@@ -231,6 +231,20 @@ def test_the_reference_waits_for_a_plant_that_does_not_follow() -> None:
     assert robot.aim > waits + 0.02
 
 
+def test_a_gap_does_not_keep_the_reference_waiting() -> None:
+    """After it the motion starts from where the needle is, where no force is due yet."""
+    robot = Robot()
+    robot.runs(200, obeys=True)
+    robot.runs(300, obeys=False)
+    assert robot.loop.supervisor.fault is not None
+    robot.loop.now += SECOND
+    robot.runs(10, obeys=False)
+    depth = robot.loop.depth
+    robot.runs(3000, obeys=True)
+    assert robot.loop.supervisor.fault is None
+    assert robot.loop.depth > depth + 0.01
+
+
 @pytest.mark.parametrize('moves', [False, True])
 def test_a_robot_that_reports_no_force_or_moves_is_not_judged(moves: bool) -> None:
     """Without efforts nothing is known; where the needle moves, reported zeros do not count."""
