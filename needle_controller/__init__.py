@@ -4,6 +4,7 @@ Control of a flexible needle: laws, references, observer, stability, safety, and
 Units are SI throughout; signs and frames are those of docs/architecture.md.
 """
 
+from needle_controller.answer import Answer
 from needle_controller.controller import (
     Command,
     Controller,
@@ -42,7 +43,7 @@ from needle_controller.stability import (
     stability_limit,
     transition_matrix,
 )
-from needle_controller.supervisor import Answer, Supervisor
+from needle_controller.supervisor import Supervisor
 
 __all__ = [
     'DEFAULT_GAINS',

@@ -9,6 +9,7 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PointStamped
+from needle_controller.answer import Answer, Reply
 from needle_controller.controller import (
     Controller,
     ControllerSettings,
@@ -21,7 +22,7 @@ from needle_controller.observer.settings import ObserverSettings
 from needle_controller.reference.guide import REFERENCES
 from needle_controller.reference.setpoint import ReferenceLimits
 from needle_controller.safety.limits import SafetyLimits
-from needle_controller.supervisor import Answer, Reply, Supervisor
+from needle_controller.supervisor import Supervisor
 from needle_dynamics.compiled.cache import announce_compilation
 from needle_dynamics.model_node import ModelNode
 from needle_ros import contract

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from time import monotonic
-from typing import Final, NamedTuple
+from typing import Final
 
+from needle_controller.answer import Answer, Reply
 from needle_controller.bending import Bending
 from needle_controller.controller import Controller, ControllerSettings, Gains, Measurement
 from needle_controller.journal import Journal, Severity
@@ -26,38 +27,6 @@ _WAITING: Final = 'no joint_states yet'
 
 #: Topics that the observer lives on.
 _SENSORS: Final = ('base_wrench', 'tip_deflection')
-
-
-class Answer(NamedTuple):
-    """
-    What to command now.
-
-    Attributes
-    ----------
-    stamp : int
-        Stamp of the measurement that it answers; the time now if it answers none [ns].
-    force, torque : float
-        Insertion force [N] and torque [N m].
-    reference : tuple of float
-        Inserted length [m] and velocity [m/s] that it aims at; empty without a motion.
-    error : tuple of float
-        The reference less the measurement; empty without a motion.
-
-    """
-
-    stamp: int
-    force: float = 0.0
-    torque: float = 0.0
-    reference: tuple[float, ...] = ()
-    error: tuple[float, ...] = ()
-
-
-class Reply(NamedTuple):
-    """The answer of a service, and what to command now, if anything."""
-
-    success: bool
-    message: str
-    answer: Answer | None = None
 
 
 class Supervisor:
