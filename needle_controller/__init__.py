@@ -44,6 +44,7 @@ from needle_controller.stability import (
     transition_matrix,
 )
 from needle_controller.supervisor import Supervisor
+from needle_controller.uncertainty import Uncertainty
 
 __all__ = [
     'DEFAULT_GAINS',
@@ -81,6 +82,7 @@ __all__ = [
     'Stream',
     'Supervisor',
     'Trapezoid',
+    'Uncertainty',
     'check_stability',
     'no_memory',
     'run_batch',

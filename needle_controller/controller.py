@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from math import isfinite, nan
 from typing import Final, TypeAlias
 
@@ -14,6 +14,7 @@ from needle_controller.laws.pid import Pid, PidGains
 from needle_controller.reference.guide import Guide
 from needle_controller.reference.setpoint import ReferenceLimits, Setpoint
 from needle_controller.stability import check_stability, Limit, MARGIN
+from needle_controller.uncertainty import Uncertainty
 from needle_dynamics import NeedleParameters
 from needle_ros.errors import ParameterError
 from needle_ros.settings import check_constants, constant
@@ -59,6 +60,12 @@ class ControllerSettings:
     stability_margin: float = constant(
         MARGIN, '1', 'required relative decrease of every control error per period', high=0.5
     )
+    rotation: bool = field(
+        default=True,
+        metadata={
+            'description': 'whether the robot turns the needle; without it the torque is zero'
+        },
+    )
     lowest_depth: float = constant(
         0.0, 'm', 'least inserted length to control; minimum_depth if that is larger'
     )
@@ -69,6 +76,8 @@ class ControllerSettings:
 
     def __post_init__(self) -> None:
         check_constants(self)
+        if not isinstance(self.rotation, bool):
+            raise ParameterError(f'rotation must be true or false, got {self.rotation!r}')
         if self.delay != int(self.delay):
             raise ParameterError(f'delay must be a whole number of periods, got {self.delay!r}')
 
@@ -188,6 +197,8 @@ class Controller:
         Motion to a target, a key of `REFERENCES`.
     limits : ReferenceLimits, optional
         Limits of the reference.
+    uncertainty : Uncertainty, optional
+        How far the needle may be from its constants: the gains shall be stable for all of that.
 
     Attributes
     ----------
@@ -230,7 +241,9 @@ class Controller:
         settings: ControllerSettings | None = None,
         reference: str = 'trapezoid',
         limits: ReferenceLimits | None = None,
+        uncertainty: Uncertainty | None = None,
     ) -> None:
+        self._uncertainty = uncertainty or Uncertainty()
         self.settings = settings = settings or ControllerSettings()
         self.period, self.delay = 1.0 / settings.rate, int(settings.delay)
         self.guide = Guide(reference, limits or ReferenceLimits(), settings.depths(parameters))
@@ -257,10 +270,15 @@ class Controller:
                 law = Pid(axis=axis, gains=chosen, period=self.period)
             else:
                 law = InverseDynamics(axis=axis, gains=chosen, period=self.period)
-            limits[where] = check_stability(
-                law, self.delay, f'{name}.{where} gains', margin=self.settings.stability_margin
-            )
             laws.append(law)
+            if where == 'insertion' or self.settings.rotation:
+                limits[where] = check_stability(
+                    law,
+                    self.delay,
+                    f'{name}.{where} gains',
+                    margin=self.settings.stability_margin,
+                    plants=self._uncertainty.axes(axis, carriage=where == 'insertion'),
+                )
         return laws, limits
 
     def change(
@@ -273,7 +291,7 @@ class Controller:
         """
         Continue with other constants, gains or another law; target, reference and memory stay.
 
-        With other gains or another law during a motion, the first forces are the last ones again.
+        During a motion the first forces are the last ones again.
 
         Parameters
         ----------
@@ -293,14 +311,13 @@ class Controller:
         parameters, name = parameters or self.parameters, law or self.law
         completed = _completed(gains or {}, self._gains)
         (insertion, rotation), limits = self._checked(name, parameters, completed)
-        steady = (name, completed[name]) == (self.law, self._gains[self.law])
         self.law, self.parameters, self._gains = name, parameters, completed
         self.limits = limits
-        if steady or not self.guide.moves:
-            self._insertion.law, self._rotation.law = insertion, rotation
-        else:
+        if self.guide.moves:
             self._insertion.switch(insertion)
             self._rotation.switch(rotation)
+        else:
+            self._insertion.law, self._rotation.law = insertion, rotation
 
     @property
     def target(self) -> float | None:
@@ -422,9 +439,13 @@ class Controller:
             )
         now = self.guide.at(measured.time, measured.depth)
         ahead = self.guide.ahead(measured.time + self.delay * self.period)
+        torque = 0.0
+        if self.settings.rotation:
+            still = Setpoint(0.0)
+            torque = self._rotation.command(measured.angle, measured.angular_speed, still)
         return Command(
             force=self._insertion.command(measured.depth, measured.speed, ahead, load),
-            torque=self._rotation.command(measured.angle, measured.angular_speed, Setpoint(0.0)),
+            torque=torque,
             setpoint=now,
             notice=notice,
         )

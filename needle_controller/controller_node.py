@@ -23,6 +23,7 @@ from needle_controller.reference.guide import REFERENCES
 from needle_controller.reference.setpoint import ReferenceLimits
 from needle_controller.safety.limits import SafetyLimits
 from needle_controller.supervisor import Supervisor
+from needle_controller.uncertainty import Uncertainty
 from needle_dynamics.compiled.cache import announce_compilation
 from needle_dynamics.model_node import ModelNode
 from needle_ros import contract
@@ -107,6 +108,7 @@ class ControllerNode(ModelNode):
         self.declare_settings('', ControllerSettings())
         self.declare_settings('reference.', ReferenceLimits())
         self.declare_settings('safety.', SafetyLimits())
+        self.declare_settings('uncertainty.', Uncertainty())
         self.declare_settings('observer.', ObserverSettings())
         for law, axes in DEFAULT_GAINS.items():
             for axis, gains in axes.items():
@@ -146,6 +148,7 @@ class ControllerNode(ModelNode):
             settings=self.settings('', ControllerSettings),
             reference=self.text('reference.kind', tuple(REFERENCES)),
             limits=self.settings('reference.', ReferenceLimits),
+            uncertainty=self.settings('uncertainty.', Uncertainty),
         )
         self._supervisor.retract_depth = self._retract_depth({})
         limits, observed = self.settings('safety.', SafetyLimits), None

@@ -1,23 +1,37 @@
 """
 Poles of the sampled loops, and the rejection of gains that are unstable.
 
-Accepted gains have all poles within 1 - margin at the configured delay, and within 1 with one more
-period of delay that the law does not know. That period is the reserve for everything that is not
-modeled. The setting ``margin`` requires convergence: every error decreases by at least this part
-in a period. The poles of slow loops are close to one (the paper's k_p = 1, k_v = 0.1 at 1 kHz:
-1 - 5e-5). The default margin is therefore small, but far above the rounding of an eigenvalue.
+Accepted gains have all poles within 1 - margin on the axis as modeled, at the configured delay. On
+every axis that `Uncertainty` allows, and with one more period of delay that the law does not know,
+all poles are within 1. The setting ``margin`` requires convergence: every error decreases by at
+least this part in a period. The poles of slow loops are close to one (the paper's k_p = 1,
+k_v = 0.1 at 1 kHz: 1 - 5e-5). The default margin is therefore small, but far above the rounding of
+an eigenvalue.
+
+Poles do not show a limit cycle of dry friction. It occurs if a law compensates more dry friction
+than there is, in the direction of the measured speed. Laws that do so are also run on each axis.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from math import floor, inf, log10
 from typing import Final
 
-from needle_controller.compiled.laws import INTEGRAL, PID, RATE
+from needle_controller.compiled.laws import (
+    FOLLOWS,
+    INTEGRAL,
+    INVERSE_DYNAMICS,
+    POSITION,
+    RATE,
+    SPEED,
+)
+from needle_controller.laws.axis import Axis
+from needle_controller.laws.inverse_dynamics import BANDWIDTH, InverseDynamics
 from needle_controller.laws.law import Law, SampledLoop
 from needle_controller.reference.setpoint import Setpoint
+from needle_controller.uncertainty import limit_cycle
 from needle_dynamics import FloatArray
 from needle_ros.errors import ParameterError
 import numpy as np
@@ -46,26 +60,34 @@ class Limit:
         Largest valid radius: 1 - margin, or with the reserve just below 1.
     unmodeled : int
         Periods of delay that the law does not know: 0 or RESERVE.
+    plant : Axis
+        The true axis.
+    cycle : float
+        Amplitude of a limit cycle of dry friction [m] or [rad]; 0 if there is none.
 
     """
 
     radius: float
     bound: float
     unmodeled: int
+    plant: Axis
+    cycle: float = 0.0
 
     @property
     def stable(self) -> bool:
-        """Whether the loop is stable with its margin."""
-        return self.radius <= self.bound
+        """Whether the loop is stable with its margin, without a limit cycle."""
+        return self.radius <= self.bound and self.cycle == 0.0
 
 
-def transition_matrix(law: Law, delay: int, unmodeled: int = 0) -> FloatArray:
+def transition_matrix(
+    law: Law, delay: int, unmodeled: int = 0, plant: Axis | None = None
+) -> FloatArray:
     """
     One period of the closed loop as a matrix, exact for its linear part.
 
-    The state is position, speed, the memory of the law (integral and filtered rate, if its gains
-    use them) and the pending commands; the last ones are those that the law knows. The matrix is
-    found from the loop itself, so that what is analyzed is what runs.
+    The state is position, speed, the memory of the law (integral, filtered rate and modeled
+    motion, if its gains use them) and the pending commands; the last ones are those that the law
+    knows. The matrix is found from the loop itself, so that what is analyzed is what runs.
 
     Parameters
     ----------
@@ -75,6 +97,8 @@ def transition_matrix(law: Law, delay: int, unmodeled: int = 0) -> FloatArray:
         Periods from measurement to effect that the law takes into account.
     unmodeled : int
         Further periods that the law does not know.
+    plant : Axis, optional
+        The true axis, if it is another one than the law believes; its dry friction is left out.
 
     Returns
     -------
@@ -83,31 +107,34 @@ def transition_matrix(law: Law, delay: int, unmodeled: int = 0) -> FloatArray:
 
     """
     linear, late = law.linear(), delay + unmodeled
+    moved = (plant or law.axis).without_coulomb()
     loop, rest = SampledLoop(linear, delay, inf), Setpoint(0.0)
     # Only memory that the gains use belongs to the loop; the offset after a switch just fades.
     c = law.constants
-    used = [k for k, uses in ((INTEGRAL, c.ki), (RATE, c.filter_time * c.kd)) if uses > 0.0]
+    follows = c.kp if c.kind == INVERSE_DYNAMICS else 0.0
+    uses = {INTEGRAL: c.ki, RATE: c.filter_time * c.kd, POSITION: follows, SPEED: follows}
+    used = [entry for entry, gain in uses.items() if gain > 0.0]
     first = 2 + len(used)
 
     def period(state: FloatArray) -> list[float]:
         position, speed = state[:2].tolist()
         commands: list[float] = state[first:].tolist()
-        loop.memory[used] = state[2:first]
+        loop.memory[used], loop.memory[FOLLOWS] = state[2:first], float(follows > 0.0)
         loop.pending.extend(commands[unmodeled:])
         commands.append(loop.command(position, speed, rest))
-        end = linear.axis.propagate(position, speed, commands[0], linear.period)
+        end = moved.propagate(position, speed, commands[0], linear.period)
         return [*end, *loop.memory[used].tolist(), *commands[1:]]
 
     return np.array([period(unit) for unit in np.eye(first + late)]).T
 
 
-def spectral_radius(law: Law, delay: int, unmodeled: int = 0) -> float:
+def spectral_radius(law: Law, delay: int, unmodeled: int = 0, plant: Axis | None = None) -> float:
     """
     Return the largest modulus of the poles; see `transition_matrix`. Below 1 is stable.
 
     Parameters
     ----------
-    law, delay, unmodeled
+    law, delay, unmodeled, plant
         As for `transition_matrix`.
 
     Returns
@@ -116,10 +143,34 @@ def spectral_radius(law: Law, delay: int, unmodeled: int = 0) -> float:
         The modulus.
 
     """
-    return float(np.abs(np.linalg.eigvals(transition_matrix(law, delay, unmodeled))).max())
+    matrix = transition_matrix(law, delay, unmodeled, plant)
+    return float(np.abs(np.linalg.eigvals(matrix)).max())
 
 
-def stability_limit(law: Law, delay: int, *, margin: float = MARGIN) -> Limit:
+def _limits(law: Law, delay: int, margin: float, plants: Sequence[Axis]) -> Iterator[Limit]:
+    """Yield what limits the stability on the axis as modeled, and then on others."""
+    inside = float(np.nextafter(1.0, 0.0))
+    # Dry friction does not change the poles.
+    radii: dict[tuple[float, ...], float] = {}
+    for plant in (law.axis, *plants):
+        for unmodeled in (0, RESERVE):
+            bound = 1.0 - margin if plant is law.axis and unmodeled == 0 else inside
+            key = plant.inertia, plant.viscous, unmodeled
+            if key not in radii:
+                radii[key] = spectral_radius(law, delay, unmodeled, plant)
+            radius = radii[key]
+            cycle = limit_cycle(law, delay, unmodeled, plant, radius) if radius < 1.0 else 0.0
+            yield Limit(radius=radius, bound=bound, unmodeled=unmodeled, plant=plant, cycle=cycle)
+
+
+def _checked_margin(margin: float) -> None:
+    if not 0.0 <= margin < 1.0:
+        raise ParameterError(f'margin must be in [0, 1), got {margin!r}')
+
+
+def stability_limit(
+    law: Law, delay: int, *, margin: float = MARGIN, plants: Sequence[Axis] = ()
+) -> Limit:
     """
     Find what limits the stability of a loop, with its delay and with the reserve.
 
@@ -131,11 +182,13 @@ def stability_limit(law: Law, delay: int, *, margin: float = MARGIN) -> Limit:
         Periods from measurement to effect.
     margin : float
         Required distance of the spectral radius from one, in [0, 1).
+    plants : sequence of Axis
+        Other axes on which it shall be stable, such as those of `Uncertainty.axes`.
 
     Returns
     -------
     Limit
-        The radius that is farthest from its bound.
+        The largest limit cycle, or else the radius that is farthest from its bound.
 
     Raises
     ------
@@ -151,23 +204,20 @@ def stability_limit(law: Law, delay: int, *, margin: float = MARGIN) -> Limit:
     True
 
     """
-    if not 0.0 <= margin < 1.0:
-        raise ParameterError(f'margin must be in [0, 1), got {margin!r}')
-    bounds = {0: 1.0 - margin, RESERVE: float(np.nextafter(1.0, 0.0))}
-    limits = [
-        Limit(radius=spectral_radius(law, delay, unmodeled), bound=bound, unmodeled=unmodeled)
-        for unmodeled, bound in bounds.items()
-    ]
-    return max(limits, key=lambda limit: limit.radius - limit.bound)
+    _checked_margin(margin)
+    found = _limits(law, delay, margin, plants)
+    return max(found, key=lambda limit: (limit.cycle, limit.radius - limit.bound))
 
 
-def check_stability(law: Law, delay: int, name: str, *, margin: float = MARGIN) -> Limit:
+def check_stability(
+    law: Law, delay: int, name: str, *, margin: float = MARGIN, plants: Sequence[Axis] = ()
+) -> Limit:
     """
-    Reject gains that are unstable, or would be with the delay in reserve.
+    Reject gains that are unstable on any of the axes, or would be with the delay in reserve.
 
     Parameters
     ----------
-    law, delay, margin
+    law, delay, margin, plants
         As for `stability_limit`.
     name : str
         Name of the gains for the message.
@@ -180,8 +230,9 @@ def check_stability(law: Law, delay: int, name: str, *, margin: float = MARGIN) 
     Raises
     ------
     ParameterError
-        If the gains are unstable. The message names gains, rate, delay and spectral radius, and
-        the nearest stable change: a common factor on the gains, or else a rate.
+        If the gains are unstable. The message names gains, rate, delay, the axis and the spectral
+        radius or limit cycle there, and the nearest stable change: the feedback of inverse
+        dynamics, a common factor on the gains, or else a rate.
 
     Examples
     --------
@@ -194,37 +245,65 @@ def check_stability(law: Law, delay: int, name: str, *, margin: float = MARGIN) 
     needle_ros.errors.ParameterError: my gains are unstable at 1000 Hz ...
 
     """
-    limit = stability_limit(law, delay, margin=margin)
+    limit = stability_limit(law, delay, margin=margin, plants=plants)
     if limit.stable:
         return limit
     late = delay + limit.unmodeled
-    bound = f'<= 1 - {margin:g}' if limit.unmodeled == 0 else '< 1'
+    if limit.cycle:
+        found = f'a limit cycle of {limit.cycle:.3g}'
+    else:
+        bound = '< 1' if limit.bound > 1.0 - margin else f'<= 1 - {margin:g}'
+        found = f'spectral radius {limit.radius:.7g} must be {bound}'
     raise ParameterError(
         f'{name} are unstable at {1.0 / law.period:.7g} Hz with a delay of {late} '
-        f'period{"" if late == 1 else "s"}: spectral radius {limit.radius:.7g} must be '
-        f'{bound}; {_advice(law, delay, margin)}'
+        f'period{"" if late == 1 else "s"}{_difference(limit.plant, law.axis)}: {found}; '
+        f'{_advice(law, delay, margin, plants, limit)}'
     )
 
 
-def _advice(law: Law, delay: int, margin: float) -> str:
-    """Say what would be stable: a factor on all gains, or else a rate."""
+def _difference(plant: Axis, modeled: Axis) -> str:
+    """Say in what an axis differs from the modeled one."""
+    units = {'coulomb': 'coulomb friction', 'viscous': 'viscous friction', 'inertia': 'inertia'}
+    changed = [
+        f'{words} {getattr(plant, name):.4g} instead of {getattr(modeled, name):.4g}'
+        for name, words in units.items()
+        if getattr(plant, name) != getattr(modeled, name)
+    ]
+    return f' if the axis has {", ".join(changed)} (SI units)' if changed else ''
+
+
+def _advice(law: Law, delay: int, margin: float, plants: Sequence[Axis], worst: Limit) -> str:
+    """Say what would be stable: feedback, a factor on all gains, or else a rate."""
 
     def accepts(changed: Law) -> bool:
-        return stability_limit(changed, delay, margin=margin).stable
+        # The axis that was the worst is the likeliest to reject it again.
+        most = stability_limit(changed, delay, margin=margin, plants=(worst.plant,))
+        return most.stable and all(
+            limit.stable for limit in _limits(changed, delay, margin, plants)
+        )
 
+    known = ''
+    if worst.plant is not law.axis and stability_limit(law, delay, margin=margin).stable:
+        known = '; or say by uncertainty.* how well the model is known: as modeled it is stable'
+    if isinstance(law, InverseDynamics) and law.gains.bandwidth == 0.0:
+        with_feedback = replace(law, gains=replace(law.gains, bandwidth=BANDWIDTH))
+        if accepts(with_feedback):
+            return f'with feedback, bandwidth = {BANDWIDTH:g}, they would be stable{known}'
     for factor in _nearby():
         if accepts(law.scaled(factor)):
-            return f'all of them times {factor:g} would be stable'
+            return f'all of them times {factor:g} would be stable{known}'
     for factor in _upwards(_MOST_RATE):
         rate = _digits(factor / law.period, 3)
         if accepts(replace(law, period=1.0 / rate)):
-            return f'a rate of {rate:.7g} Hz would be stable'
-    damping = 'kd' if law.constants.kind == PID else 'kv'
-    gains = {'kp': law.constants.kp, damping: law.constants.kd}
+            return f'a rate of {rate:.7g} Hz would be stable{known}'
+    c = law.constants
+    gains = {'kp': c.kp, 'kd': c.kd}
+    if isinstance(law, InverseDynamics):
+        gains = {'kp': c.model_kp, 'kv': c.model_kv}
     missing = [name for name, gain in gains.items() if gain == 0.0]
     if missing:
         return f'{" and ".join(missing)} must not be zero'
-    return 'neither a common factor on them nor a higher rate would be stable'
+    return f'neither a common factor on them nor a higher rate would be stable{known}'
 
 
 def _digits(value: float, digits: int) -> float:

@@ -8,19 +8,27 @@ recognizes a plain tuple several times faster than a named one.
 
 from __future__ import annotations
 
+from math import inf
 from typing import Final, NamedTuple
 
 from needle_dynamics.arrays import FloatArray
 from needle_dynamics.compiled.cache import compiled
+from needle_dynamics.compiled.friction import (
+    dry_friction,
+    friction_flow,
+    FrictionConstants,
+    TANH,
+)
 
 #: Kinds of laws.
 INVERSE_DYNAMICS: Final = 0.0
 PID: Final = 1.0
 
-#: Entries of the memory of a law: integral of the error, filtered rate of the error, and a force
-#: that fades after a switch of laws.
-INTEGRAL, RATE, OFFSET = 0, 1, 2
-MEMORY: Final = 3
+#: Entries of the memory of a law: integral of the error, filtered rate of the error, a force that
+#: fades after a switch of laws, and for inverse dynamics position and speed of the modeled motion,
+#: which count if the last entry is 1.
+INTEGRAL, RATE, OFFSET, POSITION, SPEED, FOLLOWS = 0, 1, 2, 3, 4, 5
+MEMORY: Final = 6
 
 
 class LawConstants(NamedTuple):
@@ -34,15 +42,22 @@ class LawConstants(NamedTuple):
     period : float
         Sample period h [s].
     pv, vv, pf, vf : float
-        Response of the axis over one period to its speed and to a constant force; see `Response`.
-    coulomb : float
-        Coulomb friction [N].
+        Response of the axis over one period of insertion to its speed and to a constant force; see
+        `Response`.
+    back_pv, back_vv, back_pf, back_vf : float
+        The same for withdrawal.
+    inertia : float
+        Inertia of the axis [kg].
+    friction_law, coulomb, viscous, withdrawal, breakaway, stribeck_speed, smoothing_speed : float
+        Friction of the axis; see `FrictionConstants`.
     breakaway_speed : float
         Speed from which on Coulomb friction is fully compensated [m/s].
     ahead : float
         Time ahead of that speed [s].
     kp, ki, kd : float
-        Gains; ``kd`` is k_v of inverse dynamics, which has no ``ki``.
+        Gains of the feedback: force by the error, its integral and its rate.
+    model_kp, model_kv : float
+        Gains k_p [1/s^2] and k_v [1/s] of the modeled motion (inverse dynamics).
     filter_time : float
         Time constant of the filter of the error rate [s].
     tolerance : float
@@ -63,12 +78,25 @@ class LawConstants(NamedTuple):
     vv: float
     pf: float
     vf: float
+    back_pv: float
+    back_vv: float
+    back_pf: float
+    back_vf: float
+    inertia: float
+    friction_law: float
     coulomb: float
+    viscous: float
+    withdrawal: float
+    breakaway: float
+    stribeck_speed: float
+    smoothing_speed: float
     breakaway_speed: float
     ahead: float
     kp: float
     ki: float
     kd: float
+    model_kp: float
+    model_kv: float
     filter_time: float
     tolerance: float
     tracking: float
@@ -98,78 +126,130 @@ class Instant(NamedTuple):
 
 class _Implicit(NamedTuple):
     """
-    PID as an equation for its own force: force = dry + push / divisor.
+    Feedback as an equation for its own force: force = forward + push / divisor.
 
-    The filtered rate of the error at the end of the period is rate - slope (force - dry).
+    The filtered rate of the error at the end of the period is rate - slope times the feedback.
+    `end` and `reached` are position and speed to aim at for the end of the period.
     """
 
+    forward: float
     push: float
     divisor: float
-    dry: float
     rate: float
     slope: float
+    end: float
+    reached: float
 
 
 @compiled
-def _lean(c: LawConstants, speed: float, acceleration: float) -> float:
-    """Return the share of Coulomb friction to compensate, by the speed shortly ahead."""
+def _friction(c: LawConstants) -> FrictionConstants:
+    return FrictionConstants(
+        int(c.friction_law),
+        c.coulomb,
+        c.viscous,
+        c.withdrawal,
+        c.breakaway,
+        c.stribeck_speed,
+        c.smoothing_speed,
+    )
+
+
+@compiled
+def _dry(c: LawConstants, speed: float, acceleration: float) -> float:
+    """Return the dry friction of a motion, by its speed shortly ahead."""
     if c.coulomb == 0.0:
         return 0.0
-    return min(max((speed + c.ahead * acceleration) / c.breakaway_speed, -1.0), 1.0)
+    soon = speed + c.ahead * acceleration
+    level = dry_friction(_friction(c), c.coulomb, abs(soon))[0]
+    if soon < 0.0:
+        level *= c.withdrawal
+    if c.friction_law == TANH:
+        return level if soon > 0.0 else -level
+    return level * min(max(soon / c.breakaway_speed, -1.0), 1.0)
 
 
 @compiled
-def _implicit(c: LawConstants, memory: FloatArray, at: Instant) -> _Implicit:
-    """Set up the implicit form of `needle_controller.laws.pid.Pid`."""
-    h = c.period
-    share = h / (c.filter_time + h)
-    error = at.target + h * at.target_speed - at.position - c.pv * at.speed
-    reached = at.target_speed + h * at.target_acceleration
-    rate = (1.0 - share) * memory[RATE] + share * (reached - c.vv * at.speed)
-    stiffness = c.kp + h * c.ki
-    push = stiffness * error + c.kd * rate + c.ki * memory[INTEGRAL] + memory[OFFSET]
-    dry = 0.0
-    if c.feed_forward != 0.0:
-        push += (reached - c.vv * at.target_speed) / c.vf
-        dry = c.coulomb * _lean(c, at.target_speed, at.target_acceleration)
-    slope = share * c.vf
-    return _Implicit(push, 1.0 + stiffness * c.pf + c.kd * slope, dry, rate, slope)
+def _aim(c: LawConstants, memory: FloatArray, at: Instant) -> Instant:
+    """
+    Return the motion to follow: the reference, or the modeled one of inverse dynamics.
 
-
-@compiled
-def _force(c: LawConstants, memory: FloatArray, at: Instant, load: float) -> float:
-    """Return the force for the next period, before any limit."""
+    That one starts at the measurement and goes to the reference as k_p and k_v say.
+    """
     if c.kind == PID:
-        form = _implicit(c, memory, at)
-        return form.dry + form.push / form.divisor
+        return at
+    position, speed = at.position, at.speed
+    if memory[FOLLOWS] == 1.0:
+        position, speed = float(memory[POSITION]), float(memory[SPEED])
     acceleration = (
         at.target_acceleration
-        + c.kd * (at.target_speed - at.speed)
-        + c.kp * (at.target - at.position)
+        + c.model_kv * (at.target_speed - speed)
+        + c.model_kp * (at.target - position)
     )
-    linear = (at.speed + c.period * acceleration - c.vv * at.speed) / c.vf
-    dry = c.coulomb * _lean(c, at.speed, acceleration)
-    return linear + dry + load + float(memory[OFFSET])
+    return Instant(at.position, at.speed, position, speed, acceleration)
 
 
 @compiled
-def _remember(
-    c: LawConstants, memory: FloatArray, at: Instant, wanted: float, force: float
-) -> None:
-    """Update the memory for a wanted force and the one that the limit left of it."""
+def _implicit(c: LawConstants, memory: FloatArray, aim: Instant) -> _Implicit:
+    """Set up feed-forward and implicit feedback; see `needle_controller.laws.pid.Pid`."""
+    h = c.period
+    reached = aim.target_speed + h * aim.target_acceleration
+    way = aim.target_speed + reached
+    if way == 0.0:
+        way = aim.target - aim.position
+    pv, vv, pf, vf = c.pv, c.vv, c.pf, c.vf
+    if way < 0.0:
+        pv, vv, pf, vf = c.back_pv, c.back_vv, c.back_pf, c.back_vf
+    linear = (reached - vv * aim.target_speed) / vf
+    share = h / (c.filter_time + h)
+    rate = (1.0 - share) * memory[RATE]
+    stiffness, slope = c.kp + h * c.ki, share * vf
+    divisor = 1.0 + stiffness * pf + c.kd * slope
     if c.kind == PID:
-        form = _implicit(c, memory, at)
-        memory[RATE] = form.rate - form.slope * (force - form.dry)
-        error, excess = at.target - at.position, wanted - force
-        at_rest = at.target_speed == 0.0 and at.target_acceleration == 0.0
-        if not (at_rest and abs(error) < c.tolerance):
-            if c.tracking > 0.0:
-                memory[INTEGRAL] += c.period * error
-                if c.ki > 0.0:
-                    memory[INTEGRAL] -= c.tracking * excess * form.divisor / c.ki
-            elif excess * error <= 0.0:
-                memory[INTEGRAL] += c.period * error
+        end = aim.target + h * aim.target_speed
+        rate += share * (reached - vv * aim.speed)
+        push = stiffness * (end - aim.position - pv * aim.speed)
+    else:
+        # The feed-forward takes the model to the end, so that only the deviation matters.
+        end = aim.target + pv * aim.target_speed + pf * linear
+        slower = aim.target_speed - aim.speed
+        rate += share * vv * slower
+        push = stiffness * (aim.target - aim.position + pv * slower)
+    push += c.kd * rate + c.ki * memory[INTEGRAL] + memory[OFFSET]
+    forward = 0.0
+    if c.kind == PID and c.feed_forward != 0.0:
+        push += linear
+    if c.feed_forward != 0.0:
+        forward = _dry(c, aim.target_speed, aim.target_acceleration)
+        if c.kind != PID:
+            forward += linear
+    return _Implicit(forward, push, divisor, rate, slope, end, reached)
+
+
+@compiled
+def _step(c: LawConstants, memory: FloatArray, at: Instant, load: float, limit: float) -> float:
+    """Return the force within its limit and update the memory."""
+    aim = _aim(c, memory, at)
+    form = _implicit(c, memory, aim)
+    wanted = form.forward + form.push / form.divisor
+    if c.kind != PID:
+        wanted += load
+    force = min(max(wanted, -limit), limit)
+    excess = wanted - force
+    memory[RATE] = form.rate - form.slope * (form.push / form.divisor - excess)
+    error = aim.target - aim.position
+    at_rest = at.target_speed == 0.0 and at.target_acceleration == 0.0
+    if not (at_rest and abs(at.target - at.position) < c.tolerance):
+        if c.tracking > 0.0:
+            memory[INTEGRAL] += c.period * error
+            if c.ki > 0.0:
+                memory[INTEGRAL] -= c.tracking * excess * form.divisor / c.ki
+        elif excess * error <= 0.0:
+            memory[INTEGRAL] += c.period * error
     memory[OFFSET] *= c.fade
+    # Without feedback, and where the force has no room, the modeled motion starts anew.
+    memory[FOLLOWS] = 1.0 if c.kp > 0.0 and excess == 0.0 else 0.0
+    memory[POSITION], memory[SPEED] = form.end, form.reached
+    return force
 
 
 @compiled
@@ -196,7 +276,7 @@ def law_force(
         Force [N]; the equations are those of the classes of the laws.
 
     """
-    return _force(LawConstants(*constants), memory, Instant(*instant), load)
+    return _step(LawConstants(*constants), memory.copy(), Instant(*instant), load, inf)
 
 
 @compiled
@@ -219,15 +299,16 @@ def law_match(
 
     """
     c, at = LawConstants(*constants), Instant(*instant)
-    memory[INTEGRAL] = memory[OFFSET] = 0.0
+    memory[:] = 0.0
     memory[RATE] = at.target_speed - at.speed
-    missing = force - _force(c, memory, at, load)
-    if c.kind == PID:
-        missing *= _implicit(c, memory, at).divisor
-        if c.ki > 0.0:
-            memory[INTEGRAL] = missing / c.ki
-            return
-    memory[OFFSET] = missing
+    form = _implicit(c, memory, _aim(c, memory, at))
+    missing = (force - form.forward) * form.divisor - form.push
+    if c.kind != PID:
+        missing -= load * form.divisor
+    if c.ki > 0.0:
+        memory[INTEGRAL] = missing / c.ki
+    else:
+        memory[OFFSET] = missing
 
 
 @compiled
@@ -254,8 +335,31 @@ def law_step(
         Force for the next period [N].
 
     """
-    c, at = LawConstants(*constants), Instant(*instant)
-    wanted = _force(c, memory, at, load)
-    force = min(max(wanted, -limit), limit)
-    _remember(c, memory, at, wanted, force)
-    return force
+    return _step(LawConstants(*constants), memory, Instant(*instant), load, limit)
+
+
+@compiled
+def axis_step(
+    constants: tuple[float, ...], position: float, speed: float, force: float
+) -> tuple[float, float]:
+    """
+    Move the axis of a law through one period under a constant force.
+
+    Parameters
+    ----------
+    constants : tuple of float
+        Fields of `LawConstants`.
+    position, speed : float
+        State of the axis.
+    force : float
+        Force less known loads [N].
+
+    Returns
+    -------
+    position, speed : float
+        State after the period.
+
+    """
+    c = LawConstants(*constants)
+    speed, moved = friction_flow(_friction(c), c.inertia, speed, force, c.period)
+    return position + moved, speed

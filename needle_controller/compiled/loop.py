@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from needle_controller.compiled.laws import law_step, LawConstants, MEMORY
+from needle_controller.compiled.laws import axis_step, law_step, LawConstants, MEMORY
 from needle_dynamics.arrays import FloatArray
 from needle_dynamics.compiled.cache import compiled
-from needle_dynamics.compiled.friction import slide
+from needle_dynamics.compiled.friction import friction_flow, FrictionConstants
 from needle_dynamics.compiled.step import advance, Inputs, Needle
 import numpy as np
 
@@ -15,7 +15,6 @@ def run_loop(
     c: Needle,
     state: FloatArray,
     law: tuple[float, ...],
-    axis: tuple[float, float, float],
     limit: float,
     setpoints: FloatArray,
     goal: FloatArray,
@@ -35,8 +34,6 @@ def run_loop(
         Initial state; overwritten with the state at the end.
     law : tuple of float
         Fields of `LawConstants`.
-    axis : tuple of float
-        Inertia [kg], Coulomb friction [N] and viscous friction [N s/m] that the law believes in.
     limit : float
         Largest force [N].
     setpoints : ndarray, shape (k, 3)
@@ -60,7 +57,6 @@ def run_loop(
         Number of periods completed: fewer than k if the needle left its range.
 
     """
-    inertia, coulomb, viscous = axis
     memory = np.zeros(MEMORY)
     period, delay, m = LawConstants(*law).period, pending.shape[0], state.shape[0] // 2
     count = setpoints.shape[0]
@@ -76,8 +72,7 @@ def run_loop(
         if k == count:
             break
         for i in range(delay):
-            speed, moved = slide(speed, pending[i], inertia, coulomb, viscous, period)
-            depth = depth + moved
+            depth, speed = axis_step(law, depth, speed, pending[i])
         aim = setpoints[k]
         instant = (depth, speed, aim[0], aim[1], aim[2])
         command = law_step(law, memory, instant, 0.0, limit)
@@ -92,3 +87,69 @@ def run_loop(
         if left != 0.0:
             return k
     return int(count)
+
+
+@compiled
+def ring(
+    law: tuple[float, ...],
+    friction: FrictionConstants,
+    inertia: float,
+    known: int,
+    pending: FloatArray,
+    start: float,
+    count: int,
+) -> tuple[float, float, int]:
+    """
+    Run a law from rest to zero on an axis of its own, and see whether it comes to rest.
+
+    Parameters
+    ----------
+    law : tuple of float
+        Fields of `LawConstants`.
+    friction : FrictionConstants
+        Friction of the true axis.
+    inertia : float
+        Inertia of the true axis [kg].
+    known : int
+        Periods of delay that the law knows: it sees that many of the newest pending commands.
+    pending : ndarray, shape (delay,)
+        Commands that have not yet taken effect [N]; overwritten.
+    start : float
+        Initial position [m].
+    count : int
+        Periods in a third of the run.
+
+    Returns
+    -------
+    before, after : float
+        Span of the position in the second and in the last third [m].
+    turns : int
+        Reversals in the last third.
+
+    """
+    memory = np.zeros(MEMORY)
+    period, delay = LawConstants(*law).period, pending.shape[0]
+    position, velocity, turns, way = start, 0.0, 0, 0.0
+    spans = np.zeros(3)
+    for part in range(3):
+        low, high = position, position
+        for _ in range(count):
+            seen, speed = position, velocity
+            for i in range(delay - known, delay):
+                seen, speed = axis_step(law, seen, speed, pending[i])
+            command = law_step(law, memory, (seen, speed, 0.0, 0.0, 0.0), 0.0, np.inf)
+            force = command
+            if delay > 0:
+                force = pending[0]
+                for i in range(1, delay):
+                    pending[i - 1] = pending[i]
+                pending[delay - 1] = command
+            velocity, moved = friction_flow(friction, inertia, velocity, force, period)
+            position = position + moved
+            low, high = min(low, position), max(high, position)
+            if velocity * way < 0.0 and part == 2:
+                turns += 1
+            if velocity != 0.0:
+                way = velocity
+        spans[part] = high - low
+    return float(spans[1]), float(spans[2]), turns

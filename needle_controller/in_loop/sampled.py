@@ -262,9 +262,8 @@ def run_batch(
     def run(share: range) -> None:
         for i in share:
             law = each_law[i % len(each_law)]
-            axis = law.axis.inertia, law.axis.coulomb, law.axis.viscous
             completed[i] = run_loop(
-                needles[i % len(needles)], ends[i], law.packed, axis, float(limit), setpoints,
+                needles[i % len(needles)], ends[i], law.packed, float(limit), setpoints,
                 goal, np.zeros(delay), float(step), depths[i], errors[i],
             )  # fmt: skip
             if progress is not None:

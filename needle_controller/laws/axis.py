@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from math import isfinite
+from dataclasses import dataclass, fields, replace
+from math import inf
 from typing import NamedTuple
 
-from needle_dynamics import NeedleParameters
-from needle_dynamics.compiled.friction import slide
+from needle_dynamics import Friction, NeedleParameters
+from needle_dynamics.compiled.friction import friction_flow
 from needle_dynamics.compiled.oscillator import decay_means
 from needle_ros.errors import ParameterError
 
@@ -56,14 +56,16 @@ class Response(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Axis:
+class Axis(Friction):
     """
-    Insertion (SI: kg, N, N s/m) or rotation (kg m^2, N m, N m s).
+    Insertion (SI: kg, N, N s/m) or rotation (kg m^2, N m, N m s): a mass with friction.
 
     Attributes
     ----------
-    inertia, coulomb, viscous : float
-        Inertia, Coulomb friction mu_s and viscous friction mu_v.
+    inertia : float
+        Inertia.
+    law, coulomb, viscous, withdrawal, breakaway, stribeck_speed, smoothing_speed
+        As for `Friction`; without friction by default.
 
     Raises
     ------
@@ -77,11 +79,10 @@ class Axis:
     viscous: float = 0.0
 
     def __post_init__(self) -> None:
-        for name in ('inertia', 'coulomb', 'viscous'):
-            value = getattr(self, name)
-            if not (isfinite(value) and value >= 0.0) or (name == 'inertia' and value == 0.0):
-                sign = '>' if name == 'inertia' else '>='
-                raise ParameterError(f'{name} must be finite and {sign} 0, got {value!r}')
+        # Without arguments, super does not work in a dataclass with slots.
+        Friction.__post_init__(self)
+        if not 0.0 < self.inertia < inf:
+            raise ParameterError(f'inertia must be finite and > 0, got {self.inertia!r}')
 
     @classmethod
     def insertion(cls, parameters: NeedleParameters) -> Axis:
@@ -99,11 +100,9 @@ class Axis:
             Its moving mass [kg] and friction.
 
         """
-        return cls(
-            inertia=parameters.moving_mass,
-            coulomb=parameters.coulomb_friction,
-            viscous=parameters.viscous_friction,
-        )
+        friction = parameters.friction
+        constants = {item.name: getattr(friction, item.name) for item in fields(friction)}
+        return cls(inertia=parameters.moving_mass, **constants)
 
     @classmethod
     def rotation(cls, parameters: NeedleParameters) -> Axis:
@@ -148,10 +147,10 @@ class Axis:
             State at the end.
 
         """
-        end, moved = slide(speed, force, self.inertia, self.coulomb, self.viscous, t)
+        end, moved = friction_flow(self.constants, self.inertia, speed, force, t)
         return position + moved, end
 
-    def response(self, t: float) -> Response:
+    def response(self, t: float, factor: float = 1.0) -> Response:
         """
         Return the linear response over a time [s], exactly.
 
@@ -159,6 +158,8 @@ class Axis:
         ----------
         t : float
             Time [s].
+        factor : float
+            Factor on viscous friction.
 
         Returns
         -------
@@ -166,7 +167,7 @@ class Axis:
             The response to a speed and to a constant force.
 
         """
-        x = self.viscous * t / self.inertia
+        x = factor * self.viscous * t / self.inertia
         mean, ramp = decay_means(x)
         push = t / self.inertia
         return Response(mean * t, 1.0 - x * mean, ramp * t * push, mean * push)

@@ -1,17 +1,28 @@
-"""Inverse dynamics control, section 3.2.7.1 of the paper, in sampled form."""
+"""Inverse dynamics control, section 3.2.7.1 of the paper, in sampled form, with feedback."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
 
 from needle_controller.compiled.laws import INVERSE_DYNAMICS
 from needle_controller.laws.law import Law, LawGains
 from needle_ros.settings import check_constants, constant
 
+#: The feedback at a bandwidth b: it adds this part of viscous friction to the damping, its
+#: integral has this part of the bandwidth, and b is reduced to b / (1 + 5 b h). With these values
+#: the loop is stable for friction and inertia 50 % off, see docs/control.md.
+_DAMPING: Final = 1.0 / 3.0
+_INTEGRAL: Final = 0.25
+_PERIODS: Final = 5.0
+
+#: Default bandwidth of the feedback [1/s].
+BANDWIDTH: Final = 30.0
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class InverseDynamicsGains(LawGains):
-    """Gains of the closed loop e_ddot + kv e_dot + kp e = 0 on one axis."""
+    """Gains of the motion e_ddot + kv e_dot + kp e = 0 on one axis, and of its feedback."""
 
     kp: float = constant(900.0, '1/s^2', 'position gain k_p')
     kv: float = constant(60.0, '1/s', 'speed gain k_v')
@@ -19,6 +30,13 @@ class InverseDynamicsGains(LawGains):
         1e-4, '(m or rad)/s', 'commanded speed at which Coulomb friction is fully compensated',
         open_low=True,
     )  # fmt: skip
+    bandwidth: float = constant(
+        BANDWIDTH, '1/s', 'bandwidth of the feedback that corrects deviations from the modeled motion; '
+        '0: without it, as in the paper',
+    )  # fmt: skip
+    tolerance: float = constant(
+        5e-6, 'm or rad', 'error at rest below which the integral is frozen (no hunting)'
+    )
 
     def __post_init__(self) -> None:
         check_constants(self)
@@ -34,10 +52,21 @@ class InverseDynamics(Law):
 
     .. math:: f = \mu_v \frac{u + h a - u e^{-x}}{1 - e^{-x}}, \quad x = \mu_v h / M
 
-    It tends to M a + mu_v u as h -> 0 (the continuous law), and to mu_v times the predicted
-    speed if friction is fast compared with the period. Coulomb friction is compensated in the
-    direction of the predicted speed. At rest that is the direction of the wanted acceleration,
-    so that the law breaks away.
+    It tends to M a + mu_v u as h -> 0 (the continuous law), and to mu_v times the wanted speed if
+    friction is fast compared with the period. Dry friction is compensated in the direction of the
+    speed shortly ahead. At rest that is the direction of the wanted acceleration, so that the law
+    breaks away.
+
+    In the paper u is measured. Then friction that is smaller than modeled is compensated too much,
+    which makes the loop unstable. Here u and e are those of the *modeled motion*: it starts at
+    the measurement and has exactly the force above. If the model is right, the needle does the
+    same, and the law is that of the paper. What differs is corrected by an implicit PID feedback
+    of the deviation (see `Pid`), whose gains follow from its bandwidth b:
+
+    .. math:: k_d = \mu_v / 3 + 2 b M, \quad k_p' = b (\mu_v + k_d), \quad k_i = b k_p' / 4
+
+    Friction compensation is then outside of the loop and cannot make it unstable. With
+    ``bandwidth=0`` the law is that of the paper: the modeled motion starts again in each period.
 
     Attributes
     ----------
@@ -60,5 +89,18 @@ class InverseDynamics(Law):
     gains: InverseDynamicsGains
 
     def __post_init__(self) -> None:
-        gains = self.gains
-        self._set_constants(gains.breakaway_speed, kind=INVERSE_DYNAMICS, kp=gains.kp, kd=gains.kv)
+        gains, axis = self.gains, self.axis
+        b = gains.bandwidth / (1.0 + _PERIODS * gains.bandwidth * self.period)
+        kd = _DAMPING * axis.viscous + 2.0 * b * axis.inertia if b > 0.0 else 0.0
+        kp = b * (axis.viscous + kd)
+        self._set_constants(
+            gains.breakaway_speed,
+            kind=INVERSE_DYNAMICS,
+            feed_forward=1.0,
+            model_kp=gains.kp,
+            model_kv=gains.kv,
+            kp=kp,
+            ki=_INTEGRAL * b * kp,
+            kd=kd,
+            tolerance=gains.tolerance,
+        )

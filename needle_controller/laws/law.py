@@ -8,6 +8,8 @@ from math import exp
 from typing import Any, Final
 
 from needle_controller.compiled.laws import (
+    axis_step,
+    FOLLOWS,
     law_force,
     law_match,
     law_step,
@@ -35,7 +37,7 @@ def no_memory() -> FloatArray:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LawGains:
-    """Gains of a law on one axis: some of kp, ki, kd and kv, and what does not scale."""
+    """Gains of a law on one axis: some of kp, ki, kd, kv and bandwidth, and what does not scale."""
 
     def scaled(self, factor: float) -> LawGains:
         """
@@ -52,7 +54,8 @@ class LawGains:
             The gains, of the same class.
 
         """
-        gains = [item.name for item in fields(self) if item.name in ('kp', 'ki', 'kd', 'kv')]
+        scales = ('kp', 'ki', 'kd', 'kv', 'bandwidth')
+        gains = [item.name for item in fields(self) if item.name in scales]
         return replace(self, **{name: factor * getattr(self, name) for name in gains})
 
 
@@ -83,17 +86,23 @@ class Law:
 
     def _set_constants(self, breakaway_speed: float, **gains: float) -> None:
         """Make the constants of axis, period and gains."""
-        unused = dict.fromkeys(('ki', 'filter_time', 'tolerance', 'tracking', 'feed_forward'), 0.0)
+        unused = ('model_kp', 'model_kv', 'filter_time', 'tracking', 'feed_forward')
+        friction = self.axis.constants._asdict()
+        back = self.axis.response(self.period, self.axis.withdrawal)._asdict()
         values: dict[str, Any] = {
-            **unused,
+            **dict.fromkeys(unused, 0.0),
             **self.axis.response(self.period)._asdict(),
+            **{f'back_{name}': value for name, value in back.items()},
+            **friction,
+            'friction_law': friction.pop('law'),
+            'inertia': self.axis.inertia,
             'period': self.period,
-            'coulomb': self.axis.coulomb,
             'breakaway_speed': breakaway_speed,
             'ahead': max(self.period, BREAKAWAY_TIME),
             'fade': exp(-self.period / HANDOVER_TIME),
             **gains,
         }
+        del values['law']
         constants = LawConstants(**{name: float(value) for name, value in values.items()})
         object.__setattr__(self, 'constants', constants)
         object.__setattr__(self, 'packed', tuple(constants))
@@ -193,9 +202,10 @@ class SampledLoop:
         self._take_over = False
 
     def stop(self) -> None:
-        """Discard the pending commands; the memory of the law stays."""
+        """Discard the pending commands and the modeled motion; the rest of the memory stays."""
         for i in range(len(self.pending)):
             self.pending[i] = 0.0
+        self.memory[FOLLOWS] = 0.0
         self.last = 0.0
         self._take_over = False
 
@@ -251,7 +261,7 @@ class SampledLoop:
         """
         law, load = self.law, float(load)
         for force in self.pending:
-            position, speed = law.axis.propagate(position, speed, force - load, law.period)
+            position, speed = axis_step(law.packed, position, speed, force - load)
         instant = _instant(position, speed, setpoint)
         if self._take_over:
             self._take_over = False

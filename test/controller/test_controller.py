@@ -127,7 +127,7 @@ def test_it_goes_on_with_other_constants() -> None:
     depths, aims = insert(told, truth, 3.5)
     # As with the right model from the start.
     assert np.abs(depths - aims).max() < 5e-5
-    assert np.abs(believed - aims[:2000]).max() > 5e-4
+    assert np.abs(believed - aims[:2000]).max() > 1e-4
 
 
 def test_constants_that_its_gains_cannot_bear_are_refused() -> None:

@@ -1,0 +1,116 @@
+"""How far the true axis may be from the modeled one, and limit cycles of dry friction there."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import product
+from math import ceil, log
+from typing import Final
+
+from needle_controller.compiled.laws import INVERSE_DYNAMICS
+from needle_controller.compiled.loop import ring
+from needle_controller.laws.axis import Axis
+from needle_controller.laws.law import Law
+from needle_ros.settings import check_constants, constant
+import numpy as np
+
+#: Parts of the mass of the carriage that are tried.
+_PARTS: Final = (1.0 / 64.0, 1.0 / 16.0, 1.0 / 4.0, 1.0)
+
+#: Starts of the runs that look for a limit cycle [m] or [rad].
+_STARTS: Final = (1e-3, 5e-5)
+
+#: Time of such a run [s]: at least, at most. Errors decrease to this part in each third of it.
+_SHORTEST: Final = 0.5
+_LONGEST: Final = 20.0
+_DECREASE: Final = 0.1
+
+#: Spans of the motion below this are no limit cycle [m] or [rad].
+_LEAST: Final = 1e-6
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Uncertainty:
+    """Largest deviation of the true axis from the modeled one, for the check of stability."""
+
+    viscous: float = constant(0.3, '1', 'relative uncertainty of viscous friction', high=0.9)
+    coulomb: float = constant(0.3, '1', 'relative uncertainty of Coulomb friction', high=0.9)
+    inertia: float = constant(0.3, '1', 'relative uncertainty of the moving mass', high=0.9)
+    carriage: float = constant(
+        2.0, 'kg', 'mass that may move with the needle beyond model.carriage_mass'
+    )
+
+    def __post_init__(self) -> None:
+        check_constants(self)
+
+    def axes(self, axis: Axis, *, carriage: bool = False) -> list[Axis]:
+        """
+        Return the axes at the bounds, and some with a part of the carriage.
+
+        Parameters
+        ----------
+        axis : Axis
+            The axis as modeled.
+        carriage : bool
+            Whether the axis may carry the carriage.
+
+        Returns
+        -------
+        list of Axis
+            The axes.
+
+        """
+        extra = [part * self.carriage for part in _PARTS if carriage and self.carriage > 0.0]
+        inertias = [*_bounds(axis.inertia, self.inertia)]
+        inertias += [max(inertias) + mass for mass in extra]
+        return [
+            replace(axis, coulomb=coulomb, viscous=viscous, inertia=inertia)
+            for coulomb, viscous, inertia in product(
+                _bounds(axis.coulomb, self.coulomb), _bounds(axis.viscous, self.viscous), inertias
+            )
+        ]
+
+
+def _bounds(value: float, share: float) -> list[float]:
+    """Return a value and its bounds, without repetition; the value first."""
+    return list(dict.fromkeys((value, value * (1.0 - share), value * (1.0 + share))))
+
+
+def limit_cycle(law: Law, delay: int, unmodeled: int, plant: Axis, radius: float) -> float:
+    """
+    Look for a limit cycle of dry friction on another axis, by running the law on it.
+
+    Only a law that compensates friction in the direction of the measured speed can have one:
+    inverse dynamics without feedback. Others are not run.
+
+    Parameters
+    ----------
+    law : Law
+        Control law.
+    delay, unmodeled : int
+        Periods of delay that the law knows, and those that it does not.
+    plant : Axis
+        The true axis.
+    radius : float
+        Spectral radius of the loop, below 1.
+
+    Returns
+    -------
+    float
+        Largest amplitude [m] or [rad]; 0 without a limit cycle.
+
+    """
+    c = law.constants
+    if c.kind != INVERSE_DYNAMICS or c.kp > 0.0 or law.axis.coulomb == 0.0:
+        return 0.0
+    periods = log(_DECREASE) / log(max(radius, 1e-3))
+    count = ceil(min(max(periods, _SHORTEST / c.period), _LONGEST / c.period))
+    amplitudes = [0.0]
+    for start in _STARTS:
+        pending = np.zeros(delay + unmodeled)
+        before, after, turns = ring(
+            law.packed, plant.constants, plant.inertia, delay, pending, start, count
+        )
+        if turns > 1 and after > max(0.5 * before, _LEAST):
+            amplitudes.append(0.5 * after)
+    return max(amplitudes)
