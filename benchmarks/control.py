@@ -40,7 +40,9 @@ _LIMIT: Final = 15.0
 
 class NumpyInverseDynamics:
     """
-    The law of `InverseDynamics` with its delay, written plainly with NumPy, for comparison.
+    Inverse dynamics as in the paper with a delay, written plainly with NumPy, for comparison.
+
+    It does less than `InverseDynamics`: it has no feedback of deviations from the model.
 
     Parameters
     ----------
@@ -114,7 +116,8 @@ def jobs() -> dict[str, Callable[[], object]]:
         return observer.load
 
     found: dict[str, Callable[[], object]] = {}
-    for name, law in sampled_laws(parameters, PERIOD).items():
+    laws = sampled_laws(parameters, PERIOD)
+    for name, law in ((name, laws[name]) for name in ('inverse_dynamics', 'pid')):
         loop = SampledLoop(law, DELAY, _LIMIT)
         rotation = _sampled_loop(Axis.rotation(parameters), name)
 

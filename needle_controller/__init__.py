@@ -16,6 +16,7 @@ from needle_controller.controller import (
 from needle_controller.in_loop.continuous import run_continuous
 from needle_controller.in_loop.run import LoopRun
 from needle_controller.in_loop.sampled import Commander, LoopBatch, run_batch, run_controller
+from needle_controller.laws.adaptive import Adaptive, AdaptiveGains
 from needle_controller.laws.axis import Axis
 from needle_controller.laws.continuous import (
     ContinuousInverseDynamics,
@@ -50,6 +51,8 @@ __all__ = [
     'DEFAULT_GAINS',
     'LAWS',
     'REFERENCES',
+    'Adaptive',
+    'AdaptiveGains',
     'Answer',
     'Axis',
     'Command',

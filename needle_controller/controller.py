@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from math import isfinite, nan
 from typing import Final, TypeAlias
 
+from needle_controller.laws.adaptive import Adaptive, AdaptiveGains
 from needle_controller.laws.axis import Axis, require_complete
 from needle_controller.laws.inverse_dynamics import InverseDynamics, InverseDynamicsGains
 from needle_controller.laws.law import Law, SampledLoop
@@ -22,7 +23,7 @@ from needle_ros.settings import check_constants, constant
 #: Controlled axes.
 AXES: Final = ('insertion', 'rotation')
 
-Gains: TypeAlias = InverseDynamicsGains | PidGains
+Gains: TypeAlias = InverseDynamicsGains | AdaptiveGains | PidGains
 
 #: Default gains by law and axis. Those of rotation by PID make a closed loop of 20 rad/s on the
 #: rotary inertia of the paper's needle.
@@ -32,6 +33,7 @@ DEFAULT_GAINS: Final[Mapping[str, Mapping[str, Gains]]] = {
         'rotation': InverseDynamicsGains(),
     },
     'pid': {'insertion': PidGains(), 'rotation': PidGains(kp=2.1e-7, ki=0.0, kd=2.1e-8)},
+    'adaptive': {'insertion': AdaptiveGains(), 'rotation': AdaptiveGains()},
 }
 
 #: Control laws by name.
@@ -268,6 +270,8 @@ class Controller:
             law: Law
             if isinstance(chosen, PidGains):
                 law = Pid(axis=axis, gains=chosen, period=self.period)
+            elif isinstance(chosen, AdaptiveGains):
+                law = Adaptive(axis=axis, gains=chosen, period=self.period)
             else:
                 law = InverseDynamics(axis=axis, gains=chosen, period=self.period)
             laws.append(law)
@@ -323,6 +327,11 @@ class Controller:
     def target(self) -> float | None:
         """Inserted length to reach [m]; None without a target."""
         return self.guide.target
+
+    @property
+    def learned(self) -> dict[str, tuple[float, float]]:
+        """Learned friction of insertion beyond the model; see `SampledLoop.learned`."""
+        return self._insertion.learned
 
     def set_target(self, depth: float) -> None:
         """
@@ -382,6 +391,11 @@ class Controller:
         self._insertion.stop()
         self._rotation.stop()
         self._stopped = True
+
+    def unwind(self) -> None:
+        """Forget what the laws have integrated; for a time when their force has no effect."""
+        self._insertion.unwind()
+        self._rotation.unwind()
 
     def _gap(self, measured: Measurement) -> float:
         """Return the time between measurements [s] if it is too long or negative; else zero."""

@@ -9,7 +9,8 @@ k_v = 0.1 at 1 kHz: 1 - 5e-5). The default margin is therefore small, but far ab
 an eigenvalue.
 
 Poles do not show a limit cycle of dry friction. It occurs if a law compensates more dry friction
-than there is, in the direction of the measured speed. Laws that do so are also run on each axis.
+than there is, in the direction of the measured speed, or if its integral is too fast. Such laws
+are also run on each axis.
 """
 
 from __future__ import annotations
@@ -150,16 +151,23 @@ def spectral_radius(law: Law, delay: int, unmodeled: int = 0, plant: Axis | None
 def _limits(law: Law, delay: int, margin: float, plants: Sequence[Axis]) -> Iterator[Limit]:
     """Yield what limits the stability on the axis as modeled, and then on others."""
     inside = float(np.nextafter(1.0, 0.0))
-    # Dry friction does not change the poles.
+    # Dry friction does not change the poles, and cycles are looked for at bounds of friction.
     radii: dict[tuple[float, ...], float] = {}
-    for plant in (law.axis, *plants):
+    axes = (law.axis, *plants)
+    dry, viscous = (
+        {min(values), max(values)}
+        for values in ([axis.coulomb for axis in axes], [axis.viscous for axis in axes])
+    )
+    for plant in axes:
         for unmodeled in (0, RESERVE):
             bound = 1.0 - margin if plant is law.axis and unmodeled == 0 else inside
             key = plant.inertia, plant.viscous, unmodeled
             if key not in radii:
                 radii[key] = spectral_radius(law, delay, unmodeled, plant)
             radius = radii[key]
-            cycle = limit_cycle(law, delay, unmodeled, plant, radius) if radius < 1.0 else 0.0
+            cycle = 0.0
+            if radius < 1.0 and plant.coulomb in dry and plant.viscous in viscous:
+                cycle = limit_cycle(law, delay, unmodeled, plant, radius)
             yield Limit(radius=radius, bound=bound, unmodeled=unmodeled, plant=plant, cycle=cycle)
 
 

@@ -546,6 +546,7 @@ class Supervisor:
         if lost != controller.guide.waits:
             controller.guide.wait(lost)
         if lost:
+            controller.unwind()
             self._say_fault(
                 'the plant does not follow: it reports '
                 f'{measured.force:.3g} N, {self._last.force:.3g} N is commanded',
@@ -660,6 +661,8 @@ class Supervisor:
                 'least stable axis': name,
                 'spectral radius': f'{limit.radius:.9g} (at most {limit.bound:.9g})',
             }
+            for what, (value, error) in control.learned.items():
+                values[what] = f'{value:+.4g} +- {1.96 * error:.2g}'
         values |= {
             **self.bending.describe(),
             'measurements answered': self._answered,

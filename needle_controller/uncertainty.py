@@ -80,8 +80,8 @@ def limit_cycle(law: Law, delay: int, unmodeled: int, plant: Axis, radius: float
     """
     Look for a limit cycle of dry friction on another axis, by running the law on it.
 
-    Only a law that compensates friction in the direction of the measured speed can have one:
-    inverse dynamics without feedback. Others are not run.
+    A law can have one if it has an integral, or if it compensates friction in the direction of
+    the measured speed, as inverse dynamics without feedback does. Others are not run.
 
     Parameters
     ----------
@@ -101,7 +101,8 @@ def limit_cycle(law: Law, delay: int, unmodeled: int, plant: Axis, radius: float
 
     """
     c = law.constants
-    if c.kind != INVERSE_DYNAMICS or c.kp > 0.0 or law.axis.coulomb == 0.0:
+    measured = c.kind == INVERSE_DYNAMICS and c.kp == 0.0
+    if law.axis.coulomb == 0.0 or not (c.ki > 0.0 or measured):
         return 0.0
     periods = log(_DECREASE) / log(max(radius, 1e-3))
     count = ceil(min(max(periods, _SHORTEST / c.period), _LONGEST / c.period))

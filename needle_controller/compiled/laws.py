@@ -11,11 +11,13 @@ from __future__ import annotations
 from math import inf
 from typing import Final, NamedTuple
 
+from needle_controller.compiled.learning import BLOCK, bounds, correction, learn
 from needle_dynamics.arrays import FloatArray
 from needle_dynamics.compiled.cache import compiled
 from needle_dynamics.compiled.friction import (
     dry_friction,
     friction_flow,
+    friction_force,
     FrictionConstants,
     TANH,
 )
@@ -26,9 +28,17 @@ PID: Final = 1.0
 
 #: Entries of the memory of a law: integral of the error, filtered rate of the error, a force that
 #: fades after a switch of laws, and for inverse dynamics position and speed of the modeled motion,
-#: which count if the last entry is 1.
+#: which count if the next entry is 1.
 INTEGRAL, RATE, OFFSET, POSITION, SPEED, FOLLOWS = 0, 1, 2, 3, 4, 5
-MEMORY: Final = 6
+
+#: What is learned, for insertion and then for withdrawal, and before it the last measured position
+#: and speed, which count if the entry before them is 1.
+SEEN: Final = 6
+LEARNED: Final = 9
+MEMORY: Final = LEARNED + 2 * BLOCK
+
+#: Slowest motion that is learned from [m/s].
+_SLIDES: Final = 5e-4
 
 
 class LawConstants(NamedTuple):
@@ -69,6 +79,10 @@ class LawConstants(NamedTuple):
         1 with feed-forward, 0 without.
     fade : float
         Factor by which the offset after a switch decreases in one period.
+    bound : float
+        Largest learned part of the friction of the axis; 0 without learning.
+    noise : float
+        Standard deviation of the force that is learned from [N]; infinite while frozen.
 
     """
 
@@ -102,6 +116,8 @@ class LawConstants(NamedTuple):
     tracking: float
     feed_forward: float
     fade: float
+    bound: float
+    noise: float
 
 
 class Instant(NamedTuple):
@@ -189,6 +205,61 @@ def _aim(c: LawConstants, memory: FloatArray, at: Instant) -> Instant:
 
 
 @compiled
+def _learned(c: LawConstants, memory: FloatArray, aim: Instant) -> float:
+    """Return the learned friction of the motion to follow, beyond the modeled one."""
+    if c.bound == 0.0:
+        return 0.0
+    soon = aim.target_speed + c.ahead * aim.target_acceleration
+    first = LEARNED if soon > 0.0 else LEARNED + BLOCK
+    most = bounds(c.bound, c.coulomb, c.viscous)
+    found = correction(memory[first : first + BLOCK], most, aim.target, abs(soon))
+    return found * min(max(soon / c.breakaway_speed, -1.0), 1.0)
+
+
+@compiled
+def law_learn(
+    constants: tuple[float, ...], memory: FloatArray, position: float, speed: float, force: float
+) -> None:
+    """
+    Learn from the period that has passed, if the law learns and the axis was sliding.
+
+    Parameters
+    ----------
+    constants, memory
+        As for `law_force`.
+    position, speed : float
+        Measured state of the axis, now.
+    force : float
+        Force less known loads that has acted over the period [N].
+
+    """
+    c = LawConstants(*constants)
+    if c.bound == 0.0:
+        return
+    seen, before, rate = memory[SEEN], memory[SEEN + 1], memory[SEEN + 2]
+    memory[SEEN], memory[SEEN + 1], memory[SEEN + 2] = 1.0, position, speed
+    if seen != 1.0 or c.noise == inf:
+        return
+    mean = (position - before) / c.period
+    # Both ends slide in the same direction, and no measurement is missing between them.
+    slides = min(abs(mean), abs(speed), abs(rate)) > _SLIDES and speed * rate > 0.0
+    if not slides or abs(mean - 0.5 * (speed + rate)) > 0.5 * abs(mean):
+        return
+    sign = 1.0 if mean > 0.0 else -1.0
+    first = LEARNED if mean > 0.0 else LEARNED + BLOCK
+    modeled = friction_force(_friction(c), mean, 0.0) + c.inertia * (speed - rate) / c.period
+    learn(
+        memory[first : first + BLOCK],
+        bounds(c.bound, c.coulomb, c.viscous),
+        position,
+        abs(mean),
+        sign * (force - modeled),
+        c.noise,
+        c.period,
+    )
+
+
+@compiled
 def _implicit(c: LawConstants, memory: FloatArray, aim: Instant) -> _Implicit:
     """Set up feed-forward and implicit feedback; see `needle_controller.laws.pid.Pid`."""
     h = c.period
@@ -215,11 +286,11 @@ def _implicit(c: LawConstants, memory: FloatArray, aim: Instant) -> _Implicit:
         rate += share * vv * slower
         push = stiffness * (aim.target - aim.position + pv * slower)
     push += c.kd * rate + c.ki * memory[INTEGRAL] + memory[OFFSET]
-    forward = 0.0
+    forward = _learned(c, memory, aim)
     if c.kind == PID and c.feed_forward != 0.0:
         push += linear
     if c.feed_forward != 0.0:
-        forward = _dry(c, aim.target_speed, aim.target_acceleration)
+        forward += _dry(c, aim.target_speed, aim.target_acceleration)
         if c.kind != PID:
             forward += linear
     return _Implicit(forward, push, divisor, rate, slope, end, reached)
@@ -299,7 +370,7 @@ def law_match(
 
     """
     c, at = LawConstants(*constants), Instant(*instant)
-    memory[:] = 0.0
+    memory[:SEEN] = 0.0
     memory[RATE] = at.target_speed - at.speed
     form = _implicit(c, memory, _aim(c, memory, at))
     missing = (force - form.forward) * form.divisor - form.push

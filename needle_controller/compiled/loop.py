@@ -2,7 +2,13 @@
 
 from __future__ import annotations
 
-from needle_controller.compiled.laws import axis_step, law_step, LawConstants, MEMORY
+from needle_controller.compiled.laws import (
+    axis_step,
+    law_learn,
+    law_step,
+    LawConstants,
+    MEMORY,
+)
 from needle_dynamics.arrays import FloatArray
 from needle_dynamics.compiled.cache import compiled
 from needle_dynamics.compiled.friction import friction_flow, FrictionConstants
@@ -60,7 +66,7 @@ def run_loop(
     memory = np.zeros(MEMORY)
     period, delay, m = LawConstants(*law).period, pending.shape[0], state.shape[0] // 2
     count = setpoints.shape[0]
-    largest, squares = 0.0, 0.0
+    largest, squares, force = 0.0, 0.0, 0.0
     for k in range(count + 1):
         depth, speed = c.length - state[0], -state[m]
         if depths.shape[0] > 0:
@@ -71,6 +77,7 @@ def run_loop(
         errors[0], errors[1], errors[2] = error, largest, squares / (k + 1)
         if k == count:
             break
+        law_learn(law, memory, depth, speed, force)
         for i in range(delay):
             depth, speed = axis_step(law, depth, speed, pending[i])
         aim = setpoints[k]

@@ -31,8 +31,8 @@ class InverseDynamicsGains(LawGains):
         open_low=True,
     )  # fmt: skip
     bandwidth: float = constant(
-        BANDWIDTH, '1/s', 'bandwidth of the feedback that corrects deviations from the modeled motion; '
-        '0: without it, as in the paper',
+        BANDWIDTH, '1/s', 'bandwidth of the feedback that corrects deviations from the modeled '
+        'motion; 0: without it, as in the paper',
     )  # fmt: skip
     tolerance: float = constant(
         5e-6, 'm or rad', 'error at rest below which the integral is frozen (no hunting)'

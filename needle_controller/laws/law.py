@@ -4,18 +4,22 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass, field, fields, replace
-from math import exp
+from math import exp, inf, sqrt
 from typing import Any, Final
 
 from needle_controller.compiled.laws import (
     axis_step,
     FOLLOWS,
     law_force,
+    law_learn,
     law_match,
     law_step,
     LawConstants,
+    LEARNED,
     MEMORY,
+    SEEN,
 )
+from needle_controller.compiled.learning import BLOCK, TERMS
 from needle_controller.laws.axis import Axis
 from needle_controller.reference.setpoint import Setpoint
 from needle_dynamics import FloatArray
@@ -30,6 +34,14 @@ BREAKAWAY_TIME: Final = 1e-3
 HANDOVER_TIME: Final = 0.1
 
 
+#: What is learned, with units, in the order of `needle_controller.compiled.learning`.
+_TERMS: Final = {
+    'dry friction': 'N',
+    'viscous friction': 'N s/m',
+    'dry friction per length': 'N/m',
+}
+
+
 def no_memory() -> FloatArray:
     """Return the memory of a law at the beginning: `MEMORY` zeros."""
     return np.zeros(MEMORY)
@@ -37,7 +49,7 @@ def no_memory() -> FloatArray:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LawGains:
-    """Gains of a law on one axis: some of kp, ki, kd, kv and bandwidth, and what does not scale."""
+    """Gains of a law on one axis: kp, ki, kd, kv and bandwidth scale, others do not."""
 
     def scaled(self, factor: float) -> LawGains:
         """
@@ -86,11 +98,12 @@ class Law:
 
     def _set_constants(self, breakaway_speed: float, **gains: float) -> None:
         """Make the constants of axis, period and gains."""
-        unused = ('model_kp', 'model_kv', 'filter_time', 'tracking', 'feed_forward')
+        unused = ('model_kp', 'model_kv', 'filter_time', 'tracking', 'feed_forward', 'bound')
         friction = self.axis.constants._asdict()
         back = self.axis.response(self.period, self.axis.withdrawal)._asdict()
         values: dict[str, Any] = {
             **dict.fromkeys(unused, 0.0),
+            'noise': inf,
             **self.axis.response(self.period)._asdict(),
             **{f'back_{name}': value for name, value in back.items()},
             **friction,
@@ -199,13 +212,15 @@ class SampledLoop:
         self.pending: deque[float] = deque([0.0] * delay, maxlen=delay)
         self.memory = no_memory()
         self.last = 0.0
+        #: Force of the period that begins now [N].
+        self._acts = 0.0
         self._take_over = False
 
     def stop(self) -> None:
         """Discard the pending commands and the modeled motion; the rest of the memory stays."""
         for i in range(len(self.pending)):
             self.pending[i] = 0.0
-        self.memory[FOLLOWS] = 0.0
+        self.memory[FOLLOWS] = self.memory[SEEN] = 0.0
         self.last = 0.0
         self._take_over = False
 
@@ -233,8 +248,28 @@ class SampledLoop:
             raise ParameterError(
                 f'the period must stay {self.law.period:g} s, got {law.period!r} s'
             )
+        if law.axis != self.law.axis:
+            # What was learned is what the other axis had too little.
+            self.memory[LEARNED:] = 0.0
         self.law = law
         self._take_over = True
+
+    @property
+    def learned(self) -> dict[str, tuple[float, float]]:
+        """Learned friction beyond the model and its standard deviation, by name with unit."""
+        if self.law.constants.bound == 0.0:
+            return {}
+        blocks = self.memory[LEARNED:].reshape(2, BLOCK)
+        return {
+            f'learned {term}, {way} [{unit}]': (float(block[i]), sqrt(float(variance)))
+            for way, block in zip(('insertion', 'withdrawal'), blocks, strict=True)
+            for i, (term, unit) in enumerate(_TERMS.items())
+            if (variance := block[TERMS + i * (TERMS + 1)]) > 0.0
+        }
+
+    def unwind(self) -> None:
+        """Discard what is integrated and the modeled motion; what is learned stays."""
+        self.memory[:LEARNED] = 0.0
 
     def command(
         self, position: float, speed: float, setpoint: Setpoint, load: float = 0.0
@@ -260,6 +295,7 @@ class SampledLoop:
 
         """
         law, load = self.law, float(load)
+        law_learn(law.packed, self.memory, float(position), float(speed), self._acts - load)
         for force in self.pending:
             position, speed = axis_step(law.packed, position, speed, force - load)
         instant = _instant(position, speed, setpoint)
@@ -267,5 +303,6 @@ class SampledLoop:
             self._take_over = False
             law_match(law.packed, self.memory, instant, load, self.last)
         self.last = force = law_step(law.packed, self.memory, instant, load, self.limit)
+        self._acts = self.pending[0] if self.pending else force
         self.pending.append(force)
         return force

@@ -1,8 +1,9 @@
 """
-Both control laws on needles with other friction and stiffness than they believe: 30 % off.
+The control laws on needles with other friction and stiffness than they believe: 30 % off.
 
-The sampled laws of the node with their default gains, at 1 kHz with a delay of one period, drive
-the base (`physical`). They believe in the preset; each run has a needle of its own.
+The sampled laws of the node with their default gains, and as they are in the paper: inverse
+dynamics without feedback, PID without integral. At 1 kHz they drive the base (`physical`). They
+believe in the preset; each run has a needle of its own.
 """
 
 from __future__ import annotations
@@ -26,7 +27,6 @@ from needle_controller import (
     run_batch,
     Setpoint,
 )
-from needle_controller.laws.law import BREAKAWAY_TIME
 from needle_dynamics import FloatArray, NeedleModel, NeedleParameters
 from needle_insertion.paper.figures import LAW_COLORS
 from needle_insertion.paper.runs import LAWS
@@ -49,6 +49,16 @@ STEP: Final = 1e-3
 #: Preset that the laws believe in, and the middle of the true needles.
 PRESET: Final = 'phantom'
 
+#: What is studied, in words, and its delay [periods].
+CASES: Final[Mapping[str, tuple[str, int]]] = {
+    'inverse_dynamics': ('inverse dynamics', 1),
+    'pid': ('PID', 1),
+    'paper_inverse_dynamics': ('inverse dynamics, as in the paper', 1),
+    'paper_pid': ('PID, as in the paper', 1),
+    'paper_inverse_dynamics_at_once': ('inverse dynamics, as in the paper, no delay', 0),
+    'paper_pid_at_once': ('PID, as in the paper, no delay', 0),
+}
+
 _MEASURES: Final = {
     'final': 'depth error at the end',
     'largest': 'largest depth error',
@@ -66,9 +76,9 @@ class Mismatch:
     factors : ndarray, shape (runs, 3)
         True over believed value of mu_s, mu_v and k_a.
     batches : Mapping[str, LoopBatch]
-        Runs of each law.
+        Runs of each of `CASES`.
     nominal : Mapping[str, LoopBatch]
-        The one run of each law on the needle that it believes in.
+        The one run of each on the needle that it believes in.
 
     """
 
@@ -83,7 +93,7 @@ class Mismatch:
         Parameters
         ----------
         law : str
-            Name of the law.
+            One of `CASES`.
 
         Returns
         -------
@@ -108,12 +118,12 @@ def study(
     progress: Callable[[], object] | None = None,
 ) -> Mismatch:
     """
-    Run both laws on the same needles.
+    Run all `CASES` on the same needles.
 
     Parameters
     ----------
     runs : int
-        Runs of each law.
+        Runs of each.
     seed : int
         Seed of the needles.
     step : float
@@ -138,13 +148,13 @@ def study(
     reference = MinimumJerk(Setpoint(START), TARGET, ReferenceLimits())
     settings = ControllerSettings()
 
-    def run(law: Law, needles: list[NeedleParameters]) -> LoopBatch:
+    def run(case: str, needles: list[NeedleParameters]) -> LoopBatch:
         return run_batch(
-            law,
+            laws[case.removesuffix('_at_once')],
             needles,
             start,
             reference,
-            delay=int(settings.delay),
+            delay=CASES[case][1],
             limit=settings.force_limit,
             duration=DURATION,
             step=step,
@@ -154,14 +164,14 @@ def study(
     laws = sampled_laws(believed, 1.0 / settings.rate)
     return Mismatch(
         factors,
-        {name: run(law, plants) for name, law in laws.items()},
-        {name: run(law, [believed]) for name, law in laws.items()},
+        {case: run(case, plants) for case in CASES},
+        {case: run(case, [believed]) for case in CASES},
     )
 
 
 def sampled_laws(parameters: NeedleParameters, period: float) -> dict[str, Law]:
     """
-    Return both laws of insertion with their default gains.
+    Return the laws of insertion with their default gains, and as they are in the paper.
 
     Parameters
     ----------
@@ -177,11 +187,15 @@ def sampled_laws(parameters: NeedleParameters, period: float) -> dict[str, Law]:
 
     """
     axis = Axis.insertion(parameters)
+
+    def inverse(gains: InverseDynamicsGains) -> InverseDynamics:
+        return InverseDynamics(axis=axis, gains=gains, period=period)
+
     return {
-        'inverse_dynamics': InverseDynamics(
-            axis=axis, gains=InverseDynamicsGains(), period=period
-        ),
+        'inverse_dynamics': inverse(InverseDynamicsGains()),
         'pid': Pid(axis=axis, gains=PidGains(), period=period),
+        'paper_inverse_dynamics': inverse(InverseDynamicsGains(bandwidth=0.0)),
+        'paper_pid': Pid(axis=axis, gains=PidGains(ki=0.0), period=period),
     }
 
 
@@ -194,7 +208,7 @@ def _table(found: Mismatch) -> Grid:
             middle, most = np.quantile(values, (0.5, 0.95))
             known = 1e3 * abs(float(getattr(found.nominal[law], name)[0]))
             cells = (f'{value:.3g}' for value in (known, middle, most, values.max()))
-            rows.append((f'{LAWS[law]}, {words} [mm]', *cells))
+            rows.append((f'{CASES[law][0]}: {words} [mm]', *cells))
     return Grid(
         caption=f'{len(found.factors)} insertions with friction and stiffness up to '
         f'{100.0 * WIDTH:g} % off',
@@ -207,8 +221,9 @@ def _figure(found: Mismatch) -> Figure:
     """Draw the distribution of each error, and the final error against that of mu_s."""
     figure = Figure(figsize=(12.0, 4.2), layout='constrained')
     axes = figure.subplots(1, 4)
+    drawn = {law: found.batches[law] for law in LAWS}
     for panel, (name, words) in zip(axes[:3], _MEASURES.items(), strict=True):
-        for law, batch in found.batches.items():
+        for law, batch in drawn.items():
             values = np.sort(1e3 * np.abs(getattr(batch, name)))
             share = np.arange(1, len(values) + 1) / len(values)
             panel.step(values, share, where='post', color=LAW_COLORS[law], label=LAWS[law])
@@ -218,7 +233,7 @@ def _figure(found: Mismatch) -> Figure:
     axes[0].set_ylabel('share of the runs')
     axes[0].legend(fontsize='small')
     friction = 100.0 * (found.factors[:, 0] - 1.0)
-    for law, batch in found.batches.items():
+    for law, batch in drawn.items():
         axes[3].plot(friction, 1e3 * batch.final, '.', markersize=2.5, color=LAW_COLORS[law])
     axes[3].set(
         xlabel=r'true $\mu_s$ over believed - 1 [%]', ylabel='signed error at the end [mm]'
@@ -243,38 +258,42 @@ def section(found: Mismatch) -> Section:
         For the page of results.
 
     """
-    finals = {name: 1e3 * np.abs(batch.final) for name, batch in found.batches.items()}
-    better = 100.0 * float(np.mean(finals['pid'] < finals['inverse_dynamics']))
-    final = {name: float(np.median(values)) for name, values in finals.items()}
-    largest = {name: 1e3 * float(np.median(b.largest)) for name, b in found.batches.items()}
-    inverse = 100.0 * found.shares('inverse_dynamics')
-    gains = InverseDynamicsGains()
-    fade = 1e3 * gains.breakaway_speed / (gains.kp * BREAKAWAY_TIME)
+    final = {name: 1e6 * np.median(np.abs(b.final)) for name, b in found.batches.items()}
+    rms = {name: 1e6 * np.median(b.rms) for name, b in found.batches.items()}
+    stiffness = 100.0 * found.shares('inverse_dynamics')[2]
     caption = (
         'Distribution of the errors over the runs (dotted: the needle is known exactly), and the '
-        'final error against the error in mu_s. Inverse dynamics stops where Coulomb friction '
-        f'holds the needle: its compensation fades within {fade:.2f} mm of the goal. The integral '
-        'of PID continues until the error is within its tolerance.'
+        'final error against the error in mu_s. The integral of each law continues until the '
+        'error is within its tolerance.'
     )
     return Section(
         title='Needles that the controller does not know',
         paragraphs=(
             (
                 f'{len(found.factors)} insertions from {100.0 * START:g} to {100.0 * TARGET:g} cm '
-                'in 9.4 s with each law, sampled at 1 kHz, one period late, default gains, f_y '
-                'alone. mu_s, mu_v and k_a of the needle are each uniform within 30 % of what the '
-                f'law believes (preset {PRESET}; the needles are the same for both laws). No '
-                'observer: the laws do not know the force of the bent needle, which starts with '
-                '0.5 mm of deflection that rings out within tens of milliseconds.'
+                'in 9.4 s with each law, at 1 kHz, default gains, f_y alone. mu_s, mu_v and k_a of '
+                'the needle are each uniform within 30 % of what the law believes (preset '
+                f'{PRESET}; the same needles for all laws). No observer: the laws do not '
+                'know the force of the bent needle, which starts with 0.5 mm of deflection that '
+                'rings out within tens of milliseconds.'
             ),
             (
-                f'At the end PID is nearer in {better:.0f} % of the runs: median '
-                f'{final["pid"]:.2g} mm against {final["inverse_dynamics"]:.2g} mm. On the way '
-                f'the largest error of inverse dynamics is {largest["inverse_dynamics"]:.2g} mm '
-                f'in the median, that of PID {largest["pid"]:.2g} mm. Of the variance of the '
-                f'final error of inverse dynamics mu_s alone explains {inverse[0]:.0f} %, mu_v '
-                f'{inverse[1]:.0f} % and k_a {inverse[2]:.0f} %: the stiffness of the tissue does '
-                'not matter to the base of a needle that is nearly straight.'
+                f'Inverse dynamics with its feedback ends {final["inverse_dynamics"]:.2g} um from '
+                f'the goal in the median, with an rms error of {rms["inverse_dynamics"]:.2g} um; '
+                f'PID {final["pid"]:.2g} um and {rms["pid"]:.2g} um. The integral of both removes '
+                'what is not modeled, and the feed-forward of inverse dynamics leaves less of it. '
+                f'k_a explains {stiffness:.0f} % of the variance of its final error: the '
+                'stiffness of the tissue does not matter to the base of a needle that is nearly '
+                'straight.'
+            ),
+            (
+                'As in the paper, inverse dynamics has no feedback of what differs from the '
+                'model, and compensates friction with the measured velocity. With a delay of one '
+                f'period it ends {final["paper_inverse_dynamics"]:.2g} um from the goal (PID '
+                f'without integral: {final["paper_pid"]:.2g} um). Without delay it compensates '
+                'more friction than there is, and moves back and forth: '
+                f'{final["paper_inverse_dynamics_at_once"]:.2g} um '
+                f'({final["paper_pid_at_once"]:.2g} um).'
             ),
         ),
         tables=(_table(found),),

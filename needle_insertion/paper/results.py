@@ -179,7 +179,7 @@ def _of_figure(name: str) -> Result:
 
 @cache
 def _study() -> mismatch.Mismatch:
-    with tqdm(total=2002, unit=' insertions', **_bar('mismatch')) as bar:
+    with tqdm(total=1001 * len(mismatch.CASES), unit=' insertions', **_bar('mismatch')) as bar:
         return mismatch.study(progress=bar.update)
 
 

@@ -20,7 +20,7 @@ PHANTOM = NeedleParameters.preset('phantom')
 
 def test_the_plain_law_is_ours() -> None:
     plain = NumpyInverseDynamics(PHANTOM, InverseDynamicsGains())
-    law = sampled_laws(PHANTOM, PERIOD)['inverse_dynamics']
+    law = sampled_laws(PHANTOM, PERIOD)['paper_inverse_dynamics']
     ours = SampledLoop(law, bench_control.DELAY, 15.0)
     for k, (before, depth) in enumerate(pairwise(np.linspace(0.1, 0.101, 101))):
         speed, target = (depth - before) / PERIOD, depth + 1e-5

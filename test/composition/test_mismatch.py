@@ -2,6 +2,7 @@
 
 from needle_insertion.paper import mismatch
 from needle_insertion.paper.mismatch import Mismatch
+from needle_insertion.paper.runs import LAWS
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest
@@ -22,16 +23,21 @@ def test_needles_are_drawn_independently_within_30_percent(found: Mismatch) -> N
 
 
 def test_every_run_arrives(found: Mismatch) -> None:
-    for batch in found.batches.values():
-        assert (batch.completed == batch.completed[0]).all()
-        # A tenth of a millimeter: what dry friction can hold against either law.
-        assert np.abs(batch.final).max() < 1.5e-4
+    for case, batch in found.batches.items():
         assert (batch.rms <= batch.largest).all()
+        if case == 'paper_inverse_dynamics_at_once':
+            # It compensates more friction than there is.
+            assert np.median(batch.largest) > 1e-3
+            continue
+        assert (batch.completed == batch.completed[0]).all()
+        # Without integral, what dry friction can hold: 1.3 * 0.56 N / 6000 N/m, and its divisor.
+        assert np.abs(batch.final).max() < (2e-5 if case in LAWS else 2e-4)
 
 
 def test_the_step_is_fine_enough(found: Mismatch) -> None:
     fine = mismatch.study(3, step=5e-5)
-    for law, batch in fine.batches.items():
+    for law in LAWS:
+        batch = fine.batches[law]
         assert_allclose(found.batches[law].largest[:3], batch.largest, atol=1e-9)
 
 
@@ -43,16 +49,16 @@ def test_the_same_seed_gives_the_same_numbers_and_another_one_others(found: Mism
 
 
 def test_errors_are_compared_with_those_of_an_exact_model(found: Mismatch) -> None:
-    for law, nominal in found.nominal.items():
+    for law in LAWS:
+        nominal = found.nominal[law]
         assert nominal.rms[0] < np.median(found.batches[law].rms) * 1.1
     assert found.nominal['inverse_dynamics'].rms < found.nominal['pid'].rms
 
 
 def test_the_section_has_a_row_for_each_error_of_each_law(found: Mismatch) -> None:
     section = mismatch.section(found)
-    assert len(section.tables[0].rows) == 6
+    assert len(section.tables[0].rows) == 3 * len(mismatch.CASES)
     assert len(section.pictures) == 1
     assert 'final error' in section.pictures[0].caption
     shares = found.shares('inverse_dynamics')
     assert (shares >= 0.0).all()
-    assert shares.argmax() == 0

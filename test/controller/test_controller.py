@@ -21,7 +21,7 @@ PERIOD = 1e-3
 
 
 def controller(
-    law: str = 'inverse_dynamics', preset: str = 'phantom', **changes: float
+    law: str = 'inverse_dynamics', preset: str = 'phantom', **changes: Any
 ) -> Controller:
     """Return a controller with default gains."""
     return Controller(NeedleParameters.preset(preset), law, settings=ControllerSettings(**changes))

@@ -130,7 +130,7 @@ def test_response_joins_its_limits() -> None:
         ({'inertia': 1.0, 'viscous': -1.0}, 'viscous must be finite and >= 0'),
     ],
 )
-def test_axes_that_are_none_are_refused(changes: dict[str, float], words: str) -> None:
+def test_invalid_axes_are_rejected(changes: dict[str, Any], words: str) -> None:
     """No mass, and negative damping."""
     with pytest.raises(ParameterError, match=words):
         Axis(**changes)

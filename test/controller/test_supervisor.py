@@ -221,11 +221,16 @@ def test_the_reference_waits_for_a_plant_that_does_not_follow() -> None:
     robot.runs(300, obeys=False)
     assert 'the plant does not follow: it reports 0 N' in str(supervisor.fault)
     waits = robot.aim
-    robot.runs(5000, obeys=False)
+    robot.runs(1000, obeys=False)
+    force = supervisor._last.force
+    robot.runs(4000, obeys=False)
     assert robot.aim == waits
     assert supervisor.safety.stop is None
     # A tenth of a second at the velocity of the reference, and its brake.
     assert 0.0 < waits - start < 0.01
+    # Nothing is integrated meanwhile: the force does not grow.
+    assert supervisor._last.force == pytest.approx(force, rel=1e-6)
+    assert 0.0 < force < 10.0
     robot.runs(3000, obeys=True)
     assert supervisor.fault is None
     assert robot.aim > waits + 0.02

@@ -21,7 +21,11 @@ import numpy as np
 
 
 def _informed(study: Mismatch) -> Finding:
-    """Judge whether knowledge of the model helps, where it is exact and where it is not."""
+    """
+    Judge whether knowledge of the model helps, where it is exact and where it is not.
+
+    Like is compared with like: both laws as in the paper, without integral.
+    """
     model = needle('paper_mm', 'complete')
     friction = 0.99 * model.parameters.coulomb_friction
     believed = NeedleModel(replace(model.parameters, coulomb_friction=friction))
@@ -37,8 +41,11 @@ def _informed(study: Mismatch) -> Finding:
         1e3 * abs(Outcome.of(closed_loop(law, 'paper_mm', 'complete', hub_stop=True)).error)
         for law in LAWS
     )
-    finals = [1e6 * float(np.median(np.abs(study.batches[law].final))) for law in LAWS]
-    known = [1e6 * float(study.nominal[law].rms[0]) for law in LAWS]
+    finals, at_once = (
+        [1e6 * float(np.median(np.abs(study.batches[f'paper_{law}{when}'].final))) for law in LAWS]
+        for when in ('', '_at_once')
+    )
+    known = [1e6 * float(study.nominal[f'paper_{law}'].rms[0]) for law in LAWS]
     return finding(
         {
             'inverse_mm': inverse,
@@ -47,9 +54,11 @@ def _informed(study: Mismatch) -> Finding:
             'pid_known_um': known[1],
             'inverse_um': finals[0],
             'pid_um': finals[1],
+            'inverse_at_once_um': at_once[0],
+            'pid_at_once_um': at_once[1],
             'left_mm': 1e3 * float(run.states[-1, 0]),
         },
-        always=finals[0] < finals[1],
+        always=finals[0] < finals[1] and at_once[0] < at_once[1],
         sometimes=known[0] < known[1],
     )
 

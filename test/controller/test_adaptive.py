@@ -1,0 +1,187 @@
+"""Friction learned on the way: right, bounded, and without effect on stability."""
+
+from dataclasses import replace
+from math import inf, pi, sin
+from typing import Any
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from needle_controller import (
+    Adaptive,
+    AdaptiveGains,
+    Axis,
+    Controller,
+    InverseDynamics,
+    InverseDynamicsGains,
+    Measurement,
+    MinimumJerk,
+    ReferenceLimits,
+    run_batch,
+    SampledLoop,
+    Setpoint,
+    transition_matrix,
+)
+from needle_controller.compiled.laws import LEARNED, SEEN
+from needle_controller.compiled.learning import bounds, correction
+from needle_dynamics import NeedleModel, NeedleParameters
+import numpy as np
+from numpy.testing import assert_allclose, assert_array_equal
+import pytest
+
+NEEDLE = NeedleParameters.preset('phantom')
+PHANTOM = Axis.insertion(NEEDLE)
+PERIOD = 1e-3
+
+
+def law(axis: Axis = PHANTOM, **changes: Any) -> Adaptive:
+    """Return the law with default gains, but for some."""
+    return Adaptive(axis=axis, gains=AdaptiveGains(**changes), period=PERIOD)
+
+
+def drive(loop: SampledLoop, plant: Axis, duration: float) -> None:
+    """Move back and forth at up to 20 mm/s, 1 s a swing."""
+    amplitude, rate = 0.02 / (2.0 * pi), 2.0 * pi
+    position, speed = 0.05, 0.0
+    for i in range(round(duration / PERIOD)):
+        phase = rate * i * PERIOD
+        aim = Setpoint(
+            0.05 + amplitude * (1.0 - np.cos(phase)),
+            amplitude * rate * sin(phase),
+            amplitude * rate**2 * np.cos(phase),
+        )
+        force = loop.command(position, speed, aim)
+        position, speed = plant.propagate(position, speed, force, PERIOD)
+
+
+def test_what_differs_from_the_model_is_learned() -> None:
+    """Dry and viscous friction of both directions, within three standard deviations."""
+    truth = replace(PHANTOM, coulomb=0.7, viscous=240.0, withdrawal=0.8)
+    loop = SampledLoop(law(), 0, 20.0)
+    drive(loop, truth, 8.0)
+    expected = {
+        'learned dry friction, insertion [N]': 0.7 - 0.56,
+        'learned viscous friction, insertion [N s/m]': 240.0 - 300.0,
+        'learned dry friction, withdrawal [N]': 0.8 * 0.7 - 0.56,
+        'learned viscous friction, withdrawal [N s/m]': 0.8 * 240.0 - 300.0,
+    }
+    for name, value in expected.items():
+        found, error = loop.learned[name]
+        assert abs(found - value) < 3.0 * error, name
+        # The interval says that the difference is known: 4 % of dry, 5 % of viscous friction.
+        assert error < (0.02 if 'dry' in name else 15.0), name
+
+
+@settings(deadline=None, derandomize=True, max_examples=50)
+@given(
+    st.lists(
+        st.tuples(*[st.floats(-1e3, 1e3)] * 3, st.floats(-1.0, 1.0)), min_size=5, max_size=60
+    ),
+    st.floats(0.1, 3.0),
+)
+def test_it_never_leaves_its_bounds(
+    measured: list[tuple[float, float, float, float]], bound: float
+) -> None:
+    """Whatever is measured, the force beyond the model is within the bounds, and finite."""
+    loop = SampledLoop(law(bound=bound), 1, inf)
+    most = bounds(bound, PHANTOM.coulomb, PHANTOM.viscous)
+    position = 0.05
+    for speed, jump, target, share in measured:
+        # Some of the motions are what their speed says, so that they count.
+        position += PERIOD * speed + (1e-3 * jump if share < 0.0 else 0.0)
+        loop.command(position, speed, Setpoint(target))
+        for block in loop.memory[LEARNED:].reshape(2, -1):
+            for depth in (0.0, 0.05, 0.2):
+                force = correction(block, most, depth, 0.01)
+                assert abs(force) <= (most[0] + 0.01 * most[1]) * (1.0 + 1e-12)
+
+
+def test_frozen_it_stays() -> None:
+    """`learn: false` keeps what is learned and uses it."""
+    truth = replace(PHANTOM, coulomb=0.7, viscous=240.0)
+    loop = SampledLoop(law(), 0, 20.0)
+    drive(loop, truth, 2.0)
+    loop.switch(law(learn=False))
+    learned = loop.memory[LEARNED:].copy()
+    drive(loop, replace(PHANTOM, coulomb=0.3), 2.0)
+    assert_array_equal(loop.memory[LEARNED:], learned)
+    assert loop.learned['learned dry friction, insertion [N]'][0] > 0.1
+
+
+def test_it_survives_a_stop_but_not_another_needle() -> None:
+    """A pause, a stop and other gains keep what is learned; other constants and a reset do not."""
+    loop = SampledLoop(law(), 0, 20.0)
+    drive(loop, replace(PHANTOM, coulomb=0.7), 2.0)
+    learned = loop.learned
+    loop.stop()
+    loop.unwind()
+    loop.switch(law(kp=400.0))
+    assert loop.learned == learned != {}
+    loop.switch(law(replace(PHANTOM, coulomb=0.7)))
+    assert loop.learned == {}
+    drive(loop, PHANTOM, 1.0)
+    loop.reset()
+    assert loop.learned == {}
+
+
+def test_a_missing_sample_is_not_learned_from() -> None:
+    """Two periods between measurements look like twice the speed, and do not count."""
+    loop = SampledLoop(law(), 0, 20.0)
+    loop.command(0.05, 0.01, Setpoint(0.05, 0.01))
+    loop.command(0.05 + 2.5 * PERIOD * 0.01, 0.01, Setpoint(0.05, 0.01))
+    assert loop.learned == {}
+    loop.command(0.05 + 3.5 * PERIOD * 0.01, 0.01, Setpoint(0.05, 0.01))
+    assert loop.learned != {}
+    loop.stop()
+    assert loop.memory[SEEN] == 0.0
+
+
+def test_learning_is_outside_of_the_loop() -> None:
+    """Its poles are those of inverse dynamics."""
+    other = InverseDynamics(axis=PHANTOM, gains=InverseDynamicsGains(), period=PERIOD)
+    assert_allclose(transition_matrix(law(), 1, 1), transition_matrix(other, 1, 1), rtol=1e-12)
+
+
+def test_without_friction_there_is_nothing_to_learn() -> None:
+    """On the axis of rotation all bounds are zero."""
+    loop = SampledLoop(law(Axis(inertia=1e-9)), 0, 1.0)
+    drive(loop, Axis(inertia=1e-9), 0.2)
+    assert all(value == (0.0, 0.0) for value in loop.learned.values())
+
+
+@pytest.mark.parametrize('delay', [0, 1])
+def test_it_follows_better_than_inverse_dynamics(delay: int) -> None:
+    """On needles with friction 50 % off, each rms error is smaller; the end is as good."""
+    plants = [
+        replace(NEEDLE, coulomb_friction=0.56 * dry, viscous_friction=300.0 * viscous)
+        for dry in (0.5, 1.5)
+        for viscous in (0.5, 1.5)
+    ]
+    start = NeedleModel(NEEDLE).state_at(0.02, 5e-4)
+    reference = MinimumJerk(Setpoint(0.02), 0.05, ReferenceLimits())
+    gains = InverseDynamicsGains()
+    each = (InverseDynamics(axis=PHANTOM, gains=gains, period=PERIOD), law())
+    fixed, learned = (
+        run_batch(one, plants, start, reference, delay=delay, limit=15.0, duration=8.0, step=1e-3)
+        for one in each
+    )
+    assert (learned.rms < 0.9 * fixed.rms).all()
+    assert np.abs(learned.final).max() < 1e-5
+
+
+def test_the_controller_tells_what_it_has_learned() -> None:
+    """By name, with unit and standard deviation; nothing under another law."""
+    controller = Controller(NEEDLE, 'adaptive')
+    controller.set_target(0.05)
+    assert controller.learned == {}
+    truth = replace(PHANTOM, viscous=400.0)
+    position, speed, force = 0.02, 0.0, 0.0
+    for i in range(3000):
+        measured = Measurement(time=i * PERIOD, depth=position, speed=speed)
+        coming = controller.command(measured).force
+        position, speed = truth.propagate(position, speed, force, PERIOD)
+        force = coming
+    names = list(controller.learned)
+    assert names[0] == 'learned dry friction, insertion [N]'
+    assert len(names) == 3
+    controller.change(law='inverse_dynamics')
+    assert controller.learned == {}
