@@ -271,7 +271,7 @@ def section(found: Mismatch) -> Section:
         paragraphs=(
             (
                 f'{len(found.factors)} insertions from {100.0 * START:g} to {100.0 * TARGET:g} cm '
-                'in 9.4 s with each law, at 1 kHz, default gains, f_y alone. mu_s, mu_v and k_a of '
+                'in 9.4 s with each law, at 1 kHz, default gains, f_y alone. mu_s, mu_v, k_a of '
                 'the needle are each uniform within 30 % of what the law believes (preset '
                 f'{PRESET}; the same needles for all laws). No observer: the laws do not '
                 'know the force of the bent needle, which starts with 0.5 mm of deflection that '
