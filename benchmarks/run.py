@@ -24,6 +24,7 @@ MODULES = {
     'identification': ('identification',),
     'calibration': ('calibration',),
     'control': ('control',),
+    'laws': ('laws',),
     'graph': ('graph',),
 }
 
@@ -53,6 +54,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--seed', type=int, metavar='N', help='seed of the true values and the noise'
     )
     add('control', help='cost of a control step')
+    laws = add('laws', help='control laws on needles, robots and tissues that they do not know')
+    laws.add_argument('--needles', type=int, metavar='N', help='needles in a cell')
     graph = add('graph', help='the nodes beside bare rclpy nodes')
     plan = graph.add_mutually_exclusive_group()
     plan.add_argument(

@@ -18,7 +18,7 @@ ARGUMENTS = {
         '',
         'constants of the model in plant and controller: phantom, paper_si or paper_mm',
     ),
-    'law': ('', 'law of the controller: inverse_dynamics or pid'),
+    'law': ('', 'law of the controller: adaptive, inverse_dynamics or pid'),
     'lockstep': ('', 'true: each sample waits for the command that answers the sample before'),
     'real_time_factor': ('', 'simulated seconds per second; 0: as fast as possible'),
     'bag': ('', 'folder to record to; empty: no recording'),

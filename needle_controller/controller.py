@@ -28,15 +28,15 @@ Gains: TypeAlias = InverseDynamicsGains | AdaptiveGains | PidGains
 #: Default gains by law and axis. Those of rotation by PID make a closed loop of 20 rad/s on the
 #: rotary inertia of the paper's needle.
 DEFAULT_GAINS: Final[Mapping[str, Mapping[str, Gains]]] = {
+    'adaptive': {'insertion': AdaptiveGains(), 'rotation': AdaptiveGains()},
     'inverse_dynamics': {
         'insertion': InverseDynamicsGains(),
         'rotation': InverseDynamicsGains(),
     },
     'pid': {'insertion': PidGains(), 'rotation': PidGains(kp=2.1e-7, ki=0.0, kd=2.1e-8)},
-    'adaptive': {'insertion': AdaptiveGains(), 'rotation': AdaptiveGains()},
 }
 
-#: Control laws by name.
+#: Control laws by name, the default first.
 LAWS: Final = tuple(DEFAULT_GAINS)
 
 

@@ -12,7 +12,7 @@ from needle_controller.compiled.laws import (
 from needle_dynamics.arrays import FloatArray
 from needle_dynamics.compiled.cache import compiled
 from needle_dynamics.compiled.friction import friction_flow, FrictionConstants
-from needle_dynamics.compiled.step import advance, Inputs, Needle
+from needle_dynamics.compiled.step import advance, Inputs, Needle, with_friction
 import numpy as np
 
 
@@ -25,6 +25,7 @@ def run_loop(
     setpoints: FloatArray,
     goal: FloatArray,
     pending: FloatArray,
+    added: FloatArray,
     longest: float,
     depths: FloatArray,
     errors: FloatArray,
@@ -48,6 +49,9 @@ def run_loop(
         Position of the reference at the times of the measurements [m].
     pending : ndarray, shape (delay,)
         Commands that have not yet taken effect [N]; overwritten.
+    added : ndarray, shape (m, 3)
+        Friction along the way: inserted length from which on [m] the needle has this much more
+        Coulomb friction [N] and viscous friction [N s/m], until the next row.
     longest : float
         Longest step of the integrator [s].
     depths : ndarray, shape (k + 1,) or (0,)
@@ -90,7 +94,11 @@ def run_loop(
                 pending[i - 1] = pending[i]
             pending[delay - 1] = command
         inputs = Inputs(force, 0.0, 0.0, False)
-        left, _ = advance(c, state, k * period, inputs, longest, False, period)
+        needle = c
+        for row in added:
+            if c.length - state[0] >= row[0]:
+                needle = with_friction(c, row[1], row[2])
+        left, _ = advance(needle, state, k * period, inputs, longest, False, period)
         if left != 0.0:
             return k
     return int(count)

@@ -180,6 +180,7 @@ def run_batch(
     delay: int,
     limit: float,
     duration: float,
+    added: ArrayLike = (),
     step: float = DEFAULT_STEP,
     keep: bool = False,
     workers: int | None = None,
@@ -207,6 +208,10 @@ def run_batch(
         Largest force [N].
     duration : float
         Time to simulate [s].
+    added : array_like, shape (m, 3)
+        Friction along the way, for membranes and layers: inserted length from which on [m] the
+        needles have this much more Coulomb friction [N] and viscous friction [N s/m], until the
+        next row.
     step : float
         Longest step of the integrator [s].
     keep : bool
@@ -251,6 +256,9 @@ def run_batch(
     # What a command aims at: the reference when it takes effect.
     setpoints = np.array([reference.at(k * period + delay * period) for k in range(count)])
     goal = np.array([reference.at(k * period).position for k in range(count + 1)])
+    along = np.array(added, dtype=np.float64).reshape(-1, 3)
+    if not np.isfinite(along).all() or (np.diff(along[:, 0]) <= 0.0).any():
+        raise ParameterError(f'added must be finite, with increasing lengths, got {added!r}')
     models = [NeedleModel(p) for p in each]
     needles = [model.compiled for model in models]
     ends = np.array(
@@ -264,7 +272,7 @@ def run_batch(
             law = each_law[i % len(each_law)]
             completed[i] = run_loop(
                 needles[i % len(needles)], ends[i], law.packed, float(limit), setpoints,
-                goal, np.zeros(delay), float(step), depths[i], errors[i],
+                goal, np.zeros(delay), along, float(step), depths[i], errors[i],
             )  # fmt: skip
             if progress is not None:
                 progress()

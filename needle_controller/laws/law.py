@@ -268,7 +268,8 @@ class SampledLoop:
         }
 
     def unwind(self) -> None:
-        """Discard what is integrated and the modeled motion; what is learned stays."""
+        """Discard pending commands, what is integrated and the modeled motion; see `stop`."""
+        self.stop()
         self.memory[:LEARNED] = 0.0
 
     def command(

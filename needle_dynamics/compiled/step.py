@@ -62,6 +62,54 @@ class Needle(NamedTuple):
     layers: Layers
 
 
+@compiled
+def with_friction(c: Needle, coulomb: float, viscous: float) -> Needle:
+    """
+    Return a needle with more friction.
+
+    Parameters
+    ----------
+    c : Needle
+        The needle.
+    coulomb, viscous : float
+        What is added to Coulomb friction [N] and to viscous friction [N s/m].
+
+    Returns
+    -------
+    Needle
+        The needle, otherwise the same.
+
+    """
+    f = c.friction
+    friction = FrictionConstants(
+        f.law,
+        f.coulomb + coulomb,
+        f.viscous + viscous,
+        f.withdrawal,
+        f.breakaway,
+        f.stribeck_speed,
+        f.smoothing_speed,
+    )
+    return Needle(
+        c.length,
+        c.linear_density,
+        c.bending_stiffness,
+        c.tissue_damping,
+        c.moving_mass,
+        c.carriage_mass,
+        c.rotary_inertia,
+        c.minimum_depth,
+        c.maximum_depth,
+        c.hub_stop,
+        c.as_printed,
+        c.swelling,
+        c.swelling_time,
+        friction,
+        c.modes,
+        c.layers,
+    )
+
+
 class Inputs(NamedTuple):
     """
     What the base does over a time.

@@ -169,7 +169,7 @@ def test_unknown_names_are_listed() -> None:
 @pytest.mark.parametrize(
     ('gains', 'reason'),
     [
-        ({'lqr': {'insertion': PidGains()}}, 'unknown gains lqr.insertion; valid: inverse_dyn'),
+        ({'lqr': {'insertion': PidGains()}}, 'unknown gains lqr.insertion; valid: adaptive, inverse_dyn'),
         ({'pid': {'deflection': PidGains()}}, 'with insertion and rotation'),
         ({'pid': {'rotation': InverseDynamicsGains()}}, 'pid.rotation must be PidGains'),
     ],
@@ -245,7 +245,7 @@ def test_a_switch_to_gains_that_cannot_be_stable_is_refused() -> None:
     unstable = InverseDynamicsGains(kv=3000.0)
     with pytest.raises(ParameterError, match=r'inverse_dynamics.insertion gains are unstable'):
         steering.change(gains={'inverse_dynamics': {'insertion': unstable}})
-    with pytest.raises(ParameterError, match='valid: inverse_dynamics, pid'):
+    with pytest.raises(ParameterError, match='valid: adaptive, inverse_dynamics, pid'):
         steering.change(law='bang_bang')
     assert steering.law == 'inverse_dynamics'
 

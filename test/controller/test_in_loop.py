@@ -26,6 +26,7 @@ from needle_controller import (
     Setpoint,
 )
 from needle_dynamics import (
+    FloatArray,
     InsertedLengthError,
     Integrator,
     NeedleError,
@@ -306,3 +307,28 @@ def test_a_batch_refuses_what_does_not_agree() -> None:
         run_batch([law, other], BELIEVED, START, REFERENCE, **options)
     with pytest.raises(ParameterError, match='duration must be'):
         run_batch(law, BELIEVED, START, REFERENCE, delay=1, limit=15.0, duration=0.0)
+
+
+def test_friction_along_the_way_is_that_of_another_needle() -> None:
+    """From the beginning it is a needle with more friction; from later on, the same until then."""
+    needle, start = NeedleParameters.preset('phantom'), Setpoint(0.02)
+    reference = MinimumJerk(start, 0.03, ReferenceLimits())
+    law = Pid(axis=Axis.insertion(needle), gains=PidGains(), period=1e-3)
+    more = replace(needle, coulomb_friction=1.0, viscous_friction=400.0)
+    added = 1.0 - needle.coulomb_friction, 400.0 - needle.viscous_friction
+    state = NeedleModel(needle).state_at(0.02)
+
+    def run(plant: NeedleParameters, along: Any = ()) -> FloatArray:
+        return run_batch(
+            law, plant, state, reference, delay=1, limit=15.0, duration=3.0, added=along, keep=True
+        ).depths[0]
+
+    plain, whole = run(needle), run(needle, [(0.0, *added)])
+    # The sums of friction are rounded.
+    assert_allclose(whole, run(more), rtol=0.0, atol=1e-12)
+    later = run(needle, [(0.025, *added)])
+    same = plain < 0.025
+    assert_allclose(later[same], plain[same], rtol=0.0, atol=1e-15)
+    assert np.abs(later - plain).max() > 1e-5
+    with pytest.raises(ParameterError, match='added must be finite, with increasing lengths'):
+        run(needle, [(0.025, *added), (0.02, *added)])

@@ -1,0 +1,66 @@
+"""The study of the laws judges what it runs; its figures are not tested here."""
+
+from benchmarks import laws as study_of_laws
+from benchmarks.laws import Cell, compare, laws, situations, study
+from needle_controller import LAWS, LoopBatch
+from needle_dynamics import ParameterError
+import numpy as np
+import pytest
+
+
+def batch(depths: list[float], completed: int = 1000) -> LoopBatch:
+    """Return the runs of one needle with these depths."""
+    path = np.array([depths])
+    return LoopBatch(
+        final=path[:, -1],
+        largest=np.abs(path).max(axis=1),
+        rms=np.sqrt(np.mean(path**2, axis=1)),
+        states=np.empty((1, 8)),
+        completed=np.array([completed]),
+        depths=path,
+    )
+
+
+def test_a_cycle_is_told_from_a_creep_and_from_a_lost_needle() -> None:
+    goal, time = np.zeros(1001), np.arange(1001)
+    moving = Cell.of(batch(list(2e-5 * np.sin(0.05 * time))), goal, 1.0)
+    assert (moving.cycles, moving.lost) == (1, 0)
+    assert str(moving) == '**1 cycle**'
+    creeping = Cell.of(batch(list(1e-4 * np.exp(-0.005 * time))), goal, 1.0)
+    assert (creeping.cycles, creeping.lost) == (0, 0)
+    assert creeping.beyond[0] == 1e-4
+    assert Cell.of(batch([0.0] * 1001, completed=10), goal, 1.0).lost == 1
+    assert Cell.of(batch([6e-3] * 1001), goal, 1.0).lost == 1
+
+
+def test_every_situation_ends_at_rest_within_two_centimeters() -> None:
+    for one in situations():
+        end = one.reference.at(one.duration)
+        assert abs(one.reference.at(0.0).position - one.start) < 1e-12
+        assert abs(end.speed) < 1e-9
+        assert 1e-3 < abs(end.position - one.start) < 0.021
+
+
+def test_the_default_law_comes_first() -> None:
+    assert next(iter(laws())) == LAWS[0]
+
+
+def test_a_membrane_makes_a_needle_go_too_far() -> None:
+    """The drop of 3 N moves it beyond the reference by a tenth of a millimeter, and no more."""
+    names = {one.name: one for one in situations()}
+    puncture, law = names['puncture, 3 N'], laws()['adaptive']
+    cell = study(puncture, law, 0.3, 1, 2.0, 4)
+    plain = study(names['insertion'], law, 0.3, 1, 2.0, 4)
+    assert 0.1e-3 < cell.beyond.max() < 0.3e-3
+    assert plain.beyond.max() < 0.05e-3
+
+
+def test_the_page_has_a_map_for_each_situation(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(study_of_laws, '_DELAYS', (1,))
+    monkeypatch.setattr(study_of_laws, '_CARRIAGES', (0.0,))
+    sections, bars = compare(lambda _stage: None, needles=2)
+    assert len(sections) == 2 * len(situations()) + 1
+    assert [len(section.rows) for section in sections[:-1]] == [len(laws())] * 10
+    assert not any(bar.missed for bar in bars)
+    with pytest.raises(ParameterError, match='needles must be at least 1, got 0'):
+        compare(lambda _stage: None, needles=0)
