@@ -169,7 +169,10 @@ def test_unknown_names_are_listed() -> None:
 @pytest.mark.parametrize(
     ('gains', 'reason'),
     [
-        ({'lqr': {'insertion': PidGains()}}, 'unknown gains lqr.insertion; valid: adaptive, inverse_dyn'),
+        (
+            {'lqr': {'insertion': PidGains()}},
+            'unknown gains lqr.insertion; valid: adaptive',
+        ),
         ({'pid': {'deflection': PidGains()}}, 'with insertion and rotation'),
         ({'pid': {'rotation': InverseDynamicsGains()}}, 'pid.rotation must be PidGains'),
     ],
