@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from math import isfinite
+from typing import Final
 
 from needle_controller.controller import Measurement
 from needle_controller.observer.observer import Observer
@@ -11,6 +12,9 @@ from needle_dynamics import NeedleModel, NeedleParameters
 from needle_ros.errors import ParameterError
 from needle_ros.timing import NANOSECONDS
 import numpy as np
+
+#: Samples between two looks at the consistency of the observer.
+_LOOK: Final = 25
 
 
 class Bending:
@@ -29,7 +33,9 @@ class Bending:
     Attributes
     ----------
     load : float
-        Force against insertion [N]; zero where it is not known.
+        Force against insertion [N]; zero where it is not known, or the observer is doubtful.
+    warning : str or None
+        Why the observer is doubtful.
     model : NeedleModel
         The needle, for the load of a true state.
     observer : Observer or None
@@ -45,6 +51,8 @@ class Bending:
     def forget(self) -> None:
         """Know nothing of what was measured."""
         self.load = 0.0
+        self.warning: str | None = None
+        self._updates = 0
         #: Stamp, lateral force and moment of the last wrench that no measurement has taken.
         self._waiting: tuple[int, float, float] | None = None
         if self.observer is not None:
@@ -134,7 +142,23 @@ class Bending:
             self._waiting = None
         self.load = 0.0
         observer.update(stamp / NANOSECONDS, measured.depth, measured.speed, own)
-        self.load = observer.load
+        self._updates += 1
+        if self._updates % _LOOK == 0:
+            self._judge(observer)
+        if self.warning is None:
+            self.load = observer.load
+
+    def _judge(self, observer: Observer) -> None:
+        """See whether the errors of the observer are as large as it says."""
+        # What it begins with is a guess, and counts as long as the history has it.
+        known = self._updates * observer.period > 1.2 * observer.settings.history
+        nis = observer.nis
+        self.warning = None
+        if known and nis.doubtful:
+            self.warning = (
+                f'the observer does not explain what is measured: NIS is {nis.ratio:.2f} '
+                f'instead of 1; the load of the bent needle is not used'
+            )
 
     def describe(self) -> dict[str, object]:
         """Return what diagnostics say of the observer, if there is one that has begun."""
@@ -142,12 +166,14 @@ class Bending:
         if observer is None or not observer.ready:
             return {}
         consistency, (tip, spread) = observer.nis, observer.tip_deflection
+        force, deviation = observer.tip_force
         return {
             'tip deflection [m]': f'{tip:.6f} +- {spread:.6f}',
             'load of the bent needle [N]': f'{observer.load:.4f}',
             'observer consistency (NIS)': (
                 f'{consistency.ratio:.3f} in [{consistency.low:.3f}, {consistency.high:.3f}]'
             ),
+            'lateral force at the tip [N]': f'{force:.3f} +- {deviation:.3f}',
             'observer samples refused': observer.refused,
             'observer restarts': observer.restarts,
             'observer warning': observer.warning or '',

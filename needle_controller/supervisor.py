@@ -509,6 +509,8 @@ class Supervisor:
                 self.bending.update(stamp, measured)
             except NeedleError as error:
                 self._warn('observer', f'observer: {error}')
+            if self.bending.warning is not None:
+                self._warn('doubt', self.bending.warning)
         return self._answer(controller, stamp, measured)
 
     def _again(self, stamp: int) -> Answer:
@@ -674,5 +676,6 @@ class Supervisor:
         }
         if self.safety.stop is not None:
             return Severity.ERROR, f'{self.safety.stop}; ~/clear_stop releases', values
-        held = (self.fault or self.safety.warning(now)) if self._active is not None else None
+        held = self.fault or self.safety.warning(now) or self.bending.warning
+        held = held if self._active is not None else None
         return Severity.WARNING if held else Severity.INFO, held, values

@@ -222,3 +222,41 @@ def base_impulse(needle: Needle, f: Frozen, velocity: float, rows: FloatArray) -
     outside = needle.length - f.depth
     for k in range(2 * n):
         rows[1, k] += outside * rows[0, k]
+
+
+@inlined
+def tip_response(needle: Needle, f: Frozen, rest: FloatArray, direct: FloatArray) -> None:
+    """
+    Write what a constant lateral force of 1 N at the tip does.
+
+    Parameters
+    ----------
+    needle : Needle
+        The needle.
+    f : Frozen
+        The needle at the mean depth.
+    rest : ndarray, shape (n,)
+        Overwritten with c of each mode at rest under the force [sqrt(J)/N].
+    direct : ndarray, shape (2,)
+        Overwritten with the lateral force [1] and the moment about the base [m] beyond what
+        `base_impulse` says of the motion of c and b.
+
+    """
+    n = f.modes.squares.shape[0]
+    integrals, above = (f.at.area, f.at.moment), (needle.layers.area, needle.layers.moment)
+    arms = (1.0, f.depth)
+    for k in range(n):
+        tip = 0.0
+        for i in range(n):
+            tip += f.at.value[i] * f.modes.shapes[i, k]
+        rest[k] = tip / sqrt(f.modes.squares[k])
+    for channel in range(2):
+        direct[channel] = -arms[channel]
+        for k in range(n):
+            held = 0.0
+            for i in range(n):
+                tissue = f.stiffness * integrals[channel][i]
+                tissue += f.growth * above[channel][f.layer, i]
+                held += tissue * f.modes.shapes[i, k]
+            direct[channel] += held / sqrt(f.modes.squares[k]) * rest[k]
+    direct[1] += (needle.length - f.depth) * direct[0]

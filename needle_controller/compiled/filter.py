@@ -7,10 +7,17 @@ so that a measurement that comes late is taken in where it belongs.
 
 from __future__ import annotations
 
-from math import pi, sqrt
-from typing import NamedTuple, TYPE_CHECKING
+from math import exp, pi, sqrt
+from typing import Final, NamedTuple, TYPE_CHECKING
 
-from needle_controller.compiled.bending import base_impulse, change_basis, freeze, Frozen, turn
+from needle_controller.compiled.bending import (
+    base_impulse,
+    change_basis,
+    freeze,
+    Frozen,
+    tip_response,
+    turn,
+)
 from needle_controller.compiled.kalman import add_to_mean, clear_mean, measure, propagate
 from needle_dynamics.arrays import FloatArray
 from needle_dynamics.compiled.cache import compiled, inlined
@@ -60,6 +67,11 @@ class LowPass(NamedTuple):
     steady: FloatArray
 
 
+#: Entries of the state after c and b of the modes: lateral force at the tip [N], and the offsets
+#: of lateral force [N] and moment [N m] as they are read. They change slowly and drive the rest.
+LOADS: Final = 3
+
+
 class Noise(NamedTuple):
     """
     What is uncertain.
@@ -76,6 +88,8 @@ class Noise(NamedTuple):
         Variances of the readings of lateral force [N^2] and moment [N^2 m^2], behind the low-pass.
     wrench : tuple of float
         Variances of their white noise before it.
+    loads, rates : tuple of float
+        Variances of the `LOADS`, and the rates at which they become others [1/s].
 
     """
 
@@ -84,6 +98,8 @@ class Noise(NamedTuple):
     tip: float
     reading: tuple[float, float]
     wrench: tuple[float, float]
+    loads: tuple[float, float, float]
+    rates: tuple[float, float, float]
 
 
 class Filter(NamedTuple):
@@ -187,12 +203,28 @@ def begin(held: Held[Filter], time: float, span: float, depth: float) -> None:
             by_c, by_b = _over(rate, frozen.modes.squares[k], impulse[channel], k, tick)
             reaction += by_c * by_c + by_b * by_b
         reaction *= variance
-        first = 2 * n + channel * filters
+        first = 2 * n + LOADS + channel * filters
         for i in range(filters):
             covariance[first + i, first + i] += f.noise.wrench[channel] + reaction
             for j in range(filters):
-                held = low_pass.steady[i] * low_pass.steady[j]
-                covariance[first + i, first + j] += reaction * held
+                steady = low_pass.steady[i] * low_pass.steady[j]
+                covariance[first + i, first + j] += reaction * steady
+    # What the loads have left in the memory of the low-pass, and among its channels.
+    arms = (-1.0, -needle.length)
+    for load in range(LOADS):
+        covariance[2 * n + load, 2 * n + load] = f.noise.loads[load]
+    for entry in range(2 * filters):
+        one, i = entry // filters, 2 * n + LOADS + entry
+        by_tip = arms[one] * low_pass.steady[entry % filters] * f.noise.loads[0]
+        by_offset = low_pass.steady[entry % filters] * f.noise.loads[1 + one]
+        covariance[i, 2 * n] = covariance[2 * n, i] = by_tip
+        covariance[i, 2 * n + 1 + one] = covariance[2 * n + 1 + one, i] = by_offset
+        for other in range(2 * filters):
+            two, j = other // filters, 2 * n + LOADS + other
+            steady = low_pass.steady[other % filters]
+            covariance[i, j] += by_tip * arms[two] * steady
+            if one == two:
+                covariance[i, j] += by_offset * steady
 
 
 @inlined
@@ -206,7 +238,7 @@ def _over(
 
 
 @inlined
-def _write_transition(
+def _write_transition(  # noqa: C901
     f: Filter, frozen: Frozen, change: FloatArray, span: float, velocity: float, out: FloatArray
 ) -> None:
     """Write the transition over a sample: change of basis, then modes that drive the low-pass."""
@@ -215,13 +247,19 @@ def _write_transition(
     modal, tick, rate = 2 * n, span / ticks, needle.tissue_damping / needle.linear_density
     impulse, drive = np.empty((2, modal)), np.zeros((2 * filters, modal))
     base_impulse(needle, frozen, velocity, impulse)
+    rest, direct = np.empty(n), np.empty(2)
+    tip_response(needle, frozen, rest, direct)
     out[:] = 0.0
+    for load in range(LOADS):
+        out[modal + load, modal + load] = exp(-span * f.noise.rates[load])
     for k in range(n):
         square = frozen.modes.squares[k]
         cc, cb, bc, bb = turn(rate, square, span)
         for j in range(modal):
             out[k, j] = cc * change[k, j] + cb * change[n + k, j]
             out[n + k, j] = bc * change[k, j] + bb * change[n + k, j]
+        # Under a force at the tip the mode turns about its rest.
+        out[k, modal], out[n + k, modal] = (1.0 - cc) * rest[k], -bc * rest[k]
         cc, cb, bc, bb = turn(rate, square, tick)
         for channel in range(2):
             by_c, by_b = _over(rate, square, impulse[channel], k, tick)
@@ -232,8 +270,15 @@ def _write_transition(
                     drive[channel * filters + i, n + k] += left * by_b
                 by_c, by_b = by_c * cc + by_b * bc, by_c * cb + by_b * bb
     for channel in range(2):
-        first = modal + channel * filters
+        first = modal + LOADS + channel * filters
         for i in range(filters):
+            constant = 0.0
+            for count in range(ticks):
+                constant += low_pass.response[count, i]
+            out[first + i, modal] = direct[channel] * constant
+            out[first + i, modal + 1 + channel] = constant
+            for k in range(n):
+                out[first + i, modal] -= rest[k] * drive[channel * filters + i, k]
             for k in range(modal):
                 part = drive[channel * filters + i, k]
                 for j in range(modal):
@@ -255,7 +300,8 @@ def _expose(
 ) -> None:
     """Add a part of the sample, times from its start, to the running mean of the tip."""
     n = f.squares.shape[1]
-    change, fresh, row = f.changes[slot], work[0], work[1, : 2 * n]
+    change, fresh, row = f.changes[slot], work[0], work[1, : 2 * n + 1]
+    by_force = 0.0
     rate = f.needle.tissue_damping / f.needle.linear_density
     for k in range(n):
         square = f.squares[slot, k]
@@ -266,6 +312,9 @@ def _expose(
         share = -f.tips[slot, k] / (square * exposure)
         fresh[k] = share * (e3 - c3 + rate / omega * (e1 - c1))
         fresh[n + k] = share * (e4 - c4 + rate / omega * (e2 - c2))
+        rest = f.tips[slot, k] / omega
+        by_force += rest * (rest * (end - start) / exposure - fresh[k])
+    row[2 * n] = by_force
     for k in range(2 * n):
         row[k] = 0.0
         for i in range(2 * n):
@@ -278,6 +327,7 @@ def _advance(f: Filter, count: int, old: int, new: int) -> None:  # noqa: C901
     """Fill the slot ``new`` from the slot ``old``, with what was measured in between."""
     n, filters, size = f.squares.shape[1], f.low_pass.steady.shape[0], f.states.shape[1]
     modal, last = 2 * n, size - 1
+    drivers = modal + LOADS
     work = np.empty((size + 2, size))
     x, covariance = f.states[new], f.covariances[new]
     x[:] = f.states[old]
@@ -288,6 +338,9 @@ def _advance(f: Filter, count: int, old: int, new: int) -> None:  # noqa: C901
     kick = 0.5 * span * f.noise.force / f.needle.linear_density
     for k in range(n, modal):
         covariance[k, k] += kick
+    for load in range(LOADS):
+        kept = exp(-2.0 * span * f.noise.rates[load])
+        covariance[modal + load, modal + load] += (1.0 - kept) * f.noise.loads[load]
     nis, degrees = 0.0, 0.0
     for w in range(count):
         start, end, value = f.exposures[w]
@@ -306,10 +359,10 @@ def _advance(f: Filter, count: int, old: int, new: int) -> None:  # noqa: C901
             degrees += 1.0
             clear_mean(x, covariance)
     used = size if covariance[last, last] > 0.0 else last
-    propagate(x, covariance, f.transitions[new], modal, filters, used, work)
+    propagate(x, covariance, f.transitions[new], drivers, filters, used, work)
     readings = (sample['lateral'], sample['moment'])
     for channel in range(2):
-        first = modal + channel * filters
+        first = drivers + channel * filters
         for i in range(filters):
             for j in range(filters):
                 covariance[first + i, first + j] += f.low_pass.noise[channel, i, j]
@@ -317,7 +370,7 @@ def _advance(f: Filter, count: int, old: int, new: int) -> None:  # noqa: C901
         reading, variance = readings[channel], f.noise.reading[channel]
         # A reading that is missing is NaN.
         if reading == reading:
-            index = modal + (channel + 1) * filters - 1
+            index = drivers + (channel + 1) * filters - 1
             nis += measure(x, covariance, index, reading, variance, used, work)
             degrees += 1.0
     for k in range(n, modal):

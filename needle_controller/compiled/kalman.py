@@ -1,7 +1,8 @@
 """
 Steps of a Kalman filter in which every measurement is a reading of one entry of the state.
 
-The state is, in this order: c and b of the modes (`bending`); of each channel of the wrench the
+The state is, in this order: c and b of the modes (`bending`), and loads that change slowly, which
+together drive all the rest; of each channel of the wrench the
 memory of its low-pass and, last, its reading; the running mean of the tip deflection over the
 exposure that is going on.
 """
@@ -157,8 +158,8 @@ def propagate(
     """
     Take state and covariance through a transition, in place.
 
-    Only what can differ from zero is multiplied: the modes drive everything, each low-pass drives
-    itself, and its reading is not remembered.
+    Only what can differ from zero is multiplied: modes and loads drive everything, each low-pass
+    drives itself, and its reading is not remembered.
 
     Parameters
     ----------
@@ -169,7 +170,7 @@ def propagate(
     transition : ndarray, shape (N, N)
         Transition; the last entry of the state stays as it is.
     modal, filters : int
-        Number of entries of the modes, 2 n, and of each low-pass with its reading.
+        Number of entries of modes and loads, and of each low-pass with its reading.
     size : int
         N, or N - 1 while the last entry is zero and exactly known.
     work : ndarray, shape (N + 2, N)

@@ -3,9 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from math import inf, nan
 
 from scipy.special import chdtri
+
+
+@lru_cache(maxsize=64)
+def _far(degrees: int) -> float:
+    """Return the ratio that chance exceeds once in a million cases."""
+    return float(chdtri(degrees, 1e-6)) / degrees
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -51,6 +58,11 @@ class Consistency:
             return cls(ratio=nan, low=0.0, high=inf, degrees=0)
         low, high = (float(chdtri(degrees, tail)) / degrees for tail in (0.975, 0.025))
         return cls(ratio=float(total) / degrees, low=low, high=high, degrees=degrees)
+
+    @property
+    def doubtful(self) -> bool:
+        """Whether errors are far larger than said: by chance once in a million cases."""
+        return self.degrees > 0 and self.ratio > _far(self.degrees)
 
     @property
     def holds(self) -> bool:

@@ -7,16 +7,27 @@ that modes far above the sample rate are no trouble; means over the sample, whic
 report, are then linear in the state at its start. The low-pass of the force sensor belongs to the
 state: its noise enters before it and is not white behind it.
 
+A constant force at the tip, such as that of a bevel, and offsets of the sensor are estimated, too.
+
 A tip sample that comes late is taken in where it belongs: the filter keeps its past for a while
 and runs it once more from there. The result is that of a filter to which nothing came late.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
 from math import ceil, inf, isfinite, nan
 from typing import Final
 
-from needle_controller.compiled.filter import begin, estimate, Filter, observe, replay, SAMPLE
+from needle_controller.compiled.filter import (
+    begin,
+    estimate,
+    Filter,
+    LOADS,
+    observe,
+    replay,
+    SAMPLE,
+)
 from needle_controller.laws.axis import require_complete
 from needle_controller.observer.consistency import Consistency
 from needle_controller.observer.settings import ObserverSettings
@@ -28,6 +39,9 @@ from numpy.typing import ArrayLike
 
 #: Encoder samples are taken to be even if their stamps are to this part of the period.
 _EVEN: Final = 0.01
+
+#: The rate of the sensor's filter is a whole multiple of the sample rate, to this part of it.
+_NEAR: Final = 0.1
 
 #: A wrench belongs to an encoder sample if their stamps differ by less than this part of a period.
 _SAME: Final = 0.1
@@ -67,7 +81,7 @@ class Observer:
     ------
     ParameterError
         If the formulation is `as_printed`, or the period is not positive, not shorter than the
-        history, or not a whole number of samples of the force sensor's filter.
+        history, or far from a whole number of samples of the force sensor's filter.
 
     """
 
@@ -80,17 +94,19 @@ class Observer:
                 f'period must be > 0 and < history = {settings.history:g} s, got {period!r}'
             )
         ticks = round(settings.filter_rate * period)
-        if ticks < 1 or abs(ticks - settings.filter_rate * period) > _EVEN:
+        if ticks < 1 or abs(ticks - settings.filter_rate * period) > _NEAR * ticks:
             raise ParameterError(
                 f'filter_rate must be a whole multiple of the sample rate {1.0 / period:g} Hz, '
-                f'got {settings.filter_rate:g} Hz'
+                f'to {100.0 * _NEAR:g} %, got {settings.filter_rate:g} Hz'
             )
+        settings = replace(settings, filter_rate=ticks / period)
         self.period = float(period)
         self.settings = settings
         self.model = NeedleModel(parameters)
         needle, n = self.model.compiled, parameters.modes
         low_pass = settings.low_pass(ticks)
-        size, slots = 2 * n + 2 * len(low_pass.steady) + 1, ceil(settings.history / period) + 2
+        size = 2 * n + LOADS + 2 * len(low_pass.steady) + 1
+        slots = ceil(settings.history / period) + 2
         self._filter = Filter(
             needle=needle,
             noise=settings.noise(),
@@ -249,8 +265,9 @@ class Observer:
         Parameters
         ----------
         stamp : float
-            When it was taken, the end of its exposure [s], on the clock of `update`. It may be
-            ahead of the last encoder sample, and earlier than tip samples that came before.
+            When it was taken, the end of its exposure [s], or ``tip_latency`` later, on the clock
+            of `update`. It may be ahead of the last encoder sample, and earlier than tip samples
+            that came before.
         deflection : float
             Mean deflection over the exposure [m].
 
@@ -259,7 +276,7 @@ class Observer:
             self.refused += 1
             return
         exposure = self.settings.tip_exposure
-        end = float(stamp) - (self._origin or 0.0)
+        end = float(stamp) - self.settings.tip_latency - (self._origin or 0.0)
         start = end - exposure
         slack = _OVERLAP * exposure
         oldest = float(self._filter.samples[self._oldest]['time'])
@@ -381,6 +398,15 @@ class Observer:
         the estimates of their rates are noise, and the load goes with the square of it.
         """
         return self._look()[2]
+
+    @property
+    def tip_force(self) -> tuple[float, float]:
+        """Estimate of the lateral force at the tip, and its standard deviation [N]."""
+        if not self._begun:
+            raise NeedleError('the observer has no estimate before the first encoder sample')
+        entry = len(self._jacobian)
+        variance = self._filter.covariances[self._slot, entry, entry]
+        return float(self._filter.states[self._slot, entry]), float(np.sqrt(variance))
 
     @property
     def nis(self) -> Consistency:

@@ -81,6 +81,12 @@ class ObserverSettings:
     initial_deflection: float = constant(
         1e-3, 'm', 'standard deviation of the tip deflection at the start', open_low=True
     )
+    tip_force: float = constant(
+        0.5, 'N', 'standard deviation of a lateral force at the tip, such as that of a bevel'
+    )
+    tip_force_time: float = constant(
+        1000.0, 's', 'time in which that force becomes another one', open_low=True
+    )
     tip_noise: float = constant(
         TipParameters().noise, 'm', 'standard deviation of a sample of the tip deflection',
         open_low=True,
@@ -88,12 +94,24 @@ class ObserverSettings:
     tip_exposure: float = constant(
         1e-3, 's', 'time before its stamp over which a tip sample is the mean', open_low=True
     )
+    tip_latency: float = constant(
+        0.0, 's', 'time from the end of the exposure to the stamp of a tip sample', high=1.0
+    )
     force_noise: float = constant(
         _read_noise(2, 6), 'N', 'standard deviation of the lateral force as it is read',
         open_low=True,
     )  # fmt: skip
     torque_noise: float = constant(
         _read_noise(3, 8), 'N m', 'standard deviation of the moment as it is read', open_low=True
+    )
+    force_offset: float = constant(
+        0.01, 'N', 'standard deviation of the offset of the lateral force as it is read'
+    )
+    torque_offset: float = constant(
+        1e-3, 'N m', 'standard deviation of the offset of the moment as it is read'
+    )
+    offset_time: float = constant(
+        1000.0, 's', 'time in which these offsets become others', open_low=True
     )
     force_resolution: float = constant(_of_sensor('resolution', 2), 'N', 'force per count')
     torque_resolution: float = constant(_of_sensor('resolution', 3), 'N m', 'torque per count')
@@ -109,7 +127,7 @@ class ObserverSettings:
         open_low=True,
     )  # fmt: skip
     history: float = constant(
-        0.25, 's', 'how far back a late tip sample may begin; longer gaps start anew',
+        0.3, 's', 'how far back a late tip sample may begin; longer gaps start anew',
         open_low=True, high=10.0,
     )  # fmt: skip
     jump: float = constant(
@@ -135,8 +153,15 @@ class ObserverSettings:
         # A count of the reading is uniform rounding.
         counts = self.force_resolution**2 / 12.0, self.torque_resolution**2 / 12.0
         white = (self.force_noise / gain) ** 2, (self.torque_noise / gain) ** 2
+        offsets = self.force_offset**2, self.torque_offset**2
         return Noise(
-            self.irregularity**2, self.initial_deflection**2, self.tip_noise**2, counts, white
+            self.irregularity**2,
+            self.initial_deflection**2,
+            self.tip_noise**2,
+            counts,
+            white,
+            (self.tip_force**2, *offsets),
+            (1.0 / self.tip_force_time, 1.0 / self.offset_time, 1.0 / self.offset_time),
         )
 
     def low_pass(self, ticks: int) -> LowPass:

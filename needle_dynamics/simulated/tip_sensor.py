@@ -60,23 +60,25 @@ class TipSensor:
     Raises
     ------
     ParameterError
-        If the plant's rate is not a whole multiple of the sensor's.
+        If the sensor is faster than the plant.
 
     """
 
     def __init__(self, parameters: TipParameters, rate: float, seed: int) -> None:
         self._noise = parameters.noise
-        self._every = round(rate / parameters.rate) if parameters.rate else 1
-        if parameters.rate and abs(self._every * parameters.rate - rate) > 1e-6 * rate:
+        #: Samples of the plant in one of the sensor; it ends with the nearest one of the plant.
+        self._every = rate / parameters.rate if parameters.rate else 1.0
+        if self._every < 1.0 - 1e-9:
             raise ParameterError(
-                f'tip.rate must divide the rate of the plant {rate:g} Hz, got '
+                f'tip.rate must be at most the rate of the plant {rate:g} Hz, got '
                 f'{parameters.rate:g} Hz'
             )
         # A message leaves with the first sample of the plant that is late enough.
         self._late = ceil(parameters.delay * rate * (1.0 - 1e-9))
         self._random = np.random.default_rng([seed, 1])
         self._sum = 0.0
-        self._count = 0
+        #: Samples of the plant, and of the sensor.
+        self._count = self._taken = 0
         self._waiting: deque[tuple[int, float, float]] = deque()
 
     def measure(self, depth: float, deflection: float) -> TipReading | None:
@@ -98,8 +100,9 @@ class TipSensor:
         """
         self._count += 1
         self._sum += deflection
-        if self._count % self._every == 0:
-            value = self._sum / self._every
+        if self._count >= round(self._taken * self._every + self._every):
+            value = self._sum / (self._count - round(self._taken * self._every))
+            self._taken += 1
             if self._noise:
                 value += self._noise * float(self._random.standard_normal())
             self._waiting.append((self._count, depth, value))

@@ -347,9 +347,12 @@ def test_noise_of_the_tip_is_of_the_size_asked_for_and_seeded() -> None:
     assert 0.33 < np.std(errors) < 0.67
 
 
-def test_a_rate_of_the_tip_that_does_not_divide_the_plants_is_refused() -> None:
-    """Its exposures would not end with samples of the plant."""
+def test_a_rate_of_the_tip_need_not_divide_that_of_the_plant() -> None:
+    """Each exposure ends with the nearest sample of the plant, and none is left out or twice."""
+    seen = [k for k, reading in enumerate(watched(rate=30.0), 1) if reading]
+    # 100 Hz: every 10/3 samples.
+    assert seen[:6] == [3, 7, 10, 13, 17, 20]
     with pytest.raises(
-        ParameterError, match=r'tip\.rate must divide the rate of the plant 100 Hz'
+        ParameterError, match=r'tip\.rate must be at most the rate of the plant 100 Hz'
     ):
-        watched(rate=30.0)
+        watched(rate=150.0)

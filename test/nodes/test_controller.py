@@ -146,7 +146,7 @@ class Bench:
         return self.commands[-1].wrench.force.y
 
 
-@pytest.mark.parametrize('law', ['inverse_dynamics', 'pid'])
+@pytest.mark.parametrize('law', ['adaptive', 'inverse_dynamics', 'pid'])
 @pytest.mark.parametrize('reference', ['trapezoid', 'minimum_jerk'])
 def test_reaches_the_target(ros_graph: RosGraph, law: str, reference: str) -> None:
     """Around the plant over DDS each law brings the needle to the target with each reference."""
@@ -230,16 +230,16 @@ def test_a_target_out_of_reach_is_refused(ros_graph: RosGraph) -> None:
 def test_unstable_gains_refuse_the_transition(ros_graph: RosGraph) -> None:
     """Unstable gains leave the node unconfigured with the reason."""
     controller = ros_graph.add(
-        ControllerNode, start=False, parameters={'inverse_dynamics.insertion.kv': 3000.0}
+        ControllerNode, start=False, parameters={'adaptive.insertion.kv': 3000.0}
     )
     assert not controller.start()
-    assert 'inverse_dynamics.insertion gains are unstable at 1000 Hz' in controller.failure
+    assert 'adaptive.insertion gains are unstable at 1000 Hz' in controller.failure
     assert not controller.is_active
 
 
 def test_unstable_gains_end_the_process(ros_graph: RosGraph) -> None:
     """Run on its own it says so in one line and exits with 2."""
-    controller = ros_graph.start('controller', {'inverse_dynamics.insertion.kv': 3000.0})
+    controller = ros_graph.start('controller', {'adaptive.insertion.kv': 3000.0})
     assert controller.process.wait(30) == 2
     assert 'are unstable' in controller.last_line
 
@@ -464,9 +464,9 @@ def test_switches_law_and_gains_in_motion_without_a_bump(ros_graph: RosGraph) ->
 @pytest.mark.parametrize(
     ('name', 'value', 'reason'),
     [
-        ('inverse_dynamics.insertion.kv', 3000.0, 'are unstable'),
+        ('adaptive.insertion.kv', 3000.0, 'are unstable'),
         ('pid.insertion.kp', [1.0, 2.0], 'must be a number'),
-        ('law', 'bang_bang', 'law must be one of inverse_dynamics, pid'),
+        ('law', 'bang_bang', 'law must be one of adaptive, inverse_dynamics, pid'),
         ('retract_depth', 0.5, 'retract_depth must be in [0.001, 0.2] m'),
     ],
 )
