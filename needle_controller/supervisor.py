@@ -17,7 +17,7 @@ from needle_controller.safety.following import Following
 from needle_controller.safety.limits import SafetyLimits
 from needle_controller.safety.safety import Safety
 from needle_controller.safety.stream import REPEATED
-from needle_dynamics import NeedleModel, NeedleParameters
+from needle_dynamics import euler_loads, NeedleModel, NeedleParameters
 from needle_ros.errors import NeedleError, ParameterError
 from needle_ros.timing import NANOSECONDS
 from needle_ros.trajectories import joint_values
@@ -558,6 +558,13 @@ class Supervisor:
             self.fault = None
             self.journal.say(Severity.INFO, kind='recovery')
         force, torque, limits = command.force, command.torque, controller.settings
+        most = euler_loads(controller.parameters, max(measured.depth, 0.0)).pinned
+        if force > most:
+            self._warn(
+                'buckling',
+                f"{force:.3g} N is more than Euler's load {most:.3g} N of the part outside of the "
+                'tissue: without a guide it buckles; lower force_limit',
+            )
         full = abs(force) >= limits.force_limit or abs(torque) >= limits.torque_limit
         safety.saturation.add(stamp, full)
         return self._command(Answer(stamp, force, torque, aim[:2], error))

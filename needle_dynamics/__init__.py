@@ -11,6 +11,7 @@ from needle_ros.lazy import lazy_names
 if TYPE_CHECKING:
     from needle_dynamics.analysis import Analysis, analyze
     from needle_dynamics.arrays import FloatArray
+    from needle_dynamics.buckling import euler_loads, EulerLoads
     from needle_dynamics.compiled.friction import FRICTION_LAWS
     from needle_dynamics.compiled.integrals import ModeIntegrals
     from needle_dynamics.errors import InsertedLengthError, ToleranceError
@@ -36,6 +37,7 @@ __all__ = [
     'PRESETS',
     'Analysis',
     'Batch',
+    'EulerLoads',
     'FloatArray',
     'ForceSensor',
     'ForceSensorParameters',
@@ -59,6 +61,7 @@ __all__ = [
     'ToleranceError',
     'Trajectory',
     'analyze',
+    'euler_loads',
     'linearize',
     'mode_shapes',
     'operating_point',

@@ -357,3 +357,16 @@ def test_nothing_is_said_twice_in_a_second() -> None:
     assert said == ['line 0', 'line 2', 'line 4', 'another', 'always']
     assert not journal.changed
     assert journal.take() == []
+
+
+def test_a_push_beyond_eulers_load_is_warned_of() -> None:
+    """Almost the whole needle is outside, and something holds it: it buckles at 13 N."""
+    loop = Loop()
+    loop.depth = 0.002
+    loop.supervisor.target(0, '', 0.1, 0.0, loop.now)
+    said = []
+    for _ in range(400):
+        loop.measure()
+        said += loop.said()
+    (line,) = (one for one in said if 'Euler' in one)
+    assert "is more than Euler's load 13.2 N of the part outside" in line

@@ -1,0 +1,69 @@
+"""Euler's load of the part of the needle outside of the tissue."""
+
+from __future__ import annotations
+
+from math import inf, pi
+from typing import Final, NamedTuple
+
+from needle_dynamics.errors import InsertedLengthError
+from needle_dynamics.parameters import NeedleParameters
+
+#: First root of tan(x) = x: a column that is clamped at one end and pinned at the other.
+_PINNED: Final = 4.493409457909064
+
+
+class EulerLoads(NamedTuple):
+    """
+    Axial forces at which the part outside buckles, clamped at the base [N].
+
+    Attributes
+    ----------
+    free : float
+        With a free end, as before the tip has entered.
+    pinned : float
+        Pinned at the entry, which may turn there but not move sideways.
+
+    """
+
+    free: float
+    pinned: float
+
+
+def euler_loads(parameters: NeedleParameters, depth: float) -> EulerLoads:
+    """
+    Return Euler's loads of the part of the needle outside of the tissue.
+
+    A guide that holds the needle in between shortens the part that can buckle; it is not modeled.
+
+    Parameters
+    ----------
+    parameters : NeedleParameters
+        The needle.
+    depth : float
+        Inserted length [m].
+
+    Returns
+    -------
+    EulerLoads
+        Both loads [N]; infinite if nothing is outside.
+
+    Raises
+    ------
+    InsertedLengthError
+        If the inserted length is negative or not finite.
+
+    Examples
+    --------
+    >>> from needle_dynamics import euler_loads, NeedleParameters
+    >>> loads = euler_loads(NeedleParameters.preset('phantom'), 0.02)
+    >>> print(f'{loads.free:.1f} N, {loads.pinned:.1f} N')
+    1.9 N, 16.0 N
+
+    """
+    if not 0.0 <= depth < inf:
+        raise InsertedLengthError(f'inserted length must be finite and >= 0, got {depth!r} m')
+    outside = parameters.length - depth
+    if outside <= 0.0:
+        return EulerLoads(inf, inf)
+    stiffness = parameters.bending_stiffness / outside**2
+    return EulerLoads(0.25 * pi**2 * stiffness, _PINNED**2 * stiffness)
