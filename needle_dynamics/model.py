@@ -10,6 +10,7 @@ final form, which leaves out the row of d and what comes from dG/dt.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from math import isfinite
@@ -181,12 +182,14 @@ class NeedleModel:
         held = tissue.growth(time) * (tissue.stiffnesses[layer] * at.gram + above)
         return np.asarray(self.parameters.bending_stiffness * at.curvature_gram + held)
 
-    def state_at(self, depth: float, tip_deflection: float = 0.0) -> FloatArray:
+    def state_at(
+        self, depth: float, tip_deflection: float = 0.0, modal: Sequence[float] = ()
+    ) -> FloatArray:
         """
-        Return the state at rest with a given inserted length and tip deflection.
+        Return the state at rest with a given inserted length and tip deflection or shape.
 
-        The shape is the one a lateral force at the tip would hold: the least elastic energy
-        for that deflection. (The source gives the deflection of the tip alone.)
+        With a tip deflection the shape is the one a lateral force at the tip would hold: the least
+        elastic energy for that deflection. (The source gives the deflection of the tip alone.)
 
         Parameters
         ----------
@@ -194,6 +197,8 @@ class NeedleModel:
             Inserted length s [m].
         tip_deflection : float
             w(s) [m].
+        modal : sequence of float, shape (n,) or (0,)
+            q1 to qn [m^3/2], instead of a tip deflection.
 
         Returns
         -------
@@ -205,12 +210,24 @@ class NeedleModel:
         InsertedLengthError
             If ``depth`` is outside its range.
         ShapeError
-            If a number is not finite.
+            If a number is not finite, or the number of modal coordinates is another one.
+        ParameterError
+            If both a tip deflection and modal coordinates are given.
 
         """
         state = np.zeros(2 * self.coordinates)
         state[0] = self.parameters.length - depth
         state = self.checked_state(state)
+        if len(modal):
+            if len(modal) != self.modes.count:
+                raise ShapeError(f'modal must have {self.modes.count} numbers, got {modal!r}')
+            if tip_deflection != 0.0:
+                raise ParameterError(
+                    'modal and tip_deflection are two ways to say the same: '
+                    f'one must be empty or 0, got {modal!r} and {tip_deflection!r} m'
+                )
+            state[2 : self.coordinates] = modal
+            return self.checked_state(state)
         at = self.modes.integrals(depth)
         shape = np.linalg.solve(self._stiffness(at, depth, 0.0), at.value)
         state[2 : self.coordinates] = shape * (tip_deflection / (at.value @ shape))

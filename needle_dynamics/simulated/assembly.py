@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, field, fields
 from typing import Any, Final
 
 from needle_dynamics.model import NeedleModel
@@ -40,6 +40,10 @@ class PlantSettings:
     tip_deflection: float = constant(
         0.0, 'm', 'deflection of the tip at the start', low=-0.1, high=0.1
     )
+    modal: tuple[float, ...] = field(
+        default=(),
+        metadata={'description': 'q1 to qn at the start [m^3/2], instead of tip_deflection'},
+    )
     step: float = constant(2e-5, 's', 'longest step of the integrator', low=1e-7, high=1e-2)
     command_timeout: float = constant(
         0.1, 's', 'age at which a command no longer counts', open_low=True
@@ -52,6 +56,11 @@ class PlantSettings:
 
     def __post_init__(self) -> None:
         check_constants(self)
+        try:
+            modal = tuple(float(value) for value in self.modal)
+        except (TypeError, ValueError):
+            raise ParameterError(f'modal must be numbers, got {self.modal!r}') from None
+        object.__setattr__(self, 'modal', modal)
 
 
 #: Parameters by namespace, as settings with their default values.
@@ -158,7 +167,7 @@ class PlantConstants:
         tip = TipSensor(self.tip, rate, self.seed)
         if self.mode == 'indenter':
             return Indenter(self.indenter, sensor, rate, self.seed, own.force_limit)
-        state = NeedleModel(self.model).state_at(own.depth, own.tip_deflection)
+        state = NeedleModel(self.model).state_at(own.depth, own.tip_deflection, own.modal)
         base = None
         if self.mode == 'robot':
             depths = self.model.minimum_depth, self.model.length

@@ -6,6 +6,7 @@ import argparse
 import json
 from pathlib import Path
 import sys
+from typing import Final
 
 from needle_dynamics import NeedleModel, NeedleParameters, PRESETS, simulate
 from needle_dynamics.simulated.integrator import DEFAULT_TOLERANCE
@@ -14,13 +15,15 @@ from needle_insertion.report import trajectory as report
 from needle_insertion.report.text import table
 from needle_ros.errors import ParameterError
 
+#: Deflection of the tip at the start by default [m], that of section 3.2.8.
+_DEFLECTION: Final = 5e-4
+
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of `needle simulate`."""
     add_needle(parser, PRESETS, 'paper_si')
     for name, default, unit, words in (
         ('depth', 0.02, 'm', 'inserted length at the start'),
-        ('tip-deflection', 5e-4, 'm', 'at the start'),
         ('force', 3.0, 'N', 'insertion force'),
         ('duration', 0.05, 's', 'time to simulate'),
         ('interval', 1e-4, 's', 'time between samples'),
@@ -33,6 +36,20 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
             metavar=unit,
             help=f'{words} (default {default:g})',
         )
+    start = parser.add_mutually_exclusive_group()
+    start.add_argument(
+        '--tip-deflection',
+        type=float,
+        metavar='m',
+        help=f'at the start, with the least elastic energy (default {_DEFLECTION:g})',
+    )
+    start.add_argument(
+        '--modal',
+        type=float,
+        nargs='+',
+        metavar='Q',
+        help='modal coordinates q1 to qn at the start [m^3/2], instead of a tip deflection',
+    )
     parser.add_argument(
         '-o',
         '--output',
@@ -53,9 +70,12 @@ def _run(options: argparse.Namespace) -> int:
             raise ParameterError(f'{path}: a bag must not exist')
         check_file(path)
     parameters = NeedleParameters.preset(options.preset, **constants(options.set))
+    modal = options.modal or ()
+    given = options.tip_deflection
+    deflection = given if given is not None else 0.0 if modal else _DEFLECTION
     trajectory = simulate(
         parameters,
-        NeedleModel(parameters).state_at(options.depth, options.tip_deflection),
+        NeedleModel(parameters).state_at(options.depth, deflection, modal),
         options.force,
         duration=options.duration,
         interval=options.interval,

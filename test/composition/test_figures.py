@@ -142,3 +142,21 @@ def test_the_section_compares_the_controllers() -> None:
     assert len(rows) == 8
     assert all(len(row) == len(found.tables[0].heads) for row in rows)
     assert '0.56 mm = mu_s / k_p' in found.paragraphs[2]
+
+
+@pytest.mark.parametrize(('law', 'peak'), [('inverse_dynamics', 16.0), ('pid', 4.87)])
+def test_peaks_depend_on_the_shape_at_the_start(law: str, peak: float) -> None:
+    """From mode 1 alone, with the same deflection, they are less than half as large."""
+    model = needle('paper_mm', 'complete', hub_stop=False)
+    first = DEFLECTION / model.modes.integrals(DEPTH).value[0]
+    run = run_continuous(
+        paper_law(law, model),
+        model,
+        model.state_at(DEPTH, modal=(first, 0.0)),
+        np.zeros((3, 4)),
+        np.linspace(0.0, 20.0, 5001),
+        method='Radau' if law == 'pid' else 'DOP853',
+    )
+    assert 1e3 * np.abs(run.tip_deflection).max() == pytest.approx(peak, rel=0.01)
+    least_energy = abs(Outcome.of(closed_loop(law, 'paper_mm', 'complete', hub_stop=False)).peak)
+    assert 1e3 * least_energy > 2.0 * peak

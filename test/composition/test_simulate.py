@@ -102,3 +102,19 @@ def test_the_contact_of_the_hub_is_named(capsys: pytest.CaptureFixture[str]) -> 
     assert 0.0 < json.loads(capsys.readouterr().out)[name] < 0.05
     assert main([*SHORT, '--json']) == 0
     assert name not in json.loads(capsys.readouterr().out)
+
+
+def test_a_run_may_start_from_modal_coordinates(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """q1 and q2 as given, instead of a deflection; not both, and not another number of them."""
+    assert main([*SHORT, '--modal', '1e-5', '-2e-6', '-o', str(tmp_path / 'run.csv')]) == 0
+    with (tmp_path / 'run.csv').open() as file:
+        first = list(csv.reader(file))[1]
+    assert [float(value) for value in first[3:5]] == [1e-5, -2e-6]
+    capsys.readouterr()
+    assert main([*SHORT, '--modal', '1e-5']) == 2
+    assert 'modal must have 2 numbers' in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        main([*SHORT, '--modal', '1e-5', '0', '--tip-deflection', '1e-3'])
+    assert 'not allowed with argument' in capsys.readouterr().err

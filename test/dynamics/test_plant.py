@@ -18,6 +18,7 @@ from needle_dynamics import (
     PRESETS,
     ShapeError,
 )
+from needle_dynamics.simulated.assembly import PlantConstants
 from needle_dynamics.simulated.base import BaseMotion, BaseParameters
 from needle_dynamics.simulated.plant import Plant, Sample
 from needle_dynamics.simulated.tip_sensor import TipParameters, TipReading, TipSensor
@@ -356,3 +357,14 @@ def test_a_rate_of_the_tip_need_not_divide_that_of_the_plant() -> None:
         ParameterError, match=r'tip\.rate must be at most the rate of the plant 100 Hz'
     ):
         watched(rate=150.0)
+
+
+def test_a_plant_may_start_from_modal_coordinates() -> None:
+    """As its parameter says; a deflection beside them, or no numbers, are refused."""
+    plant = PlantConstants.of({'modal': [1e-5, 2e-6]}).make()
+    assert isinstance(plant, Plant)
+    assert plant.integrator.state[2:4].tolist() == [1e-5, 2e-6]
+    with pytest.raises(ParameterError, match='modal and tip_deflection are two ways'):
+        PlantConstants.of({'modal': [1e-5, 2e-6], 'tip_deflection': 1e-3}).make()
+    with pytest.raises(ParameterError, match='modal must be numbers'):
+        PlantConstants.of({'modal': ['one', 'two']})
