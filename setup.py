@@ -1,6 +1,7 @@
 """Package needle_insertion for pip and for ament; package.xml holds name and version."""
 
 from pathlib import Path
+import runpy
 import xml.etree.ElementTree as ET
 
 from setuptools import find_packages, setup
@@ -9,13 +10,7 @@ from setuptools import find_packages, setup
 ROOT = Path(__file__).resolve().parent
 MANIFEST = ET.parse(ROOT / 'package.xml').getroot()  # noqa: S314
 NAME = MANIFEST.findtext('name')
-NODES = {
-    'plant': 'needle_dynamics.plant_node',
-    'controller': 'needle_controller.controller_node',
-    'identification': 'needle_identification.identification_node',
-    'recorder': 'needle_identification.recorder_node',
-    'player': 'needle_identification.player_node',
-}
+NODES = runpy.run_path(str(ROOT / 'needle_insertion/nodes.py'))['NODES']
 TEST = ['hypothesis>=6.100', 'lxml>=5.0', 'mpmath>=1.3', 'pytest>=8.0', 'sympy>=1.12']
 
 
@@ -89,7 +84,7 @@ setup(
     entry_points={
         'console_scripts': [
             'needle = needle_insertion.cli:main',
-            *(f'needle-{node} = {module}:main' for node, module in NODES.items()),
+            *(f'needle-{node} = needle_insertion.nodes:main' for node in NODES),
         ]
     },
     zip_safe=False,

@@ -10,9 +10,12 @@ from typing import Final
 from benchmarks.measure import Bar, least_times
 from benchmarks.page import Answer, Section, Tick
 from needle_controller import (
+    Adaptive,
+    AdaptiveGains,
     Axis,
     InverseDynamics,
     InverseDynamicsGains,
+    Law,
     Observer,
     ObserverSettings,
     Pid,
@@ -21,7 +24,6 @@ from needle_controller import (
     Setpoint,
 )
 from needle_dynamics import FloatArray, NeedleParameters
-from needle_insertion.paper.mismatch import sampled_laws
 import numpy as np
 
 #: Sample period [s], delay in periods, and the bar for a whole law with the observer [s].
@@ -116,10 +118,11 @@ def jobs() -> dict[str, Callable[[], object]]:
         return observer.load
 
     found: dict[str, Callable[[], object]] = {}
-    laws = sampled_laws(parameters, PERIOD)
-    for name, law in ((name, laws[name]) for name in ('inverse_dynamics', 'pid')):
+    along = _laws(Axis.insertion(parameters), PidGains())
+    around = _laws(Axis.rotation(parameters), PidGains(kp=1e-6, ki=1e-6, kd=1e-8))
+    for name, law in along.items():
         loop = SampledLoop(law, DELAY, _LIMIT)
-        rotation = _sampled_loop(Axis.rotation(parameters), name)
+        rotation = SampledLoop(around[name], DELAY, inf)
 
         def physical(
             loop: SampledLoop = loop, rotation: SampledLoop = rotation, load: float = 0.0
@@ -141,14 +144,15 @@ def _observed(physical: Callable[..., float], observe: Callable[[], float]) -> C
     return lambda: physical(load=observe())
 
 
-def _sampled_loop(axis: Axis, name: str) -> SampledLoop:
-    """Return the loop of a law on an axis with little inertia and no friction."""
-    law = (
-        InverseDynamics(axis=axis, gains=InverseDynamicsGains(), period=PERIOD)
-        if name == 'inverse_dynamics'
-        else Pid(axis=axis, gains=PidGains(kp=1e-6, ki=1e-6, kd=1e-8), period=PERIOD)
-    )
-    return SampledLoop(law, DELAY, inf)
+def _laws(axis: Axis, pid: PidGains) -> dict[str, Law]:
+    """Return the laws of an axis by name; only the gains of PID depend on the axis."""
+    return {
+        'adaptive': Adaptive(axis=axis, gains=AdaptiveGains(), period=PERIOD),
+        'inverse_dynamics': InverseDynamics(
+            axis=axis, gains=InverseDynamicsGains(), period=PERIOD
+        ),
+        'pid': Pid(axis=axis, gains=pid, period=PERIOD),
+    }
 
 
 def compare(tick: Tick) -> Answer:
@@ -196,6 +200,6 @@ def compare(tick: Tick) -> Answer:
     )
     bars = [
         Bar(f'{name}, with observer', 1e6 * times[f'{name}, with observer'], 1e6 * BUDGET, 'us')
-        for name in ('inverse_dynamics', 'pid')
+        for name in ('adaptive', 'inverse_dynamics', 'pid')
     ]
     return [section], bars

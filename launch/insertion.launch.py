@@ -1,29 +1,57 @@
 """Plant and controller, and optionally a recorder and RViz."""
 
+import os
+from pathlib import Path
+import signal
+
+from ament_index_python.packages import get_package_share_directory, PackageNotFoundError
 from launch import LaunchContext, LaunchDescription
-from launch.actions import DeclareLaunchArgument, OpaqueFunction, SetEnvironmentVariable
-from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
+from launch.action import Action
+from launch.actions import (
+    DeclareLaunchArgument,
+    OpaqueFunction,
+    SetEnvironmentVariable,
+    Shutdown,
+)
+from launch.events.process import ProcessExited
+from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
-from launch_ros.substitutions import FindPackageShare
 import yaml
 
-#: Default and meaning of each argument; an empty one leaves the value of the parameter file.
+#: Default, meaning and values of each argument; an empty one leaves the value of the parameter
+#: file. Without a list of values all are allowed.
 ARGUMENTS = {
-    'params_file': ('', 'ROS parameter file; empty: config/insertion.yaml of this package'),
+    'params_file': ('', 'ROS parameter file; empty: config/insertion.yaml of this package', []),
     'mode': (
         '',
-        'mode of the plant: simulation, robot or indenter; the controller runs only in simulation',
+        'mode of the plant; the controller runs only in simulation',
+        ['', 'simulation', 'robot', 'indenter'],
     ),
     'preset': (
         '',
-        'constants of the model in plant and controller: phantom, paper_si or paper_mm',
+        'constants of the model in plant and controller',
+        ['', 'phantom', 'paper_si', 'paper_mm'],
     ),
-    'law': ('', 'law of the controller: adaptive, inverse_dynamics or pid'),
-    'lockstep': ('', 'true: each sample waits for the command that answers the sample before'),
-    'real_time_factor': ('', 'simulated seconds per second; 0: as fast as possible'),
-    'bag': ('', 'folder to record to; empty: no recording'),
-    'rviz': ('false', 'true: show the needle in RViz, which must be installed'),
-    'discovery': ('LOCALHOST', 'which nodes may join: LOCALHOST, SUBNET, OFF or SYSTEM_DEFAULT'),
+    'law': ('', 'law of the controller', ['', 'adaptive', 'inverse_dynamics', 'pid']),
+    'lockstep': (
+        '',
+        'each sample waits for the command that answers the sample before',
+        ['', 'true', 'false'],
+    ),
+    'real_time_factor': ('', 'simulated seconds per second; 0: as fast as possible', []),
+    'use_sim_time': (
+        '',
+        'controller and recorder take their time from /clock',
+        ['', 'true', 'false'],
+    ),
+    'namespace': ('', 'namespace of all nodes', []),
+    'bag': ('', 'folder to record to; empty: no recording', []),
+    'rviz': ('false', 'show the needle in RViz, which must be installed', ['true', 'false']),
+    'discovery': (
+        '',
+        'which nodes may join; empty: ROS_AUTOMATIC_DISCOVERY_RANGE, or LOCALHOST without it',
+        ['', 'LOCALHOST', 'SUBNET', 'OFF', 'SYSTEM_DEFAULT'],
+    ),
 }
 
 #: Parameters that arguments set, by node.
@@ -34,15 +62,39 @@ PARAMETERS = {
         'lockstep': 'lockstep',
         'real_time_factor': 'real_time_factor',
     },
-    'controller': {'preset': 'model.preset', 'law': 'law'},
-    'recorder': {'bag': 'path'},
+    'controller': {'preset': 'model.preset', 'law': 'law', 'use_sim_time': 'use_sim_time'},
+    'recorder': {'bag': 'path', 'use_sim_time': 'use_sim_time'},
 }
 
 
-def start(context: LaunchContext) -> list[Node]:
-    """Return the nodes that the arguments ask for."""
+def ended(event: ProcessExited, context: LaunchContext) -> Action | None:
+    """End the others with a node; a node that failed makes launch fail."""
+    if context.is_shutdown:
+        return None
+    reason = f'{event.process_name} has ended with exit code {event.returncode}'
+    if event.returncode:
+        raise RuntimeError(f'{reason}; its log says why. All nodes are ended')
+    return Shutdown(reason=reason)
+
+
+def share(package: str, why: str) -> Path:
+    """Return the share of a package, or say that it is needed."""
+    try:
+        return Path(get_package_share_directory(package))
+    except PackageNotFoundError:
+        raise RuntimeError(f'{why} needs the package {package}, which is not installed') from None
+
+
+def start(context: LaunchContext) -> list[Action]:
+    """Return what the arguments ask for, or refuse it before any node has started."""
+    # A terminal that is closed ends launch; the nodes shall end with it.
+    signal.signal(signal.SIGHUP, lambda *_: os.kill(os.getpid(), signal.SIGINT))
     given = {name: LaunchConfiguration(name).perform(context) for name in ARGUMENTS}
-    config = PathJoinSubstitution([FindPackageShare('needle_insertion'), 'config'])
+    config = share('needle_insertion', 'this launch file') / 'config'
+    file = Path(given['params_file']).expanduser() if given['params_file'] else None
+    file = file or config / 'insertion.yaml'
+    if not file.is_file():
+        raise RuntimeError(f'params_file {file} does not exist')
     values = {
         # Typed as in a parameter file.
         node: {key: yaml.safe_load(given[name]) for name, key in table.items() if given[name]}
@@ -53,18 +105,31 @@ def start(context: LaunchContext) -> list[Node]:
         names.append('controller')
     if given['bag']:
         names.append('recorder')
+        values['recorder']['path'] = str(Path(given['bag']).expanduser())
     if values['plant'].get('lockstep') or given['real_time_factor']:
         values['plant']['publish_clock'] = True
-        values['controller']['use_sim_time'] = True
-    file = given['params_file'] or PathJoinSubstitution([config, 'insertion.yaml'])
+        values['controller'].setdefault('use_sim_time', True)
+    common = {
+        'namespace': given['namespace'],
+        'on_exit': ended,
+        # On SIGTERM launch leaves its nodes behind.
+        'additional_env': {'NEEDLE_END_WITH_PARENT': '1'},
+    }
     nodes = [
-        Node(package='needle_insertion', executable=name, parameters=[file, values[name]])
+        Node(
+            package='needle_insertion',
+            executable=name,
+            parameters=[str(file), values[name]],
+            **common,
+        )
         for name in names
     ]
-    if yaml.safe_load(given['rviz']):
-        layout = PathJoinSubstitution([config, 'insertion.rviz'])
-        nodes.append(Node(package='rviz2', executable='rviz2', arguments=['-d', layout]))
-    return nodes
+    if given['rviz'] == 'true':
+        share('rviz2', 'rviz:=true')
+        layout = str(config / 'insertion.rviz')
+        nodes.append(Node(package='rviz2', executable='rviz2', arguments=['-d', layout], **common))
+    reach = given['discovery'] or os.environ.get('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+    return [SetEnvironmentVariable('ROS_AUTOMATIC_DISCOVERY_RANGE', reach), *nodes]
 
 
 def generate_launch_description() -> LaunchDescription:
@@ -72,11 +137,10 @@ def generate_launch_description() -> LaunchDescription:
     return LaunchDescription(
         [
             *(
-                DeclareLaunchArgument(name, default_value=default, description=meaning)
-                for name, (default, meaning) in ARGUMENTS.items()
-            ),
-            SetEnvironmentVariable(
-                'ROS_AUTOMATIC_DISCOVERY_RANGE', LaunchConfiguration('discovery')
+                DeclareLaunchArgument(
+                    name, default_value=default, description=meaning, choices=values or None
+                )
+                for name, (default, meaning, values) in ARGUMENTS.items()
             ),
             OpaqueFunction(function=start),
         ]

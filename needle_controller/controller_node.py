@@ -205,6 +205,15 @@ class ControllerNode(ModelNode):
             self._supervisor.watch_period, self._on_watchdog, clock=self._steady
         )
 
+    def about(self) -> str:
+        """Name law, constants, rate and topics."""
+        values = self.values()
+        return (
+            f'law {values["law"]}, preset {values["model.preset"]}, {values["rate"]:g} Hz, delay '
+            f'{values["delay"]:g}; takes {contract.TARGET.name}, {contract.JOINT_TRAJECTORY.name} '
+            f'and {contract.JOINT_STATES.name}, publishes {contract.WRENCH_COMMAND.name}'
+        )
+
     def deactivate(self) -> None:
         """Let go: zero force, and no memory of the motion nor of its target."""
         self._act(self._supervisor.deactivate(self.now()))

@@ -32,6 +32,7 @@ from rcl_interfaces.msg import IntegerRange, ParameterDescriptor
 from rclpy.clock import Clock as NodeClock
 from rclpy.clock_type import ClockType
 from rclpy.publisher import Publisher
+from rclpy.subscription import Subscription
 from rosgraph_msgs.msg import Clock
 from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import JointTrajectory
@@ -137,7 +138,7 @@ class PlantNode(ModelNode):
         self._clock_topic: Publisher | None = None
         self._commanders = Commanders(self)
         self.listen(contract.WRENCH_COMMAND, self._on_command)
-        self.subscribe(contract.JOINT_TRAJECTORY, self._on_trajectory)
+        self._trajectories: Subscription | None = None
         self.create_service(Trigger, '~/tare', self._on_tare)
         self.create_service(SetBool, '~/pause', self._on_pause)
         self.create_service(Trigger, '~/step', self._on_step)
@@ -193,6 +194,9 @@ class PlantNode(ModelNode):
         self._run = plant_run
         if publishes:
             self._clock_topic = self.publisher(contract.CLOCK, always=True)
+        if mode != 'simulation':
+            # There it is the reference of a controller.
+            self._trajectories = self.subscribe(contract.JOINT_TRAJECTORY, self._on_trajectory)
 
     @staticmethod
     def _write(
@@ -211,6 +215,9 @@ class PlantNode(ModelNode):
         if self._clock_topic is not None:
             self.destroy_publisher(self._clock_topic)
             self._clock_topic = None
+        if self._trajectories is not None:
+            self.destroy_subscription(self._trajectories)
+            self._trajectories = None
 
     def change(self, changes: Mapping[str, Any]) -> None:
         """Go on with other friction, or another fault; the state stays."""
@@ -244,6 +251,15 @@ class PlantNode(ModelNode):
         steady = NodeClock(clock_type=ClockType.STEADY_TIME)
         self._watch = self.create_timer(_WATCH, self._on_watch, clock=steady)
 
+    def about(self) -> str:
+        """Name mode, constants, rate and topics."""
+        values = self.values()
+        takes = contract.JOINT_TRAJECTORY if self._trajectories else contract.WRENCH_COMMAND
+        return (
+            f'mode {values["mode"]}, preset {values["model.preset"]}, {values["rate"]:g} Hz; '
+            f'takes {takes.name}, publishes {", ".join(self._publish)}'
+        )
+
     def deactivate(self) -> None:
         """Stop sampling."""
         self.destroy_timer(self._timer)
@@ -265,12 +281,6 @@ class PlantNode(ModelNode):
             self._on_timer()
 
     def _on_trajectory(self, message: JointTrajectory) -> None:
-        if (
-            self.get_parameter('mode').value == 'simulation'
-            and self.count_subscribers('joint_trajectory') > 1
-        ):
-            # It is the reference of a controller.
-            return
         try:
             if self._run is None:
                 raise ParameterError('the plant is not configured')

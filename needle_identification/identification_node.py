@@ -154,6 +154,12 @@ class IdentificationNode(BaseNode):
             )
             self._timer = self.create_timer(1.0, self._publish_live)
 
+    def about(self) -> str:
+        """Name what is identified, and how to ask for it."""
+        live = (contract.JOINT_STATES.name, contract.BASE_WRENCH.name) if self._is_live else ()
+        heard = f', and live from {" and ".join(live)}' if live else ''
+        return f'{self._what} from {len(self._bags)} recordings at ~/identify{heard}'
+
     def deactivate(self) -> None:
         """Stop listening."""
         if self._is_live:

@@ -178,6 +178,10 @@ class PlayerNode(BaseNode):
             self.create_timer(_LOOK, self._look, clock=steady),
         ]
 
+    def about(self) -> str:
+        """Name the recording and its topics."""
+        return f'plays {", ".join(sorted(self._outputs))} of {self._playback.bag.path}'
+
     def deactivate(self) -> None:
         """Stop playing; the messages published last still have to arrive."""
         for timer in self._timers_of_play:
@@ -243,7 +247,8 @@ class PlayerNode(BaseNode):
 
     def _show_time(self, position: int) -> None:
         """Publish a time of the recording on /clock if it is later than the last one."""
-        step = 1 if self._playback.is_paused else _CLOCK_PERIOD
+        # While it pauses the time is repeated, for nodes that join.
+        step = 0 if self._playback.is_paused else _CLOCK_PERIOD
         if self._clock_publisher is None or position - self._shown < step:
             return
         self._shown = position
@@ -291,6 +296,8 @@ class PlayerNode(BaseNode):
         for name in sorted(contested - self._contested):
             self.get_logger().warning(f'{name} has another publisher: its readers get both')
         self._contested = contested
+        if self._playback.is_paused:
+            self._show_time(self._playback.position)
 
     def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
         """Report the position in the recording, and delays."""

@@ -193,6 +193,18 @@ class BaseNode(LifecycleNode):
 
         """
 
+    def about(self) -> str:
+        """
+        Return what is said when the node has become active.
+
+        Returns
+        -------
+        str
+            What it works with, and the topics that count; ``''`` for nothing more.
+
+        """
+        return ''
+
     def deactivate(self) -> None:
         """Stop acting, and leave no force applied."""
 
@@ -571,8 +583,11 @@ class BaseNode(LifecycleNode):
         return self._attempt(configure, super().on_configure, state)
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Call `activate`; rclpy calls this."""
-        return self._attempt(self.activate, super().on_activate, state)
+        """Call `activate`, and say so; rclpy calls this."""
+        done = self._attempt(self.activate, super().on_activate, state)
+        if done == _SUCCESS:
+            self.get_logger().info(': '.join(filter(None, ('active', self.about()))))
+        return done
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Call `deactivate`; rclpy calls this."""

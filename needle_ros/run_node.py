@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import argparse
+from collections.abc import Callable, Sequence
 import ctypes
 import gc
+import inspect
 import os
+from pathlib import Path
 import signal
 import sys
+import textwrap
 import time
 from types import FrameType
 
@@ -19,6 +23,7 @@ from rclpy.exceptions import ParameterException
 from rclpy.executors import Executor
 from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.task import Future
+from rclpy.utilities import remove_ros_args
 
 #: Environment variable: if it is set, a node ends when the process that started it ends.
 END_WITH_PARENT = 'NEEDLE_END_WITH_PARENT'
@@ -28,49 +33,59 @@ _PR_SET_PDEATHSIG = 1
 #: What ends a node; SIGHUP comes when its terminal is closed.
 _ENDINGS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
+_USAGE = '%(prog)s [-h] [--ros-args [-p NAME:=VALUE ...] [--params-file FILE] ...]'
+_WIDTH, _DEEP = 99, 6 * ' '
 
-def run(kind: Callable[[], BaseNode], arguments: list[str] | None = None) -> int:
+
+def run(kind: Callable[[], BaseNode]) -> int:
     """
     Run one node until SIGINT, SIGTERM or SIGHUP, then deactivate it while it can still publish.
+
+    This is the whole life of a process: its signals are taken over for good.
 
     Parameters
     ----------
     kind : callable
         Makes the node.
-    arguments : list of str, optional
-        Command line with ROS arguments; ``sys.argv`` if not given.
 
     Returns
     -------
     int
         Exit status: 0, or 2 if the node refused to start.
 
-    """
-    stopping = False
+    Raises
+    ------
+    SystemExit
+        For a signal before the node runs, after ``--help`` and for unknown words.
 
-    def stop(_signal: int, _frame: FrameType | None) -> None:
+    """
+    stopping = spinning = False
+
+    def stop(_number: int, _frame: FrameType | None) -> None:
         nonlocal stopping
+        if not spinning:
+            # Nothing has been commanded yet, and compiling may take a minute.
+            raise SystemExit(0)
         stopping = True
 
     if os.environ.get(END_WITH_PARENT):
         # Linux sends the signal when the process that started this one ends, in whatever way.
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
-    try:
-        # Not rclpy's handlers: they end the context before the node can publish its last command.
-        rclpy.init(args=arguments, signal_handler_options=rclpy.signals.SignalHandlerOptions.NO)
-    except RuntimeError as error:
-        # rcl could not read the arguments or the parameter file.
-        sys.stderr.write(f'error: {" ".join(str(error).split())}\n')
-        return 2
-    previous = {one: signal.signal(one, stop) for one in _ENDINGS}
+    for one in _ENDINGS:
+        signal.signal(one, stop)
     try:
         try:
+            _check_words(kind, sys.argv)
+            # Not rclpy's handlers: they end the context before the node can publish its last
+            # command.
+            rclpy.init(signal_handler_options=rclpy.signals.SignalHandlerOptions.NO)
             node = kind()
         except (ParameterException, NeedleError, RuntimeError) as error:
-            # RuntimeError is rcl's, for a node that its security refuses.
+            # RuntimeError is rcl's, for arguments or a parameter file that it cannot read, and
+            # for a node that its security refuses.
             sys.stderr.write(f'error: {" ".join(str(error).split())}\n')
             return 2
-        found, name = sections(arguments or sys.argv), node.get_fully_qualified_name()
+        found, name = sections(sys.argv), node.get_fully_qualified_name()
         for line in strangers(found, name):
             node.get_logger().warning(line)
         node.shared = shared_names(found, name)
@@ -83,6 +98,7 @@ def run(kind: Callable[[], BaseNode], arguments: list[str] | None = None) -> int
             status = 2
         # A full collection takes 0.2 s: it shall not scan what was imported.
         gc.freeze()
+        spinning = True
         while not stopping and status == 0:
             # Unlike spin_once it does not return to Python at each event.
             executor.spin_until_future_complete(Future(), timeout_sec=0.1)
@@ -96,5 +112,41 @@ def run(kind: Callable[[], BaseNode], arguments: list[str] | None = None) -> int
         return status
     finally:
         rclpy.utilities.try_shutdown()
-        for one, handler in previous.items():
-            signal.signal(one, handler)
+        # A second Ctrl-C shall not change how the process ends.
+        for one in _ENDINGS:
+            signal.signal(one, signal.SIG_IGN)
+
+
+def _check_words(kind: Callable[[], BaseNode], words: Sequence[str]) -> None:
+    """Refuse words that are not for ROS, and answer ``--help``, by SystemExit."""
+    program, *others = remove_ros_args(list(words))
+    parser = argparse.ArgumentParser(Path(program).name, usage=_USAGE, add_help=False)
+    parser.add_argument('-h', '--help', action='store_true')
+    known, unknown = parser.parse_known_args(others)
+    if known.help:
+        summary, *_ = inspect.cleandoc(kind.__doc__ or '').split('\n\n')
+        parser.print_usage()
+        lines = [summary, '', 'Parameters, with their defaults:', *_parameters(kind)]
+        parser.exit(message='\n'.join(lines) + '\n')
+    if unknown:
+        parser.error(
+            f'unknown: {" ".join(unknown)}; parameters are given by --ros-args -p NAME:=VALUE'
+        )
+
+
+def _parameters(kind: Callable[[], BaseNode]) -> list[str]:
+    """Return what a node declares, in lines."""
+    # No other node may see this one: it would count as a rival.
+    os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'OFF'
+    os.environ.pop('ROS_STATIC_PEERS', None)
+    rclpy.init(args=[])
+    try:
+        node = kind()
+        lines = []
+        for name, value in node.values().items():
+            lines.append(f'  {name}: {value}')
+            meaning = node.describe_parameter(name).description
+            lines += textwrap.wrap(meaning, _WIDTH, initial_indent=_DEEP, subsequent_indent=_DEEP)
+        return lines
+    finally:
+        rclpy.utilities.try_shutdown()

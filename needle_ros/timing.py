@@ -6,6 +6,9 @@ from typing import Any, Final
 
 NANOSECONDS: Final = 1_000_000_000
 
+#: Two clocks of this machine are farther apart, two of the same kind are not [ns].
+_DAYS: Final = 10 * 24 * 3600 * NANOSECONDS
+
 
 def nanoseconds(time: Any) -> int:
     """
@@ -41,6 +44,26 @@ def seconds(time: Any) -> float:
 
     """
     return float(time.sec + time.nanosec / NANOSECONDS)
+
+
+def apart(age: int) -> str:
+    """
+    Say how far a stamp is from now.
+
+    Parameters
+    ----------
+    age : int
+        Now minus the stamp [ns].
+
+    Returns
+    -------
+    str
+        Its age; or that it is of another clock, if it is off by days.
+
+    """
+    if abs(age) > _DAYS:
+        return 'of another clock: use_sim_time must be alike in all nodes, with a /clock if true'
+    return f'{abs(age) / NANOSECONDS:.3f} s {"old" if age > 0 else "ahead"}'
 
 
 class RateCounter:

@@ -81,7 +81,9 @@ class Safety:
         }  # fmt: skip
         self._expected = expected
         self._back = round(settings.measurement_timeout * NANOSECONDS)
-        self._seen = self._begun = 0
+        self._seen = 0
+        #: Since when the encoders have come without a gap [ns]; at 0 there is no /clock yet.
+        self._begun: int | None = None
         self._stale: set[str] = set()
 
     def begin(self, now: int) -> None:
@@ -94,7 +96,7 @@ class Safety:
             Time [ns].
 
         """
-        self._seen = self._begun = now
+        self._seen, self._begun = now, now or None
         self._stale.clear()
         for stream in self.streams.values():
             stream.forget()
@@ -184,10 +186,11 @@ class Safety:
         """Return a line for each expected topic that is silent while the encoders are not."""
         joints = self.streams['joint_states']
         if joints.counted is None or now - joints.counted > joints.timeout:
-            self._begun = now
+            self._begun = now or None
             return {}
+        begun = self._begun = self._begun or joints.counted
         silences = {
-            name: (now - max(self.streams[name].counted or 0, self._begun)) / NANOSECONDS
+            name: (now - max(self.streams[name].counted or 0, begun)) / NANOSECONDS
             for name in self._expected
         }
         return {

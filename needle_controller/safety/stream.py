@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from math import isfinite
 from typing import Final, NamedTuple
 
-from needle_ros.timing import NANOSECONDS, RateCounter
+from needle_ros.timing import apart, NANOSECONDS, RateCounter
 
 #: Kinds of messages that do not count and do no harm.
 REPEATED: Final = 'repeated'
@@ -138,8 +138,7 @@ class Stream:
         if abs(age) > self.timeout:
             if stamp == 0:
                 return Refusal('not stamped', f'{self.name} is stale: it is not stamped')
-            when = f'{abs(age) / NANOSECONDS:.3f} s {"old" if age > 0 else "ahead"}'
-            return Refusal('stale', f'{self.name} is stale: its stamp is {when}')
+            return Refusal('stale', f'{self.name} is stale: its stamp is {apart(age)}')
         if stamp == self.last:
             return Refusal(REPEATED, f'{self.name} came twice')
         if stamp < self.last:

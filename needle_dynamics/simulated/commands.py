@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from needle_ros.contract import BASE
-from needle_ros.timing import NANOSECONDS
+from needle_ros.timing import apart, NANOSECONDS
 
 
 class Command(NamedTuple):
@@ -110,7 +110,7 @@ class Commands:
         if abs(age) > self._timeout:
             self.stale += 1
             return False, (
-                f'command ignored, it is {age / NANOSECONDS:.3f} s old: command_timeout is '
+                f'command ignored, its stamp is {apart(age)}: command_timeout is '
                 f'{self._timeout / NANOSECONDS:g} s'
             )
         # A newest one from the future is of the time before the clock was set back.

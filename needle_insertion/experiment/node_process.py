@@ -9,17 +9,9 @@ import subprocess
 import sys
 from typing import IO
 
+from needle_insertion.nodes import NODES
 from needle_ros.errors import JobError
 import yaml
-
-#: Modules of the nodes by name.
-MODULES: Mapping[str, str] = {
-    'plant': 'needle_dynamics.plant_node',
-    'controller': 'needle_controller.controller_node',
-    'identification': 'needle_identification.identification_node',
-    'player': 'needle_identification.player_node',
-    'recorder': 'needle_identification.recorder_node',
-}
 
 
 class GraphError(JobError):
@@ -33,7 +25,7 @@ class NodeProcess:
     Parameters
     ----------
     name : str
-        A key of `MODULES`.
+        A key of `NODES`.
     parameters : Mapping[str, object]
         Parameters by name.
     environment : Mapping[str, str]
@@ -59,7 +51,7 @@ class NodeProcess:
             text = yaml.safe_dump(value, default_flow_style=True, width=10_000).splitlines()[0]
             settings += ['-p', f'{key}:={text}']
         self.process = subprocess.Popen(
-            [sys.executable, '-m', MODULES[name], '--ros-args', *settings],
+            [sys.executable, '-m', NODES[name], '--ros-args', *settings],
             env=dict(environment),
             stdout=log,
             stderr=subprocess.STDOUT,

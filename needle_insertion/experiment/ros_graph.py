@@ -182,7 +182,7 @@ class Graph:
         Parameters
         ----------
         name : str
-            A key of `MODULES`.
+            A key of `NODES`.
         parameters : Mapping[str, object], optional
             Parameters by name.
 

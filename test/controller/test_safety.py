@@ -236,11 +236,22 @@ def test_sensors_are_missed_while_the_encoders_speak() -> None:
     assert whole.news(now + 9 * SECOND) == []
 
 
+def test_silence_does_not_count_from_before_the_clock() -> None:
+    """A node with simulated time is at 0 before the first /clock."""
+    whole = safety(expected=('base_wrench',), sensor_timeout=0.5)
+    whole.begin(0)
+    assert whole.news(0) == []
+    now = 1_795_193_306 * SECOND
+    whole.streams['joint_states'].check(now, now)
+    assert whole.news(now) == []
+
+
 def test_a_stop_for_want_of_sensors_is_kept_while_they_are_missing() -> None:
     """With `sensors_required` clearing is refused until they are back."""
     whole = safety(expected=('base_wrench',), sensor_timeout=0.5, sensors_required=True)
     joints, wrench = (whole.streams[name] for name in ('joint_states', 'base_wrench'))
     now = 11 * SECOND
+    whole.begin(now)
     joints.check(now, now)
     wrench.check(now, now, 'needle_base', [0.0, 0.0])
     later = now + SECOND

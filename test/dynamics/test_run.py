@@ -128,6 +128,8 @@ def test_what_the_plant_refuses_is_no_event() -> None:
     ):
         with pytest.raises(error):
             plant.perform(event)
+    with pytest.raises(ParameterError, match='in the modes robot and indenter only'):
+        PlantRun(VALUES).perform(Event(TRAJECTORY, COURSE.content))
     # A fault alters measurements, not the plant.
     plant.perform(Event(PARAMETERS, {'fault.kind': 'drop'}))
     assert plant.events() == []

@@ -3,10 +3,16 @@
 from __future__ import annotations
 
 import ast
+from pathlib import Path
+import re
 import shutil
+import signal
 import subprocess
+import sys
+import time
 from typing import Any
 
+from needle_ros.run_node import END_WITH_PARENT
 import pytest
 from support.installed import node_class, ROOT
 from support.ros_graph import RosGraph
@@ -37,15 +43,9 @@ def test_every_argument_has_a_meaning_and_a_use() -> None:
         if isinstance(item, ast.Subscript) and ast.unparse(item.value) == 'given'
         if isinstance(item.slice, ast.Constant)
     }
-    asked |= {
-        item.args[0].value
-        for item in ast.walk(TREE)
-        if isinstance(item, ast.Call)
-        and ast.unparse(item.func) == 'LaunchConfiguration'
-        and isinstance(item.args[0], ast.Constant)
-    }
     assert used | asked == ARGUMENTS.keys()
-    assert all(meaning for _, meaning in ARGUMENTS.values())
+    assert f"'{END_WITH_PARENT}'" in PATH.read_text()
+    assert all(meaning for _, meaning, _ in ARGUMENTS.values())
 
 
 @pytest.mark.parametrize('name', PARAMETERS)
@@ -63,3 +63,78 @@ def test_where_ros2_launch_is_installed_it_takes_the_file() -> None:
             [ros2, 'launch', PATH, '--show-args'], capture_output=True, text=True, check=True
         )
         assert [name for name in ARGUMENTS if f"'{name}'" not in shown.stdout] == []
+
+
+#: `ros2 launch PATH name:=value ...` without the command line.
+LAUNCH = """
+import sys
+from launch import LaunchDescription, LaunchService
+from launch.actions import IncludeLaunchDescription
+from launch.launch_description_sources import PythonLaunchDescriptionSource
+
+source = PythonLaunchDescriptionSource(sys.argv[1])
+given = [tuple(word.split(':=', 1)) for word in sys.argv[2:]]
+service = LaunchService()
+included = IncludeLaunchDescription(source, launch_arguments=given)
+service.include_launch_description(LaunchDescription([included]))
+sys.exit(service.run())
+"""
+
+
+def start(*words: str) -> subprocess.Popen[str]:
+    """Start the launch file, or skip where launch is not installed."""
+    pytest.importorskip('launch_ros')
+    return subprocess.Popen(
+        [sys.executable, '-c', LAUNCH, str(PATH), *words],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+
+
+@pytest.mark.parametrize(
+    ('words', 'reason'),
+    [
+        (['params_file:=/no/such.yaml'], 'params_file /no/such.yaml does not exist'),
+        (['law:=bang'], 'adaptive'),
+        (['rviz:=true'], 'rviz2'),
+    ],
+)
+def test_launch_refuses_before_a_node_starts(words: list[str], reason: str) -> None:
+    launch = start(*words)
+    if reason == 'rviz2' and shutil.which('rviz2'):
+        launch.kill()
+    said, _ = launch.communicate(timeout=120)
+    assert (launch.returncode != 0, reason in said, 'process started' in said) == (
+        True,
+        True,
+        False,
+    )
+
+
+def test_a_refused_node_ends_the_others_and_launch_fails() -> None:
+    """The carriage is not known for `paper_si`, so that the controller refuses its gains."""
+    launch = start('preset:=paper_si')
+    said, _ = launch.communicate(timeout=120)
+    assert launch.returncode != 0
+    assert said.count('process started') == 2
+    assert '[ERROR] [plant-1]: process has died' not in said
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGKILL])
+def test_a_signal_to_launch_leaves_nothing_running(number: int) -> None:
+    launch = start()
+    assert launch.stdout is not None
+    lines = []
+    for line in launch.stdout:
+        lines.append(line)
+        if 'active' in line:
+            break
+    nodes = [int(pid) for pid in re.findall(r'process started with pid \[(\d+)\]', ''.join(lines))]
+    assert len(nodes) == 2
+    launch.send_signal(number)
+    launch.communicate(timeout=60)
+    deadline = time.monotonic() + 30.0
+    while any(Path(f'/proc/{pid}').exists() for pid in nodes):
+        assert time.monotonic() < deadline
+        time.sleep(0.05)

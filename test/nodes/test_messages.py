@@ -14,6 +14,7 @@ from needle_dynamics.plant_node import PlantNode
 from needle_identification import deserialize, encode
 from needle_identification import Topic as BagTopic
 from needle_insertion.experiment.protocol import SHIPPED_BAGS
+from needle_insertion.nodes import NODES
 from needle_ros import wire
 from needle_ros.base_node import message_class, profile, SENSOR
 from needle_ros.contract import EVERY_NODE, Topic, TOPICS
@@ -23,7 +24,7 @@ from needle_ros.wire import JOINT_STATE, POINT, Reading, Template, WRENCH
 import pytest
 from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import JointState
-from support.installed import node_class, NODES
+from support.installed import node_class
 from support.ros_graph import RosGraph
 
 numbers = st.lists(st.floats(allow_nan=False), min_size=9, max_size=9)

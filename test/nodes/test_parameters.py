@@ -8,9 +8,10 @@ import sys
 
 from needle_controller.controller_node import ControllerNode
 from needle_dynamics.plant_node import PlantNode
+from needle_insertion.nodes import NODES
 import pytest
 from rclpy.parameter import Parameter
-from support.installed import node_class, NODES
+from support.installed import node_class
 from support.ros_graph import RosGraph
 import yaml
 

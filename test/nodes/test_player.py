@@ -278,10 +278,12 @@ def test_pauses_steps_and_continues(ros_graph: RosGraph, tmp_path: Path) -> None
         (True, '/text at 0.000000 s'),
         (True, '/joints at 0.010000 s'),
     ]
-    ros_graph.spin_until(lambda: len(listener.heard) >= 6, 'three messages and their times')
+    last = serialize_message(Clock(clock=_time(3 + 10 * MILLISECOND)))
+    ros_graph.spin_until(lambda: last in listener.of('clock'), 'three messages and their times')
     assert listener.of('text') == [text('000')]
     assert listener.of('joints') == [joints(0.0), joints(1.0 / 3.0)]
-    assert listener.of('clock') == [
+    # While it pauses a time may be repeated.
+    assert list(dict.fromkeys(listener.of('clock'))) == [
         serialize_message(Clock(clock=at)) for at in map(_time, (3, 4, 3 + 10 * MILLISECOND))
     ]
     go(ros_graph)
@@ -314,7 +316,8 @@ def test_publishes_the_recorded_time_as_clock(ros_graph: RosGraph, tmp_path: Pat
     node = ros_graph.add(RosNode, 'follower', parameters={'use_sim_time': True})
     listener = Listener(ros_graph, clock=(Clock, WEAK))
     listener.wait()
-    ros_graph.spin_until(lambda: node.count_publishers('/clock') == 1, 'the clock')
+    # The player pauses, and tells the time all the same.
+    ros_graph.spin_until(lambda: node.get_clock().now().nanoseconds >= EPOCH, 'the clock')
     go(ros_graph)
     last = EPOCH + 190 * MILLISECOND + 4
     ros_graph.spin_until(
@@ -325,7 +328,7 @@ def test_publishes_the_recorded_time_as_clock(ros_graph: RosGraph, tmp_path: Pat
     times = [deserialize_message(data, Clock).clock for data in listener.of('clock')]
     stamps = [at.sec * 10**9 + at.nanosec for at in times]
     assert stamps[0] >= EPOCH
-    assert all(late > early for early, late in pairwise(stamps))
+    assert all(late >= early for early, late in pairwise(stamps))
     # Many more than the 20 times of messages: two seconds are 2000 ticks.
     assert len(stamps) > 100
 

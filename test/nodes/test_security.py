@@ -12,9 +12,10 @@ from typing import NamedTuple
 
 from lxml import etree
 from needle_insertion.experiment.protocol import SHIPPED_BAGS
+from needle_insertion.nodes import NODES
 from needle_ros.base_node import BaseNode
 import pytest
-from support.installed import node_class, NODES, ROOT
+from support.installed import node_class, ROOT
 from support.ros_graph import RosGraph
 
 POLICIES = ROOT / 'config/security/policies.xml'

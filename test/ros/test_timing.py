@@ -5,7 +5,7 @@ from fractions import Fraction
 from builtin_interfaces.msg import Time
 from hypothesis import given
 from hypothesis import strategies as st
-from needle_ros.timing import NANOSECONDS, nanoseconds, RateCounter, seconds
+from needle_ros.timing import apart, NANOSECONDS, nanoseconds, RateCounter, seconds
 
 MILLISECOND = NANOSECONDS // 1000
 
@@ -18,6 +18,14 @@ def test_times_are_those_of_the_message(sec: int, nanosec: int) -> None:
     exact = sec + Fraction(nanosec, NANOSECONDS)
     # Half a unit in the last place, 2^-53, for the fraction, and for the sum.
     assert abs(Fraction(seconds(time)) - exact) <= exact / 2**52
+
+
+def test_an_absurd_age_is_that_of_another_clock() -> None:
+    """A node with simulated time and one without are decades apart: no such number is said."""
+    assert apart(1_500_000_000) == '1.500 s old'
+    assert apart(-1_500_000_000) == '1.500 s ahead'
+    for age in (1_795_193_306 * NANOSECONDS, -1_795_193_306 * NANOSECONDS):
+        assert apart(age).startswith('of another clock: use_sim_time must be alike in all nodes')
 
 
 def test_rates_and_shares_are_those_of_the_last_second() -> None:

@@ -1,0 +1,34 @@
+"""The programs of the nodes, as started by ``ros2 run needle_insertion plant`` or needle-plant."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from pathlib import Path
+import signal
+import sys
+from typing import Final
+
+#: Module of each node; setup.py installs them by these names.
+NODES: Final = {
+    'plant': 'needle_dynamics.plant_node',
+    'controller': 'needle_controller.controller_node',
+    'identification': 'needle_identification.identification_node',
+    'recorder': 'needle_identification.recorder_node',
+    'player': 'needle_identification.player_node',
+}
+
+
+def main() -> int:
+    """
+    Run the node that this program is named after.
+
+    Returns
+    -------
+    int
+        Exit status.
+
+    """
+    # Imports take a second: Ctrl-C ends them at once, without a traceback.
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    name = Path(sys.argv[0]).stem.removeprefix('needle-')
+    return int(import_module(NODES[name]).main())

@@ -1,0 +1,98 @@
+"""A node as a process: its words, its signals, and what it says when it runs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+import signal
+import subprocess
+import sys
+import time
+
+from needle_insertion.nodes import NODES
+from needle_ros.base_node import SENSOR
+import pytest
+from sensor_msgs.msg import JointState
+from support.installed import node_class, ROOT
+from support.ros_graph import RosGraph
+
+
+def started(
+    ros_graph: RosGraph,
+    name: str,
+    *words: str,
+    python: Sequence[str] = (),
+    environment: Mapping[str, str] | None = None,
+) -> subprocess.Popen[str]:
+    """Start a node with words of its command line, and of that of Python."""
+    return subprocess.Popen(
+        [sys.executable, *python, ROOT / 'scripts' / name, *words],
+        env={**ros_graph.environment, **(environment or {})},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+
+
+@pytest.mark.parametrize('name', NODES)
+def test_help_names_every_parameter(ros_graph: RosGraph, name: str) -> None:
+    """It also says what the node is for."""
+    asked = started(ros_graph, name, '--help')
+    said, _ = asked.communicate(timeout=60.0)
+    assert asked.returncode == 0
+    assert said.startswith(f'usage: {name} [-h] [--ros-args')
+    node = ros_graph.add(node_class(name), start=False)
+    assert [key for key in node.values() if f'\n  {key}: ' not in said] == []
+
+
+def test_an_unknown_word_is_refused(ros_graph: RosGraph) -> None:
+    """Before the node exists, with the way to give a parameter."""
+    asked = started(ros_graph, 'plant', 'rate:=500')
+    said, _ = asked.communicate(timeout=60.0)
+    assert asked.returncode == 2
+    assert 'unknown: rate:=500; parameters are given by --ros-args -p NAME:=VALUE' in said
+
+
+def test_a_node_says_that_it_runs_and_a_second_ctrl_c_changes_nothing(
+    ros_graph: RosGraph,
+) -> None:
+    """One line names needle, rate and topics. It ends with 0, however often Ctrl-C comes."""
+    came = ros_graph.listen(ros_graph.node('probe'), JointState, 'joint_states', SENSOR)
+    node = started(ros_graph, 'plant', '--ros-args', '-p', 'rate:=500.0')
+    assert node.stdout is not None
+    said = next(line for line in node.stdout if 'active' in line)
+    assert 'active: mode simulation, preset phantom, 500 Hz; takes wrench_command' in said
+    ros_graph.spin_until(lambda: came, 'joint_states')
+    deadline = time.monotonic() + 30.0
+    while node.poll() is None and time.monotonic() < deadline:
+        node.send_signal(signal.SIGINT)
+        time.sleep(0.005)
+    node.communicate()
+    assert node.returncode == 0
+
+
+@pytest.mark.parametrize('stage', ['numpy', 'rclpy', 'visualization_msgs.msg'])
+def test_ctrl_c_while_it_imports_ends_it_at_once(ros_graph: RosGraph, stage: str) -> None:
+    """Killed, or refused before it runs; without a traceback, and without waiting."""
+    node = started(ros_graph, 'plant', python=('-X', 'importtime'))
+    assert node.stdout is not None
+    assert any(line.endswith(f' {stage}\n') for line in node.stdout)
+    begin = time.monotonic()
+    node.send_signal(signal.SIGINT)
+    said, _ = node.communicate(timeout=60.0)
+    assert time.monotonic() - begin < 5.0
+    assert node.returncode in (-signal.SIGINT, 0)
+    assert 'Traceback' not in said
+
+
+def test_ctrl_c_while_it_compiles_ends_it_at_once(ros_graph: RosGraph, tmp_path: Path) -> None:
+    """A fresh machine compiles for a minute."""
+    fresh = {'NUMBA_CACHE_DIR': str(tmp_path)}
+    node = started(ros_graph, 'controller', environment=fresh)
+    assert node.stdout is not None
+    assert any('compiling' in line for line in node.stdout)
+    begin = time.monotonic()
+    node.send_signal(signal.SIGINT)
+    said, _ = node.communicate(timeout=60.0)
+    assert time.monotonic() - begin < 5.0
+    assert (node.returncode, 'Traceback' in said) == (0, False)
