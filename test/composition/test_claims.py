@@ -16,9 +16,9 @@ from needle_insertion.paper.claims import Claim, FAILS, HOLDS, judge, ONLY_IF, T
 from needle_insertion.paper.claims import identified as judges
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
+from scipy.integrate import quad, solve_ivp
 from scipy.linalg import eigh
-from scipy.optimize import brentq
+from scipy.optimize import brentq, minimize_scalar
 
 ROOT = Path(__file__).parents[2]
 
@@ -26,6 +26,9 @@ ROOT = Path(__file__).parents[2]
 NEEDLES = 8
 
 VERDICTS = {
+    'three_dimensions': ONLY_IF,
+    'bending_outside': ONLY_IF,
+    'stiffness_along': ONLY_IF,
     'mass_matrix': HOLDS,
     'zero_rows': ONLY_IF,
     'rates_in_bias': ONLY_IF,
@@ -42,10 +45,13 @@ VERDICTS = {
     'rotation_energy': FAILS,
     'axis_of_rotation': FAILS,
     'table_3': ONLY_IF,
+    'cannula': ONLY_IF,
     'sign_of_force': FAILS,
     'friction_direction': ONLY_IF,
     'friction_matters': HOLDS,
     'transients': ONLY_IF,
+    'friction_length': ONLY_IF,
+    'no_cutting': ONLY_IF,
     'reading_of_table_1': ONLY_IF,
     'identifiable': ONLY_IF,
     'consistency': ONLY_IF,
@@ -53,6 +59,7 @@ VERDICTS = {
     'linear': FAILS,
     'off_plane': ONLY_IF,
     'tissue_stiffness': ONLY_IF,
+    'linearization': ONLY_IF,
     'controllability': ONLY_IF,
     'output_controllability': ONLY_IF,
     'state_and_output': ONLY_IF,
@@ -254,6 +261,80 @@ def exact_beam() -> FloatArray:
     return np.asarray(np.max(errors, axis=0))
 
 
+def beam(
+    parts: list[tuple[float, float]], *, pivot: bool = False, frequency: float = 0.0
+) -> tuple[FloatArray, FloatArray]:
+    """
+    Return matrix and basis roots of a beam of parts (length [m], foundation [N/m^2]).
+
+    Unknowns are the weights of exponentials in each part; rows are the conditions at the base
+    (clamped), at the joints (a pivot at the first if asked for) and at the tip, force last.
+    """
+    inertia = LINEAR * (2 * pi * frequency) ** 2
+    roots = np.array(
+        [((inertia - k) / BENDING + 0j) ** 0.25 * 1j ** np.arange(4) for _, k in parts]
+    )
+
+    def at(part: int, y: float, order: int) -> FloatArray:
+        row = np.zeros((len(parts), 4), complex)
+        row[part] = roots[part] ** order * np.exp(roots[part] * y)
+        return row.ravel()
+
+    rows = [at(0, 0.0, 0), at(0, 0.0, 1)]
+    for k, (length, _) in enumerate(parts[:-1]):
+        here, there = (
+            [at(part, y, order) for order in range(4)] for part, y in ((k, length), (k + 1, 0.0))
+        )
+        jumps = [a - b for a, b in zip(here, there, strict=True)]
+        rows += [here[0], there[0], *jumps[1:3]] if pivot and k == 0 else jumps
+    last = len(parts) - 1
+    rows += [at(last, parts[-1][0], order) for order in (2, 3)]
+    return np.array(rows), roots
+
+
+def beam_tip(parts: list[tuple[float, float]], *, pivot: bool = False) -> tuple[float, float]:
+    """Return deflection at the tip [m] and force at the base [N] under 1 N at the tip."""
+    # Free parts have polynomials; a foundation of 1e-3 N/m^2 is as good as none.
+    parts = [(length, max(k, 1e-3)) for length, k in parts]
+    matrix, roots = beam(parts, pivot=pivot)
+    right = np.zeros(len(matrix))
+    right[-1] = -1.0 / BENDING
+    weights = np.linalg.solve(matrix, right).reshape(len(parts), 4)
+    tip = weights[-1] @ np.exp(roots[-1] * parts[-1][0])
+    return float(tip.real), float(abs(BENDING * (weights[0] @ roots[0] ** 3).real))
+
+
+def beam_frequency(parts: list[tuple[float, float]], near: float, *, pivot: bool) -> float:
+    """Return the natural frequency [Hz] near a value: there the determinant vanishes."""
+
+    def size(frequency: float) -> float:
+        return float(abs(np.linalg.det(beam(parts, pivot=pivot, frequency=frequency)[0])))
+
+    found = minimize_scalar(size, bounds=(0.95 * near, 1.05 * near), method='bounded')
+    assert 0.96 * near < found.x < 1.04 * near
+    return float(found.x)
+
+
+def lost_to_the_way() -> tuple[float, float]:
+    """Return how much earlier a bent needle is at the hub [s], fast and slow."""
+    time, bent, _ = run()
+    _, straight, _ = run(tip=0.0)
+
+    def there(d: FloatArray) -> float:
+        k = int(np.flatnonzero(d > 1e-6)[-1])
+        return float(time[k] + (time[k] - time[k - 1]) * d[k] / (d[k - 1] - d[k]))
+
+    # Slow: each mode keeps its energy over its frequency, so that it pulls by E (-w' / w).
+    depths = np.linspace(0.02, LENGTH, 801)
+    modes = [normal_modes(float(s)) for s in depths]
+    frequencies = np.array([mode[0] for mode in modes])
+    amplitude = np.linalg.inv(modes[0][1]) @ start()
+    energy = 0.5 * (amplitude * frequencies[0]) ** 2 * frequencies / frequencies[0]
+    pull = -(energy * np.gradient(np.log(frequencies), depths, axis=0)).sum(axis=1)
+    slower = MU_V['mm'] / (FORCE - MU_S) - MU_V['mm'] / (FORCE - MU_S + pull)
+    return there(straight) - there(bent), float(np.trapezoid(slower, depths))
+
+
 def tip_spring() -> float:
     """Return what a spring at the tip stores in the second shape over the first, by quadrature."""
     y, weights = np.polynomial.legendre.leggauss(40)
@@ -311,6 +392,12 @@ def expected(study: mismatch.Mismatch) -> dict[str, dict[str, tuple[float | str,
     gains = [(1.0, 1.0), (2.0, 1.0), (0.5, 1.0), (1.0, 2.0), (1.0, 0.5)]
     peaks = sorted(peak(pid(*pair)[1]) for pair in gains)
     rest, rest_tip = pid(1.0, 1.0, 150.0)
+    whole, pivot, free = (
+        [(WAY, 0.0), (0.02, K_A)],
+        *(beam_tip([(WAY, 0.0), (0.02, K_A)], pivot=pivot) for pivot in (True, False)),
+    )
+    layers = [(0.15, K_A), (0.01, 2 * K_A)]
+    earlier = lost_to_the_way()
     beam = exact_beam()
     first_frequency = normal_modes(LENGTH)[0][0]
     # Depth rises evenly in the slow run, so that its mean is that over the depths.
@@ -323,6 +410,40 @@ def expected(study: mismatch.Mismatch) -> dict[str, dict[str, tuple[float | str,
     known = {law: 1e6 * float(batch.rms[0]) for law, batch in study.nominal.items()}
     times = {'si_ms': (1e3 * fast, 1e-3), 'mm_s': (slow, 1e-4)}
     return {
+        # At rest and straight at its free end, row d is k_a w^2 / 2.
+        'three_dimensions': {'one': (K_A * 5e-4**2 / 2, 0.02), 'both': (K_A * 5e-4**2, 0.02)},
+        'bending_outside': {
+            'model_hz': (normal_modes(0.02)[0][0] / (2 * pi), 1e-6),
+            # Two modes are a little stiffer than the beam.
+            'model_mm': (1e3 * beam_tip([(0.02, K_A)])[0], 0.03),
+            'free_hz': (beam_frequency(whole, 30.6, pivot=False), 1e-3),
+            'free_mm': (1e3 * free[0], 1e-3),
+            'free_felt': (free[1], 1e-3),
+            'pinned_hz': (beam_frequency(whole, 119.4, pivot=True), 1e-3),
+            'pinned_mm': (1e3 * pivot[0], 1e-3),
+            'pinned_felt': (pivot[1], 1e-3),
+            'guided_felt': (0.0, 0.0),
+        },
+        'stiffness_along': {
+            'layer_cm': (15.0, 1e-9),
+            'error': (100 * (1 - beam_tip([(0.16, 2 * K_A)])[0] / beam_tip(layers)[0]), 0.05),
+        },
+        'cannula': {
+            'solid': (100 * AREA / (pi * 0.635e-3**2), 1e-9),
+            'bore_mm': (0.79, 1e-9),
+            'area': (100 * (1.27**2 - 0.79**2) / 1.27**2, 1e-9),
+            'area_moment': (100 * (1.27**4 - 0.79**4) / 1.27**4, 1e-9),
+        },
+        'friction_length': {
+            'constant': times['mm_s'],
+            'per_length': (
+                quad(lambda s: MU_V['mm'] / (FORCE * LENGTH / s - MU_S), 0.02, LENGTH)[0],
+                1e-6,
+            ),
+        },
+        'no_cutting': {'cutting': (1.0, 0.0), 'dry': (MU_S, 0.0), 'both': (1.0 + MU_S, 1e-12)},
+        # So short a needle is nearly a cantilever: its frequency falls with the length squared.
+        'linearization': {'way_mm': (20 * (sqrt(1.1) - 1), 0.01), 'insertion_mm': (180, 1e-9)},
         'zero_rows': {
             'largest': (np.abs(row_d).max(), 0.01),
             'percent': (100 * np.abs(row_d).max() / MU_S, 0.01),
@@ -342,6 +463,9 @@ def expected(study: mismatch.Mismatch) -> dict[str, dict[str, tuple[float | str,
             'one_mm': (1e3 * apart(1, 0.02), 0.01),
             'two_mm': (1e3 * apart(2, 0.02), 0.01),
             'three_mm': (1e3 * apart(3, 0.02), 0.01),
+            # Samples are 0.01 ms apart.
+            'si_ms': (1e3 * earlier[0], 0.1),
+            'mm_ms': (1e3 * earlier[1], 0.05),
         },
         'deflection_changes': {
             'peak_mm': (1e3 * peak(si_tip), 0.01),
@@ -522,7 +646,7 @@ def test_verdicts_on_friction_follow_the_tables(study: mismatch.Mismatch) -> Non
 def test_the_section_lists_all(found: dict[str, Claim]) -> None:
     page = claims.section(list(found.values()))
     rows = page.tables[0].rows
-    assert len(rows) == len(found) == 44
+    assert len(rows) == len(found) == 51
     total = sum(int(word) for word in page.paragraphs[0].split() if word.isdigit())
     assert total == 2 * len(found)
     for row, one in zip(rows, found.values(), strict=True):

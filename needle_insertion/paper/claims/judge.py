@@ -7,7 +7,14 @@ from importlib.resources import files
 from types import ModuleType
 from typing import Any
 
-from needle_insertion.paper.claims import analysis, control, identified, mismatch, needle
+from needle_insertion.paper.claims import (
+    analysis,
+    assumptions,
+    control,
+    identified,
+    mismatch,
+    needle,
+)
 from needle_insertion.paper.claims.claim import Claim, FAILS, Finding, HOLDS, ONLY_IF, Tables
 from needle_insertion.paper.mismatch import Mismatch
 from needle_insertion.report.content import Grid, Section
@@ -53,7 +60,7 @@ def _judged(entry: dict[str, Any], tables: Tables, study: Mismatch) -> Claim:
     """Judge a claim by the function of its name, which is private to its module."""
     name = f'_{entry["name"]}'
     modules: tuple[tuple[ModuleType, tuple[Any, ...]], ...] = (
-        *((needle, ()), (identified, (tables,)), (analysis, ()), (control, ())),
+        *((needle, ()), (assumptions, ()), (identified, (tables,)), (analysis, ()), (control, ())),
         (mismatch, (study,)),
     )
     judge, arguments = next(

@@ -92,7 +92,14 @@ def _two_modes_cause() -> Finding:
     one, two, three = (
         1e3 * float(np.abs(path(n, DEFLECTION) - path(n, 0.0)).max()) for n in (1, 2, 3)
     )
-    return finding({'one_mm': one, 'two_mm': two, 'three_mm': three}, always=three < 0.1 * two)
+    si, mm = (
+        hub_time(open_loop(reading, 'complete', 0.0)) - hub_time(open_loop(reading, 'complete'))
+        for reading in READINGS
+    )
+    return finding(
+        {'one_mm': one, 'two_mm': two, 'three_mm': three, 'si_ms': 1e3 * si, 'mm_ms': 1e3 * mm},
+        always=three < 0.1 * two,
+    )
 
 
 def _deflection_changes() -> Finding:

@@ -1,0 +1,99 @@
+"""The whole needle as a beam, to judge what the model assumes of the part outside."""
+
+from __future__ import annotations
+
+from typing import Final, NamedTuple
+
+from needle_dynamics import FloatArray, NeedleParameters
+import numpy as np
+from scipy.linalg import eigh
+
+#: What holds the needle where it enters the tissue, with the coordinates of that point it fixes.
+ENTRIES: Final = {'free': (), 'pinned': (0,), 'clamped': (0, 1)}
+
+#: Elements outside and inside: first frequency and compliance have converged to six digits.
+_ELEMENTS: Final = 24
+
+#: Matrices of a cubic element of unit length, bending stiffness and mass; coordinates are value
+#: and slope at both ends.
+_BENDING: Final = np.array(
+    [
+        [12.0, 6.0, -12.0, 6.0],
+        [6.0, 4.0, -6.0, 2.0],
+        [-12.0, -6.0, 12.0, -6.0],
+        [6.0, 2.0, -6.0, 4.0],
+    ]
+)
+_GRAM: Final = (
+    np.array(
+        [
+            [156.0, 22.0, 54.0, -13.0],
+            [22.0, 4.0, 13.0, -3.0],
+            [54.0, 13.0, 156.0, -22.0],
+            [-13.0, -3.0, -22.0, 4.0],
+        ]
+    )
+    / 420.0
+)
+
+
+class WholeNeedle(NamedTuple):
+    """
+    What a beam clamped at its base does.
+
+    Attributes
+    ----------
+    frequency : float
+        First natural frequency [Hz].
+    compliance : float
+        Deflection of the tip per lateral force there [m/N].
+    force : float
+        Modulus of the lateral force at the base under 1 N at the tip [N].
+
+    """
+
+    frequency: float
+    compliance: float
+    force: float
+
+
+def whole_needle(parameters: NeedleParameters, depth: float, entry: str) -> WholeNeedle:
+    """
+    Solve the needle from base to tip, on its elastic foundation inside of the tissue.
+
+    Parameters
+    ----------
+    parameters : NeedleParameters
+        Needle and tissue of one layer.
+    depth : float
+        Inserted length [m], less than the length of the needle.
+    entry : str
+        A key of `ENTRIES`: what holds the needle at the entry.
+
+    Returns
+    -------
+    WholeNeedle
+        Frequency, compliance and what the base feels.
+
+    """
+    p, n = parameters, _ELEMENTS
+    lengths = np.repeat([(p.length - depth) / n, depth / n], n)
+    stiffness, mass = np.zeros((2, 4 * n + 2, 4 * n + 2))
+    for k, h in enumerate(lengths):
+        part = slice(2 * k, 2 * k + 4)
+        # Slopes count by the length of the element.
+        scale = np.array([1.0, h, 1.0, h])
+        gram = _GRAM * np.outer(scale, scale) * h
+        stiffness[part, part] += p.bending_stiffness / h**3 * _BENDING * np.outer(scale, scale)
+        stiffness[part, part] += p.tissue_stiffness * gram if k >= n else 0.0
+        mass[part, part] += p.linear_density * gram
+    held = [0, 1, *(2 * n + coordinate for coordinate in ENTRIES[entry])]
+    moving = np.setdiff1d(np.arange(4 * n + 2), held)
+    inner = np.ix_(moving, moving)
+    least = eigh(stiffness[inner], mass[inner], eigvals_only=True, subset_by_index=(0, 0))
+    load = np.zeros(4 * n + 2)
+    load[-2] = 1.0
+    shape: FloatArray = np.zeros(4 * n + 2)
+    shape[moving] = np.linalg.solve(stiffness[inner], load[moving])
+    force = float(abs(stiffness[0] @ shape))
+    return WholeNeedle(float(np.sqrt(least[0])) / (2.0 * np.pi), float(shape[-2]), force)

@@ -1,0 +1,140 @@
+"""Claims about what the model assumes, sections 3.2.1 to 3.2.4 and 3.2.8."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from math import log, pi
+
+from needle_dynamics import NeedleModel, NeedleParameters
+from needle_insertion.paper.beam import ENTRIES, whole_needle
+from needle_insertion.paper.claims.claim import Finding, finding
+from needle_insertion.paper.runs import DEFLECTION, DEPTH, FORCE, hub_time, needle, open_loop
+import numpy as np
+from scipy.linalg import eigh
+from scipy.optimize import brentq
+
+#: Least bore of an 18 gauge tube of regular wall [m], and its outer diameter: ISO 9626.
+_BORE, _OUTER = 0.79e-3, 1.27e-3
+
+#: Depth of a second layer [m]: beyond the length over which the tissue takes up a deflection.
+_LAYER = 0.15
+
+
+def _first_frequency(model: NeedleModel, depth: float) -> float:
+    """Return the first natural frequency of the model at a depth [Hz]."""
+    gram = model.modes.integrals(depth).gram
+    stiffness = model.stiffness_matrix(depth)
+    squares = eigh(stiffness, model.parameters.linear_density * gram, eigvals_only=True)
+    return float(np.sqrt(squares[0])) / (2.0 * pi)
+
+
+def _compliance(model: NeedleModel, depth: float) -> float:
+    """Return the deflection of the tip per lateral force there [m/N]."""
+    value = model.modes.integrals(depth).value
+    return float(value @ np.linalg.solve(model.stiffness_matrix(depth), value))
+
+
+def _bending_outside() -> Finding:
+    """Judge the clamp at the entry by a beam that bends outside, too."""
+    model = needle('paper_si', 'complete')
+    p = model.parameters
+    free, pinned, guided = (whole_needle(p, DEPTH, entry) for entry in ENTRIES)
+    clamped = _compliance(model, DEPTH)
+    return finding(
+        {
+            'model_hz': _first_frequency(model, DEPTH),
+            'model_mm': 1e3 * clamped,
+            'free_hz': free.frequency,
+            'free_mm': 1e3 * free.compliance,
+            'pinned_hz': pinned.frequency,
+            'pinned_mm': 1e3 * pinned.compliance,
+            'free_felt': free.force,
+            'pinned_felt': pinned.force,
+            'guided_felt': guided.force,
+        },
+        always=free.compliance < 1.1 * clamped,
+        sometimes=abs(guided.compliance / clamped - 1.0) < 0.1,
+    )
+
+
+def _three_dimensions() -> Finding:
+    """Judge a second plane of bending: row d of N has the sum of both, for it is quadratic."""
+    model = needle('paper_si', 'complete')
+    one = model.bias_forces(model.state_at(DEPTH, DEFLECTION))
+    # A round needle bent by w in both planes stores what one bent by sqrt(2) w stores.
+    both = model.bias_forces(model.state_at(DEPTH, np.sqrt(2.0) * DEFLECTION))
+    return finding(
+        {'one': abs(float(one[0])), 'both': abs(float(both[0]))},
+        always=False,
+        sometimes=abs(both[0] - 2.0 * one[0]) < 1e-9 * abs(one[0]),
+    )
+
+
+def _linearization() -> Finding:
+    """Judge the linearized system by how far it may go before its first frequency is another."""
+    model = needle('paper_si', 'complete')
+    there = _first_frequency(model, DEPTH)
+
+    def change(way: float) -> float:
+        return there / _first_frequency(model, DEPTH + way) - 1.1
+
+    way = float(brentq(change, 1e-5, 0.1))
+    return finding(
+        {'way_mm': 1e3 * way, 'insertion_mm': 1e3 * (model.parameters.length - DEPTH)},
+        always=way > model.parameters.length - DEPTH,
+        sometimes=True,
+    )
+
+
+def _friction_length() -> Finding:
+    """Judge friction that does not depend on the inserted length, by one that does."""
+    p = NeedleParameters.preset('paper_mm')
+    # F = (mu_s + mu_v v) s / l without inertia; the integral of ds / v with a = F l / mu_s.
+    a = FORCE * p.length / p.coulomb_friction
+    way = a * log((a - DEPTH) / (a - p.length)) - (p.length - DEPTH)
+    per_length = p.viscous_friction / p.coulomb_friction * way
+    constant = hub_time(open_loop('paper_mm', 'complete', 0.0))
+    return finding(
+        {'constant': constant, 'per_length': per_length},
+        always=abs(per_length / constant - 1.0) < 0.1,
+        sometimes=True,
+    )
+
+
+def _no_cutting() -> Finding:
+    """Judge friction without the cutting force, which a tip in tissue has as well."""
+    dry = NeedleParameters().coulomb_friction
+    cutting = 1.0
+    return finding(
+        {'cutting': cutting, 'dry': dry, 'both': dry + cutting}, always=False, sometimes=True
+    )
+
+
+def _cannula() -> Finding:
+    """Judge the cross-section by that of a tube, through which seeds can pass."""
+    p = NeedleParameters()
+    bore, tube = _BORE / _OUTER, pi * _OUTER**2 / 4.0
+    area = 1.0 - bore**2
+    return finding(
+        {
+            'bore_mm': 1e3 * _BORE,
+            'area': 100.0 * area,
+            'area_moment': 100.0 * (1.0 - bore**4),
+            'solid': 100.0 * p.area / tube,
+        },
+        always=abs(p.area / tube - area) < 0.05,
+        sometimes=abs(p.area / tube - 1.0) < 0.05,
+    )
+
+
+def _stiffness_along() -> Finding:
+    """Judge k(d, t) where the tip has just entered a second layer that is twice as stiff."""
+    p = NeedleParameters()
+    depth, stiff = _LAYER + 0.01, 2.0 * p.tissue_stiffness
+    layered = replace(p, layer_depths=(_LAYER,), layer_stiffnesses=(stiff,))
+    along = _compliance(NeedleModel(layered), depth)
+    lumped = _compliance(NeedleModel(replace(p, tissue_stiffness=stiff)), depth)
+    error = 100.0 * abs(lumped / along - 1.0)
+    return finding(
+        {'error': error, 'layer_cm': 100.0 * _LAYER}, always=error < 5.0, sometimes=True
+    )
