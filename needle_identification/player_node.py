@@ -13,7 +13,7 @@ from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticStatus
 from needle_identification.bags.bag import Bag, Recorded
 from needle_identification.bags.playback import Playback, PlaybackSettings
-from needle_identification.bags.topics import OfferedQos, Topic
+from needle_identification.bags.topics import OfferedQos, Topic, UNLIMITED
 from needle_identification.errors import RecordingError
 from needle_identification.recorder_node import is_hidden
 from needle_ros.base_node import BaseNode, message_class
@@ -103,7 +103,7 @@ class PlayerNode(BaseNode):
                 'publish_clock and use_sim_time cannot both be true: the player would follow its '
                 'own /clock'
             )
-        bag = Bag(path)
+        bag = Bag(Path(path).expanduser())
         topics = self._chosen(bag.path, bag.topics(), publishes)
         self._left_out = {}
         kinds = {name: self._imported(name, found) for name, found in topics.items()}
@@ -202,7 +202,8 @@ class PlayerNode(BaseNode):
         try:
             action()
         except NeedleError as error:
-            self._playback.is_ended, self.failure = True, str(error)
+            self._playback.is_ended = self.failed = True
+            self.failure = str(error)
             self.get_logger().error(self.failure)
             self.publish_diagnostics()
 
@@ -330,13 +331,24 @@ def _profile(topics: list[Topic]) -> QoSProfile:
     offered = [qos for topic in topics for qos in topic.offered_qos()] or [OfferedQos()]
     best_effort = all(qos.reliability == 'best_effort' for qos in offered)
     reliability = ReliabilityPolicy.BEST_EFFORT if best_effort else ReliabilityPolicy.RELIABLE
+    times = {
+        name: Duration(nanoseconds=at)
+        for name, found in (
+            ('deadline', {qos.deadline for qos in offered}),
+            ('lifespan', {qos.lifespan for qos in offered}),
+            ('liveliness_lease_duration', {qos.lease for qos in offered}),
+        )
+        # What publishers do not agree on is unlimited.
+        for at in found
+        if len(found) == 1 and at != UNLIMITED
+    }
     if not any(qos.durability == 'transient_local' for qos in offered):
-        return QoSProfile(depth=_DEPTH, reliability=reliability)
+        return QoSProfile(depth=_DEPTH, reliability=reliability, **times)
     # The middleware does not tell a recorder the depth: then one message of each publisher.
     known = [qos.depth for qos in offered if qos.durability == 'transient_local']
     depth = min(sum(max(1, number) for number in known), _DEPTH)
     durability = DurabilityPolicy.TRANSIENT_LOCAL
-    return QoSProfile(depth=depth, reliability=reliability, durability=durability)
+    return QoSProfile(depth=depth, reliability=reliability, durability=durability, **times)
 
 
 def _player() -> PlayerNode:

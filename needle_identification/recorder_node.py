@@ -35,11 +35,12 @@ _NOT_FOR_ALL: Final = ('/rosout', '/parameter_events')
 
 
 class _Recorded(NamedTuple):
-    """A subscription and the quality of service that it requests."""
+    """A subscription, what it requests, and what the publishers so far have offered."""
 
     subscription: Subscription
     best_effort: bool
     latched: bool
+    offered: dict[tuple[int, ...], OfferedQos]
 
 
 class RecorderNode(BaseNode):
@@ -71,7 +72,7 @@ class RecorderNode(BaseNode):
         path = self.text('path')
         if not path:
             raise RecordingError('path must name a folder to record to, got nothing')
-        self._path = Path(path)
+        self._path = Path(path).expanduser()
         self._compression = self.text('compression', COMPRESSIONS)
         names = self.get_parameter('topics').value
         self._all = '*' in names
@@ -152,6 +153,7 @@ class RecorderNode(BaseNode):
         """Stop after an error of the disk; what is in the file remains readable."""
         self._release()
         bag.abort()
+        self.failed = True
         self.failure = f'recording to {bag.path} stopped: {error.strerror or error}'
         self.get_logger().error(self.failure)
         self.publish_diagnostics()
@@ -188,18 +190,17 @@ class RecorderNode(BaseNode):
         self, bag: BagWriter, topic: str, types: list[str], publishers: list[TopicEndpointInfo]
     ) -> None:
         """Subscribe, or subscribe again if a new publisher offers less than was requested."""
-        offered = [publisher.qos_profile for publisher in publishers]
-        best_effort = any(q.reliability == ReliabilityPolicy.BEST_EFFORT for q in offered)
-        latched = all(q.durability == DurabilityPolicy.TRANSIENT_LOCAL for q in offered)
-        recorded = self._recorded.get(topic)
-        if recorded and recorded.best_effort >= best_effort and recorded.latched <= latched:
+        profiles = [publisher.qos_profile for publisher in publishers]
+        best_effort = any(q.reliability == ReliabilityPolicy.BEST_EFFORT for q in profiles)
+        latched = all(q.durability == DurabilityPolicy.TRANSIENT_LOCAL for q in profiles)
+        before = self._recorded.get(topic)
+        offered = {} if before is None else dict(before.offered)
+        offered.update((tuple(p.endpoint_gid), _described(p.qos_profile)) for p in publishers)
+        if before and offered == before.offered:
             return
         try:
             kind = message_class(*types)
-            if recorded:
-                self.destroy_subscription(recorded.subscription)
-            else:
-                bag.add_topic(topic, types[0], [_described(qos) for qos in offered])
+            bag.add_topic(topic, types[0], tuple(offered.values()))
         except (MessageError, RecordingError) as error:
             self._left_out.add(topic)
             self.get_logger().warning(f'{topic} left out: {error}')
@@ -207,6 +208,11 @@ class RecorderNode(BaseNode):
         except OSError as error:
             self._give_up(bag, error)
             return
+        if before and before.best_effort >= best_effort and before.latched <= latched:
+            self._recorded[topic] = before._replace(offered=offered)
+            return
+        if before:
+            self.destroy_subscription(before.subscription)
         reliability = ReliabilityPolicy.BEST_EFFORT if best_effort else ReliabilityPolicy.RELIABLE
         durability = DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE
         subscription = self.create_subscription(
@@ -218,7 +224,7 @@ class RecorderNode(BaseNode):
             event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
             raw=True,
         )
-        self._recorded[topic] = _Recorded(subscription, best_effort, latched)
+        self._recorded[topic] = _Recorded(subscription, best_effort, latched, offered)
 
 
 def is_hidden(topic: str) -> bool:
@@ -245,6 +251,10 @@ def _described(qos: QoSProfile) -> OfferedQos:
         durability=qos.durability.name.lower(),
         history=qos.history.name.lower(),
         depth=qos.depth,
+        deadline=qos.deadline.nanoseconds,
+        lifespan=qos.lifespan.nanoseconds,
+        liveliness=qos.liveliness.name.lower(),
+        lease=qos.liveliness_lease_duration.nanoseconds,
     )
 
 

@@ -137,6 +137,8 @@ class BaseNode(LifecycleNode):
     ----------
     failure : str or None
         Why the last transition was refused.
+    failed : bool
+        Whether the node could not do what it is for: its process ends with status 1.
     invalid : Counter
         Number of invalid messages by topic.
     shared : frozenset of str
@@ -151,6 +153,7 @@ class BaseNode(LifecycleNode):
     def __init__(self, name: str, **node_options: Any) -> None:
         super().__init__(name, **node_options)
         self.failure: str | None = None
+        self.failed = False
         self.invalid: Counter[str] = Counter()
         #: Names of the parameters that are numbers.
         self._numbers: set[str] = set()

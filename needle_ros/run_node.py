@@ -51,7 +51,7 @@ def run(kind: Callable[[], BaseNode]) -> int:
     Returns
     -------
     int
-        Exit status: 0, or 2 if the node refused to start.
+        Exit status: 0, 1 if the node `failed`, or 2 if it refused to start.
 
     Raises
     ------
@@ -63,10 +63,10 @@ def run(kind: Callable[[], BaseNode]) -> int:
 
     def stop(_number: int, _frame: FrameType | None) -> None:
         nonlocal stopping
+        stopping = True
         if not spinning:
             # Nothing has been commanded yet, and compiling may take a minute.
             raise SystemExit(0)
-        stopping = True
 
     if os.environ.get(END_WITH_PARENT):
         # Linux sends the signal when the process that started this one ends, in whatever way.
@@ -93,9 +93,9 @@ def run(kind: Callable[[], BaseNode]) -> int:
         executor.add_node(node)
         status = 0
         if node.get_parameter('autostart').value and not node.start():
-            # The reason, on /diagnostics.
+            # The reason, on /diagnostics. A signal may look like an error of what it met.
             node.publish_diagnostics()
-            status = 2
+            status = 0 if stopping else 2
         # A full collection takes 0.2 s: it shall not scan what was imported.
         gc.freeze()
         spinning = True
@@ -109,7 +109,7 @@ def run(kind: Callable[[], BaseNode]) -> int:
             executor.spin_once(timeout_sec=0.02)
         executor.shutdown()
         node.destroy_node()
-        return status
+        return status or int(node.failed)
     finally:
         rclpy.utilities.try_shutdown()
         # A second Ctrl-C shall not change how the process ends.

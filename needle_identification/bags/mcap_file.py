@@ -115,7 +115,10 @@ def indexed_topics(file: Path) -> set[Topic] | None:
         for begin, end in _records(summary):
             for first, after in zip(begin.tolist(), end.tolist(), strict=True):
                 channels.define(summary[first - _HEAD.size], summary[first:after])
-        return {channels.topics[id_] for id_, number in channels.counts.items() if number} or None
+        # A topic has a further channel when it got further publishers: the last knows them all.
+        latest = {topic: topic for topic in channels.topics.values()}
+        found = {channels.topics[id_] for id_, number in channels.counts.items() if number}
+        return {latest[topic] for topic in found} or None
     except (OSError, *DAMAGED_MCAP):
         return None
 

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from functools import lru_cache
+import os
+from pathlib import Path
 import re
 from typing import Any
 
 from needle_identification.bags.compression import DAMAGED
 from needle_identification.bags.topics import Topic
 from needle_identification.errors import RecordingError
+from rosbags.interfaces import Nodetype
 from rosbags.serde import SerdeError
 from rosbags.typesys import (
     get_types_from_idl,
@@ -48,16 +51,53 @@ def message_type(type_name: str) -> Any:
     try:
         return _jazzy().types[type_name]
     except KeyError:
-        raise _unknown(type_name) from None
+        raise RecordingError(
+            f'no definition of {type_name}; valid: the types of ROS 2 Jazzy'
+        ) from None
 
 
-def _unknown(type_name: str) -> RecordingError:
-    return RecordingError(f'no definition of {type_name}; valid: the types of ROS 2 Jazzy')
+@lru_cache(maxsize=64)
+def _installed(type_name: str) -> Typestore:
+    """Return a store that knows a type, those within it from their .msg files if need be."""
+    store, types, wanted = _jazzy(), {}, [type_name]
+    while wanted:
+        name = wanted.pop()
+        if name in store.fielddefs or name in types:
+            continue
+        found = get_types_from_msg(_message_file(name).read_text(encoding='utf-8'), name)
+        types.update(found)
+        for _, fields in found.values():
+            wanted += [part for _, kind in fields if (part := _message_in(kind))]
+    if not types:
+        return store
+    own = get_typestore(Stores.ROS2_JAZZY)
+    own.register(types)
+    return own
+
+
+def _message_in(kind: Any) -> str | None:
+    """Return the type of the message in a field, if there is one; arrays wrap another kind."""
+    while kind[0] in (Nodetype.ARRAY, Nodetype.SEQUENCE):
+        kind = kind[1][0]
+    return str(kind[1]) if kind[0] == Nodetype.NAME else None
+
+
+def _message_file(type_name: str) -> Path:
+    """Return the file that defines a type in a sourced workspace."""
+    package, _, name = type_name.partition('/msg/')
+    for prefix in os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep):
+        path = Path(prefix) / 'share' / package / 'msg' / f'{name}.msg'
+        if prefix and path.is_file():
+            return path
+    raise RecordingError(
+        f'no definition of {type_name}: it is no type of ROS 2 Jazzy, and no package of the '
+        'sourced workspaces has it as a .msg file'
+    )
 
 
 def definition_of(type_name: str) -> tuple[str, str]:
     """
-    Return what a bag stores of a standard message.
+    Return what a bag stores of a message type.
 
     Parameters
     ----------
@@ -72,14 +112,15 @@ def definition_of(type_name: str) -> tuple[str, str]:
     Raises
     ------
     RecordingError
-        If it is not a type of ROS 2 Jazzy.
+        If it is not a type of ROS 2 Jazzy nor installed, or its definition is not readable.
 
     """
     try:
-        definition, _ = _jazzy().generate_msgdef(type_name, ros_version=2)
-        return definition, _jazzy().hash_rihs01(type_name)
-    except TypesysError as error:
-        raise _unknown(type_name) from error
+        store = _installed(type_name)
+        definition, _ = store.generate_msgdef(type_name, ros_version=2)
+        return definition, store.hash_rihs01(type_name)
+    except (OSError, UnicodeDecodeError, TypesysError) as error:
+        raise RecordingError(f'the definition of {type_name} is not readable: {error}') from error
 
 
 def encode(message: Any) -> bytes:

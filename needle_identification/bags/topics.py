@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 import re
 from typing import Any, Final, NamedTuple
 
+from needle_ros.timing import NANOSECONDS
 import yaml
 
 #: Numbers that older recordings have instead of the words of rosbag2.
@@ -13,10 +15,11 @@ _WORDS: Final = {
     'reliability': {1: 'reliable', 2: 'best_effort'},
     'durability': {1: 'transient_local', 2: 'volatile'},
     'history': {1: 'keep_last', 2: 'keep_all'},
+    'liveliness': {1: 'automatic', 3: 'manual_by_topic'},
 }
 
-#: No limit, as rosbag2 stores it.
-_UNLIMITED: Final = {'sec': 9223372036, 'nsec': 854775807}
+#: No limit, as the middleware says it [ns].
+UNLIMITED: Final = 2**63 - 1
 
 
 class OfferedQos(NamedTuple):
@@ -30,6 +33,12 @@ class OfferedQos(NamedTuple):
         ``keep_all``.
     depth : int
         Number of messages that are kept.
+    deadline, lifespan : int
+        Longest time between messages, and that for which one counts [ns].
+    liveliness : str
+        ``automatic`` or ``manual_by_topic``.
+    lease : int
+        Longest time without a sign of the publisher [ns].
 
     """
 
@@ -37,6 +46,10 @@ class OfferedQos(NamedTuple):
     durability: str = 'volatile'
     history: str = 'keep_last'
     depth: int = 10
+    deadline: int = UNLIMITED
+    lifespan: int = UNLIMITED
+    liveliness: str = 'automatic'
+    lease: int = UNLIMITED
 
     def as_mapping(self) -> dict[str, Any]:
         """
@@ -45,7 +58,7 @@ class OfferedQos(NamedTuple):
         Returns
         -------
         dict
-            The profile; what is not known here is unlimited.
+            The profile.
 
         """
         return {
@@ -53,12 +66,24 @@ class OfferedQos(NamedTuple):
             'depth': self.depth,
             'reliability': self.reliability,
             'durability': self.durability,
-            'deadline': dict(_UNLIMITED),
-            'lifespan': dict(_UNLIMITED),
-            'liveliness': 'automatic',
-            'liveliness_lease_duration': dict(_UNLIMITED),
+            'deadline': _time(self.deadline),
+            'lifespan': _time(self.lifespan),
+            'liveliness': self.liveliness,
+            'liveliness_lease_duration': _time(self.lease),
             'avoid_ros_namespace_conventions': False,
         }
+
+
+def _time(nanoseconds: int) -> dict[str, int]:
+    sec, nsec = divmod(nanoseconds, NANOSECONDS)
+    return {'sec': sec, 'nsec': nsec}
+
+
+def _nanoseconds(time: Mapping[str, int] | None) -> int:
+    """Return a time as stored; none and zero stand for no limit."""
+    if time is None:
+        return UNLIMITED
+    return min(int(time['sec']) * NANOSECONDS + int(time['nsec']), UNLIMITED) or UNLIMITED
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,12 +129,16 @@ class Topic:
                     **{
                         name: words.get(stored[name], stored[name])
                         for name, words in _WORDS.items()
+                        if name in stored or name != 'liveliness'
                     },
                     depth=int(stored['depth']),
+                    deadline=_nanoseconds(stored.get('deadline')),
+                    lifespan=_nanoseconds(stored.get('lifespan')),
+                    lease=_nanoseconds(stored.get('liveliness_lease_duration')),
                 )
                 for stored in profiles
             )
-        except (yaml.YAMLError, KeyError, TypeError, ValueError, RecursionError):
+        except (yaml.YAMLError, AttributeError, KeyError, TypeError, ValueError, RecursionError):
             return ()
 
 

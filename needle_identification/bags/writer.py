@@ -103,7 +103,7 @@ class BagWriter:
         self, topic: str, type_name: str, offered: Sequence[OfferedQos] = (OfferedQos(),)
     ) -> None:
         """
-        Announce a topic.
+        Announce a topic, or that it has other publishers now.
 
         Parameters
         ----------
@@ -112,7 +112,7 @@ class BagWriter:
         type_name : str
             Message type, such as ``geometry_msgs/msg/WrenchStamped``.
         offered : sequence of OfferedQos
-            QoS of its publishers.
+            QoS of its publishers so far.
 
         Raises
         ------
@@ -135,7 +135,7 @@ class BagWriter:
                 'topic_type_hash': type_hash,
             },
         )
-        self._counts[topic] = 0
+        self._counts.setdefault(topic, 0)
         self._topics[topic] = {
             'name': topic,
             'type': type_name,

@@ -341,7 +341,7 @@ class Loop:
             },
         )
         self.until(lambda: self.aims and self.targets.get_subscription_count(), 'discovery')
-        self.until(lambda: self.paths.get_subscription_count() == 2, 'discovery')
+        self.until(self.paths.get_subscription_count, 'discovery')
 
     def until(self, condition: Callable[..., Any], what: str) -> None:
         self.graph.spin_until(condition, what)

@@ -198,6 +198,7 @@ def test_tracks_at_1_khz_as_the_continuous_loop_does(tmp_path: Path, preset: str
             **common,
             **gains,
             **straight,
+            'law': 'inverse_dynamics',
             'reference.kind': 'step',
             'safety.tracking_error': TARGET,
         },

@@ -3,21 +3,30 @@
 from collections.abc import Callable, Iterator
 import errno
 from pathlib import Path
+import signal
+import subprocess
+import sys
 import time
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from geometry_msgs.msg import Point, Pose, PoseStamped
 from nav_msgs.msg import Goals
-from needle_identification import BagWriter, message_counts, read_topic
+from needle_identification import Bag, BagWriter, message_counts, read_topic
+from needle_identification.bags.messages import definition_of
+from needle_identification.bags.topics import UNLIMITED
 from needle_identification.recorder_node import RecorderNode
 from needle_ros.base_node import COMMAND, LATCHED, SENSOR
 import pytest
 from rcl_interfaces.msg import Log
+from rclpy.duration import Duration
 from rclpy.node import Node
+from rclpy.qos import QoSProfile
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
+from support.installed import ROOT
 from support.ros_graph import RosGraph
 import yaml
 
@@ -222,6 +231,99 @@ def test_a_disk_error_ends_the_recording_and_is_reported(
     assert node.failure == reports[-1].status[0].message == expected
     assert node.is_active
     assert not (tmp_path / 'bag' / 'metadata.yaml').exists()
+
+
+def test_a_full_disk_is_an_exit_status(ros_graph: RosGraph, tmp_path: Path) -> None:
+    """A script sees that the recording is not whole: status 1 after Ctrl-C, with a line why."""
+    script = ROOT / 'scripts/recorder'
+    node = subprocess.Popen(
+        [
+            # No file may grow beyond 64 kB.
+            *('bash', '-c', f'ulimit -f 64; exec {sys.executable} {script} --ros-args "$@"', ''),
+            *('-p', f'path:={tmp_path / "bag"}', '-p', 'compression:=none'),
+        ],
+        env=ros_graph.environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+    assert node.stdout is not None
+    publisher = ros_graph.node('probe').create_publisher(String, 'text', COMMAND)
+    ros_graph.spin_until(publisher.get_subscription_count, 'the recorder')
+    for _ in range(20):
+        publisher.publish(String(data=20_000 * 'x'))
+    assert any('stopped: File too large' in line for line in node.stdout)
+    node.send_signal(signal.SIGINT)
+    node.communicate(timeout=60.0)
+    assert node.returncode == 1
+
+
+def test_later_publishers_and_all_of_their_qos_are_recorded(
+    ros_graph: RosGraph, record: Callable[..., Any], tmp_path: Path
+) -> None:
+    """Deadline, lifespan and lease too; the player offers what all publishers agree on."""
+    probe = ros_graph.node('probe')
+    timed = QoSProfile(
+        depth=5,
+        deadline=Duration(seconds=2.5),
+        lifespan=Duration(seconds=30.0),
+        liveliness_lease_duration=Duration(seconds=1.5),
+    )
+    first = probe.create_publisher(String, 'text', timed)
+    node = record(tmp_path / 'bag', topics=['text'])
+    ros_graph.spin_until(first.get_subscription_count, 'subscription')
+    first.publish(String(data='first'))
+    ros_graph.spin_until(lambda: node.diagnose()[2].get('/text') == 1, 'the first message')
+    later = probe.create_publisher(String, 'text', COMMAND)
+    ros_graph.spin_until(lambda: len(node._recorded['/text'].offered) == 2, 'the later publisher')
+    ros_graph.spin_until(later.get_subscription_count, 'subscription')
+    later.publish(String(data='later'))
+    ros_graph.spin_until(lambda: node.diagnose()[2].get('/text') == 2, 'the second message')
+    node.stop()
+    (topic,) = Bag(tmp_path / 'bag').topics()
+    one, two = topic.offered_qos()
+    assert (one.deadline, one.lifespan, one.lease) == (
+        2_500_000_000, 30_000_000_000, 1_500_000_000
+    )  # fmt: skip
+    assert (two.deadline, two.lifespan) == (UNLIMITED, UNLIMITED)
+    information = yaml.safe_load((tmp_path / 'bag' / 'metadata.yaml').read_text())
+    (listed,) = information['rosbag2_bagfile_information']['topics_with_message_count']
+    assert listed['message_count'] == 2
+    assert listed['topic_metadata']['offered_qos_profiles'] == [
+        one.as_mapping(), two.as_mapping()
+    ]  # fmt: skip
+    assert {m.data for _, m in read_topic(tmp_path / 'bag', '/text')} == {'first', 'later'}
+
+
+def test_a_type_that_only_its_package_knows_is_recorded(
+    ros_graph: RosGraph,
+    record: Callable[..., Any],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The definition, and those within it, come from .msg files of the sourced workspace."""
+    for name, text in {
+        'nav_msgs/msg/Goals': 'std_msgs/Header header\ngeometry_msgs/PoseStamped[] goals\n',
+        'own_msgs/msg/Plan': 'nav_msgs/Goals[2] parts\nOther[<=3] others\n',
+        'own_msgs/msg/Other': 'uint8 KIND=3\nfloat64[] values\n',
+    }.items():
+        path = tmp_path / 'prefix/share' / f'{name}.msg'
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+    monkeypatch.setenv('AMENT_PREFIX_PATH', f'/no/such:{tmp_path / "prefix"}')
+    publisher = ros_graph.node('probe').create_publisher(Goals, 'goals', COMMAND)
+    node = record(tmp_path / 'bag', topics=['goals'])
+    ros_graph.spin_until(publisher.get_subscription_count, 'subscription')
+    publisher.publish(Goals(goals=[PoseStamped(pose=Pose(position=Point(x=0.5)))]))
+    ros_graph.spin_until(lambda: node.diagnose()[2].get('/goals') == 1, 'the message')
+    node.stop()
+    # By the definition in the bag.
+    [(_, message)] = read_topic(tmp_path / 'bag', '/goals')
+    assert message.goals[0].pose.position.x == 0.5
+    definition, _ = definition_of('own_msgs/msg/Plan')
+    assert 'nav_msgs/Goals[2] parts' in definition
+    assert 'MSG: own_msgs/Other\nuint8 KIND=3\nfloat64[] values' in definition
+    assert 'MSG: geometry_msgs/Quaternion' in definition
 
 
 def publish(ros_graph: RosGraph, node: Node, count: int) -> None:
