@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from needle_dynamics.parameters import NeedleParameters, PRESETS
+from needle_dynamics.parameters import DEFAULT_PRESET, NeedleParameters, PRESETS
 from needle_ros.base_node import BaseNode
 from rcl_interfaces.msg import ParameterDescriptor
 
@@ -18,7 +18,7 @@ class ModelNode(BaseNode):
         # Fixed at start: the other defaults follow from it.
         self.declare_parameter(
             'model.preset',
-            'phantom',
+            DEFAULT_PRESET,
             ParameterDescriptor(description=f'one of {", ".join(PRESETS)}', read_only=True),
         )
         preset = self.get_parameter('model.preset').value

@@ -312,3 +312,6 @@ PRESETS: Final[Mapping[str, NeedleParameters]] = {
     'paper_mm': _PAPER_MM,
     'phantom': replace(_PAPER_MM, tissue_damping=1.6),
 }
+
+#: What nodes and commands take if nothing is said.
+DEFAULT_PRESET: Final = 'phantom'

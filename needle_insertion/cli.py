@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from codecs import register_error
 from collections.abc import Iterator, Mapping, Sequence
 from importlib import import_module
 from io import TextIOWrapper
@@ -27,6 +28,9 @@ COMMANDS: Final[Mapping[str, str]] = {
     'bench': 'measure speed and accuracy (from a clone)',
 }
 
+#: Characters of tables, for terminals that do not have them.
+_PLAIN: Final = {'±': '+-', '−': '-', '–': '-'}
+
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
@@ -46,9 +50,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
-    if isinstance(sys.stdout, TextIOWrapper):
-        # A terminal may not know a character such as that of plus or minus.
-        sys.stdout.reconfigure(errors='replace')
+    register_error('plain', _plain)
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, TextIOWrapper):
+            stream.reconfigure(errors='plain')
     # Imports take up to a second and leave nothing to clean up: until then a signal just ends it.
     previous = {name: signal.signal(name, signal.SIG_DFL) for name in _SIGNALS}
     try:
@@ -56,6 +61,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     finally:
         for name, handler in previous.items():
             signal.signal(name, handler)
+
+
+def _plain(error: UnicodeError) -> tuple[str, int]:
+    """Write what a terminal cannot show with characters that it can, for `codecs`."""
+    if not isinstance(error, UnicodeEncodeError):
+        raise error
+    text = error.object[error.start : error.end]
+    return ''.join(_PLAIN.get(character, '?') for character in text), error.end
 
 
 def _run(words: list[str]) -> int:

@@ -8,7 +8,7 @@ import json
 from pathlib import Path
 import sys
 
-from needle_dynamics import FORMULATIONS, NeedleModel, NeedleParameters, PRESETS
+from needle_dynamics import FORMULATIONS, NeedleModel, NeedleParameters
 from needle_dynamics.linearization import SLIDING
 from needle_insertion.commands.common import (
     add_needle,
@@ -24,7 +24,7 @@ from needle_ros.errors import ParameterError
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of `needle analyze`."""
-    add_needle(parser, PRESETS, 'phantom')
+    add_needle(parser)
     parser.add_argument('--formulation', choices=FORMULATIONS, default='complete')
     parser.add_argument('--modes', type=int, default=2, metavar='N', help='shape modes')
     points = parser.add_argument_group(

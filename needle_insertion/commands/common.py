@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 import json
 import os
 from pathlib import Path
@@ -33,7 +33,7 @@ class Command(NamedTuple):
     signed: tuple[str, ...] = ()
 
 
-def add_needle(parser: ArgumentParser, presets: Iterable[str], default: str) -> None:
+def add_needle(parser: ArgumentParser) -> None:
     """
     Add the options that choose the constants of the model, ``--preset`` and ``--set``.
 
@@ -41,17 +41,15 @@ def add_needle(parser: ArgumentParser, presets: Iterable[str], default: str) -> 
     ----------
     parser : ArgumentParser
         Parser of a command.
-    presets : iterable of str
-        Names of the presets.
-    default : str
-        The preset if none is given.
 
     """
+    from needle_dynamics import DEFAULT_PRESET, PRESETS
+
     parser.add_argument(
         '--preset',
-        choices=tuple(presets),
-        default=default,
-        help=f'constants of needle and tissue (default {default})',
+        choices=tuple(PRESETS),
+        default=DEFAULT_PRESET,
+        help=f'constants of needle and tissue (default {DEFAULT_PRESET})',
     )
     parser.add_argument(
         '--set',

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import argparse
 import json
+from math import sqrt
 from pathlib import Path
 import sys
 from typing import Final
 
-from needle_dynamics import NeedleModel, NeedleParameters, PRESETS, simulate
+from needle_dynamics import NeedleModel, NeedleParameters, simulate
 from needle_dynamics.simulated.integrator import DEFAULT_TOLERANCE
 from needle_insertion.commands.common import add_needle, check_file, Command, constants
 from needle_insertion.report import trajectory as report
@@ -18,15 +19,19 @@ from needle_ros.errors import ParameterError
 #: Deflection of the tip at the start by default [m], that of section 3.2.8.
 _DEFLECTION: Final = 5e-4
 
+#: Samples of a run by default, and its duration where the force does not insert the needle [s].
+_SAMPLES: Final = 5000
+_NO_WAY: Final = 1.0
+
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of `needle simulate`."""
-    add_needle(parser, PRESETS, 'paper_si')
+    add_needle(parser)
     for name, default, unit, words in (
         ('depth', 0.02, 'm', 'inserted length at the start'),
         ('force', 3.0, 'N', 'insertion force'),
-        ('duration', 0.05, 's', 'time to simulate'),
-        ('interval', 1e-4, 's', 'time between samples'),
+        ('duration', None, 's', 'time to simulate (default: until the hub is at the skin)'),
+        ('interval', None, 's', f'time between samples (default: {_SAMPLES} of them)'),
         ('tolerance', DEFAULT_TOLERANCE, 'X', 'relative error of each interval'),
     ):
         parser.add_argument(
@@ -34,7 +39,7 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
             type=float,
             default=default,
             metavar=unit,
-            help=f'{words} (default {default:g})',
+            help=words if default is None else f'{words} (default {default:g})',
         )
     start = parser.add_mutually_exclusive_group()
     start.add_argument(
@@ -61,6 +66,18 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--json', action='store_true', help='print JSON instead of a table')
 
 
+def _time_to_hub(parameters: NeedleParameters, depth: float, force: float) -> float:
+    """Return a time in which a constant force inserts the needle, to two digits [s]."""
+    drive, way = force - parameters.coulomb_friction, parameters.length - depth
+    if drive <= 0.0 or way <= 0.0:
+        return _NO_WAY
+    # Speeding up and steady motion, one after the other, take longer than both at once.
+    longest = way * parameters.viscous_friction / drive + sqrt(
+        2.0 * way * parameters.moving_mass / drive
+    )
+    return float(f'{1.05 * longest:.2g}')
+
+
 def _run(options: argparse.Namespace) -> int:
     """Simulate, write the outputs, and print a summary."""
     for path in options.output:
@@ -73,12 +90,15 @@ def _run(options: argparse.Namespace) -> int:
     modal = options.modal or ()
     given = options.tip_deflection
     deflection = given if given is not None else 0.0 if modal else _DEFLECTION
+    duration = options.duration
+    if duration is None:
+        duration = _time_to_hub(parameters, options.depth, options.force)
     trajectory = simulate(
         parameters,
         NeedleModel(parameters).state_at(options.depth, deflection, modal),
         options.force,
-        duration=options.duration,
-        interval=options.interval,
+        duration=duration,
+        interval=duration / _SAMPLES if options.interval is None else options.interval,
         tolerance=options.tolerance,
     )
     for path in options.output:
@@ -89,10 +109,11 @@ def _run(options: argparse.Namespace) -> int:
     if options.json:
         sys.stdout.write(f'{json.dumps(summary, indent=2)}\n')
     else:
-        rows = [(name, f'{value:.6g}') for name, value in summary.items()]
+        # What has faded has no digits left.
+        rows = [(name, f'{round(value, 15):.6g}') for name, value in summary.items()]
         sys.stdout.write(
             f'{options.preset}: inserted {options.depth:g} m at the start, force '
-            f'{options.force:g} N, for {options.duration:g} s\n\n'
+            f'{options.force:g} N, for {duration:g} s\n\n'
             f'{table(rows, ("quantity", "value"))}\n'
         )
         for path in options.output:

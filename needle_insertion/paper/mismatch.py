@@ -27,7 +27,7 @@ from needle_controller import (
     run_batch,
     Setpoint,
 )
-from needle_dynamics import FloatArray, NeedleModel, NeedleParameters
+from needle_dynamics import DEFAULT_PRESET, FloatArray, NeedleModel, NeedleParameters
 from needle_insertion.paper.figures import LAW_COLORS
 from needle_insertion.paper.runs import LAWS
 from needle_insertion.report.content import Grid, Picture, Section
@@ -47,7 +47,7 @@ DEFLECTION: Final = 5e-4
 STEP: Final = 1e-3
 
 #: Preset that the laws believe in, and the middle of the true needles.
-PRESET: Final = 'phantom'
+PRESET: Final = DEFAULT_PRESET
 
 #: What is studied, in words, and its delay [periods].
 CASES: Final[Mapping[str, tuple[str, int]]] = {

@@ -22,7 +22,7 @@ from needle_insertion.paper.identified import (
 from needle_insertion.paper.tables import TABLE_1, TABLE_2
 from needle_insertion.report.content import Section
 from needle_insertion.report.page import write_page
-from needle_insertion.report.text import table
+from needle_insertion.report.text import filled, table
 from tqdm import tqdm
 
 #: Tables that a result is judged by.
@@ -143,7 +143,7 @@ def _of_claims(judged: list[claims.Claim]) -> Result:
     rows = [(one.section, one.claim, one.words) for one in judged]
     return Result(
         section=section,
-        text=f'{section.paragraphs[0]}\n\n{table(rows, VERDICT_HEADS)}',
+        text=f'{filled(section.paragraphs[0])}\n\n{table(rows, VERDICT_HEADS)}',
         verdicts=tuple((one.section, one.claim, one.verdict) for one in judged),
         document={'claims': [asdict(one) for one in judged]},
     )
@@ -154,7 +154,7 @@ def _of_section(section: Section, **more: object) -> Result:
     captions = [one.caption for one in section.pictures]
     return Result(
         section=section,
-        text='\n\n'.join((*section.paragraphs, *grids, *captions)),
+        text='\n\n'.join((*map(filled, section.paragraphs), *grids, *map(filled, captions))),
         document={
             'title': section.title,
             'paragraphs': section.paragraphs,

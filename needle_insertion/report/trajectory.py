@@ -23,6 +23,10 @@ if TYPE_CHECKING:
 #: Deflection up to which a linear beam is valid, as a part of the inserted length.
 _LINEAR: Final = 0.1
 
+#: A mode that has faded by a factor of e to this power within this part of a run is not missed.
+_FADED: Final = 7.0
+_SOON: Final = 0.02
+
 
 def summary(trajectory: Trajectory) -> dict[str, float]:
     """
@@ -77,6 +81,10 @@ def warnings(trajectory: Trajectory) -> Iterator[str]:
             f'the tip deflects {1e3 * tips[worst]:.3g} mm at {1e3 * depths[worst]:.3g} mm '
             'inserted: a linear beam is valid up to about a tenth of the inserted length'
         )
+    p, duration = trajectory.parameters, float(trajectory.time[-1])
+    fade = p.tissue_damping / (2.0 * p.linear_density)
+    if fade * _SOON * duration > _FADED:
+        return
     # The frequencies depend on the inserted length.
     ends = [
         linearize(model, trajectory.states[k], time=float(trajectory.time[k]), sliding='insertion')

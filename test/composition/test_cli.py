@@ -251,7 +251,7 @@ def test_a_terminal_without_unicode_gets_a_result() -> None:
     """Characters that it does not know are replaced."""
     done = run('identify', 'friction', BAGS[0], PYTHONIOENCODING='ascii')
     assert (done.returncode, done.stderr) == (0, '')
-    assert 'mean ? SE' in done.stdout
+    assert 'mean +- SE' in done.stdout
 
 
 def test_the_wrong_kind_of_recording_names_the_right_subcommand(

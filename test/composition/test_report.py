@@ -46,6 +46,24 @@ def test_columns_of_a_table_line_up(rows: list[tuple[str, str, str]]) -> None:
             start += width + 2
 
 
+WORDS = st.lists(st.text('ab-', min_size=1, max_size=12), min_size=1, max_size=12).map(' '.join)
+
+
+@given(st.lists(st.tuples(WORDS, WORDS, WORDS, WORDS), min_size=1, max_size=3))
+@settings(deadline=None)
+def test_a_table_fits_a_terminal(rows: list[tuple[str, ...]]) -> None:
+    """At most 100 columns, with every word in its column."""
+    lines = table(rows, ('a', 'b', 'c', 'd')).splitlines()
+    assert max(map(len, lines)) <= 100
+    starts = [match.start() for match in re.finditer('-+', lines[1])]
+    columns = [
+        ' '.join(' '.join(line[start:end].split()) for line in lines[2:])
+        for start, end in zip(starts, [*starts[1:], None], strict=True)
+    ]
+    for column, cells in zip(columns, zip(*rows, strict=True), strict=True):
+        assert column.split() == ' '.join(cells).split()
+
+
 def test_a_failure_is_printed_in_capitals() -> None:
     """The verdict follows the check."""
     assert Check('x', '1', '2', passed=False).row == ('x', '1', '2', 'FAIL')
