@@ -9,10 +9,10 @@ SOURCES := needle_ros needle_dynamics needle_controller needle_identification ne
 demo: setup
 	$(BIN)/needle demo
 
-test: setup
+test: $(VENV)/.dev
 	$(BIN)/python -m pytest -n auto
 
-check: setup
+check: $(VENV)/.dev
 	$(BIN)/ruff format --check $(SOURCES)
 	$(BIN)/ruff check $(SOURCES)
 	$(BIN)/mypy
@@ -22,7 +22,7 @@ docs: $(VENV)/.docs
 	$(BIN)/python -m sphinx -q -W --keep-going -b html docs docs/_build/html
 	@echo 'docs/_build/html/index.html'
 
-format: setup
+format: $(VENV)/.dev
 	$(BIN)/ruff check --fix $(SOURCES)
 	$(BIN)/ruff format $(SOURCES)
 
@@ -35,6 +35,11 @@ $(VENV)/.complete: requirements.lock setup.py package.xml
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
 	touch $@
 
+# What tests and checks need besides.
+$(VENV)/.dev: requirements-dev.lock $(VENV)/.complete
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements-dev.lock
+	touch $@
+
 $(VENV)/.docs: requirements-docs.lock $(VENV)/.complete
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements-docs.lock
 	touch $@
@@ -42,9 +47,12 @@ $(VENV)/.docs: requirements-docs.lock $(VENV)/.complete
 # Pins for every supported Python at once; run after a change of dependencies in setup.py.
 lock:
 	uv pip compile --quiet --universal --python-version 3.10 --no-annotate --no-header \
-		--extra ros --extra dev setup.py requirements-build.in -o requirements.lock
+		--extra ros setup.py requirements-build.in -o requirements.lock
 	uv pip compile --quiet --universal --python-version 3.10 --no-annotate --no-header \
-		--extra docs --constraints requirements.lock setup.py -o requirements-docs.lock
+		--extra ros --extra dev --constraints requirements.lock \
+		setup.py requirements-build.in -o requirements-dev.lock
+	uv pip compile --quiet --universal --python-version 3.10 --no-annotate --no-header \
+		--extra docs --constraints requirements-dev.lock setup.py -o requirements-docs.lock
 
 # The shipped recordings, made anew through real nodes.
 bags: setup

@@ -45,6 +45,7 @@ setup(
         (f'lib/{NAME}', [f'scripts/{node}' for node in NODES]),
     ],
     install_requires=[
+        'argcomplete>=2.0',
         'jinja2>=3.1',
         'lz4>=4.0',
         'markupsafe>=2.1',

@@ -7,6 +7,7 @@ from codecs import register_error
 from collections.abc import Iterator, Mapping, Sequence
 from importlib import import_module
 from io import TextIOWrapper
+import os
 import re
 import signal
 import sys
@@ -50,6 +51,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
+    if '_ARGCOMPLETE' in os.environ:
+        # The shell asks what may follow.
+        words = os.environ.get('COMP_LINE', '').split()[1:]
     register_error('plain', _plain)
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):
@@ -77,7 +81,12 @@ def _run(words: list[str]) -> int:
     if chosen in COMMANDS:
         command = import_module(f'needle_insertion.commands.{chosen}').COMMAND
         words = _joined(words, command.signed)
-    options = _parser(chosen, command).parse_args([_as_value(word) for word in words])
+    parser = _parser(chosen, command)
+    if '_ARGCOMPLETE' in os.environ:
+        import argcomplete
+
+        argcomplete.autocomplete(parser)
+    options = parser.parse_args([_as_value(word) for word in words])
     if command is not None:
         from needle_dynamics.compiled.cache import announce_compilation
 

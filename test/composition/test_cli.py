@@ -247,6 +247,32 @@ def test_a_cutoff_that_the_recording_cannot_have_is_named(
     assert 'beyond half the sampling rate, 50 Hz' in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ('line', 'offered'),
+    [
+        ('needle simu', ['simulate']),
+        ('needle simulate --pre', ['--preset']),
+        ('needle identify friction --estimator h', ['huber']),
+    ],
+)
+def test_the_shell_completes_commands_options_and_values(line: str, offered: list[str]) -> None:
+    """As after ``eval "$(register-python-argcomplete needle)"``: answers go to descriptor 8."""
+    asked = subprocess.run(
+        ['/bin/bash', '-c', f'exec {sys.executable} -m needle_insertion 8>&1 >/dev/null'],
+        env={
+            **os.environ,
+            '_ARGCOMPLETE': '1',
+            '_ARGCOMPLETE_IFS': ' ',
+            'COMP_LINE': line,
+            'COMP_POINT': str(len(line)),
+        },
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert asked.stdout.split() == offered
+
+
 def test_a_terminal_without_unicode_gets_a_result() -> None:
     """Characters that it does not know are replaced."""
     done = run('identify', 'friction', BAGS[0], PYTHONIOENCODING='ascii')
