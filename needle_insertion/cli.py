@@ -9,12 +9,14 @@ from importlib import import_module
 from io import TextIOWrapper
 import os
 import re
+import shlex
 import signal
 import sys
 from types import FrameType
 from typing import Any, Final, NoReturn
 
 from needle_insertion.commands.common import Command
+from needle_insertion.report.made import COMMAND
 from needle_ros.errors import JobError, NeedleError
 
 #: Subcommands, each a module of `needle_insertion.commands`, and what the help says of them.
@@ -78,6 +80,7 @@ def _plain(error: UnicodeError) -> tuple[str, int]:
 def _run(words: list[str]) -> int:
     chosen = next((word for word in words if not word.startswith('-')), '')
     command: Command | None = None
+    COMMAND.set(shlex.join(['needle', *words]))
     if chosen in COMMANDS:
         command = import_module(f'needle_insertion.commands.{chosen}').COMMAND
         words = _joined(words, command.signed)

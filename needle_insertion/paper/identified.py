@@ -216,7 +216,7 @@ class IdentifiedTable:
             ),
             tables=(
                 Grid(
-                    caption=f'{self.title} from {len(self.bags)} recordings',
+                    caption=f'{self.title} from {len(self.bags)} simulated recordings',
                     heads=_HEADS,
                     rows=tuple(line.row for line in self.lines),
                 ),

@@ -107,7 +107,7 @@ def results(what: str, recorded: Mapping[str, Sequence[Path]] | None = None) -> 
 
     """
     tables = {name: identify_table(name, recorded) for name in _JUDGED_BY.get(what, ())}
-    source = 'the shipped recordings' if recorded is None else 'the recordings'
+    source = f'the {"shipped" if recorded is None else "new"} simulated recordings'
     jobs = _jobs(tables, source)
     chosen = [name for name in jobs if name not in figures.FIGURES] if what == 'all' else [what]
     return {name: jobs[name]() for name in tqdm(chosen, **_bar('results'))}
@@ -244,7 +244,7 @@ def write_results(folder: Path, found: Mapping[str, Result]) -> Path:
         )
     for one in (found[name] for name in TABLES if name in found):
         lines, bags = (len(one.document[name]) for name in ('lines', 'bags'))
-        note = f'{lines} quantities, means and STD, from {bags} recordings'
+        note = f'{lines} quantities, means and STD, from {bags} simulated recordings'
         cards.append((one.section.title, VERDICTS[one.holds], note))
     sections = [one.section for one in found.values()]
     path = folder / 'reproduce.html'

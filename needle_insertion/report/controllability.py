@@ -44,9 +44,13 @@ POINT_HEADS: Final = (
 _MAPPED: Final = ('rank', 'distance', 'observed_rank', 'observed_margin', 'output_gain')
 
 _PANELS: Final = (
-    ('distance', 'distance from losing state controllability'),
-    ('output_gain', 'tip deflection per base travel'),
-    ('observed_margin', 'distance from seeing less of the state'),
+    ('distance', 'distance from losing state controllability', 'change of A, B (natural units)'),
+    ('output_gain', 'tip deflection per base travel', 'm per m'),
+    (
+        'observed_margin',
+        'distance from seeing less of the state',
+        'change of A, C (natural units)',
+    ),
 )
 
 
@@ -81,7 +85,7 @@ class Point:
             f'{1e2 * self.depth:g} cm, {1e3 * self.deflection:g} mm, {1e3 * self.speed:g} mm/s',
             *_cells(found.state),
             *_cells(found.observed),
-            f'{found.output_gain:.2g}' if found.output_controllable else 'not steered',
+            f'{found.output_gain:.2g}' if found.output_controllable else 'none',
         )
 
     @property
@@ -234,7 +238,8 @@ def draw_map(found: ControllabilityMap) -> Figure:
     figure = Figure(figsize=(13.0, 4.6), layout='constrained')
     order = 2 * (2 + parameters.modes)
     lost = found.rank < order
-    for axes, (name, title) in zip(figure.subplots(1, 3, sharey=True), _PANELS, strict=True):
+    panels = zip(figure.subplots(1, 3, sharey=True), _PANELS, strict=True)
+    for axes, (name, title, unit) in panels:
         shown = np.ma.masked_array(getattr(found, name), lost).T
         axes.set_facecolor('0.75')
         mesh = axes.pcolormesh(
@@ -244,7 +249,7 @@ def draw_map(found: ControllabilityMap) -> Figure:
             norm=LogNorm() if shown.count() else None,
             shading='nearest',
         )
-        figure.colorbar(mesh, ax=axes, location='bottom')
+        figure.colorbar(mesh, ax=axes, location='bottom', label=unit)
         axes.set(title=title, xlabel='inserted length [cm]')
         axes.title.set_fontsize('medium')
     figure.axes[0].set_ylabel('tip deflection [mm]')

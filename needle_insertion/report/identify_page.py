@@ -96,7 +96,7 @@ def _friction_content(summary: FrictionSummary, label: Mapping[str, str]) -> dic
     return {
         'title': 'Friction between needle and tissue',
         'introduction': f'Identified from {_counted(len(estimates), "recording")} of force and '
-        'motion of the needle base by regression on equation (15).',
+        'motion of the needle base by regression on F = mu_s sgn(v) + mu_v v, equation (15).',
         'pictures': _friction_pictures(label, means, shown, estimates),
         'cards': [_card(one) for one in main or summary.statistics[:2]],
         'mean_rows': [(*mean_row(one), _published(one)) for one in means],
@@ -151,8 +151,9 @@ def _friction_pictures(
     return [
         Picture(
             'friction_data',
-            f'{name}: force over time and against speed after the low-pass filter, and the fit '
-            f'of {", ".join(shown.terms)} to the samples in steady motion.',
+            f'{name}, whose mu_s is nearest to the median: force over time and against speed '
+            f'after the low-pass filter, and the fit of {", ".join(shown.terms)} to the samples '
+            'in steady motion.',
             figures.friction_data(shown),
             f'Two plots of {name}. The force over time follows the strokes of the needle, with '
             'the fitted force on top of it. Against speed the force jumps at zero by twice mu_s '
@@ -186,7 +187,7 @@ def _stiffness_content(summary: StiffnessSummary, label: Mapping[str, str]) -> d
     return {
         'title': 'Stiffness of the tissue',
         'introduction': f'Identified from {_counted(len(estimates), "recording")} of presses in '
-        'the plane of deflection, as in Table 2 of the paper.',
+        'the plane of deflection by F = K x, with the matrix K of Table 2 of the paper.',
         'pictures': _stiffness_pictures(summary, force, rows, shown, label[shown.name]),
         'cards': [
             _card(result),
@@ -260,9 +261,10 @@ def _stiffness_pictures(
         ),
         Picture(
             'stiffness_presses',
-            f'{name}. Left: force against displacement along each direction. Right: where the '
-            'end-effector came to rest, the ellipse on which each level of force ends according '
-            'to the fitted matrix, and the principal axes at the largest force.',
+            f'{name}, whose k_a is nearest to the median. Left: force against displacement along '
+            'each direction. Right: where the end-effector came to rest, the ellipse on which '
+            'each level of force ends according to the fitted matrix, and the principal axes at '
+            'the largest force.',
             figures.stiffness_presses(shown),
             f'Two plots of {name}. Force grows with displacement in each direction. The rest '
             'positions of a level of force lie on an ellipse.',

@@ -2,23 +2,33 @@
 Self-contained HTML pages from the templates of this folder.
 
 A page needs no other file and loads nothing, and its own policy tells the browser so. The same
-content gives the same bytes. Templates escape all text that they are given.
+content gives the same bytes, but for the date. Templates escape all text that they are given.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from functools import partial
 from pathlib import Path
 import re
 from typing import Any, Final
 
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template
+from markupsafe import Markup
 from needle_identification.result import write_whole
 from needle_insertion.report.content import Picture
+from needle_insertion.report.made import made
 from needle_insertion.report.symbols import symbols
 
 #: A text that starts with a number and is longer, such as a checksum, is not a number.
 _LONGEST_NUMBER: Final = 40
+
+#: A longer cell has words for reading.
+_SENTENCE: Final = 30
+#: Headings, and how many of them are worth a table of contents.
+_HEADING: Final = re.compile('<h2 id="([^"]*)">(.*?)</h2>')
+_FEWEST_HEADINGS: Final = 4
+
 _NUMBER: Final = re.compile(r'[-+]?\d')
 
 #: Style classes of cells that hold a verdict.
@@ -37,6 +47,26 @@ def _kind(cell: str) -> str:
     return _VERDICTS.get(cell, 'number' if is_number else '')
 
 
+def _has_sentences(rows: Sequence[Sequence[str]]) -> bool:
+    """Return whether the cells of a table are for reading rather than comparing."""
+    return any(len(cell) > _SENTENCE for row in rows for cell in row[1:])
+
+
+def _anchor(words: str) -> str:
+    """Return the name of a heading in an address."""
+    return re.sub(r'\W+', '-', words.lower()).strip('-')
+
+
+def _contents(content: str) -> Markup:
+    """Return the table of contents of a page, nothing for a short one."""
+    found = _HEADING.findall(content)
+    if len(found) < _FEWEST_HEADINGS:
+        return Markup()
+    # Both are from the page itself, where they have been escaped.
+    links = ''.join(f'<a href="#{anchor}">{words}</a>\n' for anchor, words in found)
+    return Markup(f'<nav aria-label="Contents">\n{links}</nav>')  # noqa: S704
+
+
 #: Templates of this folder.
 TEMPLATES: Final = Environment(
     loader=PackageLoader('needle_insertion.report'),
@@ -45,7 +75,14 @@ TEMPLATES: Final = Environment(
     trim_blocks=True,
     lstrip_blocks=True,
 )
-TEMPLATES.filters.update(symbols=symbols, kind=_kind)
+TEMPLATES.filters.update(
+    symbols=symbols,
+    kind=_kind,
+    anchor=_anchor,
+    contents=_contents,
+    has_sentences=_has_sentences,
+    zip=partial(zip, strict=True),
+)
 
 
 def write_page(
@@ -72,7 +109,7 @@ def write_page(
 
     """
     shown = {one.name: one for one in pictures}
-    page = TEMPLATES.get_template(template).render(pictures=shown, **content)
+    page = TEMPLATES.get_template(template).render(pictures=shown, made=made(), **content)
     for name, one in shown.items():
         write_whole(path.parent / f'{name}.png', one.image)
     write_whole(path, page.encode())

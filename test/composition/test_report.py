@@ -12,6 +12,7 @@ from markupsafe import Markup
 from matplotlib.figure import Figure
 from needle_dynamics import ParameterError
 from needle_insertion.report.content import Picture
+from needle_insertion.report.made import COMMAND
 from needle_insertion.report.page import TEMPLATES, write_page
 from needle_insertion.report.text import Check, CHECK_HEADS, table
 import pytest
@@ -178,6 +179,7 @@ def test_the_page_needs_nothing_beside_it(tmp_path: Path) -> None:
         [picture()],
         title='title',
         introduction='text',
+        cards=[('Checks', '1 of 1', 'pass')],
         rows=[check.row for check in checks],
         heads=CHECK_HEADS,
     )
@@ -191,8 +193,11 @@ def test_the_page_needs_nothing_beside_it(tmp_path: Path) -> None:
     assert {item.name for item in tmp_path.iterdir()} == {'report.html', 'plot.png'}
 
 
-def test_the_same_content_gives_the_same_bytes(tmp_path: Path) -> None:
-    """No date and no name of the folder gets into the page or its pictures."""
+def test_the_same_content_gives_the_same_bytes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No name of the folder gets into the page or its pictures, and the date that is asked for."""
+    monkeypatch.setenv('SOURCE_DATE_EPOCH', '86400')
     pages = []
     for name in ('one', 'two'):
         folder = tmp_path / name
@@ -200,6 +205,33 @@ def test_the_same_content_gives_the_same_bytes(tmp_path: Path) -> None:
         show(folder / 'page.html', [], [picture()])
         pages.append([(folder / file).read_bytes() for file in ('page.html', 'plot.png')])
     assert pages[0] == pages[1]
+    assert b'1970-01-02 00:00 UTC</footer>' in pages[0][0]
+
+
+def test_a_long_page_has_contents(tmp_path: Path) -> None:
+    """Each heading has a link that leads to it; a short page has none."""
+    path = tmp_path / 'page.html'
+    titles = ['mu_s & more', 'Data <fit>', 'Files', 'k_xx']
+    for count in (3, 4):
+        show(path, [BLOCKS.heading(title) for title in titles[:count]])
+        reader = Reader(path.read_text())
+        links = [given['href'] for tag, given in reader.tags if tag == 'a']
+        anchors = [f'#{given["id"]}' for tag, given in reader.tags if tag == 'h2']
+        assert links == (anchors if count == 4 else [])
+    assert len(set(links)) == 4
+
+
+def test_a_page_says_how_it_was_made(tmp_path: Path) -> None:
+    """Version, the command as it was typed, and the date."""
+    token = COMMAND.set("needle identify friction 'a b'")
+    show(tmp_path / 'page.html', [])
+    COMMAND.reset(token)
+    made = re.search('<footer>(.*)</footer>', (tmp_path / 'page.html').read_text())
+    assert made
+    assert re.fullmatch(
+        r'needle_insertion [\d.]+, needle identify friction &#39;a b&#39;, [-\d]+ [:\d]+ UTC',
+        made[1],
+    )
 
 
 def test_a_page_fits_a_telephone(tmp_path: Path) -> None:
