@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import isfinite
 from typing import Final
 
 from needle_controller.controller import Measurement
@@ -29,6 +28,8 @@ class Bending:
         Needle and tissue.
     observer : Observer, optional
         Estimates the bending from tip and wrench.
+    largest : float
+        Load that no needle has [N]; an observer that says so is started anew.
 
     Attributes
     ----------
@@ -43,9 +44,14 @@ class Bending:
 
     """
 
-    def __init__(self, parameters: NeedleParameters, observer: Observer | None = None) -> None:
+    def __init__(
+        self,
+        parameters: NeedleParameters,
+        observer: Observer | None = None,
+        largest: float = 1e6,
+    ) -> None:
         self.model = NeedleModel(parameters)
-        self.observer = observer
+        self.observer, self._largest = observer, largest
         self.forget()
 
     def forget(self) -> None:
@@ -113,8 +119,8 @@ class Bending:
         # What is finite may be too large all the same.
         with np.errstate(over='ignore', invalid='ignore'):
             load = -float(self.model.bias_forces(state)[0])
-        if not isfinite(load):
-            raise ParameterError('the forces of such a needle are not finite')
+        if not abs(load) <= self._largest:
+            raise ParameterError(f'such a needle has a load of {load:.3g} N')
         self.load = load
 
     def update(self, stamp: int, measured: Measurement) -> None:
@@ -145,6 +151,10 @@ class Bending:
         self._updates += 1
         if self._updates % _LOOK == 0:
             self._judge(observer)
+        if not abs(observer.load) <= self._largest:
+            load = observer.load
+            self.forget()
+            raise ParameterError(f'a load of {load:.3g} N is absurd; the observer started anew')
         if self.warning is None:
             self.load = observer.load
 

@@ -109,7 +109,8 @@ class Supervisor:
                 raise ParameterError(f'observer.{error}') from error
             noise['base_wrench'] = observed.force_noise, observed.torque_noise
             noise['tip_deflection'] = (observed.tip_noise,)
-        self.controller, self.bending = controller, Bending(controller.parameters, observer)
+        self.controller = controller
+        self.bending = Bending(controller.parameters, observer, limits.axial_load)
         stop = self.safety.stop
         self.safety = Safety(
             limits,
@@ -346,6 +347,7 @@ class Supervisor:
             self.journal.refuse(message)
             return Reply(False, message, answer)
         self.fault = _WAITING
+        self.bending.forget()
         self.journal.say(Severity.INFO, 'the stop is cleared')
         return Reply(True, 'cleared; the motion starts anew', answer)
 
@@ -404,7 +406,9 @@ class Supervisor:
         answer, deflection = self._check_clock(now), reading.values[0][2]
         if self._counts('tip_deflection', reading, [deflection], now):
             answer = self._stop_for(self.safety.guard.tip(deflection), now) or answer
-            self.bending.take_tip(reading.stamp, deflection)
+            # What is beyond a limit is not believed, be it a single reading.
+            if not self.safety.guard.is_beyond('tip_deflection'):
+                self.bending.take_tip(reading.stamp, deflection)
         return answer
 
     def wrench(self, reading: Reading, now: int) -> Answer | None:
@@ -432,7 +436,8 @@ class Supervisor:
             # The sensor also feels the torque that turns the base.
             moment -= self._last.torque
             newest = self.safety.streams['joint_states'].last
-            self.bending.take_wrench(reading.stamp, lateral, moment, newest)
+            if not self.safety.guard.is_beyond('base_wrench'):
+                self.bending.take_wrench(reading.stamp, lateral, moment, newest)
         return answer
 
     def truth(self, reading: Reading, now: int) -> Answer | None:
@@ -504,7 +509,11 @@ class Supervisor:
         except ParameterError as error:
             return self._let_go(str(error), stamp)
         if measured.is_finite():
-            self._stop_for(self.safety.guard.encoders(measured.depth, measured.speed), stamp)
+            self._stop_for(self.safety.guard.encoders(measured), stamp)
+            if self.safety.guard.is_beyond('joint_states'):
+                # Alone it is a fault of the sensor: what is commanded stays, for a period.
+                last = Answer(stamp, self._last.force, self._last.torque)
+                return self._command(Answer(stamp) if self.safety.stop else last)
             try:
                 self.bending.update(stamp, measured)
             except NeedleError as error:
@@ -609,6 +618,7 @@ class Supervisor:
         if not self.safety.latch(reason):
             return None
         self.fault = reason
+        self.bending.forget()
         self.journal.say(Severity.ERROR, f'stopped: {reason}; no force until ~/clear_stop')
         return self._release(stamp)
 

@@ -181,16 +181,19 @@ class Observer:
         Raises
         ------
         ParameterError
-            If time, depth or speed is not finite; the estimate stays as it is.
+            If time, depth or speed is not finite, or the speed is absurd; the estimate stays as it
+            is.
         InsertedLengthError
             If the depth is outside its range; the estimate stays as it is.
 
         """
-        if not (isfinite(time) and isfinite(depth) and isfinite(speed)):
-            raise ParameterError(
-                f'time, depth and speed must be finite, got {time!r}, {depth!r} and {speed!r}'
-            )
         needle = self._filter.needle
+        fastest = needle.length / self.period
+        if not (isfinite(time) and isfinite(depth) and abs(speed) <= fastest):
+            raise ParameterError(
+                'time, depth and speed must be finite, and the speed at most a needle length in '
+                f'a period, {fastest:g} m/s, got {time!r}, {depth!r} and {speed!r}'
+            )
         slack = ROUNDING * needle.length
         if not needle.minimum_depth <= depth <= needle.maximum_depth + slack:
             low = self.model.parameters.minimum_depth

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
+from needle_controller.controller import Measurement
 from needle_controller.safety.limits import SafetyLimits
 
 #: Readings in a row that have to be beyond a limit: one alone may be a fault of the sensor.
@@ -48,14 +49,31 @@ class Guard:
         self._beyond[topic] = line, count
         return line if count >= _IN_A_ROW else None
 
-    def encoders(self, depth: float, speed: float) -> str | None:
+    def is_beyond(self, topic: str) -> bool:
         """
-        Return the limit that inserted length [m] or insertion speed [m/s] violate.
+        Return whether the last reading of a topic is beyond a limit, alone or not.
 
         Parameters
         ----------
-        depth, speed : float
-            Inserted length [m] and insertion velocity [m/s].
+        topic : str
+            The topic.
+
+        Returns
+        -------
+        bool
+            Whether it is.
+
+        """
+        return topic in self._beyond
+
+    def encoders(self, measured: Measurement) -> str | None:
+        """
+        Return the limit that the encoders violate.
+
+        Parameters
+        ----------
+        measured : Measurement
+            Inserted length, angle and their velocities.
 
         Returns
         -------
@@ -64,6 +82,7 @@ class Guard:
 
         """
         low, high = self._depths
+        depth, limits = measured.depth, self.limits
         if not low <= depth <= high:
             return self._count(
                 'joint_states',
@@ -71,8 +90,12 @@ class Guard:
                 '(lowest_depth, highest_depth, safety.depth_tolerance)',
             )
         return self._hold(
-            'joint_states', ('insertion speed', speed, self.limits.speed, 'm/s', 'speed')
-        )
+            'joint_states',
+            ('insertion speed', measured.speed, limits.speed, 'm/s', 'speed'),
+            ('angle', measured.angle, limits.angle, 'rad', 'angle'),
+            ('angular speed', measured.angular_speed, limits.angular_speed, 'rad/s',
+             'angular_speed'),
+        )  # fmt: skip
 
     def tracking(self, error: float) -> str | None:
         """

@@ -26,6 +26,12 @@ class SafetyLimits:
     depth_tolerance: float = constant(
         2e-3, 'm', 'how far beyond lowest_depth and highest_depth the needle may be'
     )
+    angular_speed: float = constant(
+        100.0, 'rad/s', 'largest angular speed of the base, in both directions', open_low=True
+    )
+    angle: float = constant(
+        1000.0, 'rad', 'largest angle of the base, in both directions', open_low=True
+    )
     tip_deflection: float = constant(
         0.05, 'm', 'largest deflection of the tip, in both directions', open_low=True
     )

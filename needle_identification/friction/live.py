@@ -23,6 +23,9 @@ _LARGEST_STEP: Final = 0.1
 #: arrived late [s].
 _SET_BACK: Final = 1.0
 
+#: What no recording holds: forces [N], and depths [m] or speeds [m/s].
+_LARGEST: Final = {'force': 1e4, 'motion': 100.0}
+
 #: Samples that may wait for the other topic.
 _MAX_WAITING: Final = 20_000
 
@@ -134,8 +137,8 @@ class LiveFriction:
 
     def _time(self, topic: str, stamp: int, value: float) -> float | None:
         """Return the time from the start [s], or None if the sample is dropped."""
-        if not isfinite(value):
-            self._dropped['not finite'] += 1
+        if not abs(value) <= _LARGEST[topic]:
+            self._dropped['absurd' if isfinite(value) else 'not finite'] += 1
             return None
         if self._start is None:
             self._start = stamp

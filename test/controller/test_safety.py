@@ -136,12 +136,23 @@ def test_a_reading_without_noise_may_stand_still(readings: list[float]) -> None:
     assert set(feed(stream(noise=[0.01]), readings)) == {''}
 
 
+def encoded(depth: float, speed: float, angle: float = 0.0, rate: float = 0.0) -> Measurement:
+    """Return a sample of the encoders."""
+    return Measurement(time=0.0, depth=depth, speed=speed, angle=angle, angular_speed=rate)
+
+
 GUARD = [
-    ('encoders', (0.05, 0.11), 'insertion speed 0.11 m/s is beyond the limit of 0.1 m/s'),
-    ('encoders', (0.05, -0.11), 'insertion speed -0.11 m/s'),
-    ('encoders', (0.0025, nan), 'insertion speed nan m/s'),
-    ('encoders', (0.103, 0.0), 'inserted length 0.103 m is outside [-0.001, 0.102] m'),
-    ('encoders', (-0.002, 0.0), 'inserted length -0.002 m'),
+    (
+        'encoders',
+        (encoded(0.05, 0.11),),
+        'insertion speed 0.11 m/s is beyond the limit of 0.1 m/s',
+    ),
+    ('encoders', (encoded(0.05, -0.11),), 'insertion speed -0.11 m/s'),
+    ('encoders', (encoded(0.0025, nan),), 'insertion speed nan m/s'),
+    ('encoders', (encoded(0.103, 0.0),), 'inserted length 0.103 m is outside [-0.001, 0.102] m'),
+    ('encoders', (encoded(-0.002, 0.0),), 'inserted length -0.002 m'),
+    ('encoders', (encoded(0.05, 0.0, 1001.0),), 'angle 1001 rad'),
+    ('encoders', (encoded(0.05, 0.0, 0.0, -101.0),), 'angular speed -101 rad/s'),
     ('tracking', (0.011,), 'tracking error 0.011 m is beyond the limit of 0.01 m'),
     ('wrench', (-31.0, 0.0, 0.0), 'axial force -31 N is beyond the limit of 30 N'),
     ('wrench', (0.0, 10.5, 0.0), 'lateral force 10.5 N'),
@@ -152,11 +163,11 @@ GUARD = [
 
 @pytest.mark.parametrize(('name', 'values', 'words'), GUARD)
 def test_two_readings_beyond_a_limit_violate_it(
-    name: str, values: tuple[float, ...], words: str
+    name: str, values: tuple[Any, ...], words: str
 ) -> None:
     """Quantity, value, limit and unit in one line; one reading alone does not count."""
     guard = Guard(SafetyLimits(), (0.001, 0.1))
-    good = {'encoders': (0.05, 0.0), 'wrench': (0.0, 0.0, 0.0)}.get(name, (0.0,))
+    good = {'encoders': (encoded(0.05, 0.0),), 'wrench': (0.0, 0.0, 0.0)}.get(name, (0.0,))
     hold = getattr(guard, name)
     assert [hold(*v) for v in (good, values, good, values)] == [None] * 4
     line = hold(*values)
@@ -171,7 +182,14 @@ def test_readings_at_a_limit_are_within_it() -> None:
     """Limits are the largest values that may be."""
     guard, limits = Guard(SafetyLimits(), (0.001, 0.1)), SafetyLimits()
     for _ in range(3):
-        assert guard.encoders(0.1 + limits.depth_tolerance, limits.speed) is None
+        edge = Measurement(
+            time=0.0,
+            depth=0.1 + limits.depth_tolerance,
+            speed=limits.speed,
+            angle=limits.angle,
+            angular_speed=-limits.angular_speed,
+        )
+        assert guard.encoders(edge) is None
         assert guard.wrench(-limits.axial_load, limits.lateral_load, limits.moment_load) is None
         assert guard.tip(limits.tip_deflection) is None
         assert guard.tracking(-limits.tracking_error) is None

@@ -7,7 +7,14 @@ from math import inf, isfinite, nan
 
 from hypothesis import given
 from hypothesis import strategies as st
-from needle_controller import Answer, Controller, ObserverSettings, SafetyLimits, Supervisor
+from needle_controller import (
+    Answer,
+    Controller,
+    Measurement,
+    ObserverSettings,
+    SafetyLimits,
+    Supervisor,
+)
 from needle_controller.journal import Journal, Severity
 from needle_dynamics import NeedleModel, NeedleParameters
 from needle_ros.wire import Reading
@@ -277,7 +284,7 @@ def test_a_measurement_beyond_a_limit_is_answered_once_and_with_its_stamp() -> N
     """The stop is the answer: two readings in a row, and no third command."""
     loop = Loop()
     loop.pushes()
-    loop.supervisor.safety.guard.encoders(0.02, 0.2)
+    loop.supervisor.safety.guard.encoders(Measurement(time=0.0, depth=0.02, speed=0.2))
     answer = loop.measure(0.0, 0.2)
     assert answer == Answer(loop.now)
     assert loop.said()[-1] == (

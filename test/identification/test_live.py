@@ -77,14 +77,17 @@ def test_positions_alone_are_differentiated() -> None:
     check(live, 0.02)
 
 
-@pytest.mark.parametrize('value', [nan, inf])
-def test_what_is_not_finite_is_dropped_and_counted(value: float) -> None:
+@pytest.mark.parametrize(
+    ('value', 'kind'),
+    [(nan, 'not finite'), (inf, 'not finite'), (-1e300, 'absurd'), (2e4, 'absurd')],
+)
+def test_what_is_not_sane_is_dropped_and_counted(value: float, kind: str) -> None:
     """A temporary failure of a sensor does not change the estimate."""
     live = make()
     for k, (stamp, depth, speed, force) in enumerate(SAMPLES):
         live.take_force(stamp, value if k % 50 == 0 else force)
         live.take_motion(stamp, depth, value if k % 75 == 0 else speed)
-    assert live.dropped['not finite'] == -(-len(SAMPLES) // 50) - (-len(SAMPLES) // 75)
+    assert live.dropped[kind] == -(-len(SAMPLES) // 50) - (-len(SAMPLES) // 75)
     check(live, 0.02)
 
 
@@ -96,7 +99,7 @@ def test_late_and_repeated_stamps_are_dropped() -> None:
         live.take_force(stamp, force)
         if k % 10 == 0:
             live.take_force(stamp, 1e3)
-            live.take_motion(stamp - 5_000_000, depth, 1e3)
+            live.take_motion(stamp - 5_000_000, depth, 10.0)
     assert live.dropped == {'out of order': 2 * -(-len(SAMPLES) // 10)}
     check(live, 0.01)
 
