@@ -32,6 +32,7 @@ setup(
     packages=find_packages(include=['needle_*']),
     package_data={
         '': ['py.typed'],
+        'needle_ros': ['*.xml'],
         'needle_insertion.report': ['templates/*'],
         'needle_insertion.paper.claims': ['*.yaml'],
     },

@@ -16,6 +16,7 @@ from launch.actions import (
 from launch.events.process import ProcessExited
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
+from needle_ros.network import LOCAL, RANGE, stay_local
 import yaml
 
 #: Default, meaning and values of each argument; an empty one leaves the value of the parameter
@@ -49,7 +50,7 @@ ARGUMENTS = {
     'rviz': ('false', 'show the needle in RViz, which must be installed', ['true', 'false']),
     'discovery': (
         '',
-        'which nodes may join; empty: ROS_AUTOMATIC_DISCOVERY_RANGE, or LOCALHOST without it',
+        'SUBNET lets other machines in; empty: ROS_AUTOMATIC_DISCOVERY_RANGE or LOCALHOST',
         ['', 'LOCALHOST', 'SUBNET', 'OFF', 'SYSTEM_DEFAULT'],
     ),
 }
@@ -128,8 +129,13 @@ def start(context: LaunchContext) -> list[Action]:
         share('rviz2', 'rviz:=true')
         layout = str(config / 'insertion.rviz')
         nodes.append(Node(package='rviz2', executable='rviz2', arguments=['-d', layout], **common))
-    reach = given['discovery'] or os.environ.get('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
-    return [SetEnvironmentVariable('ROS_AUTOMATIC_DISCOVERY_RANGE', reach), *nodes]
+    # What is open is said: by the argument, or by the environment.
+    environment = {**os.environ, **({RANGE: given['discovery']} if given['discovery'] else {})}
+    stay_local(environment)
+    variables = [
+        SetEnvironmentVariable(name, environment[name]) for name in LOCAL if name in environment
+    ]
+    return [*variables, *nodes]
 
 
 def generate_launch_description() -> LaunchDescription:

@@ -17,6 +17,7 @@ from types import FrameType
 
 from needle_ros.base_node import BaseNode
 from needle_ros.errors import NeedleError
+from needle_ros.network import LOCAL, RANGE, stay_local
 from needle_ros.parameter_files import sections, shared_names, strangers
 import rclpy
 from rclpy.exceptions import ParameterException
@@ -56,7 +57,7 @@ def run(kind: Callable[[], BaseNode]) -> int:
     Raises
     ------
     SystemExit
-        For a signal before the node runs, after ``--help`` and for unknown words.
+        After ``--help`` and for unknown words.
 
     """
     stopping = spinning = False
@@ -65,14 +66,15 @@ def run(kind: Callable[[], BaseNode]) -> int:
         nonlocal stopping
         stopping = True
         if not spinning:
-            # Nothing has been commanded yet, and compiling may take a minute.
-            raise SystemExit(0)
+            # Nothing has been commanded yet. An exception would be an error of the compiler.
+            os._exit(0)
 
     if os.environ.get(END_WITH_PARENT):
         # Linux sends the signal when the process that started this one ends, in whatever way.
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
     for one in _ENDINGS:
         signal.signal(one, stop)
+    stay_local(os.environ)
     try:
         try:
             _check_words(kind, sys.argv)
@@ -93,9 +95,9 @@ def run(kind: Callable[[], BaseNode]) -> int:
         executor.add_node(node)
         status = 0
         if node.get_parameter('autostart').value and not node.start():
-            # The reason, on /diagnostics. A signal may look like an error of what it met.
+            # The reason, on /diagnostics.
             node.publish_diagnostics()
-            status = 0 if stopping else 2
+            status = 2
         # A full collection takes 0.2 s: it shall not scan what was imported.
         gc.freeze()
         spinning = True
@@ -137,7 +139,7 @@ def _check_words(kind: Callable[[], BaseNode], words: Sequence[str]) -> None:
 def _parameters(kind: Callable[[], BaseNode]) -> list[str]:
     """Return what a node declares, in lines."""
     # No other node may see this one: it would count as a rival.
-    os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'OFF'
+    os.environ.update({**LOCAL, RANGE: 'OFF'})
     os.environ.pop('ROS_STATIC_PEERS', None)
     rclpy.init(args=[])
     try:

@@ -17,6 +17,7 @@ from domain_coordinator import domain_id
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from needle_insertion.experiment.node_process import GraphError, NodeProcess
+from needle_ros.network import LOCAL
 from needle_ros.run_node import END_WITH_PARENT
 from rclpy.client import Client
 from rclpy.context import Context
@@ -66,11 +67,11 @@ class Graph:
         self.environment = {
             **os.environ,
             'ROS_DOMAIN_ID': str(domain),
-            'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
+            **LOCAL,
             END_WITH_PARENT: '1',
         }
-        # The context of this process reads its discovery range from the environment too.
-        os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
+        # The context of this process reads the environment too.
+        os.environ.update(LOCAL)
         self.context = Context()
         self.context.init(domain_id=domain)
         self.executor = self._executor_kind(context=self.context)

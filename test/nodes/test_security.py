@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import ast
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from functools import partial
+import os
 from pathlib import Path
+import shutil
 import subprocess
 import sys
 from typing import NamedTuple
@@ -14,6 +15,7 @@ from lxml import etree
 from needle_insertion.experiment.protocol import SHIPPED_BAGS
 from needle_insertion.nodes import NODES
 from needle_ros.base_node import BaseNode
+from needle_ros.network import LOCAL, RANGE, stay_local
 import pytest
 from support.installed import node_class, ROOT
 from support.ros_graph import RosGraph
@@ -162,10 +164,106 @@ def test_no_node_starts_without_credentials_where_they_are_enforced(
 
 
 def test_what_we_start_stays_on_this_machine(ros_graph: RosGraph) -> None:
-    """Our processes and the launch file look for others on this machine only, unless asked."""
-    assert ros_graph.environment['ROS_AUTOMATIC_DISCOVERY_RANGE'] == 'LOCALHOST'
-    launch = ast.parse((ROOT / 'launch/insertion.launch.py').read_text())
-    calls = [ast.unparse(item) for item in ast.walk(launch) if isinstance(item, ast.Call)]
-    assert "SetEnvironmentVariable('ROS_AUTOMATIC_DISCOVERY_RANGE', reach)" in calls
-    assert "os.environ.get('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')" in calls
-    assert "'discovery': ('', " in ast.unparse(launch)
+    """Range and transports of our processes; of nodes and launch unless the environment opens."""
+    assert LOCAL.items() <= ros_graph.environment.items()
+    plain: dict[str, str] = {}
+    opened, profiled = {RANGE: 'SUBNET'}, {PROFILE: 'own.xml'}
+    for environment in (opened, profiled, plain):
+        stay_local(environment)
+    assert opened == {RANGE: 'SUBNET'}
+    assert profiled == {**LOCAL, PROFILE: 'own.xml'}
+    assert plain == LOCAL
+
+
+PROFILE = 'FASTRTPS_DEFAULT_PROFILES_FILE'
+
+#: Another machine: two network namespaces, joined by a cable.
+CABLE = """
+link add {a} type veth peer name {b}
+link set {a} netns {a}
+link set {b} netns {b}
+-n {a} addr add 10.77.0.1/24 dev {a}
+-n {b} addr add 10.77.0.2/24 dev {b}
+-n {a} link set lo up
+-n {b} link set lo up
+-n {a} link set {a} up
+-n {b} link set {b} up
+-n {a} route add default dev {a}
+-n {b} route add default dev {b}
+"""
+
+#: A stranger there pushes for some seconds, and says how many plants it has found.
+STRANGER = """
+import time
+from geometry_msgs.msg import WrenchStamped
+from needle_ros.base_node import COMMAND
+import rclpy
+rclpy.init()
+node = rclpy.create_node('stranger')
+publisher = node.create_publisher(WrenchStamped, 'wrench_command', COMMAND)
+push, found, begin = WrenchStamped(), 0, time.monotonic()
+push.wrench.force.y = 5.0
+while time.monotonic() - begin < 5.0:
+    publisher.publish(push)
+    rclpy.spin_once(node, timeout_sec=0.01)
+    found = max(found, publisher.get_subscription_count())
+print(found)
+"""
+
+
+@pytest.fixture
+def cable() -> Iterator[tuple[str, str]]:
+    """Return the names of two machines."""
+    ip = shutil.which('ip')
+    if ip is None or os.geteuid() != 0:
+        pytest.skip('making network namespaces needs root and ip')
+    ends = f'needle-a{os.getpid()}', f'needle-b{os.getpid()}'
+    try:
+        for end in ends:
+            made = subprocess.run([ip, 'netns', 'add', end], capture_output=True, check=False)
+            if made.returncode:
+                pytest.skip(f'this machine has no network namespaces: {made.stderr!r}')
+        for line in CABLE.format(a=ends[0], b=ends[1]).strip().splitlines():
+            made = subprocess.run([ip, *line.split()], capture_output=True, check=False)
+            if made.returncode:
+                pytest.skip(f'this machine cannot join network namespaces: {made.stderr!r}')
+        yield ends
+    finally:
+        for end in ends:
+            subprocess.run([ip, 'netns', 'delete', end], capture_output=True, check=False)
+
+
+@pytest.mark.parametrize(('opened', 'found'), [({}, '0'), ({RANGE: 'SUBNET'}, '1')])
+def test_another_machine_cannot_reach_the_plant(
+    ros_graph: RosGraph, cable: tuple[str, str], opened: dict[str, str], found: str
+) -> None:
+    """It names the plant's machine as its peer: that alone does not let it in. SUBNET does."""
+    here, there = cable
+    bare = {name: value for name, value in ros_graph.environment.items() if name not in LOCAL}
+    plant = subprocess.Popen(
+        [shutil.which('ip') or '', 'netns', 'exec', here, sys.executable, '-m', NODES['plant']],
+        env={**bare, **opened},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+    try:
+        assert plant.stdout is not None
+        assert any('active' in line for line in plant.stdout)
+        # Its own shared memory, as another machine has.
+        script = f'mount -t tmpfs tmpfs /dev/shm && exec "{sys.executable}" -c "$0"'
+        stranger = subprocess.run(
+            [
+                *('ip', 'netns', 'exec', there, 'unshare', '--mount', '--ipc'),
+                *('bash', '-c', script, STRANGER),
+            ],
+            env={**bare, RANGE: 'SUBNET', 'ROS_STATIC_PEERS': '10.77.0.1'},
+            capture_output=True,
+            text=True,
+            check=True,
+            timeout=60.0,
+        )
+        assert stranger.stdout.split() == [found]
+    finally:
+        plant.kill()
+        plant.communicate()
