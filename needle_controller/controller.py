@@ -349,6 +349,8 @@ class Controller:
 
         """
         self.guide.aim(depth)
+        # A target that is given now counts, wherever the needle has been.
+        self._last_depth = None
 
     def follow(
         self,
@@ -371,6 +373,7 @@ class Controller:
 
         """
         self.guide.follow(times, positions, speeds)
+        self._last_depth = None
 
     def forget(self) -> None:
         """Forget target, motion and the memory of the laws."""

@@ -31,6 +31,7 @@ from needle_ros.commanders_node import Commanders
 from needle_ros.errors import ParameterError
 from needle_ros.run_node import run
 from needle_ros.timing import nanoseconds, seconds
+from needle_ros.trajectories import MOST_POINTS
 from needle_ros.wire import Reading
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.clock import Clock
@@ -248,7 +249,8 @@ class ControllerNode(ModelNode):
         )
 
     def _on_trajectory(self, message: JointTrajectory) -> None:
-        points = message.points
+        # One more than may be is enough to refuse it.
+        points = message.points[: MOST_POINTS + 1]
         self._act(
             self._supervisor.trajectory(
                 nanoseconds(message.header.stamp),

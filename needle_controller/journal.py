@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 from enum import IntEnum
 from math import inf
 from time import monotonic
 from typing import Final
+
+from needle_ros.errors import printable
 
 #: Shortest time between two lines of one kind [s].
 _PAUSE: Final = 1.0
@@ -47,10 +50,13 @@ class Journal:
         self._steady = steady
         self._lines: list[tuple[Severity, str]] = []
         self._told: dict[str, float] = {}
+        self._left_out: Counter[str] = Counter()
 
     def say(self, severity: Severity, line: str = '', kind: str = '') -> None:
         """
-        Say a line, if any: at most once a second of a kind. Tell that /diagnostics changed.
+        Say a line, if any, and tell that /diagnostics changed: at most once a second of a kind.
+
+        The next line of a kind says how many have been left out.
 
         Parameters
         ----------
@@ -65,10 +71,13 @@ class Journal:
         if kind:
             now = self._steady()
             if now - self._told.get(kind, -inf) < _PAUSE:
+                self._left_out[kind] += 1
                 return
             self._told[kind] = now
+            more = self._left_out.pop(kind, 0)
+            line = f'{line} ({more} more like it)' if line and more else line
         if line:
-            self._lines.append((severity, line))
+            self._lines.append((severity, printable(line)))
         self.changed = True
 
     def refuse(self, complaint: str) -> None:
@@ -82,8 +91,9 @@ class Journal:
 
         """
         self.refused += 1
-        self.complaint = complaint
-        self.say(Severity.ERROR, complaint)
+        self.complaint = printable(complaint)
+        # Those of one topic or service begin alike.
+        self.say(Severity.ERROR, complaint, f'refused {complaint.partition(" ")[0]}')
 
     def take(self) -> list[tuple[Severity, str]]:
         """Return what was said since the last call."""

@@ -20,7 +20,7 @@ from needle_controller.safety.stream import REPEATED
 from needle_dynamics import euler_loads, NeedleModel, NeedleParameters
 from needle_ros.errors import NeedleError, ParameterError
 from needle_ros.timing import NANOSECONDS
-from needle_ros.trajectories import joint_values
+from needle_ros.trajectories import joint_values, MOST_POINTS
 from needle_ros.wire import Reading
 
 _WAITING: Final = 'no joint_states yet'
@@ -279,6 +279,8 @@ class Supervisor:
         """
 
         def follow(controller: Controller) -> None:
+            if len(times) > MOST_POINTS:
+                raise ParameterError(f'a path may have at most {MOST_POINTS} points')
             lengths, rates = (
                 [one for one in joint_values('insertion', joints, values) if one is not None]
                 for values in (positions, velocities)

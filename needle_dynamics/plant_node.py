@@ -22,10 +22,11 @@ from needle_dynamics.simulated.plant import Plant, Sample
 from needle_dynamics.simulated.run import Event, PARAMETERS, PlantRun, RESET, TARE, TRAJECTORY
 from needle_ros import contract
 from needle_ros.commanders_node import Commanders
-from needle_ros.errors import JobError, NeedleError, ParameterError
+from needle_ros.errors import JobError, NeedleError, ParameterError, printable
 from needle_ros.run_node import run
 from needle_ros.sample_clock import SampleClock
 from needle_ros.timing import NANOSECONDS, RateCounter, seconds
+from needle_ros.trajectories import MOST_POINTS
 from needle_ros.wire import Reading
 import numpy as np
 from rcl_interfaces.msg import IntegerRange, ParameterDescriptor
@@ -284,7 +285,9 @@ class PlantNode(ModelNode):
         try:
             if self._run is None:
                 raise ParameterError('the plant is not configured')
-            points = message.points
+            points = message.points[: MOST_POINTS + 1]
+            if len(points) > MOST_POINTS:
+                raise ParameterError(f'a path may have at most {MOST_POINTS} points')
             content = {
                 'joints': list(message.joint_names),
                 'times': [seconds(point.time_from_start) for point in points],
@@ -294,7 +297,9 @@ class PlantNode(ModelNode):
             self._run.perform(Event(TRAJECTORY, content))
         except ParameterError as error:
             self._refused_trajectories += 1
-            self.get_logger().error(f'joint_trajectory: {error}')
+            self.get_logger().error(
+                printable(f'joint_trajectory: {error}'), throttle_duration_sec=1.0
+            )
 
     # Services.
 

@@ -20,7 +20,7 @@ from typing import Any, ClassVar, TypeVar
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from needle_ros import contract
 from needle_ros.contract import Qos, Topic
-from needle_ros.errors import MessageError, NeedleError, ParameterError
+from needle_ros.errors import MessageError, NeedleError, ParameterError, printable
 from needle_ros.settings import from_values, unknown_name
 from needle_ros.wire import Reader, Reading
 from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor, SetParametersResult
@@ -625,7 +625,7 @@ class BaseNode(LifecycleNode):
         try:
             action()
         except NeedleError as error:
-            self.failure = str(error)
+            self.failure = printable(str(error))
             self.get_logger().error(self.failure)
             return TransitionCallbackReturn.FAILURE
         # rclpy would ignore it.

@@ -4,8 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import pairwise
+from typing import Final
 
 from needle_ros.errors import ParameterError
+
+#: Points that a path may have: a million of bad ones would take seconds.
+MOST_POINTS: Final = 10_000
 
 
 def joint_values(

@@ -17,6 +17,7 @@ from needle_controller import (
 )
 from needle_controller.journal import Journal, Severity
 from needle_dynamics import NeedleModel, NeedleParameters
+from needle_ros.trajectories import MOST_POINTS
 from needle_ros.wire import Reading
 import pytest
 
@@ -361,9 +362,42 @@ def test_nothing_is_said_twice_in_a_second() -> None:
     journal.say(Severity.INFO, 'always')
     assert journal.changed
     said = [line for _, line in journal.take()]
-    assert said == ['line 0', 'line 2', 'line 4', 'another', 'always']
+    # What was left out is counted in the next line of its kind.
+    assert said == [
+        *('line 0', 'line 2 (1 more like it)', 'line 4 (1 more like it)'),
+        *('another', 'always'),
+    ]
     assert not journal.changed
     assert journal.take() == []
+
+
+def test_a_flood_of_refused_targets_is_one_line_a_second() -> None:
+    """All are counted; /diagnostics change as rarely as the lines come."""
+    loop = Loop()
+    changes = 0
+    for _ in range(1000):
+        loop.supervisor.target(0, '', 9.0, 0.0, loop.now)
+        changes += loop.supervisor.journal.changed
+        loop.supervisor.journal.take()
+    assert loop.supervisor.journal.refused == 1000
+    assert changes == 1
+
+
+def test_a_path_of_a_million_points_is_refused_in_a_short_line() -> None:
+    """By their number, whatever they are; long and unprintable lines are shortened."""
+    loop = Loop()
+    loop.said()
+    many = [[float(k)] for k in range(MOST_POINTS + 1)]
+    times = [float(k) for k in range(MOST_POINTS + 1)]
+    loop.supervisor.trajectory(0, '', ['insertion'], times, many, [], loop.now)
+    (line,) = loop.said()
+    assert line == f'joint_trajectory refused: a path may have at most {MOST_POINTS} points'
+    loop.seconds += 1.0
+    evil = '\x1b]0;evil\x07\u202e' + 1000 * 'x'
+    loop.supervisor.trajectory(0, evil, ['insertion'], [1.0], [[0.03]], [], loop.now)
+    line = loop.said()[-1]
+    assert len(line) <= 500
+    assert line.isprintable()
 
 
 def test_a_push_beyond_eulers_load_is_warned_of() -> None:
