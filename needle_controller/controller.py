@@ -253,6 +253,7 @@ class Controller:
         (insertion, rotation), self.limits = self._checked(law, parameters, self._gains)
         self._insertion = SampledLoop(insertion, self.delay, settings.force_limit)
         self._rotation = SampledLoop(rotation, self.delay, settings.torque_limit)
+        self._last_depth: float | None = None
         self.forget()
 
     def _checked(
@@ -381,7 +382,7 @@ class Controller:
         self._insertion.reset()
         self._rotation.reset()
         self._seen: Measurement | None = None
-        self._last_depth: float | None = None
+        self._last_depth = None
         self._stopped = False
 
     def release(self) -> None:

@@ -513,9 +513,10 @@ class Supervisor:
         if measured.is_finite():
             self._stop_for(self.safety.guard.encoders(measured), stamp)
             if self.safety.guard.is_beyond('joint_states'):
-                # Alone it is a fault of the sensor: what is commanded stays, for a period.
-                last = Answer(stamp, self._last.force, self._last.torque)
-                return self._command(Answer(stamp) if self.safety.stop else last)
+                # Alone it is a fault of the sensor: neither law nor observer gets it.
+                if self.safety.stop is not None:
+                    return self._command(Answer(stamp))
+                return self._let_go('joint_states is beyond a limit', stamp)
             try:
                 self.bending.update(stamp, measured)
             except NeedleError as error:
