@@ -126,25 +126,25 @@ def _check_words(kind: Callable[[], BaseNode], words: Sequence[str]) -> None:
     parser.add_argument('-h', '--help', action='store_true')
     known, unknown = parser.parse_known_args(others)
     if known.help:
-        summary, *_ = inspect.cleandoc(kind.__doc__ or '').split('\n\n')
         parser.print_usage()
-        lines = [summary, '', 'Parameters, with their defaults:', *_parameters(kind)]
-        parser.exit(message='\n'.join(lines) + '\n')
+        sys.stdout.write('\n'.join(_described(kind)) + '\n')
+        parser.exit()
     if unknown:
         parser.error(
             f'unknown: {" ".join(unknown)}; parameters are given by --ros-args -p NAME:=VALUE'
         )
 
 
-def _parameters(kind: Callable[[], BaseNode]) -> list[str]:
-    """Return what a node declares, in lines."""
+def _described(kind: Callable[[], BaseNode]) -> list[str]:
+    """Return what a node is for, and what it declares, in lines."""
     # No other node may see this one: it would count as a rival.
     os.environ.update({**LOCAL, RANGE: 'OFF'})
     os.environ.pop('ROS_STATIC_PEERS', None)
     rclpy.init(args=[])
     try:
         node = kind()
-        lines = []
+        summary, *_ = inspect.cleandoc(type(node).__doc__ or '').split('\n\n')
+        lines = [summary, '', 'Parameters, with their defaults:']
         for name, value in node.values().items():
             lines.append(f'  {name}: {value}')
             meaning = node.describe_parameter(name).description

@@ -23,13 +23,14 @@ def started(
     *words: str,
     python: Sequence[str] = (),
     environment: Mapping[str, str] | None = None,
+    errors: int = subprocess.STDOUT,
 ) -> subprocess.Popen[str]:
     """Start a node with words of its command line, and of that of Python."""
     return subprocess.Popen(
         [sys.executable, *python, ROOT / 'scripts' / name, *words],
         env={**ros_graph.environment, **(environment or {})},
         stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
+        stderr=errors,
         text=True,
     )
 
@@ -37,10 +38,11 @@ def started(
 @pytest.mark.parametrize('name', NODES)
 def test_help_names_every_parameter(ros_graph: RosGraph, name: str) -> None:
     """It also says what the node is for."""
-    asked = started(ros_graph, name, '--help')
+    asked = started(ros_graph, name, '--help', errors=subprocess.DEVNULL)
     said, _ = asked.communicate(timeout=60.0)
     assert asked.returncode == 0
     assert said.startswith(f'usage: {name} [-h] [--ros-args')
+    assert f'\n{(node_class(name).__doc__ or "").strip().splitlines()[0]}\n' in said
     node = ros_graph.add(node_class(name), start=False)
     assert [key for key in node.values() if f'\n  {key}: ' not in said] == []
 
