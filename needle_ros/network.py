@@ -9,15 +9,16 @@ from typing import Final
 #: Environment variable of ROS 2: how far a node looks for others.
 RANGE: Final = 'ROS_AUTOMATIC_DISCOVERY_RANGE'
 
-#: Variables that keep a node on this machine. The range alone does not: another machine that names
-#: this one as a static peer would be let in. So the transports are limited, too, to shared memory
-#: and 127.0.0.1; Fast DDS 2 and 3 read the profile by two names.
+#: Environment variables by which Fast DDS 2 and 3 find their profile.
+PROFILES: Final = ('FASTRTPS_DEFAULT_PROFILES_FILE', 'FASTDDS_DEFAULT_PROFILES_FILE')
+
+#: Variables that keep a node on this machine: its transport is 127.0.0.1, and there is no socket
+#: that another machine could send to. The range LOCALHOST would be no wall (another machine that
+#: names this one as a static peer is let in), and it brings shared memory: where a process that
+#: used it was killed, the next one hears nothing for up to 3 s.
 LOCAL: Final = {
-    RANGE: 'LOCALHOST',
-    **dict.fromkeys(
-        ('FASTRTPS_DEFAULT_PROFILES_FILE', 'FASTDDS_DEFAULT_PROFILES_FILE'),
-        str(Path(__file__).with_name('loopback.xml')),
-    ),
+    RANGE: 'SUBNET',
+    **dict.fromkeys(PROFILES, str(Path(__file__).with_name('loopback.xml'))),
 }
 
 #: Ranges that let other machines in.
@@ -31,10 +32,14 @@ def stay_local(environment: MutableMapping[str, str]) -> None:
     Parameters
     ----------
     environment : MutableMapping[str, str]
-        Environment to change. `RANGE` set to one of `OPEN` opens it; a profile that is set
-        stays.
+        Environment to change. `RANGE` set to one of `OPEN` opens it; the range OFF, a profile
+        that is set, and another middleware than Fast DDS stay.
 
     """
-    if environment.get(RANGE) not in OPEN:
-        for name, value in LOCAL.items():
-            environment.setdefault(name, value)
+    if environment.get(RANGE) in OPEN:
+        return
+    fast = 'fastrtps' in (environment.get('RMW_IMPLEMENTATION') or 'rmw_fastrtps_cpp')
+    if fast and environment.get(RANGE) != 'OFF' and not any(map(environment.get, PROFILES)):
+        environment.update(LOCAL)
+    else:
+        environment.setdefault(RANGE, 'LOCALHOST')

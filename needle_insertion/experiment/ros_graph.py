@@ -79,8 +79,6 @@ class Graph:
 
     def __exit__(self, *raised: Any) -> None:
         try:
-            # Before the processes: Fast DDS 2.14 may crash where one that shared its memory with
-            # this one has been killed.
             for node in self._nodes:
                 self.executor.remove_node(node)
                 node.destroy_node()
@@ -92,7 +90,7 @@ class Graph:
             # rclpy's nodes are in reference cycles. Until these are collected DDS keeps the nodes
             # in the domain, where the next graph would find them.
             gc.collect()
-            # A process that is killed leaves its shared memory behind.
+            # Asked first: a recorder closes its bag.
             for started in self._processes:
                 if started.process.poll() is None:
                     started.process.terminate()

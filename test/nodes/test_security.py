@@ -15,7 +15,7 @@ from lxml import etree
 from needle_insertion.experiment.protocol import SHIPPED_BAGS
 from needle_insertion.nodes import NODES
 from needle_ros.base_node import BaseNode
-from needle_ros.network import LOCAL, RANGE, stay_local
+from needle_ros.network import LOCAL, PROFILES, RANGE, stay_local
 import pytest
 from support.installed import node_class, ROOT
 from support.ros_graph import RosGraph
@@ -166,16 +166,55 @@ def test_no_node_starts_without_credentials_where_they_are_enforced(
 def test_what_we_start_stays_on_this_machine(ros_graph: RosGraph) -> None:
     """Range and transports of our processes; of nodes and launch unless the environment opens."""
     assert LOCAL.items() <= ros_graph.environment.items()
-    plain: dict[str, str] = {}
-    opened, profiled = {RANGE: 'SUBNET'}, {PROFILE: 'own.xml'}
-    for environment in (opened, profiled, plain):
+    closed: list[dict[str, str]] = [{}, {RANGE: 'LOCALHOST'}]
+    left: list[dict[str, str]] = [
+        {RANGE: 'SUBNET'},
+        {RANGE: 'OFF'},
+        # What they say of transports is not ours to change.
+        {RANGE: 'LOCALHOST', PROFILES[0]: 'own.xml'},
+        {RANGE: 'LOCALHOST', 'RMW_IMPLEMENTATION': 'rmw_cyclonedds_cpp'},
+    ]
+    for environment in closed:
         stay_local(environment)
-    assert opened == {RANGE: 'SUBNET'}
-    assert profiled == {**LOCAL, PROFILE: 'own.xml'}
-    assert plain == LOCAL
+        assert environment == LOCAL
+    for environment in left:
+        before = dict(environment)
+        stay_local(environment)
+        assert environment == before
 
 
-PROFILE = 'FASTRTPS_DEFAULT_PROFILES_FILE'
+@pytest.mark.parametrize('range_', ['LOCALHOST', 'SUBNET'])
+def test_neighbors_find_each_other(ros_graph: RosGraph, range_: str) -> None:
+    """A node of this machine that knows nothing of our profile hears the plant and finds it."""
+    ros_graph.start('plant')
+    bare = {name: value for name, value in ros_graph.environment.items() if name not in LOCAL}
+    neighbor = subprocess.run(
+        [sys.executable, '-c', NEIGHBOR],
+        env={**bare, RANGE: range_},
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=60.0,
+    )
+    heard, found = neighbor.stdout.split()
+    assert (int(heard) > 0, found) == (True, '1')
+
+
+#: Waits until it hears the plant and has found it.
+NEIGHBOR = """
+import time
+import rclpy
+from rclpy.qos import qos_profile_sensor_data
+from sensor_msgs.msg import JointState
+rclpy.init()
+node = rclpy.create_node('neighbor')
+heard = []
+node.create_subscription(JointState, 'joint_states', heard.append, qos_profile_sensor_data)
+begin = time.monotonic()
+while time.monotonic() - begin < 20.0 and not (heard and node.count_subscribers('wrench_command')):
+    rclpy.spin_once(node, timeout_sec=0.01)
+print(len(heard), node.count_subscribers('wrench_command'))
+"""
 
 #: Another machine: two network namespaces, joined by a cable.
 CABLE = """
