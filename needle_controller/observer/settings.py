@@ -9,12 +9,12 @@ from typing import Final
 
 from needle_controller.compiled.filter import LowPass, Noise
 from needle_dynamics import FloatArray, ForceSensorParameters
+from needle_dynamics.simulated.force_sensor import low_pass
 from needle_dynamics.simulated.tip_sensor import TipParameters
 from needle_ros.errors import ParameterError
 from needle_ros.settings import check_constants, constant
 import numpy as np
 from scipy.linalg import cholesky, solve_discrete_lyapunov, solve_triangular
-from scipy.signal import butter
 
 #: What the plant feels with as it is by default, and hence what the observer believes in.
 _SENSOR: Final = ForceSensorParameters()
@@ -34,7 +34,7 @@ def _low_pass(
     c: FloatArray = np.zeros(0)
     d = 1.0
     for cutoff in cutoffs:
-        over, under = butter(2, cutoff, fs=rate)
+        over, under = low_pass(cutoff, rate).reshape(2, 3)
         # Transposed direct form II behind what there is.
         own = np.array([[-under[1], 1.0], [-under[2], 0.0]])
         drive = over[1:] - under[1:] * over[0]
