@@ -27,8 +27,8 @@ from needle_controller.uncertainty import Uncertainty
 from needle_dynamics.compiled.cache import announce_compilation
 from needle_dynamics.model_node import ModelNode
 from needle_ros import contract
-from needle_ros.commanders_node import Commanders
 from needle_ros.errors import ParameterError
+from needle_ros.publishers_node import offer_lease, Publishers
 from needle_ros.run_node import run
 from needle_ros.timing import nanoseconds, seconds
 from needle_ros.trajectories import MOST_POINTS
@@ -118,16 +118,27 @@ class ControllerNode(ModelNode):
 
         self._supervisor = supervisor = Supervisor()
         self._truths: Subscription | None = None
-        self._commanders = Commanders(self)
-        self._commanders.join()
+        offer_lease(self, contract.COMMANDER)
+        commanders = Publishers(self, contract.COMMANDER, self._look)
+        measurers = Publishers(self, contract.MEASURER, self._look)
+        #: Who counts the nodes that publish what may have one source only.
+        self._sources = {
+            contract.WRENCH_COMMAND: commanders,
+            contract.JOINT_STATES: measurers,
+            contract.BASE_WRENCH: measurers,
+            contract.TIP_DEFLECTION: measurers,
+        }
         self._wrench_command = self.publisher(contract.WRENCH_COMMAND)
         self._reference = self.publisher(contract.REFERENCE)
         self._tracking_error = self.publisher(contract.TRACKING_ERROR)
         self._write_wrench = contract.WRENCH_COMMAND.template().serialize
         self._write_aim = contract.REFERENCE.template().serialize
-        self.listen(contract.JOINT_STATES, self._passing(supervisor.encoders))
-        self.listen(contract.BASE_WRENCH, self._passing(supervisor.wrench))
-        self.listen(contract.TIP_DEFLECTION, self._passing(supervisor.tip))
+        for topic, take in (
+            (contract.JOINT_STATES, supervisor.encoders),
+            (contract.BASE_WRENCH, supervisor.wrench),
+            (contract.TIP_DEFLECTION, supervisor.tip),
+        ):
+            self.listen(topic, self._passing(take), self._look)
         self.subscribe(contract.TARGET, self._on_target)
         self.subscribe(contract.JOINT_TRAJECTORY, self._on_trajectory)
         self._serve(Trigger, 'emergency_stop', lambda _: supervisor.emergency_stop(self.now()))
@@ -201,9 +212,9 @@ class ControllerNode(ModelNode):
 
     def activate(self) -> None:
         """Begin to answer measurements and to watch for their absence."""
-        self._supervisor.activate(self.now(), self._who_commands())
+        self._supervisor.activate(self.now(), self._who_publishes())
         self._watchdog = self.create_timer(
-            self._supervisor.watch_period, self._on_watchdog, clock=self._steady
+            self._supervisor.watch_period, self._look, clock=self._steady
         )
 
     def about(self) -> str:
@@ -263,12 +274,14 @@ class ControllerNode(ModelNode):
             )
         )
 
-    def _who_commands(self) -> dict[str, int]:
-        """Count who commands; those that are not active count too."""
-        return {self._commanders.topic: self._commanders.count()}
+    def _who_publishes(self) -> dict[str, int]:
+        """Count who publishes what may have one source only; active or not."""
+        return {topic.name: sources.count(topic) for topic, sources in self._sources.items()}
 
-    def _on_watchdog(self) -> None:
-        self._act(self._supervisor.watch(self.now(), self._who_commands()))
+    def _look(self) -> None:
+        """Look for what does not come, and who has come, from time to time and when one comes."""
+        if self.is_active:
+            self._act(self._supervisor.watch(self.now(), self._who_publishes()))
 
     # What goes out.
 

@@ -14,6 +14,7 @@ from needle_controller.observer.observer import Observer
 from needle_controller.observer.settings import ObserverSettings
 from needle_controller.safety.encoders import read_encoders
 from needle_controller.safety.following import Following
+from needle_controller.safety.lateness import Lateness
 from needle_controller.safety.limits import SafetyLimits
 from needle_controller.safety.safety import Safety
 from needle_controller.safety.stream import REPEATED
@@ -65,9 +66,7 @@ class Supervisor:
         self.safety = Safety(SafetyLimits(), ControllerSettings(), NeedleParameters())
         self.retract_depth = 0.0
         self.fault: str | None = None
-        #: Measurements answered, those too late for the delay, and the age of the oldest [s].
-        self._answered = self._late = 0
-        self._oldest = 0.0
+        self._lateness = Lateness()
         self._deflection_ignored = False
         self._last = Answer(0)
         self._following = Following()
@@ -159,21 +158,21 @@ class Supervisor:
         timeout = self.safety.streams['joint_states'].timeout / NANOSECONDS
         return min(0.1, 0.5 * timeout)
 
-    def activate(self, now: int, commanders: Mapping[str, int]) -> None:
+    def activate(self, now: int, publishers: Mapping[str, int]) -> None:
         """
         Begin to answer measurements; see `watch`.
 
         Parameters
         ----------
-        now, commanders
+        now, publishers
             As for `watch`.
 
         """
         self.fault = _WAITING
-        self._answered = self._late = 0
-        self._oldest = 0.0
+        if self.controller is not None:
+            self._lateness = Lateness(self.controller.delay, self.controller.period)
         self._begin(now)
-        self.safety.count_commanders(commanders)
+        self.safety.count_publishers(publishers)
         self._active = self.controller
 
     def deactivate(self, now: int) -> Answer:
@@ -502,10 +501,7 @@ class Supervisor:
             if refusal.kind == REPEATED:
                 return self._again(stamp)
             return answer if refusal.harmless else self._let_go(refusal.line, now)
-        age = (now - stamp) / NANOSECONDS
-        self._answered += 1
-        self._late += age > (controller.delay + 1) * controller.period
-        self._oldest = max(self._oldest, age)
+        self._lateness.add(now, (now - stamp) / NANOSECONDS)
         try:
             measured = read_encoders(reading)
         except ParameterError as error:
@@ -581,16 +577,16 @@ class Supervisor:
         safety.saturation.add(stamp, full)
         return self._command(Answer(stamp, force, torque, aim[:2], error))
 
-    def watch(self, now: int, commanders: Mapping[str, int]) -> Answer | None:
+    def watch(self, now: int, publishers: Mapping[str, int]) -> Answer | None:
         """
-        Look for what does not come, and for who else publishes a topic of commands.
+        Look for what does not come, and for who else publishes what may have one source only.
 
         Parameters
         ----------
         now : int
             Time [ns].
-        commanders : Mapping[str, int]
-            How many nodes command, this one included, by topic.
+        publishers : Mapping[str, int]
+            How many nodes publish them, this one included, by topic.
 
         Returns
         -------
@@ -599,13 +595,14 @@ class Supervisor:
 
         """
         answer, safety = self._check_clock(now), self.safety
-        safety.count_commanders(commanders)
+        safety.count_publishers(publishers)
         timeout = safety.streams['joint_states'].timeout / NANOSECONDS
         silence = safety.streams['joint_states'].silence(now)
-        if silence > timeout:
-            answer = self._let_go(f'joint_states is stale: the last came {silence:.3f} s ago', now)
-        elif safety.rivals is not None:
+        if safety.rivals is not None:
             answer = self._let_go(safety.rivals, now)
+        elif silence > timeout:
+            answer = self._let_go(f'joint_states is stale: the last came {silence:.3f} s ago', now)
+        answer = self._stop_for(safety.muddled(now), now) or answer
         if safety.streams['ground_truth'].silence(now) > timeout:
             self.bending.load = 0.0
         for line in safety.news(now):
@@ -687,15 +684,14 @@ class Supervisor:
                 values[what] = f'{value:+.4g} +- {1.96 * error:.2g}'
         values |= {
             **self.bending.describe(),
-            'measurements answered': self._answered,
-            'answered too late for the delay': self._late,
-            'oldest measurement answered [s]': f'{self._oldest:.4f}',
+            **self._lateness.describe(),
             'inputs refused': self.journal.refused,
             'last complaint': self.journal.complaint,
             **self.safety.describe(now),
         }
         if self.safety.stop is not None:
             return Severity.ERROR, f'{self.safety.stop}; ~/clear_stop releases', values
-        held = self.fault or self.safety.warning(now) or self.bending.warning
+        late = self._lateness.warning(now)
+        held = self.fault or self.safety.warning(now) or self.bending.warning or late
         held = held if self._active is not None else None
         return Severity.WARNING if held else Severity.INFO, held, values

@@ -21,8 +21,8 @@ from needle_dynamics.simulated.faults import Fault, FaultParameters, FAULTS, FAU
 from needle_dynamics.simulated.plant import Plant, Sample
 from needle_dynamics.simulated.run import Event, PARAMETERS, PlantRun, RESET, TARE, TRAJECTORY
 from needle_ros import contract
-from needle_ros.commanders_node import Commanders
 from needle_ros.errors import JobError, NeedleError, ParameterError, printable
+from needle_ros.publishers_node import offer_lease, Publishers
 from needle_ros.run_node import run
 from needle_ros.sample_clock import SampleClock
 from needle_ros.timing import NANOSECONDS, RateCounter, seconds
@@ -126,6 +126,7 @@ class PlantNode(ModelNode):
         #: By a steady clock.
         self._command_rate, self._sample_rate = RateCounter(), RateCounter()
 
+        offer_lease(self, contract.MEASURER)
         streams = (
             contract.JOINT_STATES, contract.BASE_WRENCH, contract.TIP_DEFLECTION,
             contract.GROUND_TRUTH, contract.END_EFFECTOR_POSE,
@@ -137,8 +138,12 @@ class PlantNode(ModelNode):
         self._needle_poses = self.publisher(contract.NEEDLE_POSES)
         self._events = self.publisher(contract.EVENTS)
         self._clock_topic: Publisher | None = None
-        self._commanders = Commanders(self)
-        self.listen(contract.WRENCH_COMMAND, self._on_command)
+        self._commanders = Publishers(self, contract.COMMANDER, self._look_who_commands)
+        self._commands = self.listen(
+            contract.WRENCH_COMMAND, self._on_command, self._look_who_commands
+        )
+        #: Publishers of commands that DDS has matched, dead ones too.
+        self._matched = 0
         self._trajectories: Subscription | None = None
         self.create_service(Trigger, '~/tare', self._on_tare)
         self.create_service(SetBool, '~/pause', self._on_pause)
@@ -192,6 +197,10 @@ class PlantNode(ModelNode):
         # Rounding to counts may leave a saturated reading just below.
         self._full_scale = [limit * (1.0 - 1e-9) for limit in limits]
         self._period = NANOSECONDS / own.rate
+        self._exhausted = (
+            f'commands have put in more than {own.power_limit:g} J within a second (power_limit); '
+            'no force is applied until it is half of that'
+        )
         self._run = plant_run
         if publishes:
             self._clock_topic = self.publisher(contract.CLOCK, always=True)
@@ -244,6 +253,7 @@ class PlantNode(ModelNode):
         self._halted = None
         self._sampled = self._made_up = self._saturated = 0
         self._run.commands.begin()
+        self._look_who_commands()
         own = self._run.constants.own
         #: Samples from one picture to the next.
         self._picture = max(1, round(own.rate * max(1.0, own.real_time_factor) / _PICTURES))
@@ -272,6 +282,9 @@ class PlantNode(ModelNode):
         if self._run is None or not self.is_active:
             return
         self._command_rate.add(monotonic_ns())
+        if self._commands.get_publisher_count() != self._matched:
+            # Before its event, it seems: not one command of a second node may act.
+            self._look_who_commands()
         _, force, _, torque, _, _ = reading.values[0]
         commands, now = self._run.commands, self._time.simulated(self.now())
         counts, complaint = commands.offer(reading.stamp, reading.frame, force, torque, now)
@@ -361,14 +374,25 @@ class PlantNode(ModelNode):
         """Look who commands, and ask again for an answer that does not come."""
         if self._run is None:
             return
-        commanders = self._commanders.count()
-        if self._run.commands.count_commanders(commanders) and self._run.commands.rivals:
-            self.get_logger().error(f'{commanders} nodes command; no force is applied')
+        self._look_who_commands()
         self._looks = self._looks + 1 if self._time.awaited is not None else 0
         if self._looks and self._looks % _REPEAT == 0 and not self._time.paused:
             stamp, (topic, _, values) = self._last
             self._publish[topic](stamp, values)
         self.report_change()
+
+    def _look_who_commands(self) -> None:
+        """Let no force act while several nodes command."""
+        self._matched = self._commands.get_publisher_count()
+        if self._run is None:
+            return
+        count = self._commanders.count(contract.WRENCH_COMMAND, self._matched)
+        if self._run.commands.count_commanders(count):
+            if self._run.commands.rivals:
+                self.get_logger().error(
+                    f'{count} nodes command; no force is applied', throttle_duration_sec=1.0
+                )
+            self.report_change()
 
     def _sample(self, stamp: int) -> None:
         """Take a sample and publish it."""
@@ -378,6 +402,7 @@ class PlantNode(ModelNode):
             self._clock_topic.publish(Clock(clock=_message(stamp)))
         if plant_run is None or self._halted is not None:
             return
+        was_exhausted = plant_run.commands.exhausted
         try:
             measured = plant_run.take(stamp)
         except NeedleError as error:
@@ -387,6 +412,8 @@ class PlantNode(ModelNode):
             return
         self._sampled += 1
         self._sample_rate.add(monotonic_ns())
+        if plant_run.commands.exhausted and not was_exhausted:
+            self.get_logger().error(self._exhausted, throttle_duration_sec=1.0)
         events = plant_run.events()
         if events:
             self._tell(events, stamp, plant_run.number)
@@ -471,6 +498,8 @@ class PlantNode(ModelNode):
             return DiagnosticStatus.ERROR, self._halted, values
         if given.rivals:
             return DiagnosticStatus.ERROR, f'{given.rivals + 1} nodes command', values
+        if given.exhausted:
+            return DiagnosticStatus.ERROR, self._exhausted, values
         warnings = []
         if clock.paused:
             warnings.append(f'paused at {clock.stamp / NANOSECONDS:.6f} s')

@@ -27,6 +27,7 @@ from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor, SetParam
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.duration import Duration
+from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
@@ -299,7 +300,12 @@ class BaseNode(LifecycleNode):
         kind = message_class(topic.type_name)
         return self.create_subscription(kind, topic.name, take, profile(topic.qos))
 
-    def listen(self, topic: Topic, take: Callable[[Reading], None]) -> Subscription:
+    def listen(
+        self,
+        topic: Topic,
+        take: Callable[[Reading], None],
+        matched: Callable[[], None] | None = None,
+    ) -> Subscription:
         """
         Subscribe to a topic that comes at the sample rate; its messages are read from their bytes.
 
@@ -309,6 +315,8 @@ class BaseNode(LifecycleNode):
             The topic, of a type that `wire` knows.
         take : callable
             Called with each `Reading`.
+        matched : callable, optional
+            Called when a publisher has come, before its first message, and when one has gone.
 
         Returns
         -------
@@ -329,8 +337,14 @@ class BaseNode(LifecycleNode):
                 return
             take(reading)
 
+        events = SubscriptionEventCallbacks(matched=(lambda _: matched()) if matched else None)
         return self.create_subscription(
-            message_class(topic.type_name), name, on_bytes, profile(topic.qos), raw=True
+            message_class(topic.type_name),
+            name,
+            on_bytes,
+            profile(topic.qos),
+            raw=True,
+            event_callbacks=events,
         )
 
     # Parameters.

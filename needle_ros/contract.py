@@ -296,6 +296,13 @@ COMMANDER: Final = Topic(
     qos=ALIVE,
 )
 
+MEASURER: Final = replace(
+    COMMANDER,
+    name='joint_states/alive',
+    publisher='plant',
+    meaning='no messages: its lease tells the others when a plant has died',
+)
+
 REFERENCE: Final = Topic(
     'reference',
     JOINT_STATE,

@@ -1,8 +1,9 @@
-"""All inputs of a controller, the stop that latches, and who else commands."""
+"""All inputs of a controller, the stop that latches, and who else publishes them."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Final
 
 from needle_controller.controller import ControllerSettings
 from needle_controller.safety.guard import Guard
@@ -10,6 +11,17 @@ from needle_controller.safety.limits import SafetyLimits
 from needle_controller.safety.stream import Stream
 from needle_dynamics import NeedleParameters
 from needle_ros.timing import NANOSECONDS, RateCounter
+
+#: Topics without which, and with several sources of which, there is no force.
+_VITAL: Final = ('wrench_command', 'joint_states')
+
+#: Topics whose messages come in the order of their stamps.
+_MEASURED: Final = ('joint_states', 'ground_truth', 'base_wrench', 'tip_deflection')
+
+#: Shares of messages after later ones: what is said, and what is not borne; of so many [Hz].
+_LATE: Final = 0.5
+_MUDDLED: Final = 0.9
+_FEW: Final = 10.0
 
 
 class Safety:
@@ -36,7 +48,7 @@ class Safety:
     stops : int
         How often it was latched.
     rivals : str or None
-        Who else commands.
+        Why nobody knows whose command, or whose measurement, it is.
     streams : dict of str to Stream
         Inputs by topic.
     saturation : RateCounter
@@ -61,19 +73,22 @@ class Safety:
         self.saturation = RateCounter()
         noise = noise or {}
         timeout, base = limits.sensor_timeout, ('', 'needle_entry')
+        # A stamp that is ahead would make those of the true source late.
+        ahead = 1.0 / settings.rate
         self.streams = {
             stream.name: stream
             for stream in (
-                Stream('joint_states', settings.measurement_timeout),
-                Stream('ground_truth', settings.measurement_timeout),
+                Stream('joint_states', settings.measurement_timeout, ahead=ahead),
+                Stream('ground_truth', settings.measurement_timeout, ahead=ahead),
                 Stream(
                     'base_wrench', timeout, frames=('needle_base',),
                     jumps=(limits.lateral_jump, limits.moment_jump),
-                    noise=noise.get('base_wrench', ()),
+                    noise=noise.get('base_wrench', ()), ahead=ahead,
                 ),
                 Stream(
                     'tip_deflection', timeout, frames=('needle_entry',),
                     jumps=(limits.tip_jump,), noise=noise.get('tip_deflection', ()),
+                    ahead=ahead,
                 ),
                 Stream('target', timeout, frames=base, stamped=False),
                 Stream('joint_trajectory', timeout, frames=base, stamped=False),
@@ -169,18 +184,46 @@ class Safety:
             self.stop = None
         return reason
 
-    def count_commanders(self, publishers: Mapping[str, int]) -> None:
+    def count_publishers(self, publishers: Mapping[str, int]) -> None:
         """
-        Take in how many publish each topic of commands, this controller included.
+        Take in how many nodes publish what may have one source only, this controller included.
 
         Parameters
         ----------
         publishers : Mapping[str, int]
-            Number of publishers by topic.
+            Number of nodes by topic.
 
         """
-        several = [(count, topic) for topic, count in publishers.items() if count > 1]
-        self.rivals = ', '.join(f'{n} nodes publish {t}' for n, t in several) or None
+        for name, count in publishers.items():
+            if name in self.streams:
+                self.streams[name].publishers = count
+        vital = (
+            f'{count} nodes publish {name}'
+            for name, count in publishers.items()
+            if count > 1 and name in _VITAL
+        )
+        self.rivals = ', '.join(vital) or None
+
+    def muddled(self, now: int) -> str | None:
+        """
+        Return why the encoders are not those of one robot with one clock.
+
+        Parameters
+        ----------
+        now : int
+            Time [ns].
+
+        Returns
+        -------
+        str or None
+            Which share of their messages came after later ones, if that is nearly all.
+
+        """
+        window = self.streams['joint_states'].window
+        share = window.share(now)
+        if share <= _MUDDLED or window.rate(now) < _FEW:
+            return None
+        return f'joint_states has {share:.0%} of its messages after later ones'
 
     def _silent(self, now: int) -> dict[str, str]:
         """Return a line for each expected topic that is silent while the encoders are not."""
@@ -221,7 +264,7 @@ class Safety:
 
     def warning(self, now: int) -> str | None:
         """
-        Return which expected topics are stale or frozen.
+        Return which expected topics are stale or frozen, and which come out of order.
 
         Parameters
         ----------
@@ -242,7 +285,14 @@ class Safety:
         silent = {
             name: line for name, line in self._silent(now).items() if not self.streams[name].frozen
         }
-        return '; '.join((*frozen, *silent.values())) or None
+        late = (
+            f'{name} has {share:.0%} of its messages after later ones'
+            for name, stream in self.streams.items()
+            if name in _MEASURED
+            and (share := stream.window.share(now)) > _LATE
+            and stream.window.rate(now) >= _FEW
+        )
+        return '; '.join((*frozen, *silent.values(), *late)) or None
 
     def describe(self, now: int) -> dict[str, object]:
         """

@@ -17,6 +17,10 @@ DROPPED: Final = 'dropped'
 _LIVELY: Final = 10
 
 
+#: Stamps are rounded to nanoseconds [ns].
+_ROUNDING: Final = 2
+
+
 class Refusal(NamedTuple):
     """Why a message does not count: a kind to count by, and a line for people."""
 
@@ -48,6 +52,8 @@ class Stream:
     noise : sequence of float
         Noise of each value: a stream that had it and is frozen is not believed. None: it may
         be as still as it likes.
+    ahead : float, optional
+        How far a stamp may be ahead [s]; as far as it may be old, if it is not given.
 
     Attributes
     ----------
@@ -59,6 +65,10 @@ class Stream:
         Messages by what became of them.
     frozen : bool
         Whether a noisy stream has had the same values for longer than the timeout.
+    publishers : int
+        How many nodes publish the topic. While there are several no message counts.
+    window : RateCounter
+        Messages, those that came after a later one marked.
 
     """
 
@@ -71,9 +81,12 @@ class Stream:
         stamped: bool = True,
         jumps: Sequence[float] = (),
         noise: Sequence[float] = (),
+        ahead: float | None = None,
     ) -> None:
         self.name = name
         self.timeout = round(timeout * NANOSECONDS)
+        self._ahead = self.timeout if ahead is None else round(ahead * NANOSECONDS) + _ROUNDING
+        self.publishers = 1
         self._frames = frames
         self._stamped = stamped
         self._jumps, self._noise = jumps, noise
@@ -110,8 +123,8 @@ class Stream:
             None for a message that counts.
 
         """
-        self.window.add(now)
         refusal = self._judge(stamp, now, frame, values)
+        self.window.add(now, refusal is not None and refusal.kind == DROPPED)
         if refusal is None:
             self.counts['taken'] += 1
             self.counted = now
@@ -120,6 +133,8 @@ class Stream:
         return refusal
 
     def _judge(self, stamp: int, now: int, frame: str, values: Sequence[float]) -> Refusal | None:
+        if self.publishers > 1:
+            return Refusal('disputed', f'{self.publishers} nodes publish {self.name}')
         if self._stamped or stamp != 0:
             refusal = self._judge_stamp(stamp, now)
             if refusal is not None:
@@ -135,7 +150,7 @@ class Stream:
 
     def _judge_stamp(self, stamp: int, now: int) -> Refusal | None:
         age = now - stamp
-        if abs(age) > self.timeout:
+        if not -self._ahead <= age <= self.timeout:
             if stamp == 0:
                 return Refusal('not stamped', f'{self.name} is stale: it is not stamped')
             return Refusal('stale', f'{self.name} is stale: its stamp is {apart(age)}')

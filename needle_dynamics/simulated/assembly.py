@@ -48,8 +48,14 @@ class PlantSettings:
     command_timeout: float = constant(
         0.1, 's', 'age at which a command no longer counts', open_low=True
     )
-    force_limit: float = constant(1e3, 'N', 'largest force that a command may ask for')
+    force_limit: float = constant(15.0, 'N', 'largest force that a command may ask for')
     torque_limit: float = constant(1.0, 'N m', 'largest torque that a command may ask for')
+    force_rate_limit: float = constant(
+        3e4, 'N/s', 'fastest growth of a commanded force; it may end at once', open_low=True
+    )
+    power_limit: float = constant(
+        1.5, 'W', 'energy that commands may put in within a second', open_low=True
+    )
     backlog: float = constant(
         0.5, 's', 'longest delay after a stall whose samples are still computed', open_low=True
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from math import exp, inf
 from typing import NamedTuple
 
 from needle_ros.contract import BASE
@@ -34,8 +35,9 @@ class Commands:
 
     The command that is newest when a sample is taken acts until the next sample: a zero-order
     hold. A command counts if its stamp is within the timeout of now and not older than that of
-    the newest. It stands for no force if it is invalid, when it is older than the timeout, and
-    while several nodes command.
+    the newest. It stands for no force if it is invalid, when it is older than the timeout, while
+    several nodes command, and while commands have put in too much energy. A force may end at
+    once, but grows no faster than it may.
 
     Parameters
     ----------
@@ -45,6 +47,12 @@ class Commands:
         Largest valid force [N], either sign.
     torque_limit : float
         Largest valid torque [N m], either sign.
+    interval : float, optional
+        Time from one sample to the next [s].
+    force_rate_limit : float, optional
+        Fastest growth of the force, either sign [N/s].
+    power_limit : float, optional
+        Energy that may be put in within a second [W].
 
     Attributes
     ----------
@@ -60,12 +68,27 @@ class Commands:
         Number of commands that came after a newer one.
     rivals : int
         Number of nodes that command beyond the one that may.
+    exhausted : bool
+        Whether commands have put in more energy than they may; they act again at half of it.
 
     """
 
-    def __init__(self, timeout: float, force_limit: float, torque_limit: float) -> None:
+    def __init__(
+        self,
+        timeout: float,
+        force_limit: float,
+        torque_limit: float,
+        *,
+        interval: float = 1e-3,
+        force_rate_limit: float = inf,
+        power_limit: float = inf,
+    ) -> None:
         self._timeout = timeout * NANOSECONDS
         self._limits = force_limit, torque_limit
+        #: Most that a force may grow from one sample to the next [N].
+        self._growth = force_rate_limit * interval
+        #: Most energy [J], and what is left of it after a sample; a second is its time constant.
+        self._most_energy, self._left = power_limit, exp(-interval)
         self.refused = self.stale = self.overtaken = 0
         self.begin()
 
@@ -73,6 +96,9 @@ class Commands:
         """Forget the commands and who gave them, as at an activation."""
         self.held = self.newest = Command()
         self.rivals = 0
+        self.exhausted = False
+        #: Energy put in, less what is long ago [J].
+        self._energy = 0.0
 
     def forget(self) -> None:
         """Let no force act; commands older than the newest still do not count."""
@@ -133,8 +159,9 @@ class Commands:
         # Written so that NaN is refused too.
         if not (abs(force) <= largest and abs(torque) <= strongest):
             return (
-                f'wrench_command must be within {largest:g} N and {strongest:g} N m, got force.y '
-                f'= {force}, torque.x = {torque}; no force is applied'
+                f'wrench_command must be within force_limit, {largest:g} N, and torque_limit, '
+                f'{strongest:g} N m, got force.y = {force}, torque.x = {torque}; no force is '
+                'applied'
             )
         return ''
 
@@ -161,7 +188,7 @@ class Commands:
         self.newest = Command(self.newest.stamp)
         return True
 
-    def hold(self, stamp: int) -> None:
+    def hold(self, stamp: int, distance: float = 0.0) -> None:
         """
         Let the newest command act until the next sample, unless it is too old.
 
@@ -169,7 +196,16 @@ class Commands:
         ----------
         stamp : int
             Time of the sample that was just taken [ns].
+        distance : float, optional
+            How far the needle has moved under the command that was held [m].
 
         """
-        fresh = stamp - self.newest.stamp <= self._timeout
-        self.held = self.newest if fresh else Command(self.newest.stamp)
+        before, newest = self.held.force, self.newest
+        self._energy = self._left * self._energy + max(0.0, before * distance)
+        self.exhausted = self._energy > (0.5 if self.exhausted else 1.0) * self._most_energy
+        if self.exhausted or stamp - newest.stamp > self._timeout:
+            self.held = Command(newest.stamp)
+            return
+        growth = self._growth
+        force = min(max(newest.force, min(before, 0.0) - growth), max(before, 0.0) + growth)
+        self.held = newest if force == newest.force else newest._replace(force=force)

@@ -102,7 +102,14 @@ class PlantRun:
         self.constants = PlantConstants.of(values)
         self.plant = self.constants.make()
         own = self.constants.own
-        self.commands = Commands(own.command_timeout, own.force_limit, own.torque_limit)
+        self.commands = Commands(
+            own.command_timeout,
+            own.force_limit,
+            own.torque_limit,
+            interval=1.0 / own.rate,
+            force_rate_limit=own.force_rate_limit,
+            power_limit=own.power_limit,
+        )
         self.number = number
         self.sample: Sample | Press | None = None
         topics = [BASE_WRENCH, END_EFFECTOR_POSE]
@@ -198,13 +205,17 @@ class PlantRun:
 
         """
         acting = self.commands.held if command is None else command
+        before = self.sample
         self.sample = sample = self.plant.advance(acting.force, acting.torque)
         # Whole nanoseconds first: a float has too few digits for a stamp.
         if abs(stamp - self._stamp - self._period) > _ROUNDING:
             self._events.append(Event(TIME))
         self._stamp = stamp
         self.number += 1
-        self.commands.hold(stamp)
+        moved = 0.0
+        if isinstance(before, Sample) and isinstance(sample, Sample):
+            moved = sample.depth - before.depth
+        self.commands.hold(stamp, moved)
         measured: list[Measurement] = [(BASE_WRENCH.name, 0, sample.wrench.tolist())]
         if isinstance(sample, Press):
             pose = [*sample.position.tolist(), 0.0, 0.0, 0.0, 1.0]

@@ -34,6 +34,9 @@ _OTHERS: Final = ('configuration', 'events', 'joint_trajectory')
 #: Parameters without which a plant cannot be made again.
 _NEEDED: Final = ('mode', 'seed', 'rate', 'step', 'depth', 'force_limit', 'command_timeout')
 
+#: Limits that older plants did not have.
+_UNLIMITED: Final = {'force_rate_limit': 1e12, 'power_limit': 1e12}
+
 #: Messages of a topic, each with the time at which it was recorded [ns].
 _Messages = list[tuple[int, Any]]
 
@@ -200,7 +203,7 @@ class RecordedRun:
         configurations = _configurations(messages[f'{name}/configuration'])
         said = _events(messages.get(f'{name}/events', []))
         made = (event.content for _, _, event in said if event.kind == CONFIGURED)
-        self.values = dict(next(made, configurations[0][1]))
+        self.values = {**_UNLIMITED, **next(made, configurations[0][1])}
         lacking = next((name for name in _NEEDED if name not in self.values), None)
         if lacking:
             raise RecordingError(f'{path}: the parameters of {name} lack {lacking!r}')

@@ -290,10 +290,53 @@ def test_a_clock_set_back_is_told_from_one_that_stands() -> None:
 def test_who_else_commands_is_named() -> None:
     """Each topic with more than one publisher, until it is alone again."""
     whole = safety()
-    whole.count_commanders({'/wrench_command': 2})
-    assert whole.rivals == '2 nodes publish /wrench_command'
-    whole.count_commanders({'/wrench_command': 1})
+    whole.count_publishers({'wrench_command': 2})
+    assert whole.rivals == '2 nodes publish wrench_command'
+    whole.count_publishers({'wrench_command': 1})
     assert whole.rivals is None
+
+
+def test_a_sensor_with_two_sources_is_not_believed() -> None:
+    """Encoders of two robots are no encoders; without the others it goes on, without them."""
+    whole, now = safety(), 5 * SECOND
+    whole.count_publishers({'joint_states': 2, 'base_wrench': 3})
+    assert whole.rivals == '2 nodes publish joint_states'
+    for name, count in (('joint_states', 2), ('base_wrench', 3)):
+        refusal = whole.streams[name].check(now, now, 'needle_base')
+        assert refusal is not None
+        assert (refusal.kind, refusal.line) == ('disputed', f'{count} nodes publish {name}')
+    whole.count_publishers({'joint_states': 1, 'base_wrench': 2})
+    assert whole.rivals is None
+    # What the other said has left no trace.
+    assert whole.streams['joint_states'].check(now - SECOND // 100, now) is None
+
+
+@pytest.mark.parametrize('name', ['joint_states', 'ground_truth', 'base_wrench', 'tip_deflection'])
+def test_a_stamp_may_be_ahead_by_a_period(name: str) -> None:
+    """By more it is refused: it would make those of the true source late."""
+    whole, now = safety(), 5 * SECOND
+    stream, frame = whole.streams[name], 'needle_entry' if name[0] == 't' else 'needle_base'
+    period = round(SECOND / ControllerSettings().rate)
+    refusal = stream.check(now + 2 * period, now, frame)
+    assert refusal is not None
+    assert refusal.line == f'{name} is stale: its stamp is 0.002 s ahead'
+    assert stream.check(now + period, now, frame) is None
+    assert stream.check(now + period + 1, now, frame) is None
+
+
+def test_encoders_of_two_clocks_stop_the_motion() -> None:
+    """More than nine in ten after later ones stop, more than half are said; few say nothing."""
+    for late, warned, stopped in ((4, False, False), (6, True, False), (19, True, True)):
+        whole, now = safety(), 5 * SECOND
+        stream = whole.streams['joint_states']
+        for k in range(2000):
+            now += SECOND // 1000
+            stream.check(now if k % (late + 1) == 0 else now - SECOND // 50, now)
+        share = late / (late + 1)
+        assert (stream.window.share(now) > 0.5) == (share > 0.5)
+        said = f'joint_states has {stream.window.share(now):.0%} of its messages after later ones'
+        assert whole.warning(now) == (said if warned or share > 0.5 else None)
+        assert whole.muddled(now) == (said if stopped else None)
 
 
 @pytest.mark.parametrize(

@@ -4,17 +4,20 @@ from __future__ import annotations
 
 from math import inf, nan
 
+from hypothesis import given
+from hypothesis import strategies as st
 from needle_dynamics.simulated.commands import Command, Commands
 from needle_ros.timing import NANOSECONDS
 import pytest
 
 PERIOD = 1_000_000
+BEYOND = 'must be within force_limit, 10 N, and torque_limit, 1 N m'
 #: A stamp that a float could not hold to the nanosecond.
 NOW = 1_700_000_000 * NANOSECONDS + 1
 
 
-def made() -> Commands:
-    return Commands(timeout=0.1, force_limit=10.0, torque_limit=1.0)
+def made(**limits: float) -> Commands:
+    return Commands(timeout=0.1, force_limit=10.0, torque_limit=1.0, **limits)
 
 
 def test_a_command_acts_from_the_next_sample_to_the_one_after() -> None:
@@ -79,9 +82,9 @@ def test_a_command_that_was_overtaken_does_not_count() -> None:
     ('frame', 'force', 'torque', 'complaint'),
     [
         ('needle_entry', 1.0, 0.0, "must be in needle_base, got 'needle_entry'"),
-        ('', nan, 0.0, 'must be within 10 N and 1 N m, got force.y = nan, torque.x = 0.0'),
-        ('', 0.0, inf, 'must be within 10 N and 1 N m, got force.y = 0.0, torque.x = inf'),
-        ('', -10.1, 0.0, 'must be within 10 N and 1 N m, got force.y = -10.1, torque.x = 0.0'),
+        ('', nan, 0.0, f'{BEYOND}, got force.y = nan, torque.x = 0.0'),
+        ('', 0.0, inf, f'{BEYOND}, got force.y = 0.0, torque.x = inf'),
+        ('', -10.1, 0.0, f'{BEYOND}, got force.y = -10.1, torque.x = 0.0'),
     ],
 )
 def test_an_invalid_command_is_no_force(
@@ -111,6 +114,56 @@ def test_while_several_nodes_command_no_force_acts() -> None:
     assert commands.count_commanders(1)
     commands.offer(NOW + 2 * PERIOD, '', 1.0, 0.0, NOW + 2 * PERIOD)
     assert commands.newest.force == 1.0
+
+
+@given(st.lists(st.floats(-10.0, 10.0), min_size=1, max_size=30))
+def test_a_force_grows_no_faster_than_it_may_and_ends_at_once(forces: list[float]) -> None:
+    """From one sample to the next; through zero it may go, and grow from there."""
+    commands, growth = made(interval=1e-3, force_rate_limit=2000.0), 2.0
+    before = 0.0
+    for k, force in enumerate(forces):
+        stamp = NOW + k * PERIOD
+        commands.offer(stamp, '', force, 0.5, stamp)
+        commands.hold(stamp)
+        held = commands.held
+        assert (held.stamp, held.torque) == (stamp, 0.5)
+        assert abs(held.force) <= max(abs(force), 0.0)
+        if abs(force) <= abs(before) and force * before >= 0.0:
+            assert held.force == force
+        elif force * before >= 0.0:
+            # The numbers have 16 digits.
+            assert abs(held.force) == pytest.approx(min(abs(force), abs(before) + growth), 1e-12)
+        else:
+            assert abs(held.force) == pytest.approx(min(abs(force), growth), 1e-12)
+        before = held.force
+    commands.hold(NOW + 1000 * PERIOD)
+    assert commands.held.force == 0.0
+
+
+def test_no_force_acts_while_more_energy_was_put_in_than_may_be() -> None:
+    """5 N at 0.4 m/s are 2 W: after 1 J within less than a second, until it is half of that."""
+    commands = made(interval=1e-3, power_limit=1.0)
+    acted, spent = [], 0.0
+    for k in range(4000):
+        stamp = NOW + k * PERIOD
+        commands.offer(stamp, '', 5.0, 0.0, stamp)
+        distance = 0.4e-3 if commands.held.force else 0.0
+        spent += commands.held.force * distance
+        commands.hold(stamp, distance)
+        acted.append(commands.held.force == 5.0)
+        assert commands.exhausted != acted[-1]
+    first = acted.index(False)
+    # 2 W (1 - exp(-t)) is 1 J at ln 2; then it halves in ln 2.
+    assert first == pytest.approx(693, abs=2)
+    assert acted.index(True, first) - first == pytest.approx(693, abs=2)
+    # What is forgotten in a second is at most what may be put in.
+    assert spent <= 1.0 + 4.0 * 1.0
+    # Being moved puts nothing in, nor does what the needle gives back.
+    commands = made(interval=1e-3, power_limit=1e-9)
+    commands.offer(NOW, '', 5.0, 0.0, NOW)
+    commands.hold(NOW, 0.0)
+    commands.hold(NOW, -1.0)
+    assert not commands.exhausted
 
 
 def test_what_was_commanded_is_forgotten() -> None:

@@ -367,7 +367,8 @@ def test_beyond_its_range_without_hub_stop_it_stands_still(ros_graph: RosGraph) 
     probe = ros_graph.node('probe')
     reports = ros_graph.listen(probe, DiagnosticArray, '/diagnostics', 10)
     commands = probe.create_publisher(WrenchStamped, 'wrench_command', COMMAND)
-    free = {'model.hub_stop': False, 'model.preset': 'paper_si', 'depth': 0.1}
+    limits = {'force_limit': 20.0, 'power_limit': 1e3}
+    free = {'model.hub_stop': False, 'model.preset': 'paper_si', 'depth': 0.1, **limits}
     ros_graph.add(PlantNode, parameters={**RATE, **free})
     ros_graph.spin_until(commands.get_subscription_count, 'discovery')
 
@@ -542,7 +543,7 @@ def test_the_end_effector_presses_the_tissue(ros_graph: RosGraph) -> None:
         (
             'robot',
             trajectory(['insertion'], (1.0, [], [5e3])),
-            'a push must be within 1000 N, got [5000.0] N',
+            'a push must be within 15 N, got [5000.0] N',
         ),
         (
             'robot',
@@ -558,7 +559,7 @@ def test_the_end_effector_presses_the_tissue(ros_graph: RosGraph) -> None:
         (
             'indenter',
             trajectory(['x', 'z'], (1.0, [], [1.0])),
-            'each point needs efforts of x and z within 1000 N, got [[1.0]]',
+            'each point needs efforts of x and z within 15 N, got [[1.0]]',
         ),
     ],
 )

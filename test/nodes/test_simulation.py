@@ -115,7 +115,7 @@ def test_a_command_acts_from_the_sample_after_it(ros_graph: RosGraph) -> None:
     def answer(message: JointState) -> None:
         # Friction is settled within microseconds: the speed tells the force.
         k = round(stamp_ns(message) / PERIOD)
-        forces[k] = 0.56 + 3.0 * (1 + k % 5)
+        forces[k] = 0.56 + 2.5 * (1 + k % 5)
         bench.command(forces[k], stamp=message.header.stamp)
 
     setattr(bench, 'on_state', answer)  # noqa: B010

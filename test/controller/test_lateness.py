@@ -1,0 +1,31 @@
+"""Whether answers come in time for the delay that the laws count on."""
+
+from __future__ import annotations
+
+from needle_controller.safety.lateness import Lateness
+from needle_ros.timing import NANOSECONDS
+import pytest
+
+
+@pytest.mark.parametrize(
+    ('rate', 'late', 'said'),
+    [(1000, 40, False), (1000, 60, True), (20, 2, False), (20, 10, True)],
+)
+def test_more_than_one_late_answer_in_twenty_is_said(rate: int, late: int, said: bool) -> None:
+    """Of the last full second, and not for the sake of one or two."""
+    period = 1.0 / rate
+    lateness = Lateness(delay=1, period=period)
+    for k in range(2 * rate + 1):
+        now = k * NANOSECONDS // rate
+        # Two periods are in time; a little more is not.
+        lateness.add(now, 2.0 * period if k % rate >= late else 2.1 * period)
+    warning = lateness.warning(now)
+    share = f'{late / rate:.0%} of the answers come too late for delay 1: raise it'
+    assert (warning is not None and warning.startswith(share)) == said
+    values = lateness.describe()
+    assert values['measurements answered'] == 2 * rate + 1
+    assert values['answered too late for the delay'] == 2 * late + 1
+    # A second without any: all is well again.
+    lateness.add(now + 1 * NANOSECONDS, 0.0)
+    lateness.add(now + 2 * NANOSECONDS, 0.0)
+    assert lateness.warning(now + 2 * NANOSECONDS) is None
