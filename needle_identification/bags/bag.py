@@ -11,6 +11,7 @@ from typing import Any, Final, NamedTuple
 
 from needle_identification.bags.batch import Batch, Tally
 from needle_identification.bags.files import files_of, form_of
+from needle_identification.bags.limits import Budget
 from needle_identification.bags.mcap_file import DAMAGED_MCAP, indexed_topics, mcap_batches
 from needle_identification.bags.sqlite_file import sqlite_batches
 from needle_identification.bags.topics import Topic
@@ -190,7 +191,7 @@ class Bag:
         self.losses[:] = self._missing
         for file in self._files:
             faults: list[str] = []
-            tally = Tally(self.counts, wanted, faults)
+            tally = Tally(self.counts, wanted, faults, Budget(file))
             try:
                 for batch in _BATCHES[form_of(file)](file, tally):
                     yield (file, tally.piece), batch

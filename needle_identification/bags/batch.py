@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 from needle_identification.bags.compression import DAMAGED, decompress
+from needle_identification.bags.limits import Budget
 from needle_identification.bags.topics import Topic
 import numpy as np
 from numpy.typing import NDArray
@@ -20,9 +21,6 @@ LATEST: Final = 2**62
 
 #: How compressed messages begin; others begin with 0.
 _COMPRESSED: Final = {b'\x28\xb5\x2f\xfd': 'zstd', b'\x04\x22\x4d\x18': 'lz4'}
-
-#: Larger messages are not decompressed [bytes].
-_LARGEST_MESSAGE: Final = 2**26
 
 
 class Batch(NamedTuple):
@@ -84,14 +82,24 @@ class Batch(NamedTuple):
         for received, begin, end in zip(self.received, self.begin, self.end, strict=True):
             yield int(received), self.data[begin:end].tobytes()
 
-    def decompressed(self) -> Batch:
+    def decompressed(self, budget: Budget) -> Batch:
         """
         Decompress messages that were compressed one by one.
+
+        Parameters
+        ----------
+        budget : Budget
+            What they may unfold to.
 
         Returns
         -------
         Batch
             The same messages; a damaged one is empty.
+
+        Raises
+        ------
+        RecordingError
+            If they unfold to too much.
 
         """
         compression = _COMPRESSED.get(next(self.messages())[1][:4])
@@ -100,7 +108,8 @@ class Batch(NamedTuple):
         parts = [b''] * len(self.received)
         for k, (_, data) in enumerate(self.messages()):
             with suppress(*DAMAGED):
-                parts[k] = decompress(compression, data, _LARGEST_MESSAGE)
+                parts[k] = decompress(compression, data, budget.largest_message)
+            budget.spend(len(parts[k]))
         return Batch.joined(self.topic, self.received, parts)
 
 
@@ -117,6 +126,8 @@ class Tally:
         Tells whether the messages of a topic are wanted.
     faults : list of str
         What is wrong with the file.
+    budget : Budget
+        What the file may unfold to.
     count, written : int
         Messages read of known topics, and messages that the file should have, if it says so.
     piece : int
@@ -127,6 +138,7 @@ class Tally:
     counts: dict[Topic, int]
     wanted: Callable[[Topic], bool]
     faults: list[str]
+    budget: Budget
     count: int = 0
     written: int | None = None
     piece: int = 0

@@ -16,9 +16,6 @@ COMPRESSED: Final = ('.zstd', '.zst', '.lz4')
 #: Bytes that are read at a time.
 BLOCK: Final = 2**20
 
-#: A larger record or chunk is a damaged length [bytes].
-LARGEST: Final = 2**30
-
 #: What readers raise at damaged bytes.
 DAMAGED: Final = (
     RuntimeError,
@@ -76,7 +73,7 @@ def read_up_to(stream: Any, length: int) -> bytes:
     """
     parts = []
     with suppress(EOFError):
-        while length > 0 and (part := stream.read(min(length, LARGEST))):
+        while length > 0 and (part := stream.read(min(length, BLOCK))):
             parts.append(part)
             length -= len(part)
     return parts[0] if len(parts) == 1 else b''.join(parts)

@@ -8,7 +8,7 @@ from typing import Final
 
 from needle_identification.bags.compression import COMPRESSED
 from needle_identification.errors import RecordingError
-import yaml
+from needle_ros.documents import DocumentError, LARGEST, read_document
 
 #: File of a rosbag2 folder that lists the others; written when the bag is closed.
 METADATA: Final = 'metadata.yaml'
@@ -86,14 +86,18 @@ def files_of(path: Path) -> tuple[list[Path], list[str]]:
         inside = min(path.glob(f'*/{METADATA}'), default=None)
         hint = _VALID if inside is None else f'name those inside, such as {inside.parent}'
         raise RecordingError(f'{path} holds no recording; {hint}')
-    names = _names_in_metadata(path)
+    names, why = None, f'no readable {METADATA}: the recording was not closed'
+    try:
+        names = _names_in_metadata(path)
+    except DocumentError as error:
+        why = f'{METADATA} {error}'
     if names is None:
         # The parts of one recording differ in a number at the end.
         if len({re.sub(r'_\d+$', '', _uncompressed(file).stem) for file in chosen}) > 1:
             raise RecordingError(
-                f'{path} holds several recordings; name them, such as {chosen[0]}'
+                f'{path} holds several recordings; name them, such as {chosen[0]}; {why}'
             )
-        return chosen, [f'no readable {METADATA}: the recording was not closed']
+        return chosen, [why]
     there = {file.name for file in chosen}
     losses = [f'{name} is missing' for name in names if name not in there]
     if there.isdisjoint(names):
@@ -107,12 +111,13 @@ def files_of(path: Path) -> tuple[list[Path], list[str]]:
 
 
 def _names_in_metadata(folder: Path) -> list[str] | None:
-    """Return the files of a bag by its metadata; None if that is not readable."""
+    """Return the files of a bag by its metadata; None if there is none, or of another kind."""
     try:
-        document = yaml.safe_load((folder / METADATA).read_text(encoding='utf-8'))
+        with (folder / METADATA).open(encoding='utf-8') as stream:
+            document = read_document(stream.read(LARGEST + 1))
         paths = document['rosbag2_bagfile_information']['relative_file_paths']
         if not isinstance(paths, list):
             return None
         return list(dict.fromkeys(Path(str(name)).name for name in paths))
-    except (OSError, yaml.YAMLError, KeyError, TypeError, ValueError, RecursionError):
+    except (OSError, UnicodeDecodeError, KeyError, TypeError):
         return None

@@ -25,7 +25,6 @@ from needle_identification.bags.compression import (
     BLOCK,
     DAMAGED,
     decompress,
-    LARGEST,
     open_file,
     read_up_to,
 )
@@ -148,7 +147,7 @@ def mcap_batches(file: Path, tally: Tally) -> Iterator[Batch]:
     channels = _Channels()
     loose = bytearray()
     is_complete = False
-    with open_file(file) as stream:
+    with tally.budget.metered(open_file(file)) as stream:
         magic = read_up_to(stream, len(_MAGIC))
         if magic != _MAGIC:
             begin = repr(magic) if magic else 'nothing'
@@ -156,8 +155,8 @@ def mcap_batches(file: Path, tally: Tally) -> Iterator[Batch]:
         while len(head := read_up_to(stream, _HEAD.size)) == _HEAD.size:
             opcode, length = _HEAD.unpack(head)
             if opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE, Opcode.CHUNK):
-                if length > LARGEST:
-                    tally.faults.append(f'is damaged: a record of {length} bytes')
+                if length > tally.budget.largest:
+                    tally.faults.append(f'is damaged: {tally.budget.too_large("record", length)}')
                     break
                 body = read_up_to(stream, length)
                 if opcode != Opcode.CHUNK:
@@ -192,9 +191,10 @@ def _chunk_content(chunk: bytes, length: int, tally: Tally) -> bytes:
     try:
         _, _, size, checksum, name_length = _CHUNK.unpack_from(chunk)
         begin = _CHUNK.size + name_length + 8
-        if size > LARGEST:
-            raise ValueError(f'a chunk of {size} bytes')
+        if size > tally.budget.largest:
+            raise ValueError(tally.budget.too_large('chunk', size))
         data = decompress(chunk[_CHUNK.size : begin - 8].decode(), chunk[begin:], size)
+        tally.budget.spend(len(data))
         if len(chunk) == length:
             if len(data) != size:
                 raise ValueError(f'a chunk of {len(data)} instead of {size} bytes')
@@ -247,4 +247,6 @@ def _batches(content: bytes, channels: _Channels, tally: Tally) -> Iterator[Batc
             rows = np.flatnonzero(ids == id_)
             if tally.enter(topic, len(rows)) and topic is not None:
                 starts = first[rows] + _MESSAGE_HEAD
-                yield Batch(topic, received[rows], data, starts, after[rows]).decompressed()
+                yield Batch(topic, received[rows], data, starts, after[rows]).decompressed(
+                    tally.budget
+                )

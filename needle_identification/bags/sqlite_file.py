@@ -8,13 +8,26 @@ from itertools import islice
 from pathlib import Path
 import sqlite3
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, Final
 from urllib.parse import quote
 
 from needle_identification.bags.batch import Batch, LARGEST_BATCH, LATEST, Tally
 from needle_identification.bags.compression import BLOCK, COMPRESSED, open_file, read_up_to
+from needle_identification.bags.limits import factor
 from needle_identification.bags.topics import make_topic, Topic
+from needle_identification.errors import RecordingError
 import numpy as np
+
+_TABLES: Final = ('messages', 'topics', 'message_definitions')
+
+#: Bytes that a row stands for beside its data.
+_ROW: Final = 16
+
+#: Steps of SQLite: of any query, by each byte of the file, and between two counts. A message takes
+#: about 20 steps and 40 bytes.
+_STEPS: Final = 10**7
+_STEPS_PER_BYTE: Final = 20
+_STEPS_PER_CALL: Final = 10**5
 
 
 def sqlite_batches(file: Path, tally: Tally) -> Iterator[Batch]:
@@ -42,7 +55,8 @@ def sqlite_batches(file: Path, tally: Tally) -> Iterator[Batch]:
     with ExitStack() as stack:
         if file.suffix in COMPRESSED:
             folder = stack.enter_context(TemporaryDirectory())
-            with open_file(file) as stream, Path(folder, file.stem).open('wb') as copy:
+            unfolded = tally.budget.metered(open_file(file))
+            with unfolded as stream, Path(folder, file.stem).open('wb') as copy:
                 while part := read_up_to(stream, BLOCK):
                     copy.write(part)
             file = Path(folder, file.stem)
@@ -51,7 +65,30 @@ def sqlite_batches(file: Path, tally: Tally) -> Iterator[Batch]:
         uri = f'file:{quote(str(file.resolve()))}?{"mode=ro" if journal else "immutable=1"}'
         database = stack.enter_context(closing(sqlite3.connect(uri, uri=True)))
         database.text_factory = bytes
+        # Otherwise nothing is read of a file whose end, with an index, is missing.
+        database.execute('PRAGMA writable_schema = ON')
+        _bound(database, file.stat().st_size, tally)
         yield from _rows(database, tally)
+
+
+def _bound(database: sqlite3.Connection, size: int, tally: Tally) -> None:
+    """Let no query run for longer than the file may take, nor compute what it does not hold."""
+    steps = _STEPS + size * _STEPS_PER_BYTE
+    calls = iter(range(int(factor() * steps) // _STEPS_PER_CALL))
+    # Something other than None or 0 ends the query.
+    database.set_progress_handler(lambda: next(calls, None) is None, _STEPS_PER_CALL)
+    if hasattr(database, 'setlimit'):
+        # From Python 3.11 on.
+        database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, tally.budget.largest)
+    for kind, name in database.execute('SELECT type, name FROM sqlite_master').fetchall():
+        if _text(name) not in _TABLES:
+            continue
+        # A view or a computed column need not end.
+        columns = database.execute(f'PRAGMA table_xinfo("{_text(name)}")').fetchall()
+        if _text(kind) != 'table' or any(hidden for *_, hidden in columns):
+            raise RecordingError(
+                f'{tally.budget.name}: {_text(name)} is not a plain table, and is not read'
+            )
 
 
 def _topics(database: sqlite3.Connection) -> dict[int, Topic]:
@@ -82,8 +119,6 @@ def _topics(database: sqlite3.Connection) -> dict[int, Topic]:
 
 def _rows(database: sqlite3.Connection, tally: Tally) -> Iterator[Batch]:
     """Yield the messages of a database, as far as it is readable."""
-    # Otherwise nothing is read of a file whose end, with an index, is missing.
-    database.execute('PRAGMA writable_schema = ON')
     topics = _topics(database)
     wanted = ', '.join(str(key) for key, topic in topics.items() if tally.wanted(topic))
     # Only wanted data are loaded, not the images beside them.
@@ -101,6 +136,7 @@ def _rows(database: sqlite3.Connection, tally: Tally) -> Iterator[Batch]:
         if not some:
             break
         tally.piece += 1
+        tally.budget.spend(sum(_ROW + len(data or b'') for _, _, data in some))
         groups: dict[int, list[tuple[int, bytes]]] = {}
         for key, received, data in some:
             groups.setdefault(key, []).append((received, data))
@@ -112,7 +148,7 @@ def _rows(database: sqlite3.Connection, tally: Tally) -> Iterator[Batch]:
                     topics[key],
                     np.clip(stamps, -LATEST, LATEST),
                     [part if isinstance(part, bytes) else b'' for part in parts],
-                ).decompressed()
+                ).decompressed(tally.budget)
     if fault is not None:
         raise fault
 

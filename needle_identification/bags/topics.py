@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 import re
 from typing import Any, Final, NamedTuple
 
+from needle_ros.documents import DocumentError, read_document
 from needle_ros.timing import NANOSECONDS
-import yaml
 
 #: Numbers that older recordings have instead of the words of rosbag2.
 _WORDS: Final = {
@@ -123,7 +123,7 @@ class Topic:
 
         """
         try:
-            profiles = yaml.safe_load(self.profiles) or []
+            profiles = read_document(self.profiles) or []
             return tuple(
                 OfferedQos(
                     **{
@@ -138,7 +138,7 @@ class Topic:
                 )
                 for stored in profiles
             )
-        except (yaml.YAMLError, AttributeError, KeyError, TypeError, ValueError, RecursionError):
+        except (DocumentError, AttributeError, KeyError, TypeError, ValueError, OverflowError):
             return ()
 
 

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from needle_dynamics.arrays import FloatArray
+from needle_ros.documents import DocumentError, read_document
 from needle_ros.errors import ShapeError
 import numpy as np
-import yaml
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
@@ -26,8 +26,8 @@ class _AnyRecording:
     def truth(self) -> Mapping[str, Any] | None:
         """Parameters of the recorded plant by name; None if there is no configuration."""
         try:
-            document = yaml.safe_load(self.configuration)
-        except (yaml.YAMLError, ValueError, RecursionError):
+            document = read_document(self.configuration)
+        except DocumentError:
             return None
         if not isinstance(document, dict):
             return None

@@ -16,6 +16,7 @@ from needle_insertion.experiment.campaign import Campaign
 from needle_insertion.experiment.protocol import Protocol, SPEED
 from needle_insertion.experiment.ros_graph import ACTIVATE, CLEANUP, CONFIGURE, DEACTIVATE, Graph
 from needle_ros.base_node import COMMAND, SENSOR
+from needle_ros.documents import DocumentError, read_document
 from needle_ros.timing import seconds
 import numpy as np
 from rclpy.duration import Duration
@@ -23,7 +24,6 @@ from rclpy.parameter import Parameter
 from rclpy.parameter_client import AsyncParameterClient
 from tqdm import tqdm
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
-import yaml
 
 #: Largest share of samples that a bag may lack: a few in a thousand change no stroke or press,
 #: even in a row. A reader that stalls loses far more.
@@ -270,9 +270,9 @@ def _is_finished(bag: Path, protocol: Protocol, parameters: Mapping[str, Any]) -
         return False
     try:
         ((_, message),) = read_topic(bag, '/plant/configuration')
-        found = dict(yaml.safe_load(message.data)['/plant']['ros__parameters'])
+        found = dict(read_document(message.data)['/plant']['ros__parameters'])
         commanded = [_points(message) for _, message in read_topic(bag, '/joint_trajectory')]
-    except (RecordingError, yaml.YAMLError, AttributeError, KeyError, TypeError, ValueError):
+    except (RecordingError, DocumentError, AttributeError, KeyError, TypeError, ValueError):
         raise ParameterError(
             f'{bag} exists and is not a run of this experiment; name another folder'
         ) from None

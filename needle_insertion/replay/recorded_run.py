@@ -18,12 +18,12 @@ from needle_dynamics.simulated.assembly import SETTINGS
 from needle_dynamics.simulated.run import CONFIGURED, Event, PARAMETERS, PlantRun, TRAJECTORY
 from needle_identification import Bag, deserialize, RecordingError, Topic
 from needle_ros.contract import TIP_DEFLECTION, TOPICS
+from needle_ros.documents import DocumentError, read_document
 from needle_ros.errors import MessageError
 from needle_ros.timing import NANOSECONDS, nanoseconds, seconds
 from needle_ros.wire import Reader, TYPES
 import numpy as np
 from numpy.typing import NDArray
-import yaml
 
 #: Message types by the last part of the name of a topic.
 _TYPES: Final = {topic.name.rpartition('/')[2]: topic.type_name for topic in TOPICS}
@@ -100,8 +100,8 @@ def _configurations(messages: _Messages) -> list[tuple[int, dict[str, Any]]]:
     found = []
     for received, message in messages:
         # Some other text, or another node.
-        with suppress(yaml.YAMLError, AttributeError, KeyError, TypeError):
-            for node in yaml.safe_load(message.data).values():
+        with suppress(DocumentError, AttributeError, KeyError, TypeError):
+            for node in read_document(message.data).values():
                 values = node['ros__parameters']
                 if 'mode' in values and 'sensor.force_noise' in values:
                     found.append((received, values))

@@ -1,0 +1,241 @@
+"""Small files that stand for more than a machine holds, or never end: one line, little memory."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from contextlib import closing
+from io import BytesIO
+import os
+from pathlib import Path
+import sqlite3
+import struct
+import subprocess
+import sys
+
+import lz4.frame
+from mcap.writer import CompressionType
+from mcap.writer import Writer as McapWriter
+from needle_identification.bags.writer import BagWriter
+from needle_ros.documents import DocumentError, read_document
+import pytest
+from support.installed import ROOT
+from support.samples import EPOCH, TEXT, text
+import zstandard
+
+WRENCH = 'geometry_msgs/msg/WrenchStamped'
+JOINTS = 'sensor_msgs/msg/JointState'
+MEGABYTE = 2**20
+
+#: Most memory that a file may take that is small [kB], and time after which it hangs [s].
+MEMORY, PATIENCE = 1_000_000, 120.0
+
+#: A quadratic, or worse, number of things behind a few lines.
+LAUGHS = 'a0: &a0 [lol, lol, lol, lol, lol, lol, lol, lol, lol, lol]\n' + ''.join(
+    f'a{k}: &a{k} [{", ".join([f"*a{k - 1}"] * 10)}]\n' for k in range(1, 12)
+)
+MERGES = 'a0: &a0 {k: 0}\n' + ''.join(
+    f'a{k}: &a{k}\n  <<: [{", ".join([f"*a{k - 1}"] * 10)}]\n' for k in range(1, 12)
+)
+
+
+def mcap(file: Path, messages: Iterable[bytes], compression: CompressionType) -> None:
+    """Write messages on both topics that an identification wants."""
+    with file.open('wb') as stream:
+        writer = McapWriter(stream, compression=compression)
+        writer.start(profile='ros2')
+        channels = []
+        for name, kind in (('/base_wrench', WRENCH), ('/joint_states', JOINTS)):
+            schema = writer.register_schema(name=kind, encoding='ros2msg', data=b'')
+            channels.append(writer.register_channel(name, 'cdr', schema))
+        for k, data in enumerate(messages):
+            for channel in channels:
+                writer.add_message(channel, log_time=k, publish_time=k, data=data)
+        writer.finish()
+
+
+def zeros(size: int) -> bytes:
+    """Compress zeros in pieces: they do not fit in the memory of every machine."""
+    stream = BytesIO()
+    with zstandard.ZstdCompressor(level=19).stream_writer(stream, closefd=False) as packer:
+        for _ in range(size // MEGABYTE):
+            packer.write(bytes(MEGABYTE))
+    return stream.getvalue()
+
+
+def zstd_messages(folder: Path) -> Path:
+    """64 messages of 60 MB each, in a few kB, and those in a chunk that is compressed too."""
+    file = folder / 'messages.mcap'
+    mcap(file, [zeros(60 * MEGABYTE)] * 64, CompressionType.ZSTD)
+    return file
+
+
+def lz4_messages(folder: Path) -> Path:
+    """60 MB are 250 kB."""
+    file = folder / 'messages.mcap'
+    mcap(file, [lz4.frame.compress(bytes(60 * MEGABYTE))] * 64, CompressionType.ZSTD)
+    return file
+
+
+def zstd_file(folder: Path) -> Path:
+    """Let 3 GB of zeros follow the first bytes."""
+    file = folder / 'whole.mcap.zst'
+    head = b'\x89MCAP0\r\n' + struct.pack('<BQ', 0x0F, 2**62)
+    file.write_bytes(zstandard.ZstdCompressor().compress(head) + zeros(3072 * MEGABYTE))
+    return file
+
+
+def chunks(folder: Path) -> Path:
+    """Chunks that are 1 GB each, of 32 kB."""
+    file, name = folder / 'chunks.mcap', b'zstd'
+    for size, claims in ((100, 100), (1024, 1024)):
+        packed = zeros(size * MEGABYTE)
+        body = struct.pack('<QQQII', 0, 0, claims * MEGABYTE, 0, len(name)) + name
+        body += struct.pack('<Q', len(packed)) + packed
+        record = struct.pack('<BQ', 0x06, len(body)) + body
+        with file.open('ab') as stream:
+            stream.write((b'\x89MCAP0\r\n' if size == 100 else b'') + record * 23)
+    return file
+
+
+def bag_with(metadata: str) -> Callable[[Path], Path]:
+    def make(folder: Path) -> Path:
+        mcap(folder / 'a_0.mcap', [b''], CompressionType.NONE)
+        mcap(folder / 'b_0.mcap', [b''], CompressionType.NONE)
+        (folder / 'metadata.yaml').write_text(metadata, encoding='utf-8')
+        return folder
+
+    return make
+
+
+def database(*statements: str) -> Callable[[Path], Path]:
+    """Return what makes a database of two topics, with what is here as its messages."""
+
+    def make(folder: Path) -> Path:
+        file = folder / 'bag.db3'
+        with closing(sqlite3.connect(file)) as made, made:
+            made.execute('CREATE TABLE topics (id INTEGER, name, type, serialization_format)')
+            for k, (name, kind) in enumerate((('/base_wrench', WRENCH), ('/joints', JOINTS))):
+                made.execute('INSERT INTO topics VALUES (?, ?, ?, ?)', (k, name, kind, 'cdr'))
+            for statement in statements:
+                made.execute(statement)
+        return file
+
+    return make
+
+
+ENDLESS = (
+    'CREATE VIEW messages AS WITH RECURSIVE n(k) AS (SELECT 1 UNION ALL SELECT k + 1 FROM n) '
+    "SELECT k % 2 AS topic_id, k AS timestamp, x'00' AS data FROM n"
+)
+COMPUTED = (
+    'CREATE TABLE messages (topic_id, timestamp, data AS (zeroblob(900000000)))',
+    'INSERT INTO messages VALUES (0, 1), (0, 2), (1, 1), (1, 2)',
+)
+
+
+def zstd_database(folder: Path) -> Path:
+    """Let 3 GB of zeros follow a database."""
+    plain = database('CREATE TABLE messages (topic_id, timestamp, data)')(folder)
+    packed = zstandard.ZstdCompressor().compress(plain.read_bytes()) + zeros(3072 * MEGABYTE)
+    plain.unlink()
+    file = folder / 'bag.db3.zst'
+    file.write_bytes(packed)
+    return file
+
+
+@pytest.mark.parametrize(
+    ('make', 'reason'),
+    [
+        pytest.param(zstd_messages, 'NEEDLE_BAG_FACTOR=10 raises', id='zstd messages'),
+        pytest.param(lz4_messages, 'NEEDLE_BAG_FACTOR=10 raises', id='lz4 messages'),
+        pytest.param(zstd_file, 'NEEDLE_BAG_FACTOR=10 raises', id='zstd file'),
+        pytest.param(chunks, 'NEEDLE_BAG_FACTOR=10 raises', id='chunks'),
+        pytest.param(bag_with(LAUGHS), 'aliases are not read', id='aliases'),
+        pytest.param(bag_with(MERGES), 'aliases are not read', id='merge keys'),
+        pytest.param(bag_with('[' * 5000), 'nested deeper than 32', id='depth'),
+        pytest.param(bag_with('a' * 2**21), 'at most 1048576 are read', id='length'),
+        pytest.param(database(ENDLESS), 'messages is not a plain table', id='view'),
+        pytest.param(database(*COMPUTED), 'messages is not a plain table', id='computed'),
+        pytest.param(zstd_database, 'NEEDLE_BAG_FACTOR=10 raises', id='zstd database'),
+    ],
+)
+def test_a_bomb_ends_in_one_line(
+    make: Callable[[Path], Path], reason: str, tmp_path: Path
+) -> None:
+    """It names the limit; a file of some kB takes no more memory than any recording."""
+    bomb = make(tmp_path)
+    files = [bomb] if bomb.is_file() else [*bomb.iterdir()]
+    # The chunks of 100 MB are honest enough for the limit of a record, but not all together.
+    assert sum(file.stat().st_size for file in files) < 32 * MEGABYTE
+    command = [sys.executable, '-m', 'needle_insertion', 'identify', 'friction', str(bomb)]
+    run = subprocess.Popen(
+        command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, cwd=ROOT
+    )
+    try:
+        _, said = run.communicate(timeout=PATIENCE)
+    finally:
+        run.kill()
+    lines = said.splitlines()
+    assert (run.returncode, len(lines)) == (2, 1), said
+    assert reason in lines[0]
+    assert peak(command) < MEMORY
+
+
+@pytest.mark.parametrize('bomb', [LAUGHS, MERGES])
+def test_recorded_parameters_that_are_a_bomb_are_none(bomb: str, tmp_path: Path) -> None:
+    """As any other text."""
+    with BagWriter(tmp_path / 'bag') as bag:
+        bag.add_topic('/plant/configuration', TEXT)
+        bag.write('/plant/configuration', text(bomb), EPOCH)
+    command = [sys.executable, '-m', 'needle_insertion', 'verify', str(tmp_path / 'bag')]
+    run = subprocess.run(
+        command, capture_output=True, text=True, timeout=PATIENCE, check=False, cwd=ROOT
+    )
+    assert run.returncode == 2
+    assert 'holds no parameters of a plant' in run.stderr
+    assert peak(command) < MEMORY
+
+
+def peak(command: list[str]) -> int:
+    """Run a command once more and return the most memory that it had [kB]."""
+    pid = os.posix_spawn(
+        command[0],
+        command,
+        os.environ,
+        file_actions=[(os.POSIX_SPAWN_OPEN, fd, os.devnull, os.O_RDWR, 0) for fd in (0, 1, 2)],
+    )
+    _, _, usage = os.wait4(pid, 0)
+    return usage.ru_maxrss
+
+
+def test_a_limit_can_be_raised(tmp_path: Path) -> None:
+    """By one factor for all; one that is no number is refused."""
+    file = tmp_path / 'bag.mcap'
+    mcap(file, [zeros(50 * MEGABYTE)] * 4, CompressionType.ZSTD)
+    command = [sys.executable, '-m', 'needle_insertion', 'info', str(file)]
+    said = {}
+    for factor in ('1', '4', 'many', '-1'):
+        run = subprocess.run(
+            [*command[:3], 'identify', 'friction', str(file)],
+            env={**os.environ, 'NEEDLE_BAG_FACTOR': factor},
+            capture_output=True,
+            text=True,
+            timeout=PATIENCE,
+            check=False,
+            cwd=ROOT,
+        )
+        assert run.returncode == 2
+        said[factor] = run.stderr
+    assert 'unfolds to more than 256 MB' in said['1']
+    assert 'unfolds' not in said['4']
+    for factor in ('many', '-1'):
+        assert f'NEEDLE_BAG_FACTOR must be a positive number, got {factor!r}' in said[factor]
+
+
+@pytest.mark.parametrize(
+    'text', ['a: &x 1\nb: *x', '{' * 40, '"' + 'a' * 2**20 + '"', 'a: [', '\0']
+)
+def test_a_document_that_stands_for_more_is_refused(text: str) -> None:
+    """Aliases, depth and length; what is not YAML at all too."""
+    with pytest.raises(DocumentError):
+        read_document(text)
