@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from functools import partial
 from pathlib import Path
 import sys
-import time
 from typing import Any, Final, NamedTuple
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from needle_identification.bags.topics import OfferedQos
-from needle_identification.bags.writer import BagWriter, COMPRESSIONS
+from needle_identification.bags.writer import BagWriter, COMPRESSIONS, described
 from needle_identification.errors import RecordingError
 from needle_ros.base_node import BaseNode, message_class
 from needle_ros.errors import MessageError
@@ -23,12 +21,15 @@ from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 from std_srvs.srv import Trigger
 
-#: Time between checks for new topics, and between writes that survive a crash [s].
+#: Time between checks for new topics, between writes that survive a crash, and between looks at
+#: what has come [s].
 _DISCOVERY_PERIOD: Final = 0.1
 _FLUSH_PERIOD: Final = 0.5
+_TAKE_PERIOD: Final = 0.005
 
-#: Messages of one topic that may wait while the recorder is busy.
+#: Messages of one topic that may wait while the recorder is busy, and that are taken at once.
 _DEPTH: Final = 5000
+_AT_ONCE: Final = 1000
 
 #: Topics of the middleware that * does not include.
 _NOT_FOR_ALL: Final = ('/rosout', '/parameter_events')
@@ -37,6 +38,7 @@ _NOT_FOR_ALL: Final = ('/rosout', '/parameter_events')
 class _Recorded(NamedTuple):
     """A subscription, what it requests, and what the publishers so far have offered."""
 
+    kind: type
     subscription: Subscription
     best_effort: bool
     latched: bool
@@ -60,12 +62,15 @@ class RecorderNode(BaseNode):
         self._recordings = 0
         self._recorded: dict[str, _Recorded] = {}
         self._left_out: set[str] = set()
+        #: Number of the newest message of each topic, by its publisher.
+        self._newest: dict[str, int] = {}
         self.create_service(Trigger, '~/start', self._on_start)
         self.create_service(Trigger, '~/stop', self._on_stop)
         # A simulation that pauses must not pause the recorder.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(_DISCOVERY_PERIOD, self._discover, clock=steady)
         self.create_timer(_FLUSH_PERIOD, self._flush, clock=steady)
+        self.create_timer(_TAKE_PERIOD, self._take, clock=steady)
 
     def configure(self) -> None:
         """Read what to record, and where to."""
@@ -91,12 +96,17 @@ class RecorderNode(BaseNode):
         """Report what has been recorded."""
         if self._bag is None:
             return DiagnosticStatus.OK, 'not recording', {}
-        counts = self._bag.counts
-        return (
-            DiagnosticStatus.OK,
-            f'recording to {self._bag.path}',
-            {'messages': sum(counts.values()), 'bytes': self._bag.size, **counts},
-        )
+        counts, lost = self._bag.counts, self._bag.lost
+        values: dict[str, object] = {
+            'messages': sum(counts.values()),
+            'bytes': self._bag.size,
+            **counts,
+        }
+        values |= {f'lost of {topic}': number for topic, number in lost.items()}
+        what = f'recording to {self._bag.path}'
+        if lost:
+            return DiagnosticStatus.WARN, f'{what}; lost {described(lost)}', values
+        return DiagnosticStatus.OK, what, values
 
     # Services.
 
@@ -126,12 +136,16 @@ class RecorderNode(BaseNode):
         self._bag = BagWriter(path, self._compression)
         self._recordings = number
         self._left_out.clear()
+        self._newest.clear()
         self.failure = None
         self.get_logger().info(f'recording to {path}')
         self._discover()
 
     def _end(self, bag: BagWriter) -> str:
         """Complete the bag; return what it holds, or why it cannot be completed."""
+        self._take()
+        if self._bag is None:
+            return self.failure or 'not recording'
         self._release()
         try:
             bag.close()
@@ -141,11 +155,15 @@ class RecorderNode(BaseNode):
         result = f'recorded {sum(counts.values())} messages to {bag.path}'
         lines = [f'{count:8d} {topic}' for topic, count in sorted(counts.items())]
         self.get_logger().info('\n'.join([result, *lines]))
+        if bag.lost:
+            lost = f'lost {described(bag.lost)}'
+            self.get_logger().warning(lost)
+            return f'{result}; {lost}'
         return result
 
     def _release(self) -> None:
         for recorded in self._recorded.values():
-            self.destroy_subscription(recorded.subscription)
+            recorded.subscription.destroy()
         self._recorded.clear()
         self._bag = None
 
@@ -166,14 +184,34 @@ class RecorderNode(BaseNode):
             except OSError as error:
                 self._give_up(self._bag, error)
 
-    def _on_message(self, topic: str, data: bytes) -> None:
-        # The receive time of the middleware would be better, but the events executor of rclpy
-        # 7.1 raises SystemError for callbacks that request it.
-        if self._bag is not None:
+    def _take(self) -> None:
+        """Write what has come, with the time at which the middleware has received it."""
+        for topic, recorded in self._recorded.items():
+            if self._bag is None:
+                return
             try:
-                self._bag.write(topic, data, time.time_ns())
+                self._take_from(self._bag, topic, recorded)
             except OSError as error:
                 self._give_up(self._bag, error)
+                return
+        if self._bag is not None and self._bag.lost:
+            self.report_change()
+
+    def _take_from(self, bag: BagWriter, topic: str, recorded: _Recorded) -> None:
+        handle, kind = recorded.subscription.handle, recorded.kind
+        with handle:
+            for _ in range(_AT_ONCE):
+                taken = handle.take_message(kind, True)
+                if taken is None:
+                    return
+                data, about = taken
+                bag.write(topic, data, about['received_timestamp'])
+                number = about['publication_sequence_number']
+                missing = number - self._newest.get(topic, number) - 1
+                self._newest[topic] = number
+                # Two publishers count on their own.
+                if missing > 0 and len(recorded.offered) == 1:
+                    bag.lose(topic, missing)
 
     def _discover(self) -> None:
         for topic, types in self.get_topic_names_and_types():
@@ -195,7 +233,7 @@ class RecorderNode(BaseNode):
         latched = all(q.durability == DurabilityPolicy.TRANSIENT_LOCAL for q in profiles)
         before = self._recorded.get(topic)
         offered = {} if before is None else dict(before.offered)
-        offered.update((tuple(p.endpoint_gid), _described(p.qos_profile)) for p in publishers)
+        offered.update((tuple(p.endpoint_gid), _offer(p.qos_profile)) for p in publishers)
         if before and offered == before.offered:
             return
         try:
@@ -212,19 +250,22 @@ class RecorderNode(BaseNode):
             self._recorded[topic] = before._replace(offered=offered)
             return
         if before:
-            self.destroy_subscription(before.subscription)
+            self._take_from(bag, topic, before)
+            before.subscription.destroy()
         reliability = ReliabilityPolicy.BEST_EFFORT if best_effort else ReliabilityPolicy.RELIABLE
         durability = DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE
         subscription = self.create_subscription(
             kind,
             topic,
-            partial(self._on_message, topic),
+            lambda _: None,
             QoSProfile(depth=_DEPTH, reliability=reliability, durability=durability),
             # By default a mismatch is logged; here the next check for topics ends it.
             event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
             raw=True,
         )
-        self._recorded[topic] = _Recorded(subscription, best_effort, latched, offered)
+        # The executor would take the messages one by one, without their numbers and times.
+        self._subscriptions.remove(subscription)
+        self._recorded[topic] = _Recorded(kind, subscription, best_effort, latched, offered)
 
 
 def is_hidden(topic: str) -> bool:
@@ -245,7 +286,7 @@ def is_hidden(topic: str) -> bool:
     return '/_' in topic or topic in _NOT_FOR_ALL
 
 
-def _described(qos: QoSProfile) -> OfferedQos:
+def _offer(qos: QoSProfile) -> OfferedQos:
     return OfferedQos(
         reliability=qos.reliability.name.lower(),
         durability=qos.durability.name.lower(),

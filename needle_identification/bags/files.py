@@ -9,9 +9,13 @@ from typing import Final
 from needle_identification.bags.compression import COMPRESSED
 from needle_identification.errors import RecordingError
 from needle_ros.documents import DocumentError, LARGEST, read_document
+from needle_ros.errors import printable
 
 #: File of a rosbag2 folder that lists the others; written when the bag is closed.
 METADATA: Final = 'metadata.yaml'
+
+#: Key under which the metadata say what the recorder has lost.
+LOST: Final = 'messages lost'
 
 _FORMS: Final = ('.mcap', '.db3')
 
@@ -86,20 +90,24 @@ def files_of(path: Path) -> tuple[list[Path], list[str]]:
         inside = min(path.glob(f'*/{METADATA}'), default=None)
         hint = _VALID if inside is None else f'name those inside, such as {inside.parent}'
         raise RecordingError(f'{path} holds no recording; {hint}')
-    names, why = None, f'no readable {METADATA}: the recording was not closed'
+    names, losses = None, [f'no readable {METADATA}: the recording was not closed']
     try:
-        names = _names_in_metadata(path)
+        names, lost = _metadata(path)
     except DocumentError as error:
-        why = f'{METADATA} {error}'
+        losses = [f'{METADATA} {error}']
+    except (OSError, UnicodeDecodeError, KeyError, TypeError):
+        # There is none, or it is of another kind.
+        pass
     if names is None:
         # The parts of one recording differ in a number at the end.
         if len({re.sub(r'_\d+$', '', _uncompressed(file).stem) for file in chosen}) > 1:
             raise RecordingError(
-                f'{path} holds several recordings; name them, such as {chosen[0]}; {why}'
+                f'{path} holds several recordings; name them, such as {chosen[0]}; {losses[0]}'
             )
-        return chosen, [why]
+        return chosen, losses
     there = {file.name for file in chosen}
-    losses = [f'{name} is missing' for name in names if name not in there]
+    losses = [f'the recorder lost {lost}'] if lost else []
+    losses += [f'{name} is missing' for name in names if name not in there]
     if there.isdisjoint(names):
         return chosen, losses
     losses += [
@@ -110,14 +118,14 @@ def files_of(path: Path) -> tuple[list[Path], list[str]]:
     return [path / name for name in names if name in there], losses
 
 
-def _names_in_metadata(folder: Path) -> list[str] | None:
-    """Return the files of a bag by its metadata; None if there is none, or of another kind."""
-    try:
-        with (folder / METADATA).open(encoding='utf-8') as stream:
-            document = read_document(stream.read(LARGEST + 1))
-        paths = document['rosbag2_bagfile_information']['relative_file_paths']
-        if not isinstance(paths, list):
-            return None
-        return list(dict.fromkeys(Path(str(name)).name for name in paths))
-    except (OSError, UnicodeDecodeError, KeyError, TypeError):
-        return None
+def _metadata(folder: Path) -> tuple[list[str], str]:
+    """Return the files of a bag by its metadata, and what its recorder has lost."""
+    with (folder / METADATA).open(encoding='utf-8') as stream:
+        document = read_document(stream.read(LARGEST + 1))
+    information = document['rosbag2_bagfile_information']
+    paths = information['relative_file_paths']
+    if not isinstance(paths, list):
+        raise TypeError('relative_file_paths is no list')
+    own = information.get('custom_data') or {}
+    lost = printable(str(own.get(LOST, ''))) if isinstance(own, dict) else ''
+    return list(dict.fromkeys(Path(str(name)).name for name in paths)), lost

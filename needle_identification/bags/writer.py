@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from mcap.writer import CompressionType, Writer
-from needle_identification.bags.files import METADATA
+from needle_identification.bags.files import LOST, METADATA
 from needle_identification.bags.messages import definition_of
 from needle_identification.bags.topics import OfferedQos
 from needle_identification.errors import RecordingError
@@ -87,12 +87,18 @@ class BagWriter:
         self._channels: dict[str, int] = {}
         self._topics: dict[str, dict[str, Any]] = {}
         self._counts: dict[str, int] = {}
+        self._lost: dict[str, int] = {}
         self._start, self._end = 2**63 - 1, 0
 
     @property
     def counts(self) -> Mapping[str, int]:
         """Number of messages written so far, by topic."""
         return dict(self._counts)
+
+    @property
+    def lost(self) -> Mapping[str, int]:
+        """Number of messages known to be lost so far, by topic."""
+        return dict(self._lost)
 
     @property
     def size(self) -> int:
@@ -163,6 +169,20 @@ class BagWriter:
         self._start = min(self._start, receive_ns)
         self._end = max(self._end, receive_ns)
 
+    def lose(self, topic: str, number: int) -> None:
+        """
+        Take note of messages that are lost; the metadata will say so.
+
+        Parameters
+        ----------
+        topic : str
+            Full name.
+        number : int
+            Number of messages.
+
+        """
+        self._lost[topic] = self._lost.get(topic, 0) + number
+
     def flush(self) -> None:
         """Pass everything on to the operating system."""
         self._writer.flush()
@@ -204,7 +224,7 @@ class BagWriter:
                 'compression_mode': '',
                 'relative_file_paths': [name],
                 'files': [{'path': name, **self._extent()}],
-                'custom_data': None,
+                'custom_data': {LOST: described(self._lost)} if self._lost else None,
                 'ros_distro': 'jazzy',
             }
         }
@@ -215,3 +235,21 @@ class BagWriter:
             'starting_time': {'nanoseconds_since_epoch': self._start},
             'message_count': sum(self._counts.values()),
         }
+
+
+def described(lost: Mapping[str, int]) -> str:
+    """
+    Say how many messages are lost.
+
+    Parameters
+    ----------
+    lost : Mapping[str, int]
+        Number by topic.
+
+    Returns
+    -------
+    str
+        In one line.
+
+    """
+    return ', '.join(f'{number} of {topic}' for topic, number in sorted(lost.items()))

@@ -361,3 +361,47 @@ def test_ctrl_c_completes_the_bag(ros_graph: RosGraph, tmp_path: Path) -> None:
     process.interrupt()
     assert (tmp_path / 'bag' / 'metadata.yaml').exists()
     assert message_counts(tmp_path / 'bag')['/text'] == 50
+
+
+def test_what_is_lost_is_counted_and_said(
+    ros_graph: RosGraph, record: Callable[..., Any], tmp_path: Path
+) -> None:
+    """More than may wait while it is busy: by topic, in diagnostics, summary, and bag."""
+    probe = ros_graph.node('probe')
+    flood = probe.create_publisher(JointState, 'flood', SENSOR)
+    calm = probe.create_publisher(String, 'calm', COMMAND)
+    node = record(tmp_path / 'bag', topics=['flood', 'calm'])
+    ros_graph.spin_until(
+        lambda: flood.get_subscription_count() and calm.get_subscription_count(), 'subscriptions'
+    )
+    flood.publish(JointState())
+    calm.publish(String())
+
+    def counts() -> tuple[int, int]:
+        values = node.diagnose()[2]
+        return values['/flood'], values['/calm']
+
+    ros_graph.spin_until(lambda: counts() == (1, 1), 'the first')
+    assert node.diagnose()[0] == DiagnosticStatus.OK
+    sent = 20_000
+    for _ in range(sent):
+        # Nobody takes them: the recorder is in this thread.
+        flood.publish(JointState())
+    ros_graph.spin_until(lambda: node.diagnose()[0] == DiagnosticStatus.WARN, 'the warning')
+    flood.publish(JointState())
+    calm.publish(String())
+
+    def are_all_there() -> bool:
+        values = node.diagnose()[2]
+        return counts()[1] == 2 and counts()[0] + values['lost of /flood'] == sent + 2
+
+    ros_graph.spin_until(are_all_there, 'the rest')
+    _, message, values = node.diagnose()
+    lost = values['lost of /flood']
+    assert lost > 0
+    assert message.endswith(f'lost {lost} of /flood')
+    _, answer = call(ros_graph, 'recorder/stop')
+    assert answer.endswith(f'; lost {lost} of /flood')
+    bag = Bag(tmp_path / 'bag')
+    assert bag.losses == [f'the recorder lost {lost} of /flood']
+    assert message_counts(tmp_path / 'bag')['/flood'] == values['/flood']
