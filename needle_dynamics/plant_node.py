@@ -16,7 +16,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import Point, Pose, PoseArray
 from needle_dynamics.compiled.cache import announce_compilation
 from needle_dynamics.model_node import ModelNode
-from needle_dynamics.simulated.assembly import MODES, SETTINGS
+from needle_dynamics.simulated.assembly import LARGEST_SEED, MODES, SETTINGS
 from needle_dynamics.simulated.faults import Fault, FaultParameters, FAULTS, FAULTY
 from needle_dynamics.simulated.plant import Plant, Sample
 from needle_dynamics.simulated.run import Event, PARAMETERS, PlantRun, RESET, TARE, TRAJECTORY
@@ -102,7 +102,7 @@ class PlantNode(ModelNode):
             1,
             ParameterDescriptor(
                 description='seed of the sensor noise: the same seed gives the same noise',
-                integer_range=[IntegerRange(from_value=0, to_value=2**62)],
+                integer_range=[IntegerRange(from_value=0, to_value=LARGEST_SEED)],
             ),
         )
         self.declare_model()
@@ -183,6 +183,13 @@ class PlantNode(ModelNode):
                 f'command_timeout must be at least a period, {1.0 / own.rate:g} s, got '
                 f'{own.command_timeout:g} s'
             )
+        real_time = not publishes and own.real_time_factor == 1.0
+        if mode == 'simulation' and real_time and own.backlog > 0.5 * own.command_timeout:
+            raise ParameterError(
+                f'backlog must be at most half of command_timeout, {own.command_timeout:g} s, got '
+                f'{own.backlog:g} s: an overloaded plant would show samples that are too old to '
+                'answer'
+            )
         self._time = SampleClock(
             own.rate, own.real_time_factor, own.backlog, own=publishes, lockstep=lockstep
         )
@@ -197,6 +204,7 @@ class PlantNode(ModelNode):
         # Rounding to counts may leave a saturated reading just below.
         self._full_scale = [limit * (1.0 - 1e-9) for limit in limits]
         self._period = NANOSECONDS / own.rate
+        self._patience = 0.25 * own.backlog * NANOSECONDS
         self._exhausted = (
             f'commands have put in more than {own.power_limit:g} J within a second (power_limit); '
             'no force is applied until it is half of that'
@@ -367,8 +375,12 @@ class PlantNode(ModelNode):
         """Take every sample that is due, each stamped with its own time."""
         due = self._time.due(self.now())
         self._made_up += max(0, due - 1)
+        end = monotonic_ns() + self._patience
         for _ in range(due):
             self._sample(self._time.take())
+            if monotonic_ns() > end:
+                # Commands wait: a machine that cannot keep up must not let them become old.
+                break
 
     def _on_watch(self) -> None:
         """Look who commands, and ask again for an answer that does not come."""

@@ -9,6 +9,10 @@ _LONGEST: Final = 500
 class NeedleError(Exception):
     """Base of all errors raised on purpose; its message is one line for a person."""
 
+    def __str__(self) -> str:
+        # It may have names from a recording, or from another's folder.
+        return shown(super().__str__())
+
 
 class JobError(NeedleError):
     """A job failed though nothing was wrong with what it was given."""
@@ -26,9 +30,29 @@ class ShapeError(NeedleError, ValueError):
     """An array does not have the shape that is needed."""
 
 
+def shown(text: str) -> str:
+    """
+    Return text as a terminal and a file can show it in a line: without what would steer them.
+
+    Parameters
+    ----------
+    text : str
+        May have whatever a message or a name has.
+
+    Returns
+    -------
+    str
+        The text, with blanks for line ends, and question marks for what cannot be printed.
+
+    """
+    if text.isprintable():
+        return text
+    return ''.join(one if one.isprintable() else ' ' if one.isspace() else '?' for one in text)
+
+
 def printable(line: str) -> str:
     """
-    Return a line as a terminal can show it: not too long, and without what would steer it.
+    Return a line for a log: as `shown`, and not too long.
 
     Parameters
     ----------
@@ -41,6 +65,4 @@ def printable(line: str) -> str:
         The line.
 
     """
-    if len(line) > _LONGEST:
-        line = f'{line[: _LONGEST - 4]} ...'
-    return ''.join(one if one.isprintable() else '?' for one in line)
+    return shown(f'{line[: _LONGEST - 4]} ...' if len(line) > _LONGEST else line)

@@ -57,7 +57,7 @@ class PlantSettings:
         1.5, 'W', 'energy that commands may put in within a second', open_low=True
     )
     backlog: float = constant(
-        0.5, 's', 'longest delay after a stall whose samples are still computed', open_low=True
+        0.05, 's', 'longest delay after a stall whose samples are still computed', open_low=True
     )
 
     def __post_init__(self) -> None:
@@ -68,6 +68,9 @@ class PlantSettings:
             raise ParameterError(f'modal must be numbers, got {self.modal!r}') from None
         object.__setattr__(self, 'modal', modal)
 
+
+#: Largest seed of the noise: parameters have 64 bits.
+LARGEST_SEED: Final = 2**62
 
 #: Parameters by namespace, as settings with their default values.
 SETTINGS: Final[Mapping[str, Any]] = {
@@ -140,7 +143,7 @@ class PlantConstants:
         """
         mode, preset = values.get('mode', MODES[0]), values.get('model.preset', 'paper_si')
         for name, value, valid in (('mode', mode, MODES), ('model.preset', preset, PRESETS)):
-            if value not in valid:
+            if not isinstance(value, str) or value not in valid:
                 raise ParameterError(f'{name} must be one of {", ".join(valid)}, got {value!r}')
         made = {}
         for prefix, defaults in SETTINGS.items():
@@ -149,7 +152,10 @@ class PlantConstants:
             if prefix == 'model.':
                 given = {**asdict(PRESETS[preset]), **given}
             made[prefix.rstrip('.') or 'own'] = from_values(type(defaults), given, prefix)
-        return cls(mode=mode, seed=values.get('seed', 1), **made)
+        seed = values.get('seed', 1)
+        if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed <= LARGEST_SEED:
+            raise ParameterError(f'seed must be an integer from 0 to 2^62, got {seed!r}')
+        return cls(mode=mode, seed=seed, **made)
 
     def make(self) -> Plant | Indenter:
         """

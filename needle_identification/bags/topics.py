@@ -8,6 +8,7 @@ import re
 from typing import Any, Final, NamedTuple
 
 from needle_ros.documents import DocumentError, read_document
+from needle_ros.errors import shown
 from needle_ros.timing import NANOSECONDS
 
 #: Numbers that older recordings have instead of the words of rosbag2.
@@ -80,10 +81,11 @@ def _time(nanoseconds: int) -> dict[str, int]:
 
 
 def _nanoseconds(time: Mapping[str, int] | None) -> int:
-    """Return a time as stored; none and zero stand for no limit."""
+    """Return a time as stored; none, zero, and what is less stand for no limit."""
     if time is None:
         return UNLIMITED
-    return min(int(time['sec']) * NANOSECONDS + int(time['nsec']), UNLIMITED) or UNLIMITED
+    found = int(time['sec']) * NANOSECONDS + int(time['nsec'])
+    return found if 0 < found < UNLIMITED else UNLIMITED
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,11 +167,10 @@ def make_topic(
     Returns
     -------
     Topic
-        The topic, with the full name of its type and no control characters in the names.
+        The topic, with the full name of its type and names that can be shown.
 
     """
     full = re.sub(r'^(\w+)/(\w+)$', r'\1/msg/\2', type_name)
     full = full if message_encoding == 'cdr' else f'{full} [{message_encoding}]'
     # Messages about a topic are one line, whatever a damaged file calls it.
-    name, full = (re.sub(r'[\x00-\x1f\x7f]', '?', word) for word in (name, full))
-    return Topic(name, full, encoding, definition, profiles)
+    return Topic(shown(name), shown(full), encoding, definition, profiles)

@@ -8,7 +8,7 @@ from typing import Any
 
 from needle_dynamics.arrays import FloatArray
 from needle_ros.documents import DocumentError, read_document
-from needle_ros.errors import ShapeError
+from needle_ros.errors import ShapeError, shown
 import numpy as np
 
 
@@ -42,6 +42,8 @@ class _AnyRecording:
 
     def _freeze(self, **columns: int | None) -> None:
         """Replace arrays of (n,) or (n, columns) by read-only copies, and check them."""
+        object.__setattr__(self, 'name', shown(self.name))
+        object.__setattr__(self, 'losses', tuple(map(shown, self.losses)))
         length = np.shape(self.time)
         for field, count in {'time': None, **columns}.items():
             rest = () if count is None else (count,)

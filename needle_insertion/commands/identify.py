@@ -27,7 +27,7 @@ from needle_identification.recordings import TIMES
 from needle_insertion.commands.common import check_file, check_folder, Command, make_folder
 from needle_insertion.report.identify_text import identified_document, identified_text
 from needle_insertion.report.origin import identify_all, Origin
-from needle_ros.errors import NeedleError, ParameterError
+from needle_ros.errors import NeedleError, ParameterError, shown
 
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -245,7 +245,7 @@ def _identify(
         written.append(write_identified_page(options.report, summary, origin))
     for estimate, source in zip(summary.estimates, origin.sources, strict=True):
         for words in (*source.losses, *estimate.warnings):
-            sys.stderr.write(f'warning: {source.name}: {words}\n')
+            sys.stderr.write(shown(f'warning: {source.name}: {words}') + '\n')
     if options.json:
         result = {**identified_document(summary, origin), 'files': [str(path) for path in written]}
         sys.stdout.write(f'{json.dumps(result, indent=2, allow_nan=False)}\n')
@@ -259,10 +259,10 @@ def _identify(
 def _report_failures(origin: Origin, other: str, identify: Callable[[Path], Any]) -> None:
     """Name the recordings that cannot be used, and the other subcommand if that can use them."""
     for line in origin.failed:
-        sys.stderr.write(f'error: {line}\n')
+        sys.stderr.write(shown(f'error: {line}') + '\n')
     for name, _reason in origin.failures:
         if _can(identify, Path(name)):
-            sys.stderr.write(f'{name}: try needle identify {other}\n')
+            sys.stderr.write(shown(f'{name}: try needle identify {other}') + '\n')
 
 
 def _can(identify: Callable[[Path], Any], bag: Path) -> bool:

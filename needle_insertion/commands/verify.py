@@ -12,7 +12,7 @@ import sys
 from needle_insertion.commands.common import Command
 from needle_insertion.replay.rerun import Rerun, TOLERANCE, verify
 from needle_insertion.report.text import table
-from needle_ros.errors import ParameterError
+from needle_ros.errors import ParameterError, shown
 from needle_ros.timing import NANOSECONDS
 from tqdm import tqdm
 
@@ -42,19 +42,19 @@ def _run(options: argparse.Namespace) -> int:
         document = [result.document for result in results]
         sys.stdout.write(f'{json.dumps(document, indent=2)}\n')
     else:
-        sys.stdout.write('\n'.join([_table(results), *_remarks(results), '']))
+        sys.stdout.write('\n'.join([_table(results), *map(shown, _remarks(results)), '']))
     return int(any(result.verdict == 'differs' for result in results))
 
 
 def _table(results: Sequence[Rerun]) -> str:
     rows = []
     for result in results:
-        name = result.recorded.path.name
+        name = shown(result.recorded.path.name)
         for topic, found in result.topics.items():
             worst = f'{found.difference:.3g} {found.unit} ({found.quantity})'
             rows.append(
                 (
-                    name, topic, str(found.compared), worst if found.quantity else '0',
+                    name, shown(topic), str(found.compared), worst if found.quantity else '0',
                     str(found.differing), found.verdict,
                 )
             )  # fmt: skip

@@ -776,3 +776,27 @@ def test_all_that_is_done_to_a_plant_is_done_again(tmp_path: Path) -> None:
         'the plant was put back (~/reset)',
     ]
     assert said.count(pause) >= 2
+
+
+@pytest.mark.parametrize(
+    ('name', 'value', 'reason'),
+    [
+        ('rate', 'x', "rate must be a number, got 'x'"),
+        ('rate', 0, 'rate must be finite, >= 1 and <= 8000 Hz, got 0.0'),
+        ('rate', float('nan'), 'rate must be finite, >= 1 and <= 8000 Hz, got nan'),
+        ('seed', -1, 'seed must be an integer from 0 to 2^62, got -1'),
+        ('seed', 'x', "seed must be an integer from 0 to 2^62, got 'x'"),
+        ('seed', 1.5, 'seed must be an integer from 0 to 2^62, got 1.5'),
+        ('seed', True, 'seed must be an integer from 0 to 2^62, got True'),
+        ('model.preset', ['phantom'], 'model.preset must be one of '),
+        ('mode', {}, 'mode must be one of '),
+    ],
+)
+def test_a_parameter_that_no_plant_can_have_is_named(
+    tmp_path: Path, name: str, value: object, reason: str
+) -> None:
+    """As a plant would refuse it; nothing is computed."""
+    messages = without_events(simulated())
+    messages[0].data = text(configuration(**{name: value}))
+    with pytest.raises(RecordingError, match=re.escape(f'the parameters of /plant: {reason}')):
+        verify(written(tmp_path / 'bag', messages))

@@ -13,6 +13,7 @@ from typing import Any
 from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
 from needle_dynamics import FloatArray
+from needle_identification import BagWriter
 from needle_insertion.cli import main
 import numpy as np
 from numpy.typing import NDArray
@@ -477,3 +478,28 @@ def test_stiffness_comes_from_every_type_of_motion(
         told = [level['statistics'][name]['mean'] for name in ('k_xx', 'k_xz', 'k_zx', 'k_zz')]
         # Noise of 1 um and 2 mN over 30 samples and 8 presses: some N/m at most.
         assert told == pytest.approx(truth.ravel(), abs=5.0)
+
+
+def test_names_cannot_steer_a_terminal(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Whatever a folder, a topic or a joint is called, and a result is written of it."""
+    evil = '\x1b[31m\x9b2J\u202eevil\u2066\x07\r\n'
+    bag, wrenches, motion = tmp_path / f'bag{evil}', f'/w{evil}', f'/j{evil}'
+    names = (f'slide{evil}', f'other{evil}')
+    stamps, depth, speed, force = samples()
+    with BagWriter(bag) as writer:
+        writer.add_topic(wrenches, WRENCH)
+        writer.add_topic(motion, JOINTS)
+        for at, d, v, f in zip(stamps.tolist(), depth, speed, force, strict=True):
+            writer.write(wrenches, wrench(at, f), at)
+            writer.write(motion, joints(at, d, v, names), at)
+    # Two joints: their names are told.
+    assert main(['identify', 'friction', str(bag)]) == 2
+    result = tmp_path / 'result.yaml'
+    arguments = ['--motion-axis', names[0], '--output', str(result)]
+    assert main(['identify', 'friction', str(bag), *arguments]) == 0
+    assert main(['verify', str(bag)]) == 2
+    captured = capsys.readouterr()
+    for text_ in (captured.out, captured.err, result.read_text(encoding='utf-8')):
+        assert 'evil' in text_
+        for line in text_.splitlines():
+            assert line.isprintable(), ascii(line)

@@ -116,6 +116,12 @@ def test_offered_qos_is_stored(tmp_path: Path) -> None:
     assert message.topic.offered_qos() == (weak,)
 
 
+def said(field: str, value: str) -> str:
+    """Return the default profile, with another value."""
+    stored = yaml.safe_dump({**OfferedQos().as_mapping(), field: 'VALUE'}, default_flow_style=True)
+    return f'- {stored.replace("VALUE", value)}'
+
+
 @pytest.mark.parametrize(
     ('stored', 'found'),
     [
@@ -126,6 +132,10 @@ def test_offered_qos_is_stored(tmp_path: Path) -> None:
         ('{', ()),
         ('5', ()),
         ('- [1]', ()),
+        # Whatever a damaged or hostile recording says: then a player offers its own.
+        *((said('depth', number), ()) for number in ('.inf', '-.inf', '.nan', '1.0e+400', '[]')),
+        *((said('deadline', f'{{sec: {number}, nsec: 0}}'), ()) for number in ('.inf', '.nan')),
+        (said('lifespan', '{sec: -5, nsec: 0}'), (OfferedQos(),)),
     ],
 )
 def test_offered_qos_of_any_version_of_rosbag2_is_read(

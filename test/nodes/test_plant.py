@@ -636,7 +636,7 @@ def test_simulated_time_runs_faster(ros_graph: RosGraph) -> None:
     begin, first = time.monotonic(), len(bench.states)
     bench.until(lambda: len(bench.states) >= first + 1000, 'ten seconds')
     passed = time.monotonic() - begin
-    # Not faster, but for what a stall of the backlog of 0.5 s has left to make up; slower
+    # Not faster, but for what a stall of the backlog has left to make up; slower
     # only as far as this machine is busy.
     assert 0.5 < passed < 5.0
     stamps = np.diff([stamp_ns(message) for message in bench.states])

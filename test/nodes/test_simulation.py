@@ -253,6 +253,27 @@ def test_stale_and_foreign_commands_do_not_move_it(ros_graph: RosGraph) -> None:
     bench.until(lambda: bench.states[-1].position[0] > 0.0201, 'motion')
 
 
+def test_a_plant_that_cannot_keep_up_is_commanded_all_the_same(ros_graph: RosGraph) -> None:
+    """It leaves out samples rather than show old ones: those could not be answered in time."""
+    # 10^7 steps per second are more than any machine does.
+    bench = Bench(ros_graph, rate=1000.0, step=1e-7)
+    bench.until(lambda: bench.counts('samples given up') > 300, 'the overload')
+    bench.force = 8.0
+    bench.until(lambda: bench.states[-1].position[0] > 0.03, 'motion')
+    given_up = bench.counts('samples given up')
+    bench.until(lambda: bench.counts('samples given up') > given_up, 'more of it')
+
+
+def test_more_may_not_be_made_up_than_commands_may_be_old(ros_graph: RosGraph) -> None:
+    """Where samples have the time of the clock; others wait for it."""
+    reason = 'backlog must be at most half of command_timeout, 0.1 s, got 0.5 s'
+    plant = ros_graph.add(PlantNode, parameters={'backlog': 0.5}, start=False)
+    assert not plant.start()
+    assert plant.failure.startswith(reason)
+    for valid in ({'real_time_factor': 2.0}, {'publish_clock': True}, {'mode': 'robot'}):
+        assert ros_graph.add(PlantNode, parameters={'backlog': 0.5, **valid}).is_active
+
+
 def test_two_commanders_are_none(ros_graph: RosGraph) -> None:
     """While another node commands too no force is applied, and the diagnostics say so."""
     bench = Bench(ros_graph)
