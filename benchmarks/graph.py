@@ -138,6 +138,9 @@ def compare_pairs(folder: Path, plan: Plan, tick: Tick) -> dict[str, list[Figure
         for pair in pairs.values():
             pair.ready('controller')
         rounds.append(_take_turns('loop', pairs, _close_loop, plan, tick))
+        for pair in pairs.values():
+            # Two sources of measurements are none.
+            pair.kill('plant')
         rounds.append(_take_turns('round trip', pairs, _answer_probe, plan, tick))
     return {
         name: [

@@ -83,6 +83,7 @@ class Pair:
         self.graph = graph
         self.node = graph.node(f'watch_{PAIRS.index(name)}')
         self.pids: dict[str, int] = {}
+        self._kill: dict[str, Callable[[], None]] = {}
         self._bare: list[subprocess.Popen[bytes]] = []
         self._executor = _BARE.get(name)
         self._run = self.node.create_publisher(Bool, 'run', LATCHED)
@@ -100,9 +101,29 @@ class Pair:
 
         """
         if self._executor is None:
-            self.pids[what] = self.graph.start(what, {'autostart': False}).process.pid
+            node = self.graph.start(what, {'autostart': False})
+            self.pids[what], self._kill[what] = node.process.pid, node.kill
         else:
-            self.pids[what] = self.start_bare(_ROLES[what], self._executor).pid
+            bare = self.start_bare(_ROLES[what], self._executor)
+            self.pids[what], self._kill[what] = bare.pid, partial(self._kill_bare, bare)
+
+    def kill(self, what: str) -> None:
+        """
+        Kill a process: it does not take part any more.
+
+        Parameters
+        ----------
+        what : str
+            ``plant`` or ``controller``.
+
+        """
+        self._kill.pop(what)()
+        del self.pids[what]
+
+    def _kill_bare(self, process: subprocess.Popen[bytes]) -> None:
+        self._bare.remove(process)
+        process.kill()
+        process.communicate()
 
     def start_bare(self, role: str, executor: str = 'events') -> subprocess.Popen[bytes]:
         """

@@ -18,13 +18,14 @@ from tqdm import tqdm
 #: Measures something.
 Question: TypeAlias = Callable[[Tick], Answer]
 
-#: Modules of each benchmark; those of `graph` need ROS. Each module has a function `compare`.
+#: Modules of each benchmark, each with a function `compare`; `graph` and `safety` need ROS.
 MODULES = {
     'dynamics': ('step', 'solvers', 'rods', 'batches'),
     'identification': ('identification',),
     'calibration': ('calibration',),
     'control': ('control',),
     'laws': ('laws',),
+    'safety': ('safety',),
     'graph': ('graph',),
 }
 
@@ -56,6 +57,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('control', help='cost of a control step')
     laws = add('laws', help='control laws on needles, robots and tissues that they do not know')
     laws.add_argument('--needles', type=int, metavar='N', help='needles in a cell')
+    safety = add('safety', help='what faults, strangers and kills do to a motion')
+    safety.add_argument('--fault', metavar='NAME', help='this one only, in simulated time')
     graph = add('graph', help='the nodes beside bare rclpy nodes')
     plan = graph.add_mutually_exclusive_group()
     plan.add_argument(

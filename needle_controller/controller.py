@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from math import isfinite, nan
+from math import exp, isfinite, nan
 from typing import Final, TypeAlias
 
 from needle_controller.laws.adaptive import Adaptive, AdaptiveGains
@@ -55,8 +55,8 @@ class ControllerSettings:
         0.1, 's', 'age from which a measurement is stale', open_low=True
     )
     jump: float = constant(
-        2e-3, 'm', 'displacement that the measured speed does not explain and that counts as a '
-        'fault; after a displacement of this size during a fault the target is cleared',
+        2e-3, 'm', 'displacement, at once or within 2 s, that the measured speed does not explain '
+        'and that counts as a fault; after one of this size during a fault the target is cleared',
         open_low=True,
     )  # fmt: skip
     stability_margin: float = constant(
@@ -144,6 +144,9 @@ class Measurement:
         insertion = isfinite(self.depth) and isfinite(self.speed)
         return insertion and isfinite(self.angle) and isfinite(self.angular_speed)
 
+
+#: Time over which positions and speeds are compared [s].
+_MEMORY: Final = 2.0
 
 #: Setpoint of a command without a reference.
 NO_SETPOINT: Final = Setpoint(nan)
@@ -382,6 +385,8 @@ class Controller:
         self._insertion.reset()
         self._rotation.reset()
         self._seen: Measurement | None = None
+        #: Displacement that the speeds of the last seconds do not explain [m].
+        self._unexplained = 0.0
         self._last_depth = None
         self._stopped = False
 
@@ -412,15 +417,27 @@ class Controller:
         if not measured.is_finite():
             return f'joint_states must be finite, got {measured}'
         before, self._seen = self._seen, measured
-        if before is not None and not gap:
-            elapsed = measured.time - before.time
-            moved = measured.depth - before.depth
-            explained = 0.5 * (before.speed + measured.speed) * elapsed
-            if not abs(moved - explained) <= self.settings.jump:
-                return (
-                    f'insertion moved by {moved:.6g} m in {elapsed:.6g} s at speeds of '
-                    f'{before.speed:.6g} and {measured.speed:.6g} m/s'
-                )
+        if before is None or gap:
+            self._unexplained = 0.0
+            return None
+        jump, elapsed = self.settings.jump, measured.time - before.time
+        moved = measured.depth - before.depth
+        rest = moved - 0.5 * (before.speed + measured.speed) * elapsed
+        if not abs(rest) <= jump:
+            # It is there now; the next ones may well be good.
+            self._unexplained = 0.0
+            return (
+                f'insertion moved by {moved:.6g} m in {elapsed:.6g} s at speeds of '
+                f'{before.speed:.6g} and {measured.speed:.6g} m/s'
+            )
+        unexplained = exp(-elapsed / _MEMORY) * self._unexplained + rest
+        # No more than it takes: as soon as position and speed agree again it is well.
+        self._unexplained = min(max(unexplained, -jump), jump)
+        if abs(unexplained) > jump:
+            return (
+                f'insertion and its speed contradict each other: {1e3 * abs(unexplained):.3g} mm '
+                f'too {"much" if unexplained > 0.0 else "little"} within {_MEMORY:g} s'
+            )
         return None
 
     def command(self, measured: Measurement, load: float = 0.0) -> Command:
@@ -474,9 +491,10 @@ class Controller:
         moved = abs(measured.depth - last) if last is not None else 0.0
         elsewhere = self._stopped and moved > self.settings.jump and self.target is not None
         if elsewhere:
-            seen = self._seen
+            seen, unexplained = self._seen, self._unexplained
             self.forget()
-            self._seen, self._last_depth = seen, measured.depth
+            self._seen, self._unexplained = seen, unexplained
+            self._last_depth = measured.depth
         self._stopped = False
         if not elsewhere:
             return None

@@ -143,7 +143,7 @@ class PlantNode(ModelNode):
             contract.WRENCH_COMMAND, self._on_command, self._look_who_commands
         )
         #: Publishers of commands that DDS has matched, dead ones too.
-        self._matched = 0
+        self._matched, self._matched_at = 0, 0
         self._trajectories: Subscription | None = None
         self.create_service(Trigger, '~/tare', self._on_tare)
         self.create_service(SetBool, '~/pause', self._on_pause)
@@ -395,10 +395,14 @@ class PlantNode(ModelNode):
 
     def _look_who_commands(self) -> None:
         """Let no force act while several nodes command."""
-        self._matched = self._commands.get_publisher_count()
+        matched, now = self._commands.get_publisher_count(), monotonic_ns()
+        if matched != self._matched:
+            self._matched, self._matched_at = matched, now
         if self._run is None:
             return
-        count = self._commanders.count(contract.WRENCH_COMMAND, self._matched)
+        # What came and went at once may be counted for ever; the graph knows better by then.
+        fresh = now - self._matched_at < NANOSECONDS
+        count = self._commanders.count(contract.WRENCH_COMMAND, matched if fresh else 0)
         if self._run.commands.count_commanders(count):
             if self._run.commands.rivals:
                 self.get_logger().error(

@@ -1,0 +1,209 @@
+"""Plant and supervisor over the bytes of the wire, without ROS: as the nodes, at any speed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from heapq import heappop, heappush
+from typing import Final, NamedTuple
+
+from needle_controller import (
+    Answer,
+    Controller,
+    ControllerSettings,
+    ObserverSettings,
+    SafetyLimits,
+    Supervisor,
+)
+from needle_dynamics import NeedleParameters
+from needle_dynamics.simulated.plant import Sample
+from needle_dynamics.simulated.run import PlantRun
+from needle_ros.contract import BASE_WRENCH, JOINT_STATES, TIP_DEFLECTION
+from needle_ros.errors import MessageError
+from needle_ros.timing import NANOSECONDS
+from needle_ros.wire import Reader
+
+#: When time begins [ns].
+EPOCH: Final = 1_700_000_000 * NANOSECONDS
+
+#: What is measured, in the order in which it is sent.
+MEASURED: Final = (BASE_WRENCH.name, TIP_DEFLECTION.name, JOINT_STATES.name)
+
+
+class Sent(NamedTuple):
+    """A measurement on its way."""
+
+    stamp: int
+    values: Sequence[float]
+    late: int = 0
+    frame: str | None = None
+
+
+class Commanded(NamedTuple):
+    """A command on its way."""
+
+    stamp: int
+    force: float
+    late: int = 0
+    frame: str = 'needle_base'
+
+
+class Fault:
+    """What happens to a topic; this one lets everything pass."""
+
+    def measured(self, sent: Sent) -> Iterable[Sent]:
+        """
+        Return what arrives in place of a measurement.
+
+        Parameters
+        ----------
+        sent : Sent
+            The measurement.
+
+        Returns
+        -------
+        iterable of Sent
+            Any number.
+
+        """
+        return (sent,)
+
+    def commanded(self, command: Commanded) -> Iterable[Commanded]:
+        """
+        Return what arrives in place of a command.
+
+        Parameters
+        ----------
+        command : Commanded
+            The command.
+
+        Returns
+        -------
+        iterable of Commanded
+            Any number.
+
+        """
+        return (command,)
+
+
+class Loop:
+    """
+    A plant and what commands it.
+
+    Parameters
+    ----------
+    law : str
+        Name of the law.
+    rate : float
+        Samples per second [Hz].
+    seed : int
+        Seed of the noise.
+
+    Attributes
+    ----------
+    now : int
+        Time [ns].
+    publishers : dict
+        How many nodes publish what may have one source only.
+    depth : float
+        True inserted length [m].
+    acting : float
+        Force that acts on the needle [N].
+
+    """
+
+    def __init__(self, law: str = 'adaptive', rate: float = 200.0, seed: int = 1) -> None:
+        phantom = NeedleParameters.preset('phantom')
+        self.run = PlantRun({'model.preset': 'phantom', 'rate': rate, 'depth': 0.02, 'seed': seed})
+        self.now, self._period = EPOCH, round(NANOSECONDS / rate)
+        self.publishers = {'wrench_command': 1}
+        self.supervisor = Supervisor(lambda: self.now / NANOSECONDS)
+        controller = Controller(phantom, law, settings=ControllerSettings(rate=rate))
+        self.supervisor.configure(controller, SafetyLimits(), ObserverSettings())
+        self.supervisor.activate(self.now, self.publishers)
+        self.depth, self.acting = 0.02, 0.0
+        self._take = {
+            BASE_WRENCH.name: self.supervisor.wrench,
+            TIP_DEFLECTION.name: self.supervisor.tip,
+            JOINT_STATES.name: self.supervisor.encoders,
+        }
+        self._ends = {
+            name: (topic, Reader(topic.type_name).read) for name, topic in self.run.topics.items()
+        }
+        #: Messages on their way: when they arrive, their order, and what they are.
+        self._waiting: list[tuple[int, int, str | None, bytes | Commanded]] = []
+        self._order = 0
+
+    def target(self, depth: float) -> None:
+        """
+        Set a target.
+
+        Parameters
+        ----------
+        depth : float
+            Inserted length to reach [m].
+
+        """
+        self.supervisor.target(0, '', depth, 0.0, self.now)
+
+    def step(self, topic: str = '', fault: Fault | None = None) -> None:
+        """
+        Take a sample, pass it on, and apply the answers.
+
+        Parameters
+        ----------
+        topic : str
+            Topic that suffers from the fault.
+        fault : Fault, optional
+            What happens to it.
+
+        """
+        self.now += self._period
+        told = {name: values for name, _, values in self.run.take(self.now)}
+        # Lateral numbers of the tip are what the sensor of the tip says.
+        for name in MEASURED:
+            if name not in told:
+                continue
+            sent = Sent(self.now, told[name])
+            hit = fault is not None and name == topic
+            for one in fault.measured(sent) if hit and fault is not None else (sent,):
+                self._post(one.late, name, self._written(name, one))
+        while self._waiting and self._waiting[0][0] <= self.now:
+            _, _, name_, what = heappop(self._waiting)
+            self._arrive(name_, what, fault if topic == 'wrench_command' else None)
+        self._answer(self.supervisor.watch(self.now, self.publishers), None)
+        self.run.commands.count_commanders(self.publishers['wrench_command'])
+        sample = self.run.sample
+        if isinstance(sample, Sample):
+            self.depth = sample.depth
+        self.acting = self.run.commands.held.force
+
+    def _written(self, name: str, sent: Sent) -> bytes:
+        topic, _ = self._ends[name]
+        if sent.frame is not None:
+            topic = replace(topic, frame=sent.frame)
+        return topic.template().serialize(sent.stamp, *sent.values)
+
+    def _post(self, late: int, name: str | None, what: bytes | Commanded) -> None:
+        self._order += 1
+        heappush(self._waiting, (self.now + late, self._order, name, what))
+
+    def _arrive(self, name: str | None, what: bytes | Commanded, fault: Fault | None) -> None:
+        if isinstance(what, Commanded):
+            self.run.commands.offer(what.stamp, what.frame, what.force, 0.0, self.now)
+        elif name is not None:
+            try:
+                reading = self._ends[name][1](what)
+            except MessageError:
+                return
+            self._answer(self._take[name](reading, self.now), fault)
+
+    def _answer(self, answer: Answer | None, fault: Fault | None) -> None:
+        if answer is None:
+            return
+        command = Commanded(answer.stamp, answer.force)
+        for one in fault.commanded(command) if fault is not None else (command,):
+            if one.late:
+                self._post(one.late, None, one)
+            else:
+                self._arrive(None, one, None)

@@ -1,0 +1,321 @@
+"""Nodes that nobody asked for, and nodes that are killed, beside a real plant and controller."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+import signal
+import subprocess
+import sys
+from tempfile import TemporaryDirectory
+from typing import Any, Final
+
+from benchmarks.measure import Bar
+from benchmarks.page import Tick
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PointStamped
+from needle_insertion.experiment.node_process import GraphError, NodeProcess
+from needle_insertion.experiment.ros_graph import Graph
+from needle_ros.base_node import COMMAND, SENSOR
+from sensor_msgs.msg import JointState
+
+#: Comes, pushes for 6 to 48 ms, or for 80 ms from its first breath, and goes, again and again.
+PUSHER: Final = """
+import sys, time
+from geometry_msgs.msg import WrenchStamped
+from needle_ros.base_node import COMMAND
+import rclpy
+force, waits, tries = float(sys.argv[1]), sys.argv[2] == 'found', int(sys.argv[3])
+rclpy.init()
+node = rclpy.create_node('stranger')
+push, found = WrenchStamped(), 0
+push.wrench.force.y = force
+for k in range(tries):
+    publisher = node.create_publisher(WrenchStamped, 'wrench_command', COMMAND)
+    deadline = time.monotonic() + 10.0
+    while waits and not publisher.get_subscription_count() and time.monotonic() < deadline:
+        time.sleep(1e-4)
+    end = time.monotonic() + ((6 + 42 * k / (tries - 1)) * 1e-3 if waits else 0.08)
+    while time.monotonic() < end:
+        push.header.stamp = node.get_clock().now().to_msg()
+        publisher.publish(push)
+    found += bool(publisher.get_subscription_count())
+    node.destroy_publisher(publisher)
+    time.sleep(0.4)
+print(found)
+"""
+
+#: Says for 2 s that the needle is elsewhere, with stamps that are ahead or not.
+LIAR: Final = """
+import sys, time
+import rclpy
+from rclpy.duration import Duration
+from rclpy.qos import qos_profile_sensor_data
+from sensor_msgs.msg import JointState
+ahead = Duration(seconds=float(sys.argv[1]))
+rclpy.init()
+node = rclpy.create_node('liar')
+publisher = node.create_publisher(JointState, 'joint_states', qos_profile_sensor_data)
+lie = JointState(name=['insertion', 'rotation'], velocity=[0.0, 0.0], effort=[0.0, 0.0])
+found, end = 0, time.monotonic() + 2.0
+while time.monotonic() < end:
+    lie.header.stamp = (node.get_clock().now() + ahead).to_msg()
+    lie.position = [0.045, 0.0]
+    publisher.publish(lie)
+    found = max(found, publisher.get_subscription_count())
+    time.sleep(5e-4)
+print(found)
+"""
+
+#: Asks for targets that no needle can reach, as fast as it can for 2 s.
+ASKER: Final = """
+import time
+from geometry_msgs.msg import PointStamped
+from needle_ros.base_node import COMMAND
+import rclpy
+rclpy.init()
+node = rclpy.create_node('asker')
+publisher = node.create_publisher(PointStamped, 'target', COMMAND)
+wish = PointStamped()
+wish.point.y = 9.0
+found, end = 0, time.monotonic() + 2.0
+while time.monotonic() < end:
+    publisher.publish(wish)
+    found = max(found, publisher.get_subscription_count())
+print(found)
+"""
+
+#: Where the needle rests before a stranger comes, where it goes afterwards, and how near is there.
+START, NEXT, NEAR = 0.04, 0.045, 2e-4
+
+
+class Bystander:
+    """
+    Watches a plant and a controller, each a process, and sets targets.
+
+    Parameters
+    ----------
+    graph : Graph
+        Graph to start them in.
+
+    Attributes
+    ----------
+    plant, controller : NodeProcess
+        The processes.
+    depths : list of float
+        True inserted lengths since the last stranger came [m].
+
+    """
+
+    def __init__(self, graph: Graph) -> None:
+        self._graph, self.depths = graph, list[float]()
+        self._health: list[DiagnosticArray] = []
+        probe = graph.node('bystander')
+        probe.create_subscription(JointState, 'ground_truth', self._on_truth, SENSOR)
+        probe.create_subscription(DiagnosticArray, '/diagnostics', self._health.append, 10)
+        self._targets = probe.create_publisher(PointStamped, 'target', COMMAND)
+        self.plant, self.controller = graph.start('plant'), graph.start('controller')
+        self.goes_to(START)
+
+    def _on_truth(self, message: JointState) -> None:
+        self.depths.append(0.2 - message.position[0])
+
+    def until(self, condition: Callable[[], Any], what: str) -> None:
+        """
+        Spin until a condition holds.
+
+        Parameters
+        ----------
+        condition : callable
+            The condition.
+        what : str
+            What is waited for.
+
+        """
+        self._graph.spin_until(condition, what, timeout=60.0)
+
+    def goes_to(self, depth: float) -> None:
+        """
+        Ask for a depth until the needle rests there.
+
+        Parameters
+        ----------
+        depth : float
+            Inserted length [m].
+
+        """
+        target = PointStamped()
+        target.point.y = depth
+
+        def rests() -> bool:
+            self._targets.publish(target)
+            there = self.depths[-500:]
+            return len(there) == 500 and max(abs(one - depth) for one in there) < NEAR
+
+        self.until(rests, f'{depth} m')
+
+    def endures(self, script: str, *arguments: object) -> tuple[int, float]:
+        """
+        Let a stranger in.
+
+        Parameters
+        ----------
+        script : str
+            Program of the stranger.
+        *arguments : object
+            Its arguments.
+
+        Returns
+        -------
+        int, float
+            How often it was connected, and how far the needle moved [m].
+
+        """
+        self.depths.clear()
+        stranger = subprocess.Popen(
+            [sys.executable, '-c', script, *map(str, arguments)],
+            env=self._graph.environment,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        self.until(lambda: stranger.poll() is not None, 'the end of the stranger')
+        said, _ = stranger.communicate()
+        return int(said), self.moved
+
+    @property
+    def moved(self) -> float:
+        """How far the needle moved since the last stranger came [m]."""
+        return max(self.depths) - min(self.depths)
+
+    def was_told(self, what: str) -> bool:
+        """
+        Return whether diagnostics have said something.
+
+        Parameters
+        ----------
+        what : str
+            Part of a message.
+
+        Returns
+        -------
+        bool
+            Whether they have.
+
+        """
+        return any(what in status.message for one in self._health for status in one.status)
+
+    @property
+    def complaints(self) -> str:
+        """What each node has said last."""
+        last = {status.name: status.message for one in self._health for status in one.status}
+        return '; '.join(f'{name} says {message!r}' for name, message in last.items())
+
+    @property
+    def stops(self) -> set[str]:
+        """How many stops the controllers have latched, as they said."""
+        statuses = (status for one in self._health for status in one.status)
+        values = ({one.key: one.value for one in status.values} for status in statuses)
+        return {one['stops latched'] for one in values if 'stops latched' in one}
+
+
+def measure(tick: Tick, tries: int = 10) -> tuple[list[tuple[str, ...]], list[Bar]]:
+    """
+    Let strangers in, and kill nodes.
+
+    Parameters
+    ----------
+    tick : callable
+        Called with the name of each stage.
+    tries : int
+        How often each stranger comes.
+
+    Returns
+    -------
+    rows : list of tuple of str
+        Rows of a table.
+    bars : list of Bar
+        Bars.
+
+    """
+    rows: list[tuple[str, ...]] = []
+    bars: list[Bar] = []
+    for what, bar, count, act in _trials(tries):
+        tick(what)
+        with TemporaryDirectory() as logs, Graph(Path(logs)) as graph:
+            bystander = Bystander(graph)
+            moved = afterwards = ''
+            found = float('inf')
+            try:
+                found = 1e3 * act(graph, bystander)
+                moved = f'{found:.3f} mm'
+                bystander.goes_to(NEXT)
+                afterwards = 'goes on' if bystander.stops <= {'0'} else 'goes on after a stop'
+            except GraphError as error:
+                afterwards = f'{error}: {bystander.complaints}'
+        rows.append((what, str(count), moved, f'{bar:g} mm', afterwards))
+        bars.append(Bar(what, found if afterwards == 'goes on' else float('inf'), bar, 'mm'))
+    return rows, bars
+
+
+#: A trial: what comes, how far the needle may move [mm], how often it comes, and what lets it.
+_Trial = tuple[str, float, int, Callable[[Graph, Bystander], float]]
+
+
+def _trials(tries: int) -> list[_Trial]:
+    """Return the trials. A killed controller leaves the motion where it was."""
+    pushers = [
+        (
+            f'{force:g} N from a second commander, {words}',
+            1.0,
+            tries,
+            _visit(PUSHER, force, when, tries),
+        )
+        for force in (900.0, 14.0)
+        for when, words in (('found', 'for 6 to 48 ms'), ('blind', 'that lives for 80 ms'))
+    ]
+    liars = [
+        (f'joint_states from a second robot{words}', 1.0, 1, _visit(LIAR, ahead))
+        for ahead, words in ((0.0, ''), (0.09, ', 90 ms ahead'))
+    ]
+    return [
+        *pushers,
+        *liars,
+        ('targets out of reach, without a pause', 1.0, 1, _visit(ASKER)),
+        ('the controller is killed in motion', 2.0, 1, _killed('controller', signal.SIGKILL)),
+        ('the controller is frozen in motion', 2.0, 1, _killed('controller', signal.SIGSTOP)),
+    ]
+
+
+def _visit(script: str, *arguments: object) -> Callable[[Graph, Bystander], float]:
+    def act(_graph: Graph, bystander: Bystander) -> float:
+        found, moved = bystander.endures(script, *arguments)
+        return moved if found else float('inf')
+
+    return act
+
+
+def _killed(name: str, how: signal.Signals) -> Callable[[Graph, Bystander], float]:
+    """Return what ends a node in motion and starts another one."""
+
+    def act(graph: Graph, bystander: Bystander) -> float:
+        target = PointStamped()
+        target.point.y = 0.1
+        victim: NodeProcess = getattr(bystander, name)
+
+        def moves() -> bool:
+            bystander._targets.publish(target)
+            return bystander.depths[-1] > START + 5e-3
+
+        bystander.until(moves, 'motion')
+        if how == signal.SIGKILL:
+            victim.kill()
+        else:
+            victim.process.send_signal(how)
+        bystander.depths.clear()
+        bystander.until(lambda: len(bystander.depths) > 1500, 'a second and a half')
+        moved = bystander.moved
+        victim.kill()
+        graph.start(name)
+        return moved
+
+    return act
