@@ -314,7 +314,11 @@ def test_a_refused_configuration_leaves_nothing_behind(ros_graph: RosGraph) -> N
 
 
 class Loop:
-    """Controller and simulated plant in one thread, with a probe."""
+    """
+    Controller and simulated plant in one thread, with a probe.
+
+    Time is the plant's: a machine that stalls makes it wait, and is no fault of its own.
+    """
 
     def __init__(
         self, graph: RosGraph, *, rate: float = 200.0, depth: float = 0.02, **parameters: float
@@ -326,14 +330,20 @@ class Loop:
         self.forces = graph.listen(self.probe, WrenchStamped, 'wrench_command', COMMAND)
         self.targets = self.probe.create_publisher(PointStamped, 'target', COMMAND)
         self.paths = self.probe.create_publisher(JointTrajectory, 'joint_trajectory', COMMAND)
-        # All in one thread, which may be held up.
         self.plant = graph.add(
-            PlantNode, parameters={'rate': rate, 'depth': depth, 'command_timeout': 1.0}
+            PlantNode,
+            parameters={
+                'rate': rate,
+                'depth': depth,
+                'command_timeout': 1.0,
+                'publish_clock': True,
+            },
         )
         self.node = graph.add(
             ControllerNode,
             parameters={
                 'rate': rate,
+                'use_sim_time': True,
                 'measurement_timeout': 1.0,
                 # A needle that is pushed on while all is held up is ahead of its reference.
                 'safety.tracking_error': 0.1,
