@@ -7,12 +7,16 @@ from collections.abc import Mapping, Set
 from dataclasses import dataclass
 from itertools import chain
 import time
+from typing import Final
 
 from needle_identification.bags.bag import Bag, Recorded
 from needle_identification.errors import RecordingError
 from needle_ros.errors import ParameterError
 from needle_ros.settings import check_constants, constant
 from needle_ros.timing import NANOSECONDS
+
+#: Longest pause between two messages that is believed: a day [ns].
+_LONGEST_PAUSE: Final = 24 * 3600 * NANOSECONDS
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -214,9 +218,21 @@ class Playback:
         bool
             Whether it is due; False if there is none.
 
+        Raises
+        ------
+        RecordingError
+            If it is so much later than the one before that its receive time must be wrong.
+
         """
         if self._next is None:
             return False
+        pause = self._next.received - self._last
+        if pause > _LONGEST_PAUSE:
+            days, name = pause / _LONGEST_PAUSE, self._next.topic.name
+            raise RecordingError(
+                f'{self.bag.path} has a damaged receive time at {self.seconds(self._last):.3f} s: '
+                f'a message of {name} came {days:.3g} days later'
+            )
         if self._settings.rate > 0.0:
             late = self.position - self._next.received
             if late < 0:

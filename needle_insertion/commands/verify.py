@@ -12,7 +12,7 @@ import sys
 from needle_insertion.commands.common import Command
 from needle_insertion.replay.rerun import Rerun, TOLERANCE, verify
 from needle_insertion.report.text import table
-from needle_ros.errors import ParameterError, shown
+from needle_ros.errors import NeedleError, ParameterError, shown
 from needle_ros.timing import NANOSECONDS
 from tqdm import tqdm
 
@@ -32,18 +32,30 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(options: argparse.Namespace) -> int:
-    """Verify each bag and print what was found; return 1 if a run differs."""
+    """Verify each bag and print what was found; return 1 if a run differs, 2 if one is bad."""
     if not 0.0 <= options.tolerance < 1.0:
         raise ParameterError(f'--tolerance must be in [0, 1), got {options.tolerance}')
     results: list[Rerun] = []
+    bad = 0
     for path in tqdm(options.bags, desc='bags', disable=None, delay=2.0):
-        results += verify(path, options.tolerance)
+        found = _verified(path, options.tolerance)
+        results += found
+        bad += not found
     if options.json:
         document = [result.document for result in results]
         sys.stdout.write(f'{json.dumps(document, indent=2)}\n')
-    else:
+    elif results:
         sys.stdout.write('\n'.join([_table(results), *map(shown, _remarks(results)), '']))
-    return int(any(result.verdict == 'differs' for result in results))
+    return 2 if bad else int(any(result.verdict == 'differs' for result in results))
+
+
+def _verified(path: Path, tolerance: float) -> list[Rerun]:
+    """Verify a bag; say what is wrong with it, and return nothing, if that cannot be done."""
+    try:
+        return verify(path, tolerance)
+    except (NeedleError, OSError) as error:
+        tqdm.write(f'error: {error}', file=sys.stderr)
+        return []
 
 
 def _table(results: Sequence[Rerun]) -> str:

@@ -617,6 +617,20 @@ def test_bad_input_is_named(
     assert said.count('\n') == 1
 
 
+def test_the_others_are_verified_all_the_same(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A bag that is not there, and one that is damaged, are named; the good one has its row."""
+    (tmp_path / 'bad.mcap').write_bytes(b'nothing of the kind')
+    good = written(tmp_path / 'good', simulated())
+    bags = [str(tmp_path / 'none'), str(tmp_path / 'bad.mcap'), str(good)]
+    assert main(['verify', *bags]) == 2
+    captured = capsys.readouterr()
+    assert [line.split(':')[0] for line in captured.err.splitlines()] == ['error', 'error']
+    assert 'none does not exist' in captured.err
+    assert '1 runs: 1 identical' in captured.out
+
+
 def test_a_parameter_that_is_missing_is_named(tmp_path: Path) -> None:
     """Without the rate there is no time."""
     messages = without_events(simulated())

@@ -4,7 +4,7 @@ from itertools import pairwise
 from pathlib import Path
 import time
 
-from needle_identification import Bag, BagWriter, OfferedQos, Topic
+from needle_identification import Bag, BagWriter, OfferedQos, RecordingError, Topic
 from needle_identification.bags import bag as reading
 from needle_identification.bags.playback import Playback, PlaybackSettings
 import pytest
@@ -90,6 +90,26 @@ def test_a_very_late_message_is_not_lost(tmp_path: Path, monkeypatch: pytest.Mon
     times = [message.received for message in Bag(tmp_path / 'bag').messages(everything)]
     assert sorted(times) == [EPOCH - k for k in reversed(range(10))]
     assert any(late < early for early, late in pairwise(times))
+
+
+@pytest.mark.parametrize('damaged', [5, 0], ids=['late', 'early'])
+def test_a_receive_time_that_is_damaged_is_not_waited_for(tmp_path: Path, damaged: int) -> None:
+    """One that is years away ends the playback in one line; what comes before is played."""
+    with BagWriter(tmp_path / 'bag') as writer:
+        writer.add_topic('/a', TEXT)
+        for k in range(10):
+            at = EPOCH + k * 1_000_000
+            shift = 0 if k != damaged else 10**18 if damaged else -(10**18)
+            writer.write('/a', text(str(k)), at + shift)
+    bag = Bag(tmp_path / 'bag')
+    play = Playback(bag, {'/a'}, {}, PlaybackSettings(rate=0.0, delay=0.0))
+    play.start(paused=False)
+    for _ in range(9 if damaged else 1):
+        assert play.is_due()
+        assert len(play.take()) == 1
+    with pytest.raises(RecordingError, match='has a damaged receive time') as caught:
+        play.is_due()
+    assert 'a message of /a came 1.16e+04 days later' in str(caught.value)
 
 
 def test_offered_qos_is_stored(tmp_path: Path) -> None:
