@@ -80,7 +80,14 @@ def fit_warnings(
     unknown = [parameter.name for parameter in parameters if not parameter.determined]
     if unknown:
         yield f'the data do not determine {", ".join(unknown)}: use more speeds, or fewer terms'
-    cutoff, rate = design.signals.settings.cutoff, 1.0 / design.signals.period
+    settings = design.signals.settings
+    if not all(map(design.reaches, settings.terms)):
+        slowest = float(np.abs(design.speed[design.used]).min())
+        yield (
+            f'no sample is slow enough for the term stribeck: {slowest:.2g} m/s and more, with '
+            f'stribeck_speed {settings.stribeck_speed:g} m/s; its coefficient is a guess'
+        )
+    cutoff, rate = settings.cutoff, 1.0 / design.signals.period
     if cutoff > 0.5 * rate:
         yield (
             f'not filtered: the cutoff of {cutoff:g} Hz is beyond half the sampling rate, '

@@ -19,6 +19,10 @@ import numpy as np
 _SIGNIFICANCE: Final = 0.05
 
 
+#: Terms whose coefficient cannot be negative.
+_POSITIVE: Final = ('inertia', 'stribeck')
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Comparison:
     """
@@ -99,6 +103,8 @@ def _tried(design: Design) -> list[tuple[str, Regression, list[int]]]:
     for term in TERMS:
         if term in chosen or (term == 'inertia' and design.estimates_lag):
             continue
+        if not design.reaches(term):
+            continue
         if term == 'direction' and (
             settings.estimator == 'total' or not {'coulomb', 'viscous'} <= set(chosen)
         ):
@@ -142,7 +148,9 @@ def _added(
     if not other.determined[which].all():
         words = f'the data do not distinguish the term {term} from the others'
         return Comparison(terms=terms, words=words)
-    supported = p_value < _SIGNIFICANCE and difference < 0.0
+    # Neither a mass nor what breaks away is less than nothing.
+    impossible = term in _POSITIVE and other.values[which[0]] < 0.0
+    supported = p_value < _SIGNIFICANCE and difference < 0.0 and not impossible
     verdict = 'support' if supported else 'do not support'
     sizes = ' and '.join(
         f'{column.name} = {other.values[k]:.3g} ± {other.errors[k]:.2g} {column.unit}'

@@ -26,6 +26,9 @@ FEWEST_SAMPLES: Final = 10.0
 #: Time after a change at which the filters of the sensor have settled too [lags of the force].
 _SETTLING: Final = 3.0
 
+#: Part of a term's full size that is felt.
+_FELT: Final = 0.05
+
 #: A longer settling time than this is the lag of a clock [s].
 _LONGEST_SETTLING: Final = 0.1
 
@@ -88,6 +91,30 @@ class Design:
         """
         columns = regressors(self.speed, self.acceleration, terms, self.signals.settings)
         return np.column_stack([columns, self.lag_column])
+
+    def reaches(self, term: str) -> bool:
+        """
+        Tell whether there are enough samples at which a term would be felt for one to count.
+
+        Only ``stribeck`` has a place: near rest. Beyond it the term is nearly zero, and what
+        speaks for it is the noise of the speed.
+
+        Parameters
+        ----------
+        term : str
+            Term, of `TERMS`.
+
+        Returns
+        -------
+        bool
+            Whether there are.
+
+        """
+        if term != 'stribeck':
+            return True
+        column = regressors(self.speed, self.acceleration, [term], self.signals.settings)
+        felt = np.count_nonzero(np.abs(column[self.used]) >= _FELT)
+        return bool(felt >= self.signals.correlation)
 
     def with_lag_column(self) -> Design:
         """

@@ -393,6 +393,31 @@ def test_the_breakaway_force_needs_a_rest_with_a_rising_force() -> None:
     assert sticky.breakaway is None or sticky.breakaway.error < 0.02
 
 
+@pytest.mark.parametrize('slowest', [2.0e-3, 2.9e-3])
+def test_noise_of_the_speed_is_not_taken_for_stribeck(slowest: float) -> None:
+    """Positions alone, white noise of 1 um, and nothing near rest: 20 of 20 said so once."""
+    advised = 0
+    for seed in range(20):
+        made = strokes(seed=seed, speeds=(slowest, 5e-3, 10e-3, 20e-3), push=0.0)
+        noise = np.random.default_rng(1000 + seed).normal(scale=1e-6, size=len(made.depth))
+        recording = Recording(
+            name='positions', time=made.time, depth=made.depth + noise, force=made.force
+        )
+        found = identify_friction(recording)
+        advised += any('add the term' in words for words in found.warnings)
+    assert advised == 0
+    # Who asks for it hears that it is a guess.
+    asked = identify_friction(recording, settings('stribeck'))
+    assert any('no sample is slow enough' in words for words in asked.warnings)
+
+
+def test_no_term_is_advised_that_physics_forbids() -> None:
+    """A force that is ahead of its motion looks like less friction near rest, or less mass."""
+    for seed in range(10):
+        found = identify_friction(strokes(seed=seed, lag=-1e-3))
+        assert not any('add the term' in words for words in found.warnings)
+
+
 def test_lost_samples_and_another_start_time_do_no_harm() -> None:
     recording = strokes(seed=9)
     whole = identify_friction(recording)
