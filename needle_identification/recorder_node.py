@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 import sys
+import time
 from typing import Any, Final, NamedTuple
 
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -143,7 +144,7 @@ class RecorderNode(BaseNode):
 
     def _end(self, bag: BagWriter) -> str:
         """Complete the bag; return what it holds, or why it cannot be completed."""
-        self._take()
+        self._take(_DEPTH)
         if self._bag is None:
             return self.failure or 'not recording'
         self._release()
@@ -184,29 +185,32 @@ class RecorderNode(BaseNode):
             except OSError as error:
                 self._give_up(self._bag, error)
 
-    def _take(self) -> None:
+    def _take(self, most: int = _AT_ONCE) -> None:
         """Write what has come, with the time at which the middleware has received it."""
         for topic, recorded in self._recorded.items():
             if self._bag is None:
                 return
             try:
-                self._take_from(self._bag, topic, recorded)
+                self._take_from(self._bag, topic, recorded, most)
             except OSError as error:
                 self._give_up(self._bag, error)
                 return
         if self._bag is not None and self._bag.lost:
             self.report_change()
 
-    def _take_from(self, bag: BagWriter, topic: str, recorded: _Recorded) -> None:
+    def _take_from(self, bag: BagWriter, topic: str, recorded: _Recorded, most: int) -> None:
         handle, kind = recorded.subscription.handle, recorded.kind
         with handle:
-            for _ in range(_AT_ONCE):
+            for _ in range(most):
                 taken = handle.take_message(kind, True)
                 if taken is None:
                     return
                 data, about = taken
-                bag.write(topic, data, about['received_timestamp'])
+                # Not every middleware says when, nor which.
+                bag.write(topic, data, about['received_timestamp'] or time.time_ns())
                 number = about['publication_sequence_number']
+                if number is None:
+                    continue
                 missing = number - self._newest.get(topic, number) - 1
                 self._newest[topic] = number
                 # Two publishers count on their own.
@@ -250,7 +254,7 @@ class RecorderNode(BaseNode):
             self._recorded[topic] = before._replace(offered=offered)
             return
         if before:
-            self._take_from(bag, topic, before)
+            self._take_from(bag, topic, before, _DEPTH)
             before.subscription.destroy()
         reliability = ReliabilityPolicy.BEST_EFFORT if best_effort else ReliabilityPolicy.RELIABLE
         durability = DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE
