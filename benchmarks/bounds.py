@@ -166,7 +166,7 @@ def friction_truth(
     names = [column.name for column in columns_of(settings.terms)]
     acceleration = np.gradient(speed, time)
     known = information(
-        regressors(speed, acceleration, settings.terms, settings),
+        regressors(speed, acceleration, time - time[0], settings.terms, settings),
         reading_noise(sensor, 1),
         np.abs(speed) > settings.moving_speed,
     )

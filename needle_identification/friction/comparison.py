@@ -16,7 +16,7 @@ from needle_identification.friction.terms import columns_of
 import numpy as np
 
 #: Probability of a false alarm of all comparisons of one recording.
-_SIGNIFICANCE: Final = 0.05
+_SIGNIFICANCE: Final = 0.02
 
 
 #: Terms whose coefficient cannot be negative.

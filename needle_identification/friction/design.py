@@ -89,8 +89,13 @@ class Design:
             One column per coefficient.
 
         """
-        columns = regressors(self.speed, self.acceleration, terms, self.signals.settings)
+        columns = self._columns(self.speed, terms)
         return np.column_stack([columns, self.lag_column])
+
+    def _columns(self, speed: FloatArray, terms: Sequence[str]) -> FloatArray:
+        signals = self.signals
+        since = signals.time - signals.time[0]
+        return regressors(speed, self.acceleration, since, terms, signals.settings)
 
     def reaches(self, term: str) -> bool:
         """
@@ -112,7 +117,7 @@ class Design:
         """
         if term != 'stribeck':
             return True
-        column = regressors(self.speed, self.acceleration, [term], self.signals.settings)
+        column = self._columns(self.speed, [term])
         felt = np.count_nonzero(np.abs(column[self.used]) >= _FELT)
         return bool(felt >= self.signals.correlation)
 
@@ -128,12 +133,7 @@ class Design:
         """
         settings, step = self.signals.settings, 0.5 * self.signals.period
         early, now, late = (
-            regressors(
-                self.speed - shift * self.acceleration,
-                self.acceleration,
-                settings.terms,
-                settings,
-            )
+            self._columns(self.speed - shift * self.acceleration, settings.terms)
             for shift in (-step, 0.0, step)
         )
         used = self.used

@@ -100,7 +100,8 @@ def _coarse_lag(signals: FilteredSignals) -> float:
         if np.count_nonzero(moving) <= FEWEST_SAMPLES:
             return 0.0
         settings = signals.settings
-        x = regressors(speed[moving], acceleration[moving], settings.terms, settings)
+        since = time[moving] - time[0]
+        x = regressors(speed[moving], acceleration[moving], since, settings.terms, settings)
         solution = np.linalg.lstsq(x, force[moving], rcond=None)[0]
         misfits.append(float(np.mean((force[moving] - x @ solution) ** 2)))
     best = int(np.argmin(misfits))

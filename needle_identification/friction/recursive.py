@@ -77,6 +77,8 @@ class RecursiveFriction:
             raise ParameterError(
                 f'recursive estimation needs the estimator ordinary, got {settings.estimator!r}'
             )
+        if 'drift' in settings.terms:
+            raise ParameterError('recursive estimation forgets, and has no term drift')
         self._settings = settings
         self._period = 1.0 / rate
         self._taps = filter_taps(settings.cutoff, self._period)
@@ -153,7 +155,11 @@ class RecursiveFriction:
 
     def _learn(self, speed: float, acceleration: float, force: float) -> None:
         row = regressors(
-            np.array([speed]), np.array([acceleration]), self._settings.terms, self._settings
+            np.array([speed]),
+            np.array([acceleration]),
+            np.zeros(1),
+            self._settings.terms,
+            self._settings,
         )[0]
         if self._estimates_lag:
             row = np.append(row, acceleration)

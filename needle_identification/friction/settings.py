@@ -10,7 +10,7 @@ from needle_ros.errors import ParameterError
 from needle_ros.settings import check_constants, constant
 
 #: Terms of the friction force, by name; their equations are in `terms`.
-TERMS: Final = ('coulomb', 'viscous', 'offset', 'inertia', 'direction', 'stribeck')
+TERMS: Final = ('coulomb', 'viscous', 'offset', 'drift', 'inertia', 'direction', 'stribeck')
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -5,7 +5,7 @@ Equation (15) of the paper has the first two; the others are optional:
 
 .. math::
 
-   f_y = \mu_s \operatorname{sgn}(\dot s) + \mu_v \dot s + b + m \ddot s
+   f_y = \mu_s \operatorname{sgn}(\dot s) + \mu_v \dot s + b + c t + m \ddot s
    + (\Delta\mu_s \operatorname{sgn}(\dot s) + \Delta\mu_v \dot s)_{\dot s < 0}
    + (\mu_b - \mu_s) \operatorname{sgn}(\dot s) \, e^{-(\dot s / v_s)^2}
 
@@ -33,25 +33,30 @@ class Column:
     name, symbol, unit : str
         Coefficient: name, symbol in text and unit.
     of : callable
-        Regressor from speed [m/s], acceleration [m/s^2], each of shape (n,), and the settings.
+        Regressor from speed [m/s], acceleration [m/s^2] and time [s], each of shape (n,), and the
+        settings.
 
     """
 
     name: str
     symbol: str
     unit: str
-    of: Callable[[FloatArray, FloatArray, FrictionSettings], FloatArray]
+    of: Callable[[FloatArray, FloatArray, FloatArray, FrictionSettings], FloatArray]
 
 
 _COLUMNS: Final[Mapping[str, tuple[Column, ...]]] = {
-    'coulomb': (Column('coulomb_friction', 'mu_s', 'N', lambda v, _a, _s: np.sign(v)),),
-    'viscous': (Column('viscous_friction', 'mu_v', 'N s/m', lambda v, _a, _s: v),),
-    'offset': (Column('offset', 'b', 'N', lambda v, _a, _s: np.ones_like(v)),),
-    'inertia': (Column('moving_mass', 'm', 'kg', lambda _v, a, _s: a),),
+    'coulomb': (Column('coulomb_friction', 'mu_s', 'N', lambda v, _a, _t, _s: np.sign(v)),),
+    'viscous': (Column('viscous_friction', 'mu_v', 'N s/m', lambda v, _a, _t, _s: v),),
+    'offset': (Column('offset', 'b', 'N', lambda v, _a, _t, _s: np.ones_like(v)),),
+    # Of the sensor, or of the tissue: since the recording began.
+    'drift': (Column('force_drift', 'c', 'N/s', lambda _v, _a, t, _s: t),),
+    'inertia': (Column('moving_mass', 'm', 'kg', lambda _v, a, _t, _s: a),),
     # What Coulomb and viscous friction are more on withdrawal than on insertion.
     'direction': (
-        Column('withdrawal_coulomb', 'd mu_s', 'N', lambda v, _a, _s: np.minimum(np.sign(v), 0)),
-        Column('withdrawal_viscous', 'd mu_v', 'N s/m', lambda v, _a, _s: np.minimum(v, 0.0)),
+        Column(
+            'withdrawal_coulomb', 'd mu_s', 'N', lambda v, _a, _t, _s: np.minimum(np.sign(v), 0)
+        ),
+        Column('withdrawal_viscous', 'd mu_v', 'N s/m', lambda v, _a, _t, _s: np.minimum(v, 0.0)),
     ),
     # What the breakaway friction is more than mu_s.
     'stribeck': (
@@ -59,7 +64,7 @@ _COLUMNS: Final[Mapping[str, tuple[Column, ...]]] = {
             'stribeck_friction',
             'mu_b - mu_s',
             'N',
-            lambda v, _a, s: np.sign(v) * np.exp(-((v / s.stribeck_speed) ** 2)),
+            lambda v, _a, _t, s: np.sign(v) * np.exp(-((v / s.stribeck_speed) ** 2)),
         ),
     ),
 }
@@ -84,7 +89,11 @@ def columns_of(terms: Sequence[str]) -> list[Column]:
 
 
 def regressors(
-    speed: FloatArray, acceleration: FloatArray, terms: Sequence[str], settings: FrictionSettings
+    speed: FloatArray,
+    acceleration: FloatArray,
+    time: FloatArray,
+    terms: Sequence[str],
+    settings: FrictionSettings,
 ) -> FloatArray:
     """
     Return the regressors of terms.
@@ -93,6 +102,8 @@ def regressors(
     ----------
     speed, acceleration : ndarray, shape (n,)
         Insertion speed [m/s] and acceleration [m/s^2], positive into the tissue.
+    time : ndarray, shape (n,)
+        Time since the recording began [s].
     terms : sequence of str
         Terms, of `TERMS`.
     settings : FrictionSettings
@@ -104,4 +115,5 @@ def regressors(
         One column per coefficient, as in `columns_of`.
 
     """
-    return np.column_stack([c.of(speed, acceleration, settings) for c in columns_of(terms)])
+    columns = columns_of(terms)
+    return np.column_stack([c.of(speed, acceleration, time, settings) for c in columns])
