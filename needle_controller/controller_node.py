@@ -278,7 +278,7 @@ class ControllerNode(ModelNode):
         """Count who publishes what may have one source only; active or not."""
         return {topic.name: sources.count(topic) for topic, sources in self._sources.items()}
 
-    def _look(self) -> None:
+    def _look(self, _came: int = 0) -> None:
         """Look for what does not come, and who has come, from time to time and when one comes."""
         if self.is_active:
             self._act(self._supervisor.watch(self.now(), self._who_publishes()))

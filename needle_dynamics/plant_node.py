@@ -393,13 +393,17 @@ class PlantNode(ModelNode):
             self._publish[topic](stamp, values)
         self.report_change()
 
-    def _look_who_commands(self) -> None:
+    def _look_who_commands(self, came: int = 0) -> None:
         """Let no force act while several nodes command."""
         matched, now = self._commands.get_publisher_count(), monotonic_ns()
-        if matched != self._matched:
+        before, several = self._matched, max(self._matched, matched) > 1
+        if matched != before:
             self._matched, self._matched_at = matched, now
         if self._run is None:
             return
+        # One may have come and gone while this process had to wait.
+        if (several and matched != before) or (before and came):
+            self._run.commands.hush(self._time.simulated(self.now()))
         # What came and went at once may be counted for ever; the graph knows better by then.
         fresh = now - self._matched_at < NANOSECONDS
         count = self._commanders.count(contract.WRENCH_COMMAND, matched if fresh else 0)

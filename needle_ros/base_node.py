@@ -304,7 +304,7 @@ class BaseNode(LifecycleNode):
         self,
         topic: Topic,
         take: Callable[[Reading], None],
-        matched: Callable[[], None] | None = None,
+        matched: Callable[[int], None] | None = None,
     ) -> Subscription:
         """
         Subscribe to a topic that comes at the sample rate; its messages are read from their bytes.
@@ -316,7 +316,8 @@ class BaseNode(LifecycleNode):
         take : callable
             Called with each `Reading`.
         matched : callable, optional
-            Called when a publisher has come, before its first message, and when one has gone.
+            Called with the number of publishers that have come since the last call, before
+            their first message, and with zero when one has gone.
 
         Returns
         -------
@@ -337,7 +338,11 @@ class BaseNode(LifecycleNode):
                 return
             take(reading)
 
-        events = SubscriptionEventCallbacks(matched=(lambda _: matched()) if matched else None)
+        def on_match(event: Any) -> None:
+            if matched is not None:
+                matched(event.total_count_change)
+
+        events = SubscriptionEventCallbacks(matched=on_match)
         return self.create_subscription(
             message_class(topic.type_name),
             name,

@@ -96,6 +96,7 @@ class Commands:
         """Forget the commands and who gave them, as at an activation."""
         self.held = self.newest = Command()
         self.rivals = 0
+        self._quiet = 0
         self.exhausted = False
         #: Energy put in, less what is long ago [J].
         self._energy = 0.0
@@ -146,8 +147,8 @@ class Commands:
         complaint = self._complaint(frame, force, torque)
         if complaint:
             self.refused += 1
-        # While several nodes command none of them may.
-        acts = not complaint and not self.rivals
+        # While several nodes command none of them may; then what they said must be over.
+        acts = not complaint and not self.rivals and now >= self._quiet
         self.newest = Command(stamp, force, torque) if acts else Command(stamp)
         return True, complaint
 
@@ -164,6 +165,19 @@ class Commands:
                 'applied'
             )
         return ''
+
+    def hush(self, now: int) -> None:
+        """
+        Let no command act for the timeout: one of a node that has come and gone may be among them.
+
+        Parameters
+        ----------
+        now : int
+            Simulated time [ns].
+
+        """
+        self._quiet = now + round(self._timeout)
+        self.newest = Command(self.newest.stamp)
 
     def count_commanders(self, number: int) -> bool:
         """

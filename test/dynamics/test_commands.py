@@ -166,6 +166,18 @@ def test_no_force_acts_while_more_energy_was_put_in_than_may_be() -> None:
     assert not commands.exhausted
 
 
+def test_after_somebody_came_and_went_no_command_acts_for_the_timeout() -> None:
+    """What they said may come late, and is over by then."""
+    commands = made()
+    commands.offer(NOW, '', 1.0, 0.0, NOW)
+    commands.hush(NOW)
+    assert commands.newest == Command(NOW)
+    for k, acts in ((1, False), (99, False), (100, True)):
+        at = NOW + k * PERIOD
+        commands.offer(at, '', 2.0, 0.0, at)
+        assert (commands.newest.force == 2.0) == acts
+
+
 def test_what_was_commanded_is_forgotten() -> None:
     """At a reset older commands still do not count; at an activation nothing is known."""
     commands = made()
