@@ -208,9 +208,10 @@ def test_the_friction_page_shows_what_was_found(
 
 
 def test_the_same_recordings_give_the_same_page(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Byte by byte: pages can be compared, and kept under version control."""
+    monkeypatch.setenv('SOURCE_DATE_EPOCH', '1700000000')
     pages = []
     for _ in range(2):
         identify(capsys, 'friction', BAGS[0], '--report', str(tmp_path / 'report'))

@@ -41,6 +41,6 @@ def test_a_flood_of_wishes_moves_nothing(ros_graph: RosGraph) -> None:
     bystander = Bystander(ros_graph)
     found, moved = bystander.endures(ASKER)
     assert found > 0
-    assert moved < 1e-4
+    assert moved < 1e-3
     bystander.goes_to(NEXT)
     assert bystander.stops == {'0'}
