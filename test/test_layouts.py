@@ -106,8 +106,9 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Recording:
         recorder = graph.start('recorder', {'path': str(folder / 'bag')})
         for node in NODES:
             graph.start(node, settings[f'/**/{node}']['ros__parameters'])
+        # The first nodes that a new machine runs are compiled, here beside other tests.
         graph.spin_until(
-            lambda: all(int(counts.get(topic, 0)) for topic in STREAMS), 'the streams', 120.0
+            lambda: all(int(counts.get(topic, 0)) for topic in STREAMS), 'the streams', 400.0
         )
         # The recorder has found these nodes, so what they say from now on is recorded.
         heard.clear()

@@ -19,7 +19,7 @@ def test_a_second_commander_moves_nothing(ros_graph: RosGraph, force: float, whe
     assert found > 0
     # At 14 N the needle would go 2 mm in 48 ms.
     assert moved < 1e-3
-    assert bystander.was_told('2 nodes command')
+    bystander.until(lambda: bystander.was_told('2 nodes command'), 'the word of it')
     bystander.goes_to(NEXT)
     assert bystander.stops == {'0'}
 
@@ -31,7 +31,7 @@ def test_a_second_robot_moves_nothing(ros_graph: RosGraph, ahead: float) -> None
     found, moved = bystander.endures(LIAR, ahead)
     assert found > 0
     assert moved < 1e-3
-    assert bystander.was_told('2 nodes publish joint_states')
+    bystander.until(lambda: bystander.was_told('2 nodes publish joint_states'), 'the word of it')
     bystander.goes_to(NEXT)
     assert bystander.stops == {'0'}
 
