@@ -10,7 +10,7 @@ from needle_ros.errors import ParameterError
 ESTIMATORS: Final = ('ordinary', 'weighted', 'huber', 'total')
 
 
-def check_estimator(estimator: str) -> None:
+def check_estimator(estimator: str, *more: str) -> None:
     """
     Reject an unknown estimator.
 
@@ -18,14 +18,15 @@ def check_estimator(estimator: str) -> None:
     ----------
     estimator : str
         Name to check.
+    *more : str
+        Further names that are valid.
 
     Raises
     ------
     ParameterError
-        If it is not one of `ESTIMATORS`.
+        If it is none of `ESTIMATORS` nor of these.
 
     """
-    if estimator not in ESTIMATORS:
-        raise ParameterError(
-            f'estimator must be one of {", ".join(ESTIMATORS)}, got {estimator!r}'
-        )
+    names = (*more, *ESTIMATORS)
+    if estimator not in names:
+        raise ParameterError(f'estimator must be one of {", ".join(names)}, got {estimator!r}')

@@ -12,8 +12,9 @@ ordinary least squares takes for signal; this is total least squares with exact 
 and free noise of the response, which has a closed solution [VanHuffel1991]_.
 
 The covariance of the parameters comes from the sums of their scores over a triangular window, so
-that it holds for noise that is correlated, uneven, or both [NeweyWest1987]_. Intervals are those
-of Student's t, with the degrees of freedom of Satterthwaite.
+that it holds for noise that is correlated over the window, uneven, or both [NeweyWest1987]_. Noise
+that may be correlated for longer is modeled, and the errors grow by what the window misses; see
+`memory`. Intervals are those of Student's t, with the degrees of freedom of Satterthwaite.
 
 References
 ----------
@@ -33,6 +34,7 @@ from typing import Final, NamedTuple
 from needle_dynamics.arrays import BoolArray, FloatArray, IntArray
 from needle_identification.errors import IdentificationError
 from needle_identification.estimation.estimators import check_estimator
+from needle_identification.estimation.memory import divided, Memory, memory_of
 from needle_ros.errors import ParameterError, ShapeError
 import numpy as np
 from numpy.typing import ArrayLike
@@ -87,6 +89,8 @@ class Regression:
         Number of independent samples with the same information.
     degrees_of_freedom : ndarray, shape (k,)
         Degrees of freedom of the errors; few where few samples determine a parameter.
+    memory : Memory or None
+        Memory of the noise, which the errors allow for; None if it was not asked for.
 
     """
 
@@ -100,11 +104,17 @@ class Regression:
     samples: int
     effective_samples: float
     degrees_of_freedom: FloatArray
+    memory: Memory | None = None
 
     def __repr__(self) -> str:
         pairs = zip(self.values.tolist(), self.errors.tolist(), strict=True)
         values = ', '.join(f'{value:.4g} ± {error:.2g}' for value, error in pairs)
         return f'<Regression: {values}; {self.samples} samples, R^2 = {self.determination:.4f}>'
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether what is left of the response is rounding."""
+        return 1.0 - self.determination < _ROUNDING
 
     def interval(self, level: float = 0.95) -> FloatArray:
         """
@@ -150,6 +160,33 @@ class Regression:
         freedom = float(self.degrees_of_freedom[at].min())
         return found, float(fdtrc(len(at), freedom, found / len(at)))
 
+    def differs(self, whole: Regression, count: int) -> float:
+        """
+        Test whether this fit to a part of the samples contradicts that to all of them.
+
+        Where the model holds for all, the parameters differ by no more than their errors here
+        (Hausman's test; the errors of ``whole`` would make it sharper, but not safer).
+
+        Parameters
+        ----------
+        whole : Regression
+            Fit of the same parameters to these samples and others.
+        count : int
+            How many parameters to compare, from the first.
+
+        Returns
+        -------
+        float
+            The p-value, from the F distribution; 1 if no parameter is determined in both.
+
+        """
+        at = np.flatnonzero(self.determined[:count] & whole.determined[:count])
+        if not len(at) or not np.diag(self.covariance)[at].all():
+            return 1.0
+        off = self.values[at] - whole.values[at]
+        found = float(off @ np.linalg.solve(self.covariance[np.ix_(at, at)], off)) / len(at)
+        return float(fdtrc(len(at), float(self.degrees_of_freedom[at].min()), found))
+
 
 class _Solution(NamedTuple):
     """
@@ -174,6 +211,7 @@ def regress(
     groups: IntArray | None = None,
     regressor_noise: FloatArray | None = None,
     used: BoolArray | None = None,
+    colored: bool = False,
 ) -> Regression:
     """
     Solve ``response = regressors @ values + noise``.
@@ -195,6 +233,8 @@ def regress(
     used : ndarray of bool, shape (n,), optional
         Samples to use; default all. Samples that are not used keep the others at their true
         distance in time.
+    colored : bool
+        Whether the noise may be correlated for longer, and the errors shall allow for it.
 
     Returns
     -------
@@ -249,7 +289,7 @@ def regress(
         noise = np.diag(np.asarray(regressor_noise) / norms) ** 2
         solution = _total(x, y, used, basis.T @ noise @ basis)
     return _with_errors(
-        solution, x, y, used, correlation, basis / norms[:, np.newaxis], unknown, singular
+        solution, x, y, used, correlation, basis / norms[:, np.newaxis], unknown, singular, colored
     )
 
 
@@ -262,6 +302,7 @@ def _with_errors(
     back: FloatArray,
     unknown: BoolArray,
     singular: FloatArray,
+    colored: bool,
 ) -> Regression:
     """Add covariance and degrees of freedom, and go back to the columns that were given."""
     samples, k = int(np.count_nonzero(used)), len(unknown)
@@ -271,7 +312,8 @@ def _with_errors(
     middle = score_covariance(solution.scores, correlation) * effective / (effective - k)
     # Effective number of samples behind each parameter, from the share of each sample in its
     # variance (Satterthwaite).
-    shares = (solution.influence @ (back @ solution.inverse).T) ** 2
+    influence = solution.influence @ (back @ solution.inverse).T
+    shares = influence**2
     variance_of_shares = np.diag(score_covariance(shares, correlation))
     behind = np.divide(
         shares.sum(axis=0) ** 2,
@@ -281,6 +323,10 @@ def _with_errors(
     )
     values = back @ solution.values
     covariance = back @ (solution.inverse @ middle @ solution.inverse.T) @ back.T
+    memory = None
+    if colored:
+        memory = memory_of(residual, x, influence, divided(used, correlation))
+        covariance *= np.outer(memory.inflation, memory.inflation)
     values[unknown] = np.nan
     covariance[unknown] = covariance[:, unknown] = np.nan
     covariance[unknown, unknown] = np.inf
@@ -297,6 +343,7 @@ def _with_errors(
         samples=samples,
         effective_samples=effective,
         degrees_of_freedom=behind * (1.0 - k / effective),
+        memory=memory,
     )
     for array in (
         values, covariance, residual, result.errors, result.determined, result.degrees_of_freedom,

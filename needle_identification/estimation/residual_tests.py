@@ -6,9 +6,10 @@ from dataclasses import dataclass
 from typing import Final
 import warnings
 
-from needle_dynamics.arrays import BoolArray, FloatArray, IntArray
+from needle_dynamics.arrays import FloatArray, IntArray
+from needle_identification.estimation.memory import Memory, Parts
 import numpy as np
-from scipy.special import betaincc, chdtrc, fdtrc, stdtr
+from scipy.special import chdtrc, fdtrc, stdtr
 
 #: Fewest parts of the residual that are tested.
 _FEWEST_PARTS: Final = 10
@@ -16,8 +17,8 @@ _FEWEST_PARTS: Final = 10
 #: Fewest parts for the test of d'Agostino and Pearson; below, that of Shapiro and Wilk.
 _FEWEST_FOR_MOMENTS: Final = 20
 
-#: p-value below which a test fails.
-_SIGNIFICANCE: Final = 0.01
+#: p-value below which a test fails: one recording in a hundred fails any of the four by chance.
+_SIGNIFICANCE: Final = 0.0025
 
 #: What each test says if it fails, and if it does not.
 _WORDS: Final = {
@@ -37,10 +38,6 @@ _WORDS: Final = {
         'the noise depends on the speed: consider estimator weighted',
         'the noise is the same at all speeds',
     ),
-    'memory': (
-        'the residuals are correlated for longer than the standard errors assume',
-        'the residuals are not correlated for longer than the standard errors assume',
-    ),
 }
 
 
@@ -52,7 +49,7 @@ class ResidualTest:
     Attributes
     ----------
     name, words : str
-        ``normality``, ``trend``, ``speed``, ``spread`` or ``memory``, and the result in words.
+        ``normality``, ``trend``, ``speed`` or ``spread``, and the result in words.
     statistic, p_value : float
         Statistic and p-value of the test; a small p-value is evidence against the model.
 
@@ -72,25 +69,25 @@ class ResidualTest:
 def residual_tests(
     residual: FloatArray,
     *,
-    used: BoolArray,
     time: FloatArray,
     speed: FloatArray,
-    length: int,
+    parts: Parts,
+    memory: Memory,
     parameters: int,
 ) -> tuple[ResidualTest, ...]:
     """
-    Test the means of the residual over parts as long as its correlation.
+    Test the means of the residual over parts, less what the memory of the noise explains.
 
-    The means are nearly independent, although the samples are not.
+    They are nearly independent, although the samples are not.
 
     Parameters
     ----------
     residual, time, speed : ndarray, shape (n,)
         Response minus model, time [s], and the speed that it may depend on.
-    used : ndarray of bool, shape (n,)
-        Samples that were fitted; a part holds no other sample.
-    length : int
-        Length of a part [samples].
+    parts : Parts
+        Parts of the samples that were fitted, as long as a filter correlates them.
+    memory : Memory
+        Memory of the noise that the errors allow for.
     parameters : int
         Number of fitted parameters.
 
@@ -100,18 +97,16 @@ def residual_tests(
         The tests for which there are enough parts.
 
     """
-    parts, follows = _parts(used, length)
-    if len(parts) < _FEWEST_PARTS:
+    if len(parts.limits) < _FEWEST_PARTS:
         return ()
-    means, speeds, times = (values[parts].mean(axis=1) for values in (residual, speed, time))
-    groups = np.array_split(np.argsort(speeds), min(10, len(parts) // 5))
+    means = memory.whitened(parts.means(residual), parts)
+    speeds, times = parts.means(speed), parts.means(time)
+    groups = np.array_split(np.argsort(speeds), min(10, len(means) // 5))
     with np.errstate(invalid='ignore', divide='ignore'):
         found = {'normality': _normality(means), 'trend': _trend(times, means)}
         if len(groups) > parameters:
             found['speed'] = _lack_of_fit(means, groups, parameters)
             found['spread'] = _equal_spread([means[group] for group in groups])
-        if np.count_nonzero(follows) >= _FEWEST_PARTS:
-            found['memory'] = _correlation(means[:-1][follows[1:]], means[follows])
     # Residuals that are all equal give nan.
     return tuple(
         ResidualTest(name=name, statistic=statistic, p_value=p_value, words=_words(name, p_value))
@@ -123,20 +118,6 @@ def residual_tests(
 def _words(name: str, p_value: float) -> str:
     failed, passed = _WORDS[name]
     return f'{failed if p_value < _SIGNIFICANCE else passed} (p = {p_value:.2g})'
-
-
-def _parts(used: BoolArray, length: int) -> tuple[IntArray, BoolArray]:
-    """Return the indices of the parts, shape (m, length), and which follow their predecessor."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], used.astype(np.int8), [0]])))
-    starts = [
-        start + length * k
-        for start, end in edges.reshape(-1, 2)
-        for k in range((end - start) // length)
-    ]
-    first = np.array(starts, dtype=np.int_)
-    follows = np.zeros(len(first), dtype=np.bool_)
-    follows[1:] = np.diff(first) == length
-    return first[:, np.newaxis] + np.arange(length), follows
 
 
 def _normality(values: FloatArray) -> tuple[float, float]:
@@ -219,15 +200,3 @@ def _equal_spread(groups: list[FloatArray]) -> tuple[float, float]:
     within = free[0] * sum(((group - group.mean()) ** 2).sum() for group in off)
     found = float(between / within)
     return found, float(fdtrc(*free, found))
-
-
-def _correlation(first: FloatArray, second: FloatArray) -> tuple[float, float]:
-    """Test for a linear relation (correlation of Pearson)."""
-    scaled = []
-    for values in (first, second):
-        off = values - values.mean()
-        largest = np.abs(off).max()
-        scaled.append(off / (largest * np.linalg.norm(off / largest, axis=-1)))
-    r = float(np.clip(scaled[0] @ scaled[1], -1.0, 1.0))
-    half = len(first) / 2 - 1
-    return r, float(2.0 * betaincc(half, half, (abs(r) + 1.0) / 2.0))

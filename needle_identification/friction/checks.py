@@ -16,6 +16,12 @@ import numpy as np
 #: Lag beyond that of usual sensor filters [s].
 _UNUSUAL_LAG: Final = 0.01
 
+#: Growth of the errors by the memory of the noise that is worth a word.
+_MUCH_LARGER: Final = 1.5
+
+#: Noise that is correlated for more than this part of the recording has no time of its own.
+_WANDERS: Final = 0.25
+
 _FRICTION: Final = ('coulomb_friction', 'viscous_friction')
 
 
@@ -94,7 +100,11 @@ def fit_warnings(
             f'{0.5 * rate:.4g} Hz'
         )
     yield from _of_lag(lag, coarse, design.signals.period)
-    yield from _of_noise(design, fit)
+    bias = noise_bias(design, fit)
+    if bias:
+        remedy = ': choose estimator total' if settings.allows_total else ', which nothing corrects'
+        yield noise_words(design, bias) + remedy
+    yield from _of_memory(design, fit)
     known = {parameter.name: parameter for parameter in parameters if parameter.determined}
     if {'moving_mass', 'viscous_friction'} <= set(known):
         mass = 1e-3 * known['viscous_friction'].value
@@ -116,23 +126,71 @@ def _of_lag(lag: ParameterEstimate, coarse: float, period: float) -> Iterator[st
             yield f'the force is {size} ahead of the motion: clocks, or a mass (term inertia)'
 
 
-def _of_noise(design: Design, fit: Regression) -> Iterator[str]:
-    """Warn if noise of the speed reduces mu_v by more than half its standard error."""
+def noise_bias(design: Design, fit: Regression) -> float:
+    """
+    Return how much noise of the speed reduces mu_v, if that counts.
+
+    Parameters
+    ----------
+    design : Design
+        The regression.
+    fit : Regression
+        Its solution.
+
+    Returns
+    -------
+    float
+        Bias [N s/m]; 0 if it is less than half the standard error, or is corrected.
+
+    """
     settings, noise = design.signals.settings, design.signals.speed_noise
     columns = columns_of(settings.terms)
     names = [column.name for column in columns]
     if settings.estimator == 'total' or 'viscous_friction' not in names:
-        return
+        return 0.0
     k = names.index('viscous_friction')
     if not fit.determined[k]:
-        return
+        return 0.0
     x = design.regressors(settings.terms)[design.used, : len(columns)]
     bias = float(fit.values[k] * fit.samples * noise**2 * np.linalg.pinv(x.T @ x)[k, k])
-    if abs(bias) > 0.5 * fit.errors[k]:
-        yield (
-            f'noise of {noise:.2g} m/s in the speed reduces mu_v by {bias:.2g} N s/m: '
-            'choose estimator total'
-        )
+    return bias if abs(bias) > 0.5 * fit.errors[k] else 0.0
+
+
+def noise_words(design: Design, bias: float) -> str:
+    """
+    Say what noise of the speed does.
+
+    Parameters
+    ----------
+    design : Design
+        The regression.
+    bias : float
+        How much it reduces mu_v [N s/m].
+
+    Returns
+    -------
+    str
+        Words.
+
+    """
+    return f'noise of {design.signals.speed_noise:.2g} m/s in the speed reduces mu_v by {bias:.2g} N s/m'
+
+
+def _of_memory(design: Design, fit: Regression) -> Iterator[str]:
+    """Warn if the memory of the noise makes the errors much larger."""
+    if fit.memory is None or not fit.memory.length or fit.is_exact:
+        return
+    growth = float(fit.memory.inflation[fit.determined].max(initial=1.0))
+    if growth < _MUCH_LARGER:
+        return
+    time = fit.memory.length * design.signals.period
+    lasts = design.signals.time[-1] - design.signals.time[0]
+    how = (
+        f'is correlated over about {time:.2g} s'
+        if time < _WANDERS * lasts
+        else 'wanders for as long as the recording'
+    )
+    yield f'the noise of the force {how}: the errors are {growth:.2g} times those of white noise'
 
 
 def missing_term(chosen: Sequence[str], comparisons: Sequence[Comparison]) -> str:

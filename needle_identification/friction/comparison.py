@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import log, nan
 from typing import Final
 
@@ -18,6 +18,9 @@ import numpy as np
 #: Probability of a false alarm of all comparisons of one recording.
 _SIGNIFICANCE: Final = 0.02
 
+
+#: Parts of the strokes that are held out in turn.
+_FOLDS: Final = 5
 
 #: Terms whose coefficient cannot be negative.
 _POSITIVE: Final = ('inertia', 'stribeck')
@@ -41,7 +44,8 @@ class Comparison:
         p-value of the Wald test that the terms which differ are zero, with errors that respect
         autocorrelation. It is corrected for the number of terms tried (Holm).
     supported : bool
-        Whether the data support the other set.
+        Whether the data support the other set; a further term must also predict samples better
+        that were held out.
     words : str
         The result in words.
 
@@ -85,12 +89,18 @@ def compare_terms(design: Design, fit: Regression) -> tuple[Comparison, ...]:
         _added((*chosen, term), other, which, _bic_difference(other, fit, samples), p_value)
         for (term, other, which), p_value in zip(tried, p_values, strict=True)
     ]
+    found = [
+        replace(one, supported=False, words=f'{one.words}, but it does not predict better')
+        if one.supported and not _predicts_better(design, one.terms)
+        else one
+        for one in found
+    ]
     for term in chosen:
         rest = tuple(other for other in chosen if other != term)
         if rest and not ('direction' in chosen and term in ('coulomb', 'viscous')):
             names = [column.name for column in columns_of(chosen)]
             which = [names.index(column.name) for column in columns_of([term])]
-            less = design.solve(rest, 'ordinary')
+            less = design.solve(rest, 'ordinary', colored=False)
             found.append(_removed(rest, term, fit, which, _bic_difference(less, fit, samples)))
     return tuple(found)
 
@@ -113,8 +123,34 @@ def _tried(design: Design) -> list[tuple[str, Regression, list[int]]]:
         which = list(range(start, start + len(columns_of([term]))))
         # Too few samples for one more parameter are no fault of the chosen terms.
         with suppress(IdentificationError):
-            found.append((term, design.solve((*chosen, term), settings.estimator), which))
+            other = design.solve((*chosen, term), settings.estimator, colored=False)
+            if other.determined[which].all() and other.wald(which)[1] < _SIGNIFICANCE:
+                # Noise with a memory looks like many a term.
+                other = design.solve((*chosen, term), settings.estimator)
+            found.append((term, other, which))
     return found
+
+
+def _predicts_better(design: Design, terms: tuple[str, ...]) -> bool:
+    """
+    Tell whether the last term lowers the error of predictions of samples that were held out.
+
+    The samples are held out in turn by strokes and rests that follow each other, so that what a
+    term learns of noise with a memory does not help it.
+    """
+    used = design.used
+    x, y = design.regressors(terms)[used], design.signals.force[used]
+    without = np.ones(x.shape[1], dtype=np.bool_)
+    start = len(columns_of(terms[:-1]))
+    without[start : start + len(columns_of(terms[-1:]))] = False
+    fold = np.unique(design.stroke[used], return_inverse=True)[1] % _FOLDS
+    misfits = np.zeros(2)
+    for held in range(int(fold.max()) + 1):
+        out = fold == held
+        for k, chosen in enumerate((without, slice(None))):
+            solution = np.linalg.lstsq(x[~out][:, chosen], y[~out], rcond=None)[0]
+            misfits[k] += float(np.sum((y[out] - x[out][:, chosen] @ solution) ** 2))
+    return bool(misfits[1] < misfits[0])
 
 
 def _holm(p_values: Sequence[float]) -> list[float]:
@@ -132,6 +168,8 @@ def _independent_samples(design: Design, fit: Regression) -> float:
     left = fit.residual[:, np.newaxis]
     covariance = score_covariance(left, design.signals.correlation)[0, 0]
     number = fit.samples * float((left**2).sum() / covariance)
+    if fit.memory is not None:
+        number /= float(np.mean(fit.memory.inflation**2))
     return min(max(number, len(fit.values) + 1.0), float(fit.samples))
 
 

@@ -141,7 +141,7 @@ class Design:
         column = np.where(used, (late - early) @ solution / (2.0 * step), 0.0)
         return replace(self, lag_column=column[:, np.newaxis])
 
-    def solve(self, terms: Sequence[str], estimator: str) -> Regression:
+    def solve(self, terms: Sequence[str], estimator: str, *, colored: bool = True) -> Regression:
         """
         Fit terms to the force.
 
@@ -151,6 +151,8 @@ class Design:
             Terms, of `TERMS`.
         estimator : str
             One of `ESTIMATORS`.
+        colored : bool
+            Whether the errors shall allow for noise with a memory.
 
         Returns
         -------
@@ -181,6 +183,7 @@ class Design:
             groups=self.stroke,
             regressor_noise=np.array(noise),
             used=self.used,
+            colored=colored,
         )
 
     def check(self) -> None:
@@ -209,7 +212,9 @@ class Design:
             )
 
 
-def select_samples(signals: FilteredSignals, lag: float, settling_lag: float) -> Design:
+def select_samples(
+    signals: FilteredSignals, lag: float, settling_lag: float, distance: float = 0.0
+) -> Design:
     """
     Select samples in steady regimes, farther from changes than the filters reach.
 
@@ -221,6 +226,8 @@ def select_samples(signals: FilteredSignals, lag: float, settling_lag: float) ->
         Lag of the force [s].
     settling_lag : float
         Lag of the filters of the sensor [s], for which more samples are left out.
+    distance : float
+        Time from each change within which all samples are left out [s].
 
     Returns
     -------
@@ -237,7 +244,7 @@ def select_samples(signals: FilteredSignals, lag: float, settling_lag: float) ->
     # The sensor settles while the filter does, whose outer third weighs little.
     settling = min(_SETTLING * settling_lag, _LONGEST_SETTLING)
     settling -= HALF_LENGTH / settings.cutoff / 1.5
-    more = max(0, ceil(settling / signals.period))
+    more = max(0, ceil(max(settling, distance) / signals.period))
     margin = signals.margin + more
     used = (regime != 0.0) & (time - lag >= time[0])
     used &= time - lag <= time[-1]

@@ -21,14 +21,23 @@ The steps, each in a file of its own:
 
 from __future__ import annotations
 
+from contextlib import suppress
+from dataclasses import replace
 from math import nan, sqrt
-from typing import Final
+from typing import Final, NamedTuple
 
 from needle_identification.errors import IdentificationError
+from needle_identification.estimation.memory import divided
 from needle_identification.estimation.regression import Regression
 from needle_identification.estimation.residual_tests import residual_tests
 from needle_identification.friction.breakaway import breakaway_force
-from needle_identification.friction.checks import check_friction, fit_warnings, missing_term
+from needle_identification.friction.checks import (
+    check_friction,
+    fit_warnings,
+    missing_term,
+    noise_bias,
+    noise_words,
+)
 from needle_identification.friction.comparison import compare_terms
 from needle_identification.friction.design import Design, select_samples
 from needle_identification.friction.estimate import Fit, FrictionEstimate
@@ -39,12 +48,18 @@ from needle_identification.friction.filtering import (
 )
 from needle_identification.friction.intervals import parameter_estimates
 from needle_identification.friction.lag import find_lag, lag_estimate
-from needle_identification.friction.settings import FrictionSettings
+from needle_identification.friction.settings import AUTO, FrictionSettings
+from needle_identification.friction.terms import columns_of
 from needle_identification.recordings.recording import Recording
 import numpy as np
 
-#: Part of the variance of the force below which the residual is rounding.
-_EXACT: Final = 1e-9
+#: Positions tell the speed better if it has less than this part of the noise.
+_CLEANER: Final = 0.5
+
+#: Time from a change within which the force may not follow the terms yet [s], and the p-value
+#: below which the samples within it are left out because they say something else.
+_TRANSITION: Final = 0.1
+_TRANSITIONS_DIFFER: Final = 0.001
 
 
 def identify_friction(
@@ -96,32 +111,28 @@ def identify_friction(
 
 
 def _identify(recording: Recording, settings: FrictionSettings) -> FrictionEstimate:
-    signals = filter_signals(recording, settings)
+    choice = _chosen(recording, settings)
+    signals, design, fit = choice.signals, choice.design, choice.fit
+    settings = signals.settings
     has_inertia = 'inertia' in settings.terms
-    coarse, fine = find_lag(signals)
-    design, fit = _fitted(signals, coarse, fine)
-    if design.estimates_lag and not fit.errors[-1] < HALF_LENGTH / settings.cutoff:
-        # Beyond the length of the filter the force is not linear in the lag.
-        design, fit = _fitted(signals, coarse, None)
     used = design.used
     mean_speed = float(np.mean(np.abs(design.speed[used])))
     parameters = parameter_estimates(fit, settings, mean_speed, signals.period)
     check_friction(parameters)
-    lag = lag_estimate(fine, design, fit)
-    is_exact = 1.0 - fit.determination < _EXACT
+    lag = lag_estimate(choice.fine, design, fit)
     tests = (
         ()
-        if is_exact
+        if fit.is_exact or fit.memory is None
         else residual_tests(
             fit.residual,
-            used=used,
             time=signals.time,
             speed=design.speed,
-            length=signals.correlation,
+            parts=divided(used, signals.correlation),
+            memory=fit.memory,
             parameters=len(fit.values),
         )
     )
-    comparison = () if is_exact else compare_terms(design, fit)
+    comparison = () if fit.is_exact else compare_terms(design, fit)
     missing = missing_term(settings.terms, comparison)
     doubts = [missing] if missing else [test.words for test in tests if test.failed]
     return FrictionEstimate(
@@ -131,7 +142,7 @@ def _identify(recording: Recording, settings: FrictionSettings) -> FrictionEstim
         parameters=parameters,
         breakaway=breakaway_force(design, parameters),
         # The resolution of positions and a mass make errors of the lag that its interval lacks.
-        lag=None if recording.speed is None or has_inertia else lag,
+        lag=None if choice.from_positions or has_inertia else lag,
         samples=fit.samples,
         residual=sqrt(float(fit.residual @ fit.residual) / fit.samples),
         determination=fit.determination,
@@ -139,7 +150,8 @@ def _identify(recording: Recording, settings: FrictionSettings) -> FrictionEstim
         tests=tests,
         comparison=comparison,
         warnings=(
-            *fit_warnings(design, fit, parameters, lag, 0.0 if has_inertia else coarse),
+            *choice.remarks,
+            *fit_warnings(design, fit, parameters, lag, choice.coarse),
             *doubts,
         ),
         fit=Fit(
@@ -152,17 +164,93 @@ def _identify(recording: Recording, settings: FrictionSettings) -> FrictionEstim
     )
 
 
+class _Choice(NamedTuple):
+    """What was chosen by the data, and the lag of the force [s] as `find_lag` gives it."""
+
+    signals: FilteredSignals
+    design: Design
+    fit: Regression
+    coarse: float
+    fine: float | None
+    from_positions: bool
+    remarks: tuple[str, ...] = ()
+
+
+def _chosen(recording: Recording, settings: FrictionSettings) -> _Choice:
+    """Choose the source of the speed, the estimator and the samples; say what is unusual."""
+    simple = replace(settings, estimator='ordinary') if settings.estimator == AUTO else settings
+    choice = _first_choice(filter_signals(recording, simple), recording.speed is None)
+    bias = noise_bias(choice.design, choice.fit)
+    if settings.estimator != AUTO or not bias:
+        return _without_transitions(choice)
+    remark = noise_words(choice.design, bias)
+    if recording.speed is not None:
+        signals = filter_signals(replace(recording, speed=None), simple)
+        if _is_cleaner(signals, choice.signals):
+            choice = _first_choice(signals, from_positions=True)._replace(
+                remarks=(f'{remark}: took the speed from the positions',)
+            )
+            if not noise_bias(choice.design, choice.fit):
+                return _without_transitions(choice)
+    if settings.allows_total:
+        total = replace(choice.signals, settings=replace(settings, estimator='total'))
+        with suppress(IdentificationError):
+            choice = _first_choice(total, choice.from_positions)._replace(
+                remarks=(f'{remark}: took estimator total',)
+            )
+    return _without_transitions(choice)
+
+
+def _is_cleaner(positions: FilteredSignals, speeds: FilteredSignals) -> bool:
+    """Whether positions tell the speed better; those that are integrated speeds do not."""
+    apart = float(np.std(positions.motion(speeds.time) - speeds.motion(speeds.time)))
+    noise = speeds.speed_noise
+    return positions.speed_noise < _CLEANER * noise and apart > _CLEANER * noise
+
+
+def _first_choice(signals: FilteredSignals, from_positions: bool) -> _Choice:
+    """Fit with the lag that the motion determines, if it does."""
+    coarse, fine = find_lag(signals)
+    if 'inertia' in signals.settings.terms:
+        # What looked like a lag was the mass.
+        coarse, fine = 0.0, None
+    design, fit = _fitted(signals, coarse, fine)
+    if design.estimates_lag and not fit.errors[-1] < HALF_LENGTH / signals.settings.cutoff:
+        # Beyond the length of the filter the force is not linear in the lag.
+        fine = None
+        design, fit = _fitted(signals, coarse, fine)
+    return _Choice(signals, design, fit, coarse, fine, from_positions)
+
+
+def _without_transitions(choice: _Choice) -> _Choice:
+    """Leave out more around each change, if the force does not follow the terms there."""
+    count = len(columns_of(choice.signals.settings.terms))
+    if choice.fit.is_exact:
+        return choice
+    try:
+        design, fit = _fitted(choice.signals, choice.coarse, choice.fine, _TRANSITION)
+    except IdentificationError:
+        # Little is left without them.
+        return choice
+    if fit.differs(choice.fit, count) >= _TRANSITIONS_DIFFER:
+        return choice
+    remark = (
+        f'within {_TRANSITION:g} s of starts, stops and reversals the force does not follow the '
+        'terms (presliding, play, stick-slip, or a force that settles): left out'
+    )
+    return choice._replace(design=design, fit=fit, remarks=(*choice.remarks, remark))
+
+
 def _fitted(
-    signals: FilteredSignals, coarse: float, fine: float | None
+    signals: FilteredSignals, coarse: float, fine: float | None, distance: float = 0.0
 ) -> tuple[Design, Regression]:
     """Fit with a further lag as one more unknown, or at the coarse lag if there is no fine one."""
     settings = signals.settings
     lag = coarse if fine is None else fine
     # A coarse lag is wrong by up to half a step.
     error = 0.5 * signals.half_filter * signals.period if fine is None else 0.0
-    is_corrected = 'inertia' not in settings.terms
-    design = select_samples(signals, lag if is_corrected else 0.0, abs(lag) + error)
+    design = select_samples(signals, lag, abs(lag) + error, distance)
     design.check()
-    if is_corrected and fine is not None:
+    if fine is not None:
         design = design.with_lag_column()
     return design, design.solve(settings.terms, settings.estimator)

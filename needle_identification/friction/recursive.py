@@ -19,7 +19,7 @@ from needle_identification.estimation.estimate import ParameterEstimate
 from needle_identification.estimation.regression import determinable, Regression
 from needle_identification.friction.filtering import CORRELATION_LENGTH, filter_taps, GAP
 from needle_identification.friction.intervals import parameter_estimates
-from needle_identification.friction.settings import FrictionSettings
+from needle_identification.friction.settings import AUTO, FrictionSettings
 from needle_identification.friction.terms import columns_of, regressors
 from needle_ros.errors import ParameterError
 import numpy as np
@@ -73,7 +73,7 @@ class RecursiveFriction:
         for name, value in (('rate', rate), ('forgetting', forgetting)):
             if not 0.0 < value < inf:
                 raise ParameterError(f'{name} must be finite and > 0, got {value!r}')
-        if settings.estimator != 'ordinary':
+        if settings.estimator not in (AUTO, 'ordinary'):
             raise ParameterError(
                 f'recursive estimation needs the estimator ordinary, got {settings.estimator!r}'
             )

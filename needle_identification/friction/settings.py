@@ -12,6 +12,9 @@ from needle_ros.settings import check_constants, constant
 #: Terms of the friction force, by name; their equations are in `terms`.
 TERMS: Final = ('coulomb', 'viscous', 'offset', 'drift', 'inertia', 'direction', 'stribeck')
 
+#: Name of the choice of an estimator by the data.
+AUTO: Final = 'auto'
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FrictionSettings:
@@ -23,8 +26,9 @@ class FrictionSettings:
     terms : tuple of str
         Terms of the friction force, of `TERMS`; the default is equation (15).
     estimator : str
-        One of `ESTIMATORS`. ``weighted`` measures the noise in each stroke, ``total`` takes the
-        noise of the speed into account.
+        ``auto`` or one of `ESTIMATORS`. ``weighted`` measures the noise in each stroke, ``total``
+        takes the noise of the speed into account; ``auto`` is ``total`` where that noise counts,
+        otherwise ``ordinary``.
 
     Raises
     ------
@@ -49,8 +53,13 @@ class FrictionSettings:
         default=('coulomb', 'viscous'), metadata={'description': f'of {", ".join(TERMS)}'}
     )
     estimator: str = field(
-        default='ordinary', metadata={'description': f'one of {", ".join(ESTIMATORS)}'}
+        default=AUTO, metadata={'description': f'one of {AUTO}, {", ".join(ESTIMATORS)}'}
     )
+
+    @property
+    def allows_total(self) -> bool:
+        """Whether the noise of the speed is that of one column, as the estimator total needs."""
+        return 'viscous' in self.terms and 'direction' not in self.terms
 
     def __post_init__(self) -> None:
         check_constants(self)
@@ -62,10 +71,8 @@ class FrictionSettings:
                 raise ParameterError(f'terms must be of {", ".join(TERMS)}, got {term!r}')
         if 'direction' in self.terms and not {'coulomb', 'viscous'} <= set(self.terms):
             raise ParameterError('the term direction needs the terms coulomb and viscous')
-        check_estimator(self.estimator)
-        if self.estimator == 'total' and (
-            'direction' in self.terms or 'viscous' not in self.terms
-        ):
+        check_estimator(self.estimator, AUTO)
+        if self.estimator == 'total' and not self.allows_total:
             raise ParameterError(
                 'the estimator total needs the term viscous and does not work with direction: '
                 'the noise of the speed is that of one column'

@@ -139,12 +139,15 @@ def _add_common(
         help='go by the stamps of the messages or by when they were received (default header)',
     )
     fitting = parser.add_argument_group('how to identify')
+    # What may be chosen by the data is, unless asked otherwise.
+    default = getattr(defaults, 'estimator')
+    estimators = tuple(dict.fromkeys([default, *ESTIMATORS]))
     fitting.add_argument(
         '--estimator',
-        choices=ESTIMATORS,
-        default='ordinary',
+        choices=estimators,
+        default=estimators[0],
         help='least squares: ordinary, weighted by the noise measured, huber against outliers, '
-        'total for noise in the motion too (default ordinary)',
+        f'total for noise in the motion too (default {estimators[0]})',
     )
     for item in fields(defaults):  # type: ignore[arg-type]
         if 'unit' in item.metadata:

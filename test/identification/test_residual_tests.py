@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from needle_dynamics import FloatArray
 from needle_identification.estimation import residual_tests as ours
+from needle_identification.estimation.memory import divided, Memory
 from needle_identification.estimation.residual_tests import residual_tests, ResidualTest
 import numpy as np
 from numpy.testing import assert_allclose
@@ -12,16 +13,18 @@ from scipy import stats
 
 COUNT, LENGTH = 200, 25
 
+WHITE = Memory(inflation=np.ones(2), length=0.0, ratio=0.0)
+
 
 def results_of(means: FloatArray, speeds: FloatArray) -> dict[str, ResidualTest]:
     """Test a residual that is constant over each part."""
     residual, speed = (np.repeat(values, LENGTH) for values in (means, speeds))
     found = residual_tests(
         residual,
-        used=np.ones(len(residual), dtype=np.bool_),
         time=np.arange(len(residual), dtype=np.float64),
         speed=speed,
-        length=LENGTH,
+        parts=divided(np.ones(len(residual), dtype=np.bool_), LENGTH),
+        memory=WHITE,
         parameters=2,
     )
     return {test.name: test for test in found}
@@ -39,7 +42,6 @@ def test_statistics_and_p_values_are_those_of_scipy(seed: int, power: int) -> No
         'normality': stats.normaltest(means),
         'trend': stats.spearmanr(np.arange(COUNT), means),
         'spread': stats.levene(*groups, center='median'),
-        'memory': stats.pearsonr(means[:-1], means[1:]),
     }
     for name, (statistic, p_value) in expected.items():
         # 1e-9: rounding of sums of 200 values, and of the means over parts.
@@ -60,7 +62,7 @@ def test_few_parts_are_tested_for_normality_by_shapiro_and_wilk() -> None:
     )
 
 
-@pytest.mark.parametrize('name', ['normality', 'trend', 'speed', 'spread', 'memory'])
+@pytest.mark.parametrize('name', ['normality', 'trend', 'speed', 'spread'])
 def test_each_test_fails_for_its_own_fault(name: str) -> None:
     rng = np.random.default_rng(1)
     noise, speeds = rng.normal(size=(2, COUNT))
@@ -69,7 +71,6 @@ def test_each_test_fails_for_its_own_fault(name: str) -> None:
         'trend': noise + np.linspace(-1.0, 1.0, COUNT),
         'speed': noise + speeds**2,
         'spread': noise * np.exp(speeds),
-        'memory': noise + np.roll(noise, 1),
     }
     assert not any(test.failed for test in results_of(noise, speeds).values())
     assert results_of(faulty[name], speeds)[name].failed

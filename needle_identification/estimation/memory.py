@@ -1,0 +1,287 @@
+r"""
+How long noise remembers, and what that does to the errors of a regression.
+
+The samples of a recording are put together to parts, as long as a filter correlates white noise.
+Their mean residuals are modeled as white noise and exponentially correlated noise,
+
+.. math:: \operatorname{cov}(r_i, r_j) = \sigma^2 \left( w_i \delta_{ij}
+   + g \, e^{-|t_i - t_j| / \tau} \right)
+
+with :math:`w_i` one over the relative length of part i. White noise alone is one of the models;
+the others are a grid of :math:`g` and :math:`\tau`, up to times longer than the recording, where
+the model is a random walk. Each has its restricted likelihood [Patterson1971]_, which knows that
+the fit has taken a part of slow noise away. The error of a parameter is such that its 95 %
+interval is that of all models, each weighted by its probability. So errors widen with what the
+data show, and also with what they cannot exclude.
+
+References
+----------
+.. [Patterson1971] H. D. Patterson, R. Thompson, "Recovery of inter-block information when block
+   sizes are unequal", Biometrika 58(3), 1971, doi:10.1093/biomet/58.3.545.
+
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import exp, sqrt
+from typing import Final
+
+from needle_dynamics.arrays import BoolArray, FloatArray, IntArray
+import numpy as np
+from scipy.linalg.lapack import dpttrf, dpttrs
+from scipy.special import ndtr, ndtri
+
+#: Variances of correlated over that of white noise in a part.
+_RATIOS: Final = np.geomspace(0.02, 2e6, 10)
+
+#: Number of times of correlation, from half a part to so many times the recording.
+_TIMES: Final = 12
+_LONGEST: Final = 10.0
+
+#: Probability of white noise before anything is seen.
+_WHITE: Final = 0.5
+
+#: Half the width of a 95 % interval [standard deviations].
+_NORMAL: Final = float(ndtri(0.975))
+
+#: Models of less probability do not count.
+_NEGLIGIBLE: Final = 1e-6
+
+#: Halvings that find an interval to less than a thousandth of the widest.
+_BISECTIONS: Final = 30
+
+#: Relative size of what counts as rounding.
+_ROUNDING: Final = 1e-9
+
+#: Parts of a long recording are longer, so that there are not more.
+_MOST_PARTS: Final = 2000
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Parts:
+    """
+    Parts of about equal length, without a gap.
+
+    Attributes
+    ----------
+    limits : ndarray of int, shape (m, 2)
+        First sample of each part, and one past its last.
+    length : float
+        Length that they should have [samples].
+
+    """
+
+    limits: IntArray
+    length: float
+
+    @property
+    def sizes(self) -> FloatArray:
+        """Number of samples of each part, shape (m,)."""
+        return np.diff(self.limits, axis=1)[:, 0].astype(np.float64)
+
+    @property
+    def centers(self) -> FloatArray:
+        """Middle of each part [samples], shape (m,)."""
+        return np.asarray(self.limits.mean(axis=1))
+
+    def sums(self, values: FloatArray) -> FloatArray:
+        """
+        Return the sum over each part.
+
+        Parameters
+        ----------
+        values : ndarray, shape (n, ...)
+            A value for each sample.
+
+        Returns
+        -------
+        ndarray, shape (m, ...)
+            Sums.
+
+        """
+        # The limit behind the last sample needs one more.
+        padded = np.concatenate([values, np.zeros_like(values[:1])])
+        return np.asarray(np.add.reduceat(padded, self.limits.ravel(), axis=0)[::2])
+
+    def means(self, values: FloatArray) -> FloatArray:
+        """
+        Return the mean over each part.
+
+        Parameters
+        ----------
+        values : ndarray, shape (n, ...)
+            A value for each sample.
+
+        Returns
+        -------
+        ndarray, shape (m, ...)
+            Means.
+
+        """
+        return np.asarray((self.sums(values).T / self.sizes).T)
+
+
+def divided(used: BoolArray, length: int) -> Parts:
+    """
+    Divide the used samples into parts.
+
+    Parameters
+    ----------
+    used : ndarray of bool, shape (n,)
+        Samples that are used.
+    length : int
+        Length over which a filter correlates white noise [samples].
+
+    Returns
+    -------
+    Parts
+        Parts of about that length; of at least half of it where the used samples allow.
+
+    """
+    long = max(float(length), np.count_nonzero(used) / _MOST_PARTS)
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], used.astype(np.int8), [0]])))
+    limits = []
+    for start, end in edges.reshape(-1, 2).tolist():
+        count = max(1, round((end - start) / long))
+        cuts = [start + (end - start) * k // count for k in range(count + 1)]
+        limits += zip(cuts[:-1], cuts[1:], strict=True)
+    return Parts(np.array(limits, dtype=np.int_).reshape(-1, 2), long)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Memory:
+    """
+    The memory of noise, and what it does to the errors.
+
+    Attributes
+    ----------
+    inflation : ndarray, shape (k,)
+        Error of each parameter over that with white noise.
+    length : float
+        Time of correlation of the most probable model [samples]; 0 for white noise.
+    ratio : float
+        Variance of correlated over that of white noise in that model.
+
+    """
+
+    inflation: FloatArray
+    length: float
+    ratio: float
+
+    def whitened(self, means: FloatArray, parts: Parts) -> FloatArray:
+        """
+        Return what each mean says that those before it did not (Kalman filter).
+
+        Parameters
+        ----------
+        means : ndarray, shape (m,)
+            Means of the noise over parts.
+        parts : Parts
+            The parts.
+
+        Returns
+        -------
+        ndarray, shape (m,)
+            Uncorrelated values with one variance, if the noise is as the model says.
+
+        """
+        white = parts.length / parts.sizes
+        if not self.length:
+            return np.asarray(means / np.sqrt(white))
+        found = np.empty(len(means))
+        expected, variance, last = 0.0, self.ratio, -np.inf
+        for k, (mean, own, at) in enumerate(
+            zip(means.tolist(), white.tolist(), parts.centers.tolist(), strict=True)
+        ):
+            kept = exp((last - at) / self.length)
+            expected *= kept
+            variance = self.ratio + kept**2 * (variance - self.ratio)
+            whole = variance + own
+            found[k] = (mean - expected) / sqrt(whole)
+            expected += variance / whole * (mean - expected)
+            variance *= own / whole
+            last = at
+        return found
+
+
+def memory_of(
+    residual: FloatArray, regressors: FloatArray, influence: FloatArray, parts: Parts
+) -> Memory:
+    """
+    Find the memory of noise from what a fit leaves.
+
+    Parameters
+    ----------
+    residual : ndarray, shape (n,)
+        Response minus model.
+    regressors, influence : ndarray, shape (n, k)
+        Regressors, and the change of each parameter with the response of each sample; zero where
+        not used.
+    parts : Parts
+        Parts of the used samples.
+
+    Returns
+    -------
+    Memory
+        White noise, if there are too few parts to tell.
+
+    """
+    r, a = parts.means(residual), parts.sums(influence)
+    x, strengths, _ = np.linalg.svd(parts.means(regressors), full_matrices=False)
+    x = x[:, strengths > _ROUNDING * strengths[0]]
+    m, k = x.shape
+    free = m - k
+    if free < 1 or not r.any():
+        return Memory(inflation=np.ones(a.shape[1]), length=0.0, ratio=0.0)
+    white = parts.length / parts.sizes
+    gaps = np.diff(parts.centers)
+    both = np.column_stack([x, r])
+    weighed = both / white[:, np.newaxis]
+    plain = (a**2 * white[:, np.newaxis]).sum(axis=0)
+    # Of each model: time and ratio; log|V|; (x, r)' V^-1 (x, r); the diagonal of a' V a.
+    models, sizes = [(0.0, 0.0)], [float(np.log(white).sum())]
+    products, spreads = [both.T @ weighed], [plain]
+    for length in np.geomspace(0.5 * parts.length, _LONGEST * max(gaps.sum(), 1.0), _TIMES):
+        # Correlated noise is a chain: its precision is tridiagonal.
+        kept, new = np.exp(-gaps / length), -np.expm1(-2.0 * gaps / length)
+        diagonal = np.ones(m)
+        diagonal[:-1] += kept**2 / new
+        diagonal[1:] += kept**2 / new
+        beside = -kept / new
+        log_chain = sizes[0] + float(np.log(new).sum())
+        d, e, _ = dpttrf(diagonal, beside)
+        correlated = (a * dpttrs(d, e, a)[0]).sum(axis=0)
+        for ratio in _RATIOS.tolist():
+            d, e, _ = dpttrf(diagonal / ratio + 1.0 / white, beside / ratio)
+            models.append((float(length), ratio))
+            sizes.append(log_chain + m * np.log(ratio) + float(np.log(d).sum()))
+            products.append(products[0] - weighed.T @ dpttrs(d, e, weighed)[0])
+            spreads.append(plain + ratio * correlated)
+    table = np.array(products)
+    # The determinant of a block times what it leaves of r is that of the whole.
+    within = np.linalg.slogdet(table[:, :k, :k])[1]
+    left = np.exp(np.linalg.slogdet(table)[1] - within)
+    logs = -0.5 * (np.array(sizes) + free * np.log(left) + within)
+    logs[1:] += np.log((1.0 - _WHITE) / _WHITE / (len(logs) - 1))
+    weights = np.exp(logs - logs.max())
+    weights /= weights.sum()
+    deviations = np.sqrt((left / free)[:, np.newaxis] * np.array(spreads))
+    length, ratio = models[int(np.argmax(weights))]
+    return Memory(
+        inflation=_half_width(weights, deviations) / _NORMAL / deviations[0],
+        length=length,
+        ratio=ratio,
+    )
+
+
+def _half_width(weights: FloatArray, deviations: FloatArray) -> FloatArray:
+    """Return half the width of the 95 % intervals of mixtures of normal distributions."""
+    counts = weights > _NEGLIGIBLE
+    weights, deviations = weights[counts], deviations[counts]
+    low, high = (_NORMAL * limit(deviations, axis=0) for limit in (np.min, np.max))
+    for _ in range(_BISECTIONS):
+        middle = 0.5 * (low + high)
+        outside = weights @ (2.0 * ndtr(-middle / deviations)) > 0.05 * weights.sum()
+        low, high = np.where(outside, middle, low), np.where(outside, high, middle)
+    return np.asarray(high)
