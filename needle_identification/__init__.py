@@ -16,7 +16,6 @@ from needle_ros.lazy import lazy_names
 if TYPE_CHECKING:
     from needle_identification.bags.bag import (
         Bag,
-        check_distinct,
         message_counts,
         read_topic,
         Recorded,
@@ -84,7 +83,6 @@ __all__ = [
     'StiffnessSummary',
     'Topic',
     'asymmetry',
-    'check_distinct',
     'deserialize',
     'encode',
     'identify_friction',

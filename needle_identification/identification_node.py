@@ -10,7 +10,6 @@ from typing import Any, ClassVar, Final
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from needle_identification.application import ANSWER_TIME, Application
-from needle_identification.bags.bag import check_distinct
 from needle_identification.estimation.estimate import Statistic, statistic
 from needle_identification.friction.identify import identify_friction
 from needle_identification.friction.live import LiveFriction
@@ -198,7 +197,6 @@ class IdentificationNode(BaseNode):
 
     def _identify(self) -> None:
         """Identify from the recordings, all or none, publish and write the result."""
-        check_distinct(self._bags)
         reading: dict[str, Any] = {
             'wrench_topic': self.text('wrench_topic') or None,
             'motion_topic': self.text('motion_topic') or None,
@@ -211,7 +209,11 @@ class IdentificationNode(BaseNode):
             friction = summarize(
                 self._estimates(
                     partial(read_friction_recording, **reading),
-                    partial(identify_friction, settings=self._friction_settings),
+                    partial(
+                        identify_friction,
+                        settings=self._friction_settings,
+                        among=len(self._bags),
+                    ),
                 )
             )
             if output:
@@ -238,8 +240,12 @@ class IdentificationNode(BaseNode):
     def _estimates(self, read: Callable[[str], Any], identify: Callable[[Any], Any]) -> list[Any]:
         """Identify each recording and log what to know of it."""
         estimates = []
+        seen: dict[bytes, str] = {}
         for bag in self._bags:
             recording = read(bag)
+            if (same := seen.setdefault(recording.digest, bag)) is not bag:
+                self.get_logger().warning(f'{bag}: the same samples as {same}: counts once')
+                continue
             estimate = identify(recording)
             for words in (*recording.losses, *estimate.warnings):
                 self.get_logger().warning(f'{bag}: {words}')

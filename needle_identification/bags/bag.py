@@ -239,29 +239,6 @@ def _empty(bag: Bag) -> RecordingError:
     return RecordingError('; '.join([f'{bag.path} holds no messages', *bag.losses]))
 
 
-def check_distinct(paths: Sequence[Path | str]) -> None:
-    """
-    Reject a recording that is given twice: it would make the errors too small.
-
-    Parameters
-    ----------
-    paths : sequence of Path or str
-        Recordings.
-
-    Raises
-    ------
-    RecordingError
-        If one is given twice.
-
-    """
-    seen: set[Path] = set()
-    for path in paths:
-        resolved = Path(path).resolve()
-        if resolved in seen:
-            raise RecordingError(f'{path} is given twice; each recording counts once')
-        seen.add(resolved)
-
-
 def read_topic(path: Path | str, topic: str) -> list[tuple[int, Any]]:
     """
     Read one topic of a bag.

@@ -93,6 +93,11 @@ def fit_warnings(
             f'no sample is slow enough for the term stribeck: {slowest:.2g} m/s and more, with '
             f'stribeck_speed {settings.stribeck_speed:g} m/s; its coefficient is a guess'
         )
+    if design.signals.cut_off:
+        yield (
+            f'{100.0 * design.signals.cut_off:.2g} % of the force is at the limits of its sensor, which cut '
+            'it off: left out'
+        )
     cutoff, rate = settings.cutoff, 1.0 / design.signals.period
     if cutoff > 0.5 * rate:
         yield (
@@ -102,7 +107,9 @@ def fit_warnings(
     yield from _of_lag(lag, coarse, design.signals.period)
     bias = noise_bias(design, fit)
     if bias:
-        remedy = ': choose estimator total' if settings.allows_total else ', which nothing corrects'
+        remedy = (
+            ': choose estimator total' if settings.allows_total else ', which nothing corrects'
+        )
         yield noise_words(design, bias) + remedy
     yield from _of_memory(design, fit)
     known = {parameter.name: parameter for parameter in parameters if parameter.determined}

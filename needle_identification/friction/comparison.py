@@ -15,8 +15,8 @@ from needle_identification.friction.settings import TERMS
 from needle_identification.friction.terms import columns_of
 import numpy as np
 
-#: Probability of a false alarm of all comparisons of one recording.
-_SIGNIFICANCE: Final = 0.02
+#: Probability of a false alarm of all comparisons.
+SIGNIFICANCE: Final = 0.02
 
 
 #: Parts of the strokes that are held out in turn.
@@ -59,7 +59,7 @@ class Comparison:
     words: str
 
 
-def compare_terms(design: Design, fit: Regression) -> tuple[Comparison, ...]:
+def compare_terms(design: Design, fit: Regression, among: int = 1) -> tuple[Comparison, ...]:
     """
     Try each term that was not chosen, and leave out each chosen one.
 
@@ -69,6 +69,8 @@ def compare_terms(design: Design, fit: Regression) -> tuple[Comparison, ...]:
         Samples to use, and the chosen terms.
     fit : Regression
         The fit of the chosen terms.
+    among : int
+        Number of recordings over which the probability of a false alarm is kept.
 
     Returns
     -------
@@ -78,6 +80,7 @@ def compare_terms(design: Design, fit: Regression) -> tuple[Comparison, ...]:
     """
     chosen = design.signals.settings.terms
     samples = _independent_samples(design, fit)
+    level = SIGNIFICANCE / among
     tried = _tried(design)
     p_values = _holm(
         [
@@ -86,7 +89,7 @@ def compare_terms(design: Design, fit: Regression) -> tuple[Comparison, ...]:
         ]
     )
     found = [
-        _added((*chosen, term), other, which, _bic_difference(other, fit, samples), p_value)
+        _added((*chosen, term), other, which, _bic_difference(other, fit, samples), p_value, level)
         for (term, other, which), p_value in zip(tried, p_values, strict=True)
     ]
     found = [
@@ -124,7 +127,7 @@ def _tried(design: Design) -> list[tuple[str, Regression, list[int]]]:
         # Too few samples for one more parameter are no fault of the chosen terms.
         with suppress(IdentificationError):
             other = design.solve((*chosen, term), settings.estimator, colored=False)
-            if other.determined[which].all() and other.wald(which)[1] < _SIGNIFICANCE:
+            if other.determined[which].all() and other.wald(which)[1] < SIGNIFICANCE:
                 # Noise with a memory looks like many a term.
                 other = design.solve((*chosen, term), settings.estimator)
             found.append((term, other, which))
@@ -180,7 +183,12 @@ def _bic_difference(other: Regression, chosen: Regression, samples: float) -> fl
 
 
 def _added(
-    terms: tuple[str, ...], other: Regression, which: list[int], difference: float, p_value: float
+    terms: tuple[str, ...],
+    other: Regression,
+    which: list[int],
+    difference: float,
+    p_value: float,
+    level: float,
 ) -> Comparison:
     term = terms[-1]
     if not other.determined[which].all():
@@ -188,7 +196,7 @@ def _added(
         return Comparison(terms=terms, words=words)
     # Neither a mass nor what breaks away is less than nothing.
     impossible = term in _POSITIVE and other.values[which[0]] < 0.0
-    supported = p_value < _SIGNIFICANCE and difference < 0.0 and not impossible
+    supported = p_value < level and difference < 0.0 and not impossible
     verdict = 'support' if supported else 'do not support'
     sizes = ' and '.join(
         f'{column.name} = {other.values[k]:.3g} ± {other.errors[k]:.2g} {column.unit}'
@@ -207,7 +215,7 @@ def _removed(
         words = f'the data do not distinguish the term {term} from the others: leave one out'
         return Comparison(terms=terms, words=words)
     p_value = fit.wald(which)[1]
-    supported = p_value >= _SIGNIFICANCE and difference < 0.0
+    supported = p_value >= SIGNIFICANCE and difference < 0.0
     words = f'the data {"do not need" if supported else "need"} {term} (p = {p_value:.2g})'
     return Comparison(
         terms=terms, difference=difference, p_value=p_value, supported=supported, words=words

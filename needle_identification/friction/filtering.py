@@ -40,6 +40,9 @@ _CLEARLY: Final = 5.0
 #: Samples per period of the cutoff that are kept after the filter.
 _KEPT: Final = 8.0
 
+#: How much longer a force is held at a limit of its sensor than anywhere else.
+_LONGER: Final = 3
+
 #: Largest number of points of the even time base per sample; beyond, it would be mostly gaps.
 _LARGEST_GRID: Final = 10.0
 
@@ -60,12 +63,14 @@ class FilteredSignals:
     motion : BSpline
         Filtered speed [m/s] as a function of time [s].
     lost : ndarray of bool, shape (n,)
-        Samples within a gap of the recording.
+        Samples within a gap of the recording, or where the force is cut off.
     half_filter, margin : int
         Half the length of the filter, and distance from a change of the filtered speed at which
         the filtered force may still be affected by it [samples].
     speed_noise, acceleration_noise : float
         Standard deviations of the noise of filtered speed [m/s] and acceleration [m/s^2].
+    cut_off : float
+        Share of the samples of the force at the limits of its sensor; they count as lost.
 
     """
 
@@ -79,6 +84,7 @@ class FilteredSignals:
     margin: int
     speed_noise: float
     acceleration_noise: float
+    cut_off: float
 
     @property
     def correlation(self) -> int:
@@ -125,6 +131,8 @@ def filter_signals(recording: Recording, settings: FrictionSettings) -> Filtered
         )
     grid = time[0] + period * np.arange(int(duration / period + 1e-6) + 1)
     lost = steps[np.clip(np.searchsorted(time, grid), 1, len(steps)) - 1] > GAP * period
+    cut = cut_off(recording.force)
+    lost |= np.interp(grid, time, cut.astype(np.float64)) > 0.0
     # A filter longer than the recording may not even fit into memory.
     half = ceil(min(HALF_LENGTH / settings.cutoff / period, len(grid)))
     if len(grid) <= 4 * half:
@@ -155,7 +163,40 @@ def filter_signals(recording: Recording, settings: FrictionSettings) -> Filtered
         margin=max(1, ceil(2 * (half - 1) / step)),
         speed_noise=noise * float(np.linalg.norm(response(around))),
         acceleration_noise=noise * float(np.linalg.norm(response(around, 1))),
+        cut_off=float(cut.mean()),
     )
+
+
+def cut_off(force: FloatArray) -> BoolArray:
+    """
+    Mark samples at the limits of a sensor, where it says the same whatever the force.
+
+    The largest or smallest value is a limit if it is held for much longer than any other value.
+
+    Parameters
+    ----------
+    force : ndarray, shape (n,)
+        Measured force [N].
+
+    Returns
+    -------
+    ndarray of bool, shape (n,)
+        Samples that are cut off.
+
+    """
+    limits = force.max(), force.min()
+    found = np.zeros(force.shape, dtype=np.bool_)
+    if limits[0] == limits[1]:
+        return found
+    starts = np.flatnonzero(np.diff(force, prepend=np.nan) != 0.0)
+    lengths = np.diff(starts, append=len(force))
+    values = force[starts]
+    inner = lengths[(values != limits[0]) & (values != limits[1])]
+    longest = _LONGER * int(inner.max(initial=1))
+    for limit in limits:
+        if int(lengths[values == limit].max()) > longest:
+            found |= force == limit
+    return found
 
 
 def filter_taps(cutoff: float, period: float) -> FloatArray:

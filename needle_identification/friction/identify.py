@@ -63,7 +63,7 @@ _TRANSITIONS_DIFFER: Final = 0.001
 
 
 def identify_friction(
-    recording: Recording, settings: FrictionSettings | None = None
+    recording: Recording, settings: FrictionSettings | None = None, among: int = 1
 ) -> FrictionEstimate:
     """
     Estimate friction from one recording.
@@ -75,6 +75,9 @@ def identify_friction(
         speeds the inserted length is differentiated, by the same zero-phase filter.
     settings : FrictionSettings, optional
         Terms, filter and estimator.
+    among : int
+        Number of recordings that are identified together: all of them have one chance in fifty
+        that any is advised a term that it does not need.
 
     Returns
     -------
@@ -105,12 +108,12 @@ def identify_friction(
     """
     settings = settings or FrictionSettings()
     try:
-        return _identify(recording, settings)
+        return _identify(recording, settings, among)
     except IdentificationError as error:
         raise IdentificationError(f'{recording.name}: {error}') from None
 
 
-def _identify(recording: Recording, settings: FrictionSettings) -> FrictionEstimate:
+def _identify(recording: Recording, settings: FrictionSettings, among: int) -> FrictionEstimate:
     choice = _chosen(recording, settings)
     signals, design, fit = choice.signals, choice.design, choice.fit
     settings = signals.settings
@@ -132,7 +135,7 @@ def _identify(recording: Recording, settings: FrictionSettings) -> FrictionEstim
             parameters=len(fit.values),
         )
     )
-    comparison = () if fit.is_exact else compare_terms(design, fit)
+    comparison = () if fit.is_exact else compare_terms(design, fit, among)
     missing = missing_term(settings.terms, comparison)
     doubts = [missing] if missing else [test.words for test in tests if test.failed]
     return FrictionEstimate(

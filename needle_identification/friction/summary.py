@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from math import log
+from sys import float_info
 
 from needle_identification.errors import IdentificationError
 from needle_identification.estimation.estimate import (
@@ -12,7 +14,9 @@ from needle_identification.estimation.estimate import (
     Statistic,
     statistic,
 )
+from needle_identification.friction.comparison import Comparison, SIGNIFICANCE
 from needle_identification.friction.estimate import FrictionEstimate
+from scipy.special import chdtrc
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -26,11 +30,14 @@ class FrictionSummary(Named[Statistic]):
         One per parameter; ``summary[name]`` gives one.
     estimates : tuple of FrictionEstimate
         One per recording.
+    warnings : tuple of str
+        What all recordings together say and none of them alone, in words.
 
     """
 
     statistics: tuple[Statistic, ...]
     estimates: tuple[FrictionEstimate, ...]
+    warnings: tuple[str, ...]
 
     def _named(self) -> tuple[Statistic, ...]:
         return self.statistics
@@ -67,4 +74,29 @@ def summarize(estimates: Sequence[FrictionEstimate]) -> FrictionSummary:
     return FrictionSummary(
         statistics=tuple(statistic(parameters) for parameters in found.values()),
         estimates=tuple(estimates),
+        warnings=tuple(_together(estimates)),
     )
+
+
+def _together(estimates: Sequence[FrictionEstimate]) -> Iterator[str]:
+    """Name terms that all recordings support together, by Fisher's test, though none alone."""
+    tried: dict[str, list[Comparison]] = {}
+    for estimate in estimates:
+        for one in estimate.comparison:
+            if len(one.terms) > len(estimate.terms):
+                tried.setdefault(one.terms[-1], []).append(one)
+    if any(one.supported for ones in tried.values() for one in ones):
+        return
+    found = {
+        term: float(
+            chdtrc(2.0 * len(ones), -2.0 * sum(log(max(o.p_value, float_info.min)) for o in ones))
+        )
+        for term, ones in tried.items()
+        if len(ones) > 1
+    }
+    term = min(found, key=lambda term: found[term], default='')
+    if term and found[term] * len(found) < SIGNIFICANCE:
+        yield (
+            f'together the {len(tried[term])} recordings support {term} '
+            f'(p = {found[term] * len(found):.2g}): add the term {term}'
+        )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from hashlib import sha256
 from typing import Any
 
 from needle_dynamics.arrays import FloatArray
@@ -18,6 +19,7 @@ class _AnyRecording:
 
     name: str = 'recording'
     time: FloatArray
+    force: FloatArray
     losses: tuple[str, ...] = ()
     configuration: str = ''
     clock_offset: float = 0.0
@@ -35,6 +37,11 @@ class _AnyRecording:
             if isinstance(section, dict) and isinstance(section.get('ros__parameters'), dict):
                 return dict(section['ros__parameters'])
         return None
+
+    @property
+    def digest(self) -> bytes:
+        """SHA-256 of times and forces: the same for a copy, whatever its file."""
+        return sha256(self.time.tobytes() + self.force.tobytes()).digest()
 
     def __repr__(self) -> str:
         duration = self.time[-1] - self.time[0] if len(self.time) else 0.0

@@ -48,12 +48,15 @@ class StiffnessSummary:
         k_a [N/m^2] at the chosen level.
     estimates : tuple of StiffnessEstimate
         One per place.
+    warnings : tuple of str
+        What all places together say, in words.
 
     """
 
     levels: tuple[LevelSummary, ...]
     tissue_stiffness: Statistic
     estimates: tuple[StiffnessEstimate, ...]
+    warnings: tuple[str, ...] = ()
 
 
 def summarize_stiffness(

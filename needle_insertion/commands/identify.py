@@ -13,6 +13,7 @@ from typing import Any
 from needle_identification import (
     ESTIMATORS,
     FrictionSettings,
+    IdentificationError,
     identify_friction,
     identify_stiffness,
     read_friction_recording,
@@ -25,7 +26,7 @@ from needle_identification import (
 )
 from needle_identification.recordings import TIMES
 from needle_insertion.commands.common import check_file, check_folder, Command, make_folder
-from needle_insertion.report.identify_text import identified_document, identified_text
+from needle_insertion.report.identify_text import identified_document, identified_text, warned
 from needle_insertion.report.origin import identify_all, Origin
 from needle_ros.errors import NeedleError, ParameterError, shown
 
@@ -119,6 +120,11 @@ def _add_common(
     writing.add_argument(
         '--report', type=Path, metavar='DIR', help='folder for a page of HTML with its pictures'
     )
+    writing.add_argument(
+        '--all-warnings',
+        action='store_true',
+        help='print the warnings of each recording, not one of each kind',
+    )
     writing.add_argument('--json', action='store_true', help='print JSON instead of tables')
     reading = parser.add_argument_group('what to read')
     reading.add_argument(
@@ -183,7 +189,7 @@ def _run_friction(options: argparse.Namespace) -> int:
         settings,
         axes,
         read_friction_recording,
-        lambda recording: identify_friction(recording, settings),
+        lambda recording: identify_friction(recording, settings, len(options.bags)),
         summarize,
         write_result,
         ('stiffness', lambda bag: identify_stiffness(read_indentation_recording(bag))),
@@ -237,18 +243,24 @@ def _identify(
         return 2
     summary = summarize(estimates)
     written = []
+    complaint = ''
     if options.output is not None:
-        write(options.output, summary)
-        written.append(options.output)
+        try:
+            write(options.output, summary)
+            written.append(options.output)
+        except IdentificationError as error:
+            complaint = f'{options.output} is not written: {error}'
     if options.report is not None:
         # Draws: not wanted for tables.
         from needle_insertion.report.identify_page import write_identified_page
 
         make_folder(options.report)
         written.append(write_identified_page(options.report, summary, origin))
-    for estimate, source in zip(summary.estimates, origin.sources, strict=True):
-        for words in (*source.losses, *estimate.warnings):
-            sys.stderr.write(shown(f'warning: {source.name}: {words}') + '\n')
+    short, full = warned(summary, origin)
+    for words in full if options.all_warnings else short:
+        sys.stderr.write(shown(f'warning: {words}') + '\n')
+    if len(full) > len(short) and not options.all_warnings:
+        sys.stderr.write(f'{len(full)} warnings in {len(short)} groups: --all-warnings\n')
     if options.json:
         result = {**identified_document(summary, origin), 'files': [str(path) for path in written]}
         sys.stdout.write(f'{json.dumps(result, indent=2, allow_nan=False)}\n')
@@ -256,7 +268,9 @@ def _identify(
         sys.stdout.write(f'{identified_text(summary)}\n')
         for path in written:
             sys.stdout.write(f'wrote {path}\n')
-    return 2 if origin.failures else 0
+    if complaint:
+        sys.stderr.write(shown(f'error: {complaint}') + '\n')
+    return 2 if origin.failures or complaint else 0
 
 
 def _report_failures(origin: Origin, other: str, identify: Callable[[Path], Any]) -> None:

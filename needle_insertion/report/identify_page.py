@@ -6,7 +6,6 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from math import isfinite
 from pathlib import Path
-import re
 from typing import Any, Final
 
 from needle_identification import (
@@ -30,6 +29,8 @@ from needle_insertion.report.identify_text import (
     MEAN_HEADS,
     mean_row,
     parameter_cells,
+    short_names,
+    warned,
     with_deviation,
 )
 from needle_insertion.report.origin import Origin
@@ -41,7 +42,6 @@ _LIVE: Final = ('model.coulomb_friction', 'model.viscous_friction')
 
 _ENTRY_HEADS: Final = tuple(f'{entry} [N/m]' for entry in TABLE_2)
 _QUALITY_HEADS: Final = ('residual [mN]', 'R²', 'condition')
-_NUMBERS: Final = re.compile(r'[-+]?\d[\d.e+-]*')
 
 
 def write_identified_page(
@@ -71,7 +71,8 @@ def write_identified_page(
 
     """
     estimates = summary.estimates
-    label = _short_names([estimate.name for estimate in estimates])
+    label = short_names([estimate.name for estimate in estimates])
+    short, full = warned(summary, origin)
     if isinstance(summary, FrictionSummary):
         name, content = 'friction.html', _friction_content(summary, label)
     else:
@@ -80,7 +81,7 @@ def write_identified_page(
         folder / name,
         name,
         origin=origin,
-        warnings=_warnings(estimates, label),
+        warnings=(short, full if len(full) > len(short) else []),
         name=label[content['shown'].name],
         **content,
     )
@@ -305,30 +306,9 @@ def _counted(number: int, what: str) -> str:
     return f'{number} {what}' if number == 1 else f'{number} {what}s'
 
 
-def _short_names(names: Sequence[str]) -> dict[str, str]:
-    """Return names of recordings without their folders, unless two would be the same."""
-    short = [Path(name).name or name for name in names]
-    return dict(zip(names, short if len(set(short)) == len(names) else names, strict=True))
-
-
 def _typical(values: Iterable[float]) -> int:
     """Return the index of the value nearest to the median; 0 if all are nan."""
     found = np.array(list(values))
     if not np.isfinite(found).any():
         return 0
     return int(np.nanargmin(np.abs(found - np.nanmedian(found))))
-
-
-def _warnings(estimates: Sequence[Any], label: Mapping[str, str]) -> tuple[list[str], list[str]]:
-    """Return one of each group of warnings that differ in numbers only, and all if more."""
-    groups: dict[str, list[tuple[str, str]]] = {}
-    for estimate in estimates:
-        for words in estimate.warnings:
-            kind = _NUMBERS.sub('', words.partition(' (')[0])
-            groups.setdefault(kind, []).append((label[estimate.name], words))
-    short = [
-        f'{found[0][0]}: {found[0][1]}' + (f'; {len(found) - 1} more like it' if found[1:] else '')
-        for found in groups.values()
-    ]
-    full = [f'{name}: {words}' for found in groups.values() for name, words in found]
-    return short, full if len(full) > len(short) else []

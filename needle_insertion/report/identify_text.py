@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import fields, is_dataclass, replace
 from math import isfinite
+from pathlib import Path
+import re
 from typing import Any, Final
 
 from needle_identification import (
@@ -21,6 +23,8 @@ from needle_identification.estimation.formatting import between, measured, sprea
 from needle_insertion.report.origin import Origin
 from needle_insertion.report.text import table
 import numpy as np
+
+_NUMBERS: Final = re.compile(r'[-+]?\d[\d.e+-]*')
 
 #: Heads of the rows of `mean_row`.
 MEAN_HEADS: Final = ('parameter', 'mean ± SE', '95 % interval', 'STD over bags', 'bags')
@@ -211,6 +215,61 @@ def _stiffness_text(summary: StiffnessSummary) -> str:
         f'{result.symbol} = {measured(result.mean, result.error, result.unit)}, '
         f'95 % interval {between(result.interval)}'
     )
+
+
+def warned(
+    summary: FrictionSummary | StiffnessSummary, origin: Origin
+) -> tuple[list[str], list[str]]:
+    """
+    Return what to know before using the numbers.
+
+    Parameters
+    ----------
+    summary : FrictionSummary or StiffnessSummary
+        All recordings.
+    origin : Origin
+        What it was identified from.
+
+    Returns
+    -------
+    short, full : list of str
+        One of each group of warnings that differ in numbers only, and how many more there are;
+        and all of them.
+
+    """
+    names = short_names([one.name for one in summary.estimates])
+    found = [('', words) for words in summary.warnings]
+    found += origin.lost
+    found += [(one.name, words) for one in summary.estimates for words in one.warnings]
+    groups: dict[str, list[str]] = {}
+    for name, words in found:
+        kind = _NUMBERS.sub('', words.partition(' (')[0])
+        line = f'{names.get(name, name)}: {words}' if name else words
+        groups.setdefault(kind, []).append(line)
+    short = [
+        same[0] + (f'; {len(same) - 1} more like it' if same[1:] else '')
+        for same in groups.values()
+    ]
+    return short, [line for same in groups.values() for line in same]
+
+
+def short_names(names: Sequence[str]) -> dict[str, str]:
+    """
+    Return names of recordings without their folders, unless two would be the same.
+
+    Parameters
+    ----------
+    names : sequence of str
+        Names.
+
+    Returns
+    -------
+    dict
+        Short names by name.
+
+    """
+    short = [Path(name).name or name for name in names]
+    return dict(zip(names, short if len(set(short)) == len(names) else names, strict=True))
 
 
 def identified_document(summary: object, origin: Origin) -> dict[str, Any]:

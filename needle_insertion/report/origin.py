@@ -8,7 +8,6 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any, Final
 
-from needle_identification import check_distinct
 from needle_ros.errors import NeedleError
 from tqdm import tqdm
 
@@ -60,6 +59,8 @@ class Origin:
         The recordings.
     failures : sequence of (str, str)
         Recordings that could not be used, and why.
+    copies : sequence of (str, str)
+        Recordings with the samples of another, and that other; they count once.
 
     """
 
@@ -68,6 +69,7 @@ class Origin:
     result: Path | None
     sources: Sequence[Source] = ()
     failures: Sequence[tuple[str, str]] = ()
+    copies: Sequence[tuple[str, str]] = ()
 
     @property
     def failed(self) -> list[str]:
@@ -79,12 +81,23 @@ class Origin:
     @property
     def losses(self) -> list[str]:
         """What was lost or corrected in reading, in words."""
-        lost = [f'{one.name}: {words}' for one in self.sources for words in one.losses]
-        return lost + [
-            f'{one.name}: the clock of the force was {1e3 * one.clock_offset:+.2f} ms off the '
-            'clock of the motion; corrected'
-            for one in self.sources
-            if one.clock_offset
+        return [f'{name}: {words}' for name, words in self.lost]
+
+    @property
+    def lost(self) -> list[tuple[str, str]]:
+        """Recordings, and what was lost or corrected in reading each, in words."""
+        return [
+            *((name, f'the same samples as {other}: counts once') for name, other in self.copies),
+            *((one.name, words) for one in self.sources for words in one.losses),
+            *(
+                (
+                    one.name,
+                    f'the clock of the force was {1e3 * one.clock_offset:+.2f} ms off the clock '
+                    'of the motion; corrected',
+                )
+                for one in self.sources
+                if one.clock_offset
+            ),
         ]
 
     @property
@@ -128,7 +141,7 @@ def identify_all(
     digest: bool,
 ) -> tuple[list[Any], Origin]:
     """
-    Identify recordings one by one; those that cannot be used are left out.
+    Identify recordings one by one; those that cannot be used, and copies, are left out.
 
     Parameters
     ----------
@@ -148,17 +161,15 @@ def identify_all(
     (list, Origin)
         Estimates, and the origin with sources and failures.
 
-    Raises
-    ------
-    RecordingError
-        If a recording is given twice.
-
     """
-    check_distinct(bags)
-    estimates, sources, failures = [], [], []
+    estimates, sources, failures, copies = [], [], [], []
+    seen: dict[bytes, str] = {}
     for bag in tqdm(bags, desc='bags', disable=None, leave=False):
         try:
             recording = read(bag)
+            if (same := seen.setdefault(recording.digest, recording.name)) is not recording.name:
+                copies.append((recording.name, same))
+                continue
             estimates.append(identify(recording))
         except (NeedleError, OSError) as error:
             failures.append((str(bag), str(error)))
@@ -172,7 +183,9 @@ def identify_all(
                 files=_digests(bag) if digest else (),
             )
         )
-    return estimates, replace(origin, sources=tuple(sources), failures=tuple(failures))
+    return estimates, replace(
+        origin, sources=tuple(sources), failures=tuple(failures), copies=tuple(copies)
+    )
 
 
 def _digests(bag: Path) -> tuple[tuple[str, str], ...]:
