@@ -34,6 +34,12 @@ if TYPE_CHECKING:
     from needle_identification.friction.recursive import RecursiveFriction
     from needle_identification.friction.settings import FrictionSettings, TERMS
     from needle_identification.friction.summary import FrictionSummary, summarize
+    from needle_identification.recordings.inspection import (
+        Column,
+        Content,
+        inspect_recording,
+        Inspection,
+    )
     from needle_identification.recordings.reading import (
         read_friction_recording,
         read_indentation_recording,
@@ -59,13 +65,16 @@ __all__ = [
     'TERMS',
     'Bag',
     'BagWriter',
+    'Column',
     'Comparison',
+    'Content',
     'Fit',
     'FrictionEstimate',
     'FrictionSettings',
     'FrictionSummary',
     'IdentificationError',
     'IndentationRecording',
+    'Inspection',
     'LevelEstimate',
     'LevelSummary',
     'OfferedQos',
@@ -87,6 +96,7 @@ __all__ = [
     'encode',
     'identify_friction',
     'identify_stiffness',
+    'inspect_recording',
     'message_counts',
     'message_type',
     'read_friction_recording',

@@ -20,8 +20,16 @@ from needle_identification.errors import RecordingError
 #: Messages that wait to be put in order of time [bytes].
 _WINDOW: Final = 2**22
 
+
+def _ros1_batches(file: Path, tally: Tally) -> Iterator[Batch]:
+    # A large import that few recordings need.
+    from needle_identification.bags.ros1_file import ros1_batches
+
+    return ros1_batches(file, tally)
+
+
 #: Readers of the forms of storage.
-_BATCHES: Final = {'.mcap': mcap_batches, '.db3': sqlite_batches}
+_BATCHES: Final = {'.mcap': mcap_batches, '.db3': sqlite_batches, '.bag': _ros1_batches}
 
 
 class Recorded(NamedTuple):
@@ -51,8 +59,8 @@ class Bag:
     Parameters
     ----------
     path : Path or str
-        A rosbag2 folder, an ``.mcap`` or a ``.db3`` file, compressed or not; its end may be
-        missing.
+        A rosbag2 folder, an ``.mcap`` or a ``.db3`` file, compressed or not, whose end may be
+        missing; or a ``.bag`` file of ROS 1.
 
     Attributes
     ----------

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 from needle_identification.bags.compression import DAMAGED, decompress
 from needle_identification.bags.limits import Budget
@@ -69,6 +69,32 @@ class Batch(NamedTuple):
         data = np.frombuffer(b''.join(messages), dtype=np.uint8)
         return cls(topic, received, data, end - lengths, end)
 
+    @classmethod
+    def of_times(cls, topic: Topic, times: Sequence[Any], messages: Sequence[Any]) -> Batch:
+        """
+        Make a batch of what a file holds, which may be of another kind than it should.
+
+        Parameters
+        ----------
+        topic : Topic
+            The topic.
+        times : sequence of object
+            Receive times [ns]; 0 for what is no whole number.
+        messages : sequence of object
+            The messages; an empty one for what is not bytes.
+
+        Returns
+        -------
+        Batch
+            The batch.
+
+        """
+        stamps = np.array(
+            [min(max(t, -LATEST), LATEST) if isinstance(t, int) else 0 for t in times],
+            dtype=np.int64,
+        )
+        return cls.joined(topic, stamps, [m if isinstance(m, bytes) else b'' for m in messages])
+
     def messages(self) -> Iterator[tuple[int, bytes]]:
         """
         Go through the messages.
@@ -111,6 +137,27 @@ class Batch(NamedTuple):
                 parts[k] = decompress(compression, data, budget.largest_message)
             budget.spend(len(parts[k]))
         return Batch.joined(self.topic, self.received, parts)
+
+
+def grouped(rows: Iterable[tuple[Any, Any, Any]]) -> dict[Any, list[tuple[Any, Any]]]:
+    """
+    Group messages by topic.
+
+    Parameters
+    ----------
+    rows : iterable of (key, time, message)
+        Messages in the order of a file.
+
+    Returns
+    -------
+    dict
+        Times and messages by the key of their topic, in that order.
+
+    """
+    groups: dict[Any, list[tuple[Any, Any]]] = {}
+    for key, received, data in rows:
+        groups.setdefault(key, []).append((received, data))
+    return groups
 
 
 @dataclass(slots=True)

@@ -17,9 +17,9 @@ METADATA: Final = 'metadata.yaml'
 #: Key under which the metadata say what the recorder has lost.
 LOST: Final = 'messages lost'
 
-_FORMS: Final = ('.mcap', '.db3')
+_FORMS: Final = ('.mcap', '.db3', '.bag')
 
-_VALID: Final = 'valid: a rosbag2 folder, an .mcap or a .db3 file'
+_VALID: Final = 'valid: a rosbag2 folder, an .mcap or a .db3 file, or a .bag file of ROS 1'
 
 
 def form_of(file: Path) -> str:
@@ -34,7 +34,7 @@ def form_of(file: Path) -> str:
     Returns
     -------
     str
-        ``.mcap``, ``.db3``, or '' for another.
+        ``.mcap``, ``.db3``, ``.bag`` (of ROS 1), or '' for another.
 
     """
     suffix = _uncompressed(file).suffix
@@ -71,11 +71,6 @@ def files_of(path: Path) -> tuple[list[Path], list[str]]:
     if not path.exists():
         raise RecordingError(f'{path} does not exist; {_VALID}')
     if path.is_file():
-        if path.suffix == '.bag':
-            raise RecordingError(
-                f'{path} is a recording of ROS 1; convert it first: '
-                f'rosbags-convert --src {path} --dst {path.with_suffix("")}'
-            )
         if not form_of(path):
             raise RecordingError(f'{path} is not a recording; {_VALID}')
         return [path], []

@@ -11,12 +11,11 @@ from tempfile import TemporaryDirectory
 from typing import Any, Final
 from urllib.parse import quote
 
-from needle_identification.bags.batch import Batch, LARGEST_BATCH, LATEST, Tally
+from needle_identification.bags.batch import Batch, grouped, LARGEST_BATCH, Tally
 from needle_identification.bags.compression import BLOCK, COMPRESSED, open_file, read_up_to
 from needle_identification.bags.limits import factor
 from needle_identification.bags.topics import make_topic, Topic
 from needle_identification.errors import RecordingError
-import numpy as np
 
 _TABLES: Final = ('messages', 'topics', 'message_definitions')
 
@@ -137,18 +136,10 @@ def _rows(database: sqlite3.Connection, tally: Tally) -> Iterator[Batch]:
             break
         tally.piece += 1
         tally.budget.spend(sum(_ROW + len(data or b'') for _, _, data in some))
-        groups: dict[int, list[tuple[int, bytes]]] = {}
-        for key, received, data in some:
-            groups.setdefault(key, []).append((received, data))
-        for key, group in groups.items():
+        for key, group in grouped(some).items():
             if tally.enter(topics.get(key), len(group)):
                 times, parts = zip(*group, strict=True)
-                stamps = np.array([t if isinstance(t, int) else 0 for t in times])
-                yield Batch.joined(
-                    topics[key],
-                    np.clip(stamps, -LATEST, LATEST),
-                    [part if isinstance(part, bytes) else b'' for part in parts],
-                ).decompressed(tally.budget)
+                yield Batch.of_times(topics[key], times, parts).decompressed(tally.budget)
     if fault is not None:
         raise fault
 

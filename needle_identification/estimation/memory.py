@@ -141,7 +141,7 @@ def divided(used: BoolArray, length: int) -> Parts:
     """
     long = max(float(length), np.count_nonzero(used) / _MOST_PARTS)
     edges = np.flatnonzero(np.diff(np.concatenate([[0], used.astype(np.int8), [0]])))
-    limits = []
+    limits: list[tuple[int, int]] = []
     for start, end in edges.reshape(-1, 2).tolist():
         count = max(1, round((end - start) / long))
         cuts = [start + (end - start) * k // count for k in range(count + 1)]

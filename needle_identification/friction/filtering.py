@@ -43,6 +43,9 @@ _KEPT: Final = 8.0
 #: How much longer a force is held at a limit of its sensor than anywhere else.
 _LONGER: Final = 3
 
+#: Largest share of the samples that is taken for cut off.
+_MOST_CUT_OFF: Final = 0.5
+
 #: Largest number of points of the even time base per sample; beyond, it would be mostly gaps.
 _LARGEST_GRID: Final = 10.0
 
@@ -196,7 +199,8 @@ def cut_off(force: FloatArray) -> BoolArray:
     for limit in limits:
         if int(lengths[values == limit].max()) > longest:
             found |= force == limit
-    return found
+    # A force that hardly ever varies is as constant at its largest.
+    return found if found.mean() < _MOST_CUT_OFF else np.zeros_like(found)
 
 
 def filter_taps(cutoff: float, period: float) -> FloatArray:

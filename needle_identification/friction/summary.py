@@ -37,7 +37,7 @@ class FrictionSummary(Named[Statistic]):
 
     statistics: tuple[Statistic, ...]
     estimates: tuple[FrictionEstimate, ...]
-    warnings: tuple[str, ...]
+    warnings: tuple[str, ...] = ()
 
     def _named(self) -> tuple[Statistic, ...]:
         return self.statistics

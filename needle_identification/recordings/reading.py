@@ -8,8 +8,10 @@ of the force; see `timebase`.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from itertools import islice
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -25,10 +27,15 @@ from needle_identification.recordings.samples import (
     Source,
     source_of,
 )
+from needle_identification.recordings.tables import is_table, read_friction_table, TABLES
 from needle_identification.recordings.timebase import merge
 from needle_ros import wire
 from needle_ros.contract import BASE_WRENCH, END_EFFECTOR_POSE, JOINT_STATES
 from needle_ros.errors import MessageError
+
+
+#: Messages that show the names of joints.
+_FIRST: Final = 50
 
 
 class _Wanted(NamedTuple):
@@ -60,6 +67,7 @@ def read_friction_recording(
     force_axis: str = 'y',
     motion_axis: str | None = None,
     time: str = 'header',
+    columns: Mapping[str, str] | None = None,
 ) -> Recording:
     """
     Read force and motion of the needle base from a bag, on the time base of the force.
@@ -67,7 +75,8 @@ def read_friction_recording(
     Parameters
     ----------
     path : Path or str
-        A rosbag2 folder, an ``.mcap`` or a ``.db3`` file; its end may be missing.
+        A rosbag2 folder, an ``.mcap`` or a ``.db3`` file, whose end may be missing; a ``.bag``
+        file of ROS 1; or a table, see `tables`.
     wrench_topic : str, optional
         Topic of type WrenchStamped; default the only one, or else that with the last name
         base_wrench.
@@ -81,6 +90,8 @@ def read_friction_recording(
         the joint; default insertion, or the only one there is.
     time : str
         Stamps to use, one of `TIMES`.
+    columns : mapping of str to str, optional
+        Columns of a table by role, see `tables`; topics, axes and stamps do not apply to it.
 
     Returns
     -------
@@ -103,12 +114,26 @@ def read_friction_recording(
     ()
 
     """
+    if is_table(path):
+        others = {
+            '--wrench-topic': wrench_topic,
+            '--motion-topic': motion_topic,
+            '--motion-axis': motion_axis,
+            '--force-axis': force_axis if force_axis != 'y' else None,
+            '--time': time if time != 'header' else None,
+        }
+        for option, given in others.items():
+            if given is not None:
+                raise RecordingError(f'{path} is a table: --columns takes the place of {option}')
+        return read_friction_table(Path(path), columns or {})
+    if columns:
+        raise RecordingError(f'{path} is a bag: --columns is for tables ({", ".join(TABLES)})')
     sign, axis = signed_axis(force_axis, 'force axis')
     bag = Bag(path)
     topics = bag.topics()
     wrench = _chosen(bag, topics, _WRENCH, wrench_topic)
     motion = _chosen(bag, topics, _FRICTION_MOTION, motion_topic)
-    source, direction = _motion_source(motion.type_name, motion_axis)
+    source, direction = _motion_source(bag, motion, motion_axis)
     force_source = source_of(wrench.type_name, [axis])
     gathered, configuration = _read(bag, {wrench: force_source, motion: source}, time)
     force = gathered[wrench].samples(bag)
@@ -221,14 +246,27 @@ def signed_axis(text: str, what: str) -> tuple[float, str]:
     return sign, axis
 
 
-def _motion_source(type_name: str, axis: str | None) -> tuple[Source, float]:
+def _motion_source(bag: Bag, topic: Topic, axis: str | None) -> tuple[Source, float]:
     """Return what to take for a motion along an axis or of a joint, and its sign."""
-    if type_name == wire.JOINT_STATE:
+    if topic.type_name == wire.JOINT_STATE:
         backward = axis is not None and axis.startswith('-')
-        joint = axis[1:] if axis and backward else axis
-        return source_of(type_name, 'y', joint), -1.0 if backward else 1.0
+        joint = axis[1:] if axis and backward else axis or _only_joint(bag, topic)
+        return source_of(topic.type_name, 'y', joint), -1.0 if backward else 1.0
     sign, name = signed_axis('y' if axis is None else axis, 'motion axis')
-    return source_of(type_name, [name]), sign
+    return source_of(topic.type_name, [name]), sign
+
+
+def _only_joint(bag: Bag, topic: Topic) -> str | None:
+    """Return the joint that nearly all of the first messages name alone; None if none is."""
+    reader = wire.Reader(wire.JOINT_STATE)
+    names = Counter[tuple[str, ...]]()
+    for message in islice(bag.messages(lambda other: other == topic), _FIRST):
+        with suppress(MessageError):
+            names[reader.read(message.data).names] += 1
+    if not names:
+        return None
+    usual, count = names.most_common(1)[0]
+    return usual[0] if len(usual) == 1 and count > 0.8 * names.total() else None
 
 
 def _chosen(bag: Bag, topics: Sequence[Topic], wanted: _Wanted, name: str | None) -> Topic:

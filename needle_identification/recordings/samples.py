@@ -30,6 +30,9 @@ _MAX_NAMES: Final = 100
 #: A longer step between samples is a gap [sampling periods].
 _GAP: Final = 10.0
 
+#: A smaller part of messages that name other joints is damaged.
+_STRAY: Final = 0.1
+
 #: Latencies that are kept of a batch, and of a topic.
 _LATENCIES: Final = (64, 2**16)
 
@@ -108,18 +111,16 @@ class _Joint(Source):
     def __init__(self, joint: str | None) -> None:
         self._joint = joint
         self._seen: set[str] = set()
-        self._used: set[str] = set()
+        self._is_used = False
         self._has_position = self._has_speed = False
 
     def __call__(self, template: wire.Template) -> list[int] | None:
         if len(self._seen) < _MAX_NAMES:
             self._seen.update(template.names)
         joint = self._joint or INSERTION
-        if self._joint is None and joint not in template.names and len(template.names) == 1:
-            [joint] = template.names
         if joint not in template.names:
             return None
-        self._used.add(joint)
+        self._is_used = True
         index = template.names.index(joint)
         position, speed = (_element(array, index) for array in template.arrays[:2])
         self._has_position |= position >= 0
@@ -131,12 +132,12 @@ class _Joint(Source):
         return _position_and_speed(position if self._has_position else 0.0 * speed, speed)
 
     def _complaint(self) -> str:
-        if len(self._used) != 1:
-            what = 'several joints' if self._used else f'no joint {self._joint or INSERTION!r}'
+        joint = self._joint or INSERTION
+        if not self._is_used:
             names = f'motion_axis must name one of {_listing(self._seen)}'
-            return f'has {what}; {names}' if self._seen else 'has joints without names'
+            return f'has no joint {joint!r}; {names}' if self._seen else 'has joints without names'
         if not (self._has_position or self._has_speed):
-            return f'has neither position nor velocity of {_listing(self._used)}'
+            return f'has neither position nor velocity of {joint}'
         return ''
 
 
@@ -176,6 +177,39 @@ class _PlaneJoints(Source):
 
     def _losses(self) -> list[str]:
         return ['has no joint out of the plane: off-plane motion unknown'] if self._is_flat else []
+
+
+class _EachJoint(Source):
+    """Positions of joints by name; nan where a message lacks one."""
+
+    def __init__(self, *joints: str) -> None:
+        self.columns = self.width = len(joints)
+        self._joints = joints
+
+    def __call__(self, template: wire.Template) -> list[int]:
+        positions, names = template.arrays[0], template.names
+        return [
+            _element(positions, names.index(joint)) if joint in names else -1
+            for joint in self._joints
+        ]
+
+
+def each_joint(joints: Sequence[str]) -> Source:
+    """
+    Take the positions of joints.
+
+    Parameters
+    ----------
+    joints : sequence of str
+        Their names.
+
+    Returns
+    -------
+    Source
+        Its values are the positions.
+
+    """
+    return _EachJoint(*joints)
 
 
 def _listing(names: Set[str]) -> str:
@@ -265,7 +299,7 @@ class Gathering:
         self._by_header = by_header
         self._series = Series(source.width)
         self._latencies: list[NDArray[np.int64]] = []
-        self._unstamped = self._invalid = self._unusable = 0
+        self._unstamped = self._invalid = self._unusable = self._unwanted = self._messages = 0
         self._fault = ''
 
     def add(self, batch: Batch) -> None:
@@ -287,6 +321,8 @@ class Gathering:
             self._source.columns,
         )
         self._invalid += decoded.invalid
+        self._messages += len(batch.begin)
+        self._unwanted += len(batch.begin) - len(decoded.used) - decoded.invalid
         self._fault = self._fault or decoded.fault
         stamps = received = batch.received[decoded.used]
         if self._by_header:
@@ -336,6 +372,9 @@ class Gathering:
         ):
             if count:
                 bag.losses.append(f'{count} of {name} {what}')
+        # More of them are another robot on the same topic.
+        if 0 < self._unwanted < _STRAY * self._messages:
+            bag.losses.append(f'{self._unwanted} of {name} name other joints, left out')
         if series.width > FINEST:
             bag.losses.append(
                 f'{name} is averaged over {1e-9 * series.width:g} s, because it is very long'

@@ -25,6 +25,7 @@ from needle_identification import (
     write_result,
 )
 from needle_identification.recordings import TIMES
+from needle_identification.recordings.tables import column_roles, ROLES
 from needle_insertion.commands.common import check_file, check_folder, Command, make_folder
 from needle_insertion.report.identify_text import identified_document, identified_text, warned
 from needle_insertion.report.origin import identify_all, Origin
@@ -55,6 +56,12 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar='AXIS',
         help='likewise for the motion; of a JointState the name of the joint, or -name '
         '(default y; the joint insertion or the only one)',
+    )
+    reading.add_argument(
+        '--columns',
+        metavar='ROLE=[-]NAME[*FACTOR][UNIT],...',
+        help='columns of a table (CSV, MATLAB) by role, of '
+        f'{", ".join(ROLES)}: time=sec:nanosec,depth=-q[mm],force=Fz (default by usual names)',
     )
     fitting.add_argument(
         '--terms',
@@ -110,7 +117,7 @@ def _add_common(
         type=Path,
         nargs='+',
         metavar='BAG',
-        help='rosbag2 folder, .mcap or .db3 file; one that cannot be used is named, the others '
+        help='rosbag2 folder, .mcap, .db3 or ROS 1 .bag file, or a table (.csv, .mat); one that cannot be used is named, the others '
         'go on, and the exit status is 2',
     )
     writing = parser.add_argument_group('what to write')
@@ -183,7 +190,11 @@ def _settings(kind: Callable[..., Any], options: argparse.Namespace) -> Any:
 
 def _run_friction(options: argparse.Namespace) -> int:
     settings = _settings(FrictionSettings, options)
-    axes = {'force_axis': options.force_axis, 'motion_axis': options.motion_axis}
+    axes = {
+        'force_axis': options.force_axis,
+        'motion_axis': options.motion_axis,
+        'columns': column_roles(options.columns) if options.columns else None,
+    }
     return _identify(
         options,
         settings,

@@ -290,28 +290,42 @@ def identified_document(summary: object, origin: Origin) -> dict[str, Any]:
 
     """
     return {
-        **_plain(summary),
-        'settings': _plain(origin.settings),
-        'reading': _plain(origin.reading),
-        'recordings': _plain(origin.sources),
+        **plain(summary),
+        'settings': plain(origin.settings),
+        'reading': plain(origin.reading),
+        'recordings': plain(origin.sources),
         'failures': [{'name': name, 'reason': reason} for name, reason in origin.failures],
     }
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
+    """
+    Return a result as plain values for JSON.
+
+    Parameters
+    ----------
+    value : object
+        Dataclasses, sequences, mappings and numbers.
+
+    Returns
+    -------
+    object
+        The same without arrays as long as a recording; what is not finite is None.
+
+    """
     if is_dataclass(value):
         named = {item.name: getattr(value, item.name) for item in fields(value)}
         # Arrays as long as the recording are for figures.
         return {
-            name: _plain(one) for name, one in named.items() if not isinstance(one, (Fit, Presses))
+            name: plain(one) for name, one in named.items() if not isinstance(one, (Fit, Presses))
         }
     if isinstance(value, dict):
-        return {str(key): _plain(one) for key, one in value.items()}
+        return {str(key): plain(one) for key, one in value.items()}
     if isinstance(value, (list, tuple)):
         # Parameters and statistics are found by their names.
         if value and all(isinstance(one, (ParameterEstimate, Statistic)) for one in value):
-            return {one.name: _plain(one) for one in value}
-        return [_plain(one) for one in value]
+            return {one.name: plain(one) for one in value}
+        return [plain(one) for one in value]
     if isinstance(value, np.generic):
-        return _plain(value.item())
+        return plain(value.item())
     return None if isinstance(value, float) and not isfinite(value) else value

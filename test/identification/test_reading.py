@@ -283,8 +283,23 @@ def test_joints_may_change_order_and_publisher(tmp_path: Path) -> None:
     read = read_friction_recording(path, motion_axis='insertion')
     assert_array_equal(read.depth, 0.1 + 0.001 * np.arange(11))
     assert read.losses == ()
-    with pytest.raises(RecordingError, match=r'several joints; .* one of grip, insertion, rot'):
-        read_friction_recording(path)
+    # The joint of this name is meant unless another is asked for.
+    assert_array_equal(read_friction_recording(path).depth, read.depth)
+
+
+@pytest.mark.parametrize('first', [True, False])
+def test_one_broken_name_costs_one_message(tmp_path: Path, first: bool) -> None:
+    """Whether it is the first message or a later one; it is counted."""
+    names = ['slide'] * 100
+    names[0 if first else 70] = 'sl\x1bde'
+    messages = [
+        (10 * i, joints(at(10 * i), (name,), (0.1 + 0.001 * i,), (0.1,)))
+        for i, name in enumerate(names)
+    ]
+    path = write(tmp_path / 'bag', {'/ft': forces(100), '/joints': (MOTION, messages)})
+    read = read_friction_recording(path)
+    assert len(read.time) >= 98
+    assert '1 of /joints name other joints, left out' in read.losses
 
 
 def joints(

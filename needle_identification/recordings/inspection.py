@@ -1,0 +1,353 @@
+"""What a recording holds, which of it looks like force and motion, and how to identify from it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+import shlex
+from typing import Final, NamedTuple
+
+from needle_dynamics.arrays import FloatArray, IntArray
+from needle_identification.bags.bag import Bag
+from needle_identification.bags.topics import Topic
+from needle_identification.errors import RecordingError
+from needle_identification.recordings.reading import read_indentation_recording
+from needle_identification.recordings.samples import (
+    are_gaps,
+    AXES,
+    each_joint,
+    Gathering,
+    Samples,
+    Source,
+    source_of,
+)
+from needle_identification.recordings.tables import guessed, is_table, read_table, ROLES
+from needle_identification.stiffness.identify import identify_stiffness
+from needle_ros import wire
+from needle_ros.errors import MessageError, NeedleError
+import numpy as np
+
+#: Types with the motion of something, and that of a force.
+_MOTION: Final = (wire.JOINT_STATE, wire.POSE, wire.POINT, wire.TWIST, wire.ODOMETRY)
+_FORCE: Final = (wire.WRENCH,)
+
+#: Types whose numbers are speeds.
+_SPEEDS: Final = (wire.TWIST,)
+
+#: What counts as motion: this part of the largest speed.
+_MOVING: Final = 0.05
+
+#: Part of the force that sign and speed of a motion must explain to look like friction.
+_EXPLAINED: Final = 0.3
+
+#: Joints of a topic that are looked at.
+_MAX_JOINTS: Final = 64
+
+#: Samples on which pairs of force and motion are tried.
+_TRIED: Final = 20_000
+
+
+class Column(NamedTuple):
+    """
+    One component of a topic, or one column of a table.
+
+    Attributes
+    ----------
+    name : str
+        Axis, joint, or name of the column.
+    low, high : float
+        Its range.
+
+    """
+
+    name: str
+    low: float
+    high: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Content:
+    """
+    One topic of a bag, or a whole table.
+
+    Attributes
+    ----------
+    name, type_name : str
+        Name and type of the topic; of a table ``table``.
+    count : int
+        Messages, or rows.
+    rate : float
+        Messages per second, by the median of the steps; nan if it was not looked at.
+    gaps : int
+        Number of pauses of more than ten steps.
+    columns : tuple of Column
+        Its components with their ranges; none if the type is not read.
+
+    """
+
+    name: str
+    type_name: str
+    count: int
+    rate: float = float('nan')
+    gaps: int = 0
+    columns: tuple[Column, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Inspection:
+    """
+    What a recording holds.
+
+    Attributes
+    ----------
+    path : str
+        The recording.
+    contents : tuple of Content
+        Its topics, or the table.
+    losses : tuple of str
+        What is missing or damaged.
+    words : tuple of str
+        What looks like force and motion.
+    command : str
+        The command that identifies friction from it; '' if nothing looks like force and motion.
+
+    """
+
+    path: str
+    contents: tuple[Content, ...]
+    losses: tuple[str, ...]
+    words: tuple[str, ...]
+    command: str
+
+
+def inspect_recording(path: Path | str) -> Inspection:
+    """
+    Look into a recording.
+
+    Parameters
+    ----------
+    path : Path or str
+        As for `read_friction_recording`.
+
+    Returns
+    -------
+    Inspection
+        What it holds.
+
+    Raises
+    ------
+    RecordingError
+        If it cannot be read.
+
+    Examples
+    --------
+    >>> from needle_identification import inspect_recording
+    >>> inspect_recording('bags/friction_01').command
+    'needle identify friction bags/friction_01'
+
+    """
+    return _table(Path(path)) if is_table(path) else _bag(Path(path))
+
+
+def _table(path: Path) -> Inspection:
+    table = read_table(path)
+    roles = guessed(table)
+    columns = tuple(_column(name, values) for name, values in table.columns.items())
+    content = Content(
+        name=path.name, type_name='table', count=len(next(iter(table.columns.values()))),
+        columns=columns,
+    )  # fmt: skip
+    words = [f'{role} by its name: {spec}' for role, spec in roles.items()]
+    words += [f'factor: {name} = {value:g}' for name, value in table.scalars.items()]
+    lacking = [role for role in ('time', 'force') if role not in roles]
+    if not {'depth', 'speed'} & set(roles):
+        lacking.append('depth or speed')
+    command = f'needle identify friction {shlex.quote(str(path))}'
+    if lacking:
+        words.append(f'no column looks like {" or ".join(lacking)}: name them with --columns')
+        names = {role: roles.get(role, 'NAME') for role in ROLES if role != 'speed'}
+        command += f' --columns {shlex.quote(",".join(f"{r}={n}" for r, n in names.items()))}'
+    return Inspection(
+        path=str(path), contents=(content,), losses=tuple(table.losses), words=tuple(words),
+        command=command,
+    )  # fmt: skip
+
+
+def _column(name: str, values: FloatArray) -> Column:
+    finite = values[np.isfinite(values)]
+    if not len(finite):
+        return Column(name, float('nan'), float('nan'))
+    return Column(name, float(finite.min()), float(finite.max()))
+
+
+# Bags.
+
+
+class _Signal(NamedTuple):
+    """A component of a topic over time; `speed` if it is one."""
+
+    topic: Topic
+    axis: str
+    stamps: IntArray
+    values: FloatArray
+    speed: bool
+
+
+def _bag(path: Path) -> Inspection:
+    bag = Bag(path)
+    topics = [topic for topic in bag.topics() if topic.type_name in (*_MOTION, *_FORCE)]
+    names = _joints(bag, topics)
+    read = {topic: tuple(names.get(topic, AXES)) for topic in topics if names.get(topic, AXES)}
+    gathered = {
+        topic: Gathering(topic, _source(topic, axes), by_header=True)
+        for topic, axes in read.items()
+    }
+    counts: dict[Topic, int] = {}
+    for batch in bag.batches(lambda topic: topic in gathered):
+        gathered[batch.topic].add(batch)
+    counts.update(bag.counts)
+    contents, signals = [], []
+    losses = list(bag.losses)
+    for topic, count in sorted(counts.items(), key=lambda item: item[0].name):
+        content = Content(name=topic.name, type_name=topic.type_name, count=count)
+        if topic in gathered:
+            bag.losses.clear()
+            try:
+                samples = gathered[topic].samples(bag)
+            except RecordingError as error:
+                losses.append(str(error))
+            else:
+                losses += bag.losses
+                content = _content(topic, count, read[topic], samples)
+                signals += list(_signals(topic, read[topic], samples))
+        contents.append(content)
+    words, command = _suggestion(path, signals)
+    if not command and _presses(path):
+        words = ['presses at several places and forces: stiffness can be identified']
+        command = shlex.join(['needle', 'identify', 'stiffness', str(path)])
+    return Inspection(
+        path=str(path), contents=tuple(contents), losses=tuple(losses), words=tuple(words),
+        command=command,
+    )  # fmt: skip
+
+
+def _presses(path: Path) -> bool:
+    with suppress(NeedleError):
+        return bool(identify_stiffness(read_indentation_recording(path)).levels)
+    return False
+
+
+def _joints(bag: Bag, topics: Sequence[Topic]) -> Mapping[Topic, list[str]]:
+    """Return the names of the joints of each JointState, from its first messages."""
+    found: dict[Topic, list[str]] = {t: [] for t in topics if t.type_name == wire.JOINT_STATE}
+    waiting = set(found)
+    readers = {topic: wire.Reader(wire.JOINT_STATE) for topic in found}
+    for message in bag.messages(lambda topic: topic in found):
+        if not waiting:
+            break
+        if message.topic in waiting:
+            with suppress(MessageError):
+                if joints := readers[message.topic].read(message.data).names:
+                    found[message.topic] = list(joints)[:_MAX_JOINTS]
+                    waiting.discard(message.topic)
+    return found
+
+
+def _source(topic: Topic, axes: Sequence[str]) -> Source:
+    return (
+        each_joint(axes)
+        if topic.type_name == wire.JOINT_STATE
+        else source_of(topic.type_name, axes)
+    )
+
+
+def _content(topic: Topic, count: int, axes: Sequence[str], samples: Samples) -> Content:
+    steps = np.diff(samples.stamps)
+    return Content(
+        name=topic.name,
+        type_name=topic.type_name,
+        count=count,
+        rate=float(1e9 / np.median(steps)),
+        gaps=int(np.count_nonzero(are_gaps(steps))),
+        columns=tuple(_column(axis, samples.values[:, k]) for k, axis in enumerate(axes)),
+    )
+
+
+def _signals(topic: Topic, axes: Sequence[str], samples: Samples) -> Iterator[_Signal]:
+    for k, axis in enumerate(axes):
+        values = samples.values[:, k]
+        if np.isfinite(values).all() and np.ptp(values) > 0.0:
+            yield _Signal(topic, axis, samples.stamps, values, topic.type_name in _SPEEDS)
+
+
+def _suggestion(path: Path, signals: Sequence[_Signal]) -> tuple[list[str], str]:
+    """Find the pair of force and motion that looks most like friction."""
+    forces = [one for one in signals if one.topic.type_name in _FORCE]
+    motions = [one for one in signals if one.topic.type_name in _MOTION]
+    best: tuple[float, float, _Signal, _Signal] | None = None
+    for force in forces:
+        for motion in motions:
+            explained, size = _friction(force, motion)
+            if best is None or explained > best[0]:
+                best = explained, size, force, motion
+    if best is None or best[0] < _EXPLAINED:
+        lacking = [what for what, found in (('force', forces), ('motion', motions)) if not found]
+        why = (
+            f'nothing that varies is a {" or a ".join(lacking)}'
+            if lacking
+            else ('no force follows the direction of a motion')
+        )
+        return [f'nothing looks like friction: {why}'], ''
+    explained, size, force, motion = best
+    words = [
+        f'{force.topic.name} {force.axis} looks like the force, {motion.topic.name} '
+        f'{motion.axis} like the motion: its direction and speed explain '
+        f'{100.0 * explained:.0f} % of the force'
+    ]
+    options = []
+    if len({one.topic for one in forces}) > 1:
+        options += ['--wrench-topic', force.topic.name]
+    if len({one.topic for one in motions}) > 1:
+        options += ['--motion-topic', motion.topic.name]
+    turned = '-' if size < 0.0 else ''
+    if turned:
+        words.append('the force is against the motion: turned around')
+    if turned or force.axis != 'y':
+        options += ['--force-axis', turned + force.axis]
+    is_joint = motion.topic.type_name == wire.JOINT_STATE
+    others = [one for one in motions if one.topic == motion.topic]
+    if (is_joint and len(others) > 1) or (not is_joint and motion.axis != 'y'):
+        options += ['--motion-axis', motion.axis]
+    command = shlex.join(['needle', 'identify', 'friction', str(path), *options])
+    return words, command
+
+
+def _friction(force: _Signal, motion: _Signal) -> tuple[float, float]:
+    """Return the part of a force that Coulomb and viscous friction explain, and mu_s [N]."""
+    start = max(force.stamps[0], motion.stamps[0])
+    end = min(force.stamps[-1], motion.stamps[-1])
+    if end <= start:
+        return 0.0, 0.0
+    every = max(1, len(motion.stamps) // _TRIED)
+    time = 1e-9 * (motion.stamps[::every] - start)
+    values = motion.values[::every]
+    speed = values if motion.speed else np.gradient(values, time)
+    read = np.interp(time, 1e-9 * (force.stamps - start), force.values)
+    moving = np.abs(speed) > _MOVING * np.quantile(np.abs(speed), 0.99)
+    moving &= (time >= 0.0) & (time <= 1e-9 * (end - start))
+    if np.count_nonzero(moving) < 10:
+        return 0.0, 0.0
+    x = np.column_stack([np.sign(speed), speed, np.ones_like(speed)])[moving]
+    y = read[moving]
+    solution = np.linalg.lstsq(x, y, rcond=None)[0]
+    variance = float(np.var(y))
+    if not variance:
+        return 0.0, 0.0
+    # Of motion in one direction nothing tells friction from an offset.
+    along = float(np.var(x[:, :2] @ solution[:2]))
+    left = float(np.var(y - x @ solution))
+    return max(0.0, min(along, variance - left) / variance), float(
+        np.mean((x[:, :2] @ solution[:2]) * np.sign(speed[moving]))
+    )

@@ -1,0 +1,501 @@
+"""
+Tables with named columns: text (CSV and the like) and MATLAB files.
+
+A column is named as in the file, or by its number, and takes a role: ``time=t[ms]``,
+``force=-Fz``, ``depth=q[mm]``, ``force=current*35.15[N]``. The unit in brackets is that of the
+numbers; without one it is taken from the name (``q_mm``, ``Force (N)``) or is that of the SI. Two
+columns with the seconds and nanoseconds of a stamp are ``time=sec:nanosec``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from datetime import datetime
+from itertools import islice
+from pathlib import Path
+import re
+from typing import Any, Final, NamedTuple
+
+from needle_dynamics.arrays import FloatArray
+from needle_identification.bags.limits import Budget
+from needle_identification.errors import RecordingError
+from needle_identification.recordings.recording import integrated, Recording
+from needle_identification.recordings.samples import are_gaps
+from needle_identification.recordings.series import Series
+from needle_ros.errors import shown
+import numpy as np
+
+#: Endings of the files that are read as tables.
+MATLAB: Final = '.mat'
+TABLES: Final = ('.csv', '.tsv', '.txt', '.dat', MATLAB)
+
+#: Units by role: how many of the SI unit one is.
+UNITS: Final[Mapping[str, Mapping[str, float]]] = {
+    'time': {'s': 1.0, 'sec': 1.0, 'ms': 1e-3, 'us': 1e-6, 'µs': 1e-6, 'ns': 1e-9, 'min': 60.0},
+    'depth': {'m': 1.0, 'mm': 1e-3, 'cm': 1e-2, 'um': 1e-6, 'µm': 1e-6},
+    'speed': {'m/s': 1.0, 'mm/s': 1e-3, 'cm/s': 1e-2, 'um/s': 1e-6, 'µm/s': 1e-6},
+    'force': {'N': 1.0, 'mN': 1e-3, 'kN': 1e3, 'kgf': 9.80665, 'gf': 9.80665e-3, 'lbf': 4.4482216},
+}
+
+#: Roles of the columns that friction is identified from; a depth or a speed will do.
+ROLES: Final = tuple(UNITS)
+
+#: Usual names of columns by role, the most telling first; compared without case and signs.
+_USUAL: Final = {
+    'time': ('time', 't', 'timestamp', 'stamp', 'elapsed', 'seconds', 'sec'),
+    'depth': ('depth', 'insertion', 'position', 'pos', 'q', 'qm', 'x', 'displacement', 'joint'),
+    'speed': ('speed', 'velocity', 'vel', 'v', 'qd', 'dq', 'qdot'),
+    'force': ('force', 'fy', 'fz', 'fx', 'f', 'effort', 'load', 'axialforce'),
+}
+
+#: Lines among which the first one with numbers must be.
+_HEAD: Final = 200
+
+#: Beyond this a depth or speed without a unit is hardly in SI units.
+_SUSPICIOUS: Final = {'depth': 2.0, 'speed': 2.0}
+
+_WORD: Final = re.compile(r'[^0-9a-zµ]+')
+_BRACKETS: Final = re.compile(r'^(.*?)\s*[\[(]([^\])]*)[\])]\s*$')
+_SPEC: Final = re.compile(r'^(-?)\s*(.+?)\s*(?:\*\s*([^\[\]*]+?))?\s*(?:\[([^\]]*)\])?$')
+
+
+class Table(NamedTuple):
+    """
+    A table as it is in a file.
+
+    Attributes
+    ----------
+    path : Path
+        The file.
+    columns : dict
+        Columns by name, each of shape (n,); what is no number is nan.
+    scalars : dict
+        Single numbers by name, for factors.
+    losses : list of str
+        What could not be read.
+
+    """
+
+    path: Path
+    columns: dict[str, FloatArray]
+    scalars: dict[str, float]
+    losses: list[str]
+
+
+def column_roles(text: str) -> dict[str, str]:
+    """
+    Read columns by role from one word of a command line.
+
+    Parameters
+    ----------
+    text : str
+        ``role=column,...``.
+
+    Returns
+    -------
+    dict
+        Columns by role.
+
+    Raises
+    ------
+    RecordingError
+        If it is not of that form.
+
+    """
+    found = {}
+    for word in text.split(','):
+        role, sign, spec = (part.strip() for part in word.partition('='))
+        if not (sign and role in ROLES and spec):
+            raise RecordingError(
+                f'--columns takes ROLE=[-]NAME[*FACTOR][UNIT],... with the roles '
+                f'{", ".join(ROLES)}, got {word!r}'
+            )
+        found[role] = spec
+    return found
+
+
+def is_table(path: Path | str) -> bool:
+    """
+    Tell whether a file is read as a table.
+
+    Parameters
+    ----------
+    path : Path or str
+        A file.
+
+    Returns
+    -------
+    bool
+        By its ending.
+
+    """
+    return Path(path).suffix.lower() in TABLES
+
+
+def read_table(path: Path) -> Table:
+    """
+    Read a table.
+
+    Parameters
+    ----------
+    path : Path
+        A file of text with one sample a line, or a MATLAB file.
+
+    Returns
+    -------
+    Table
+        Its columns.
+
+    Raises
+    ------
+    RecordingError
+        If it cannot be read as one.
+
+    """
+    try:
+        table = _matlab(path) if path.suffix.lower() == MATLAB else _text(path)
+    except OSError as error:
+        raise RecordingError(f'{path} cannot be read: {error.strerror or error}') from error
+    if not table.columns:
+        raise RecordingError(f'{path} holds no columns of numbers')
+    return table
+
+
+def read_friction_table(path: Path, columns: Mapping[str, str]) -> Recording:
+    """
+    Read force and motion from a table.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    columns : mapping of str to str
+        Columns by role, of `ROLES`; what is not given is found by the usual names.
+
+    Returns
+    -------
+    Recording
+        Force and motion; its ``losses`` say what was taken, left out or repaired.
+
+    Raises
+    ------
+    RecordingError
+        If a column is missing or not usable.
+
+    """
+    table = read_table(path)
+    specs = {**guessed(table), **columns}
+    missing = [role for role in ('time', 'force') if role not in specs]
+    if not {'depth', 'speed'} & set(specs):
+        missing.append('depth or speed')
+    if missing:
+        raise RecordingError(
+            f'{path}: which column is {" and ".join(missing)}? It has '
+            f'{", ".join(table.columns)}: say --columns {missing[0].split()[0]}=NAME,...'
+        )
+    losses = list(table.losses)
+    values = {role: _values(table, role, spec, losses) for role, spec in specs.items()}
+    if words := ', '.join(f'{role}={spec}' for role, spec in specs.items() if role not in columns):
+        losses.append(f'columns by their names: {words}')
+    return _recording(path, values, losses)
+
+
+def guessed(table: Table) -> dict[str, str]:
+    """
+    Find columns by their usual names.
+
+    Parameters
+    ----------
+    table : Table
+        The table.
+
+    Returns
+    -------
+    dict
+        Columns by role.
+
+    """
+    plain = {name: _plain(name) for name in table.columns}
+    found: dict[str, str] = {}
+    for role, usual in _USUAL.items():
+        for word in usual:
+            names = [name for name, short in plain.items() if short == word]
+            names += [name for name, short in plain.items() if short.endswith('.' + word)]
+            if names:
+                found[role] = names[0]
+                break
+    pairs = [
+        (sec, nanosec)
+        for sec in table.columns
+        for nanosec in table.columns
+        if re.search(r'(?i)n(ano)?sec', nanosec)
+        and re.sub(r'(?i)n(ano)?secs?', 'sec', nanosec) == re.sub(r'(?i)secs?', 'sec', sec)
+        and sec != nanosec
+    ]
+    if pairs:
+        found['time'] = ':'.join(pairs[0])
+    return found
+
+
+def _plain(name: str) -> str:
+    """Return a name without its unit, case and signs."""
+    if match := _BRACKETS.match(name):
+        name = match[1]
+    words = [word for word in _WORD.split(name.lower()) if word]
+    units = {unit.lower().replace('/', '') for group in UNITS.values() for unit in group}
+    if len(words) > 1 and words[-1] in units:
+        words = words[:-1]
+    return ''.join(words)
+
+
+def _unit_of(name: str, role: str) -> str | None:
+    """Return the unit that a name tells, if it is one of the role."""
+    match = _BRACKETS.match(name)
+    word = match[2].strip() if match else name.rpartition('_')[2]
+    return word if word in UNITS[role] and word != name else None
+
+
+def _values(table: Table, role: str, spec: str, losses: list[str]) -> FloatArray:
+    """Return the values that a column stands for, in SI units."""
+    if role == 'time' and ':' in spec:
+        seconds, _, nanoseconds = spec.partition(':')
+        both = [_column(table, role, name)[1] for name in (seconds, nanoseconds)]
+        # Together they may need more digits than a float has.
+        return np.asarray((both[0] - both[0][np.isfinite(both[0])][:1].sum()) + 1e-9 * both[1])
+    if spec in table.columns:
+        # A name with brackets of its own.
+        sign, name, factor, unit = '', spec, None, None
+    else:
+        match = _SPEC.match(spec)
+        if match is None:
+            raise RecordingError(f'--columns {role}={spec} is not [-]NAME[*FACTOR][UNIT]')
+        sign, name, factor, unit = match.groups()
+    name, column = _column(table, role, name)
+    unit = unit or _unit_of(name, role)
+    if unit is not None and unit not in UNITS[role]:
+        raise RecordingError(
+            f'--columns {role}={spec}: the unit must be one of {", ".join(UNITS[role])}, '
+            f'got {unit!r}'
+        )
+    scale = (-1.0 if sign else 1.0) * (UNITS[role][unit] if unit else 1.0)
+    if factor is not None:
+        scale *= _factor(table, role, spec, factor)
+    found = scale * column
+    finite = found[np.isfinite(found)]
+    if unit is None and len(finite) and np.ptp(finite) > _SUSPICIOUS.get(role, np.inf):
+        losses.append(
+            f'{name} has no unit and spans {np.ptp(finite):.3g}, taken in SI units: perhaps '
+            f'{role}={name}[mm{"/s" if role == "speed" else ""}]'
+        )
+    return np.asarray(found)
+
+
+def _column(table: Table, role: str, name: str) -> tuple[str, FloatArray]:
+    """Return a column by its name, its name without the unit, or its number; and its full name."""
+    names = list(table.columns)
+    same = [other for other in names if _BRACKETS.sub(r'\1', other) == name]
+    if name not in names and len(same) == 1:
+        name = same[0]
+    elif name not in names and name.isdecimal() and 0 < int(name) <= len(names):
+        name = names[int(name) - 1]
+    if name not in names:
+        raise RecordingError(
+            f'{table.path} has no column {name!r} for {role}; it has {", ".join(names)}'
+        )
+    return name, table.columns[name]
+
+
+def _factor(table: Table, role: str, spec: str, factor: str) -> float:
+    if factor in table.scalars:
+        return table.scalars[factor]
+    with suppress(ValueError):
+        return float(factor)
+    has = ', '.join(table.scalars) or 'no single numbers'
+    raise RecordingError(
+        f'--columns {role}={spec}: the factor must be a number or the name of one, got '
+        f'{factor!r}; {table.path} has {has}'
+    )
+
+
+def _recording(path: Path, values: Mapping[str, FloatArray], losses: list[str]) -> Recording:
+    """Put samples in order, and leave out what cannot be used."""
+    roles = [role for role in ('force', 'depth', 'speed') if role in values]
+    rows = np.column_stack([values[role] for role in roles])
+    time = values['time']
+    usable = np.isfinite(rows).all(axis=1) & np.isfinite(time)
+    if lost := int(np.count_nonzero(~usable)):
+        losses.append(f'{lost} rows with a value that is no number, left out')
+    time, rows = time[usable], rows[usable]
+    if len(time) < 2:
+        raise RecordingError('; '.join([f'{path} has {len(time)} usable rows', *losses]))
+    since = time - time.min()
+    if not since.max() < 1e9:
+        raise RecordingError(f'{path}: time spans {since.max():.3g} s: is its unit right?')
+    series = Series(rows.shape[1])
+    series.add(np.rint(1e9 * since).astype(np.int64), rows)
+    series.compact()
+    for count, what in (
+        (series.late, 'rows out of order, sorted by time'),
+        (series.repeated, 'rows with the time of another, left out'),
+    ):
+        if count:
+            losses.append(f'{count} {what}')
+    if len(series.stamps) < 2:
+        raise RecordingError(f'{path}: all rows have the same time')
+    steps = np.diff(series.stamps)
+    if (gaps := steps[are_gaps(steps)]).size:
+        losses.append(f'pauses in {len(gaps)} places, {1e-9 * gaps.sum():.3g} s in all')
+    times = 1e-9 * (series.stamps - series.stamps[0])
+    found = dict(zip(roles, series.values.T, strict=True))
+    if 'depth' not in found:
+        losses.append('no depth: it is the integral of the speed from 0')
+        found['depth'] = integrated(times, found['speed'])
+    return Recording(
+        name=str(path),
+        time=times,
+        depth=found['depth'],
+        speed=found.get('speed'),
+        force=found['force'],
+        losses=tuple(losses),
+    )
+
+
+# Text.
+
+
+def _text(path: Path) -> Table:
+    with path.open(encoding='utf-8-sig', errors='replace') as stream:
+        head = [line.rstrip('\r\n') for line in islice(stream, _HEAD)]
+    first = next((k for k, line in enumerate(head) if _numbers(line)), None)
+    if first is None:
+        raise RecordingError(f'{path} has no line of numbers among its first {len(head)}')
+    separator = _separator(head[first])
+    count = len(_split(head[first], separator))
+    names = _names(head[:first], separator, count)
+    try:
+        table = np.loadtxt(
+            path,
+            delimiter=separator,
+            skiprows=first,
+            ndmin=2,
+            encoding='utf-8-sig',
+            comments=('#', '%'),
+        )
+        lost = 0
+    except (ValueError, UnicodeDecodeError):
+        # Text, gaps, or decimal commas.
+        table, lost = _rows(path, first, separator, count)
+    losses = [f'{lost} lines not readable, left out'] if lost else []
+    known = np.isfinite(table).any(axis=0)
+    columns = {name: table[:, k] for k, name in enumerate(names) if known[k]}
+    return Table(path, columns, {}, losses)
+
+
+def _rows(path: Path, first: int, separator: str | None, count: int) -> tuple[FloatArray, int]:
+    """Read line by line; a word that is no number is nan."""
+    found, lost = [], 0
+    with path.open(encoding='utf-8-sig', errors='replace') as stream:
+        for line in islice(stream, first, None):
+            words = _split(line, separator)
+            if len(words) == count:
+                found.append([_number(word) for word in words])
+            elif line.strip() and line.lstrip()[0] not in '#%':
+                lost += 1
+    return np.array(found).reshape(-1, count), lost
+
+
+def _separator(line: str) -> str | None:
+    """Return what separates the columns; None for blanks."""
+    return next((mark for mark in (';', '\t', ',') if mark in line), None)
+
+
+def _split(line: str, separator: str | None) -> list[str]:
+    return [word.strip().strip('"') for word in line.strip().split(separator)]
+
+
+def _numbers(line: str) -> bool:
+    """Whether most words of a line are numbers."""
+    words = _split(line, _separator(line))
+    found = [word for word in words if _number(word) == _number(word)]
+    return len(found) > 0 and 2 * len(found) >= len(words) and line.lstrip()[:1] not in '#%'
+
+
+def _number(word: str) -> float:
+    with suppress(ValueError):
+        return float(word)
+    with suppress(ValueError):
+        return float(word.replace(',', '.'))
+    with suppress(ValueError, OverflowError):
+        return datetime.fromisoformat(word).timestamp()
+    return float('nan')
+
+
+def _names(head: Sequence[str], separator: str | None, count: int) -> list[str]:
+    """Return the names of the columns from the lines before the numbers, else their numbers."""
+    for k, line in reversed(list(enumerate(head))):
+        words = _split(line.lstrip('#% '), separator)
+        if len(words) != count or not any(words):
+            continue
+        above = _split(head[k - 1].lstrip('#% '), separator) if k else []
+        known = {unit for units in UNITS.values() for unit in units} | {'', '-', '1', 'Nm'}
+        if len(above) == count and {word.strip('[]()') for word in words} <= known:
+            # A line of units below that of the names.
+            units = [word.strip('[]()') for word in words]
+            words = [f'{a} [{u}]' if u else a for a, u in zip(above, units, strict=True)]
+        return list(_distinct(shown(word) for word in words))
+    return [str(k + 1) for k in range(count)]
+
+
+def _distinct(names: Iterator[str]) -> Iterator[str]:
+    """Number columns without a name of their own."""
+    seen: set[str] = set()
+    for k, name in enumerate(names):
+        unique = name if name and name not in seen else f'{name}{k + 1}'
+        seen.add(unique)
+        yield unique
+
+
+# MATLAB.
+
+
+def _matlab(path: Path) -> Table:
+    # A large import that few recordings need.
+    from scipy.io import loadmat, whosmat
+    from scipy.io.matlab import MatReadError
+
+    budget = Budget(path)
+    try:
+        wanted = [
+            (name, shape)
+            for name, shape, kind in whosmat(path)
+            if kind in ('double', 'single', 'logical') or kind.lstrip('u').startswith('int')
+        ]
+        for _, shape in wanted:
+            budget.spend(8 * int(np.prod(shape, dtype=object)))
+        content: Mapping[str, Any] = loadmat(path, variable_names=[name for name, _ in wanted])
+    except NotImplementedError:
+        raise RecordingError(
+            f'{path} is a MATLAB 7.3 file: save it again with save(..., "-v7")'
+        ) from None
+    except (MatReadError, ValueError, TypeError, KeyError, MemoryError, IndexError) as error:
+        raise RecordingError(f'{path} is damaged: {shown(str(error))}') from error
+    arrays = {
+        name: np.squeeze(np.asarray(content[name], dtype=np.float64))
+        for name, _ in wanted
+        if name in content and not np.iscomplexobj(content[name])
+    }
+    lengths = [a.shape[0] for a in arrays.values() if a.ndim in (1, 2)]
+    longest = max(set(lengths), key=lengths.count, default=0)
+    columns: dict[str, FloatArray] = {}
+    for name, array in arrays.items():
+        if array.ndim == 1 and len(array) == longest:
+            columns[shown(name)] = array
+        elif array.ndim == 2 and array.shape[0] == longest:
+            columns |= {shown(f'{name}{k + 1}'): column for k, column in enumerate(array.T)}
+    scalars = {shown(name): float(array) for name, array in arrays.items() if array.ndim == 0}
+    left = sorted(
+        set(arrays) - set(scalars) - {n for n in arrays if arrays[n].shape[:1] == (longest,)}
+    )
+    losses = [f'{", ".join(map(shown, left))} of another length, left out'] if left else []
+    return Table(path, columns, scalars, losses)

@@ -1,0 +1,72 @@
+"""`needle inspect`: what a recording holds, and the command that identifies from it."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from math import isfinite
+from pathlib import Path
+import sys
+
+from needle_identification import Inspection, inspect_recording
+from needle_insertion.commands.common import Command
+from needle_insertion.report.identify_text import plain
+from needle_insertion.report.text import table
+from needle_ros.errors import NeedleError, shown
+
+
+def _add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `needle inspect`."""
+    parser.add_argument(
+        'recordings',
+        type=Path,
+        nargs='+',
+        metavar='RECORDING',
+        help='rosbag2 folder, .mcap, .db3 or ROS 1 .bag file, or a table (.csv, .mat)',
+    )
+    parser.add_argument('--json', action='store_true', help='print JSON instead of tables')
+
+
+def _run(options: argparse.Namespace) -> int:
+    """Look into each recording and print what it holds; return 2 if one cannot be read."""
+    found: list[Inspection] = []
+    bad = 0
+    for path in options.recordings:
+        try:
+            found.append(inspect_recording(path))
+        except (NeedleError, OSError) as error:
+            sys.stderr.write(shown(f'error: {error}') + '\n')
+            bad += 1
+    if options.json:
+        document = [plain(one) for one in found]
+        sys.stdout.write(f'{json.dumps(document, indent=2, allow_nan=False)}\n')
+    else:
+        sys.stdout.write('\n\n'.join(map(_text, found)) + ('\n' if found else ''))
+    return 2 if bad else 0
+
+
+def _text(found: Inspection) -> str:
+    rows = []
+    for content in found.contents:
+        first = (
+            content.name,
+            content.type_name.rpartition('/')[2],
+            f'{content.count}',
+            f'{content.rate:.4g}' if isfinite(content.rate) else '',
+            f'{content.gaps}' if content.gaps else '',
+        )
+        ranges = [
+            f'{one.name}: {one.low + 0.0:.4g} to {one.high + 0.0:.4g}' for one in content.columns
+        ]
+        for k, span in enumerate(ranges or ['']):
+            rows.append((*(first if k == 0 else ('',) * len(first)), span))
+    heads = ('topic', 'type', 'messages', 'per second', 'gaps', 'range')
+    lines = [found.path, table([tuple(map(shown, row)) for row in rows], heads)]
+    lines += [f'warning: {shown(words)}' for words in found.losses]
+    lines += [shown(words) for words in found.words]
+    if found.command:
+        lines += [f'try: {shown(found.command)}']
+    return '\n'.join(lines)
+
+
+COMMAND = Command(_add_arguments, _run)
