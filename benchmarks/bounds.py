@@ -18,7 +18,7 @@ from needle_dynamics import (
     NeedleParameters,
 )
 from needle_identification import FrictionSettings, StiffnessSettings
-from needle_identification.friction.terms import columns_of, regressors
+from needle_identification.friction.terms import columns_of, Motion, regressors
 from needle_insertion.experiment.protocol import DIRECTIONS, HOLD_TIME
 import numpy as np
 from numpy.typing import NDArray
@@ -163,10 +163,11 @@ def friction_truth(
         'breakaway_force': breakaway * coulomb,
         'lag': sensor_lag(sensor) - needle.moving_mass / viscous,
     }
-    names = [column.name for column in columns_of(settings.terms)]
-    acceleration = np.gradient(speed, time)
+    names = [column.name for column in columns_of(settings.terms, settings)]
+    still = np.zeros_like(time)
+    motion = Motion(speed, np.gradient(speed, time), time - time[0], still, still > 0.0)
     known = information(
-        regressors(speed, acceleration, time - time[0], settings.terms, settings),
+        regressors(motion, settings.terms, settings),
         reading_noise(sensor, 1),
         np.abs(speed) > settings.moving_speed,
     )

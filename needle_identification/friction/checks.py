@@ -87,11 +87,16 @@ def fit_warnings(
     if unknown:
         yield f'the data do not determine {", ".join(unknown)}: use more speeds, or fewer terms'
     settings = design.signals.settings
-    if not all(map(design.reaches, settings.terms)):
+    if 'stribeck' in settings.terms and not design.reaches('stribeck'):
         slowest = float(np.abs(design.speed[design.used]).min())
         yield (
             f'no sample is slow enough for the term stribeck: {slowest:.2g} m/s and more, with '
             f'stribeck_speed {settings.stribeck_speed:g} m/s; its coefficient is a guess'
+        )
+    if 'cutting' in settings.terms and not design.reaches('cutting'):
+        yield (
+            'the needle does not go into the same tissue twice: the term cutting is friction or '
+            'an offset as well'
         )
     if design.signals.cut_off:
         yield (
@@ -151,7 +156,7 @@ def noise_bias(design: Design, fit: Regression) -> float:
 
     """
     settings, noise = design.signals.settings, design.signals.speed_noise
-    columns = columns_of(settings.terms)
+    columns = columns_of(settings.terms, settings)
     names = [column.name for column in columns]
     if settings.estimator == 'total' or 'viscous_friction' not in names:
         return 0.0
@@ -221,4 +226,5 @@ def missing_term(chosen: Sequence[str], comparisons: Sequence[Comparison]) -> st
     if not missing:
         return ''
     best = min(missing, key=lambda c: c.difference)
-    return f'{best.words}: add the term {best.terms[-1]}'
+    more = best.terms[len(chosen) :]
+    return f'{best.words}: add the term{"s" if len(more) > 1 else ""} {" and ".join(more)}'

@@ -1,10 +1,11 @@
-"""Comparison with other sets of terms: one term more, or one term less."""
+"""Comparison with other sets of terms: one term more or less, or two more."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from itertools import combinations
 from math import log, nan
 from typing import Final
 
@@ -19,11 +20,14 @@ import numpy as np
 SIGNIFICANCE: Final = 0.02
 
 
+#: Growth of the errors by a memory of the noise that two missing terms may explain.
+_LIKE_MEMORY: Final = 1.5
+
 #: Parts of the strokes that are held out in turn.
 _FOLDS: Final = 5
 
 #: Terms whose coefficient cannot be negative.
-_POSITIVE: Final = ('inertia', 'stribeck')
+_POSITIVE: Final = ('inertia', 'stribeck', 'cutting')
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -34,7 +38,7 @@ class Comparison:
     Attributes
     ----------
     terms : tuple of str
-        The other set: one term more or one less.
+        The other set: one term more or one less, or two more.
     criterion : str
         Criterion of the comparison: BIC, with the effective number of samples.
     difference : float
@@ -78,74 +82,128 @@ def compare_terms(design: Design, fit: Regression, among: int = 1) -> tuple[Comp
         One per set of terms that could be fitted.
 
     """
-    chosen = design.signals.settings.terms
+    settings = design.signals.settings
+    chosen = settings.terms
     samples = _independent_samples(design, fit)
     level = SIGNIFICANCE / among
-    tried = _tried(design)
-    p_values = _holm(
-        [
-            other.wald(which)[1] if other.determined[which].all() else 1.0
-            for _, other, which in tried
-        ]
-    )
-    found = [
-        _added((*chosen, term), other, which, _bic_difference(other, fit, samples), p_value, level)
-        for (term, other, which), p_value in zip(tried, p_values, strict=True)
-    ]
-    found = [
-        replace(one, supported=False, words=f'{one.words}, but it does not predict better')
-        if one.supported and not _predicts_better(design, one.terms)
-        else one
-        for one in found
-    ]
+    singles = [(term,) for term in _candidates(design)]
+    found = _added(design, fit, singles, samples, level)
+    growth = 1.0 if fit.memory is None else float(fit.memory.inflation.max())
+    if growth > _LIKE_MEMORY and not any(one.supported for one in found):
+        # Two terms that are both missing leave what looks like noise with a memory.
+        pairs = [(first, second) for (first,), (second,) in combinations(singles, 2)]
+        both = _added(design, fit, pairs, samples, level)
+        found += [one for one in both if one.supported]
     for term in chosen:
         rest = tuple(other for other in chosen if other != term)
         if rest and not ('direction' in chosen and term in ('coulomb', 'viscous')):
-            names = [column.name for column in columns_of(chosen)]
-            which = [names.index(column.name) for column in columns_of([term])]
+            names = [column.name for column in columns_of(chosen, settings)]
+            which = [names.index(column.name) for column in columns_of([term], settings)]
             less = design.solve(rest, 'ordinary', colored=False)
             found.append(_removed(rest, term, fit, which, _bic_difference(less, fit, samples)))
     return tuple(found)
 
 
-def _tried(design: Design) -> list[tuple[str, Regression, list[int]]]:
-    """Fit each term that was not chosen; return term, fit and the positions of its columns."""
+def _candidates(design: Design) -> list[str]:
+    """Return the terms that could be added."""
+    settings = design.signals.settings
+    chosen = set(settings.terms)
+    # Where layers begin must be said.
+    excluded = chosen | {'layers'}
+    if design.estimates_lag:
+        excluded.add('inertia')
+    if 'layers' in chosen:
+        excluded.add('length')
+    if settings.estimator == 'total' or not {'coulomb', 'viscous'} <= chosen:
+        excluded.add('direction')
+    return [term for term in TERMS if term not in excluded and design.reaches(term)]
+
+
+def _added(
+    design: Design,
+    fit: Regression,
+    candidates: Sequence[tuple[str, ...]],
+    samples: float,
+    level: float,
+) -> list[Comparison]:
+    """Fit further terms; none is supported unless it predicts better too."""
     settings = design.signals.settings
     chosen = settings.terms
-    found = []
-    for term in TERMS:
-        if term in chosen or (term == 'inertia' and design.estimates_lag):
-            continue
-        if not design.reaches(term):
-            continue
-        if term == 'direction' and (
-            settings.estimator == 'total' or not {'coulomb', 'viscous'} <= set(chosen)
-        ):
-            continue
-        start = len(columns_of(chosen))
-        which = list(range(start, start + len(columns_of([term]))))
+    start = len(columns_of(chosen, settings))
+    tried: list[tuple[tuple[str, ...], Regression, list[int], float]] = []
+    for more in candidates:
+        which = list(range(start, start + len(columns_of(more, settings))))
+        terms = (*chosen, *more)
         # Too few samples for one more parameter are no fault of the chosen terms.
         with suppress(IdentificationError):
-            other = design.solve((*chosen, term), settings.estimator, colored=False)
-            if other.determined[which].all() and other.wald(which)[1] < SIGNIFICANCE:
+            other = design.solve(terms, settings.estimator, colored=False)
+            p_value = other.wald(which)[1] if other.determined[which].all() else 1.0
+            if p_value < SIGNIFICANCE:
                 # Noise with a memory looks like many a term.
-                other = design.solve((*chosen, term), settings.estimator)
-            found.append((term, other, which))
-    return found
+                other = design.solve(terms, settings.estimator)
+                p_value = other.wald(which)[1]
+            tried.append((more, other, which, p_value))
+    return [
+        _judged(design, more, other, which, _bic_difference(other, fit, samples), p_value, level)
+        for (more, other, which, _), p_value in zip(
+            tried, _holm([p_value for *_, p_value in tried]), strict=True
+        )
+    ]
 
 
-def _predicts_better(design: Design, terms: tuple[str, ...]) -> bool:
+def _judged(
+    design: Design,
+    more: tuple[str, ...],
+    other: Regression,
+    which: list[int],
+    difference: float,
+    p_value: float,
+    level: float,
+) -> Comparison:
+    settings = design.signals.settings
+    terms, name = (*settings.terms, *more), ' and '.join(more)
+    if not other.determined[which].all():
+        words = f'the data do not distinguish the term {name} from the others'
+        return Comparison(terms=terms, words=words)
+    columns = columns_of(more, settings)
+    firsts = {columns_of([term], settings)[0].name for term in more if term in _POSITIVE}
+    # Neither a mass nor what breaks away is less than nothing.
+    impossible = any(
+        column.name in firsts and other.values[k] < 0.0
+        for k, column in zip(which, columns, strict=True)
+    )
+    supported = p_value < level and difference < 0.0 and not impossible
+    better = not supported or _predicts_better(design, more)
+    verdict = 'support' if supported and better else 'do not support'
+    sizes = ' and '.join(
+        f'{column.name} = {other.values[k]:.3g} ± {other.errors[k]:.2g} {column.unit}'
+        for k, column in zip(which, columns, strict=True)
+    )
+    words = f'the data {verdict} {name}: {sizes} (p = {p_value:.2g})'
+    if not better:
+        words += ', which does not predict better'
+    return Comparison(
+        terms=terms,
+        difference=difference,
+        p_value=p_value,
+        supported=supported and better,
+        words=words,
+    )
+
+
+def _predicts_better(design: Design, more: tuple[str, ...]) -> bool:
     """
-    Tell whether the last term lowers the error of predictions of samples that were held out.
+    Tell whether further terms lower the error of predictions of samples that were held out.
 
     The samples are held out in turn by strokes and rests that follow each other, so that what a
     term learns of noise with a memory does not help it.
     """
     used = design.used
-    x, y = design.regressors(terms)[used], design.signals.force[used]
+    settings = design.signals.settings
+    x, y = design.regressors((*settings.terms, *more))[used], design.signals.force[used]
     without = np.ones(x.shape[1], dtype=np.bool_)
-    start = len(columns_of(terms[:-1]))
-    without[start : start + len(columns_of(terms[-1:]))] = False
+    start = len(columns_of(settings.terms, settings))
+    without[start : start + len(columns_of(more, settings))] = False
     fold = np.unique(design.stroke[used], return_inverse=True)[1] % _FOLDS
     misfits = np.zeros(2)
     for held in range(int(fold.max()) + 1):
@@ -180,32 +238,6 @@ def _bic_difference(other: Regression, chosen: Regression, samples: float) -> fl
     """Return BIC of another fit minus that of the chosen one, for independent samples."""
     misfit = float(other.residual @ other.residual) / float(chosen.residual @ chosen.residual)
     return samples * log(misfit) + (len(other.values) - len(chosen.values)) * log(samples)
-
-
-def _added(
-    terms: tuple[str, ...],
-    other: Regression,
-    which: list[int],
-    difference: float,
-    p_value: float,
-    level: float,
-) -> Comparison:
-    term = terms[-1]
-    if not other.determined[which].all():
-        words = f'the data do not distinguish the term {term} from the others'
-        return Comparison(terms=terms, words=words)
-    # Neither a mass nor what breaks away is less than nothing.
-    impossible = term in _POSITIVE and other.values[which[0]] < 0.0
-    supported = p_value < level and difference < 0.0 and not impossible
-    verdict = 'support' if supported else 'do not support'
-    sizes = ' and '.join(
-        f'{column.name} = {other.values[k]:.3g} ± {other.errors[k]:.2g} {column.unit}'
-        for k, column in zip(which, columns_of([term]), strict=True)
-    )
-    words = f'the data {verdict} {term}: {sizes} (p = {p_value:.2g})'
-    return Comparison(
-        terms=terms, difference=difference, p_value=p_value, supported=supported, words=words
-    )
 
 
 def _removed(

@@ -16,7 +16,7 @@ from needle_dynamics.arrays import BoolArray, FloatArray, IntArray
 from needle_identification.errors import IdentificationError
 from needle_identification.estimation.regression import independent_span, regress, Regression
 from needle_identification.friction.filtering import FilteredSignals, HALF_LENGTH
-from needle_identification.friction.terms import columns_of, regressors
+from needle_identification.friction.terms import columns_of, Motion, regressors
 import numpy as np
 from scipy.ndimage import maximum_filter1d
 
@@ -25,6 +25,9 @@ FEWEST_SAMPLES: Final = 10.0
 
 #: Time after a change at which the filters of the sensor have settled too [lags of the force].
 _SETTLING: Final = 3.0
+
+#: What is less deep than the deepest by no more is as deep [m]: counts, noise, play.
+_SAME_DEPTH: Final = 5e-5
 
 #: Part of a term's full size that is felt.
 _FELT: Final = 0.05
@@ -42,8 +45,10 @@ class Design:
     ----------
     signals : FilteredSignals
         Filtered force and motion.
-    speed, acceleration : ndarray, shape (n,)
-        Speed [m/s] and acceleration [m/s^2], delayed by the lag of the force.
+    speed, acceleration, depth : ndarray, shape (n,)
+        Speed [m/s], acceleration [m/s^2] and inserted length [m], delayed by the lag of the force.
+    fresh : ndarray of bool, shape (n,)
+        Whether the needle is as deep as it ever was.
     regime : ndarray, shape (n,)
         Sign of the speed; 0 at rest.
     used : ndarray of bool, shape (n,)
@@ -58,6 +63,8 @@ class Design:
     signals: FilteredSignals
     speed: FloatArray
     acceleration: FloatArray
+    depth: FloatArray
+    fresh: BoolArray
     regime: FloatArray
     used: BoolArray
     stroke: IntArray
@@ -89,20 +96,27 @@ class Design:
             One column per coefficient.
 
         """
-        columns = self._columns(self.speed, terms)
-        return np.column_stack([columns, self.lag_column])
+        return np.column_stack([self._columns(terms), self.lag_column])
 
-    def _columns(self, speed: FloatArray, terms: Sequence[str]) -> FloatArray:
+    def _columns(self, terms: Sequence[str], later: float = 0.0) -> FloatArray:
+        """Return the regressors for motion that is delayed further [s]."""
         signals = self.signals
-        since = signals.time - signals.time[0]
-        return regressors(speed, self.acceleration, since, terms, signals.settings)
+        motion = Motion(
+            self.speed - later * self.acceleration,
+            self.acceleration,
+            signals.time - signals.time[0],
+            self.depth - later * self.speed,
+            self.fresh,
+        )
+        return regressors(motion, terms, signals.settings)
 
     def reaches(self, term: str) -> bool:
         """
         Tell whether there are enough samples at which a term would be felt for one to count.
 
-        Only ``stribeck`` has a place: near rest. Beyond it the term is nearly zero, and what
-        speaks for it is the noise of the speed.
+        Two terms have a place. ``stribeck`` is near rest; beyond, the term is nearly zero, and
+        what speaks for it is the noise of the speed. ``cutting`` is in new tissue; without
+        motion into old tissue it is an offset.
 
         Parameters
         ----------
@@ -115,9 +129,13 @@ class Design:
             Whether there are.
 
         """
+        if term == 'cutting':
+            inward = self.used & (self.speed > 0.0)
+            few = min(np.count_nonzero(inward & self.fresh), np.count_nonzero(inward & ~self.fresh))
+            return bool(few >= self.signals.correlation)
         if term != 'stribeck':
             return True
-        column = self._columns(self.speed, [term])
+        column = self._columns([term])
         felt = np.count_nonzero(np.abs(column[self.used]) >= _FELT)
         return bool(felt >= self.signals.correlation)
 
@@ -132,10 +150,7 @@ class Design:
 
         """
         settings, step = self.signals.settings, 0.5 * self.signals.period
-        early, now, late = (
-            self._columns(self.speed - shift * self.acceleration, settings.terms)
-            for shift in (-step, 0.0, step)
-        )
+        early, now, late = (self._columns(settings.terms, shift) for shift in (-step, 0.0, step))
         used = self.used
         solution = np.linalg.lstsq(now[used], self.signals.force[used], rcond=None)[0]
         column = np.where(used, (late - early) @ solution / (2.0 * step), 0.0)
@@ -170,7 +185,7 @@ class Design:
             'viscous_friction': signals.speed_noise,
             'moving_mass': signals.acceleration_noise,
         }
-        noise = [noise_of.get(column.name, 0.0) for column in columns_of(terms)]
+        noise = [noise_of.get(column.name, 0.0) for column in columns_of(terms, signals.settings)]
         if self.estimates_lag:
             slope = np.linalg.norm(self.lag_column[self.used])
             slope /= np.linalg.norm(self.acceleration[self.used])
@@ -238,9 +253,13 @@ def select_samples(
     settings, time = signals.settings, signals.time
     then = np.clip(time - lag, time[0], time[-1])
     speed, acceleration = np.asarray(signals.motion(then)), np.asarray(signals.motion(then, 1))
+    depth = np.interp(then, time, signals.depth)
     regime = np.where(np.abs(speed) > signals.moving_speed, np.sign(speed), 0.0)
     change = np.ones(len(speed), dtype=np.bool_)
     change[1:-1] = signals.lost[1:-1] | (regime[1:-1] != regime[:-2])
+    fresh = depth >= np.maximum.accumulate(depth) - _SAME_DEPTH
+    if 'cutting' in settings.terms:
+        change[1:-1] |= (fresh[1:-1] != fresh[:-2]) & (speed[1:-1] > 0.0)
     # The sensor settles while the filter does, whose outer third weighs little.
     settling = min(_SETTLING * settling_lag, _LONGEST_SETTLING)
     settling -= HALF_LENGTH / settings.cutoff / 1.5
@@ -257,6 +276,8 @@ def select_samples(
         signals=signals,
         speed=speed,
         acceleration=acceleration,
+        depth=depth,
+        fresh=fresh,
         regime=regime,
         used=used,
         stroke=np.cumsum(change),

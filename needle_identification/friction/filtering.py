@@ -59,8 +59,8 @@ class FilteredSignals:
     ----------
     settings : FrictionSettings
         Settings of the identification.
-    time, force : ndarray, shape (n,)
-        Even time [s], and filtered force [N].
+    time, force, depth : ndarray, shape (n,)
+        Even time [s], filtered force [N], and inserted length [m].
     period : float
         Step of the time [s].
     motion : BSpline
@@ -80,6 +80,7 @@ class FilteredSignals:
     settings: FrictionSettings
     time: FloatArray
     force: FloatArray
+    depth: FloatArray
     period: float
     motion: BSpline
     lost: BoolArray
@@ -161,6 +162,7 @@ def filter_signals(recording: Recording, settings: FrictionSettings) -> Filtered
         period=step * period,
         motion=motion,
         force=_smooth(np.interp(grid, time, recording.force), taps)[::step],
+        depth=np.asarray(np.interp(grid[::step], time, recording.depth)),
         lost=np.asarray(maximum_filter1d(lost.astype(np.uint8), step)[::step] > 0),
         half_filter=ceil(half / step),
         margin=max(1, ceil(2 * (half - 1) / step)),

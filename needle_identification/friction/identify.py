@@ -227,7 +227,8 @@ def _first_choice(signals: FilteredSignals, from_positions: bool) -> _Choice:
 
 def _without_transitions(choice: _Choice) -> _Choice:
     """Leave out more around each change, if the force does not follow the terms there."""
-    count = len(columns_of(choice.signals.settings.terms))
+    settings = choice.signals.settings
+    count = len(columns_of(settings.terms, settings))
     if choice.fit.is_exact:
         return choice
     try:

@@ -43,7 +43,7 @@ def parameter_estimates(
         The parameters.
 
     """
-    columns = columns_of(settings.terms)
+    columns = columns_of(settings.terms, settings)
     at = {column.name: k for k, column in enumerate(columns)}
     intervals = fit.interval()
     found = []

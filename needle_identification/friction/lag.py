@@ -16,7 +16,7 @@ from needle_identification.estimation.estimate import ParameterEstimate
 from needle_identification.estimation.regression import Regression
 from needle_identification.friction.design import Design, FEWEST_SAMPLES, select_samples
 from needle_identification.friction.filtering import FilteredSignals
-from needle_identification.friction.terms import regressors
+from needle_identification.friction.terms import Motion, regressors
 import numpy as np
 from scipy.special import ndtri
 
@@ -101,7 +101,11 @@ def _coarse_lag(signals: FilteredSignals) -> float:
             return 0.0
         settings = signals.settings
         since = time[moving] - time[0]
-        x = regressors(speed[moving], acceleration[moving], since, settings.terms, settings)
+        depth = np.interp(then[moving], signals.time, signals.depth)
+        motion = Motion(
+            speed[moving], acceleration[moving], since, depth, np.ones_like(moving)[moving]
+        )
+        x = regressors(motion, settings.terms, settings)
         solution = np.linalg.lstsq(x, force[moving], rcond=None)[0]
         misfits.append(float(np.mean((force[moving] - x @ solution) ** 2)))
     best = int(np.argmin(misfits))

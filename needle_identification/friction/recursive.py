@@ -20,9 +20,12 @@ from needle_identification.estimation.regression import determinable, Regression
 from needle_identification.friction.filtering import CORRELATION_LENGTH, filter_taps, GAP
 from needle_identification.friction.intervals import parameter_estimates
 from needle_identification.friction.settings import AUTO, FrictionSettings
-from needle_identification.friction.terms import columns_of, regressors
+from needle_identification.friction.terms import columns_of, Motion, regressors
 from needle_ros.errors import ParameterError
 import numpy as np
+
+#: Terms of the time since the start, or of the inserted length.
+_OF_THE_WHOLE: Final = {'drift', 'length', 'layers', 'cutting'}
 
 #: Independent parts of the remembered motion that a meaningful standard error needs.
 _FEWEST_PARTS: Final = 10.0
@@ -77,8 +80,8 @@ class RecursiveFriction:
             raise ParameterError(
                 f'recursive estimation needs the estimator ordinary, got {settings.estimator!r}'
             )
-        if 'drift' in settings.terms:
-            raise ParameterError('recursive estimation forgets, and has no term drift')
+        if wrong := sorted(_OF_THE_WHOLE & set(settings.terms)):
+            raise ParameterError(f'recursive estimation has no term {" or ".join(wrong)}')
         self._settings = settings
         self._period = 1.0 / rate
         self._taps = filter_taps(settings.cutoff, self._period)
@@ -93,7 +96,7 @@ class RecursiveFriction:
         self._smooth: deque[tuple[float, float]] = deque(maxlen=3)
         self._pending: deque[tuple[float, float, float]] = deque()
         self._estimates_lag = 'inertia' not in settings.terms
-        k = len(columns_of(settings.terms)) + self._estimates_lag
+        k = len(columns_of(settings.terms, settings)) + self._estimates_lag
         #: Information A and, in the last column, b: of all samples, and of the part in progress.
         self._known, self._part = np.zeros((k, k + 1)), np.zeros((k, k + 1))
         self._count = 0
@@ -154,13 +157,9 @@ class RecursiveFriction:
             self._learn(*self._pending.popleft())
 
     def _learn(self, speed: float, acceleration: float, force: float) -> None:
-        row = regressors(
-            np.array([speed]),
-            np.array([acceleration]),
-            np.zeros(1),
-            self._settings.terms,
-            self._settings,
-        )[0]
+        none = np.zeros(1)
+        motion = Motion(np.array([speed]), np.array([acceleration]), none, none, none > 0.0)
+        row = regressors(motion, self._settings.terms, self._settings)[0]
         if self._estimates_lag:
             row = np.append(row, acceleration)
         products = np.outer(row, np.append(row, force))

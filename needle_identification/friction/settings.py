@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from itertools import pairwise
+from math import isfinite
 from typing import Final
 
 from needle_identification.estimation.estimators import check_estimator, ESTIMATORS
@@ -10,7 +12,10 @@ from needle_ros.errors import ParameterError
 from needle_ros.settings import check_constants, constant
 
 #: Terms of the friction force, by name; their equations are in `terms`.
-TERMS: Final = ('coulomb', 'viscous', 'offset', 'drift', 'inertia', 'direction', 'stribeck')
+TERMS: Final = (
+    'coulomb', 'viscous', 'offset', 'drift', 'inertia', 'direction', 'stribeck', 'length',
+    'layers', 'cutting',
+)  # fmt: skip
 
 #: Name of the choice of an estimator by the data.
 AUTO: Final = 'auto'
@@ -49,6 +54,12 @@ class FrictionSettings:
     stribeck_speed: float = constant(
         1e-3, 'm/s', 'speed over which the breakaway friction decays', open_low=True
     )
+    layers: tuple[float, ...] = field(
+        default=(),
+        metadata={
+            'description': 'inserted lengths at which layers begin, for the term layers [m]'
+        },
+    )
     terms: tuple[str, ...] = field(
         default=('coulomb', 'viscous'), metadata={'description': f'of {", ".join(TERMS)}'}
     )
@@ -64,6 +75,18 @@ class FrictionSettings:
     def __post_init__(self) -> None:
         check_constants(self)
         object.__setattr__(self, 'terms', tuple(self.terms))
+        object.__setattr__(self, 'layers', tuple(map(float, self.layers)))
+        if not all(map(isfinite, self.layers)) or any(
+            low >= high for low, high in pairwise(self.layers)
+        ):
+            raise ParameterError(f'layers must be finite and increase, got {list(self.layers)}')
+        if bool(self.layers) != ('layers' in self.terms):
+            raise ParameterError(
+                f'the term layers and the setting layers need each other, got the terms '
+                f'{", ".join(self.terms)} and layers {list(self.layers)}'
+            )
+        if {'length', 'layers'} <= set(self.terms):
+            raise ParameterError('the term layers takes the place of the term length')
         if not self.terms or len(set(self.terms)) < len(self.terms):
             raise ParameterError(f'terms must be distinct, at least one, got {list(self.terms)}')
         for term in self.terms:

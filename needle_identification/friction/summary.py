@@ -83,7 +83,7 @@ def _together(estimates: Sequence[FrictionEstimate]) -> Iterator[str]:
     tried: dict[str, list[Comparison]] = {}
     for estimate in estimates:
         for one in estimate.comparison:
-            if len(one.terms) > len(estimate.terms):
+            if len(one.terms) == len(estimate.terms) + 1:
                 tried.setdefault(one.terms[-1], []).append(one)
     if any(one.supported for ones in tried.values() for one in ones):
         return

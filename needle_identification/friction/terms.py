@@ -8,19 +8,46 @@ Equation (15) of the paper has the first two; the others are optional:
    f_y = \mu_s \operatorname{sgn}(\dot s) + \mu_v \dot s + b + c t + m \ddot s
    + (\Delta\mu_s \operatorname{sgn}(\dot s) + \Delta\mu_v \dot s)_{\dot s < 0}
    + (\mu_b - \mu_s) \operatorname{sgn}(\dot s) \, e^{-(\dot s / v_s)^2}
+   + \operatorname{sgn}(\dot s) \sum_i c_i \ell_i(s) + f_c \, [\text{the tip is in new tissue}]
 
-To add a friction law, add a term to `TERMS` and its columns here.
+with :math:`\ell_i` the length of the needle in layer i, and the whole inserted length for the term
+``length``. To add a friction law, add a term to `TERMS` and its columns here.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final
+from math import inf
+from typing import Final, NamedTuple
 
-from needle_dynamics.arrays import FloatArray
+from needle_dynamics.arrays import BoolArray, FloatArray
 from needle_identification.friction.settings import FrictionSettings
 import numpy as np
+
+
+class Motion(NamedTuple):
+    """
+    Motion of the needle, shape (n,) each.
+
+    Attributes
+    ----------
+    speed, acceleration : ndarray
+        Insertion speed [m/s] and acceleration [m/s^2], positive into the tissue.
+    time : ndarray
+        Time since the recording began [s].
+    depth : ndarray
+        Inserted length [m].
+    fresh : ndarray of bool
+        Whether the needle is as deep as it ever was.
+
+    """
+
+    speed: FloatArray
+    acceleration: FloatArray
+    time: FloatArray
+    depth: FloatArray
+    fresh: BoolArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,30 +60,29 @@ class Column:
     name, symbol, unit : str
         Coefficient: name, symbol in text and unit.
     of : callable
-        Regressor from speed [m/s], acceleration [m/s^2] and time [s], each of shape (n,), and the
-        settings.
+        Regressor from the motion and the settings, shape (n,).
 
     """
 
     name: str
     symbol: str
     unit: str
-    of: Callable[[FloatArray, FloatArray, FloatArray, FrictionSettings], FloatArray]
+    of: Callable[[Motion, FrictionSettings], FloatArray]
 
 
 _COLUMNS: Final[Mapping[str, tuple[Column, ...]]] = {
-    'coulomb': (Column('coulomb_friction', 'mu_s', 'N', lambda v, _a, _t, _s: np.sign(v)),),
-    'viscous': (Column('viscous_friction', 'mu_v', 'N s/m', lambda v, _a, _t, _s: v),),
-    'offset': (Column('offset', 'b', 'N', lambda v, _a, _t, _s: np.ones_like(v)),),
+    'coulomb': (Column('coulomb_friction', 'mu_s', 'N', lambda x, _: np.sign(x.speed)),),
+    'viscous': (Column('viscous_friction', 'mu_v', 'N s/m', lambda x, _: x.speed),),
+    'offset': (Column('offset', 'b', 'N', lambda x, _: np.ones_like(x.speed)),),
     # Of the sensor, or of the tissue: since the recording began.
-    'drift': (Column('force_drift', 'c', 'N/s', lambda _v, _a, t, _s: t),),
-    'inertia': (Column('moving_mass', 'm', 'kg', lambda _v, a, _t, _s: a),),
+    'drift': (Column('force_drift', 'c', 'N/s', lambda x, _: x.time),),
+    'inertia': (Column('moving_mass', 'm', 'kg', lambda x, _: x.acceleration),),
     # What Coulomb and viscous friction are more on withdrawal than on insertion.
     'direction': (
         Column(
-            'withdrawal_coulomb', 'd mu_s', 'N', lambda v, _a, _t, _s: np.minimum(np.sign(v), 0)
+            'withdrawal_coulomb', 'd mu_s', 'N', lambda x, _: np.minimum(np.sign(x.speed), 0)
         ),
-        Column('withdrawal_viscous', 'd mu_v', 'N s/m', lambda v, _a, _t, _s: np.minimum(v, 0.0)),
+        Column('withdrawal_viscous', 'd mu_v', 'N s/m', lambda x, _: np.minimum(x.speed, 0.0)),
     ),
     # What the breakaway friction is more than mu_s.
     'stribeck': (
@@ -64,13 +90,35 @@ _COLUMNS: Final[Mapping[str, tuple[Column, ...]]] = {
             'stribeck_friction',
             'mu_b - mu_s',
             'N',
-            lambda v, _a, _t, s: np.sign(v) * np.exp(-((v / s.stribeck_speed) ** 2)),
+            lambda x, s: np.sign(x.speed) * np.exp(-((x.speed / s.stribeck_speed) ** 2)),
         ),
     ),
-}
+    'length': (
+        Column('length_friction', 'c', 'N/m', lambda x, _: np.sign(x.speed) * x.depth),
+    ),
+    'cutting': (
+        Column(
+            'cutting_force', 'f_c', 'N',
+            lambda x, _: np.where(x.fresh & (x.speed > 0.0), 1.0, 0.0),
+        ),
+    ),
+}  # fmt: skip
 
 
-def columns_of(terms: Sequence[str]) -> list[Column]:
+def _layers(boundaries: Sequence[float]) -> list[Column]:
+    """Return a column for each layer: the last one ends nowhere."""
+    return [
+        Column(
+            f'layer_{k + 1}_friction', f'c_{k + 1}', 'N/m',
+            lambda x, _, low=low, high=high: np.sign(x.speed) * np.clip(x.depth - low, 0.0, high),
+        )
+        for k, (low, high) in enumerate(
+            (low, end - low) for low, end in zip(boundaries, [*boundaries[1:], inf], strict=True)
+        )
+    ]  # fmt: skip
+
+
+def columns_of(terms: Sequence[str], settings: FrictionSettings) -> list[Column]:
     """
     Return the columns of terms.
 
@@ -78,6 +126,8 @@ def columns_of(terms: Sequence[str]) -> list[Column]:
     ----------
     terms : sequence of str
         Terms, of `TERMS`.
+    settings : FrictionSettings
+        Constants of the terms.
 
     Returns
     -------
@@ -85,25 +135,21 @@ def columns_of(terms: Sequence[str]) -> list[Column]:
         Their columns, in order.
 
     """
-    return [column for term in terms for column in _COLUMNS[term]]
+    return [
+        column
+        for term in terms
+        for column in (_layers(settings.layers) if term == 'layers' else _COLUMNS[term])
+    ]
 
 
-def regressors(
-    speed: FloatArray,
-    acceleration: FloatArray,
-    time: FloatArray,
-    terms: Sequence[str],
-    settings: FrictionSettings,
-) -> FloatArray:
+def regressors(motion: Motion, terms: Sequence[str], settings: FrictionSettings) -> FloatArray:
     """
     Return the regressors of terms.
 
     Parameters
     ----------
-    speed, acceleration : ndarray, shape (n,)
-        Insertion speed [m/s] and acceleration [m/s^2], positive into the tissue.
-    time : ndarray, shape (n,)
-        Time since the recording began [s].
+    motion : Motion
+        Motion of the needle.
     terms : sequence of str
         Terms, of `TERMS`.
     settings : FrictionSettings
@@ -115,5 +161,4 @@ def regressors(
         One column per coefficient, as in `columns_of`.
 
     """
-    columns = columns_of(terms)
-    return np.column_stack([c.of(speed, acceleration, time, settings) for c in columns])
+    return np.column_stack([c.of(motion, settings) for c in columns_of(terms, settings)])
