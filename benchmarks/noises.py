@@ -37,7 +37,7 @@ _REST_SHARE: Final = 0.33
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Kind:
     """
-    A kind of recording: noise of the force and of the motion, and what the truth holds beside (15).
+    A kind of recording: noise of force and motion, and what the truth holds beside (15).
 
     Attributes
     ----------
@@ -108,11 +108,12 @@ def recorded(
     step = 1.0 / (kind.rate * _FINER)
     speed, acceleration = _strokes(rng, kind.duration, step)
     depth = 0.05 + np.concatenate([[0.0], np.cumsum(0.5 * step * (speed[1:] + speed[:-1]))])
-    time = np.arange(len(speed)) * step
+    time: FloatArray = np.arange(len(speed)) * step
     force = _force(truth, time, speed, acceleration)
     force = np.interp(time - kind.late, time, force)
     kept = slice(None, None, _FINER)
-    time, depth, speed, force = (a[kept] for a in (time, depth, speed, force))
+    time, depth = time[kept], np.asarray(depth[kept])
+    speed, force = speed[kept], np.asarray(force[kept])
     n = len(time)
     depth = depth + kind.position_noise * rng.standard_normal(n)
     recording = Recording(

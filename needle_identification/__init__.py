@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from needle_identification.friction.comparison import Comparison
     from needle_identification.friction.estimate import Fit, FrictionEstimate
     from needle_identification.friction.identify import identify_friction
+    from needle_identification.friction.punctures import Puncture
     from needle_identification.friction.recursive import RecursiveFriction
     from needle_identification.friction.settings import FrictionSettings, TERMS
     from needle_identification.friction.summary import FrictionSummary, summarize
@@ -80,6 +81,7 @@ __all__ = [
     'OfferedQos',
     'ParameterEstimate',
     'Presses',
+    'Puncture',
     'Recorded',
     'Recording',
     'RecordingError',

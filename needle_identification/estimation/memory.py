@@ -24,6 +24,7 @@ References
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from math import exp, sqrt
 from typing import Final
 
@@ -145,7 +146,7 @@ def divided(used: BoolArray, length: int) -> Parts:
     for start, end in edges.reshape(-1, 2).tolist():
         count = max(1, round((end - start) / long))
         cuts = [start + (end - start) * k // count for k in range(count + 1)]
-        limits += zip(cuts[:-1], cuts[1:], strict=True)
+        limits += pairwise(cuts)
     return Parts(np.array(limits, dtype=np.int_).reshape(-1, 2), long)
 
 

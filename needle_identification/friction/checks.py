@@ -100,8 +100,8 @@ def fit_warnings(
         )
     if design.signals.cut_off:
         yield (
-            f'{100.0 * design.signals.cut_off:.2g} % of the force is at the limits of its sensor, which cut '
-            'it off: left out'
+            f'{100.0 * design.signals.cut_off:.2g} % of the force is at the limits of its sensor, '
+            'which cut it off: left out'
         )
     cutoff, rate = settings.cutoff, 1.0 / design.signals.period
     if cutoff > 0.5 * rate:
@@ -185,7 +185,8 @@ def noise_words(design: Design, bias: float) -> str:
         Words.
 
     """
-    return f'noise of {design.signals.speed_noise:.2g} m/s in the speed reduces mu_v by {bias:.2g} N s/m'
+    noise = design.signals.speed_noise
+    return f'noise of {noise:.2g} m/s in the speed reduces mu_v by {bias:.2g} N s/m'
 
 
 def _of_memory(design: Design, fit: Regression) -> Iterator[str]:

@@ -131,7 +131,9 @@ class Design:
         """
         if term == 'cutting':
             inward = self.used & (self.speed > 0.0)
-            few = min(np.count_nonzero(inward & self.fresh), np.count_nonzero(inward & ~self.fresh))
+            few = min(
+                np.count_nonzero(inward & self.fresh), np.count_nonzero(inward & ~self.fresh)
+            )
             return bool(few >= self.signals.correlation)
         if term != 'stribeck':
             return True

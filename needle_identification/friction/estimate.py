@@ -9,6 +9,7 @@ from needle_identification.estimation.estimate import Named, ParameterEstimate
 from needle_identification.estimation.formatting import measured
 from needle_identification.estimation.residual_tests import ResidualTest
 from needle_identification.friction.comparison import Comparison
+from needle_identification.friction.punctures import Puncture
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
@@ -63,6 +64,8 @@ class FrictionEstimate(Named[ParameterEstimate]):
         Lag of the force behind the motion [s]; it was corrected. Not determined where the speed
         only jumps. A mass m beside viscous friction reduces it by m / mu_v. None if inertia is a
         term, which looks like a lag, or if only positions were recorded.
+    punctures : tuple of Puncture
+        Where the force dropped while the needle went into new tissue.
     samples : int
         Number of samples used.
     residual : float
@@ -88,6 +91,7 @@ class FrictionEstimate(Named[ParameterEstimate]):
     parameters: tuple[ParameterEstimate, ...]
     breakaway: ParameterEstimate | None
     lag: ParameterEstimate | None
+    punctures: tuple[Puncture, ...]
     samples: int
     residual: float
     determination: float

@@ -14,6 +14,7 @@ The steps, each in a file of its own:
 `design`          samples in steady motion, regressors (`terms`), and the regression
 `intervals`       parameters with standard errors and confidence intervals
 `breakaway`       the force at which the needle begins to move
+`punctures`       where the force drops on the way into new tissue
 `comparison`      other sets of terms
 `checks`          errors and warnings
 ================  =================================================================================
@@ -48,6 +49,7 @@ from needle_identification.friction.filtering import (
 )
 from needle_identification.friction.intervals import parameter_estimates
 from needle_identification.friction.lag import find_lag, lag_estimate
+from needle_identification.friction.punctures import find_punctures
 from needle_identification.friction.settings import AUTO, FrictionSettings
 from needle_identification.friction.terms import columns_of
 from needle_identification.recordings.recording import Recording
@@ -146,6 +148,7 @@ def _identify(recording: Recording, settings: FrictionSettings, among: int) -> F
         breakaway=breakaway_force(design, parameters),
         # The resolution of positions and a mass make errors of the lag that its interval lacks.
         lag=None if choice.from_positions or has_inertia else lag,
+        punctures=find_punctures(design, fit),
         samples=fit.samples,
         residual=sqrt(float(fit.residual @ fit.residual) / fit.samples),
         determination=fit.determination,

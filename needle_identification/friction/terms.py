@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from math import inf
 from typing import Final, NamedTuple
 
@@ -107,15 +108,16 @@ _COLUMNS: Final[Mapping[str, tuple[Column, ...]]] = {
 
 def _layers(boundaries: Sequence[float]) -> list[Column]:
     """Return a column for each layer: the last one ends nowhere."""
+    ends = [*boundaries[1:], inf]
     return [
-        Column(
-            f'layer_{k + 1}_friction', f'c_{k + 1}', 'N/m',
-            lambda x, _, low=low, high=high: np.sign(x.speed) * np.clip(x.depth - low, 0.0, high),
-        )
-        for k, (low, high) in enumerate(
-            (low, end - low) for low, end in zip(boundaries, [*boundaries[1:], inf], strict=True)
-        )
-    ]  # fmt: skip
+        Column(f'layer_{k + 1}_friction', f'c_{k + 1}', 'N/m', partial(_in_layer, low, end - low))
+        for k, (low, end) in enumerate(zip(boundaries, ends, strict=True))
+    ]
+
+
+def _in_layer(begin: float, thickness: float, motion: Motion, _: FrictionSettings) -> FloatArray:
+    inside = np.clip(motion.depth - begin, 0.0, thickness)
+    return np.asarray(np.sign(motion.speed) * inside)
 
 
 def columns_of(terms: Sequence[str], settings: FrictionSettings) -> list[Column]:

@@ -301,11 +301,12 @@ def _suggestion(path: Path, signals: Sequence[_Signal]) -> tuple[list[str], str]
         )
         return [f'nothing looks like friction: {why}'], ''
     explained, size, force, motion = best
-    words = [
+    what = (
         f'{force.topic.name} {force.axis} looks like the force, {motion.topic.name} '
         f'{motion.axis} like the motion: its direction and speed explain '
         f'{100.0 * explained:.0f} % of the force'
-    ]
+    )
+    words = [what]
     options = []
     if len({one.topic for one in forces}) > 1:
         options += ['--wrench-topic', force.topic.name]

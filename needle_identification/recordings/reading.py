@@ -33,7 +33,6 @@ from needle_ros import wire
 from needle_ros.contract import BASE_WRENCH, END_EFFECTOR_POSE, JOINT_STATES
 from needle_ros.errors import MessageError
 
-
 #: Messages that show the names of joints.
 _FIRST: Final = 50
 

@@ -387,7 +387,7 @@ def _text(path: Path) -> Table:
         # Text, gaps, or decimal commas.
         table, lost = _rows(path, first, separator, count)
     losses = [f'{lost} lines not readable, left out'] if lost else []
-    known = np.isfinite(table).any(axis=0)
+    known = np.isfinite(table).any(axis=0).tolist()
     columns = {name: table[:, k] for k, name in enumerate(names) if known[k]}
     return Table(path, columns, {}, losses)
 
@@ -448,7 +448,7 @@ def _names(head: Sequence[str], separator: str | None, count: int) -> list[str]:
 
 
 def _distinct(names: Iterator[str]) -> Iterator[str]:
-    """Number columns without a name of their own."""
+    """Give each column a name of its own."""
     seen: set[str] = set()
     for k, name in enumerate(names):
         unique = name if name and name not in seen else f'{name}{k + 1}'

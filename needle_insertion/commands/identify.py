@@ -71,6 +71,12 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
         help=f'terms of the force, of {", ".join(TERMS)} '
         f'(default {",".join(FrictionSettings().terms)})',
     )
+    fitting.add_argument(
+        '--layers',
+        type=_lengths,
+        metavar='M,...',
+        help='inserted lengths at which layers begin [m], for the term layers',
+    )
     friction.set_defaults(identify=_run_friction)
 
     stiffness = what.add_parser(
@@ -108,8 +114,17 @@ def _words(text: str) -> list[str]:
     return [word.strip() for word in text.split(',')]
 
 
+def _lengths(text: str) -> list[float]:
+    try:
+        return [float(word) for word in text.split(',')]
+    except ValueError:
+        raise argparse.ArgumentTypeError(
+            f'takes lengths [m] with commas between them, got {text!r}'
+        ) from None
+
+
 def _add_common(
-    parser: argparse.ArgumentParser, defaults: object
+    parser: argparse.ArgumentParser, defaults: FrictionSettings | StiffnessSettings
 ) -> tuple[argparse._ArgumentGroup, argparse._ArgumentGroup]:
     """Add what both have; return the groups of options of reading and of fitting."""
     parser.add_argument(
@@ -117,7 +132,8 @@ def _add_common(
         type=Path,
         nargs='+',
         metavar='BAG',
-        help='rosbag2 folder, .mcap, .db3 or ROS 1 .bag file, or a table (.csv, .mat); one that cannot be used is named, the others '
+        help='rosbag2 folder, .mcap, .db3 or ROS 1 .bag file, or a table (.csv, .mat); one that '
+        'cannot be used is named, the others '
         'go on, and the exit status is 2',
     )
     writing = parser.add_argument_group('what to write')
@@ -153,8 +169,7 @@ def _add_common(
     )
     fitting = parser.add_argument_group('how to identify')
     # What may be chosen by the data is, unless asked otherwise.
-    default = getattr(defaults, 'estimator')
-    estimators = tuple(dict.fromkeys([default, *ESTIMATORS]))
+    estimators = tuple(dict.fromkeys([defaults.estimator, *ESTIMATORS]))
     fitting.add_argument(
         '--estimator',
         choices=estimators,
@@ -162,7 +177,7 @@ def _add_common(
         help='least squares: ordinary, weighted by the noise measured, huber against outliers, '
         f'total for noise in the motion too (default {estimators[0]})',
     )
-    for item in fields(defaults):  # type: ignore[arg-type]
+    for item in fields(defaults):
         if 'unit' in item.metadata:
             unit = item.metadata['unit']
             default = f'{item.default:g} {unit}'.removesuffix(' 1')

@@ -8,7 +8,7 @@ from math import isfinite
 from pathlib import Path
 import sys
 
-from needle_identification import Inspection, inspect_recording
+from needle_identification import inspect_recording, Inspection
 from needle_insertion.commands.common import Command
 from needle_insertion.report.identify_text import plain
 from needle_insertion.report.text import table
@@ -32,17 +32,24 @@ def _run(options: argparse.Namespace) -> int:
     found: list[Inspection] = []
     bad = 0
     for path in options.recordings:
-        try:
-            found.append(inspect_recording(path))
-        except (NeedleError, OSError) as error:
-            sys.stderr.write(shown(f'error: {error}') + '\n')
-            bad += 1
+        one = _inspected(path)
+        found += one
+        bad += not one
     if options.json:
         document = [plain(one) for one in found]
         sys.stdout.write(f'{json.dumps(document, indent=2, allow_nan=False)}\n')
     else:
         sys.stdout.write('\n\n'.join(map(_text, found)) + ('\n' if found else ''))
     return 2 if bad else 0
+
+
+def _inspected(path: Path) -> list[Inspection]:
+    """Look into a recording; say what is wrong with it if that cannot be done."""
+    try:
+        return [inspect_recording(path)]
+    except (NeedleError, OSError) as error:
+        sys.stderr.write(shown(f'error: {error}') + '\n')
+        return []
 
 
 def _text(found: Inspection) -> str:

@@ -31,6 +31,7 @@ _SIDES: Final = ((1.0, 'into the tissue', _IN, 'o'), (-1.0, 'out of it', _OUT, '
 
 #: Points of a line; more cannot be seen.
 _MOST_POINTS: Final = 8000
+_MOST_SMALL: Final = 300
 
 _SYMBOL: Final = re.compile(r'\b(mu|k|f)_(\w{1,3})\b')
 _GREEK: Final = {'mu': r'\mu'}
@@ -116,6 +117,91 @@ def friction_residuals(estimate: FrictionEstimate) -> Figure:
     return figure
 
 
+def friction_each(estimates: Sequence[FrictionEstimate], names: Sequence[str]) -> Figure:
+    """
+    Draw force against speed of every recording, with the fit.
+
+    Parameters
+    ----------
+    estimates : sequence of FrictionEstimate
+        What each recording gave.
+    names : sequence of str
+        Their names.
+
+    Returns
+    -------
+    Figure
+        A small plot of each, all with the same axes.
+
+    """
+    figure, panels = _small_multiples(len(estimates))
+    for axes, estimate, name in zip(panels, estimates, names, strict=True):
+        fit = estimate.fit
+        for sign, words, color, mark in _SIDES:
+            side = fit.used & (np.sign(fit.speed) == sign)
+            order = np.argsort(fit.speed[side])
+            speed, force, model = (
+                _thinned(values[side][order], most=_MOST_SMALL)[0]
+                for values in (1e3 * fit.speed, fit.force, fit.model)
+            )
+            axes.plot(speed, force, mark, color=color, markersize=1.5, alpha=0.5, label=words)
+            axes.plot(speed, model, color=_FIT, linewidth=0.9)
+        axes.set_title(name, fontsize='small')
+        _label(axes, '', '')
+    figure.supxlabel('insertion speed [mm/s]')
+    figure.supylabel('force on the needle [N]')
+    return figure
+
+
+def stiffness_each(estimates: Sequence[StiffnessEstimate], names: Sequence[str]) -> Figure:
+    """
+    Draw where the end-effector came to rest in every recording, with the fitted ellipses.
+
+    Parameters
+    ----------
+    estimates : sequence of StiffnessEstimate
+        What each recording gave.
+    names : sequence of str
+        Their names.
+
+    Returns
+    -------
+    Figure
+        A small plot of each, all with the same axes.
+
+    """
+    figure, panels = _small_multiples(len(estimates))
+    for axes, estimate, name in zip(panels, estimates, names, strict=True):
+        _ellipses(axes, estimate)
+        axes.plot(*1e3 * estimate.presses.displacement.T, 'o', color=_IN, markersize=2.0)
+        axes.set_title(name, fontsize='small')
+        _label(axes, '', '')
+    figure.supxlabel('displacement x [mm]')
+    figure.supylabel('displacement z [mm]')
+    return figure
+
+
+def _small_multiples(count: int) -> tuple[Figure, list[Axes]]:
+    """Return a figure with so many small plots in rows, with shared axes."""
+    columns = min(count, 5)
+    lines = -(-count // columns)
+    figure = _new_figure(9.0, 0.6 + 1.7 * lines)
+    panels = figure.subplots(lines, columns, sharex=True, sharey=True, squeeze=False)
+    for axes in panels.flat[count:]:
+        axes.set_visible(False)
+    return figure, list(panels.flat[:count])
+
+
+def _ellipses(axes: Axes, estimate: StiffnessEstimate) -> None:
+    """Draw where each level of force ends according to its matrix."""
+    turn = np.linspace(0.0, 2.0 * np.pi, 181)
+    circle = np.array([np.cos(turn), np.sin(turn)])
+    for level in estimate.levels:
+        if np.isfinite(level.matrix).all():
+            ellipse = 1e3 * np.linalg.solve(level.matrix, level.force * circle)
+            axes.plot(*ellipse, color=_DATA, linewidth=0.8, zorder=1)
+
+
 def stiffness_levels(summary: StiffnessSummary) -> Figure:
     """
     Draw each entry of the matrix against the force, beside Table 2.
@@ -193,12 +279,7 @@ def stiffness_presses(estimate: StiffnessEstimate) -> Figure:
             label=f'{round(np.degrees(np.arctan2(way[1], way[0]))) % 360}°',
         )  # fmt: skip
         right.plot(*1e3 * presses.displacement[of].T, 'o', color=color, markersize=4.0)
-    turn = np.linspace(0.0, 2.0 * np.pi, 181)
-    circle = np.array([np.cos(turn), np.sin(turn)])
-    for level in estimate.levels:
-        if np.isfinite(level.matrix).all():
-            ellipse = 1e3 * np.linalg.solve(level.matrix, level.force * circle)
-            right.plot(*ellipse, color=_DATA, linewidth=0.8, zorder=1)
+    _ellipses(right, estimate)
     _principal_axes(right, estimate.levels[-1])
     _label(left, 'displacement along the force [mm]', 'force [N]')
     left.set(xlim=(0.0, None), ylim=(0.0, None))
@@ -291,7 +372,7 @@ def _legend_above(axes: Axes, **options: Any) -> None:
     )  # fmt: skip
 
 
-def _thinned(*signals: FloatArray) -> list[FloatArray]:
+def _thinned(*signals: FloatArray, most: int = _MOST_POINTS) -> list[FloatArray]:
     """Leave out samples that cannot be seen."""
-    step = max(1, len(signals[0]) // _MOST_POINTS)
+    step = max(1, len(signals[0]) // most)
     return [signal[::step] for signal in signals]

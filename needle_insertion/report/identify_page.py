@@ -29,6 +29,8 @@ from needle_insertion.report.identify_text import (
     MEAN_HEADS,
     mean_row,
     parameter_cells,
+    PUNCTURE_HEADS,
+    puncture_rows,
     short_names,
     warned,
     with_deviation,
@@ -39,6 +41,9 @@ import numpy as np
 
 #: Parameters that a plant takes while it runs.
 _LIVE: Final = ('model.coulomb_friction', 'model.viscous_friction')
+
+#: Recordings that have a small plot each.
+_MOST_EACH: Final = 60
 
 _ENTRY_HEADS: Final = tuple(f'{entry} [N/m]' for entry in TABLE_2)
 _QUALITY_HEADS: Final = ('residual [mN]', 'R²', 'condition')
@@ -109,6 +114,8 @@ def _friction_content(summary: FrictionSummary, label: Mapping[str, str]) -> dic
             for one in estimates
         ],
         'heads': ('recording', *map(label_of, means), 'samples used', *_QUALITY_HEADS),
+        'puncture_rows': puncture_rows(summary),
+        'puncture_heads': PUNCTURE_HEADS,
         'values': values,
         'live': [
             f'ros2 param set /plant {name} {values[name]:.6g}' for name in _LIVE if name in values
@@ -167,6 +174,15 @@ def _friction_pictures(
             figures.friction_residuals(shown),
             f'Three plots of the residual force of {name}, which has a root mean square of '
             f'{1e3 * shown.residual:.2g} mN. A good fit leaves noise around zero without a trend.',
+        ),
+        Picture(
+            'friction_each',
+            'Force against speed of each recording, and its fit.',
+            figures.friction_each(
+                estimates[:_MOST_EACH], [label[one.name] for one in estimates[:_MOST_EACH]]
+            ),
+            f'Small plots of {_shown_of(len(estimates))}: the force jumps at zero speed and rises '
+            'on a straight line.',
         ),
         Picture(
             'friction_spread',
@@ -271,6 +287,15 @@ def _stiffness_pictures(
             'positions of a level of force lie on an ellipse.',
         ),
         Picture(
+            'stiffness_each',
+            'Where the end-effector came to rest at each place, and the ellipses of its matrices.',
+            figures.stiffness_each(
+                summary.estimates[:_MOST_EACH],
+                [label for label, _ in rows][:_MOST_EACH],
+            ),
+            f'Small plots of {_shown_of(len(rows))}: points near ellipses.',
+        ),
+        Picture(
             'stiffness_spread',
             f'k_a of each place at {force:.2f} N with its 95 % interval. The line and the band '
             'are the mean and its interval.',
@@ -300,6 +325,11 @@ def _card(one: Statistic) -> tuple[str, str, str]:
     if one.deviation is not None:
         note += f'; STD {spread(one.deviation)} over {_counted(one.count, "recording")}'
     return what, rounded(one.mean, one.error, one.unit), note
+
+
+def _shown_of(number: int) -> str:
+    shown = _counted(min(number, _MOST_EACH), 'recording')
+    return shown if number <= _MOST_EACH else f'the first {shown} of {number}'
 
 
 def _counted(number: int, what: str) -> str:

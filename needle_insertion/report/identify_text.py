@@ -30,6 +30,10 @@ _NUMBERS: Final = re.compile(r'[-+]?\d[\d.e+-]*')
 MEAN_HEADS: Final = ('parameter', 'mean ± SE', '95 % interval', 'STD over bags', 'bags')
 
 
+#: Heads of the rows of `puncture_rows`.
+PUNCTURE_HEADS: Final = ('bag', 'puncture at [s]', 'depth [mm] ± SE', 'drop [N] ± SE')
+
+
 def label_of(one: ParameterEstimate | Statistic) -> str:
     """
     Return symbol and unit.
@@ -190,7 +194,37 @@ def _friction_text(summary: FrictionSummary) -> str:
         for one in summary.estimates
     ]
     heads = ('bag', *(f'{label_of(one)} ± SE' for one in means), 'samples', 'residual [N]')
-    return f'{table([mean_row(one) for one in means], MEAN_HEADS)}\n\n{table(rows, heads)}'
+    tables = [table([mean_row(one) for one in means], MEAN_HEADS), table(rows, heads)]
+    if found := puncture_rows(summary):
+        tables.append(table(found, PUNCTURE_HEADS))
+    return '\n\n'.join(tables)
+
+
+def puncture_rows(summary: FrictionSummary) -> list[tuple[str, ...]]:
+    """
+    Return the punctures of all recordings.
+
+    Parameters
+    ----------
+    summary : FrictionSummary
+        All recordings.
+
+    Returns
+    -------
+    list of tuple of str
+        Table rows with the heads `PUNCTURE_HEADS`.
+
+    """
+    return [
+        (
+            estimate.name,
+            f'{one.time:.3f}',
+            measured(1e3 * one.depth.value, 1e3 * one.depth.error),
+            measured(one.drop.value, one.drop.error),
+        )
+        for estimate in summary.estimates
+        for one in estimate.punctures
+    ]
 
 
 def _stiffness_text(summary: StiffnessSummary) -> str:

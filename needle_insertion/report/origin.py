@@ -89,15 +89,7 @@ class Origin:
         return [
             *((name, f'the same samples as {other}: counts once') for name, other in self.copies),
             *((one.name, words) for one in self.sources for words in one.losses),
-            *(
-                (
-                    one.name,
-                    f'the clock of the force was {1e3 * one.clock_offset:+.2f} ms off the clock '
-                    'of the motion; corrected',
-                )
-                for one in self.sources
-                if one.clock_offset
-            ),
+            *((one.name, _clocks(one.clock_offset)) for one in self.sources if one.clock_offset),
         ]
 
     @property
@@ -122,6 +114,12 @@ class Origin:
         return [
             (path, f'{one.samples}', digest) for one in self.sources for path, digest in one.files
         ]
+
+
+def _clocks(offset: float) -> str:
+    return (
+        f'the clock of the force was {1e3 * offset:+.2f} ms off the clock of the motion; corrected'
+    )
 
 
 def _worded(value: Any, unit: str) -> str:

@@ -1,0 +1,129 @@
+"""
+Punctures: where the force drops while the needle goes into new tissue.
+
+A membrane or a skin yields at once: the force falls within a few milliseconds by what it bore. The
+mean force before and after each moment is compared over as long as the filter correlates noise,
+less what friction explains; a drop stands out from what noise and tissue do elsewhere.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import hypot, sqrt
+from typing import Final
+
+from needle_dynamics.arrays import FloatArray
+from needle_identification.estimation.estimate import ParameterEstimate
+from needle_identification.estimation.regression import Regression
+from needle_identification.friction.design import Design
+import numpy as np
+from scipy.special import ndtri
+
+#: A puncture drops the force by this many standard deviations of other changes of it.
+_CLEAR: Final = 8.0
+
+#: Part of a change of the friction that the terms may have wrong.
+_UNKNOWN_FRICTION: Final = 0.5
+
+#: Standard deviation of normal noise over its median absolute deviation.
+_DEVIATION_OVER_MEDIAN: Final = 1.4826
+
+_DEPTH: Final = ParameterEstimate(name='puncture_depth', symbol='s_p', unit='m')
+_DROP: Final = ParameterEstimate(name='puncture_force', symbol='f_p', unit='N')
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Puncture:
+    """
+    A puncture.
+
+    Attributes
+    ----------
+    time : float
+        When it was, on the clock of the recording [s].
+    depth, drop : ParameterEstimate
+        Inserted length [m] and drop of the force [N].
+
+    """
+
+    time: float
+    depth: ParameterEstimate
+    drop: ParameterEstimate
+
+
+def find_punctures(design: Design, fit: Regression) -> tuple[Puncture, ...]:
+    """
+    Find punctures.
+
+    Parameters
+    ----------
+    design : Design
+        The samples, and the terms of the friction.
+    fit : Regression
+        Their solution.
+
+    Returns
+    -------
+    tuple of Puncture
+        In order of time; none where the needle does not go into new tissue.
+
+    """
+    signals = design.signals
+    inward = design.fresh & (design.regime > 0.0) & ~signals.lost
+    width, reach = signals.correlation, signals.half_filter
+    if np.ptp(signals.depth) == 0.0:
+        return ()
+    x = design.regressors(signals.settings.terms)
+    force = signals.force - x[:, : len(fit.values)] @ np.nan_to_num(fit.values)
+    explained = signals.force - force
+    drops, others = np.full(len(force), np.nan), np.zeros(len(force))
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], inward.astype(np.int8), [0]])))
+    inner = edges.reshape(-1, 2) + np.array([signals.margin, -signals.margin])
+    for start, end in inner:
+        if start >= end:
+            continue
+        middle = np.arange(start + width + reach, end - width - reach)
+        if not len(middle):
+            continue
+        at = middle - start
+        for values, kept in ((force, drops), (explained, others)):
+            sums = np.concatenate([[0.0], np.cumsum(values[start:end])])
+            before = sums[at - reach] - sums[at - reach - width]
+            after = sums[at + reach + width] - sums[at + reach]
+            kept[middle] = (before - after) / width
+    known = np.isfinite(drops)
+    if np.count_nonzero(known) < 4 * width:
+        return ()
+    usual = float(np.median(drops[known]))
+    noise = _DEVIATION_OVER_MEDIAN * float(np.median(np.abs(drops[known] - usual)))
+    found = []
+    # Where the speed changes, friction does, and is hardly known better than by a part.
+    clear = np.maximum(usual + _CLEAR * noise, _UNKNOWN_FRICTION * np.abs(others))
+    left = np.where(known & (drops > np.maximum(clear, 0.0)), drops, 0.0)
+    while noise > 0.0 and left.any():
+        peak = int(np.argmax(left))
+        found.append(_puncture(design, force, peak, noise))
+        left[max(0, peak - 2 * (width + reach)) : peak + 2 * (width + reach)] = 0.0
+    return tuple(sorted(found, key=lambda one: one.time))
+
+
+def _puncture(design: Design, force: FloatArray, peak: int, noise: float) -> Puncture:
+    """Locate the steepest fall near a moment, and measure the drop across it."""
+    signals = design.signals
+    width, reach = signals.correlation, signals.half_filter
+    around = slice(peak - width // 2 - reach, peak + width // 2 + reach)
+    at = around.start + int(np.argmin(np.gradient(force[around])))
+    before, after = force[at - reach - width : at - reach], force[at + reach : at + reach + width]
+    # The tissue may load the needle up to the puncture: the straight line before it is continued.
+    time = np.arange(-width, 0) - reach
+    level = np.polyfit(time, before, 1)[1]
+    drop = float(level - after.mean())
+    half_width = float(ndtri(0.975))
+    # Two means, one of them continued by half its length and half the filter.
+    error = noise * sqrt(1.0 + 1.5 * (1.0 + 2.0 * reach / width) ** 2)
+    place = hypot(reach * signals.period * float(design.speed[at]), 1e-6) / sqrt(3.0)
+    return Puncture(
+        time=float(signals.time[at]),
+        depth=_DEPTH.with_value(float(design.depth[at]), place, half_width * place),
+        drop=_DROP.with_value(drop, error, half_width * error),
+    )
