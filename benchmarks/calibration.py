@@ -17,7 +17,7 @@ from functools import partial
 from math import pi, sqrt
 from multiprocessing import get_context
 import os
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, TypeVar
 from unittest import mock
 
 from benchmarks.bounds import friction_truth, RATE, stiffness_truth, Truth
@@ -76,6 +76,8 @@ _CHUNK: Final = 5
 _MOST_RECORDINGS: Final = 100_000
 
 _BASIC: Final = ('coulomb', 'viscous')
+
+_Result = TypeVar('_Result')
 
 
 class Found(NamedTuple):
@@ -479,15 +481,15 @@ DEFAULT_CASES: Final = ('(15)', 'K, ordinary')
 
 
 def studied(
-    study: Callable[[int, int], list[Found]], recordings: int, seed: int, workers: int
-) -> Iterator[list[Found]]:
+    study: Callable[[int, int], list[_Result]], recordings: int, seed: int, workers: int
+) -> Iterator[list[_Result]]:
     """
     Identify many recordings on all cores.
 
     Parameters
     ----------
     study : callable
-        `friction` or `stiffness`.
+        Such as `friction` or `stiffness`.
     recordings, seed : int
         How many, and the seed of the study: the same seed gives the same recordings.
     workers : int
@@ -495,7 +497,7 @@ def studied(
 
     Yields
     ------
-    list of Found
+    list
         What each recording gave, in order.
 
     """

@@ -22,7 +22,7 @@ Question: TypeAlias = Callable[[Tick], Answer]
 MODULES = {
     'dynamics': ('step', 'solvers', 'rods', 'batches'),
     'identification': ('identification',),
-    'calibration': ('calibration',),
+    'calibration': ('calibration', 'noises'),
     'control': ('control',),
     'laws': ('laws',),
     'safety': ('safety',),

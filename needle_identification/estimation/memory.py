@@ -43,9 +43,6 @@ _LONGEST: Final = 10.0
 #: Probability of white noise before anything is seen.
 _WHITE: Final = 0.5
 
-#: Half the width of a 95 % interval [standard deviations].
-_NORMAL: Final = float(ndtri(0.975))
-
 #: Models of less probability do not count.
 _NEGLIGIBLE: Final = 1e-6
 
@@ -157,8 +154,9 @@ class Memory:
 
     Attributes
     ----------
-    inflation : ndarray, shape (k,)
-        Error of each parameter over that with white noise.
+    inflation, far : ndarray, shape (k,)
+        Error of each parameter over that with white noise: such that an interval of 95 % is right,
+        and one of 99.6 %, for tests that must hardly ever fail by chance.
     length : float
         Time of correlation of the most probable model [samples]; 0 for white noise.
     ratio : float
@@ -167,6 +165,7 @@ class Memory:
     """
 
     inflation: FloatArray
+    far: FloatArray
     length: float
     ratio: float
 
@@ -234,7 +233,8 @@ def memory_of(
     m, k = x.shape
     free = m - k
     if free < 1 or not r.any():
-        return Memory(inflation=np.ones(a.shape[1]), length=0.0, ratio=0.0)
+        ones = np.ones(a.shape[1])
+        return Memory(inflation=ones, far=ones, length=0.0, ratio=0.0)
     white = parts.length / parts.sizes
     gaps = np.diff(parts.centers)
     both = np.column_stack([x, r])
@@ -270,19 +270,21 @@ def memory_of(
     deviations = np.sqrt((left / free)[:, np.newaxis] * np.array(spreads))
     length, ratio = models[int(np.argmax(weights))]
     return Memory(
-        inflation=_half_width(weights, deviations) / _NORMAL / deviations[0],
+        inflation=_growth(weights, deviations, 0.05),
+        far=_growth(weights, deviations, 0.004),
         length=length,
         ratio=ratio,
     )
 
 
-def _half_width(weights: FloatArray, deviations: FloatArray) -> FloatArray:
-    """Return half the width of the 95 % intervals of mixtures of normal distributions."""
+def _growth(weights: FloatArray, deviations: FloatArray, outside: float) -> FloatArray:
+    """Return the intervals of mixtures of normal distributions over those of white noise."""
+    normal = float(ndtri(1.0 - 0.5 * outside))
     counts = weights > _NEGLIGIBLE
-    weights, deviations = weights[counts], deviations[counts]
-    low, high = (_NORMAL * limit(deviations, axis=0) for limit in (np.min, np.max))
+    white, weights, deviations = deviations[0], weights[counts], deviations[counts]
+    low, high = (normal * limit(deviations, axis=0) for limit in (np.min, np.max))
     for _ in range(_BISECTIONS):
         middle = 0.5 * (low + high)
-        outside = weights @ (2.0 * ndtr(-middle / deviations)) > 0.05 * weights.sum()
-        low, high = np.where(outside, middle, low), np.where(outside, high, middle)
-    return np.asarray(high)
+        beyond = weights @ (2.0 * ndtr(-middle / deviations)) > outside * weights.sum()
+        low, high = np.where(beyond, middle, low), np.where(beyond, high, middle)
+    return np.asarray(high / (normal * white))

@@ -153,6 +153,9 @@ class Regression:
         at = list(which)
         values = self.values[at]
         covariance = self.covariance[np.ix_(at, at)]
+        if self.memory is not None:
+            more = self.memory.far[at] / self.memory.inflation[at]
+            covariance = covariance * np.outer(more, more)
         if not covariance.any():
             found = np.inf if values.any() else 0.0
         else:

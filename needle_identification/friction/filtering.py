@@ -261,11 +261,13 @@ def _filtered_speed(
 
 def _white_noise(raw: FloatArray, speed: FloatArray, acceleration: FloatArray) -> float:
     """Estimate the standard deviation of white noise from fourth differences, robustly."""
-    unsteady = np.abs(acceleration) > 0.1 * np.max(np.abs(acceleration))
+    size = np.abs(acceleration)
+    # Where the noise is large, it is all of the acceleration most of the time.
+    unsteady = size > max(0.1 * float(size.max()), 3.0 * float(np.median(size)))
     steady = maximum_filter1d(unsteady.astype(np.uint8), 9) == 0
     steady &= np.abs(speed) > 0.1 * np.max(np.abs(speed))
     differences = np.abs(np.diff(raw, 4))[steady[2:-2]]
     # The 80th percentile: counts of a constant speed may show no noise in half the strokes. The
     # variance of the fourth difference of white noise is 70 times its own.
-    size = float(np.quantile(differences, 0.8)) if len(differences) else 0.0
-    return size / (1.2816 * sqrt(70.0))
+    usual = float(np.quantile(differences, 0.8)) if len(differences) else 0.0
+    return usual / (1.2816 * sqrt(70.0))

@@ -55,6 +55,9 @@ from needle_identification.friction.terms import columns_of
 from needle_identification.recordings.recording import Recording
 import numpy as np
 
+#: Part of the usual speed below which motion must be seen.
+_HIDDEN: Final = 0.2
+
 #: Positions tell the speed better if it has less than this part of the noise.
 _CLEANER: Final = 0.5
 
@@ -186,25 +189,38 @@ def _chosen(recording: Recording, settings: FrictionSettings) -> _Choice:
     """Choose the source of the speed, the estimator and the samples; say what is unusual."""
     simple = replace(settings, estimator='ordinary') if settings.estimator == AUTO else settings
     choice = _first_choice(filter_signals(recording, simple), recording.speed is None)
-    bias = noise_bias(choice.design, choice.fit)
-    if settings.estimator != AUTO or not bias:
+    if settings.estimator != AUTO:
         return _without_transitions(choice)
-    remark = noise_words(choice.design, bias)
-    if recording.speed is not None:
+    remark = _noise_remark(choice)
+    if remark and recording.speed is not None:
         signals = filter_signals(replace(recording, speed=None), simple)
         if _is_cleaner(signals, choice.signals):
             choice = _first_choice(signals, from_positions=True)._replace(
                 remarks=(f'{remark}: took the speed from the positions',)
             )
-            if not noise_bias(choice.design, choice.fit):
-                return _without_transitions(choice)
-    if settings.allows_total:
+    bias = noise_bias(choice.design, choice.fit)
+    if bias and settings.allows_total:
+        remark = noise_words(choice.design, bias)
         total = replace(choice.signals, settings=replace(settings, estimator='total'))
         with suppress(IdentificationError):
             choice = _first_choice(total, choice.from_positions)._replace(
-                remarks=(f'{remark}: took estimator total',)
+                remarks=(*choice.remarks, f'{remark}: took estimator total')
             )
     return _without_transitions(choice)
+
+
+def _noise_remark(choice: _Choice) -> str:
+    """Say what noise of the speed does, if it does something."""
+    if bias := noise_bias(choice.design, choice.fit):
+        return noise_words(choice.design, bias)
+    design = choice.design
+    usual = float(np.median(np.abs(design.speed[design.used])))
+    if choice.signals.moving_speed < _HIDDEN * usual:
+        return ''
+    return (
+        f'noise of {choice.signals.speed_noise:.2g} m/s in the speed hides motion below '
+        f'{choice.signals.moving_speed:.2g} m/s'
+    )
 
 
 def _is_cleaner(positions: FilteredSignals, speeds: FilteredSignals) -> bool:

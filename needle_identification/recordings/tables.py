@@ -221,7 +221,7 @@ def guessed(table: Table) -> dict[str, str]:
     for role, usual in _USUAL.items():
         for word in usual:
             names = [name for name, short in plain.items() if short == word]
-            names += [name for name, short in plain.items() if short.endswith('.' + word)]
+            names += [name for name, short in plain.items() if name.lower().endswith('.' + word)]
             if names:
                 found[role] = names[0]
                 break
@@ -242,11 +242,10 @@ def _plain(name: str) -> str:
     """Return a name without its unit, case and signs."""
     if match := _BRACKETS.match(name):
         name = match[1]
-    words = [word for word in _WORD.split(name.lower()) if word]
-    units = {unit.lower().replace('/', '') for group in UNITS.values() for unit in group}
-    if len(words) > 1 and words[-1] in units:
-        words = words[:-1]
-    return ''.join(words)
+    front, _, last = name.rpartition('_')
+    if front and any(last in units for units in UNITS.values()):
+        name = front
+    return _WORD.sub('', name.lower())
 
 
 def _unit_of(name: str, role: str) -> str | None:
@@ -387,7 +386,7 @@ def _text(path: Path) -> Table:
         # Text, gaps, or decimal commas.
         table, lost = _rows(path, first, separator, count)
     losses = [f'{lost} lines not readable, left out'] if lost else []
-    known = np.isfinite(table).any(axis=0).tolist()
+    known: list[bool] = np.isfinite(np.asarray(table)).any(axis=0).tolist()
     columns = {name: table[:, k] for k, name in enumerate(names) if known[k]}
     return Table(path, columns, {}, losses)
 

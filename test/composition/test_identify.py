@@ -199,12 +199,14 @@ def test_the_friction_page_shows_what_was_found(
         found['recordings'][0]['files'][0][1], str(file), 'ros2 param set', *BAGS,
     ):  # fmt: skip
         assert words in seen.text
-    assert len(seen.images) == 3
+    assert len(seen.images) == 4
     assert all(alt and width > 500 for alt, width in seen.images)
     assert seen.requests == []
     assert seen.overflow == 0
     pictures = {path.stem for path in folder.glob('*.png')}
-    assert pictures == {'friction_data', 'friction_residuals', 'friction_spread'}
+    assert pictures == {
+        'friction_data', 'friction_each', 'friction_residuals', 'friction_spread',
+    }  # fmt: skip
 
 
 def test_the_same_recordings_give_the_same_page(
@@ -285,7 +287,7 @@ def test_the_stiffness_page_shows_what_was_found(
     seen = look_at(folder / 'stiffness.html')
     for words in ('ka', 'Table 2', '1260 (80)', 'Is it a spring?', 'principal', *places):
         assert words in seen.text
-    assert len(seen.images) == 3
+    assert len(seen.images) == 4
     assert all(alt and width > 500 for alt, width in seen.images)
     assert seen.requests == []
     assert seen.overflow == 0

@@ -13,7 +13,7 @@ from scipy import stats
 
 COUNT, LENGTH = 200, 25
 
-WHITE = Memory(inflation=np.ones(2), length=0.0, ratio=0.0)
+WHITE = Memory(inflation=np.ones(2), far=np.ones(2), length=0.0, ratio=0.0)
 
 
 def results_of(means: FloatArray, speeds: FloatArray) -> dict[str, ResidualTest]:

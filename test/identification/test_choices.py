@@ -1,0 +1,230 @@
+"""What the data choose: source of the speed, samples, terms; and what is found in the force."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from math import exp, log
+from typing import Any
+
+from benchmarks.noises import Kind, recorded
+from needle_dynamics import ParameterError
+from needle_identification import (
+    FrictionEstimate,
+    FrictionSettings,
+    identify_friction,
+    Recording,
+    summarize,
+)
+from needle_identification.friction.filtering import cut_off
+import numpy as np
+from numpy.testing import assert_array_equal
+import pytest
+
+MU_S, MU_V = 0.2, 250.0
+NOISE = 0.02
+
+
+def insertion(
+    seed: int,
+    *,
+    layers: tuple[tuple[float, float], ...] = (),
+    cutting: float = 0.0,
+    presliding: float = 0.0,
+    punctures: tuple[tuple[float, float, float], ...] = (),
+) -> Recording:
+    """
+    Go in and out by turns, deeper and deeper, for a minute.
+
+    ``layers`` have a depth and the friction per length from there on [N/m]; ``punctures`` a depth,
+    a drop of the force, and the length over which the tissue loads the needle before.
+    """
+    rng = np.random.default_rng(seed)
+    step, lasts = 1.0 / 250.0, 60.0
+    corners, speeds, depth, sign = [0.0, 0.5], [0.0, 0.0], 0.0, 1.0
+    while corners[-1] < lasts:
+        speed = exp(rng.uniform(log(4e-3), log(12e-3)))
+        way = rng.uniform(0.02, 0.04) if sign > 0.0 else rng.uniform(0.01, 0.025)
+        if not 0.0 <= depth + sign * way <= 0.09:
+            sign = -sign
+            continue
+        ramp, begin = speed / 0.08, corners[-1]
+        corners += [begin + ramp, begin + way / speed, begin + ramp + way / speed]
+        speeds += [sign * speed, sign * speed, 0.0]
+        depth, sign = depth + sign * way, -sign
+    time = np.arange(0.0, lasts, step)
+    speed = np.interp(time, corners, speeds)
+    s = np.concatenate([[0.0], np.cumsum(0.5 * step * (speed[1:] + speed[:-1]))])
+    sliding = np.sign(speed)
+    if presliding:
+        # Asperities bend before they slide (Dahl).
+        state = 0.0
+        for k, v in enumerate(speed):
+            kept = exp(-abs(v) * step / presliding)
+            state = np.sign(v) + (state - np.sign(v)) * kept
+            sliding[k] = state
+    force = MU_S * sliding + MU_V * speed
+    ends = [*(depth for depth, _ in layers[1:]), np.inf]
+    for (begin, density), end in zip(layers, ends, strict=bool(layers)):
+        force += np.sign(speed) * density * np.clip(s - begin, 0.0, end - begin)
+    fresh = (s >= np.maximum.accumulate(s) - 1e-9) & (speed > 0.0)
+    force += cutting * fresh
+    for where, drop, load in punctures:
+        loading = (s - (where - load)) / load
+        force += np.where(fresh & (loading > 0.0) & (s < where), drop * loading, 0.0)
+    return Recording(
+        name=f'insertion {seed}',
+        time=time,
+        depth=np.round(s, 6),
+        speed=speed,
+        force=force + NOISE * rng.standard_normal(len(time)),
+    )
+
+
+def advised(found: FrictionEstimate) -> list[str]:
+    """Return the terms that are advised."""
+    words = [w.rpartition('add the term')[2] for w in found.warnings if 'add the term' in w]
+    return [term for w in words for term in w.removeprefix('s').strip().split(' and ')]
+
+
+def followed(recording: Recording) -> set[str]:
+    """Return the terms at which following the advice ends."""
+    terms = ['coulomb', 'viscous']
+    while more := advised(identify_friction(recording, FrictionSettings(terms=tuple(terms)))):
+        terms += more
+    return set(terms) - {'coulomb', 'viscous'}
+
+
+@pytest.mark.parametrize(
+    ('made', 'terms', 'layers', 'truth'),
+    [
+        ({'layers': ((0.0, 5.0),)}, ('length',), (), {'length_friction': 5.0}),
+        (
+            {'layers': ((0.0, 5.0),), 'cutting': 0.3}, ('length', 'cutting'), (),
+            {'length_friction': 5.0, 'cutting_force': 0.3},
+        ),
+        (
+            {'layers': ((0.0, 6.0), (0.03, 20.0))}, ('layers',), (0.0, 0.03),
+            {'layer_1_friction': 6.0, 'layer_2_friction': 20.0},
+        ),
+    ],
+)  # fmt: skip
+def test_friction_along_the_needle_is_found(
+    made: dict[str, Any],
+    terms: tuple[str, ...],
+    layers: tuple[float, ...],
+    truth: dict[str, float],
+) -> None:
+    """Advice leads to the terms that are missing; with them the truth is met."""
+    right, held, count = 0, 0, 0
+    for seed in range(8):
+        recording = insertion(seed, **made)
+        ends = followed(recording)
+        right += 'length' in ends if layers else ends == set(terms)
+        settings = FrictionSettings(terms=('coulomb', 'viscous', *terms), layers=layers)
+        found = identify_friction(recording, settings)
+        assert not advised(found)
+        for name, value in {'viscous_friction': MU_V, **truth}.items():
+            if found[name].determined:
+                count += 1
+                low, high = found[name].interval
+                held += low <= value <= high
+    assert right >= 7
+    # 95 % of 16 or more, with three standard deviations.
+    assert count >= 16
+    assert held >= 0.79 * count
+
+
+@pytest.mark.parametrize(
+    ('settings', 'said'),
+    [
+        ({'terms': ('coulomb', 'layers')}, 'need each other'),
+        ({'layers': (0.01,)}, 'need each other'),
+        ({'terms': ('layers',), 'layers': (0.02, 0.01)}, 'finite and increase'),
+        ({'terms': ('layers', 'length'), 'layers': (0.0,)}, 'takes the place'),
+    ],
+)
+def test_layers_must_be_said_in_order(settings: dict[str, Any], said: str) -> None:
+    with pytest.raises(ParameterError, match=said):
+        FrictionSettings(**settings)
+
+
+def test_punctures_are_found_and_located() -> None:
+    where = ((0.025, 0.4, 0.006), (0.06, 0.25, 0.01))
+    found_of, false = {depth: 0 for depth, _, _ in where}, 0
+    terms = FrictionSettings(terms=('coulomb', 'viscous', 'cutting'))
+    for seed in range(8):
+        found = identify_friction(insertion(seed, cutting=0.2, punctures=where), terms)
+        for one in found.punctures:
+            near = [p for p in where if abs(p[0] - one.depth.value) < 1e-3]
+            false += not near
+            for depth, drop, _ in near:
+                # Four standard errors, and what the load of the tissue adds while the filter
+                # looks.
+                assert abs(one.drop.value - drop) < 4.0 * one.drop.error + 0.25 * drop
+                found_of[depth] += 1
+        assert identify_friction(insertion(seed, cutting=0.2)).punctures == ()
+    assert false == 0
+    assert min(found_of.values()) >= 6
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_what_bends_before_it_slides_is_left_out(seed: int) -> None:
+    """Friction that builds up over 0.2 mm after each turn is not that of a needle that slides."""
+    found = identify_friction(insertion(seed, presliding=2e-4))
+    assert any('presliding' in words for words in found.warnings)
+    assert abs(found['coulomb_friction'].value - MU_S) < 0.02 * MU_S
+    assert abs(found['viscous_friction'].value - MU_V) < 0.01 * MU_V
+    plain = identify_friction(insertion(seed))
+    assert not any('presliding' in words for words in plain.warnings)
+
+
+def test_positions_are_taken_where_speeds_are_noisy() -> None:
+    recording, truth = recorded(Kind(speed_noise=1e-3), np.random.default_rng(3))
+    found = identify_friction(recording)
+    assert any('took the speed from the positions' in words for words in found.warnings)
+    for name, value in truth.items():
+        assert abs(found[name].value - value) < 4.0 * found[name].error
+    # The speeds alone: an order of magnitude worse, and said.
+    asked = identify_friction(recording, FrictionSettings(estimator='ordinary'))
+    assert abs(asked['viscous_friction'].value - truth['viscous_friction']) > 1.0
+    assert any('in the speed reduces mu_v' in words for words in asked.warnings)
+
+
+@pytest.mark.parametrize(
+    'kind', [Kind(), Kind(white=0.005, counts=0.02), Kind(counts=0.01, white=0.0)]
+)
+def test_only_a_sensor_at_its_limit_is_cut_off(kind: Kind) -> None:
+    for seed in range(10):
+        recording, truth = recorded(kind, np.random.default_rng(seed))
+        assert not cut_off(recording.force).any()
+        limit = float(np.quantile(np.abs(recording.force), 0.85))
+        clipped = replace(recording, force=np.clip(recording.force, -limit, limit))
+        if not kind.counts:
+            assert_array_equal(cut_off(clipped.force), np.abs(clipped.force) == limit)
+            found = identify_friction(clipped)
+            assert any('limits of its sensor' in words for words in found.warnings)
+            for name, value in truth.items():
+                assert abs(found[name].value - value) < 4.0 * found[name].error
+
+
+def test_false_advice_is_rare_over_all_recordings_together() -> None:
+    """Twenty recordings at a time: in at most one of twenty studies is a term advised."""
+    wrong = 0
+    for study in range(3):
+        rng = np.random.default_rng(study)
+        made = [recorded(Kind(duration=20.0), rng)[0] for _ in range(20)]
+        found = [identify_friction(one, among=len(made)) for one in made]
+        wrong += any(advised(one) for one in found) or bool(summarize(found).warnings)
+    assert wrong <= 1
+
+
+def test_together_recordings_show_what_none_shows_alone() -> None:
+    drift = Kind(truth={'force_drift': 1e-4}, duration=20.0)
+    made = [recorded(drift, np.random.default_rng(seed))[0] for seed in range(20)]
+    found = [identify_friction(one, among=len(made)) for one in made]
+    alone = [one for one in found if advised(one)]
+    assert len(alone) < 10
+    # As if none had shown it alone.
+    others = [one for one in found if not advised(one)]
+    assert 'add the term drift' in summarize(others).warnings[0]
+    assert not alone or not summarize(found).warnings

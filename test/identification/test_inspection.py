@@ -1,0 +1,140 @@
+"""What a recording holds is told, and the command that is printed identifies from it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+import shlex
+
+from needle_identification import inspect_recording, RecordingError
+from needle_insertion.cli import main
+import numpy as np
+import pytest
+from rosbags.rosbag1 import Writer
+from rosbags.typesys import get_typestore, Stores
+from support.strokes import strokes
+
+ROS1 = get_typestore(Stores.ROS1_NOETIC)
+WRENCH, JOINTS, POSE = (
+    'geometry_msgs/msg/WrenchStamped',
+    'sensor_msgs/msg/JointState',
+    'geometry_msgs/msg/PoseStamped',
+)
+
+
+def ros1(path: Path, *, axis: int = 2, sign: float = -1.0) -> Path:
+    """Write a recording of ROS 1 with a robot of two joints, its pose, and two force sensors."""
+    types = ROS1.types
+    vector = types['geometry_msgs/msg/Vector3']
+    made = strokes(seed=1)
+    rng = np.random.default_rng(0)
+    writer = Writer(path)
+    writer.set_compression(Writer.CompressionFormat.BZ2)
+    with writer:
+        ft, other, joints, pose = (
+            writer.add_connection(name, kind, typestore=ROS1)
+            for name, kind in (
+                ('/ft', WRENCH), ('/gripper_ft', WRENCH), ('/joints', JOINTS), ('/pose', POSE),
+            )
+        )  # fmt: skip
+        for k, (t, depth, force) in enumerate(zip(made.time, made.depth, made.force, strict=True)):
+            stamp = 1_700_000_000 * 10**9 + round(1e9 * t)
+            header = types['std_msgs/msg/Header'](
+                k, types['builtin_interfaces/msg/Time'](*divmod(stamp, 10**9)), 'base'
+            )
+            axes = [0.0, 0.0, 0.0]
+            axes[axis] = sign * force
+            moments = vector(0.0, 0.0, 0.0)
+            pair = types['geometry_msgs/msg/Wrench']
+            still = types['geometry_msgs/msg/Quaternion'](0.0, 0.0, 0.0, 1.0)
+            for connection, kind, message in (
+                (ft, WRENCH, types[WRENCH](header, pair(vector(*axes), moments))),
+                (other, WRENCH, types[WRENCH](header, pair(vector(*rng.normal(size=3)), moments))),
+                (
+                    joints, JOINTS,
+                    types[JOINTS](
+                        header, ['turn', 'slide'], np.array([0.1 * np.sin(t), depth]),
+                        np.array([]), np.array([]),
+                    ),
+                ),
+                (
+                    pose, POSE,
+                    types[POSE](
+                        header,
+                        types['geometry_msgs/msg/Pose'](
+                            types['geometry_msgs/msg/Point'](0.3, 1e-6 * k, 0.2), still
+                        ),
+                    ),
+                ),
+            ):  # fmt: skip
+                writer.write(connection, stamp, ROS1.serialize_ros1(message, kind))
+    return path
+
+
+def run(command: str) -> int:
+    program, *words = shlex.split(command)
+    assert program == 'needle'
+    return main(words)
+
+
+@pytest.mark.parametrize('bag', ['bags/friction_03', 'bags/stiffness_01'])
+def test_the_command_for_a_shipped_bag_works(bag: str, capsys: pytest.CaptureFixture[str]) -> None:
+    found = inspect_recording(bag)
+    assert found.command == f'needle identify {bag.split("/")[1].split("_", maxsplit=1)[0]} {bag}'
+    assert run(found.command) == 0
+    rates = {one.name: one.rate for one in found.contents}
+    # Samples of the simulated robot come on time.
+    assert rates['/base_wrench'] == pytest.approx(100.0 if 'friction' in bag else 40.0, rel=1e-3)
+    capsys.readouterr()
+
+
+def test_force_and_motion_are_told_from_others(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Of two sensors, three axes, two joints and a pose; the sensor is turned around."""
+    path = ros1(tmp_path / 'lab.bag')
+    found = inspect_recording(path)
+    assert found.command == (
+        f'needle identify friction {path} --wrench-topic /ft --motion-topic /joints '
+        '--force-axis -z --motion-axis slide'
+    )
+    assert found.losses == ()
+    assert run(found.command) == 0
+    out, _ = capsys.readouterr()
+    assert '0.559' in out
+    assert main(['inspect', str(path), '--json']) == 0
+    assert '"--force-axis' not in capsys.readouterr().out
+
+
+def test_a_cut_recording_of_ros_1_ends_in_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = ros1(tmp_path / 'lab.bag')
+    content = path.read_bytes()
+    for size in (20, 5000, len(content) // 2, len(content) - 100):
+        path.write_bytes(content[:size])
+        assert main(['identify', 'friction', str(path)]) == 2
+        _, err = capsys.readouterr()
+        assert len(err.strip().splitlines()) == 1
+        assert 'is damaged' in err
+
+
+def test_a_table_tells_its_columns(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    made = strokes(seed=3)
+    path = tmp_path / 'run.csv'
+    rows = np.column_stack([made.time, made.depth, made.force])
+    np.savetxt(path, rows, delimiter=',', header='time,position,force', comments='')
+    found = inspect_recording(path)
+    assert [one.name for one in found.contents[0].columns] == ['time', 'position', 'force']
+    assert run(found.command) == 0
+    np.savetxt(path, rows, delimiter=',', header='a,b,c', comments='')
+    assert 'no column looks like time' in inspect_recording(path).words[0]
+    capsys.readouterr()
+
+
+def test_what_is_not_there_ends_in_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(RecordingError, match='does not exist'):
+        inspect_recording('nowhere')
+    assert main(['inspect', 'nowhere', 'bags/friction_01']) == 2
+    out, err = capsys.readouterr()
+    assert 'try: needle identify friction bags/friction_01' in out
+    assert len(err.strip().splitlines()) == 1

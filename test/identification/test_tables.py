@@ -1,0 +1,222 @@
+"""Tables are read as their users wrote them, or refused in one line that says what to do."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from hypothesis import given
+from hypothesis import strategies as st
+from needle_identification import identify_friction, read_friction_recording, RecordingError
+from needle_identification.recordings import tables
+from needle_identification.recordings.tables import column_roles, guessed, read_table
+import numpy as np
+from numpy.testing import assert_allclose
+import pytest
+from scipy.io import savemat
+from support.strokes import COULOMB, strokes, VISCOUS
+
+NAMED = {'time': 't', 'depth': 'q', 'force': 'F'}
+
+
+def lines(head: str, *columns: Any, separator: str = ',', form: str = '.9g') -> str:
+    rows = [separator.join(format(x, form) for x in row) for row in zip(*columns, strict=True)]
+    return '\n'.join([head, *rows, '']) if head else '\n'.join([*rows, ''])
+
+
+@pytest.fixture(scope='module')
+def run() -> tuple[Any, Any, Any]:
+    made = strokes(seed=1)
+    return made.time, made.depth, made.force
+
+
+def written(folder: Path, text: str, name: str = 'run.csv') -> Path:
+    path = folder / name
+    path.write_text(text, encoding='utf-8')
+    return path
+
+
+FORMS: dict[str, tuple[Callable[..., str], dict[str, str]]] = {
+    'usual names': (lambda t, q, f: lines('time,position,force', t, q, f), {}),
+    'units in brackets': (
+        lambda t, q, f: lines('Time [ms],Position (mm),Force [mN]', 1e3 * t, 1e3 * q, 1e3 * f), {},
+    ),
+    'units in names': (
+        lambda t, q, f: lines('t_ms;pos_mm;force_N', 1e3 * t, 1e3 * q, f, separator=';'), {},
+    ),
+    'units in a line': (
+        lambda t, q, f: lines('time\tpos\tforce\ns\tmm\tN', t, 1e3 * q, f, separator='\t'), {},
+    ),
+    'comments': (lambda t, q, f: lines('# lab 3\n# t q force', t, q, f, separator=' '), {}),
+    'no head': (
+        lambda t, q, f: lines('', t, q, f), {'time': '1', 'depth': '2', 'force': '3'},
+    ),
+    'turned around': (
+        lambda t, q, f: lines('t,q,F', t, -q, -2.0 * f),
+        {**NAMED, 'depth': '-q', 'force': '-F*0.5[N]'},
+    ),
+    'decimal commas': (
+        lambda t, q, f: lines('t;q;F', t, q, f, separator=';').replace('.', ','), NAMED,
+    ),
+    'seconds and nanoseconds': (
+        lambda t, q, f: lines(
+            'header.stamp.sec,header.stamp.nanosec,frame_id,q,F',
+            1_700_000_000 + np.floor(t), np.rint(1e9 * (t % 1.0)), 0.0 * t, q, f, form='.12g',
+        ).replace(',0,', ',base,'),
+        {'depth': 'q', 'force': 'F'},
+    ),
+    'dates': (
+        lambda t, q, f: lines('t,q,F', t, q, f).replace('\n', '\n2024-01-02 03:04:05.0,', 0),
+        NAMED,
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize('form', FORMS)
+def test_the_same_friction_comes_from_each_form(
+    form: str, run: tuple[Any, Any, Any], tmp_path: Path
+) -> None:
+    make, columns = FORMS[form]
+    path = written(tmp_path, make(*run))
+    found = identify_friction(read_friction_recording(path, columns=columns))
+    for name, truth in (('coulomb_friction', COULOMB), ('viscous_friction', VISCOUS)):
+        assert abs(found[name].value - truth) < 4.0 * found[name].error
+
+
+def test_matlab_files_have_columns_and_factors(run: tuple[Any, Any, Any], tmp_path: Path) -> None:
+    time, depth, force = run
+    savemat(
+        tmp_path / 'run.mat',
+        {
+            't': time[:, np.newaxis], 'q': depth[np.newaxis], 'current': force / 35.0, 'k': 35.0,
+            'note': 'lab', 'other': np.zeros(3), 'both': np.column_stack([time, force]),
+        },
+    )  # fmt: skip
+    table = read_table(tmp_path / 'run.mat')
+    assert {'t', 'q', 'current', 'both1', 'both2'} == set(table.columns)
+    assert table.scalars == {'k': 35.0}
+    assert table.losses == ['other of another length, left out']
+    read = read_friction_recording(tmp_path / 'run.mat', columns={'force': 'current*k'})
+    assert_allclose(read.force, force, rtol=1e-12)
+    assert_allclose(read.depth, depth)
+
+
+def test_speeds_alone_are_integrated(tmp_path: Path) -> None:
+    made = strokes(seed=2)
+    path = written(tmp_path, lines('time,vel_mm/s,force', made.time, 1e3 * made.speed, made.force))
+    read = read_friction_recording(path)
+    assert any('integral of the speed' in words for words in read.losses)
+    found = identify_friction(read)
+    assert abs(found['viscous_friction'].value - VISCOUS) < 4.0 * found['viscous_friction'].error
+
+
+@given(
+    values=st.lists(
+        st.tuples(st.floats(-1e3, 1e3), st.floats(-1e3, 1e3)), min_size=2, max_size=30
+    ),
+    separator=st.sampled_from([',', ';', '\t', ' ']),
+)
+def test_numbers_come_back_as_they_were_written(
+    values: list[tuple[float, float]], separator: str
+) -> None:
+    # A file of its own for each example.
+    from tempfile import TemporaryDirectory
+
+    first, second = np.transpose(values)
+    with TemporaryDirectory() as folder:
+        text = lines(f'alpha{separator}beta', first, second, separator=separator, form='.17g')
+        table = read_table(written(Path(folder), text))
+    assert_allclose(table.columns['alpha'], first, rtol=0.0)
+    assert_allclose(table.columns['beta'], second, rtol=0.0)
+
+
+def test_what_cannot_be_used_is_counted(tmp_path: Path) -> None:
+    time = np.arange(500) / 100.0
+    text = lines('time,depth,force', time, np.sin(time), np.cos(time)).splitlines()
+    text[10] = 'n/a,1,2'
+    text[20] = '0.2,oops'
+    text[30] = text[29]
+    text[40], text[41] = text[41], text[40]
+    read = read_friction_recording(written(tmp_path, '\n'.join(text)))
+    assert len(read.time) == 500 - 3
+    assert read.losses == (
+        '1 lines not readable, left out',
+        'columns by their names: time=time, depth=depth, force=force',
+        '1 rows with a value that is no number, left out',
+        '1 rows out of order, sorted by time',
+        '1 rows with the time of another, left out',
+    )
+
+
+def test_millimeters_without_a_unit_are_suspected(tmp_path: Path) -> None:
+    time = np.arange(500) / 100.0
+    path = written(tmp_path, lines('time,depth,force', time, 30.0 * np.sin(time), np.cos(time)))
+    assert any('depth[mm]' in words for words in read_friction_recording(path).losses)
+
+
+@pytest.mark.parametrize(
+    ('text', 'columns', 'said'),
+    [
+        ('', {}, 'no line of numbers'),
+        ('hello\nworld\n', {}, 'no line of numbers'),
+        (
+            'a,b\n1,2\n2,3\n',
+            {},
+            r'which column is time and force and depth or speed\? It has a, b',
+        ),
+        ('t,q,F\n1,2,3\n2,3,4\n', {'time': 's'}, "no column 's' for time; it has t, q, F"),
+        ('t,q,F\n1,2,3\n2,3,4\n', {'force': 'F[kg]'}, "must be one of N, mN, .*, got 'kg'"),
+        ('t,q,F\n1,2,3\n2,3,4\n', {'force': 'F*k'}, 'a number or the name of one'),
+        ('t,q,F\n1,2,3\n1,3,4\n', {}, 'all rows have the same time'),
+        ('t,q,F\n1,2,3\nnan,3,4\n', {}, '1 usable rows'),
+        ('t,q,F\n1,2,3\n1e30,3,4\n', {}, 'is its unit right'),
+    ],
+)
+def test_bad_tables_are_refused(
+    text: str, columns: dict[str, str], said: str, tmp_path: Path
+) -> None:
+    with pytest.raises(RecordingError, match=said):
+        read_friction_recording(written(tmp_path, text), columns=columns)
+
+
+@pytest.mark.parametrize('words', ['', 'time', 'time=', 'tyme=t', 'time=t,force'])
+def test_bad_roles_are_refused(words: str) -> None:
+    with pytest.raises(RecordingError, match='--columns takes ROLE='):
+        column_roles(words)
+    assert column_roles('time=sec:nsec, force=-F*2[mN]') == {
+        'time': 'sec:nsec',
+        'force': '-F*2[mN]',
+    }
+
+
+def test_options_of_bags_are_not_ignored(tmp_path: Path) -> None:
+    path = written(tmp_path, 't,q,F\n1,2,3\n2,3,4\n')
+    with pytest.raises(RecordingError, match='--columns takes the place of --force-axis'):
+        read_friction_recording(path, force_axis='-z')
+    with pytest.raises(RecordingError, match='--columns is for tables'):
+        read_friction_recording('bags/friction_01', columns={'time': 't'})
+
+
+def test_damaged_and_new_matlab_files_are_refused(tmp_path: Path) -> None:
+    for content in (b'', b'MATLAB 5.0 MAT-file' + bytes(500), bytes(range(256)) * 4):
+        (tmp_path / 'run.mat').write_bytes(content)
+        with pytest.raises(RecordingError):
+            read_table(tmp_path / 'run.mat')
+    (tmp_path / 'run.mat').write_bytes(
+        b'MATLAB 7.3 MAT-file'.ljust(124) + b'\x00\x02IM' + bytes(500)
+    )
+    with pytest.raises(RecordingError, match=r'7\.3'):
+        read_table(tmp_path / 'run.mat')
+
+
+def test_usual_names_are_found_whatever_their_case_and_unit(tmp_path: Path) -> None:
+    path = written(tmp_path, 'Timestamp (s),Insertion [mm],Velocity,Fz_N\n1,2,3,4\n2,3,4,5\n')
+    assert guessed(read_table(path)) == {
+        'time': 'Timestamp (s)',
+        'depth': 'Insertion [mm]',
+        'speed': 'Velocity',
+        'force': 'Fz_N',
+    }
+    assert tables.is_table('A.CSV')
+    assert not tables.is_table('a.mcap')
