@@ -386,7 +386,7 @@ def _text(path: Path) -> Table:
         # Text, gaps, or decimal commas.
         table, lost = _rows(path, first, separator, count)
     losses = [f'{lost} lines not readable, left out'] if lost else []
-    known: list[bool] = np.isfinite(np.asarray(table)).any(axis=0).tolist()
+    known = np.atleast_1d(np.isfinite(table).any(axis=0))
     columns = {name: table[:, k] for k, name in enumerate(names) if known[k]}
     return Table(path, columns, {}, losses)
 
