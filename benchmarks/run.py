@@ -23,6 +23,7 @@ MODULES = {
     'dynamics': ('step', 'solvers', 'rods', 'batches'),
     'identification': ('identification',),
     'calibration': ('calibration', 'noises'),
+    'damage': ('damage',),
     'control': ('control',),
     'laws': ('laws',),
     'safety': ('safety',),
@@ -54,6 +55,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     calibration.add_argument(
         '--seed', type=int, metavar='N', help='seed of the true values and the noise'
     )
+    damage = add('damage', help='what identification makes of damaged recordings')
+    damage.add_argument('--files', type=int, metavar='N', help='damaged recordings')
     add('control', help='cost of a control step')
     laws = add('laws', help='control laws on needles, robots and tissues that they do not know')
     laws.add_argument('--needles', type=int, metavar='N', help='needles in a cell')

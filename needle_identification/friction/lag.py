@@ -88,28 +88,36 @@ def find_lag(signals: FilteredSignals) -> tuple[float, float | None]:
 def _coarse_lag(signals: FilteredSignals) -> float:
     """Return the lag, in steps of half the filter, that fits far better than none, else zero."""
     every = max(1, len(signals.time) // _MAX_SAMPLES)
-    time, force = signals.time[::every], signals.force[::every]
     step = signals.half_filter * signals.period
     count = int(_LARGEST_LAG / step)
     lags = step * np.arange(-count, count + 1)
-    misfits = []
-    for lag in lags:
-        then = np.clip(time - lag, time[0], time[-1])
-        speed, acceleration = signals.motion(then), signals.motion(then, 1)
-        moving = np.abs(speed) > signals.moving_speed
-        if np.count_nonzero(moving) <= FEWEST_SAMPLES:
-            return 0.0
-        settings = signals.settings
-        since = time[moving] - time[0]
-        depth = np.interp(then[moving], signals.time, signals.depth)
-        motion = Motion(
-            speed[moving], acceleration[moving], since, depth, np.ones_like(moving)[moving]
-        )
-        x = regressors(motion, settings.terms, settings)
-        solution = np.linalg.lstsq(x, force[moving], rcond=None)[0]
-        misfits.append(float(np.mean((force[moving] - x @ solution) ** 2)))
+    misfits = [_misfit(signals, lag, every) for lag in lags.tolist()]
     best = int(np.argmin(misfits))
-    return float(lags[best]) if misfits[best] < _BETTER * misfits[count] else 0.0
+    if not misfits[best] < _BETTER * misfits[count]:
+        return 0.0
+    # Few samples may have missed what speaks against it: the edges of the strokes.
+    lag = float(lags[best])
+    return lag if _misfit(signals, lag, 1) < _BETTER * _misfit(signals, 0.0, 1) else 0.0
+
+
+def _misfit(signals: FilteredSignals, lag: float, every: int) -> float:
+    """Return the mean squared misfit of some of the samples at a lag; nan if too few move."""
+    settings, time, force = signals.settings, signals.time[::every], signals.force[::every]
+    then = np.clip(time - lag, time[0], time[-1])
+    speed, acceleration = signals.motion(then), signals.motion(then, 1)
+    moving = np.abs(speed) > signals.moving_speed
+    if np.count_nonzero(moving) <= FEWEST_SAMPLES:
+        return np.nan
+    motion = Motion(
+        speed[moving],
+        acceleration[moving],
+        time[moving] - time[0],
+        np.interp(then[moving], signals.time, signals.depth),
+        np.zeros(np.count_nonzero(moving), dtype=np.bool_),
+    )
+    x = regressors(motion, settings.terms, settings)
+    solution = np.linalg.lstsq(x, force[moving], rcond=None)[0]
+    return float(np.mean((force[moving] - x @ solution) ** 2))
 
 
 def _acceleration_is_noise(design: Design) -> bool:

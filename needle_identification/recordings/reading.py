@@ -283,7 +283,8 @@ def _chosen(bag: Bag, topics: Sequence[Topic], wanted: _Wanted, name: str | None
         return meant[0]
     if name is None and fitting:
         raise RecordingError(
-            f'{bag.path} has several topics of type {short}; {wanted.option} must name one of '
+            f'{bag.path} has several topics of type {short}; {wanted.option} '
+            f'(--{wanted.option.replace("_", "-")}) must name one of '
             f'{", ".join(topic.name for topic in meant or fitting)}'
         )
     listing = ', '.join(map(str, topics))

@@ -134,7 +134,7 @@ class _Joint(Source):
     def _complaint(self) -> str:
         joint = self._joint or INSERTION
         if not self._is_used:
-            names = f'motion_axis must name one of {_listing(self._seen)}'
+            names = f'motion_axis (--motion-axis) must name one of {_listing(self._seen)}'
             return f'has no joint {joint!r}; {names}' if self._seen else 'has joints without names'
         if not (self._has_position or self._has_speed):
             return f'has neither position nor velocity of {joint}'

@@ -9,6 +9,7 @@ from typing import Any
 from needle_identification import TERMS
 from needle_insertion.cli import main
 from needle_insertion.experiment.protocol import SHIPPED_BAGS
+import numpy as np
 import pytest
 from support.pages import look_at
 from support.presses import STIFFNESS, write_presses
@@ -220,6 +221,37 @@ def test_the_same_recordings_give_the_same_page(
         pages.append((tmp_path / 'report' / 'friction.html').read_bytes())
         shutil.rmtree(tmp_path / 'report')
     assert pages[0] == pages[1]
+
+
+def test_where_nothing_is_determined_table_and_page_are_made(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    """Of one speed nothing is; only the parameter file would be empty, and is not written."""
+    time = np.arange(0.0, 20.0, 0.01)
+    depth = 0.1 + 0.01 * np.abs((time / 4.0) % 2.0 - 1.0)
+    force = np.sign(np.gradient(depth)) + 0.01 * np.sin(37.0 * time)
+    table = tmp_path / 'one_speed.csv'
+    np.savetxt(
+        table, np.column_stack([time, depth, force]), delimiter=',', header='time,depth,force',
+        comments='',
+    )  # fmt: skip
+    words = ('friction', str(table), '-o', str(tmp_path / 'x.yaml'), '--report', str(tmp_path))
+    out, err = identify(capsys, *words, status=2)
+    assert 'not determined by the data' in out
+    assert 'wrote' in out
+    assert 'the data determine no parameter' in err.splitlines()[-1]
+    assert (tmp_path / 'friction.html').exists()
+    assert not (tmp_path / 'x.yaml').exists()
+
+
+def test_warnings_of_a_kind_are_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    """With the number of those like it; all of them on request."""
+    bags = sorted(str(path) for path in SHIPPED_BAGS.glob('stiffness_0*'))
+    _, short = identify(capsys, 'stiffness', *bags)
+    _, full = identify(capsys, 'stiffness', *bags, '--all-warnings')
+    assert len(short.splitlines()) <= 5 < 20 < len(full.splitlines())
+    assert 'more like it' in short
+    assert '--all-warnings' in short.splitlines()[-1]
 
 
 def test_a_folder_that_cannot_be_made_ends_in_one_line(capsys: pytest.CaptureFixture[str]) -> None:

@@ -288,7 +288,10 @@ def test_joint_states_with_missing_fields_are_used_as_far_as_possible(
     [
         (('slide',), 'neither position nor velocity of slide'),
         ((), 'has joints without names'),
-        (('roll', 'slide'), "no joint 'insertion'; motion_axis must name one of roll, slide"),
+        (
+            ('roll', 'slide'),
+            "no joint 'insertion'; motion_axis (--motion-axis) must name one of roll, slide",
+        ),
     ],
 )
 def test_joint_states_without_position_and_velocity_are_rejected(
@@ -336,9 +339,9 @@ def test_several_topics_of_one_type_are_listed(
 ) -> None:
     rows = [*recorded(topics=('/l/ft', '/l/arm')), *recorded(topics=('/r/ft', '/r/arm'))]
     path = write_mcap(tmp_path / 'run.mcap', sorted(rows, key=lambda row: row[2]))
-    assert 'wrench_topic must name one of /l/ft, /r/ft' in refused(path)
+    assert 'wrench_topic (--wrench-topic) must name one of /l/ft, /r/ft' in refused(path)
     one = ('--wrench-topic', '/l/ft')
-    assert 'motion_topic must name one of /l/arm, /r/arm' in refused(path, *one)
+    assert 'motion_topic (--motion-topic) must name one of /l/arm, /r/arm' in refused(path, *one)
     assert identified(path, *one, '--motion-topic', '/l/arm') == ''
 
 

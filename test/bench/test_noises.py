@@ -1,0 +1,57 @@
+"""The simulator of noises and the damage of files: what they make, and what is reported."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from benchmarks import damage, noises
+from benchmarks.noises import Kind, LINES, recorded
+from needle_identification import identify_friction, read_friction_recording
+import numpy as np
+from numpy.testing import assert_allclose
+import pytest
+
+
+def test_without_noise_the_force_is_the_truth() -> None:
+    kind = Kind(white=0.0, position_counts=0.0)
+    recording, truth = recorded(kind, np.random.default_rng(0))
+    moving = np.abs(recording.speed) > 0.0
+    expected = truth['coulomb_friction'] * np.sign(recording.speed)
+    expected += truth['viscous_friction'] * recording.speed
+    assert_allclose(recording.force[moving], expected[moving], rtol=1e-12)
+    # The trapezoidal rule is exact for a speed of straight lines, but for its corners.
+    assert_allclose(np.gradient(recording.depth, recording.time), recording.speed, atol=1e-3)
+
+
+@pytest.mark.parametrize('name', ['AR(1), 20 ms', 'AR(1), 0.2 s', 'AR(1), 1 s'])
+def test_colored_noise_forgets_in_its_time(name: str) -> None:
+    kind = LINES[name].kind
+    noise = noises._noise(kind, np.random.default_rng(0), 500_000)
+    later = round(kind.memory * kind.rate)
+    alike = np.mean(noise[:-later] * noise[later:]) / (np.var(noise) - kind.white**2)
+    # The mean of 500,000 products of noise that is correlated over 250 of them or less.
+    assert abs(alike - np.exp(-1.0)) < 0.1
+
+
+def test_the_table_has_a_line_of_each_kind_and_the_bars() -> None:
+    [section], bars = noises.compare(print, recordings=4, seed=1)
+    assert [row[0] for row in section.rows] == list(LINES)
+    figures = {bar.figure: bar for bar in bars}
+    assert figures['largest share of false advice'].limit == 2.0
+    assert figures['lowest coverage of mu_s and mu_v'].at_least
+
+
+def test_every_form_holds_the_same_recording(tmp_path: Path) -> None:
+    found = {
+        form: identify_friction(read_friction_recording(path))['viscous_friction'].value
+        for form, path in damage.forms(tmp_path).items()
+    }
+    assert len(found) == 6
+    # Seven digits of the table.
+    assert_allclose(list(found.values()), found['mcap, zstd'], rtol=1e-5)
+
+
+def test_damaged_recordings_end_well() -> None:
+    [section], bars = damage.compare(print, files=120, seed=3)
+    assert sum(int(count) for row in section.rows for count in row[2:]) == 120
+    assert all(not bar.missed for bar in bars), (bars, section.notes)
