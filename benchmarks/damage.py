@@ -14,7 +14,7 @@ import resource
 import struct
 from tempfile import TemporaryDirectory
 import time
-from typing import Final
+from typing import Any, Final
 
 from benchmarks.measure import Bar
 from benchmarks.page import Answer, Section, Tick
@@ -61,16 +61,7 @@ def forms(folder: Path) -> dict[str, Path]:
     """
     time_, depth, speed, force = _strokes()
     rows = list(zip(time_, depth, speed, force, strict=True))
-    wrench, joints = message_type(_WRENCH)(), message_type(_JOINTS)()
-    joints.name = ['insertion']
-    messages = []
-    for t, s, v, f in rows:
-        stamp = _START + round(1e9 * t)
-        for message in (wrench, joints):
-            message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp, 10**9)
-        wrench.wrench.force.y = float(f)
-        joints.position, joints.velocity = [float(s)], [float(v)]
-        messages.append((stamp, encode(wrench), encode(joints)))
+    messages = [_messages(_START + round(1e9 * t), s, v, f) for t, s, v, f in rows]
     found = {}
     for compression in ('zstd', 'none'):
         with BagWriter(folder / compression, compression=compression) as bag:
@@ -107,6 +98,21 @@ def forms(folder: Path) -> dict[str, Path]:
     return found
 
 
+def _messages(stamp: int, depth: float, speed: float, force: float) -> tuple[int, bytes, bytes]:
+    """Return the stamp, and force and motion as messages."""
+    vector = message_type('geometry_msgs/msg/Vector3')
+    header = message_type('std_msgs/msg/Header')(
+        message_type('builtin_interfaces/msg/Time')(*divmod(stamp, 10**9)), 'base'
+    )
+    wrench = message_type('geometry_msgs/msg/Wrench')(
+        vector(0.0, float(force), 0.0), vector(0.0, 0.0, 0.0)
+    )
+    joints = message_type(_JOINTS)(
+        header, ['insertion'], np.array([depth]), np.array([speed]), np.array([])
+    )
+    return stamp, encode(message_type(_WRENCH)(header, wrench)), encode(joints)
+
+
 def _strokes() -> tuple[FloatArray, ...]:
     """Return 12 s of time, depth, speed and force."""
     rng = np.random.default_rng(1)
@@ -129,7 +135,7 @@ def _ros1(path: Path, messages: list[tuple[int, bytes, bytes]]) -> Path:
         ]
         for stamp, *both in messages:
             for connection, kind, data in zip(connections, (_WRENCH, _JOINTS), both, strict=True):
-                message = new.deserialize_cdr(data, kind)
+                message: Any = new.deserialize_cdr(data, kind)
                 header = old.types['std_msgs/msg/Header'](
                     0, message.header.stamp, message.header.frame_id
                 )
@@ -241,8 +247,8 @@ def compare(tick: Tick, files: int = 10_000, seed: int = 2014) -> Answer:
         ('form', 'damage', *fates),
         rows,
         f'{files} files, seed {seed}, in one process. Refused: an error of one line. The same: '
-        'mu_s and mu_v within the interval of the undamaged recording. Warned: another value, '
-        f'with a warning. The slowest took {longest:.2g} s ({worst}). '
+        'mu_s and mu_v within the interval of the undamaged recording, or those of its beginning. '
+        f'Warned: another value, with a warning. The slowest took {longest:.2g} s ({worst}). '
         + (f'To mend: {"; ".join(silent[:20])}' if silent else ''),
     )
     bars = [
@@ -257,6 +263,14 @@ def compare(tick: Tick, files: int = 10_000, seed: int = 2014) -> Answer:
 def _identified(path: Path) -> tuple[Recording, FrictionEstimate]:
     recording = read_friction_recording(path)
     return recording, identify_friction(recording)
+
+
+def _is_beginning(part: Recording, whole: Recording) -> bool:
+    count = len(part.time)
+    return bool(
+        np.array_equal(part.force, whole.force[:count])
+        and np.array_equal(part.depth, whole.depth[:count])
+    )
 
 
 def _fate(file: Path, whole: tuple[Recording, FrictionEstimate]) -> str:
@@ -275,5 +289,13 @@ def _fate(file: Path, whole: tuple[Recording, FrictionEstimate]) -> str:
     )
     if same:
         return 'the same'
+    if len(recording.time) and _is_beginning(recording, whole[0]):
+        # A table that ends between two lines is a shorter recording.
+        held = (
+            found[name].interval[0] <= truth[name].value <= found[name].interval[1]
+            for name in ('coulomb_friction', 'viscous_friction')
+        )
+        if all(held):
+            return 'the same'
     told = set(recording.losses) - set(whole[0].losses)
     return 'warned' if told or found.warnings else 'another, silently'

@@ -10,7 +10,9 @@ from math import log, nan
 from typing import Final
 
 from needle_identification.errors import IdentificationError
+from needle_identification.estimation.memory import divided
 from needle_identification.estimation.regression import Regression, score_covariance
+from needle_identification.estimation.screening import Screening, Trial
 from needle_identification.friction.design import Design
 from needle_identification.friction.settings import TERMS
 from needle_identification.friction.terms import columns_of
@@ -86,21 +88,28 @@ def compare_terms(design: Design, fit: Regression, among: int = 1) -> tuple[Comp
     chosen = settings.terms
     samples = _independent_samples(design, fit)
     level = SIGNIFICANCE / among
+    used = design.used
+    screening = Screening(
+        design.regressors(chosen)[used],
+        design.signals.force[used],
+        divided(used, design.signals.correlation),
+    )
     singles = [(term,) for term in _candidates(design)]
-    found = _added(design, fit, singles, samples, level)
+    found = _added(design, screening, singles, samples, level)
     growth = 1.0 if fit.memory is None else float(fit.memory.inflation.max())
     if growth > _LIKE_MEMORY and not any(one.supported for one in found):
         # Two terms that are both missing leave what looks like noise with a memory.
         pairs = [(first, second) for (first,), (second,) in combinations(singles, 2)]
-        both = _added(design, fit, pairs, samples, level)
+        both = _added(design, screening, pairs, samples, level)
         found += [one for one in both if one.supported]
     for term in chosen:
         rest = tuple(other for other in chosen if other != term)
         if rest and not ('direction' in chosen and term in ('coulomb', 'viscous')):
             names = [column.name for column in columns_of(chosen, settings)]
             which = [names.index(column.name) for column in columns_of([term], settings)]
-            less = design.solve(rest, 'ordinary', colored=False)
-            found.append(_removed(rest, term, fit, which, _bic_difference(less, fit, samples)))
+            misfit = screening.misfit_without(which) / screening.misfit
+            difference = samples * log(misfit) - len(which) * log(samples)
+            found.append(_removed(rest, term, fit, which, difference))
     return tuple(found)
 
 
@@ -121,63 +130,68 @@ def _candidates(design: Design) -> list[str]:
 
 def _added(
     design: Design,
-    fit: Regression,
+    screening: Screening,
     candidates: Sequence[tuple[str, ...]],
     samples: float,
     level: float,
 ) -> list[Comparison]:
-    """Fit further terms; none is supported unless it predicts better too."""
-    settings = design.signals.settings
-    chosen = settings.terms
-    start = len(columns_of(chosen, settings))
-    tried: list[tuple[tuple[str, ...], Regression, list[int], float]] = []
-    for more in candidates:
-        which = list(range(start, start + len(columns_of(more, settings))))
-        terms = (*chosen, *more)
-        # Too few samples for one more parameter are no fault of the chosen terms.
-        with suppress(IdentificationError):
-            other = design.solve(terms, settings.estimator, colored=False)
-            p_value = other.wald(which)[1] if other.determined[which].all() else 1.0
-            if p_value < SIGNIFICANCE:
-                # Noise with a memory looks like many a term.
-                other = design.solve(terms, settings.estimator)
-                p_value = other.wald(which)[1]
-            tried.append((more, other, which, p_value))
+    """Try further terms; none is supported unless it predicts better too."""
+    tried = [_tried(design, screening, more) for more in candidates]
+    p_values = _holm([trial.p_value for trial in tried])
     return [
-        _judged(design, more, other, which, _bic_difference(other, fit, samples), p_value, level)
-        for (more, other, which, _), p_value in zip(
-            tried, _holm([p_value for *_, p_value in tried]), strict=True
-        )
+        _judged(design, more, trial, screening.misfit, p_value, samples, level)
+        for more, trial, p_value in zip(candidates, tried, p_values, strict=True)
     ]
+
+
+def _tried(design: Design, screening: Screening, more: tuple[str, ...]) -> Trial:
+    """Fit further terms; those that seem to matter with errors that allow for a memory."""
+    settings = design.signals.settings
+    trial = screening.tried(design.columns(more)[design.used])
+    if not trial.determined or trial.p_value >= SIGNIFICANCE:
+        return trial
+    start = len(columns_of(settings.terms, settings))
+    which = list(range(start, start + len(trial.values)))
+    # Noise with a memory looks like many a term. Too few samples for one more parameter are no
+    # fault of the chosen terms.
+    with suppress(IdentificationError):
+        other = design.solve((*settings.terms, *more), settings.estimator)
+        if other.determined[which].all():
+            return trial._replace(
+                values=other.values[which], errors=other.errors[which],
+                p_value=other.wald(which)[1],
+            )  # fmt: skip
+    return trial._replace(determined=False, p_value=1.0)
 
 
 def _judged(
     design: Design,
     more: tuple[str, ...],
-    other: Regression,
-    which: list[int],
-    difference: float,
+    trial: Trial,
+    misfit: float,
     p_value: float,
+    samples: float,
     level: float,
 ) -> Comparison:
     settings = design.signals.settings
     terms, name = (*settings.terms, *more), ' and '.join(more)
-    if not other.determined[which].all():
+    if not trial.determined:
         words = f'the data do not distinguish the term {name} from the others'
         return Comparison(terms=terms, words=words)
     columns = columns_of(more, settings)
+    difference = samples * log(trial.misfit / misfit) + len(columns) * log(samples)
     firsts = {columns_of([term], settings)[0].name for term in more if term in _POSITIVE}
     # Neither a mass nor what breaks away is less than nothing.
     impossible = any(
-        column.name in firsts and other.values[k] < 0.0
-        for k, column in zip(which, columns, strict=True)
+        column.name in firsts and value < 0.0
+        for value, column in zip(trial.values, columns, strict=True)
     )
     supported = p_value < level and difference < 0.0 and not impossible
     better = not supported or _predicts_better(design, more)
     verdict = 'support' if supported and better else 'do not support'
     sizes = ' and '.join(
-        f'{column.name} = {other.values[k]:.3g} ± {other.errors[k]:.2g} {column.unit}'
-        for k, column in zip(which, columns, strict=True)
+        f'{column.name} = {value:.3g} ± {error:.2g} {column.unit}'
+        for value, error, column in zip(trial.values, trial.errors, columns, strict=True)
     )
     words = f'the data {verdict} {name}: {sizes} (p = {p_value:.2g})'
     if not better:
@@ -232,12 +246,6 @@ def _independent_samples(design: Design, fit: Regression) -> float:
     if fit.memory is not None:
         number /= float(np.mean(fit.memory.inflation**2))
     return min(max(number, len(fit.values) + 1.0), float(fit.samples))
-
-
-def _bic_difference(other: Regression, chosen: Regression, samples: float) -> float:
-    """Return BIC of another fit minus that of the chosen one, for independent samples."""
-    misfit = float(other.residual @ other.residual) / float(chosen.residual @ chosen.residual)
-    return samples * log(misfit) + (len(other.values) - len(chosen.values)) * log(samples)
 
 
 def _removed(

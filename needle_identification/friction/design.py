@@ -51,8 +51,8 @@ class Design:
         Whether the needle is as deep as it ever was.
     regime : ndarray, shape (n,)
         Sign of the speed; 0 at rest.
-    used : ndarray of bool, shape (n,)
-        Samples to use.
+    change, used : ndarray of bool, shape (n,)
+        Where the regime changes or samples are lost, and samples to use.
     stroke : ndarray of int, shape (n,)
         Number of the stroke or rest of each sample.
     lag_column : ndarray, shape (n, 1) or (n, 0)
@@ -66,6 +66,7 @@ class Design:
     depth: FloatArray
     fresh: BoolArray
     regime: FloatArray
+    change: BoolArray
     used: BoolArray
     stroke: IntArray
     lag_column: FloatArray
@@ -96,10 +97,25 @@ class Design:
             One column per coefficient.
 
         """
-        return np.column_stack([self._columns(terms), self.lag_column])
+        return np.column_stack([self.columns(terms), self.lag_column])
 
-    def _columns(self, terms: Sequence[str], later: float = 0.0) -> FloatArray:
-        """Return the regressors for motion that is delayed further [s]."""
+    def columns(self, terms: Sequence[str], later: float = 0.0) -> FloatArray:
+        """
+        Return the regressors of terms.
+
+        Parameters
+        ----------
+        terms : sequence of str
+            Terms, of `TERMS`.
+        later : float
+            Further lag of the force [s].
+
+        Returns
+        -------
+        ndarray, shape (n, k)
+            One column per coefficient.
+
+        """
         signals = self.signals
         motion = Motion(
             self.speed - later * self.acceleration,
@@ -137,9 +153,28 @@ class Design:
             return bool(few >= self.signals.correlation)
         if term != 'stribeck':
             return True
-        column = self._columns([term])
+        column = self.columns([term])
         felt = np.count_nonzero(np.abs(column[self.used]) >= _FELT)
         return bool(felt >= self.signals.correlation)
+
+    def far_from_changes(self, distance: float) -> Design:
+        """
+        Leave out what is near a change of regime.
+
+        Parameters
+        ----------
+        distance : float
+            Time beyond the reach of the filter within which samples are left out [s].
+
+        Returns
+        -------
+        Design
+            With fewer samples.
+
+        """
+        size = 2 * (self.signals.margin + ceil(distance / self.signals.period)) + 1
+        near = maximum_filter1d(self.change.astype(np.uint8), size) > 0
+        return replace(self, used=self.used & ~near)
 
     def with_lag_column(self) -> Design:
         """
@@ -152,7 +187,7 @@ class Design:
 
         """
         settings, step = self.signals.settings, 0.5 * self.signals.period
-        early, now, late = (self._columns(settings.terms, shift) for shift in (-step, 0.0, step))
+        early, now, late = (self.columns(settings.terms, shift) for shift in (-step, 0.0, step))
         used = self.used
         solution = np.linalg.lstsq(now[used], self.signals.force[used], rcond=None)[0]
         column = np.where(used, (late - early) @ solution / (2.0 * step), 0.0)
@@ -229,9 +264,7 @@ class Design:
             )
 
 
-def select_samples(
-    signals: FilteredSignals, lag: float, settling_lag: float, distance: float = 0.0
-) -> Design:
+def select_samples(signals: FilteredSignals, lag: float, settling_lag: float) -> Design:
     """
     Select samples in steady regimes, farther from changes than the filters reach.
 
@@ -243,8 +276,6 @@ def select_samples(
         Lag of the force [s].
     settling_lag : float
         Lag of the filters of the sensor [s], for which more samples are left out.
-    distance : float
-        Time from each change within which all samples are left out [s].
 
     Returns
     -------
@@ -265,7 +296,7 @@ def select_samples(
     # The sensor settles while the filter does, whose outer third weighs little.
     settling = min(_SETTLING * settling_lag, _LONGEST_SETTLING)
     settling -= HALF_LENGTH / settings.cutoff / 1.5
-    more = max(0, ceil(max(settling, distance) / signals.period))
+    more = max(0, ceil(settling / signals.period))
     margin = signals.margin + more
     used = (regime != 0.0) & (time - lag >= time[0])
     used &= time - lag <= time[-1]
@@ -281,6 +312,7 @@ def select_samples(
         depth=depth,
         fresh=fresh,
         regime=regime,
+        change=change,
         used=used,
         stroke=np.cumsum(change),
         lag_column=np.empty((len(speed), 0)),

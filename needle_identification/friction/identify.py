@@ -66,6 +66,9 @@ _CLEANER: Final = 0.5
 _TRANSITION: Final = 0.1
 _TRANSITIONS_DIFFER: Final = 0.001
 
+#: Parameters that differ by fewer standard errors of white noise agree.
+_CLOSE: Final = 3.0
+
 
 def identify_friction(
     recording: Recording, settings: FrictionSettings | None = None, among: int = 1
@@ -248,10 +251,13 @@ def _without_transitions(choice: _Choice) -> _Choice:
     """Leave out more around each change, if the force does not follow the terms there."""
     settings = choice.signals.settings
     count = len(columns_of(settings.terms, settings))
-    if choice.fit.is_exact:
+    design = choice.design.far_from_changes(_TRANSITION)
+    if choice.fit.is_exact or not design.is_enough or _agree(design, choice.fit, count):
         return choice
     try:
-        design, fit = _fitted(choice.signals, choice.coarse, choice.fine, _TRANSITION)
+        if design.estimates_lag:
+            design = design.with_lag_column()
+        fit = design.solve(settings.terms, settings.estimator)
     except IdentificationError:
         # Little is left without them.
         return choice
@@ -264,15 +270,32 @@ def _without_transitions(choice: _Choice) -> _Choice:
     return choice._replace(design=design, fit=fit, remarks=(*choice.remarks, remark))
 
 
+def _agree(design: Design, whole: Regression, count: int) -> bool:
+    """Whether fewer samples give the same as all, by errors that are small for their noise."""
+    used = design.used
+    x, y = design.regressors(design.signals.settings.terms)[used], design.signals.force[used]
+    norms = np.linalg.norm(x, axis=0)
+    norms[norms == 0.0] = 1.0
+    x = x / norms
+    inverse = np.linalg.pinv(x.T @ x, hermitian=True)
+    values = inverse @ (x.T @ y)
+    sizes = divided(used, design.signals.correlation).sizes
+    starts = np.concatenate([[0], np.cumsum(sizes)[:-1]]).astype(np.int_)
+    scores = np.add.reduceat(x * (y - x @ values)[:, np.newaxis], starts, axis=0)
+    errors = np.linalg.norm(scores @ inverse, axis=0)
+    off = np.abs(values / norms - whole.values) <= _CLOSE * errors / norms
+    return bool((off | ~whole.determined)[:count].all())
+
+
 def _fitted(
-    signals: FilteredSignals, coarse: float, fine: float | None, distance: float = 0.0
+    signals: FilteredSignals, coarse: float, fine: float | None
 ) -> tuple[Design, Regression]:
     """Fit with a further lag as one more unknown, or at the coarse lag if there is no fine one."""
     settings = signals.settings
     lag = coarse if fine is None else fine
     # A coarse lag is wrong by up to half a step.
     error = 0.5 * signals.half_filter * signals.period if fine is None else 0.0
-    design = select_samples(signals, lag, abs(lag) + error, distance)
+    design = select_samples(signals, lag, abs(lag) + error)
     design.check()
     if fine is not None:
         design = design.with_lag_column()

@@ -13,11 +13,14 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from datetime import datetime
 from itertools import islice
+import os
 from pathlib import Path
 import re
 from typing import Any, Final, NamedTuple
+import zlib
 
 from needle_dynamics.arrays import FloatArray
+from needle_identification.bags.compression import DAMAGED
 from needle_identification.bags.limits import Budget
 from needle_identification.errors import RecordingError
 from needle_identification.recordings.recording import integrated, Recording
@@ -48,6 +51,9 @@ _USUAL: Final = {
     'speed': ('speed', 'velocity', 'vel', 'v', 'qd', 'dq', 'qdot'),
     'force': ('force', 'fy', 'fz', 'fx', 'f', 'effort', 'load', 'axialforce'),
 }
+
+#: What SciPy raises at damaged bytes.
+_DAMAGED: Final = (*DAMAGED, zlib.error, EOFError, IndexError, AttributeError)
 
 #: Lines among which the first one with numbers must be.
 _HEAD: Final = 200
@@ -386,9 +392,17 @@ def _text(path: Path) -> Table:
         # Text, gaps, or decimal commas.
         table, lost = _rows(path, first, separator, count)
     losses = [f'{lost} lines not readable, left out'] if lost else []
+    if not _ends_with_a_line(path):
+        losses.append('the last line has no end: the file may be cut off')
     known = np.atleast_1d(np.isfinite(table).any(axis=0))
     columns = {name: table[:, k] for k, name in enumerate(names) if known[k]}
     return Table(path, columns, {}, losses)
+
+
+def _ends_with_a_line(path: Path) -> bool:
+    with path.open('rb') as stream:
+        stream.seek(-1, os.SEEK_END)
+        return stream.read(1) in b'\r\n'
 
 
 def _rows(path: Path, first: int, separator: str | None, count: int) -> tuple[FloatArray, int]:
@@ -477,7 +491,7 @@ def _matlab(path: Path) -> Table:
         raise RecordingError(
             f'{path} is a MATLAB 7.3 file: save it again with save(..., "-v7")'
         ) from None
-    except (MatReadError, ValueError, TypeError, KeyError, MemoryError, IndexError) as error:
+    except (*_DAMAGED, MatReadError) as error:
         raise RecordingError(f'{path} is damaged: {shown(str(error))}') from error
     arrays = {
         name: np.squeeze(np.asarray(content[name], dtype=np.float64))

@@ -87,7 +87,7 @@ def test_the_command_writes_the_page_and_ends_with_the_verdict(
     assert file.read_text() == capsys.readouterr().out
     assert '- command: `needle bench graph --quick`' in file.read_text().splitlines()
     assert main(['bench', 'calibration', '--seed', '3']) == status
-    assert asked[1:] == [{'seed': 3}]
+    assert asked[1:] == [{'seed': 3}] * len(run.MODULES['calibration'])
     assert '- command: `needle bench calibration --seed 3`' in capsys.readouterr().out
 
 

@@ -138,7 +138,7 @@ def test_what_cannot_be_used_is_counted(tmp_path: Path) -> None:
     text[20] = '0.2,oops'
     text[30] = text[29]
     text[40], text[41] = text[41], text[40]
-    read = read_friction_recording(written(tmp_path, '\n'.join(text)))
+    read = read_friction_recording(written(tmp_path, '\n'.join([*text, ''])))
     assert len(read.time) == 500 - 3
     assert read.losses == (
         '1 lines not readable, left out',

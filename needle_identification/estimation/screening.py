@@ -1,0 +1,152 @@
+r"""
+Further columns beside those of a least squares fit, tried at little cost.
+
+What further columns Z explain beside X is what the rest :math:`\tilde Z` of their own regression
+on X explains of the residual [Frisch1933]_. The covariance of their coefficients comes from sums
+of scores over parts that are as long as the noise is correlated.
+
+References
+----------
+.. [Frisch1933] R. Frisch, F. V. Waugh, "Partial time regressions as compared with individual
+   trends", Econometrica 1(4), 1933.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from needle_dynamics.arrays import BoolArray, FloatArray
+from needle_identification.estimation.memory import Parts
+from needle_identification.estimation.regression import determinable
+import numpy as np
+from scipy.special import fdtrc
+
+
+class Trial(NamedTuple):
+    """
+    Further columns in a fit.
+
+    Attributes
+    ----------
+    values, errors : ndarray, shape (q,)
+        Their coefficients and standard errors.
+    determined : bool
+        Whether the data distinguish them from the other columns.
+    misfit : float
+        Sum of squares that is left.
+    p_value : float
+        p-value of the test that all coefficients are zero.
+
+    """
+
+    values: FloatArray
+    errors: FloatArray
+    determined: bool
+    misfit: float
+    p_value: float
+
+
+class Screening:
+    """
+    Tries columns beside those of a least squares fit.
+
+    Parameters
+    ----------
+    regressors : ndarray, shape (n, k)
+        Columns of the fit, of the used samples only.
+    response : ndarray, shape (n,)
+        Response of these.
+    parts : Parts
+        Parts of the used samples.
+
+    Attributes
+    ----------
+    misfit : float
+        Sum of squares that the fit leaves.
+
+    """
+
+    def __init__(self, regressors: FloatArray, response: FloatArray, parts: Parts) -> None:
+        self._x = regressors / _norms(regressors)
+        self._gram = self._x.T @ self._x
+        self._moment = self._x.T @ response
+        self._power = float(response @ response)
+        self._inverse = np.linalg.pinv(self._gram, hermitian=True)
+        self._residual = response - self._x @ (self._inverse @ self._moment)
+        self._starts = np.concatenate([[0], np.cumsum(parts.sizes)[:-1]]).astype(np.int_)
+        self.misfit = float(self._residual @ self._residual)
+
+    def tried(self, columns: FloatArray) -> Trial:
+        """
+        Add columns to the fit.
+
+        Parameters
+        ----------
+        columns : ndarray, shape (n, q)
+            Further columns, of the used samples.
+
+        Returns
+        -------
+        Trial
+            What they explain.
+
+        """
+        norms = _norms(columns)
+        z = columns / norms
+        k, q = len(self._gram), z.shape[1]
+        both = self._x.T @ z
+        rest = z - self._x @ (self._inverse @ both)
+        inner = np.linalg.pinv(rest.T @ rest, hermitian=True)
+        values = inner @ (rest.T @ self._residual)
+        left = self._residual - rest @ values
+        scores = np.add.reduceat(rest * left[:, np.newaxis], self._starts, axis=0)
+        free = len(self._starts) - k - q
+        misfit = float(left @ left)
+        determined = free > 0 and not self._unknown(both, z)[k:].any()
+        if not determined:
+            return Trial(values / norms, np.full(q, np.inf), False, misfit, 1.0)
+        covariance = inner @ (scores.T @ scores) @ inner * len(self._starts) / free
+        if covariance.any():
+            wald = float(values @ np.linalg.solve(covariance, values)) / q
+        else:
+            wald = np.inf
+        return Trial(
+            values / norms,
+            np.sqrt(np.diag(covariance)) / norms,
+            True,
+            misfit,
+            float(fdtrc(q, free, wald)),
+        )
+
+    def _unknown(self, both: FloatArray, z: FloatArray) -> BoolArray:
+        whole = np.block([[self._gram, both], [both.T, z.T @ z]])
+        strengths, directions = np.linalg.eigh(whole)
+        singular = np.sqrt(np.maximum(strengths[::-1], 0.0))
+        return determinable(singular, directions[:, ::-1].T)[1]
+
+    def misfit_without(self, columns: Sequence[int]) -> float:
+        """
+        Leave out columns of the fit.
+
+        Parameters
+        ----------
+        columns : sequence of int
+            Their positions.
+
+        Returns
+        -------
+        float
+            Sum of squares that the others leave.
+
+        """
+        kept = np.setdiff1d(np.arange(len(self._gram)), columns)
+        moment = self._moment[kept]
+        inverse = np.linalg.pinv(self._gram[np.ix_(kept, kept)], hermitian=True)
+        return max(self._power - float(moment @ inverse @ moment), self.misfit)
+
+
+def _norms(columns: FloatArray) -> FloatArray:
+    norms = np.linalg.norm(columns, axis=0)
+    return np.where(norms > 0.0, norms, 1.0)
