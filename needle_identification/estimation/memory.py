@@ -52,8 +52,9 @@ _BISECTIONS: Final = 30
 #: Relative size of what counts as rounding.
 _ROUNDING: Final = 1e-9
 
-#: Parts of a long recording are longer, so that there are not more.
-_MOST_PARTS: Final = 2000
+#: Parts by which the models are judged, and parts in a run of them.
+_MOST_PARTS: Final = 1000
+_RUN: Final = 50
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -137,14 +138,13 @@ def divided(used: BoolArray, length: int) -> Parts:
         Parts of about that length; of at least half of it where the used samples allow.
 
     """
-    long = max(float(length), np.count_nonzero(used) / _MOST_PARTS)
     edges = np.flatnonzero(np.diff(np.concatenate([[0], used.astype(np.int8), [0]])))
     limits: list[tuple[int, int]] = []
     for start, end in edges.reshape(-1, 2).tolist():
-        count = max(1, round((end - start) / long))
+        count = max(1, round((end - start) / length))
         cuts = [start + (end - start) * k // count for k in range(count + 1)]
         limits += pairwise(cuts)
-    return Parts(np.array(limits, dtype=np.int_).reshape(-1, 2), long)
+    return Parts(np.array(limits, dtype=np.int_).reshape(-1, 2), float(length))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -235,28 +235,25 @@ def memory_of(
     if free < 1 or not r.any():
         ones = np.ones(a.shape[1])
         return Memory(inflation=ones, far=ones, length=0.0, ratio=0.0)
-    white = parts.length / parts.sizes
-    gaps = np.diff(parts.centers)
-    both = np.column_stack([x, r])
-    weighed = both / white[:, np.newaxis]
+    white, time = parts.length / parts.sizes, parts.centers
     plain = (a**2 * white[:, np.newaxis]).sum(axis=0)
+    # The models are judged by some of the parts of a long recording.
+    some = _spread_out(m)
+    own, both = white[some], np.column_stack([x, r])[some]
+    weighed = both / own[:, np.newaxis]
+    free = len(some) - k
     # Of each model: time and ratio; log|V|; (x, r)' V^-1 (x, r); the diagonal of a' V a.
-    models, sizes = [(0.0, 0.0)], [float(np.log(white).sum())]
+    models, sizes = [(0.0, 0.0)], [float(np.log(own).sum())]
     products, spreads = [both.T @ weighed], [plain]
-    for length in np.geomspace(0.5 * parts.length, _LONGEST * max(gaps.sum(), 1.0), _TIMES):
-        # Correlated noise is a chain: its precision is tridiagonal.
-        kept, new = np.exp(-gaps / length), -np.expm1(-2.0 * gaps / length)
-        diagonal = np.ones(m)
-        diagonal[:-1] += kept**2 / new
-        diagonal[1:] += kept**2 / new
-        beside = -kept / new
-        log_chain = sizes[0] + float(np.log(new).sum())
-        d, e, _ = dpttrf(diagonal, beside)
+    longest = _LONGEST * max(float(time[-1] - time[0]), 1.0)
+    for length in np.geomspace(0.5 * parts.length, longest, _TIMES):
+        d, e, _ = dpttrf(*_precision(time, length)[:2])
         correlated = (a * dpttrs(d, e, a)[0]).sum(axis=0)
+        diagonal, beside, log_chain = _precision(time[some], length)
         for ratio in _RATIOS.tolist():
-            d, e, _ = dpttrf(diagonal / ratio + 1.0 / white, beside / ratio)
+            d, e, _ = dpttrf(diagonal / ratio + 1.0 / own, beside / ratio)
             models.append((float(length), ratio))
-            sizes.append(log_chain + m * np.log(ratio) + float(np.log(d).sum()))
+            sizes.append(sizes[0] + log_chain + len(some) * np.log(ratio) + float(np.log(d).sum()))
             products.append(products[0] - weighed.T @ dpttrs(d, e, weighed)[0])
             spreads.append(plain + ratio * correlated)
     table = np.array(products)
@@ -275,6 +272,24 @@ def memory_of(
         length=length,
         ratio=ratio,
     )
+
+
+def _spread_out(count: int) -> IntArray:
+    """Choose runs of parts, evenly over a recording: for both short and long times."""
+    if count <= _MOST_PARTS:
+        return np.arange(count)
+    starts = np.linspace(0, count - _RUN, _MOST_PARTS // _RUN).astype(np.int_)
+    return np.asarray((starts[:, np.newaxis] + np.arange(_RUN)).ravel())
+
+
+def _precision(time: FloatArray, length: float) -> tuple[FloatArray, FloatArray, float]:
+    """Return diagonal and neighbors of the inverse of a chain's covariance, and its log size."""
+    gaps = np.diff(time)
+    kept, new = np.exp(-gaps / length), -np.expm1(-2.0 * gaps / length)
+    diagonal = np.ones(len(time))
+    diagonal[:-1] += kept**2 / new
+    diagonal[1:] += kept**2 / new
+    return diagonal, np.asarray(-kept / new), float(np.log(new).sum())
 
 
 def _growth(weights: FloatArray, deviations: FloatArray, outside: float) -> FloatArray:

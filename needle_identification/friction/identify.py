@@ -235,10 +235,9 @@ def _is_cleaner(positions: FilteredSignals, speeds: FilteredSignals) -> bool:
 
 def _first_choice(signals: FilteredSignals, from_positions: bool) -> _Choice:
     """Fit with the lag that the motion determines, if it does."""
-    coarse, fine = find_lag(signals)
-    if 'inertia' in signals.settings.terms:
-        # What looked like a lag was the mass.
-        coarse, fine = 0.0, None
+    coarse, fine = 0.0, None
+    if 'inertia' not in signals.settings.terms:
+        coarse, fine = find_lag(signals)
     design, fit = _fitted(signals, coarse, fine)
     if design.estimates_lag and not fit.errors[-1] < HALF_LENGTH / signals.settings.cutoff:
         # Beyond the length of the filter the force is not linear in the lag.

@@ -8,7 +8,6 @@ Gauss-Newton steps; the regression of friction itself takes the last step.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from math import hypot
 from typing import Final
 
@@ -53,7 +52,7 @@ def find_lag(signals: FilteredSignals) -> tuple[float, float | None]:
     Parameters
     ----------
     signals : FilteredSignals
-        Filtered force and motion. The term inertia is left out, because it looks like a lag.
+        Filtered force and motion; without the term inertia, which looks like a lag.
 
     Returns
     -------
@@ -63,19 +62,15 @@ def find_lag(signals: FilteredSignals) -> tuple[float, float | None]:
         Lag of least misfit [s]; None if the motion does not determine it.
 
     """
-    terms = tuple(term for term in signals.settings.terms if term != 'inertia')
-    if not terms:
-        return 0.0, None
-    simple = replace(signals.settings, terms=terms, estimator='ordinary')
-    signals = replace(signals, settings=simple)
+    terms = signals.settings.terms
     lag = coarse = _coarse_lag(signals)
     for _ in range(_MAX_ITERATIONS):
         design = select_samples(signals, lag, abs(lag))
         if not design.is_enough or _acceleration_is_noise(design):
             return coarse, None
         design = design.with_lag_column()
-        x, used = design.regressors(terms), design.used
-        change = float(np.linalg.lstsq(x[used], signals.force[used], rcond=None)[0][-1])
+        x, used = design.regressors(terms)[design.used], design.used
+        change = float(np.linalg.lstsq(x, signals.force[used], rcond=None)[0][-1])
         lag += change
         if abs(lag) > 2.0 * _LARGEST_LAG:
             return coarse, None

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 import shlex
 from typing import Final, NamedTuple
@@ -13,7 +14,7 @@ from needle_dynamics.arrays import FloatArray, IntArray
 from needle_identification.bags.bag import Bag
 from needle_identification.bags.topics import Topic
 from needle_identification.errors import RecordingError
-from needle_identification.recordings.reading import read_indentation_recording
+from needle_identification.recordings.reading import first_names, read_indentation_recording
 from needle_identification.recordings.samples import (
     are_gaps,
     AXES,
@@ -26,7 +27,7 @@ from needle_identification.recordings.samples import (
 from needle_identification.recordings.tables import guessed, is_table, read_table, ROLES
 from needle_identification.stiffness.identify import identify_stiffness
 from needle_ros import wire
-from needle_ros.errors import MessageError, NeedleError
+from needle_ros.errors import NeedleError
 import numpy as np
 
 #: Types with the motion of something, and that of a force.
@@ -241,18 +242,11 @@ def _presses(path: Path) -> bool:
 
 def _joints(bag: Bag, topics: Sequence[Topic]) -> Mapping[Topic, list[str]]:
     """Return the names of the joints of each JointState, from its first messages."""
-    found: dict[Topic, list[str]] = {t: [] for t in topics if t.type_name == wire.JOINT_STATE}
-    waiting = set(found)
-    readers = {topic: wire.Reader(wire.JOINT_STATE) for topic in found}
-    for message in bag.messages(lambda topic: topic in found):
-        if not waiting:
-            break
-        if message.topic in waiting:
-            with suppress(MessageError):
-                if joints := readers[message.topic].read(message.data).names:
-                    found[message.topic] = list(joints)[:_MAX_JOINTS]
-                    waiting.discard(message.topic)
-    return found
+    states = [topic for topic in topics if topic.type_name == wire.JOINT_STATE]
+    return {
+        topic: list(dict.fromkeys(chain.from_iterable(first_names(bag, topic))))[:_MAX_JOINTS]
+        for topic in states
+    }
 
 
 def _source(topic: Topic, axes: Sequence[str]) -> Source:

@@ -257,15 +257,38 @@ def _motion_source(bag: Bag, topic: Topic, axis: str | None) -> tuple[Source, fl
 
 def _only_joint(bag: Bag, topic: Topic) -> str | None:
     """Return the joint that nearly all of the first messages name alone; None if none is."""
-    reader = wire.Reader(wire.JOINT_STATE)
-    names = Counter[tuple[str, ...]]()
-    for message in islice(bag.messages(lambda other: other == topic), _FIRST):
-        with suppress(MessageError):
-            names[reader.read(message.data).names] += 1
+    names = Counter(first_names(bag, topic))
     if not names:
         return None
     usual, count = names.most_common(1)[0]
     return usual[0] if len(usual) == 1 and count > 0.8 * names.total() else None
+
+
+def first_names(bag: Bag, topic: Topic) -> list[tuple[str, ...]]:
+    """
+    Return the joints that the first messages of a topic name.
+
+    Parameters
+    ----------
+    bag : Bag
+        The bag.
+    topic : Topic
+        A topic of JointState messages.
+
+    Returns
+    -------
+    list of tuple of str
+        Names of each message that can be read.
+
+    """
+    reader = wire.Reader(wire.JOINT_STATE)
+    found: list[tuple[str, ...]] = []
+    # The first batch is enough, and all that is read.
+    for batch in islice(bag.batches(lambda other: other == topic), 1):
+        for _, data in islice(batch.messages(), _FIRST):
+            with suppress(MessageError):
+                found.append(reader.read(data).names)
+    return found
 
 
 def _chosen(bag: Bag, topics: Sequence[Topic], wanted: _Wanted, name: str | None) -> Topic:

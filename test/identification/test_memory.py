@@ -41,8 +41,18 @@ def test_parts_hold_each_used_sample_once_and_no_other(used: list[bool], length:
     assert parts.sizes.max() <= np.ceil(1.5 * length)
 
 
-def test_a_long_recording_is_divided_into_few_parts() -> None:
-    assert len(divided(np.ones(10**6, dtype=np.bool_), 25).limits) <= memory._MOST_PARTS
+def test_some_of_the_parts_of_a_long_recording_tell_as_much() -> None:
+    """The memory is as long, and the errors grow as much, as in a recording a tenth as long."""
+    found = []
+    for n in (10_000, 100_000):
+        rng = np.random.default_rng(1)
+        noise = colored(rng, n, 30.0) + 0.3 * rng.standard_normal(n)
+        x = np.sign(np.sin(2.0 * np.pi * np.arange(n) / 500.0))[:, np.newaxis]
+        found.append(regress(x, noise, correlation=LENGTH, colored=True).memory)
+        assert found[-1] is not None
+    # A factor of two is one step of the grid; the short recording leaves more models open.
+    assert 10.0 < found[1].length < 90.0
+    assert_allclose(found[1].inflation, found[0].inflation, rtol=0.3)
 
 
 def dense(
