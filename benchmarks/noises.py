@@ -61,8 +61,6 @@ class Kind:
         Whether the recording has no speeds.
     speeds : (float, float)
         Speeds of the strokes [m/s], drawn evenly in their logarithm.
-    late : float
-        How late the force is stamped [s].
     truth : mapping of str to float
         Coefficients of further terms, by the names of the parameters.
 
@@ -81,7 +79,6 @@ class Kind:
     position_counts: float = 1e-6
     positions_only: bool = False
     speeds: tuple[float, float] = (2e-3, 15e-3)
-    late: float = 0.0
     truth: Mapping[str, float] = field(default_factory=dict)
 
 
@@ -114,11 +111,10 @@ def recorded(
         **kind.truth,
     }
     step = 1.0 / (kind.rate * _FINER)
-    speed, acceleration = _strokes(rng, kind.duration, step, kind.speeds)
+    speed = _strokes(rng, kind.duration, step, kind.speeds)
     depth = 0.05 + np.concatenate([[0.0], np.cumsum(0.5 * step * (speed[1:] + speed[:-1]))])
     time = np.asarray(np.arange(len(speed)) * step, dtype=np.float64)
-    force = _force(truth, time, speed, acceleration)
-    force = np.interp(time - kind.late, time, force)
+    force = _force(truth, time, speed)
     kept = slice(None, None, _FINER)
     time, depth = time[kept], np.asarray(depth[kept])
     speed, force = speed[kept], np.asarray(force[kept])
@@ -136,8 +132,8 @@ def recorded(
 
 def _strokes(
     rng: np.random.Generator, duration: float, step: float, speeds_between: tuple[float, float]
-) -> tuple[FloatArray, FloatArray]:
-    """Return speed and acceleration of strokes in and out."""
+) -> FloatArray:
+    """Return the speed of strokes in and out."""
     corners, speeds = [0.0, 0.5], [0.0, 0.0]
     sign = 1.0
     while corners[-1] < duration:
@@ -150,21 +146,15 @@ def _strokes(
             corners.append(corners[-1] + rng.uniform(*_RESTS))
             speeds.append(0.0)
         sign = -sign
-    time = np.arange(0.0, duration, step)
-    speed = np.interp(time, corners, speeds)
-    slopes = np.append(np.diff(speeds) / np.diff(corners), 0.0)
-    return speed, slopes[np.searchsorted(corners, time, 'right') - 1]
+    return np.asarray(np.interp(np.arange(0.0, duration, step), corners, speeds))
 
 
-def _force(
-    truth: Mapping[str, float], time: FloatArray, speed: FloatArray, acceleration: FloatArray
-) -> FloatArray:
+def _force(truth: Mapping[str, float], time: FloatArray, speed: FloatArray) -> FloatArray:
     """Return the force; at rest it is what is left of the friction, a part of Coulomb's."""
     sign = np.sign(speed)
     sign[speed == 0.0] = 0.3
     force = truth['coulomb_friction'] * sign + truth['viscous_friction'] * speed
     force += truth.get('offset', 0.0) + truth.get('force_drift', 0.0) * time
-    force += truth.get('moving_mass', 0.0) * acceleration
     force += truth.get('stribeck_friction', 0.0) * sign * np.exp(-((speed / 1e-3) ** 2))
     out = speed < 0.0
     force += truth.get('withdrawal_coulomb', 0.0) * np.where(out, -1.0, 0.0)

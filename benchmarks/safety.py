@@ -37,7 +37,7 @@ MOMENTS: Final = {'at rest': 0.25, 'starting': 0.6, 'moving': 1.5, 'braking': 2.
 _LASTS, _WATCHED, _PATIENCE = 0.5, 0.5, 10.0
 
 #: The same target after each fault, and how near to it is there [m]. Dry friction holds a needle
-#: that was let go of.
+#: on which no force acts.
 _AFTER, _NEAR = 0.03, 2e-4
 
 #: A needle that a force holds farther than this from its own way is not safe [m].

@@ -218,7 +218,7 @@ class IdentificationNode(BaseNode):
             )
             if output:
                 write_result(output, friction)
-            self._found = friction.statistics
+            self._found, count = friction.statistics, len(friction.estimates)
             self._publish(self._friction, summary_statuses(friction))
         else:
             reading['axes'] = tuple(self.get_parameter('axes').value)
@@ -232,9 +232,9 @@ class IdentificationNode(BaseNode):
             )
             if output:
                 write_result(output, None, stiffness)
-            self._found = (stiffness.tissue_stiffness,)
+            self._found, count = (stiffness.tissue_stiffness,), len(stiffness.estimates)
             self._publish(self._stiffness, summary_statuses(stiffness))
-        self._words = f'{sentence(self._found)} from {len(self._bags)} recordings'
+        self._words = f'{sentence(self._found)} from {count} recordings'
         self.get_logger().info(self._words)
 
     def _estimates(self, read: Callable[[str], Any], identify: Callable[[Any], Any]) -> list[Any]:
@@ -243,9 +243,11 @@ class IdentificationNode(BaseNode):
         seen: dict[bytes, str] = {}
         for bag in self._bags:
             recording = read(bag)
-            if (same := seen.setdefault(recording.digest, bag)) is not bag:
+            if recording.digest in seen:
+                same = seen[recording.digest]
                 self.get_logger().warning(f'{bag}: the same samples as {same}: counts once')
                 continue
+            seen[recording.digest] = bag
             estimate = identify(recording)
             for words in (*recording.losses, *estimate.warnings):
                 self.get_logger().warning(f'{bag}: {words}')

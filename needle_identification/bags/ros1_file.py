@@ -13,6 +13,7 @@ from needle_identification.bags.batch import Batch, grouped, LARGEST_BATCH, Tall
 from needle_identification.bags.compression import DAMAGED, decompress
 from needle_identification.bags.limits import Budget
 from needle_identification.bags.topics import make_topic
+from needle_identification.errors import RecordingError
 from rosbags.convert.converter import generate_message_converter
 from rosbags.rosbag1 import Reader, ReaderError
 from rosbags.rosbag1.reader import decompressors
@@ -95,6 +96,8 @@ def _converted(convert: Callable[[bytes], Any], data: bytes) -> bytes:
 
 def _unfolded(library: Callable[[bytes], bytes], budget: Budget, data: bytes) -> bytes:
     bounded = _BOUNDED.get(library)
-    found = data if bounded is None else bounded(data, budget.largest)
+    found = data if bounded is None else bounded(data, budget.largest + 1)
+    if len(found) > budget.largest:
+        raise RecordingError(f'{budget.name} has {budget.too_large("chunk", len(found))}')
     budget.spend(len(found))
     return found

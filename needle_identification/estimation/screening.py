@@ -63,20 +63,28 @@ class Screening:
 
     Attributes
     ----------
+    values, errors : ndarray, shape (k,)
+        Coefficients of the fit, and their standard errors if the noise has no memory.
     misfit : float
         Sum of squares that the fit leaves.
 
     """
 
     def __init__(self, regressors: FloatArray, response: FloatArray, parts: Parts) -> None:
-        self._x = regressors / _norms(regressors)
+        norms = _norms(regressors)
+        self._x = regressors / norms
         self._gram = self._x.T @ self._x
         self._moment = self._x.T @ response
         self._power = float(response @ response)
         self._inverse = np.linalg.pinv(self._gram, hermitian=True)
-        self._residual = response - self._x @ (self._inverse @ self._moment)
+        values = self._inverse @ self._moment
+        self._residual = response - self._x @ values
         self._starts = np.concatenate([[0], np.cumsum(parts.sizes)[:-1]]).astype(np.int_)
         self.misfit = float(self._residual @ self._residual)
+        self.values = values / norms
+        self.errors = (
+            np.linalg.norm(self._scores(self._x, self._residual) @ self._inverse, axis=0) / norms
+        )
 
     def tried(self, columns: FloatArray) -> Trial:
         """
@@ -101,7 +109,7 @@ class Screening:
         inner = np.linalg.pinv(rest.T @ rest, hermitian=True)
         values = inner @ (rest.T @ self._residual)
         left = self._residual - rest @ values
-        scores = np.add.reduceat(rest * left[:, np.newaxis], self._starts, axis=0)
+        scores = self._scores(rest, left)
         free = len(self._starts) - k - q
         misfit = float(left @ left)
         determined = free > 0 and not self._unknown(both, z)[k:].any()
@@ -119,6 +127,10 @@ class Screening:
             misfit,
             float(fdtrc(q, free, wald)),
         )
+
+    def _scores(self, x: FloatArray, left: FloatArray) -> FloatArray:
+        """Return the sums of scores over each part."""
+        return np.asarray(np.add.reduceat(x * left[:, np.newaxis], self._starts, axis=0))
 
     def _unknown(self, both: FloatArray, z: FloatArray) -> BoolArray:
         whole = np.block([[self._gram, both], [both.T, z.T @ z]])

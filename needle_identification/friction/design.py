@@ -193,7 +193,7 @@ class Design:
         column = np.where(used, (late - early) @ solution / (2.0 * step), 0.0)
         return replace(self, lag_column=column[:, np.newaxis])
 
-    def solve(self, terms: Sequence[str], estimator: str, *, colored: bool = True) -> Regression:
+    def solve(self, terms: Sequence[str], estimator: str) -> Regression:
         """
         Fit terms to the force.
 
@@ -203,8 +203,6 @@ class Design:
             Terms, of `TERMS`.
         estimator : str
             One of `ESTIMATORS`.
-        colored : bool
-            Whether the errors shall allow for noise with a memory.
 
         Returns
         -------
@@ -235,7 +233,7 @@ class Design:
             groups=self.stroke,
             regressor_noise=np.array(noise),
             used=self.used,
-            colored=colored,
+            colored=True,
         )
 
     def check(self) -> None:

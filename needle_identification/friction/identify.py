@@ -31,6 +31,7 @@ from needle_identification.errors import IdentificationError
 from needle_identification.estimation.memory import divided
 from needle_identification.estimation.regression import Regression
 from needle_identification.estimation.residual_tests import residual_tests
+from needle_identification.estimation.screening import Screening
 from needle_identification.friction.breakaway import breakaway_force
 from needle_identification.friction.checks import (
     check_friction,
@@ -272,18 +273,13 @@ def _without_transitions(choice: _Choice) -> _Choice:
 def _agree(design: Design, whole: Regression, count: int) -> bool:
     """Whether fewer samples give the same as all, by errors that are small for their noise."""
     used = design.used
-    x, y = design.regressors(design.signals.settings.terms)[used], design.signals.force[used]
-    norms = np.linalg.norm(x, axis=0)
-    norms[norms == 0.0] = 1.0
-    x = x / norms
-    inverse = np.linalg.pinv(x.T @ x, hermitian=True)
-    values = inverse @ (x.T @ y)
-    sizes = divided(used, design.signals.correlation).sizes
-    starts = np.concatenate([[0], np.cumsum(sizes)[:-1]]).astype(np.int_)
-    scores = np.add.reduceat(x * (y - x @ values)[:, np.newaxis], starts, axis=0)
-    errors = np.linalg.norm(scores @ inverse, axis=0)
-    off = np.abs(values / norms - whole.values) <= _CLOSE * errors / norms
-    return bool((off | ~whole.determined)[:count].all())
+    few = Screening(
+        design.regressors(design.signals.settings.terms)[used],
+        design.signals.force[used],
+        divided(used, design.signals.correlation),
+    )
+    close = np.abs(few.values - whole.values) <= _CLOSE * few.errors
+    return bool((close | ~whole.determined)[:count].all())
 
 
 def _fitted(

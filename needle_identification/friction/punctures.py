@@ -14,6 +14,7 @@ from typing import Final
 
 from needle_dynamics.arrays import FloatArray
 from needle_identification.estimation.estimate import ParameterEstimate
+from needle_identification.estimation.memory import stretches
 from needle_identification.estimation.regression import Regression
 from needle_identification.friction.design import Design
 import numpy as np
@@ -77,8 +78,7 @@ def find_punctures(design: Design, fit: Regression) -> tuple[Puncture, ...]:
     force = signals.force - x[:, : len(fit.values)] @ np.nan_to_num(fit.values)
     explained = signals.force - force
     drops, others = np.full(len(force), np.nan), np.zeros(len(force))
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], inward.astype(np.int8), [0]])))
-    inner = edges.reshape(-1, 2) + np.array([signals.margin, -signals.margin])
+    inner = stretches(inward) + np.array([signals.margin, -signals.margin])
     for start, end in inner:
         if start >= end:
             continue

@@ -205,13 +205,11 @@ def _bag(path: Path) -> Inspection:
         topic: Gathering(topic, _source(topic, axes), by_header=True)
         for topic, axes in read.items()
     }
-    counts: dict[Topic, int] = {}
     for batch in bag.batches(lambda topic: topic in gathered):
         gathered[batch.topic].add(batch)
-    counts.update(bag.counts)
     contents, signals = [], []
     losses = list(bag.losses)
-    for topic, count in sorted(counts.items(), key=lambda item: item[0].name):
+    for topic, count in sorted(bag.counts.items(), key=lambda item: item[0].name):
         content = Content(name=topic.name, type_name=topic.type_name, count=count)
         if topic in gathered:
             bag.losses.clear()

@@ -9,6 +9,7 @@ columns with the seconds and nanoseconds of a stamp are ``time=sec:nanosec``.
 
 from __future__ import annotations
 
+from array import array
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from datetime import datetime
@@ -16,11 +17,12 @@ from itertools import islice
 import os
 from pathlib import Path
 import re
+import struct
 from typing import Any, Final, NamedTuple
 import zlib
 
 from needle_dynamics.arrays import FloatArray
-from needle_identification.bags.compression import DAMAGED
+from needle_identification.bags.compression import BLOCK, DAMAGED
 from needle_identification.bags.limits import Budget
 from needle_identification.errors import RecordingError
 from needle_identification.recordings.recording import integrated, Recording
@@ -55,8 +57,15 @@ _USUAL: Final = {
 #: What SciPy raises at damaged bytes.
 _DAMAGED: Final = (*DAMAGED, zlib.error, EOFError, IndexError, AttributeError)
 
+#: Length of the head of a MATLAB file, and the type of its variables that are compressed.
+_MATLAB_HEAD: Final = 128
+_COMPRESSED: Final = 15
+
 #: Lines among which the first one with numbers must be.
 _HEAD: Final = 200
+
+#: A longer line is not that of a sample [characters].
+_LONGEST_LINE: Final = 2**16
 
 #: Beyond this a depth or speed without a unit is hardly in SI units.
 _SUSPICIOUS: Final = {'depth': 2.0, 'speed': 2.0}
@@ -370,8 +379,7 @@ def _recording(path: Path, values: Mapping[str, FloatArray], losses: list[str]) 
 
 
 def _text(path: Path) -> Table:
-    with path.open(encoding='utf-8-sig', errors='replace') as stream:
-        head = [line.rstrip('\r\n') for line in islice(stream, _HEAD)]
+    head = [line.rstrip('\r\n') for line in islice(_lines(path), _HEAD)]
     first = next((k for k, line in enumerate(head) if _numbers(line)), None)
     if first is None:
         raise RecordingError(f'{path} has no line of numbers among its first {len(head)}')
@@ -380,12 +388,7 @@ def _text(path: Path) -> Table:
     names = _names(head[:first], separator, count)
     try:
         table = np.loadtxt(
-            path,
-            delimiter=separator,
-            skiprows=first,
-            ndmin=2,
-            encoding='utf-8-sig',
-            comments=('#', '%'),
+            _lines(path), delimiter=separator, skiprows=first, ndmin=2, comments=('#', '%')
         )
         lost = 0
     except (ValueError, UnicodeDecodeError):
@@ -407,15 +410,25 @@ def _ends_with_a_line(path: Path) -> bool:
 
 def _rows(path: Path, first: int, separator: str | None, count: int) -> tuple[FloatArray, int]:
     """Read line by line; a word that is no number is nan."""
-    found, lost = [], 0
-    with path.open(encoding='utf-8-sig', errors='replace') as stream:
-        for line in islice(stream, first, None):
-            words = _split(line, separator)
-            if len(words) == count:
-                found.append([_number(word) for word in words])
-            elif line.strip() and line.lstrip()[0] not in '#%':
-                lost += 1
+    found, lost = array('d'), 0
+    for line in islice(_lines(path), first, None):
+        words = _split(line, separator)
+        if len(words) == count:
+            found.extend(_number(word) for word in words)
+        elif line.strip() and line.lstrip()[0] not in '#%':
+            lost += 1
     return np.array(found).reshape(-1, count), lost
+
+
+def _lines(path: Path) -> Iterator[str]:
+    """Yield the lines of a file, none of which may be too long to be one sample."""
+    with path.open(encoding='utf-8-sig', errors='replace') as stream:
+        while line := stream.readline(_LONGEST_LINE):
+            if len(line) == _LONGEST_LINE:
+                raise RecordingError(
+                    f'{path} has a line of {_LONGEST_LINE} characters or more: it is no table'
+                )
+            yield line
 
 
 def _separator(line: str) -> str | None:
@@ -472,6 +485,24 @@ def _distinct(names: Iterator[str]) -> Iterator[str]:
 # MATLAB.
 
 
+def _spend(path: Path, budget: Budget) -> None:
+    """Count what the compressed variables of a file unfold to."""
+    with path.open('rb') as stream:
+        head = stream.read(_MATLAB_HEAD)
+        order = '>' if head[-2:] == b'MI' else '<'
+        while len(tag := stream.read(8)) == 8:
+            kind, size = struct.unpack(f'{order}II', tag)
+            if kind != _COMPRESSED:
+                # As large as it is.
+                stream.seek(size, os.SEEK_CUR)
+                continue
+            inflater, part = zlib.decompressobj(), stream.read(size)
+            while part and not inflater.eof:
+                unfolded = inflater.decompress(part, BLOCK)
+                budget.spend(len(unfolded))
+                part = inflater.unconsumed_tail
+
+
 def _matlab(path: Path) -> Table:
     # A large import that few recordings need.
     from scipy.io import loadmat, whosmat
@@ -479,13 +510,12 @@ def _matlab(path: Path) -> Table:
 
     budget = Budget(path)
     try:
+        _spend(path, budget)
         wanted = [
             (name, shape)
             for name, shape, kind in whosmat(path)
             if kind in ('double', 'single', 'logical') or kind.lstrip('u').startswith('int')
         ]
-        for _, shape in wanted:
-            budget.spend(8 * int(np.prod(shape, dtype=object)))
         content: Mapping[str, Any] = loadmat(path, variable_names=[name for name, _ in wanted])
     except NotImplementedError:
         raise RecordingError(
@@ -501,12 +531,12 @@ def _matlab(path: Path) -> Table:
     lengths = [a.shape[0] for a in arrays.values() if a.ndim in (1, 2)]
     longest = max(set(lengths), key=lengths.count, default=0)
     columns: dict[str, FloatArray] = {}
-    for name, array in arrays.items():
-        if array.ndim == 1 and len(array) == longest:
-            columns[shown(name)] = array
-        elif array.ndim == 2 and array.shape[0] == longest:
-            columns |= {shown(f'{name}{k + 1}'): column for k, column in enumerate(array.T)}
-    scalars = {shown(name): float(array) for name, array in arrays.items() if array.ndim == 0}
+    for name, values in arrays.items():
+        if values.ndim == 1 and len(values) == longest:
+            columns[shown(name)] = values
+        elif values.ndim == 2 and values.shape[0] == longest:
+            columns |= {shown(f'{name}{k + 1}'): column for k, column in enumerate(values.T)}
+    scalars = {shown(name): float(values) for name, values in arrays.items() if values.ndim == 0}
     left = sorted(
         set(arrays) - set(scalars) - {n for n in arrays if arrays[n].shape[:1] == (longest,)}
     )

@@ -134,8 +134,8 @@ def friction_each(estimates: Sequence[FrictionEstimate], names: Sequence[str]) -
         A small plot of each, all with the same axes.
 
     """
-    figure, panels = _small_multiples(len(estimates))
-    for axes, estimate, name in zip(panels, estimates, names, strict=True):
+    figure, panels = _small_multiples(names, 'insertion speed [mm/s]', 'force on the needle [N]')
+    for axes, estimate in zip(panels, estimates, strict=True):
         fit = estimate.fit
         for sign, words, color, mark in _SIDES:
             side = fit.used & (np.sign(fit.speed) == sign)
@@ -146,10 +146,6 @@ def friction_each(estimates: Sequence[FrictionEstimate], names: Sequence[str]) -
             )
             axes.plot(speed, force, mark, color=color, markersize=1.5, alpha=0.5, label=words)
             axes.plot(speed, model, color=_FIT, linewidth=0.9)
-        axes.set_title(name, fontsize='small')
-        _label(axes, '', '')
-    figure.supxlabel('insertion speed [mm/s]')
-    figure.supylabel('force on the needle [N]')
     return figure
 
 
@@ -170,25 +166,27 @@ def stiffness_each(estimates: Sequence[StiffnessEstimate], names: Sequence[str])
         A small plot of each, all with the same axes.
 
     """
-    figure, panels = _small_multiples(len(estimates))
-    for axes, estimate, name in zip(panels, estimates, names, strict=True):
+    figure, panels = _small_multiples(names, 'displacement x [mm]', 'displacement z [mm]')
+    for axes, estimate in zip(panels, estimates, strict=True):
         _ellipses(axes, estimate)
         axes.plot(*1e3 * estimate.presses.displacement.T, 'o', color=_IN, markersize=2.0)
-        axes.set_title(name, fontsize='small')
-        _label(axes, '', '')
-    figure.supxlabel('displacement x [mm]')
-    figure.supylabel('displacement z [mm]')
     return figure
 
 
-def _small_multiples(count: int) -> tuple[Figure, list[Axes]]:
-    """Return a figure with so many small plots in rows, with shared axes."""
+def _small_multiples(names: Sequence[str], xlabel: str, ylabel: str) -> tuple[Figure, list[Axes]]:
+    """Return a figure with a small plot for each name, in rows, with shared axes."""
+    count = len(names)
     columns = min(count, 5)
     lines = -(-count // columns)
     figure = _new_figure(9.0, 0.6 + 1.7 * lines)
     panels = figure.subplots(lines, columns, sharex=True, sharey=True, squeeze=False)
     for axes in panels.flat[count:]:
         axes.set_visible(False)
+    for axes, name in zip(panels.flat, names, strict=False):
+        axes.set_title(name, fontsize='small')
+        _label(axes, '', '')
+    figure.supxlabel(xlabel)
+    figure.supylabel(ylabel)
     return figure, list(panels.flat[:count])
 
 

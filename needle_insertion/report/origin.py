@@ -165,9 +165,10 @@ def identify_all(
     for bag in tqdm(bags, desc='bags', disable=None, leave=False):
         try:
             recording = read(bag)
-            if (same := seen.setdefault(recording.digest, recording.name)) is not recording.name:
-                copies.append((recording.name, same))
+            if recording.digest in seen:
+                copies.append((recording.name, seen[recording.digest]))
                 continue
+            seen[recording.digest] = recording.name
             estimates.append(identify(recording))
         except (NeedleError, OSError) as error:
             failures.append((str(bag), str(error)))

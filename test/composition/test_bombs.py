@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import bz2
 from collections.abc import Callable, Iterable
 from contextlib import closing
 from io import BytesIO
@@ -11,6 +12,7 @@ import sqlite3
 import struct
 import subprocess
 import sys
+import zlib
 
 import lz4.frame
 from mcap.writer import CompressionType
@@ -18,6 +20,9 @@ from mcap.writer import Writer as McapWriter
 from needle_identification.bags.writer import BagWriter
 from needle_ros.documents import DocumentError, read_document
 import pytest
+from rosbags.rosbag1 import Writer as Ros1Writer
+from rosbags.typesys import get_typestore, Stores
+from scipy.io import savemat
 from support.installed import ROOT
 from support.samples import EPOCH, TEXT, text
 import zstandard
@@ -143,9 +148,65 @@ def zstd_database(folder: Path) -> Path:
     return file
 
 
+def ros1_chunk(folder: Path) -> Path:
+    """Let a chunk of a recording of ROS 1 be 3 GB of zeros."""
+    store = get_typestore(Stores.ROS1_NOETIC)
+    file = folder / 'run.bag'
+    writer = Ros1Writer(file)
+    writer.set_compression(Ros1Writer.CompressionFormat.BZ2)
+    with writer:
+        for name, kind in (('/base_wrench', WRENCH), ('/joint_states', JOINTS)):
+            connection = writer.add_connection(name, kind, typestore=store)
+            writer.write(connection, 1, bytes(100))
+    content = file.read_bytes()
+    begin = content.index(b'BZh')
+    packer = bz2.BZ2Compressor()
+    packed = b''.join(packer.compress(bytes(MEGABYTE)) for _ in range(3072)) + packer.flush()
+    size = struct.unpack('<I', content[begin - 4 : begin])[0]
+    # The index that follows is found by its place.
+    spread = packed + content[begin + size :]
+    place = struct.unpack('<Q', field(content, b'index_pos='))[0] + len(packed) - size
+    head = content[: begin - 4].replace(
+        b'index_pos=' + field(content, b'index_pos='), b'index_pos=' + struct.pack('<Q', place)
+    )
+    file.write_bytes(head + struct.pack('<I', len(packed)) + spread)
+    return file
+
+
+def field(content: bytes, name: bytes) -> bytes:
+    at = content.index(name) + len(name)
+    return content[at : at + 8]
+
+
+def matlab(folder: Path) -> Path:
+    """Let a variable of 3 GB say that it has one number."""
+    file = folder / 'run.mat'
+    savemat(file, {'time': 1.0}, do_compression=False)
+    content = file.read_bytes()
+    inner = bytearray(content[128:])
+    packer = zlib.compressobj(9)
+    # The last element is the number, of 8 bytes: let it be of 3 GB.
+    inner[-12:-8] = struct.pack('<I', 3072 * MEGABYTE)
+    inner[4:8] = struct.pack('<I', 3072 * MEGABYTE + len(inner) - 16)
+    packed = packer.compress(bytes(inner))
+    packed += b''.join(packer.compress(bytes(MEGABYTE)) for _ in range(3072)) + packer.flush()
+    file.write_bytes(content[:128] + struct.pack('<II', 15, len(packed)) + packed)
+    return file
+
+
+def one_line(folder: Path) -> Path:
+    """Write a table of one line."""
+    file = folder / 'run.csv'
+    file.write_text('1,' * 15_000_000, encoding='utf-8')
+    return file
+
+
 @pytest.mark.parametrize(
     ('make', 'reason'),
     [
+        pytest.param(ros1_chunk, 'NEEDLE_BAG_FACTOR=10 raises', id='chunk of ROS 1'),
+        pytest.param(matlab, 'NEEDLE_BAG_FACTOR=10 raises', id='matlab'),
+        pytest.param(one_line, 'is no table', id='one line'),
         pytest.param(zstd_messages, 'NEEDLE_BAG_FACTOR=10 raises', id='zstd messages'),
         pytest.param(lz4_messages, 'NEEDLE_BAG_FACTOR=10 raises', id='lz4 messages'),
         pytest.param(zstd_file, 'NEEDLE_BAG_FACTOR=10 raises', id='zstd file'),

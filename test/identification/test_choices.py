@@ -219,7 +219,7 @@ def test_false_advice_is_rare_over_all_recordings_together() -> None:
 
 
 def test_together_recordings_show_what_none_shows_alone() -> None:
-    drift = Kind(truth={'force_drift': 1.5e-4}, duration=20.0)
+    drift = Kind(truth={'force_drift': 2.5e-4}, duration=20.0)
     made = [recorded(drift, np.random.default_rng(seed))[0] for seed in range(20)]
     found = [identify_friction(one, among=len(made)) for one in made]
     alone = [one for one in found if advised(one)]

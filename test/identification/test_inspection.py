@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 import shlex
 
@@ -76,14 +77,19 @@ def run(command: str) -> int:
     return main(words)
 
 
-@pytest.mark.parametrize('bag', ['bags/friction_03', 'bags/stiffness_01'])
-def test_the_command_for_a_shipped_bag_works(bag: str, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize(
+    ('what', 'bag', 'rate'),
+    [('friction', 'bags/friction_03', 100.0), ('stiffness', 'bags/stiffness_01', 40.0)],
+)
+def test_the_command_for_a_shipped_bag_works(
+    what: str, bag: str, rate: float, capsys: pytest.CaptureFixture[str]
+) -> None:
     found = inspect_recording(bag)
-    assert found.command == f'needle identify {bag.split("/")[1].split("_", maxsplit=1)[0]} {bag}'
+    assert found.command == f'needle identify {what} {bag}'
     assert run(found.command) == 0
     rates = {one.name: one.rate for one in found.contents}
     # Samples of the simulated robot come on time.
-    assert rates['/base_wrench'] == pytest.approx(100.0 if 'friction' in bag else 40.0, rel=1e-3)
+    assert rates['/base_wrench'] == pytest.approx(rate, rel=1e-3)
     capsys.readouterr()
 
 
@@ -102,7 +108,11 @@ def test_force_and_motion_are_told_from_others(
     out, _ = capsys.readouterr()
     assert '0.559' in out
     assert main(['inspect', str(path), '--json']) == 0
-    assert '"--force-axis' not in capsys.readouterr().out
+    [document] = json.loads(capsys.readouterr().out)
+    assert document['command'] == found.command
+    assert [one['name'] for one in document['contents']] == [
+        '/ft', '/gripper_ft', '/joints', '/pose',
+    ]  # fmt: skip
 
 
 def test_a_cut_recording_of_ros_1_ends_in_one_line(

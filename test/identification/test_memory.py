@@ -82,7 +82,8 @@ def dense(
         )
         deviations.append(np.sqrt(scale * np.einsum('ik,ij,jk->k', a, v, a)))
     weights = np.exp(np.array(logs) - max(logs))
-    weights[1:] /= len(weights) - 1
+    weights[0] *= memory._WHITE
+    weights[1:] *= (1.0 - memory._WHITE) / (len(weights) - 1)
     weights /= weights.sum()
     table = np.array(deviations)
     found = []

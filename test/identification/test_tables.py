@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from datetime import datetime, timedelta, timezone
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,11 @@ NAMED = {'time': 't', 'depth': 'q', 'force': 'F'}
 def lines(head: str, *columns: Any, separator: str = ',', form: str = '.9g') -> str:
     rows = [separator.join(format(x, form) for x in row) for row in zip(*columns, strict=True)]
     return '\n'.join([head, *rows, '']) if head else '\n'.join([*rows, ''])
+
+
+def dated(time: float) -> str:
+    begin = datetime(2024, 2, 28, 23, 59, 55, tzinfo=timezone.utc)
+    return (begin + timedelta(seconds=time)).isoformat(timespec='microseconds')
 
 
 @pytest.fixture(scope='module')
@@ -67,8 +73,8 @@ FORMS: dict[str, tuple[Callable[..., str], dict[str, str]]] = {
         {'depth': 'q', 'force': 'F'},
     ),
     'dates': (
-        lambda t, q, f: lines('t,q,F', t, q, f).replace('\n', '\n2024-01-02 03:04:05.0,', 0),
-        NAMED,
+        lambda t, q, f: lines('when,q,F', [dated(x) for x in t], q, f, form=''),
+        {**NAMED, 'time': 'when'},
     ),
 }  # fmt: skip
 
