@@ -39,6 +39,10 @@ class Commands:
     several nodes command, and while commands have put in too much energy. A force may end at
     once, but grows no faster than it may.
 
+    Nothing else tells who sent a command: one whose stamp is that of a sample answers it. After
+    such an answer a force under another stamp is of another node, however short that lives, and
+    is refused until the number of nodes changes.
+
     Parameters
     ----------
     timeout : float
@@ -95,8 +99,11 @@ class Commands:
     def begin(self) -> None:
         """Forget the commands and who gave them, as at an activation."""
         self.held = self.newest = Command()
-        self.rivals = 0
+        self.rivals = self._number = 0
         self._quiet = 0
+        #: Stamps of the samples that a command may answer, and whether commands do.
+        self._samples: dict[int, None] = {}
+        self._answers = False
         self.exhausted = False
         #: Energy put in, less what is long ago [J].
         self._energy = 0.0
@@ -132,6 +139,7 @@ class Commands:
             What is wrong with it, '' for nothing.
 
         """
+        answers = stamp in self._samples
         stamp = stamp or now
         age = now - stamp
         if abs(age) > self._timeout:
@@ -140,6 +148,13 @@ class Commands:
                 f'command ignored, its stamp is {apart(age)}: command_timeout is '
                 f'{self._timeout / NANOSECONDS:g} s'
             )
+        if self._answers and not answers and (force or torque):
+            self.refused += 1
+            return False, (
+                'command ignored, its stamp is that of no sample: it is not from the node that '
+                'answers them'
+            )
+        self._answers |= answers
         # A newest one from the future is of the time before the clock was set back.
         if stamp < self.newest.stamp <= now + self._timeout:
             self.overtaken += 1
@@ -177,6 +192,7 @@ class Commands:
 
         """
         self._quiet = now + round(self._timeout)
+        self._answers = False
         self.newest = Command(self.newest.stamp)
 
     def count_commanders(self, number: int) -> bool:
@@ -196,6 +212,8 @@ class Commands:
 
         """
         rivals = max(0, number - 1)
+        if number != self._number:
+            self._number, self._answers = number, False
         if rivals == self.rivals:
             return False
         self.rivals = rivals
@@ -214,7 +232,10 @@ class Commands:
             How far the needle has moved under the command that was held [m].
 
         """
-        before, newest = self.held.force, self.newest
+        samples, before, newest = self._samples, self.held.force, self.newest
+        samples[stamp] = None
+        while (first := next(iter(samples))) < stamp - self._timeout or first > stamp:
+            del samples[first]
         self._energy = self._left * self._energy + max(0.0, before * distance)
         self.exhausted = self._energy > (0.5 if self.exhausted else 1.0) * self._most_energy
         if self.exhausted or stamp - newest.stamp > self._timeout:

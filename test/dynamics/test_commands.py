@@ -188,3 +188,39 @@ def test_what_was_commanded_is_forgotten() -> None:
     assert commands.offer(NOW - 1, '', 1.0, 0.0, NOW) == (False, '')
     commands.begin()
     assert commands.held == commands.newest == Command()
+
+
+def test_a_force_that_answers_no_sample_is_of_another_node() -> None:
+    """Until the number of nodes changes, or one has come and gone: so another may take over."""
+    commands = made()
+    commands.count_commanders(1)
+    # Nobody has answered yet: a user by hand may stamp as he likes.
+    assert commands.offer(NOW + 5, '', 1.0, 0.0, NOW + 10) == (True, '')
+    commands.hold(NOW + PERIOD)
+    assert commands.offer(NOW + PERIOD, '', 2.0, 0.0, NOW + PERIOD + 10) == (True, '')
+    for stamp in (0, NOW + PERIOD + 20):
+        counts, complaint = commands.offer(stamp, '', 9.0, 0.0, NOW + PERIOD + 30)
+        assert not counts
+        assert 'its stamp is that of no sample' in complaint
+    assert commands.newest.force == 2.0
+    assert commands.refused == 2
+    # Letting go is nobody's harm: a stop is not of a sample.
+    assert commands.offer(0, '', 0.0, 0.0, NOW + PERIOD + 40) == (True, '')
+    for change in (lambda: commands.count_commanders(0), lambda: commands.hush(NOW + PERIOD)):
+        commands.hold(NOW + 2 * PERIOD)
+        commands.offer(NOW + 2 * PERIOD, '', 1.0, 0.0, NOW + 2 * PERIOD + 10)
+        assert not commands.offer(0, '', 9.0, 0.0, NOW + 2 * PERIOD + 20)[0]
+        change()
+        assert commands.offer(0, '', 3.0, 0.0, NOW + 2 * PERIOD + 30)[0]
+
+
+def test_samples_may_be_answered_for_the_timeout() -> None:
+    """An older answer is stale; one of a clock that was set back is no answer."""
+    commands = made()
+    for k in range(300):
+        commands.hold(NOW + k * PERIOD)
+    now = NOW + 299 * PERIOD
+    assert commands.offer(NOW + 250 * PERIOD, '', 1.0, 0.0, now)[0]
+    assert 'its stamp is' in commands.offer(NOW + 150 * PERIOD, '', 1.0, 0.0, now)[1]
+    commands.hold(NOW)
+    assert not commands.offer(NOW + 40 * PERIOD, '', 1.0, 0.0, NOW)[0]
