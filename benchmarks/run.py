@@ -25,6 +25,7 @@ MODULES = {
     'calibration': ('calibration', 'noises'),
     'damage': ('damage',),
     'control': ('control',),
+    'steering-model': ('steering_model',),
     'laws': ('laws',),
     'safety': ('safety',),
     'graph': ('graph',),
@@ -58,6 +59,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     damage = add('damage', help='what identification makes of damaged recordings')
     damage.add_argument('--files', type=int, metavar='N', help='damaged recordings')
     add('control', help='cost of a control step')
+    add('steering-model', help='a needle that cuts its path, beside NumPy and SciPy')
     laws = add('laws', help='control laws on needles, robots and tissues that they do not know')
     laws.add_argument('--needles', type=int, metavar='N', help='needles in a cell')
     safety = add('safety', help='what faults, strangers and kills do to a motion')

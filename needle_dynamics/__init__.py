@@ -31,6 +31,14 @@ if TYPE_CHECKING:
     from needle_dynamics.simulated.integrator import Integrator, Interval
     from needle_dynamics.simulated.plant import Plant
     from needle_dynamics.simulated.trajectory import simulate, Trajectory
+    from needle_dynamics.steering.batch import insert_batch
+    from needle_dynamics.steering.needle import NeedlePath, NeedleShape, SteeredNeedle
+    from needle_dynamics.steering.parameters import (
+        bending_length,
+        STEERING_PRESETS,
+        SteeringParameters,
+        SteeringPreset,
+    )
     from needle_dynamics.tissue import Tissue
     from needle_ros.errors import JobError, NeedleError, ParameterError, ShapeError
 else:
@@ -41,6 +49,7 @@ __all__ = [
     'FORMULATIONS',
     'FRICTION_LAWS',
     'PRESETS',
+    'STEERING_PRESETS',
     'Analysis',
     'Batch',
     'EulerLoads',
@@ -60,14 +69,21 @@ __all__ = [
     'NeedleError',
     'NeedleModel',
     'NeedleParameters',
+    'NeedlePath',
+    'NeedleShape',
     'ParameterError',
     'Plant',
     'ShapeError',
+    'SteeredNeedle',
+    'SteeringParameters',
+    'SteeringPreset',
     'Tissue',
     'ToleranceError',
     'Trajectory',
     'analyze',
+    'bending_length',
     'euler_loads',
+    'insert_batch',
     'linearize',
     'mode_shapes',
     'operating_point',

@@ -1,0 +1,357 @@
+r"""
+The needle as a beam on an elastic foundation about the path that its tip cut.
+
+Between two nodes the needle obeys
+
+.. math:: E I w'''' + k (w - p) = 0
+
+with a path p that is a polynomial of degree two, and this is solved exactly. All of the needle
+between the guide and a node acts on the rest of it as a spring: what the needle does there depends
+on the force and the moment ``f = (V, M)`` that its deeper part exerts on it,
+
+.. math:: x = C f + x_0 , \quad x = (w, w') .
+
+The spring of a node follows from that of the node before it alone. So a needle that grows by an
+element costs one element, whatever its length. C is the same in both planes. In the language of
+estimation, C and x_0 are the covariance and the mean of a Kalman filter, and the shape of the
+needle is its smoother.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from needle_dynamics.arrays import FloatArray
+from needle_dynamics.compiled.cache import compiled, inlined
+
+
+class Springs(NamedTuple):
+    """
+    What the needle up to each node is to the rest of it; row i is the node i.
+
+    Attributes
+    ----------
+    depths : ndarray, shape (m,)
+        Distance from the entry point [m]; node 0 is the entry point.
+    stiffness : ndarray, shape (m,)
+        Stiffness of the tissue between this node and the next one [N/m^2].
+    compliance : ndarray, shape (m, 3)
+        The entries 00, 01 and 11 of the symmetric C [m/N, 1/N, rad/(N m)].
+    response : ndarray, shape (m, 2, 2)
+        Deflection and slope of the unloaded end per position and tilt of the guide.
+    rest : ndarray, shape (m, 2, 2)
+        By plane (x, z): deflection [m] and slope of the unloaded end with the guide at zero.
+    path : ndarray, shape (m, 2, 3)
+        By plane: value [m], slope and second derivative [1/m] of the path at this node, towards
+        the next one.
+
+    """
+
+    depths: FloatArray
+    stiffness: FloatArray
+    compliance: FloatArray
+    response: FloatArray
+    rest: FloatArray
+    path: FloatArray
+
+
+class Element(NamedTuple):
+    """
+    Exact transfer of deflection, slope, shear force and moment over an element.
+
+    Attributes
+    ----------
+    p0, p1, p2, p3, p4, p5, p6 : float
+        The functions h^j sum_m z^m / (4m + j)! with z = -k h^4 / (E I), in m^j.
+    ei : float
+        Bending stiffness [N m^2].
+    k : float
+        Stiffness of the tissue [N/m^2].
+
+    """
+
+    p0: float
+    p1: float
+    p2: float
+    p3: float
+    p4: float
+    p5: float
+    p6: float
+    ei: float
+    k: float
+
+
+class Crossing(NamedTuple):
+    """
+    How the spring at the end of an element follows from that at its start.
+
+    Attributes
+    ----------
+    c00, c01, c11 : float
+        Compliance at the end.
+    t00, t01, t10, t11 : float
+        What deflection and slope of the unloaded end at the start become at the end.
+    value, slope, bend : tuple of float
+        Deflection and slope at the end per value, slope and second derivative of the path.
+
+    """
+
+    c00: float
+    c01: float
+    c11: float
+    t00: float
+    t01: float
+    t10: float
+    t11: float
+    value: tuple[float, float]
+    slope: tuple[float, float]
+    bend: tuple[float, float]
+
+
+@inlined
+def element(ei: float, k: float, h: float) -> Element:
+    """
+    Return the transfer over an element.
+
+    Parameters
+    ----------
+    ei : float
+        Bending stiffness [N m^2].
+    k : float
+        Stiffness of the tissue [N/m^2].
+    h : float
+        Length [m], at most (4 E I / k)^(1/4): then the series have ended.
+
+    Returns
+    -------
+    Element
+        The transfer.
+
+    """
+    z = -k / ei * h**4
+    # Coefficients of z^m: j! / (4m + j)!, by ratios of neighbors.
+    p0 = 1.0 + z / 24 * (1.0 + z / 1680 * (1.0 + z / 11880 * (1.0 + z / 43680)))
+    p1 = 1.0 + z / 120 * (1.0 + z / 3024 * (1.0 + z / 17160 * (1.0 + z / 57120)))
+    p2 = 1.0 + z / 360 * (1.0 + z / 5040 * (1.0 + z / 24024 * (1.0 + z / 73440)))
+    p3 = 1.0 + z / 840 * (1.0 + z / 7920 * (1.0 + z / 32760 * (1.0 + z / 93024)))
+    p4 = 1.0 + z / 1680 * (1.0 + z / 11880 * (1.0 + z / 43680 * (1.0 + z / 116280)))
+    p5 = 1.0 + z / 3024 * (1.0 + z / 17160 * (1.0 + z / 57120 * (1.0 + z / 143640)))
+    p6 = 1.0 + z / 5040 * (1.0 + z / 24024 * (1.0 + z / 73440 * (1.0 + z / 175560)))
+    return Element(
+        p0,
+        p1 * h,
+        p2 * h**2 / 2,
+        p3 * h**3 / 6,
+        p4 * h**4 / 24,
+        p5 * h**5 / 120,
+        p6 * h**6 / 720,
+        ei,
+        k,
+    )
+
+
+@inlined
+def cross(e: Element, c00: float, c01: float, c11: float) -> Crossing:
+    """
+    Carry the spring at the start of an element to its end.
+
+    Parameters
+    ----------
+    e : Element
+        The transfer over it.
+    c00, c01, c11 : float
+        Compliance at its start.
+
+    Returns
+    -------
+    Crossing
+        The compliance at its end, and what becomes of deflections and path.
+
+    """
+    a = e.k / e.ei
+    # W = Phi_fx C + Phi_ff takes the loads at the start to those at the end.
+    w00 = e.k * (e.p1 * c00 + e.p2 * c01) + e.p0
+    w01 = e.k * (e.p1 * c01 + e.p2 * c11) + a * e.p3
+    w10 = -e.k * (e.p2 * c00 + e.p3 * c01) - e.p1
+    w11 = -e.k * (e.p2 * c01 + e.p3 * c11) + e.p0
+    inverse = 1.0 / (w00 * w11 - w01 * w10)
+    # The transfer is symplectic: deflections go over with the transpose of the inverse of W.
+    t00, t01, t10, t11 = w11 * inverse, -w10 * inverse, -w01 * inverse, w00 * inverse
+    # Phi_xx C + Phi_xf, times the inverse of W.
+    v00 = e.p0 * c00 + e.p1 * c01 - e.p3 / e.ei
+    v01 = e.p0 * c01 + e.p1 * c11 + e.p2 / e.ei
+    v10 = -a * e.p3 * c00 + e.p0 * c01 - e.p2 / e.ei
+    v11 = -a * e.p3 * c01 + e.p0 * c11 + e.p1 / e.ei
+    n00 = v00 * t00 + v01 * t01
+    n01 = 0.5 * (v00 * t10 + v01 * t11 + v10 * t00 + v11 * t01)
+    n11 = v10 * t10 + v11 * t11
+    value = _loaded(e, n00, n01, n11, e.p1, e.p2, e.p3, e.p4)
+    slope = _loaded(e, n00, n01, n11, e.p2, e.p3, e.p4, e.p5)
+    bend = _loaded(e, n00, n01, n11, e.p3, e.p4, e.p5, e.p6)
+    return Crossing(n00, n01, n11, t00, t01, t10, t11, value, slope, bend)
+
+
+@inlined
+def _loaded(
+    e: Element, n00: float, n01: float, n11: float, q1: float, q2: float, q3: float, q4: float
+) -> tuple[float, float]:
+    """Return deflection and slope at the end for a unit of the path; q1 to q4 its integrals."""
+    a = e.k / e.ei
+    # The load of the path on a needle that starts at zero: w, w', V and M at the end.
+    shear, moment = -e.k * q1, e.k * q2
+    return (
+        a * q4 - n00 * shear - n01 * moment,
+        a * q3 - n01 * shear - n11 * moment,
+    )
+
+
+@compiled
+def begin(s: Springs, ei: float, free: float, skin: float, entry: FloatArray) -> None:
+    """
+    Fill the first row: from the guide over the free length to the entry point, and the skin.
+
+    Parameters
+    ----------
+    s : Springs
+        Rows.
+    ei : float
+        Bending stiffness [N m^2].
+    free : float
+        Free length between guide and entry point [m].
+    skin : float
+        Stiffness of the skin [N/m].
+    entry : ndarray, shape (2,)
+        Where the skin was pierced, by plane [m].
+
+    """
+    c00, c01, c11 = free**3 / (3.0 * ei), free**2 / (2.0 * ei), free / ei
+    held = skin / (1.0 + skin * c00)
+    s.depths[0] = 0.0
+    s.compliance[0, 0] = c00 - c00 * held * c00
+    s.compliance[0, 1] = c01 - c00 * held * c01
+    s.compliance[0, 2] = c11 - c01 * held * c01
+    s.response[0, 0, 0] = 1.0 - c00 * held
+    s.response[0, 0, 1] = free - c00 * held * free
+    s.response[0, 1, 0] = -c01 * held
+    s.response[0, 1, 1] = 1.0 - c01 * held * free
+    for plane in range(2):
+        s.rest[0, plane, 0] = c00 * held * entry[plane]
+        s.rest[0, plane, 1] = c01 * held * entry[plane]
+
+
+@inlined
+def carry(s: Springs, i: int, c: Crossing) -> None:
+    """
+    Fill the row of the end of an element, all but what its path does.
+
+    Parameters
+    ----------
+    s : Springs
+        Rows.
+    i : int
+        Row of the start of the element.
+    c : Crossing
+        The element.
+
+    """
+    j = i + 1
+    s.compliance[j, 0], s.compliance[j, 1], s.compliance[j, 2] = c.c00, c.c01, c.c11
+    for k in range(2):
+        w, turn = s.response[i, 0, k], s.response[i, 1, k]
+        s.response[j, 0, k] = c.t00 * w + c.t01 * turn
+        s.response[j, 1, k] = c.t10 * w + c.t11 * turn
+        w, turn = s.rest[i, k, 0], s.rest[i, k, 1]
+        s.rest[j, k, 0] = c.t00 * w + c.t01 * turn
+        s.rest[j, k, 1] = c.t10 * w + c.t11 * turn
+
+
+@inlined
+def follow(s: Springs, i: int, plane: int, c: Crossing) -> None:
+    """
+    Add what the path of an element does to the row of its end.
+
+    Parameters
+    ----------
+    s : Springs
+        Rows.
+    i : int
+        Row of the start of the element.
+    plane : int
+        0 for x, 1 for z.
+    c : Crossing
+        The element.
+
+    """
+    p, d, b = s.path[i, plane, 0], s.path[i, plane, 1], s.path[i, plane, 2]
+    for k in range(2):
+        s.rest[i + 1, plane, k] += p * c.value[k] + d * c.slope[k] + b * c.bend[k]
+
+
+@compiled
+def shape(
+    s: Springs,
+    last: int,
+    tip: float,
+    ei: float,
+    free: float,
+    guide: FloatArray,
+    load: FloatArray,
+    found: FloatArray,
+    felt: FloatArray,
+) -> None:
+    """
+    Find deflection and slope of the needle at its nodes, and what the guide feels.
+
+    Parameters
+    ----------
+    s : Springs
+        Rows.
+    last : int
+        Row of the node before the tip.
+    tip : float
+        Depth of the tip [m].
+    ei : float
+        Bending stiffness [N m^2].
+    free : float
+        Free length between guide and entry point [m].
+    guide : ndarray, shape (2, 2)
+        By plane: position [m] and tilt of the guide.
+    load : ndarray, shape (2,)
+        Lateral load on the tip, by plane [N].
+    found : ndarray, shape (2, last + 1, 2)
+        For deflections [m] and slopes, by plane and node.
+    felt : ndarray, shape (2, 2)
+        For force [N] and moment [N m] of the needle on the guide, by plane.
+
+    """
+    for plane in range(2):
+        b, tilt = guide[plane, 0], guide[plane, 1]
+        v, m = load[plane], 0.0
+        end = tip
+        for i in range(last, -1, -1):
+            c00, c01, c11 = s.compliance[i, 0], s.compliance[i, 1], s.compliance[i, 2]
+            w0 = s.rest[i, plane, 0] + s.response[i, 0, 0] * b + s.response[i, 0, 1] * tilt
+            t0 = s.rest[i, plane, 1] + s.response[i, 1, 0] * b + s.response[i, 1, 1] * tilt
+            # Loads at the start of the element, from those at its end.
+            k = s.stiffness[i]
+            e = element(ei, k, end - s.depths[i])
+            p, d, c = s.path[i, plane, 0], s.path[i, plane, 1], s.path[i, plane, 2]
+            v -= k * (e.p1 * (w0 - p) + e.p2 * (t0 - d) - e.p3 * c)
+            m += k * (e.p2 * (w0 - p) + e.p3 * (t0 - d) - e.p4 * c)
+            w00 = k * (e.p1 * c00 + e.p2 * c01) + e.p0
+            w01 = k * (e.p1 * c01 + e.p2 * c11) + k / ei * e.p3
+            w10 = -k * (e.p2 * c00 + e.p3 * c01) - e.p1
+            w11 = -k * (e.p2 * c01 + e.p3 * c11) + e.p0
+            inverse = 1.0 / (w00 * w11 - w01 * w10)
+            v, m = (w11 * v - w01 * m) * inverse, (w00 * m - w10 * v) * inverse
+            found[plane, i, 0] = c00 * v + c01 * m + w0
+            found[plane, i, 1] = c01 * v + c11 * m + t0
+            end = s.depths[i]
+        felt[plane, 0], felt[plane, 1] = v, m
+        if free > 0.0:
+            # The force jumps over the skin; the free length is bent by its ends alone.
+            away = found[plane, 0, 0] - b - tilt * free
+            turn = found[plane, 0, 1] - tilt
+            shear = 6.0 * ei / free**3 * (2.0 * away - free * turn)
+            felt[plane, 0] = shear
+            felt[plane, 1] = 2.0 * ei / free * (2.0 * turn - 3.0 * away / free) + shear * free

@@ -1,0 +1,158 @@
+"""Many needles that cut their paths at once, on all cores."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+import os
+
+from needle_dynamics.arrays import FloatArray
+from needle_dynamics.compiled.cut import insert
+from needle_dynamics.parameters import NeedleParameters
+from needle_dynamics.simulated.trajectory import floats
+from needle_dynamics.steering.needle import empty_cut, steered, wandering
+from needle_dynamics.steering.parameters import noise_cell, SteeringParameters
+from needle_ros.errors import ParameterError, ShapeError
+import numpy as np
+from numpy.typing import ArrayLike
+
+
+def insert_batch(
+    needles: NeedleParameters | Sequence[NeedleParameters],
+    steering: SteeringParameters | Sequence[SteeringParameters],
+    depths: ArrayLike,
+    *,
+    guides: ArrayLike = 0.0,
+    tilts: ArrayLike = 0.0,
+    rolls: ArrayLike = 0.0,
+    seeds: Sequence[int] = (0,),
+    workers: int | None = None,
+) -> FloatArray:
+    """
+    Insert many needles at once; the result does not depend on the number of workers.
+
+    Parameters
+    ----------
+    needles : NeedleParameters or sequence of them
+        Needle and tissue, for all runs or for each.
+    steering : SteeringParameters or sequence of them
+        What they have beyond; all with the same length of noise.
+    depths : array_like, shape (k,) or (runs, k)
+        Depths of the tip [m]. Guide and roll change evenly between them.
+    guides, tilts : array_like, shape (), (k, 2) or (runs, k, 2)
+        Position [m] and tilt of the guide in x and z; the first ones are those at which the tip
+        touches the skin.
+    rolls : array_like, shape (), (k,) or (runs, k)
+        Roll of the base [rad].
+    seeds : sequence of int
+        Seed of the noise of the path, for all runs or for each.
+    workers : int, optional
+        Threads; one per core if not given.
+
+    Returns
+    -------
+    ndarray, shape (runs, k, 3)
+        Where the tips are, in x, y and z [m].
+
+    Raises
+    ------
+    ShapeError
+        If the numbers of runs or of poses do not agree.
+    ParameterError
+        If a value is not valid.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from needle_dynamics import insert_batch, STEERING_PRESETS
+    >>> needle, steering, _ = STEERING_PRESETS['bending_35mm']
+    >>> depths = np.linspace(0.0, 0.1, 21)
+    >>> tilts = np.zeros((100, 21, 2))
+    >>> tilts[:, :, 1] = np.linspace(-0.02, 0.02, 100)[:, np.newaxis]
+    >>> tips = insert_batch(needle, steering, depths, tilts=tilts)
+    >>> tips.shape
+    (100, 21, 3)
+    >>> print((1e3 * tips[[0, -1], -1, 2]).round(3))
+    [-2.8  2.8]
+
+    """
+    poses = _poses(depths, guides, tilts, rolls)
+    each = [needles] if isinstance(needles, NeedleParameters) else list(needles)
+    beyond = [steering] if isinstance(steering, SteeringParameters) else list(steering)
+    sizes = {len(each), len(beyond), len(poses), len(seeds)} - {1}
+    if len(sizes) > 1 or 0 in sizes:
+        raise ShapeError(
+            f'needles, steering, poses and seeds must be for one number of runs, got {len(each)}, '
+            f'{len(beyond)}, {len(poses)} and {len(seeds)}'
+        )
+    if workers is not None and (not isinstance(workers, int) or workers < 1):
+        raise ParameterError(f'workers must be an integer >= 1, got {workers!r}')
+    runs = sizes.pop() if sizes else 1
+    cell = noise_cell(beyond[0])
+    if any(noise_cell(one) != cell for one in beyond):
+        raise ParameterError('path_noise_length must be the same for all runs')
+    kinds = range(max(len(each), len(beyond)))
+    pairs = [(each[i % len(each)], beyond[i % len(beyond)]) for i in kinds]
+    constants = [steered(*pair) for pair in pairs]
+    values = np.array(
+        [[*n[:6], s.free_length] for n, (_, s) in zip(constants, pairs, strict=True)]
+    )
+    deep, reach = poses[:, :, 0].max(axis=1), values[:, 5] - values[:, 6]
+    if (poses[:, :, 0] < 0.0).any() or (deep > reach).any():
+        raise ParameterError(
+            f'depths must be in [0, {reach.min():g}] m, the length of the needle without its free '
+            f'length, got up to {deep.max():g} m'
+        )
+    layers = np.full((len(pairs), 3, max(len(n.starts) for n in constants)), np.inf)
+    for row, n in zip(layers, constants, strict=True):
+        row[:, : len(n.starts)] = n.starts, n.stiffness, n.bevel
+    draws = range(max(len(pairs), len(seeds)) if any(s.path_noise for s in beyond) else 1)
+    drawn = [wandering(*pairs[i % len(pairs)], seeds[i % len(seeds)]) for i in draws]
+    wander = np.zeros((len(drawn), max(map(len, drawn)), 2))
+    for row, loads in zip(wander, drawn, strict=True):
+        row[: len(loads)] = loads
+    tips = np.empty((runs, poses.shape[1], 2))
+    workers = min(workers or os.cpu_count() or 1, runs)
+    longest = values[:, 5].max()
+    rooms = [empty_cut(longest, values[:, 1].min(), layers.shape[2]) for _ in range(workers)]
+
+    def take(worker: int) -> None:
+        share = np.arange(worker, runs, workers)
+        insert(values, layers, cell, wander, poses, share, rooms[worker], tips)
+
+    with ThreadPoolExecutor(workers) as pool:
+        list(pool.map(take, range(workers)))
+    x, z = tips[:, :, 0], tips[:, :, 1]
+    return np.stack([x, np.broadcast_to(poses[:, :, 0], x.shape), z], axis=2)
+
+
+def _poses(depths: ArrayLike, guides: ArrayLike, tilts: ArrayLike, rolls: ArrayLike) -> FloatArray:
+    """Return the numbers of the poses, shape (runs or 1, k, 6)."""
+    depth, roll = floats('depths', depths), floats('rolls', rolls)
+    guide, tilt = floats('guides', guides), floats('tilts', tilts)
+    if depth.ndim not in (1, 2) or 0 in depth.shape:
+        raise ShapeError(f'depths must have shape (k,) or (runs, k), got {depth.shape}')
+    k = depth.shape[-1]
+    shapes = []
+    for name, values, single in (
+        ('depths', depth, (k,)),
+        ('guides', guide, (k, 2)),
+        ('tilts', tilt, (k, 2)),
+        ('rolls', roll, (k,)),
+    ):
+        if not np.isfinite(values).all():
+            raise ParameterError(f'{name} must be finite')
+        if values.shape != () and values.shape[-len(single) :] != single:
+            several = f'(runs, {", ".join(map(str, single))})'
+            raise ShapeError(f'{name} must have shape {single} or {several}, got {values.shape}')
+        shapes.append(values.shape[: max(0, values.ndim - len(single))])
+    try:
+        runs = np.broadcast_shapes(*shapes) or (1,)
+    except ValueError:
+        raise ShapeError(f'depths, guides, tilts and rolls must agree, got {shapes}') from None
+    if len(runs) > 1:
+        raise ShapeError(f'there must be at most one axis of runs, got {runs}')
+    poses = np.empty((*runs, k, 6))
+    poses[..., 0], poses[..., 5] = depth, roll
+    poses[..., [1, 3]], poses[..., [2, 4]] = guide, tilt
+    return poses

@@ -1,0 +1,447 @@
+"""A needle that cuts its path, moved by its guide, its roll and its depth."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import ceil, exp, isfinite, sqrt
+from typing import Any, Final, NamedTuple
+
+from needle_dynamics.arrays import FloatArray
+from needle_dynamics.compiled.beam import shape, Springs
+from needle_dynamics.compiled.cut import (
+    Cut,
+    DEEPEST,
+    DEPTH,
+    FREE,
+    LAST,
+    move,
+    node_before,
+    place,
+    Pose,
+    respond,
+    ROLL,
+    set_free,
+    start,
+    Steered,
+    TIP_ROLL,
+)
+from needle_dynamics.parameters import NeedleParameters
+from needle_dynamics.steering.parameters import (
+    bending_length,
+    by_layer,
+    longest_element,
+    noise_cell,
+    SteeringParameters,
+)
+from needle_ros.errors import ParameterError, ShapeError
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.signal import lfilter
+
+#: Nodes per element of the needle: a path that begins anew takes one more.
+_SPARE: Final = 2
+
+
+class NeedleShape(NamedTuple):
+    """
+    The needle from the guide to the tip.
+
+    Attributes
+    ----------
+    depths : ndarray, shape (k,)
+        Distance y from the entry point [m], from the guide at -L0 to the tip.
+    deflections : ndarray, shape (k, 2)
+        Deflections in x and z [m].
+    slopes : ndarray, shape (k, 2)
+        Their derivatives by y.
+
+    """
+
+    depths: FloatArray
+    deflections: FloatArray
+    slopes: FloatArray
+
+
+class NeedlePath(NamedTuple):
+    """
+    The path that the tip cut.
+
+    Attributes
+    ----------
+    depths : ndarray, shape (k,)
+        Distance y from the entry point [m].
+    deflections : ndarray, shape (k, 2)
+        Where the path is in x and z [m].
+
+    """
+
+    depths: FloatArray
+    deflections: FloatArray
+
+
+def steered(
+    needle: NeedleParameters, steering: SteeringParameters, wander: FloatArray | None = None
+) -> Steered:
+    """
+    Return the constants as compiled functions take them.
+
+    Parameters
+    ----------
+    needle : NeedleParameters
+        Needle and tissue.
+    steering : SteeringParameters
+        What it has beyond.
+    wander : ndarray, shape (cells, 2), optional
+        Lateral loads on the tip by depth [N], see `wandering`.
+
+    Returns
+    -------
+    Steered
+        The constants.
+
+    Raises
+    ------
+    ParameterError
+        If there is not one load of the bevel for each layer, or the needle is too short.
+
+    """
+    tissue = needle.tissue
+    if steering.free_length >= needle.length:
+        raise ParameterError(
+            f'free_length must be < length = {needle.length:g} m, got {steering.free_length:g} m'
+        )
+    return Steered(
+        ei=needle.bending_stiffness,
+        element=longest_element(needle, steering),
+        skin=steering.skin_stiffness,
+        twist=1.0 / steering.torsional_stiffness,
+        turning=steering.torsional_friction,
+        length=needle.length,
+        starts=np.array(tissue.starts),
+        stiffness=np.array(tissue.stiffnesses),
+        bevel=by_layer('bevel_load', steering.bevel_load, len(tissue.starts)),
+        cell=noise_cell(steering),
+        wander=np.zeros((0, 2)) if wander is None else wander,
+    )
+
+
+def wandering(needle: NeedleParameters, steering: SteeringParameters, seed: int) -> FloatArray:
+    """
+    Draw the loads on the tip that make its path leave the one that the model expects.
+
+    A load F turns the path of a long needle by F lambda / (E I) per length. Loads that forget
+    themselves over the length of the noise thus turn it at random, and the variance of its
+    direction grows with its length.
+
+    Parameters
+    ----------
+    needle : NeedleParameters
+        Needle and tissue.
+    steering : SteeringParameters
+        With the noise of the path.
+    seed : int
+        Seed.
+
+    Returns
+    -------
+    ndarray, shape (cells, 2)
+        Loads in x and z by depth, `noise_cell` apart [N]; none without noise.
+
+    """
+    if steering.path_noise == 0.0:
+        return np.zeros((0, 2))
+    cell = noise_cell(steering)
+    depths = np.arange(ceil(needle.length / cell) + 2) * cell
+    keep = exp(-cell / steering.path_noise_length)
+    draws = np.random.default_rng(seed).standard_normal((len(depths), 2))
+    draws[1:] *= sqrt(1.0 - keep * keep)
+    turns = lfilter([1.0], [1.0, -keep], draws, axis=0)
+    ei, tissue = needle.bending_stiffness, needle.tissue
+    # Where there is no tissue nothing turns the path.
+    stiffness = [
+        ei / bending_length(ei, k) if k > 0.0 else 0.0 for k in map(tissue.stiffness, depths)
+    ]
+    size = sqrt(steering.path_noise / (2.0 * steering.path_noise_length))
+    return np.asarray(size * turns * np.array(stiffness)[:, np.newaxis])
+
+
+def empty_cut(length: float, element: float, layers: int) -> Cut:
+    """
+    Return room for the state of a needle.
+
+    Parameters
+    ----------
+    length : float
+        Length of the needle [m].
+    element : float
+        Longest element [m].
+    layers : int
+        Number of layers of the tissue.
+
+    Returns
+    -------
+    Cut
+        Zeros; `needle_dynamics.compiled.cut.start` fills it.
+
+    """
+    rows = _SPARE * (ceil(length / element) + layers) + 3
+    springs = Springs(
+        np.zeros(rows),
+        np.zeros(rows),
+        np.zeros((rows, 3)),
+        np.zeros((rows, 2, 2)),
+        np.zeros((rows, 2, 2)),
+        np.zeros((rows, 2, 3)),
+    )
+    return Cut(
+        springs,
+        np.zeros((2, 2)),
+        np.zeros(5),
+        np.zeros(2),
+        np.zeros((2, 2)),
+        np.zeros(2),
+        np.zeros(2, dtype=np.int64),
+    )
+
+
+class SteeredNeedle:
+    """
+    A needle between a guide and its tip, quasi-static across, that cuts its own path.
+
+    The beam in each plane minimizes its energy: bending, the tissue about the path, the skin, and
+    the lateral load of the bevel. While the tip goes deeper than ever before it cuts: the path
+    then ends where the tip is. Out, and in again, the needle follows that path.
+
+    Parameters
+    ----------
+    needle : NeedleParameters
+        Needle and tissue.
+    steering : SteeringParameters, optional
+        What it has beyond.
+    guide : sequence of float
+        Position of the guide in x and z when the tip touches the skin [m].
+    tilt : sequence of float
+        Tilt of the guide, the slope of the needle there, in x and z.
+    roll : float
+        Roll of the needle, right-handed about y [rad]; at 0 the bevel pushes the tip along z.
+    seed : int
+        Seed of the noise of the path.
+
+    Raises
+    ------
+    ParameterError
+        If a value is not valid.
+
+    Examples
+    --------
+    >>> from needle_dynamics import NeedleParameters, SteeredNeedle, SteeringParameters
+    >>> soft = NeedleParameters.preset('phantom', tissue_stiffness=2e4)
+    >>> needle = SteeredNeedle(soft, SteeringParameters(bevel_load=(0.5,)))
+    >>> needle.move(depth=0.1)
+    >>> print(f'{1e3 * needle.tip[2]:.2f} mm')
+    5.93 mm
+
+    The guide moves the tip the other way at this depth:
+
+    >>> print(f'{needle.authority[0, 0]:.2f}')
+    -0.26
+
+    """
+
+    def __init__(
+        self,
+        needle: NeedleParameters,
+        steering: SteeringParameters | None = None,
+        *,
+        guide: Sequence[float] = (0.0, 0.0),
+        tilt: Sequence[float] = (0.0, 0.0),
+        roll: float = 0.0,
+        seed: int = 0,
+    ) -> None:
+        self.needle = needle
+        self.steering = steering or SteeringParameters()
+        self._constants = steered(needle, self.steering, wandering(needle, self.steering, seed))
+        self._cut = empty_cut(needle.length, self._constants.element, len(self._constants.starts))
+        self._shift = np.zeros(3)
+        self._guide, self._tilt = _pair('guide', guide), _pair('tilt', tilt)
+        self._roll = _finite('roll', roll)
+        start(self._constants, self._cut, self._pose(0.0), self.steering.free_length)
+
+    def _pose(self, depth: float) -> Pose:
+        """Return the pose in the frame of the tissue."""
+        (x, z), (tilt_x, tilt_z) = self._guide, self._tilt
+        return Pose(
+            depth - self._shift[1],
+            x - self._shift[0],
+            tilt_x,
+            z - self._shift[2],
+            tilt_z,
+            self._roll,
+        )
+
+    def move(
+        self,
+        *,
+        depth: float | None = None,
+        guide: Sequence[float] | None = None,
+        tilt: Sequence[float] | None = None,
+        roll: float | None = None,
+        tissue: Sequence[float] | None = None,
+    ) -> None:
+        """
+        Bring the needle to another pose; what is not given stays.
+
+        Guide and roll change evenly with the depth. To move the guide first and go in then, call
+        this twice.
+
+        Parameters
+        ----------
+        depth : float, optional
+            Depth s of the tip [m].
+        guide, tilt : sequence of float, optional
+            Position [m] and tilt of the guide in x and z.
+        roll : float, optional
+            Roll of the base [rad].
+        tissue : sequence of float, optional
+            How far the tissue has moved in x, y and z [m], with its path; it moves before the
+            needle does.
+
+        Raises
+        ------
+        ParameterError
+            If a value is not finite, or the needle does not reach so deep.
+
+        """
+        here = self.depth
+        to = here if depth is None else _finite('depth', depth)
+        shift = self._shift if tissue is None else _triple(tissue)
+        free = self.steering.free_length + float(shift[1])
+        reach = self.needle.length - self.steering.free_length
+        if free < 0.0 or here < shift[1]:
+            raise ParameterError(f'tissue must stay between guide and tip, got {shift[1]:g} m')
+        if not shift[1] <= to <= reach:
+            raise ParameterError(
+                f'depth must be in [{shift[1]:g}, {reach:g}] m, the length of the needle '
+                f'without its free length, got {to!r} m'
+            )
+        given = (
+            self._guide if guide is None else _pair('guide', guide),
+            self._tilt if tilt is None else _pair('tilt', tilt),
+            self._roll if roll is None else _finite('roll', roll),
+        )
+        if (shift != self._shift).any():
+            self._shift = shift
+            if free != self._cut.pose[FREE]:
+                set_free(self._constants, self._cut, free)
+            move(self._constants, self._cut, self._pose(here))
+        self._guide, self._tilt, self._roll = given
+        move(self._constants, self._cut, self._pose(to))
+
+    @property
+    def depth(self) -> float:
+        """Depth s of the tip [m]."""
+        return float(self._cut.pose[DEPTH] + self._shift[1])
+
+    @property
+    def deepest(self) -> float:
+        """Greatest depth so far, where the path ends [m]."""
+        return float(self._cut.pose[DEEPEST] + self._shift[1])
+
+    @property
+    def tip(self) -> FloatArray:
+        """Where the tip is, in x, y and z [m]; shape (3,)."""
+        (x, _), (z, _) = self._cut.tip
+        return np.array([x + self._shift[0], self.depth, z + self._shift[2]])
+
+    @property
+    def tip_slope(self) -> FloatArray:
+        """Slope of the needle at the tip in x and z; shape (2,)."""
+        return self._cut.tip[:, 1].copy()
+
+    @property
+    def roll(self) -> float:
+        """Roll of the base [rad]."""
+        return float(self._cut.pose[ROLL])
+
+    @property
+    def tip_roll(self) -> float:
+        """Roll of the tip, behind that of the base by its windup [rad]."""
+        return float(self._cut.pose[TIP_ROLL])
+
+    @property
+    def load(self) -> FloatArray:
+        """Lateral load on the tip in x and z [N]; shape (2,)."""
+        return self._cut.load.copy()
+
+    @property
+    def compliance(self) -> FloatArray:
+        """Deflection [m] and slope of the tip per lateral force [N] and moment [N m] there."""
+        c00, c01, c11 = place(self._constants, self._cut)
+        return np.array([[c00, c01], [c01, c11]])
+
+    @property
+    def authority(self) -> FloatArray:
+        """Deflection [m] and slope of the resting tip per position [m] and tilt of the guide."""
+        found = np.empty((2, 2))
+        respond(self._constants, self._cut, found)
+        return found
+
+    @property
+    def path(self) -> NeedlePath:
+        """The path that the tip cut, at its nodes and at its end."""
+        c = self._cut
+        s, last = c.springs, int(c.counts[LAST])
+        depths, values = s.depths[: last + 1], s.path[: last + 1, :, 0]
+        rest = c.pose[DEEPEST] - s.depths[last]
+        if rest > 0.0:
+            p = s.path[last]
+            end = p[:, 0] + rest * (p[:, 1] + 0.5 * rest * p[:, 2])
+            depths, values = np.append(depths, c.pose[DEEPEST]), np.vstack([values, end])
+        return NeedlePath(depths + self._shift[1], values + self._shift[[0, 2]])
+
+    def _solve(self) -> tuple[int, FloatArray, FloatArray]:
+        n, c = self._constants, self._cut
+        last = node_before(c.springs, c.counts[LAST], c.pose[DEPTH])
+        found, felt = np.empty((2, last + 1, 2)), np.empty((2, 2))
+        free, depth = c.pose[FREE], c.pose[DEPTH]
+        shape(c.springs, last, depth, n.ei, free, c.guide, c.load, found, felt)
+        return last, found, felt
+
+    @property
+    def shape(self) -> NeedleShape:
+        """The needle from the guide to the tip, at its nodes."""
+        c = self._cut
+        last, found, _ = self._solve()
+        whole = np.concatenate([c.guide[:, np.newaxis], found, c.tip[:, np.newaxis]], axis=1)
+        whole[:, :, 0] += self._shift[[0, 2], np.newaxis]
+        depths = np.concatenate([[-c.pose[FREE]], c.springs.depths[: last + 1], [c.pose[DEPTH]]])
+        return NeedleShape(depths + self._shift[1], whole[:, :, 0].T, whole[:, :, 1].T)
+
+    @property
+    def guide_load(self) -> FloatArray:
+        """What the guide feels of the needle in x and z: forces [N], moments [N m]; (2, 2)."""
+        return self._solve()[2].T
+
+
+def _finite(name: str, value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not isfinite(value):
+        raise ParameterError(f'{name} must be a finite number, got {value!r}')
+    return float(value)
+
+
+def _pair(name: str, values: Sequence[float]) -> tuple[float, float]:
+    x, z = _numbers(name, values, 2)
+    return float(x), float(z)
+
+
+def _triple(values: ArrayLike) -> FloatArray:
+    return _numbers('tissue', values, 3)
+
+
+def _numbers(name: str, values: ArrayLike, count: int) -> FloatArray:
+    found = np.array(values, dtype=np.float64)
+    if found.shape != (count,):
+        raise ShapeError(f'{name} must have {count} numbers, got shape {found.shape}')
+    if not np.isfinite(found).all():
+        raise ParameterError(f'{name} must be finite, got {values!r}')
+    return found
