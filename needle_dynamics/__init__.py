@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from needle_dynamics.simulated.plant import Plant
     from needle_dynamics.simulated.trajectory import simulate, Trajectory
     from needle_dynamics.steering.batch import insert_batch
+    from needle_dynamics.steering.insertion import Insertion
     from needle_dynamics.steering.needle import NeedlePath, NeedleShape, SteeredNeedle
     from needle_dynamics.steering.parameters import (
         bending_length,
@@ -60,6 +61,7 @@ __all__ = [
     'Indenter',
     'IndenterParameters',
     'InsertedLengthError',
+    'Insertion',
     'Integrator',
     'Interval',
     'JobError',

@@ -286,7 +286,7 @@ class SteeredNeedle:
         guide: Sequence[float] | None = None,
         tilt: Sequence[float] | None = None,
         roll: float | None = None,
-        tissue: Sequence[float] | None = None,
+        tissue: ArrayLike | None = None,
     ) -> None:
         """
         Bring the needle to another pose; what is not given stays.
@@ -302,7 +302,7 @@ class SteeredNeedle:
             Position [m] and tilt of the guide in x and z.
         roll : float, optional
             Roll of the base [rad].
-        tissue : sequence of float, optional
+        tissue : array_like, optional
             How far the tissue has moved in x, y and z [m], with its path; it moves before the
             needle does.
 
@@ -314,7 +314,7 @@ class SteeredNeedle:
         """
         here = self.depth
         to = here if depth is None else _finite('depth', depth)
-        shift = self._shift if tissue is None else _triple(tissue)
+        shift = self._shift if tissue is None else triple(tissue)
         free = self.steering.free_length + float(shift[1])
         reach = self.needle.length - self.steering.free_length
         if free < 0.0 or here < shift[1]:
@@ -434,7 +434,26 @@ def _pair(name: str, values: Sequence[float]) -> tuple[float, float]:
     return float(x), float(z)
 
 
-def _triple(values: ArrayLike) -> FloatArray:
+def triple(values: ArrayLike) -> FloatArray:
+    """
+    Return how far the tissue has moved as an array.
+
+    Parameters
+    ----------
+    values : array_like, shape (3,)
+        In x, y and z [m].
+
+    Returns
+    -------
+    ndarray, shape (3,)
+        The same.
+
+    Raises
+    ------
+    ShapeError, ParameterError
+        If there are other numbers of them, or they are not finite.
+
+    """
     return _numbers('tissue', values, 3)
 
 

@@ -42,6 +42,22 @@ class SteeringParameters:
     bevel_load: tuple[float, ...] = constant(
         (0.0,), 'N', 'lateral load F_b of the bevel while it cuts, of each layer; 0 for a trocar'
     )
+    cutting_force: tuple[float, ...] = constant(
+        (0.0,), 'N', 'axial force on the tip that cuts, in each layer'
+    )
+    coulomb_per_length: tuple[float, ...] = constant(
+        (0.0,), 'N/m', 'Coulomb friction per inserted length, in each layer'
+    )
+    viscous_per_length: tuple[float, ...] = constant(
+        (0.0,), 'N s/m^2', 'viscous friction per inserted length, in each layer'
+    )
+    membrane_depths: tuple[float, ...] = constant((), 'm', 'depths of membranes')
+    membrane_strengths: tuple[float, ...] = constant(
+        (), 'N', 'axial force that punctures each membrane', open_low=True
+    )
+    membrane_stiffness: float = constant(
+        1e3, 'N/m', 'axial stiffness of a membrane until it is punctured', open_low=True
+    )
     path_noise: float = constant(
         0.0, 'rad^2/m', 'variance of the direction of the path that grows per length'
     )
@@ -58,8 +74,14 @@ class SteeringParameters:
 
     def __post_init__(self) -> None:
         check_constants(self)
-        if not self.bevel_load:
-            raise ParameterError('bevel_load must have one value, or one for each layer')
+        for name in ('bevel_load', 'cutting_force', 'coulomb_per_length', 'viscous_per_length'):
+            if not getattr(self, name):
+                raise ParameterError(f'{name} must have one value, or one for each layer')
+        if len(self.membrane_depths) != len(self.membrane_strengths):
+            raise ParameterError(
+                f'membrane_strengths must have one value for each of the '
+                f'{len(self.membrane_depths)} membrane_depths, got {len(self.membrane_strengths)}'
+            )
 
 
 def bending_length(stiffness: float, tissue: float) -> float:

@@ -1,0 +1,313 @@
+"""Motion along the insertion axis: friction of the inserted length, cutting, and membranes."""
+
+from __future__ import annotations
+
+from math import inf
+from typing import Final, NamedTuple
+
+from needle_dynamics.arrays import BoolArray, FloatArray
+from needle_dynamics.compiled.cache import compiled, inlined
+from needle_dynamics.compiled.friction import slide
+
+#: Places in the state of the axis.
+DEPTH: Final = 0
+SPEED: Final = 1
+DEEPEST: Final = 2
+
+#: Halvings of the time of an event: to the last digit of a step.
+_HALVINGS: Final = 60
+
+
+class Axis(NamedTuple):
+    """
+    Constants along the insertion axis.
+
+    Attributes
+    ----------
+    mass : float
+        Moving mass [kg].
+    coulomb, viscous : float
+        Friction that does not depend on the depth: mu_s [N] and mu_v [N s/m].
+    withdrawal : float
+        Friction on withdrawal over that on insertion.
+    reach : float
+        Depth at which the hub stops [m].
+    starts : ndarray, shape (layers,)
+        Depths at which the layers begin [m].
+    coulomb_per_length, viscous_per_length : ndarray, shape (layers,)
+        Friction per inserted length in each layer [N/m] and [N s/m^2].
+    cutting : ndarray, shape (layers,)
+        Force on the tip that cuts, in each layer [N].
+    membranes, strengths, stiffness : ndarray, shape (membranes,)
+        Depth of each membrane [m], the force that punctures it [N], and the stiffness with which
+        it resists until then [N/m].
+
+    """
+
+    mass: float
+    coulomb: float
+    viscous: float
+    withdrawal: float
+    reach: float
+    starts: FloatArray
+    coulomb_per_length: FloatArray
+    viscous_per_length: FloatArray
+    cutting: FloatArray
+    membranes: FloatArray
+    strengths: FloatArray
+    stiffness: FloatArray
+
+
+class Resistance(NamedTuple):
+    """
+    What resists the motion at a depth.
+
+    Attributes
+    ----------
+    dry : float
+        Coulomb friction on insertion [N].
+    viscous : float
+        Viscous friction on insertion [N s/m].
+    cutting : float
+        Force that resists insertion only [N].
+    elastic : float
+        Force that pushes the needle out [N].
+
+    """
+
+    dry: float
+    viscous: float
+    cutting: float
+    elastic: float
+
+
+@compiled
+def resistance(a: Axis, depth: float, touches: bool, punctured: BoolArray) -> Resistance:
+    """
+    Return what resists at a depth.
+
+    Parameters
+    ----------
+    a : Axis
+        Constants.
+    depth : float
+        Depth of the tip [m].
+    touches : bool
+        Whether the tip touches uncut tissue.
+    punctured : ndarray of bool, shape (membranes,)
+        Which membranes are punctured.
+
+    Returns
+    -------
+    Resistance
+        Forces.
+
+    """
+    dry, viscous, cutting, elastic = a.coulomb, a.viscous, 0.0, 0.0
+    for i in range(len(a.starts)):
+        end = a.starts[i + 1] if i + 1 < len(a.starts) else inf
+        inside = min(depth, end) - a.starts[i]
+        if inside < 0.0:
+            break
+        dry += a.coulomb_per_length[i] * inside
+        viscous += a.viscous_per_length[i] * inside
+        cutting = a.cutting[i]
+    for i in range(len(a.membranes)):
+        if not punctured[i] and depth >= a.membranes[i]:
+            # The tip pushes the membrane ahead of it, and cuts nothing.
+            elastic += a.stiffness[i] * (depth - a.membranes[i])
+            touches = False
+    return Resistance(dry, viscous, cutting if touches else 0.0, elastic)
+
+
+@compiled
+def _events(a: Axis, state: FloatArray, punctured: BoolArray) -> tuple[float, float]:
+    """Return the depths above and below between which nothing changes."""
+    depth = state[DEPTH]
+    low, high = 0.0, a.reach
+    for start in a.starts:
+        if start < depth:
+            low = max(low, start)
+        elif start > depth:
+            high = min(high, start)
+    if depth < state[DEEPEST]:
+        high = min(high, state[DEEPEST])
+    for i in range(len(a.membranes)):
+        if punctured[i]:
+            continue
+        if depth < a.membranes[i]:
+            high = min(high, a.membranes[i])
+        else:
+            high = min(high, a.membranes[i] + a.strengths[i] / a.stiffness[i])
+            if depth > a.membranes[i]:
+                low = max(low, a.membranes[i])
+    return low, high
+
+
+@inlined
+def _arrive(a: Axis, state: FloatArray, punctured: BoolArray) -> None:
+    """Do what happens at the depth where the tip has arrived."""
+    depth = state[DEPTH]
+    state[DEEPEST] = max(state[DEEPEST], depth)
+    for i in range(len(a.membranes)):
+        if depth >= a.membranes[i] + a.strengths[i] / a.stiffness[i]:
+            punctured[i] = True
+    if (depth >= a.reach and state[SPEED] > 0.0) or (depth <= 0.0 and state[SPEED] < 0.0):
+        # The hub stops on the guide.
+        state[SPEED] = 0.0
+
+
+@inlined
+def _glide(a: Axis, r: Resistance, speed: float, force: float, t: float) -> tuple[float, float]:
+    """Move under a constant resistance; cutting resists insertion only."""
+    # Friction of both directions about its middle, as `slide` takes it.
+    share = r.cutting / (1.0 + a.withdrawal)
+    drive = force - r.elastic - a.withdrawal * share
+    return slide(speed, drive, a.mass, r.dry + share, r.viscous, t, a.withdrawal)
+
+
+@compiled
+def push(
+    a: Axis, state: FloatArray, punctured: BoolArray, force: float, duration: float, step: float
+) -> float:
+    """
+    Advance under a constant force.
+
+    Parameters
+    ----------
+    a : Axis
+        Constants.
+    state : ndarray, shape (3,)
+        Depth [m], velocity [m/s] and greatest depth [m], overwritten.
+    punctured : ndarray of bool, shape (membranes,)
+        Which membranes are punctured, overwritten.
+    force : float
+        Force [N], positive into the tissue.
+    duration : float
+        Time [s].
+    step : float
+        Longest step [s].
+
+    Returns
+    -------
+    float
+        Time that is left when the needle has left the tissue [s]; 0 otherwise.
+
+    """
+    left = duration
+    while left > 0.0:
+        t = min(step, left)
+        depth, speed = state[DEPTH], state[SPEED]
+        low, high = _events(a, state, punctured)
+        if depth >= a.reach and speed >= 0.0 and force > 0.0:
+            # On the hub. What pushes it there can only push it on.
+            state[SPEED] = 0.0
+            return 0.0
+        touches = depth >= state[DEEPEST]
+        # Of second order: the resistance in the middle of the way.
+        r = resistance(a, depth, touches, punctured)
+        _, half = _glide(a, r, speed, force, 0.5 * t)
+        middle = min(max(depth + half, low), high)
+        r = resistance(a, middle, touches, punctured)
+        after, way = _glide(a, r, speed, force, t)
+        if not low < depth + way < high and way != 0.0:
+            at = high if way > 0.0 else low
+            early, late = 0.0, t
+            for _ in range(_HALVINGS):
+                between = 0.5 * (early + late)
+                _, gone = _glide(a, r, speed, force, between)
+                beyond = depth + gone >= at if way > 0.0 else depth + gone <= at
+                if beyond:
+                    late = between
+                else:
+                    early = between
+            t = late
+            after, _ = _glide(a, r, speed, force, t)
+            state[DEPTH] = at
+        else:
+            state[DEPTH] = depth + way
+        state[SPEED] = after
+        left -= t
+        if state[DEPTH] <= 0.0 and way < 0.0:
+            state[DEPTH] = 0.0
+            return max(left, 1e-300)
+        _arrive(a, state, punctured)
+    return 0.0
+
+
+@compiled
+def carry_on(
+    a: Axis, state: FloatArray, punctured: BoolArray, speed: float, duration: float, step: float
+) -> tuple[float, float]:
+    """
+    Advance with the needle brought evenly to a velocity, whatever force that takes.
+
+    Parameters
+    ----------
+    a : Axis
+        Constants.
+    state : ndarray, shape (3,)
+        Depth [m], velocity [m/s] and greatest depth [m], overwritten.
+    punctured : ndarray of bool, shape (membranes,)
+        Which membranes are punctured, overwritten.
+    speed : float
+        Velocity at the end [m/s].
+    duration : float
+        Time [s].
+    step : float
+        Longest step [s].
+
+    Returns
+    -------
+    left : float
+        Time that is left when the needle has left the tissue [s]; 0 otherwise.
+    force : float
+        Mean force over the time that it took [N].
+
+    """
+    rate = (speed - state[SPEED]) / duration
+    left, impulse = duration, 0.0
+    while left > 0.0:
+        t = min(step, left)
+        depth, before = state[DEPTH], state[SPEED]
+        low, high = _events(a, state, punctured)
+        touches = depth >= state[DEEPEST]
+        way = (before + 0.5 * rate * t) * t
+        if not low < depth + way < high and way != 0.0:
+            at = high if way > 0.0 else low
+            early, late = 0.0, t
+            for _ in range(_HALVINGS):
+                between = 0.5 * (early + late)
+                gone = (before + 0.5 * rate * between) * between
+                beyond = depth + gone >= at if way > 0.0 else depth + gone <= at
+                if beyond:
+                    late = between
+                else:
+                    early = between
+            t = late
+            way = at - depth
+            state[DEPTH] = at
+        else:
+            state[DEPTH] = depth + way
+        state[SPEED] = speed if t == left else before + rate * t
+        r = resistance(a, min(max(depth + 0.5 * way, low), high), touches, punctured)
+        mean = before + 0.5 * rate * t
+        impulse += t * (a.mass * rate + r.elastic + _held(a, r, mean))
+        left -= t
+        if state[DEPTH] <= 0.0 and way < 0.0:
+            state[DEPTH] = 0.0
+            return max(left, 1e-300), impulse / (duration - left)
+        if state[DEPTH] >= a.reach and way > 0.0:
+            return max(left, 1e-300), impulse / (duration - left)
+        _arrive(a, state, punctured)
+    return 0.0, impulse / duration
+
+
+@inlined
+def _held(a: Axis, r: Resistance, speed: float) -> float:
+    """Return friction and cutting at a velocity; at rest what asks for the least force."""
+    if speed > 0.0:
+        return r.dry + r.cutting + r.viscous * speed
+    if speed < 0.0:
+        return a.withdrawal * (r.viscous * speed - r.dry)
+    return min(max(-r.elastic, -a.withdrawal * r.dry), r.dry + r.cutting)

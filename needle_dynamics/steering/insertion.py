@@ -1,0 +1,301 @@
+"""A needle that is pushed or carried into tissue along its axis, and bends across it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import inf, isfinite
+
+from needle_dynamics.arrays import FloatArray
+from needle_dynamics.compiled.axis import Axis, carry_on, DEPTH, push, SPEED
+from needle_dynamics.errors import InsertedLengthError
+from needle_dynamics.parameters import NeedleParameters
+from needle_dynamics.steering.needle import SteeredNeedle, triple
+from needle_dynamics.steering.parameters import by_layer, SteeringParameters
+from needle_ros.errors import ParameterError
+import numpy as np
+
+#: Default step along the axis [s].
+DEFAULT_AXIS_STEP = 1e-4
+
+
+def axis_of(needle: NeedleParameters, steering: SteeringParameters) -> Axis:
+    """
+    Return the constants along the insertion axis.
+
+    Parameters
+    ----------
+    needle : NeedleParameters
+        Needle and tissue.
+    steering : SteeringParameters
+        What it has beyond.
+
+    Returns
+    -------
+    Axis
+        The constants.
+
+    Raises
+    ------
+    ParameterError
+        If the friction law is not Coulomb's, the tissue swells, or there is not one value for
+        each layer.
+
+    """
+    if needle.friction_law != 'coulomb':
+        raise ParameterError(
+            f'friction_law must be coulomb for a needle that is steered, got '
+            f'{needle.friction_law!r}'
+        )
+    if needle.swelling != 0.0:
+        raise ParameterError(
+            f'swelling must be 0 for a needle that is steered, got {needle.swelling:g}'
+        )
+    layers = len(needle.tissue.starts)
+    several = {
+        name: by_layer(name, getattr(steering, name), layers)
+        for name in ('coulomb_per_length', 'viscous_per_length', 'cutting_force')
+    }
+    membranes = np.array(steering.membrane_depths)
+    order = np.argsort(membranes)
+    return Axis(
+        mass=needle.moving_mass,
+        coulomb=needle.coulomb_friction,
+        viscous=needle.viscous_friction,
+        withdrawal=needle.withdrawal_friction,
+        reach=needle.length - steering.free_length,
+        starts=np.array(needle.tissue.starts),
+        coulomb_per_length=several['coulomb_per_length'],
+        viscous_per_length=several['viscous_per_length'],
+        cutting=several['cutting_force'],
+        membranes=membranes[order],
+        strengths=np.array(steering.membrane_strengths)[order],
+        stiffness=np.full(len(membranes), steering.membrane_stiffness),
+    )
+
+
+class Insertion:
+    """
+    A steered needle in time: dynamic along its axis, quasi-static across.
+
+    Along the axis it has its mass, friction that may grow with the inserted length, and at the tip
+    the force that cuts and membranes that resist until they are punctured. Across it is a
+    `SteeredNeedle`: mass and damping do not act there, since at the speeds of an insertion what
+    they do is over in a few tens of milliseconds.
+
+    Parameters
+    ----------
+    needle : NeedleParameters
+        Needle and tissue; Coulomb's friction, and no swelling.
+    steering : SteeringParameters, optional
+        What it has beyond.
+    depth : float
+        Depth to which it has been inserted, straight [m]. Membranes above are punctured.
+    step : float
+        Longest step along the axis [s].
+    seed : int
+        Seed of the noise of the path.
+
+    Attributes
+    ----------
+    needle : SteeredNeedle
+        The needle across.
+    axis : Axis
+        Constants along the axis.
+    time : float
+        Time [s], 0 at first.
+
+    Raises
+    ------
+    ParameterError
+        If a value is not valid.
+
+    Examples
+    --------
+    >>> from needle_dynamics import Insertion, NeedleParameters, SteeringParameters
+    >>> one = Insertion(
+    ...     NeedleParameters.preset('phantom', tissue_stiffness=2e4),
+    ...     SteeringParameters(bevel_load=(0.3,), cutting_force=(1.0,)),
+    ... )
+    >>> force = one.carry(2.0, velocity=0.01)
+    >>> print(f'{one.depth:.3f} m, {force:.2f} N')
+    0.010 m, 3.06 N
+
+    """
+
+    def __init__(
+        self,
+        needle: NeedleParameters,
+        steering: SteeringParameters | None = None,
+        *,
+        depth: float = 0.0,
+        step: float = DEFAULT_AXIS_STEP,
+        seed: int = 0,
+    ) -> None:
+        if isinstance(step, bool) or not isinstance(step, (int, float)) or not 0.0 < step < inf:
+            raise ParameterError(f'step must be positive and finite, got {step!r} s')
+        self.needle = SteeredNeedle(needle, steering, seed=seed)
+        self.axis = axis_of(needle, self.needle.steering)
+        self.needle.move(depth=depth)
+        self.time = 0.0
+        self._step = float(step)
+        self._state = np.array([depth, 0.0, depth])
+        self._punctured = np.asarray(self.axis.membranes < depth)
+        self._tissue = np.zeros(3)
+        self._drift = 0.0
+
+    @property
+    def depth(self) -> float:
+        """Depth s of the tip [m]."""
+        return float(self._state[DEPTH] + self._tissue[1])
+
+    @property
+    def velocity(self) -> float:
+        """Insertion velocity against the guide [m/s]."""
+        return float(self._state[SPEED] + self._drift)
+
+    @property
+    def punctured(self) -> tuple[bool, ...]:
+        """Which membranes are punctured, by depth."""
+        return tuple(bool(one) for one in self._punctured)
+
+    def push(
+        self,
+        duration: float,
+        force: float,
+        *,
+        guide: Sequence[float] | None = None,
+        tilt: Sequence[float] | None = None,
+        roll: float | None = None,
+        tissue: Sequence[float] | None = None,
+    ) -> None:
+        """
+        Advance under a constant force.
+
+        Parameters
+        ----------
+        duration : float
+            Time [s].
+        force : float
+            Insertion force [N], positive into the tissue.
+        guide, tilt, roll, tissue : optional
+            Where these are at the end, as in `SteeredNeedle.move`. The tissue moves evenly, guide
+            and roll evenly with the depth.
+
+        Raises
+        ------
+        ParameterError
+            If a value is not valid.
+        InsertedLengthError
+            If the needle left the tissue.
+
+        """
+        self._check(duration, 'force', force)
+        shift = self._drifted(duration, tissue)
+        left = push(
+            self.axis, self._state, self._punctured, float(force), float(duration), self._step
+        )
+        self._across(duration, left, guide, tilt, roll, shift)
+
+    def carry(
+        self,
+        duration: float,
+        velocity: float,
+        *,
+        guide: Sequence[float] | None = None,
+        tilt: Sequence[float] | None = None,
+        roll: float | None = None,
+        tissue: Sequence[float] | None = None,
+    ) -> float:
+        """
+        Advance with the base brought evenly to a velocity, whatever force that takes.
+
+        Parameters
+        ----------
+        duration : float
+            Time [s].
+        velocity : float
+            Insertion velocity at the end [m/s].
+        guide, tilt, roll, tissue : optional
+            As in `push`.
+
+        Returns
+        -------
+        float
+            Mean force of the base on the needle [N], positive into the tissue.
+
+        Raises
+        ------
+        ParameterError
+            If a value is not valid.
+        InsertedLengthError
+            If the needle left the tissue, or its hub reached the guide.
+
+        """
+        self._check(duration, 'velocity', velocity)
+        shift = self._drifted(duration, tissue)
+        left, force = carry_on(
+            self.axis,
+            self._state,
+            self._punctured,
+            float(velocity) - self._drift,
+            float(duration),
+            self._step,
+        )
+        self._across(duration, left, guide, tilt, roll, shift)
+        return float(force)
+
+    def _check(self, duration: float, name: str, value: float) -> None:
+        if not 0.0 < duration < inf:
+            raise ParameterError(f'duration must be positive and finite, got {duration!r} s')
+        if not isfinite(value):
+            raise ParameterError(f'{name} must be finite, got {value!r}')
+
+    def _drifted(self, duration: float, tissue: Sequence[float] | None) -> FloatArray:
+        """Have the tissue move evenly to where it is wanted: the axis is in its frame."""
+        shift = self._tissue if tissue is None else triple(tissue)
+        drift = float(shift[1] - self._tissue[1]) / duration
+        self._state[SPEED] += self._drift - drift
+        self._drift = drift
+        return shift
+
+    def _across(
+        self,
+        duration: float,
+        left: float,
+        guide: Sequence[float] | None,
+        tilt: Sequence[float] | None,
+        roll: float | None,
+        shift: FloatArray,
+    ) -> None:
+        self._tissue = shift
+        self.time += duration - left
+        depth = self.depth
+        self.needle.move(
+            depth=min(max(depth, float(shift[1])), self.axis.reach),
+            guide=guide,
+            tilt=tilt,
+            roll=roll,
+            tissue=shift,
+        )
+        if left > 0.0:
+            limit = (
+                f'{1e3 * self.axis.reach:.4g} mm, where its hub stops on the guide'
+                if depth > 0.5 * self.axis.reach
+                else 'the skin'
+            )
+            raise InsertedLengthError(f'the needle reached {limit}')
+
+    @property
+    def wrench(self) -> FloatArray:
+        """
+        What the base does to the needle across: force x, z [N] and torque x, y, z [N m].
+
+        Shape (5,). The torque about y is what its windup takes, by the stiffness of a needle that
+        is held where the friction of its inserted length acts in the mean.
+        """
+        across = self.needle
+        (force_x, force_z), (moment_x, moment_z) = across.guide_load
+        shaft = across.needle.length - 0.5 * across.depth
+        twist = (across.roll - across.tip_roll) * across.steering.torsional_stiffness / shaft
+        # The slope in z turns about x; that in x turns about z the other way.
+        return np.array([-force_x, -force_z, -moment_z, twist, moment_x])
