@@ -26,6 +26,7 @@ MODULES = {
     'damage': ('damage',),
     'control': ('control',),
     'steering-model': ('steering_model',),
+    'steering-fit': ('steering_fit',),
     'laws': ('laws',),
     'safety': ('safety',),
     'graph': ('graph',),
@@ -60,6 +61,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     damage.add_argument('--files', type=int, metavar='N', help='damaged recordings')
     add('control', help='cost of a control step')
     add('steering-model', help='a needle that cuts its path, beside NumPy and SciPy')
+    fit = add('steering-fit', help='how well recorded insertions tell how a needle bends')
+    fit.add_argument('--recordings', type=int, metavar='N', help='fits of each kind')
     laws = add('laws', help='control laws on needles, robots and tissues that they do not know')
     laws.add_argument('--needles', type=int, metavar='N', help='needles in a cell')
     safety = add('safety', help='what faults, strangers and kills do to a motion')

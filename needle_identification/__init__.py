@@ -47,6 +47,10 @@ if TYPE_CHECKING:
     )
     from needle_identification.recordings.recording import IndentationRecording, Recording
     from needle_identification.result import result_yaml, write_result
+    from needle_identification.steering.estimate import MediumEstimate, SteeringEstimate
+    from needle_identification.steering.identify import identify_steering, SteeringSettings
+    from needle_identification.steering.recording import SteeringRecording
+    from needle_identification.steering.tables import read_steering_table
     from needle_identification.stiffness.estimate import LevelEstimate, StiffnessEstimate
     from needle_identification.stiffness.identify import identify_stiffness
     from needle_identification.stiffness.presses import Presses
@@ -78,6 +82,7 @@ __all__ = [
     'Inspection',
     'LevelEstimate',
     'LevelSummary',
+    'MediumEstimate',
     'OfferedQos',
     'ParameterEstimate',
     'Presses',
@@ -89,6 +94,9 @@ __all__ = [
     'Regression',
     'ResidualTest',
     'Statistic',
+    'SteeringEstimate',
+    'SteeringRecording',
+    'SteeringSettings',
     'StiffnessEstimate',
     'StiffnessSettings',
     'StiffnessSummary',
@@ -97,12 +105,14 @@ __all__ = [
     'deserialize',
     'encode',
     'identify_friction',
+    'identify_steering',
     'identify_stiffness',
     'inspect_recording',
     'message_counts',
     'message_type',
     'read_friction_recording',
     'read_indentation_recording',
+    'read_steering_table',
     'read_topic',
     'regress',
     'result_yaml',

@@ -17,6 +17,7 @@ PRINTED = {
     'observer': r'1\.00 s: estimate -?0\.0\d\d mm, true -?0\.000 mm',
     'own_controller': r'own law: 0\.280 mm short of the target',
     'plot': r'wrote insertion\.png',
+    'steering': r'tip at \(0\.00, 100\.00, -3\.0\d\) mm',
     'simulate': r'depth at the end: 28\.1\d mm',
 }
 

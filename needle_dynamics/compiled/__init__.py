@@ -13,5 +13,8 @@ Compiled functions, one concept a file.
 `modal_flow`          the deflections through one step
 `step`                steps of the integrator, and runs of them
 `force_sensor`        samples of the force sensor
+`beam`                the needle as a beam about the path that it cut
+`cut`                 how it cuts that path, and follows it
+`axis`                motion along the axis: friction per length, cutting, membranes
 ====================  ============================================================================
 """

@@ -163,7 +163,7 @@ def start(n: Steered, c: Cut, to: Pose, free: float) -> None:
     place(n, c)
 
 
-@compiled
+@inlined
 def move(n: Steered, c: Cut, to: Pose) -> None:
     """
     Bring the needle to a pose; guide and roll change evenly with the depth.
@@ -186,6 +186,7 @@ def move(n: Steered, c: Cut, to: Pose) -> None:
         if begun < deepest:
             part = (deepest - begun) / far
             _set(n, c, to, x, tilt_x, z, tilt_z, roll, part, deepest)
+            place(n, c)
         _resume(n, c)
         while True:
             last = c.counts[LAST]
@@ -195,17 +196,18 @@ def move(n: Steered, c: Cut, to: Pose) -> None:
             _cut(n, c)
             if depth == end:
                 _keep(c)
+                if n.bevel[_layer(n, end)] != n.bevel[_layer(n, c.springs.depths[last])]:
+                    # Another load in the next layer: the tip springs over.
+                    place(n, c)
+                    _resume(n, c)
             if depth == to.depth:
                 break
-            if n.bevel[_layer(n, depth)] != n.bevel[_layer(n, c.springs.depths[last])]:
-                # Another load in the next layer: the tip springs over.
-                _resume(n, c)
     else:
         _set(n, c, to, x, tilt_x, z, tilt_z, roll, 1.0, to.depth)
-    place(n, c)
+        place(n, c)
 
 
-@compiled
+@inlined
 def _set(
     n: Steered,
     c: Cut,
@@ -286,11 +288,10 @@ def _unloaded(c: Cut, row: int, plane: int, k: int) -> float:
     return float(s.rest[row, plane, k] + s.response[row, k, 0] * b + s.response[row, k, 1] * tilt)
 
 
-@compiled
+@inlined
 def _resume(n: Steered, c: Cut) -> None:
     """Begin to cut: where the tip now stands, if it was shifted since it last cut."""
     s, last = c.springs, c.counts[LAST]
-    place(n, c)
     part = c.pose[DEPTH] - s.depths[last]
     shift = 0.0
     for plane in range(2):
@@ -311,7 +312,7 @@ def _resume(n: Steered, c: Cut) -> None:
     c.counts[ANEW] = 1
 
 
-@compiled
+@inlined
 def _cut(n: Steered, c: Cut) -> None:
     """Bring the tip to its depth by cutting on from the last node: find the path up to it."""
     s, last = c.springs, c.counts[LAST]
@@ -344,10 +345,13 @@ def _cut(n: Steered, c: Cut) -> None:
         s.path[last, plane, 1] = lean + slope * off
         s.path[last, plane, 2] = bend * off
         follow(s, last, plane, e)
+        load = c.load[plane]
+        c.tip[plane, 0] = _unloaded(c, last + 1, plane, 0) + e.c00 * load
+        c.tip[plane, 1] = _unloaded(c, last + 1, plane, 1) + e.c01 * load
     s.depths[last + 1] = c.pose[DEPTH]
 
 
-@compiled
+@inlined
 def _keep(c: Cut) -> None:
     """Make the tip a node: the path up to it is cut for good."""
     s, last = c.springs, c.counts[LAST]

@@ -14,6 +14,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from datetime import datetime
 from itertools import islice
+from math import pi
 import os
 from pathlib import Path
 import re
@@ -35,16 +36,23 @@ import numpy as np
 MATLAB: Final = '.mat'
 TABLES: Final = ('.csv', '.tsv', '.txt', '.dat', MATLAB)
 
+_LENGTHS: Final = {'m': 1.0, 'mm': 1e-3, 'cm': 1e-2, 'um': 1e-6, 'µm': 1e-6}
+
 #: Units by role: how many of the SI unit one is.
 UNITS: Final[Mapping[str, Mapping[str, float]]] = {
     'time': {'s': 1.0, 'sec': 1.0, 'ms': 1e-3, 'us': 1e-6, 'µs': 1e-6, 'ns': 1e-9, 'min': 60.0},
-    'depth': {'m': 1.0, 'mm': 1e-3, 'cm': 1e-2, 'um': 1e-6, 'µm': 1e-6},
+    'depth': _LENGTHS,
     'speed': {'m/s': 1.0, 'mm/s': 1e-3, 'cm/s': 1e-2, 'um/s': 1e-6, 'µm/s': 1e-6},
     'force': {'N': 1.0, 'mN': 1e-3, 'kN': 1e3, 'kgf': 9.80665, 'gf': 9.80665e-3, 'lbf': 4.4482216},
+    'guide_x': _LENGTHS,
+    'guide_z': _LENGTHS,
+    'roll': {'rad': 1.0, 'deg': pi / 180.0},
+    'tip_x': _LENGTHS,
+    'tip_z': _LENGTHS,
 }
 
 #: Roles of the columns that friction is identified from; a depth or a speed will do.
-ROLES: Final = tuple(UNITS)
+ROLES: Final = ('time', 'depth', 'speed', 'force')
 
 #: Usual names of columns by role, the most telling first; compared without case and signs.
 _USUAL: Final = {
@@ -98,7 +106,7 @@ class Table(NamedTuple):
     losses: list[str]
 
 
-def column_roles(text: str) -> dict[str, str]:
+def column_roles(text: str, roles: Sequence[str] = ROLES) -> dict[str, str]:
     """
     Read columns by role from one word of a command line.
 
@@ -106,6 +114,8 @@ def column_roles(text: str) -> dict[str, str]:
     ----------
     text : str
         ``role=column,...``.
+    roles : sequence of str
+        Valid roles.
 
     Returns
     -------
@@ -121,10 +131,10 @@ def column_roles(text: str) -> dict[str, str]:
     found = {}
     for word in text.split(','):
         role, sign, spec = (part.strip() for part in word.partition('='))
-        if not (sign and role in ROLES and spec):
+        if not (sign and role in roles and spec):
             raise RecordingError(
                 f'--columns takes ROLE=[-]NAME[*FACTOR][UNIT],... with the roles '
-                f'{", ".join(ROLES)}, got {word!r}'
+                f'{", ".join(roles)}, got {word!r}'
             )
         found[role] = spec
     return found
@@ -210,13 +220,13 @@ def read_friction_table(path: Path, columns: Mapping[str, str]) -> Recording:
             f'{", ".join(table.columns)}: say --columns {missing[0].split()[0]}=NAME,...'
         )
     losses = list(table.losses)
-    values = {role: _values(table, role, spec, losses) for role, spec in specs.items()}
+    values = {role: column_values(table, role, spec, losses) for role, spec in specs.items()}
     if words := ', '.join(f'{role}={spec}' for role, spec in specs.items() if role not in columns):
         losses.append(f'columns by their names: {words}')
     return _recording(path, values, losses)
 
 
-def guessed(table: Table) -> dict[str, str]:
+def guessed(table: Table, usual_names: Mapping[str, Sequence[str]] = _USUAL) -> dict[str, str]:
     """
     Find columns by their usual names.
 
@@ -224,6 +234,8 @@ def guessed(table: Table) -> dict[str, str]:
     ----------
     table : Table
         The table.
+    usual_names : mapping of str to sequence of str
+        Names by role, the most telling first, without signs and in small letters.
 
     Returns
     -------
@@ -233,7 +245,7 @@ def guessed(table: Table) -> dict[str, str]:
     """
     plain = {name: _plain(name) for name in table.columns}
     found: dict[str, str] = {}
-    for role, usual in _USUAL.items():
+    for role, usual in usual_names.items():
         for word in usual:
             names = [name for name, short in plain.items() if short == word]
             names += [name for name, short in plain.items() if name.lower().endswith('.' + word)]
@@ -270,8 +282,32 @@ def _unit_of(name: str, role: str) -> str | None:
     return word if word in UNITS[role] and word != name else None
 
 
-def _values(table: Table, role: str, spec: str, losses: list[str]) -> FloatArray:
-    """Return the values that a column stands for, in SI units."""
+def column_values(table: Table, role: str, spec: str, losses: list[str]) -> FloatArray:
+    """
+    Return the values that a column stands for.
+
+    Parameters
+    ----------
+    table : Table
+        The table.
+    role : str
+        Role of the column, of `UNITS`.
+    spec : str
+        Name with sign, factor and unit.
+    losses : list of str
+        For what looks wrong.
+
+    Returns
+    -------
+    ndarray, shape (n,)
+        Values in SI units.
+
+    Raises
+    ------
+    RecordingError
+        If there is no such column, or its unit or factor is not valid.
+
+    """
     if role == 'time' and ':' in spec:
         seconds, _, nanoseconds = spec.partition(':')
         both = [_column(table, role, name)[1] for name in (seconds, nanoseconds)]

@@ -27,6 +27,7 @@ from needle_identification import (
 from needle_identification.recordings import TIMES
 from needle_identification.recordings.tables import column_roles, ROLES
 from needle_insertion.commands.common import check_file, check_folder, Command, make_folder
+from needle_insertion.commands.identify_steering import add_steering
 from needle_insertion.report.identify_text import identified_document, identified_text, warned
 from needle_insertion.report.origin import identify_all, Origin
 from needle_ros.errors import NeedleError, ParameterError, shown
@@ -102,6 +103,7 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
         help='force level whose stiffness is the result (default the largest)',
     )
     stiffness.set_defaults(identify=_run_stiffness)
+    add_steering(what)
 
 
 def _run(options: argparse.Namespace) -> int:

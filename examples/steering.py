@@ -1,0 +1,30 @@
+"""
+Steer a needle with its guide, in tissue that it cuts.
+
+The guide moves when the tip is 30 mm deep. What the tip does then depends on the depth: a shift
+moves it the same way near the skin, and the other way further in.
+"""
+
+from needle_dynamics import SteeredNeedle, STEERING_PRESETS
+
+
+def main() -> None:
+    """Insert to 100 mm, with a shift of the guide by 2 mm on the way."""
+    needle, steering, source = STEERING_PRESETS['bending_35mm']
+    print(f'needle and tissue: {source}')
+
+    one = SteeredNeedle(needle, steering)
+    for millimeters in (10, 30, 60, 100):
+        one.move(depth=1e-3 * millimeters)
+        print(f'{millimeters} mm deep, the tip shifts by {one.authority[0, 0]:+.2f} of the guide')
+
+    other = SteeredNeedle(needle, steering)
+    other.move(depth=0.03)
+    other.move(guide=(0.0, 2e-3))
+    other.move(depth=0.1)
+    x, y, z = 1e3 * other.tip
+    print(f'tip at ({x:.2f}, {y:.2f}, {z:.2f}) mm')
+
+
+if __name__ == '__main__':
+    main()

@@ -1,0 +1,336 @@
+r"""
+The bending of a needle in tissue, from where its guide went and where its tip did.
+
+With the free length L0, and for each medium the bending length lambda and the skin, the tip is
+linear in everything else: in the known motion of the guide, in an offset of each recording, and in
+what makes a needle drift, which are these terms:
+
+============  =================================================================================
+``tilt``      tilt of the guide, in x and z
+``frame``     turn between the frames of robot and tracker: the tip seems to drift with its depth
+``bevel``     lateral load of the bevel, as the curvature of a long needle, along z and x at zero
+              roll
+============  =================================================================================
+
+The linear ones are solved for at each step of a search over the lengths [Golub2003]_. Intervals of
+the lengths end where all the other constants together cannot make up for another value: with few
+samples they are far from symmetric.
+
+References
+----------
+.. [Golub2003] G. H. Golub, V. Pereyra, "Separable nonlinear least squares: the variable projection
+   method and its applications", Inverse Problems 19, 2003.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from math import exp, inf, isfinite, sqrt
+from typing import Final, NamedTuple
+
+from needle_dynamics.arrays import FloatArray
+from needle_identification.errors import IdentificationError
+from needle_identification.estimation.estimate import ParameterEstimate
+from needle_identification.steering.estimate import CONSTANTS, MediumEstimate, SteeringEstimate
+from needle_identification.steering.recording import SteeringRecording
+from needle_identification.steering.response import ORDERS, TERMS
+from needle_identification.steering.search import FREE, Search, SKIN_SCALE
+from needle_ros.errors import ParameterError
+import numpy as np
+from scipy.special import stdtrit
+
+#: Recordings of one medium from which on their spread tells the errors.
+_SEVERAL: Final = 8
+
+#: A fit that leaves more than the best one by less than this part is as good.
+_AS_GOOD: Final = 0.02
+
+#: Constants of a medium that are not linear.
+_LENGTHS: Final = 2
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SteeringSettings:
+    """
+    How steered insertions are fitted.
+
+    Attributes
+    ----------
+    terms : tuple of str or None
+        What makes the needle drift, of `TERMS`; None for the one that explains the most.
+    order : str or None
+        Whether guide and needle move ``together`` between samples, or the ``guide first``; None
+        for what explains more.
+    free_length : float or None
+        Free length if it is known [m].
+
+    Raises
+    ------
+    ParameterError
+        If a value is not valid.
+
+    """
+
+    terms: tuple[str, ...] | None = None
+    order: str | None = None
+    free_length: float | None = None
+
+    def __post_init__(self) -> None:
+        for term in self.terms or ():
+            if term not in TERMS:
+                raise ParameterError(f'terms must be of {", ".join(TERMS)}, got {term!r}')
+        if self.order is not None and self.order not in ORDERS:
+            raise ParameterError(f'order must be one of {", ".join(ORDERS)}, got {self.order!r}')
+        low, high = FREE
+        if self.free_length is not None and not low <= self.free_length <= high:
+            raise ParameterError(
+                f'free_length must be in [{low:g}, {high:g}] m, got {self.free_length!r}'
+            )
+
+
+def identify_steering(
+    recordings: Sequence[SteeringRecording],
+    settings: SteeringSettings | None = None,
+    progress: Callable[[], object] | None = None,
+) -> SteeringEstimate:
+    """
+    Fit recorded insertions together.
+
+    Parameters
+    ----------
+    recordings : sequence of SteeringRecording
+        Recordings. All share the free length; those of one medium the bending length, the skin
+        and what makes the needle drift; each has an offset of its own.
+    settings : SteeringSettings, optional
+        How to fit them.
+    progress : callable, optional
+        Called after each fit.
+
+    Returns
+    -------
+    SteeringEstimate
+        Constants with intervals, and what the recordings cannot tell apart.
+
+    Raises
+    ------
+    IdentificationError
+        If there are no more samples than constants.
+
+    """
+    settings = settings or SteeringSettings()
+    if not recordings:
+        raise IdentificationError('no recordings to identify from')
+    sets = [(term,) for term in TERMS] if settings.terms is None else [settings.terms]
+    orders = ORDERS if settings.order is None else (settings.order,)
+    fits = []
+    for terms in sets:
+        for order in orders:
+            search = Search(recordings, terms, order, settings.free_length)
+            _check(search)
+            fits.append(_Fit(search, *search.best()))
+            if progress is not None:
+                progress()
+    best = min(fits, key=lambda fit: fit.cost)
+    samples = 2 * sum(one.samples for one in recordings)
+    alternatives = {
+        fit.search.terms: sqrt(2.0 * fit.cost / samples)
+        for fit in fits
+        if fit.search.order == best.search.order
+    }
+    return _estimate(best, alternatives)
+
+
+class _Fit(NamedTuple):
+    """A search, the best variables, and what they leave."""
+
+    search: Search
+    x: FloatArray
+    cost: float
+
+
+def _check(search: Search) -> None:
+    for one in search.recordings:
+        if not one.samples:
+            raise IdentificationError(f'{one.name}: no sample of the tip counts')
+    for medium, members in search.members.items():
+        samples = 2 * sum(search.recordings[k].samples for k in members)
+        unknown = _LENGTHS + 1 + 2 * len(members) + sum(len(TERMS[term]) for term in search.terms)
+        if samples <= unknown:
+            raise IdentificationError(
+                f'{unknown} constants of {medium or "these recordings"} need more than '
+                f'{unknown // 2} samples of the tip, got {samples // 2}'
+            )
+
+
+class _Errors(NamedTuple):
+    """
+    Errors of all constants: those of the search, then the linear ones of each medium.
+
+    Attributes
+    ----------
+    errors : ndarray, shape (k,)
+        Standard errors.
+    units : ndarray, shape (k,)
+        What they would be if each sample had a variance of one.
+    freedom : list of int
+        Degrees of freedom of each medium.
+    values : list of ndarray
+        Linear constants of each medium.
+    left : list of ndarray
+        What is left of the samples of each medium [m].
+
+    """
+
+    errors: FloatArray
+    units: FloatArray
+    freedom: list[int]
+    values: list[FloatArray]
+    left: list[FloatArray]
+
+
+def _errors(search: Search, x: FloatArray) -> _Errors:
+    """Return the errors of the fit; recordings are independent, and their noise may be even."""
+    parts = search.design(x)
+    slopes = search.slopes(x)
+    total = len(x) + sum(a.shape[1] for a, _ in parts)
+    normal, even, middle = np.zeros((3, total, total))
+    freedom, values, left = [], [], []
+    row, column = 0, len(x)
+    for (columns, wanted), members in zip(parts, search.members.values(), strict=True):
+        own = np.asarray(np.linalg.lstsq(columns, wanted)[0])
+        rest = wanted - columns @ own
+        jacobian = np.zeros((len(rest), total))
+        jacobian[:, : len(x)] = slopes[row : row + len(rest)]
+        jacobian[:, column : column + len(own)] = columns
+        squares = jacobian.T @ jacobian
+        normal += squares
+        free = len(rest) - len(own) - _LENGTHS
+        even += squares * float(rest @ rest) / free
+        if len(members) >= _SEVERAL:
+            # What differs from insertion to insertion is not of one sample alone.
+            starts = np.cumsum([0, *(2 * search.recordings[k].samples for k in members[:-1])])
+            scores = np.add.reduceat(jacobian * rest[:, np.newaxis], starts, axis=0)
+            middle += scores.T @ scores * len(scores) / (len(scores) - 1)
+            free = len(scores) - 1
+        else:
+            middle += squares * float(rest @ rest) / free
+        freedom.append(free)
+        values.append(own)
+        left.append(rest)
+        row, column = row + len(rest), column + len(own)
+    scale = np.sqrt(np.diag(normal))
+    scale[scale == 0.0] = 1.0
+    inverse = np.linalg.pinv(normal / np.outer(scale, scale), rcond=1e-13, hermitian=True)
+    inverse = inverse / np.outer(scale, scale)
+    # The spread of a few recordings may be small by chance.
+    both = [np.diag(inverse @ one @ inverse) for one in (even, middle)]
+    errors = np.asarray(np.sqrt(np.maximum(*both)))
+    return _Errors(errors, np.sqrt(np.diag(inverse)), freedom, values, left)
+
+
+def _estimate(fit: _Fit, alternatives: Mapping[tuple[str, ...], float]) -> SteeringEstimate:
+    """Add errors, and put the result in words."""
+    search, x, cost = fit
+    e = _errors(search, x)
+    quantiles = stdtrit(np.array(e.freedom), 0.975).tolist()
+
+    def length(name: str, at: int, quantile: float) -> ParameterEstimate:
+        """Return a constant of the search, whose interval need not be symmetric."""
+        width = quantile * float(e.errors[at])
+        rise = quantile * float(e.errors[at] / e.units[at]) if e.units[at] > 0.0 else inf
+        if not isfinite(rise):
+            return _constant(name)
+        low, high = search.interval(x, cost, at, width, rise)
+        value, error = float(x[at]), float(e.errors[at])
+        if name == 'skin':
+            low, value, high = (SKIN_SCALE * one for one in (low, value, high))
+            # Without any skin it ends at zero.
+            return _constant(name, value, SKIN_SCALE * error, (max(0.0, low), high))
+        if not (isfinite(low) and isfinite(high)):
+            return _constant(name)
+        value = exp(value)
+        return _constant(name, value, value * error, (exp(low), exp(high)))
+
+    if search.known is None:
+        free = length('free_length', 0, max(quantiles))
+    else:
+        free = _constant('free_length', search.known, 0.0, (search.known, search.known))
+    media, column = [], len(x)
+    for k, (medium, members) in enumerate(search.members.items()):
+        at = len(x) - _LENGTHS * (len(search.media) - k)
+        found = [
+            length('bending_length', at, quantiles[k]),
+            length('skin', at + 1, quantiles[k]),
+        ]
+        names = [name for term in search.terms for name in TERMS[term]]
+        for j, name in enumerate(names):
+            value, error = float(e.values[k][j]), float(e.errors[column + j])
+            half = quantiles[k] * error
+            found.append(_constant(name, value, error, (value - half, value + half)))
+        column += len(e.values[k])
+        media.append(
+            MediumEstimate(
+                medium=medium,
+                parameters=tuple(found),
+                rms=float(np.sqrt(np.mean(e.left[k] ** 2))),
+                samples=len(e.left[k]) // 2,
+                recordings=len(members),
+            )
+        )
+    return SteeringEstimate(
+        free_length=free,
+        media=tuple(media),
+        terms=search.terms,
+        order=search.order,
+        alternatives=alternatives,
+        residuals=tuple(_residuals(search, e.left)),
+        warnings=tuple(_warnings(search, alternatives)),
+    )
+
+
+def _residuals(search: Search, left: Sequence[FloatArray]) -> list[FloatArray]:
+    """Return what is left of each recording, in the order in which they came."""
+    found = {}
+    for members, rest in zip(search.members.values(), left, strict=True):
+        begin = 0
+        for at in members:
+            n = search.recordings[at].samples
+            found[at] = rest[begin : begin + 2 * n].reshape(2, n).T
+            begin += 2 * n
+    return [found[at] for at in sorted(found)]
+
+
+def _constant(
+    name: str,
+    value: float | None = None,
+    error: float = inf,
+    interval: tuple[float, float] = (-inf, inf),
+) -> ParameterEstimate:
+    """Return a constant; one whose interval has no end is not determined."""
+    symbol, unit = CONSTANTS[name]
+    if value is None or not all(map(isfinite, interval)):
+        return ParameterEstimate(name=name, symbol=symbol, unit=unit)
+    return ParameterEstimate(
+        name=name,
+        symbol=symbol,
+        unit=unit,
+        value=value,
+        error=error,
+        interval=interval,
+        determined=True,
+    )
+
+
+def _warnings(search: Search, alternatives: Mapping[tuple[str, ...], float]) -> Iterator[str]:
+    """Say what the recordings cannot tell apart, and what would."""
+    best = min(alternatives.values())
+    equal = [terms for terms, rms in alternatives.items() if rms <= (1.0 + _AS_GOOD) * best]
+    if len(equal) > 1:
+        each = ', '.join(f'{terms[0]} {1e3 * alternatives[terms]:.3f} mm' for terms in equal)
+        yield (
+            f'these explain the drift equally well (rms: {each}); all of it is taken for '
+            f'{search.terms[0]}. A motion of the guide in air would tell the frame, and a turn of '
+            'the needle half way in the bevel'
+        )

@@ -1,0 +1,131 @@
+"""Recordings of steered insertions."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+from needle_dynamics.arrays import BoolArray, FloatArray
+from needle_ros.errors import ShapeError, shown
+import numpy as np
+
+#: Equal readings in a row of a tip that goes deeper from which on its sensor has frozen.
+_FROZEN: Final = 3
+
+#: Depth that the tip must go in that time [m]: more than the noise of any robot.
+_GONE: Final = 5e-4
+
+#: A tip this much further aside than the guide and half of its depth is not that of this needle.
+_ASIDE: Final = 0.03
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
+class SteeringRecording:
+    """
+    An insertion: what moved the needle, and where its tip went.
+
+    Attributes
+    ----------
+    name : str
+        Name of the recording, for messages.
+    medium : str
+        Name of the tissue; recordings in one tissue share its constants.
+    depth : ndarray, shape (n,)
+        Depth of the tip below the skin [m]; the first one has been reached straight.
+    guide : ndarray, shape (n, 2)
+        Position of the guide in x and z [m], from any origin.
+    roll : ndarray, shape (n,)
+        Roll of the base, right-handed about y [rad].
+    tip : ndarray, shape (n, 2)
+        Position of the tip in x and z [m], from any origin; NaN where it is not known.
+    losses : tuple of str
+        What was left out or repaired.
+
+    Raises
+    ------
+    ShapeError
+        If the shapes do not match, or a value is not finite.
+
+    """
+
+    name: str = 'recording'
+    medium: str = ''
+    depth: FloatArray
+    guide: FloatArray
+    roll: FloatArray
+    tip: FloatArray
+    losses: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, 'name', shown(self.name))
+        object.__setattr__(self, 'losses', tuple(map(shown, self.losses)))
+        count = np.shape(self.depth)
+        for field, rest in (('depth', ()), ('guide', (2,)), ('roll', ()), ('tip', (2,))):
+            values = np.array(getattr(self, field), dtype=np.float64)
+            if len(count) != 1 or values.shape != count + rest:
+                raise ShapeError(
+                    f'{self.name}: {field} must have shape {("n", *rest)}, with the n of depth, '
+                    f'got {values.shape} and {count}'
+                )
+            if field != 'tip' and not np.isfinite(values).all():
+                raise ShapeError(f'{self.name}: {field} must be finite')
+            values.setflags(write=False)
+            object.__setattr__(self, field, values)
+        if (self.depth < 0.0).any():
+            raise ShapeError(f'{self.name}: depth must be >= 0, got {self.depth.min():.4g} m')
+
+    def __repr__(self) -> str:
+        deepest = 1e3 * self.depth.max(initial=0.0)
+        return f'<SteeringRecording {self.name}: {self.samples} samples to {deepest:.4g} mm>'
+
+    @property
+    def known(self) -> BoolArray:
+        """Where the tip is known, shape (n,)."""
+        return np.asarray(np.isfinite(self.tip).all(axis=1))
+
+    @property
+    def samples(self) -> int:
+        """Number of samples where the tip is known."""
+        return int(np.count_nonzero(self.known))
+
+
+def credible(depth: FloatArray, guide: FloatArray, tip: FloatArray) -> tuple[BoolArray, list[str]]:
+    """
+    Find the samples of a tip whose sensor neither froze nor says what cannot be.
+
+    Parameters
+    ----------
+    depth : ndarray, shape (n,)
+        Depth of the tip by the robot [m].
+    guide, tip : ndarray, shape (n, 2)
+        Positions in x and z, each from its value at the start [m]; NaN where there is none.
+
+    Returns
+    -------
+    good : ndarray of bool, shape (n,)
+        Samples that count.
+    losses : list of str
+        What does not, and why.
+
+    """
+    there = np.isfinite(tip).all(axis=1)
+    same = np.zeros(len(depth), dtype=np.bool_)
+    same[1:] = (tip[1:] == tip[:-1]).all(axis=1)
+    frozen = np.zeros(len(depth), dtype=np.bool_)
+    # Stretches of equal readings; the first of them was still one.
+    starts = np.flatnonzero(~same)
+    for begin, end in zip(starts, [*starts[1:], len(depth)], strict=True):
+        if end - begin >= _FROZEN and np.ptp(depth[begin:end]) > _GONE:
+            frozen[begin + 1 : end] = True
+    far = np.abs(guide).max(initial=0.0) + 0.5 * depth + _ASIDE
+    wild = there & ~frozen & (np.abs(np.nan_to_num(tip)) > far[:, np.newaxis]).any(axis=1)
+    losses = [
+        f'{count} samples of the tip {why}, left out'
+        for count, why in (
+            (np.count_nonzero(frozen), 'that repeat one while the needle goes on (frozen sensor)'),
+            (np.count_nonzero(wild), 'where this needle cannot be'),
+            (np.count_nonzero(~there), 'that are no numbers'),
+        )
+        if count
+    ]
+    return there & ~frozen & ~wild, losses

@@ -1,0 +1,259 @@
+"""`needle identify steering`: bending of a needle that cuts its path, from tables."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping, Sequence
+import json
+from math import isfinite
+from pathlib import Path
+import re
+import sys
+from typing import Any
+
+from needle_identification.estimation.estimate import ParameterEstimate
+from needle_identification.estimation.formatting import between, measured
+from needle_identification.recordings.tables import column_roles
+from needle_identification.steering.estimate import SteeringEstimate
+from needle_identification.steering.identify import identify_steering, SteeringSettings
+from needle_identification.steering.recording import SteeringRecording
+from needle_identification.steering.response import ORDERS, TERMS
+from needle_identification.steering.tables import read_steering_table, STEERING_ROLES
+from needle_insertion.report.text import table
+from needle_ros.errors import NeedleError, ParameterError, shown
+from tqdm import tqdm
+
+#: What stands for a medium without a name.
+_ONE = 'all'
+
+
+def add_steering(what: Any) -> None:
+    """
+    Add the options of `needle identify steering`.
+
+    Parameters
+    ----------
+    what : object
+        Subparsers of ``needle identify``.
+
+    """
+    parser = what.add_parser(
+        'steering',
+        help='bending length, free length, skin, tilt, bevel: a needle that cuts its path',
+        description='Fit the bending of a needle to where its guide went and where its tip did, '
+        'in one or several media, all recordings together.',
+        epilog='example: needle identify steering gel/*.csv liver/*.csv --columns '
+        "'depth=-robot[m],guide_x=base.x[mm]@1,guide_z=base.z[mm]@1,tip_x=tip.x[mm],"
+        "tip_z=tip.z[mm]'",
+    )
+    parser.add_argument(
+        'tables',
+        type=Path,
+        nargs='+',
+        metavar='TABLE',
+        help='insertions as tables (.csv, .tsv, .mat); one that cannot be used is named, the '
+        'others go on, and the exit status is 2',
+    )
+    parser.add_argument('--json', action='store_true', help='print JSON instead of tables')
+    reading = parser.add_argument_group('what to read')
+    reading.add_argument(
+        '--columns',
+        metavar='ROLE=[-]NAME[*FACTOR][UNIT][@ROWS],...',
+        help=f'columns by role, of {", ".join(STEERING_ROLES)}; @1: the value of one row before '
+        '(default by usual names)',
+    )
+    reading.add_argument(
+        '--medium',
+        type=_pattern,
+        metavar='REGEX',
+        help='what in the path of a table names its medium, a regular expression with one group '
+        '(default its folder)',
+    )
+    fitting = parser.add_argument_group('how to identify')
+    fitting.add_argument(
+        '--terms',
+        metavar='TERM,...',
+        help=f'what makes the needle drift, of {", ".join(TERMS)} (default the one that explains '
+        'the most)',
+    )
+    fitting.add_argument(
+        '--order',
+        choices=ORDERS,
+        help='whether guide and needle move together between samples, or the guide first '
+        '(default what explains more)',
+    )
+    fitting.add_argument(
+        '--free-length', type=float, metavar='M', help='free length if it is known [m]'
+    )
+    parser.set_defaults(identify=_run)
+
+
+def _pattern(text: str) -> re.Pattern[str]:
+    try:
+        pattern = re.compile(text)
+    except re.error as error:
+        raise argparse.ArgumentTypeError(f'is no regular expression: {error}') from None
+    if pattern.groups != 1:
+        raise argparse.ArgumentTypeError(f'must have one group in brackets, got {text!r}')
+    return pattern
+
+
+def _medium_of(path: Path, pattern: re.Pattern[str] | None) -> str:
+    if pattern is None:
+        return path.resolve().parent.name
+    if (match := pattern.search(str(path))) is None:
+        raise ParameterError(f'{path} does not match --medium {pattern.pattern}')
+    return str(match[1])
+
+
+def _read(
+    path: Path, columns: Mapping[str, str], pattern: re.Pattern[str] | None
+) -> SteeringRecording | None:
+    """Read a table; say why if that is not possible."""
+    try:
+        return read_steering_table(path, columns, _medium_of(path, pattern))
+    except (NeedleError, OSError) as error:
+        sys.stderr.write(shown(f'error: {error}') + '\n')
+        return None
+
+
+def _run(options: argparse.Namespace) -> int:
+    terms = None
+    if options.terms is not None:
+        terms = tuple(word.strip() for word in options.terms.split(','))
+    settings = SteeringSettings(terms=terms, order=options.order, free_length=options.free_length)
+    columns = column_roles(options.columns, STEERING_ROLES) if options.columns else {}
+    read = [_read(path, columns, options.medium) for path in options.tables]
+    recordings = [one for one in read if one is not None]
+    if not recordings:
+        return 2
+    for words, names in _alike(recordings):
+        sys.stderr.write(shown(f'warning: {names}: {words}') + '\n')
+    with tqdm(desc='fits', unit='', disable=None, leave=False, delay=2.0) as bar:
+        found = identify_steering(recordings, settings, bar.update)
+    for words in found.warnings:
+        sys.stderr.write(shown(f'warning: {words}') + '\n')
+    if options.json:
+        document = steering_document(found, recordings)
+        sys.stdout.write(f'{json.dumps(document, indent=2, allow_nan=False)}\n')
+    else:
+        sys.stdout.write(f'{steering_text(found)}\n')
+    return 0 if len(recordings) == len(read) else 2
+
+
+def _alike(recordings: Sequence[SteeringRecording]) -> list[tuple[str, str]]:
+    """Return what was lost, each with the recordings that have it."""
+    groups: dict[str, list[str]] = {}
+    for one in recordings:
+        for words in one.losses:
+            groups.setdefault(words, []).append(one.name)
+    return [
+        (words, names[0] if len(names) == 1 else f'{names[0]} and {len(names) - 1} more')
+        for words, names in groups.items()
+    ]
+
+
+def _cell(one: ParameterEstimate) -> str:
+    return measured(one.value, one.error) if one.determined else 'not determined'
+
+
+def steering_text(found: SteeringEstimate) -> str:
+    """
+    Return a result as tables for the terminal.
+
+    Parameters
+    ----------
+    found : SteeringEstimate
+        The result.
+
+    Returns
+    -------
+    str
+        Lines.
+
+    """
+    rows = []
+    for medium in found.media:
+        for one in medium.parameters:
+            name = f'{one.name.replace("_", " ").capitalize()} {one.symbol}'
+            unit = '' if one.unit == '1' else f' [{one.unit}]'
+            interval = between(one.interval) if one.determined else ''
+            rows.append((medium.medium or _ONE, f'{name}{unit}', _cell(one), interval))
+    free = found.free_length
+    interval = between(free.interval) if free.determined and free.error else ''
+    rows.append(('all media', f'Free length {free.symbol} [m]', _cell(free), interval))
+    fits = [
+        (
+            medium.medium or _ONE,
+            f'{medium.recordings}',
+            f'{medium.samples}',
+            f'{1e3 * medium.rms:.3f}',
+        )
+        for medium in found.media
+    ]
+    others = ', '.join(
+        f'{"+".join(terms)} {1e3 * rms:.3f} mm' for terms, rms in found.alternatives.items()
+    )
+    way = 'move together' if found.order == ORDERS[0] else 'move one after the other'
+    return '\n'.join(
+        [
+            table(rows, ('medium', 'parameter', 'value ± SE', '95 % interval')),
+            '',
+            table(fits, ('medium', 'recordings', 'samples', 'rms per axis [mm]')),
+            '',
+            f'drift by {"+".join(found.terms)}; rms by cause: {others}; guide and needle {way}',
+        ]
+    )
+
+
+def steering_document(
+    found: SteeringEstimate, recordings: Sequence[SteeringRecording]
+) -> dict[str, Any]:
+    """
+    Return a result as JSON holds it.
+
+    Parameters
+    ----------
+    found : SteeringEstimate
+        The result.
+    recordings : sequence of SteeringRecording
+        The recordings.
+
+    Returns
+    -------
+    dict
+        Values in SI units.
+
+    """
+
+    def entry(one: ParameterEstimate) -> dict[str, Any]:
+        if not one.determined:
+            return {'unit': one.unit, 'determined': False}
+        return {
+            'value': one.value,
+            'error': one.error,
+            'interval': [end if isfinite(end) else None for end in one.interval],
+            'unit': one.unit,
+            'determined': True,
+        }
+
+    return {
+        'free_length': entry(found.free_length),
+        'media': {
+            medium.medium or _ONE: {
+                'parameters': {one.name: entry(one) for one in medium.parameters},
+                'rms': medium.rms,
+                'samples': medium.samples,
+                'recordings': medium.recordings,
+            }
+            for medium in found.media
+        },
+        'terms': list(found.terms),
+        'order': found.order,
+        'rms_by_terms': {'+'.join(terms): rms for terms, rms in found.alternatives.items()},
+        'recordings': [
+            {'name': one.name, 'medium': one.medium, 'losses': list(one.losses)}
+            for one in recordings
+        ],
+        'warnings': list(found.warnings),
+    }

@@ -1,0 +1,39 @@
+"""The picture of steering is drawn by the present code, and shows what it says."""
+
+from __future__ import annotations
+
+from pathlib import Path
+import runpy
+
+from matplotlib.image import imread
+import numpy as np
+
+SCRIPT = Path(__file__).parents[2] / 'docs' / 'images' / 'steering.py'
+
+
+def test_the_picture_is_the_present_one(tmp_path: Path) -> None:
+    figure = runpy.run_path(str(SCRIPT))['draw']()
+    figure.savefig(tmp_path / 'now.png', dpi=120)
+    now, kept = imread(tmp_path / 'now.png'), imread(SCRIPT.with_suffix('.png'))
+    assert now.shape == kept.shape
+    # Another version of a font or of the drawing moves edges of letters, not lines and colors.
+    assert np.abs(now - kept).mean() < 0.01
+
+
+def test_the_needles_bend_and_follow_their_paths() -> None:
+    """A bevel bends one by centimeters, a turn takes that back, a guide bends another."""
+    names = runpy.run_path(str(SCRIPT))
+    bent, turned, moved = (one for one, _, _ in names['needles']())
+    assert bent.tip[2] > 8e-3
+    assert abs(turned.tip[2]) < 0.5 * bent.tip[2]
+    assert moved.tip[2] < -3e-3
+    depths, lengths, found = names['authority']()
+    assert found[:, 0].min() > 0.8
+    # From one to four bending lengths the tip goes the other way; further in it hardly moves.
+    within = (depths > 1.2 * lengths[0]) & (depths < 3.5 * lengths[0])
+    assert found[0, within].max() < 0.0
+    assert np.abs(found[0, depths > 4.0 * lengths[0]]).max() < 0.05
+    above, below = names['draw']().axes[:2]
+    assert above.get_aspect() == 1.0
+    assert 'depth' in above.get_xlabel()
+    assert 'lambda' in below.get_ylabel()

@@ -1,0 +1,235 @@
+"""Identification of a needle that cuts its path."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+import json
+from math import pi
+from pathlib import Path
+
+from benchmarks.steering_fit import insertion, NOISE, Truth
+from needle_identification import (
+    IdentificationError,
+    identify_steering,
+    read_steering_table,
+    SteeringRecording,
+    SteeringSettings,
+)
+from needle_identification.errors import RecordingError
+from needle_identification.recordings.tables import column_roles
+from needle_identification.steering.recording import credible
+from needle_identification.steering.tables import STEERING_ROLES
+from needle_insertion.cli import main
+from needle_ros.errors import ParameterError, ShapeError
+import numpy as np
+from numpy.testing import assert_allclose
+import pytest
+
+PLAIN = Truth()
+
+TILTED = SteeringSettings(terms=('tilt',), order='together')
+
+#: Columns of a table of another laboratory.
+COLUMNS = (
+    'depth=-robot[m],guide_x=base.x[mm]@1,guide_z=base.z[mm]@1,tip_x=tip.x[mm],tip_z=tip.z[mm]'
+)
+
+
+def write_table(path: Path, one: SteeringRecording, frozen: int = 0) -> None:
+    """
+    Write a recording as another laboratory has it.
+
+    Each row has the tip after the step whose guide stands in the row before, the robot counts out
+    of the tissue, and the last readings of the sensor may be one.
+    """
+    tip = one.tip.copy()
+    if frozen:
+        tip[-frozen:] = tip[-frozen - 1]
+    # At rest before the first step.
+    at = [0, *range(len(tip))]
+    ahead = [*range(len(tip)), len(tip) - 1]
+    lines = ['sec,nanosec,tip.x,tip.y,tip.z,base.x,base.y,base.z,robot']
+    for row, (now, then) in enumerate(zip(at, ahead, strict=True)):
+        stamp = 1_700_000_000_250_000_000 + row * 500_000_000
+        depth, (x, z), (guide_x, guide_z) = one.depth[now], tip[now], one.guide[then]
+        places = 1e3 * np.array([x, -depth, z, guide_x, 0.0, guide_z])
+        numbers = ','.join(f'{value:.4f}' for value in places)
+        lines.append(f'{stamp // 10**9},{stamp % 10**9},{numbers},{-0.2 - depth:.5f}')
+    path.write_text('\n'.join(lines) + '\n')
+
+
+def test_without_noise_it_finds_the_truth() -> None:
+    """From one insertion; what is left is what elements of different lengths differ by."""
+    found = identify_steering([insertion(1, replace(PLAIN, noise=0.0))], TILTED)
+    [gel] = found.media
+    assert gel['bending_length'].value == pytest.approx(PLAIN.length, rel=1e-4)
+    assert gel['skin'].value == pytest.approx(PLAIN.skin, rel=5e-3)
+    assert found.free_length.value == pytest.approx(PLAIN.free, rel=1e-3)
+    assert_allclose([gel['tilt_x'].value, gel['tilt_z'].value], PLAIN.tilt, rtol=1e-3)
+    assert found.rms < 3e-7
+
+
+def test_media_share_the_free_length() -> None:
+    """Each has its own bending length, skin and tilt; all intervals hold the truth."""
+    gel = Truth(length=0.03)
+    liver = Truth(length=0.05, skin=0.03, tilt=(0.0, 0.01), medium='liver')
+    recordings = [insertion(k, gel) for k in range(10)]
+    recordings += [insertion(k, liver) for k in range(20, 30)]
+    found = identify_steering(recordings, TILTED)
+    for truth in (gel, liver):
+        medium, values = truth.medium, (truth.length, truth.skin, *truth.tilt)
+        assert found[medium].recordings == 10
+        # Each in 95 of 100; so that all are, twice the interval.
+        for one, true in zip(found[medium].parameters, values, strict=True):
+            low, high = one.interval
+            assert low - (one.value - low) <= true <= high + (high - one.value), one
+        # 210 samples an axis, less what was fitted.
+        assert found[medium].rms == pytest.approx(NOISE, rel=0.1)
+    low, high = found.free_length.interval
+    assert low < gel.free < high
+    with pytest.raises(KeyError, match='valid: gel, liver'):
+        found['fat']
+
+
+def test_what_makes_it_drift_is_not_told_apart_where_it_cannot_be() -> None:
+    """A tilt of the guide and a turn of the frames look alike; a needle that turns tells."""
+    tilted = identify_steering([insertion(k) for k in range(6)])
+    [words] = tilted.warnings
+    assert 'these explain the drift equally well (rms: tilt 0.1' in words
+    assert 'frame 0.1' in words
+    assert 'A motion of the guide in air would tell the frame' in words
+    bent = identify_steering(
+        [
+            insertion(k, Truth(tilt=(0.0, 0.0), curvature=0.8), lambda depth: pi * (depth > 0.05))
+            for k in range(6)
+        ]
+    )
+    assert bent.terms == ('bevel',)
+    assert not bent.warnings
+    [gel] = bent.media
+    assert gel['curvature_z'].value == pytest.approx(0.8, abs=4.0 * gel['curvature_z'].error)
+    assert abs(gel['curvature_x'].value) < 4.0 * gel['curvature_x'].error
+
+
+@pytest.mark.parametrize('first', [False, True])
+def test_order_of_guide_and_needle_is_seen(first: bool) -> None:
+    found = identify_steering(
+        [insertion(k, Truth(guide_first=first)) for k in range(4)],
+        SteeringSettings(terms=('tilt',)),
+    )
+    assert found.order == ('guide first' if first else 'together')
+
+
+def test_a_known_free_length_is_taken() -> None:
+    found = identify_steering([insertion(1)], replace(TILTED, free_length=PLAIN.free))
+    assert found.free_length.value == PLAIN.free
+    assert found.free_length.interval == (PLAIN.free, PLAIN.free)
+    free = identify_steering([insertion(1)], TILTED)
+
+    def width(one: tuple[float, float]) -> float:
+        return one[1] - one[0]
+
+    [known], [unknown] = found.media, free.media
+    assert width(known['bending_length'].interval) < width(unknown['bending_length'].interval)
+
+
+def test_a_needle_that_does_not_bend_tells_nothing() -> None:
+    """Straight in, with a guide at rest: no length is determined, and none is claimed."""
+    still = insertion(1)
+    still = replace(still, guide=np.zeros_like(still.guide))
+    found = identify_steering([still], TILTED)
+    [gel] = found.media
+    assert not gel['bending_length'].determined
+
+
+def test_a_table_of_another_laboratory_reads_with_options(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Units, signs, stamps in two columns, rows that lag, and one sensor that froze."""
+    for k in range(4):
+        write_table(tmp_path / f'run_{k}.csv', insertion(k), frozen=8 if k == 2 else 0)
+    paths = [str(tmp_path / f'run_{k}.csv') for k in range(4)]
+    options = ['--columns', COLUMNS, '--terms', 'tilt', '--order', 'together']
+    assert main(['identify', 'steering', *paths, *options, '--json']) == 0
+    said = capsys.readouterr()
+    found = json.loads(said.out)
+    assert 'run_2.csv: 8 samples of the tip that repeat one while the needle goes on' in said.err
+    assert 'depths from the first, 200 mm, which is at the skin' in said.err
+    [medium] = found['media'].values()
+    assert medium['samples'] == 4 * 22 - 8
+    low, high = medium['parameters']['bending_length']['interval']
+    assert low < PLAIN.length < high
+    assert medium['rms'] == pytest.approx(NOISE, rel=0.15)
+    assert main(['identify', 'steering', *paths, *options]) == 0
+    text = capsys.readouterr().out
+    assert 'Bending length lambda [m]' in text
+    assert tmp_path.name in text
+
+
+def test_media_by_name(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for k, medium in enumerate(('gel', 'gel', 'fat', 'fat')):
+        write_table(tmp_path / f'{medium}_{k}.csv', insertion(k))
+    paths = [str(path) for path in sorted(tmp_path.glob('*.csv'))]
+    options = ['--columns', COLUMNS, '--terms', 'tilt', '--order', 'together', '--json']
+    assert main(['identify', 'steering', *paths, *options, '--medium', r'/(\w+)_\d']) == 0
+    assert list(json.loads(capsys.readouterr().out)['media']) == ['fat', 'gel']
+    (tmp_path / 'bad.csv').write_text('a,b\n1,2\n')
+    assert main(['identify', 'steering', *paths, str(tmp_path / 'bad.csv'), *options]) == 2
+    said = capsys.readouterr()
+    assert "bad.csv has no column 'robot' for depth; it has a, b" in said.err
+    assert json.loads(said.out)['media'][tmp_path.name]['recordings'] == 4
+    with pytest.raises(SystemExit):
+        main(['identify', 'steering', *paths, '--medium', '('])
+    assert 'is no regular expression' in capsys.readouterr().err
+
+
+def test_frozen_and_impossible_readings_are_left_out() -> None:
+    depth = np.linspace(0.0, 0.045, 10)
+    guide, tip = np.zeros((10, 2)), 1e-4 * np.random.default_rng(1).standard_normal((10, 2))
+    good, losses = credible(depth, guide, tip)
+    assert good.all()
+    assert not losses
+    tip[4:8] = tip[4]
+    tip[9] = 0.5
+    tip[1, 0] = np.nan
+    good, losses = credible(depth, guide, tip)
+    assert good.tolist() == [True, False, True, True, True, False, False, False, True, False]
+    assert [words.split()[0] for words in losses] == ['3', '1', '1']
+    # A needle at rest may well repeat itself.
+    rest = np.zeros((10, 2))
+    assert credible(np.full(10, 0.05), guide, rest)[0].all()
+
+
+def test_columns_may_lag_by_rows(tmp_path: Path) -> None:
+    path = tmp_path / 'run.csv'
+    path.write_text('depth,gx,gz,tx,tz\n0,1,0,0,0\n0.01,2,0,1,1\n0.02,3,0,2,2\n')
+    columns = column_roles('guide_x=gx[mm]@1,guide_z=gz,tip_x=tx[mm],tip_z=tz[mm]', STEERING_ROLES)
+    one = read_steering_table(path, columns)
+    assert_allclose(one.guide[:, 0], [1e-3, 1e-3, 2e-3])
+    assert_allclose(one.depth, [0.0, 0.01, 0.02])
+    with pytest.raises(RecordingError, match='with the roles depth, guide_x'):
+        column_roles('force=f', STEERING_ROLES)
+
+
+def test_bad_input_is_named() -> None:
+    with pytest.raises(IdentificationError, match='no recordings'):
+        identify_steering([])
+    short = SteeringRecording(
+        depth=np.zeros(3), guide=np.zeros((3, 2)), roll=np.zeros(3), tip=np.zeros((3, 2))
+    )
+    with pytest.raises(IdentificationError, match=r'7 constants of these recordings need more'):
+        identify_steering([short], TILTED)
+    blind = replace(short, name='run 7', tip=np.full((3, 2), np.nan))
+    with pytest.raises(IdentificationError, match='run 7: no sample of the tip counts'):
+        identify_steering([blind])
+    with pytest.raises(ShapeError, match=r"guide must have shape \('n', 2\)"):
+        replace(short, guide=np.zeros((2, 2)))
+    with pytest.raises(ShapeError, match='depth must be >= 0'):
+        replace(short, depth=np.array([0.0, -0.01, 0.0]))
+    for wrong, words in (
+        ({'terms': ('wind',)}, "terms must be of tilt, frame, bevel, got 'wind'"),
+        ({'order': 'never'}, 'order must be one of together, guide first'),
+        ({'free_length': 2.0}, r'free_length must be in \[0.001, 0.3\] m, got 2.0'),
+    ):
+        with pytest.raises(ParameterError, match=words):
+            SteeringSettings(**wrong)
