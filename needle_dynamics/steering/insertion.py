@@ -37,8 +37,8 @@ def axis_of(needle: NeedleParameters, steering: SteeringParameters) -> Axis:
     Raises
     ------
     ParameterError
-        If the friction law is not Coulomb's, the tissue swells, or there is not one value for
-        each layer.
+        If the friction law is not Coulomb's, the hub does not stop, or there is not one value
+        for each layer.
 
     """
     if needle.friction_law != 'coulomb':
@@ -46,10 +46,8 @@ def axis_of(needle: NeedleParameters, steering: SteeringParameters) -> Axis:
             f'friction_law must be coulomb for a needle that is steered, got '
             f'{needle.friction_law!r}'
         )
-    if needle.swelling != 0.0:
-        raise ParameterError(
-            f'swelling must be 0 for a needle that is steered, got {needle.swelling:g}'
-        )
+    if not needle.hub_stop:
+        raise ParameterError('hub_stop must be true: the hub of a steered needle stops on the guide')
     layers = len(needle.tissue.starts)
     several = {
         name: by_layer(name, getattr(steering, name), layers)

@@ -102,13 +102,18 @@ def steered(
     Raises
     ------
     ParameterError
-        If there is not one load of the bevel for each layer, or the needle is too short.
+        If there is not one load of the bevel for each layer, the needle is too short, or the
+        tissue swells.
 
     """
     tissue = needle.tissue
     if steering.free_length >= needle.length:
         raise ParameterError(
             f'free_length must be < length = {needle.length:g} m, got {steering.free_length:g} m'
+        )
+    if needle.swelling != 0.0:
+        raise ParameterError(
+            f'swelling must be 0 for a needle that is steered, got {needle.swelling:g}'
         )
     return Steered(
         ei=needle.bending_stiffness,
@@ -357,6 +362,11 @@ class SteeredNeedle:
     def tip_slope(self) -> FloatArray:
         """Slope of the needle at the tip in x and z; shape (2,)."""
         return self._cut.tip[:, 1].copy()
+
+    @property
+    def guide(self) -> FloatArray:
+        """Position of the guide in x and z [m]; shape (2,)."""
+        return np.array(self._guide)
 
     @property
     def roll(self) -> float:

@@ -22,6 +22,13 @@ _LONGEST: Final = 1.0
 #: Loads of the noise of the path per length over which it forgets itself.
 _CELLS: Final = 5
 
+#: Constants of `NeedleParameters` that a steered needle has; the others are of the paper's model.
+NEEDLE_CONSTANTS: Final = (
+    'length', 'density', 'area', 'youngs_modulus', 'area_moment', 'carriage_mass',
+    'tissue_stiffness', 'layer_depths', 'layer_stiffnesses', 'coulomb_friction',
+    'viscous_friction', 'withdrawal_friction',
+)  # fmt: skip
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SteeringParameters:

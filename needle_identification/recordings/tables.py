@@ -37,6 +37,7 @@ MATLAB: Final = '.mat'
 TABLES: Final = ('.csv', '.tsv', '.txt', '.dat', MATLAB)
 
 _LENGTHS: Final = {'m': 1.0, 'mm': 1e-3, 'cm': 1e-2, 'um': 1e-6, 'µm': 1e-6}
+_ANGLES: Final = {'rad': 1.0, 'deg': pi / 180.0}
 
 #: Units by role: how many of the SI unit one is.
 UNITS: Final[Mapping[str, Mapping[str, float]]] = {
@@ -46,7 +47,9 @@ UNITS: Final[Mapping[str, Mapping[str, float]]] = {
     'force': {'N': 1.0, 'mN': 1e-3, 'kN': 1e3, 'kgf': 9.80665, 'gf': 9.80665e-3, 'lbf': 4.4482216},
     'guide_x': _LENGTHS,
     'guide_z': _LENGTHS,
-    'roll': {'rad': 1.0, 'deg': pi / 180.0},
+    'roll': _ANGLES,
+    'tilt_x': _ANGLES,
+    'tilt_z': _ANGLES,
     'tip_x': _LENGTHS,
     'tip_z': _LENGTHS,
 }

@@ -9,9 +9,10 @@ from pathlib import Path
 import sys
 from typing import Final
 
-from needle_dynamics import NeedleModel, NeedleParameters, simulate
+from needle_dynamics import DEFAULT_PRESET, NeedleModel, NeedleParameters, simulate
 from needle_dynamics.simulated.integrator import DEFAULT_TOLERANCE
 from needle_insertion.commands.common import add_needle, check_file, Command, constants
+from needle_insertion.commands.simulate_steering import add_steering, run_steering
 from needle_insertion.report import trajectory as report
 from needle_insertion.report.text import table
 from needle_ros.errors import ParameterError
@@ -23,24 +24,38 @@ _DEFLECTION: Final = 5e-4
 _SAMPLES: Final = 5000
 _NO_WAY: Final = 1.0
 
+#: Inserted length at the start [m] and force [N] by default.
+_DEPTH, _FORCE = 0.02, 3.0
+
+#: Options that only one model has.
+_MODES: Final = 'modes'
+_ONLY: Final = {
+    _MODES: ('preset', 'force', 'duration', 'tolerance', 'tip_deflection', 'modal'),
+    'steering': ('needle', 'to', 'speed', 'way', 'seed'),
+}
+
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of `needle simulate`."""
+    parser.add_argument(
+        '--model',
+        choices=tuple(_ONLY),
+        default=_MODES,
+        help='modes: the needle of the paper; steering: one that bends about the path that it '
+        f'cuts (default {_MODES})',
+    )
     add_needle(parser)
-    for name, default, unit, words in (
-        ('depth', 0.02, 'm', 'inserted length at the start'),
-        ('force', 3.0, 'N', 'insertion force'),
-        ('duration', None, 's', 'time to simulate (default: until the hub is at the skin)'),
-        ('interval', None, 's', f'time between samples (default: {_SAMPLES} of them)'),
-        ('tolerance', DEFAULT_TOLERANCE, 'X', 'relative error of each interval'),
-    ):
-        parser.add_argument(
-            f'--{name}',
-            type=float,
-            default=default,
-            metavar=unit,
-            help=words if default is None else f'{words} (default {default:g})',
-        )
+    # Whether it was given says whether it is of the model.
+    parser.set_defaults(preset=None)
+    for name, unit, words in (
+        ('depth', 'm', f'inserted length at the start (default {_DEPTH:g}; model steering: 0)'),
+        ('force', 'N', f'insertion force (default {_FORCE:g})'),
+        ('duration', 's', 'time to simulate (default: until the hub is at the skin)'),
+        ('interval', 's', f'time between samples (default: {_SAMPLES} of them; model steering: '
+         'a millimeter)'),
+        ('tolerance', 'X', f'relative error of each interval (default {DEFAULT_TOLERANCE:g})'),
+    ):  # fmt: skip
+        parser.add_argument(f'--{name}', type=float, metavar=unit, help=words)
     start = parser.add_mutually_exclusive_group()
     start.add_argument(
         '--tip-deflection',
@@ -64,6 +79,7 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
         help='file.csv, file.png or a folder for a bag; repeatable',
     )
     parser.add_argument('--json', action='store_true', help='print JSON instead of a table')
+    add_steering(parser)
 
 
 def _time_to_hub(parameters: NeedleParameters, depth: float, force: float) -> float:
@@ -86,20 +102,33 @@ def _run(options: argparse.Namespace) -> int:
         if not path.suffix and path.exists():
             raise ParameterError(f'{path}: a bag must not exist')
         check_file(path)
-    parameters = NeedleParameters.preset(options.preset, **constants(options.set))
+    for model, names in _ONLY.items():
+        given = [name for name in names if getattr(options, name) is not None]
+        if given and model != options.model:
+            raise ParameterError(
+                f'--{given[0].replace("_", "-")} is of --model {model}, not of {options.model}'
+            )
+    return _run_modes(options) if options.model == _MODES else run_steering(options)
+
+
+def _run_modes(options: argparse.Namespace) -> int:
+    preset = options.preset or DEFAULT_PRESET
+    depth = _DEPTH if options.depth is None else options.depth
+    force = _FORCE if options.force is None else options.force
+    parameters = NeedleParameters.preset(preset, **constants(options.set))
     modal = options.modal or ()
     given = options.tip_deflection
     deflection = given if given is not None else 0.0 if modal else _DEFLECTION
     duration = options.duration
     if duration is None:
-        duration = _time_to_hub(parameters, options.depth, options.force)
+        duration = _time_to_hub(parameters, depth, force)
     trajectory = simulate(
         parameters,
-        NeedleModel(parameters).state_at(options.depth, deflection, modal),
-        options.force,
+        NeedleModel(parameters).state_at(depth, deflection, modal),
+        force,
         duration=duration,
         interval=duration / _SAMPLES if options.interval is None else options.interval,
-        tolerance=options.tolerance,
+        tolerance=DEFAULT_TOLERANCE if options.tolerance is None else options.tolerance,
     )
     for path in options.output:
         report.write(path, trajectory)
@@ -112,8 +141,8 @@ def _run(options: argparse.Namespace) -> int:
         # What has faded has no digits left.
         rows = [(name, f'{round(value, 15):.6g}') for name, value in summary.items()]
         sys.stdout.write(
-            f'{options.preset}: inserted {options.depth:g} m at the start, force '
-            f'{options.force:g} N, for {duration:g} s\n\n'
+            f'{preset}: inserted {depth:g} m at the start, force '
+            f'{force:g} N, for {duration:g} s\n\n'
             f'{table(rows, ("quantity", "value"))}\n'
         )
         for path in options.output:

@@ -217,6 +217,7 @@ def test_bad_constants_are_named() -> None:
     for needle, words in (
         (replace(NEEDLE, friction_law='tanh'), "friction_law must be coulomb .* got 'tanh'"),
         (replace(NEEDLE, swelling=0.1), 'swelling must be 0'),
+        (replace(NEEDLE, hub_stop=False), 'hub_stop must be true'),
     ):
         with pytest.raises(ParameterError, match=words):
             Insertion(needle, STEERING)

@@ -1,0 +1,201 @@
+"""`needle simulate --model steering`: a needle that bends about the path that it cuts."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping
+from dataclasses import fields
+import json
+from math import inf
+from pathlib import Path
+import sys
+from typing import Any
+
+from needle_dynamics import (
+    FloatArray,
+    Insertion,
+    NeedleParameters,
+    STEERING_PRESETS,
+    SteeringParameters,
+)
+from needle_dynamics.steering.parameters import NEEDLE_CONSTANTS
+from needle_identification import RecordingError
+from needle_identification.recordings.tables import column_values, guessed, read_table
+from needle_insertion.commands.common import constants
+from needle_insertion.report import insertion as report
+from needle_insertion.report.text import table
+from needle_ros.errors import ParameterError
+from needle_ros.settings import from_values, unknown_name
+import numpy as np
+
+#: Depth to reach [m], speed [m/s] and way between samples [m] by default.
+TO, SPEED, WAY = 0.1, 5e-3, 1e-3
+
+#: Columns of a way beside the depth.
+COLUMNS = ('guide_x', 'guide_z', 'tilt_x', 'tilt_z', 'roll')
+
+#: Most samples of a run.
+_MOST = 1_000_000
+
+
+def add_steering(parser: argparse.ArgumentParser) -> None:
+    """
+    Add the options of this model only.
+
+    Parameters
+    ----------
+    parser : ArgumentParser
+        Parser of ``needle simulate``.
+
+    """
+    group = parser.add_argument_group('model steering only')
+    group.add_argument(
+        '--needle',
+        choices=tuple(STEERING_PRESETS),
+        help='needle and tissue (default bending_35mm); --set takes the constants of both',
+    )
+    group.add_argument('--to', type=float, metavar='m', help=f'depth to reach (default {TO:g})')
+    group.add_argument(
+        '--speed', type=float, metavar='m/s', help=f'insertion velocity (default {SPEED:g})'
+    )
+    group.add_argument(
+        '--way',
+        type=Path,
+        metavar='FILE',
+        help='table (.csv, .mat) with the columns depth and any of '
+        f'{", ".join(COLUMNS)}: where guide and roll are at each depth',
+    )
+    group.add_argument('--seed', type=int, help='seed of the noise of the path (default 0)')
+
+
+def _made(name: str, words: list[str]) -> tuple[NeedleParameters, SteeringParameters]:
+    """Return needle and steering with changes; a name is of one of them."""
+    needle, steering, _ = STEERING_PRESETS[name]
+    own = [item.name for item in fields(steering)]
+    given = constants(words)
+    valid = [*NEEDLE_CONSTANTS, *own]
+    for key in given:
+        if key not in valid:
+            raise ParameterError(unknown_name(key, valid))
+    of_steering = {
+        key: (value,) if isinstance(getattr(steering, key), tuple) and _single(value) else value
+        for key, value in given.items()
+        if key in own
+    }
+    of_needle = {key: value for key, value in given.items() if key not in own}
+    return (
+        from_values(NeedleParameters, {**_values(needle), **of_needle}),
+        from_values(SteeringParameters, {**_values(steering), **of_steering}),
+    )
+
+
+def _single(value: object) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
+
+
+def _values(settings: Any) -> Mapping[str, Any]:
+    return {item.name: getattr(settings, item.name) for item in fields(settings)}
+
+
+def read_way(path: Path) -> dict[str, FloatArray]:
+    """
+    Read where guide and roll are by depth.
+
+    Parameters
+    ----------
+    path : Path
+        A table.
+
+    Returns
+    -------
+    dict
+        Columns by name, ``depth`` and at least one of `COLUMNS`.
+
+    Raises
+    ------
+    RecordingError
+        If it has no such columns, or its depth does not increase.
+
+    """
+    read = read_table(path)
+    names = {name: (name.replace('_', ''),) for name in ('depth', *COLUMNS)}
+    found = guessed(read, names)
+    if 'depth' not in found or len(found) < 2:
+        raise RecordingError(
+            f'{path} must have the columns depth and any of {", ".join(COLUMNS)}; it has '
+            f'{", ".join(read.columns)}'
+        )
+    way = {name: column_values(read, name, column, []) for name, column in found.items()}
+    if not all(np.isfinite(values).all() for values in way.values()):
+        raise RecordingError(f'{path} has values that are no numbers')
+    if len(way['depth']) < 1 or not (np.diff(way['depth']) > 0.0).all():
+        raise RecordingError(f'{path}: depth must increase from row to row')
+    return way
+
+
+def run_steering(options: argparse.Namespace) -> int:
+    """
+    Simulate, write the outputs, and print a summary.
+
+    Parameters
+    ----------
+    options : Namespace
+        Options of ``needle simulate``.
+
+    Returns
+    -------
+    int
+        Exit status.
+
+    """
+    for path in options.output:
+        if path.suffix not in ('.csv', '.png'):
+            raise ParameterError(f'{path}: output of --model steering must be .csv or .png')
+    name = options.needle or 'bending_35mm'
+    needle, steering = _made(name, options.set)
+    to = TO if options.to is None else options.to
+    speed = SPEED if options.speed is None else options.speed
+    if not 0.0 < speed < inf:
+        raise ParameterError(f'--speed must be positive and finite, got {speed!r} m/s')
+    interval = WAY / speed if options.interval is None else options.interval
+    start = 0.0 if options.depth is None else options.depth
+    if not 0.0 < interval < inf or not start < to < inf or (to - start) / speed > _MOST * interval:
+        raise ParameterError(
+            f'--to must be beyond --depth, {start:g} m, with at most {_MOST} samples of '
+            f'--interval, got {to!r} m and {interval!r} s'
+        )
+    way = read_way(options.way) if options.way is not None else {}
+    one = Insertion(needle, steering, depth=start, seed=options.seed or 0)
+    recorder = report.InsertionRecord(one)
+    while one.depth < to:
+        # Brought to its speed in the first interval, and to its depth in the last.
+        ahead = min(one.depth + 0.5 * (one.velocity + speed) * interval, to)
+        at = {key: float(np.interp(ahead, way['depth'], way[key])) for key in way}
+        duration = interval
+        if ahead == to:
+            duration = max(2.0 * (to - one.depth) / (one.velocity + speed), 1e-9)
+        force = one.carry(
+            duration,
+            speed,
+            guide=(at.get('guide_x', 0.0), at.get('guide_z', 0.0)),
+            tilt=(at.get('tilt_x', 0.0), at.get('tilt_z', 0.0)),
+            roll=at.get('roll', 0.0),
+        )
+        recorder.take(force)
+        if ahead == to:
+            break
+    for path in options.output:
+        report.write(path, recorder)
+    summary = report.summary(recorder)
+    if options.json:
+        sys.stdout.write(f'{json.dumps(summary, indent=2)}\n')
+        return 0
+    rows = [(key, f'{value + 0.0:.6g}') for key, value in summary.items()]
+    sys.stdout.write(
+        f'{name}: inserted from {start:g} m to {to:g} m at {speed:g} m/s\n\n'
+        f'{table(rows, ("quantity", "value"))}\n'
+    )
+    for path in options.output:
+        sys.stdout.write(f'wrote {path}\n')
+    return 0
+

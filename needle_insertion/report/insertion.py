@@ -1,0 +1,187 @@
+"""A simulated insertion of a steered needle as a summary, a CSV and a figure."""
+
+from __future__ import annotations
+
+import csv
+from io import StringIO
+from pathlib import Path
+from typing import Final, TYPE_CHECKING
+
+from needle_dynamics import FloatArray, Insertion, NeedlePath, NeedleShape
+from needle_identification.result import write_whole
+from needle_insertion.report.content import png
+import numpy as np
+
+if TYPE_CHECKING:
+    # Takes half a second to import; only the picture needs it.
+    from matplotlib.figure import Figure
+
+#: Columns of the CSV, as identification of friction and steering finds them.
+COLUMNS: Final = (
+    'time [s]', 'depth [m]', 'speed [m/s]', 'force [N]', 'guide_x [m]', 'guide_z [m]',
+    'roll [rad]', 'tip_x [m]', 'tip_z [m]', 'tip_roll [rad]', 'force_x [N]', 'force_z [N]',
+    'torque_x [N m]', 'torque_y [N m]', 'torque_z [N m]',
+)  # fmt: skip
+
+#: Needles drawn on the way.
+_DRAWN: Final = 4
+
+#: Width of the picture [in].
+_WIDTH: Final = 9.0
+
+
+class InsertionRecord:
+    """
+    Samples of an insertion, and the needle at some of them.
+
+    Parameters
+    ----------
+    one : Insertion
+        The needle, at its start.
+
+    """
+
+    def __init__(self, one: Insertion) -> None:
+        self._one = one
+        self._rows: list[list[float]] = []
+        self._shapes: list[NeedleShape] = []
+        self.take(0.0)
+
+    def take(self, force: float) -> None:
+        """
+        Take a sample.
+
+        Parameters
+        ----------
+        force : float
+            Mean axial force since the one before [N].
+
+        """
+        one = self._one
+        (guide_x, guide_z), (tip_x, _, tip_z) = one.needle.guide, one.needle.tip
+        force_x, force_z, *torques = one.wrench
+        self._rows.append(
+            [
+                one.time, one.depth, one.velocity, force, guide_x, guide_z, one.needle.roll,
+                tip_x, tip_z, one.needle.tip_roll, force_x, force_z, *torques,
+            ]
+        )  # fmt: skip
+        self._shapes.append(one.needle.shape)
+
+    @property
+    def table(self) -> FloatArray:
+        """The samples, shape (n, columns) in the order of `COLUMNS`."""
+        return np.array(self._rows)
+
+    @property
+    def path(self) -> NeedlePath:
+        """The path that the tip cut."""
+        return self._one.needle.path
+
+    @property
+    def shapes(self) -> list[NeedleShape]:
+        """The needle at evenly spaced samples, the last one included."""
+        at = np.linspace(0, len(self._shapes) - 1, _DRAWN + 1).round().astype(int)
+        return [self._shapes[k] for k in at[1:]]
+
+    @property
+    def punctured(self) -> int:
+        """Number of membranes that are punctured."""
+        return sum(self._one.punctured)
+
+
+def summary(record: InsertionRecord) -> dict[str, float]:
+    """
+    Return the main numbers of an insertion.
+
+    Parameters
+    ----------
+    record : InsertionRecord
+        The insertion.
+
+    Returns
+    -------
+    dict
+        Values by what they are, with their units.
+
+    """
+    rows = record.table
+    column = dict(zip(COLUMNS, rows.T, strict=True))
+    return {
+        'duration [s]': float(column['time [s]'][-1]),
+        'depth at the end [m]': float(column['depth [m]'][-1]),
+        'tip at the end, x [m]': float(column['tip_x [m]'][-1]),
+        'tip at the end, z [m]': float(column['tip_z [m]'][-1]),
+        'largest slope': float(max(np.abs(one.slopes).max() for one in record.shapes)),
+        'largest axial force [N]': float(np.abs(column['force [N]']).max()),
+        'largest lateral force on the guide [N]': float(
+            np.hypot(column['force_x [N]'], column['force_z [N]']).max()
+        ),
+        'membranes punctured': float(record.punctured),
+    }
+
+
+def write(path: Path, record: InsertionRecord) -> None:
+    """
+    Write an insertion in the format that the name of the file asks for.
+
+    Parameters
+    ----------
+    path : Path
+        A ``.csv`` or ``.png`` file.
+    record : InsertionRecord
+        The insertion.
+
+    Raises
+    ------
+    NeedleError
+        If it cannot be written.
+
+    """
+    if path.suffix == '.csv':
+        text = StringIO(newline='')
+        writer = csv.writer(text)
+        writer.writerow(COLUMNS)
+        writer.writerows(record.table.tolist())
+        write_whole(path, text.getvalue().encode())
+    else:
+        write_whole(path, png(_figure(record)))
+
+
+def _figure(record: InsertionRecord) -> Figure:
+    """Draw the needle on its way in both planes, to scale, with the path that it cut."""
+    from matplotlib.figure import Figure
+
+    shapes, path = record.shapes, record.path
+    begin = 1e3 * min(float(one.depths[0]) for one in shapes)
+    end = 1e3 * max(float(one.depths[-1]) for one in shapes) + 5.0
+    aside = 1.2e3 * max(float(np.abs(one.deflections).max()) for one in shapes) + 2.0
+    # As high as the scale asks for, with room for the words.
+    height = _WIDTH * 2.0 * aside / (end - begin)
+    figure = Figure(figsize=(_WIDTH, 2.0 * height + 1.5), layout='constrained')
+    for k, (axes, name) in enumerate(zip(figure.subplots(2, 1, sharex=True), 'xz', strict=True)):
+        axes.axvspan(0.0, end, color='#f3d9d0', lw=0)
+        axes.axvline(0.0, color='#b07060', lw=2.0)
+        for j, shape in enumerate(shapes):
+            last = j == len(shapes) - 1
+            axes.plot(
+                1e3 * shape.depths,
+                1e3 * shape.deflections[:, k],
+                color='tab:blue',
+                lw=2.0 if last else 0.8,
+                alpha=1.0 if last else 0.5,
+                label='needle' if last else None,
+            )
+        axes.plot(
+            1e3 * path.depths, 1e3 * path.deflections[:, k], 'k--', lw=0.8, label='path it cut'
+        )
+        axes.set(
+            ylabel=f'{name} [mm]',
+            xlim=(begin, end),
+            ylim=(-aside, aside),
+            aspect='equal',
+        )
+        axes.grid(visible=True, alpha=0.3)
+    axes.set_xlabel('depth y [mm]')
+    figure.legend(*axes.get_legend_handles_labels(), loc='outside upper right', ncols=2)
+    return figure

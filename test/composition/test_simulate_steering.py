@@ -1,0 +1,100 @@
+"""`needle simulate --model steering`: what it writes, and what it says of bad input."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+from needle_insertion.cli import main
+import pytest
+
+WAY = 'depth [mm],guide_z [mm],roll [deg]\n0,0,0\n20,4,0\n60,4,0\n61,4,180\n100,-2,180\n'
+
+
+def said(
+    capsys: pytest.CaptureFixture[str], *words: str, status: int = 0
+) -> tuple[dict[str, float], str]:
+    """Run the command; return its JSON, if it succeeds, and what it complains of."""
+    assert main(['simulate', *words]) == status
+    found = capsys.readouterr()
+    return (json.loads(found.out) if status == 0 else {}), found.err
+
+
+def test_what_it_writes_is_identified_again(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The CSV has what friction and steering are identified from, and gives the constants back."""
+    way, run, picture = (tmp_path / name for name in ('way.csv', 'run.csv', 'run.png'))
+    way.write_text(WAY)
+    steering = ['--model', 'steering', '--set', 'bevel_load=0.4', '--set', 'cutting_force=0.8']
+    found, _ = said(
+        capsys, *steering, '--way', str(way), '-o', str(run), '-o', str(picture), '--json'
+    )
+    assert found['depth at the end [m]'] == pytest.approx(0.1, abs=1e-12)
+    assert picture.read_bytes().startswith(b'\x89PNG')
+    with run.open(newline='') as stream:
+        rows = list(csv.DictReader(stream))
+    assert float(rows[-1]['tip_z [m]']) == found['tip at the end, z [m]']
+    assert float(rows[-1]['guide_z [m]']) == pytest.approx(-2e-3)
+    # Friction of the preset, and what cuts.
+    assert float(rows[50]['force [N]']) == pytest.approx(0.56 + 300.0 * 5e-3 + 0.8, rel=1e-9)
+    assert main(['identify', 'steering', str(run), '--terms', 'bevel', '--json']) == 0
+    identified = json.loads(capsys.readouterr().out)
+    [medium] = identified['media'].values()
+    # The preset bends over 35 mm, behind a free length of 40 mm. Samples are not at the corners
+    # of the way.
+    assert medium['parameters']['bending_length']['value'] == pytest.approx(0.035, rel=5e-3)
+    assert identified['free_length']['value'] == pytest.approx(0.04, rel=5e-3)
+    assert medium['parameters']['curvature_z']['value'] == pytest.approx(
+        0.4 * 0.035 / 0.0256, rel=0.01
+    )
+
+
+def test_a_membrane_and_a_start_on_the_way(capsys: pytest.CaptureFixture[str]) -> None:
+    changes = ['membrane_depths=0.05', 'membrane_strengths=2', 'path_noise=1e-4']
+    words = [word for change in changes for word in ('--set', change)]
+    options = ['--model', 'steering', *words, '--depth', '0.03', '--to', '0.08', '--json']
+    found, _ = said(capsys, *options)
+    assert found['membranes punctured'] == 1.0
+    again, _ = said(capsys, *options)
+    other, _ = said(capsys, *options, '--seed', '3')
+    assert again == found
+    assert other['tip at the end, z [m]'] != found['tip at the end, z [m]']
+
+
+@pytest.mark.parametrize(
+    ('words', 'complaint'),
+    [
+        (['--model', 'steering', '--force', '3'], '--force is of --model modes, not of steering'),
+        (['--to', '0.1'], '--to is of --model steering, not of modes'),
+        (['--model', 'steering', '--to', '0.3'], 'the needle reached 160 mm, where its hub stops'),
+        (['--model', 'steering', '--speed', '0'], '--speed must be positive and finite'),
+        (['--model', 'steering', '--depth', '0.2'], '--to must be beyond --depth'),
+        (['--model', 'steering', '--interval', '1e-9'], 'with at most 1000000 samples'),
+        (['--model', 'steering', '--set', 'modes=3'], "unknown parameter 'modes'; valid: area"),
+        (['--model', 'steering', '-o', 'bag'], 'must be .csv or .png'),
+        (['--model', 'steering', '--way', 'none.csv'], 'none.csv cannot be read'),
+    ],
+)
+def test_bad_input_is_named(
+    words: list[str], complaint: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert complaint in said(capsys, *words, status=2)[1]
+
+
+@pytest.mark.parametrize(
+    ('text', 'complaint'),
+    [
+        ('depth,roll\n0,0\n0,1\n', 'depth must increase from row to row'),
+        ('depth,force\n0,0\n1,1\n', 'must have the columns depth and any of guide_x'),
+        ('depth,roll\n0,0\n0.1,nan\n', 'has values that are no numbers'),
+    ],
+)
+def test_bad_ways_are_named(
+    text: str, complaint: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    way = tmp_path / 'way.csv'
+    way.write_text(text)
+    words = ['--model', 'steering', '--way', str(way)]
+    assert complaint in said(capsys, *words, status=2)[1]
