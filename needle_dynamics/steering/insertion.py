@@ -47,7 +47,9 @@ def axis_of(needle: NeedleParameters, steering: SteeringParameters) -> Axis:
             f'{needle.friction_law!r}'
         )
     if not needle.hub_stop:
-        raise ParameterError('hub_stop must be true: the hub of a steered needle stops on the guide')
+        raise ParameterError(
+            'hub_stop must be true: the hub of a steered needle stops on the guide'
+        )
     layers = len(needle.tissue.starts)
     several = {
         name: by_layer(name, getattr(steering, name), layers)

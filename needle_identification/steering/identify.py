@@ -124,12 +124,13 @@ def identify_steering(
         raise IdentificationError('no recordings to identify from')
     sets = [(term,) for term in TERMS] if settings.terms is None else [settings.terms]
     orders = ORDERS if settings.order is None else (settings.order,)
-    fits = []
+    fits: list[_Fit] = []
     for terms in sets:
         for order in orders:
             search = Search(recordings, terms, order, settings.free_length)
             _check(search)
-            fits.append(_Fit(search, *search.best()))
+            # What makes it drift hardly changes how it bends.
+            fits.append(_Fit(search, *search.best(fits[0].x if fits else None)))
             if progress is not None:
                 progress()
     best = min(fits, key=lambda fit: fit.cost)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 from math import copysign, exp, inf, log, sqrt
 from typing import Final
 
@@ -32,6 +33,9 @@ _STEP: Final = 1e-5
 
 #: Trials for an end of an interval, and how near to it is there.
 _TRIALS, _NEAR = 12, 0.01
+
+#: Media at lengths that are remembered.
+_KEPT: Final = 256
 
 
 class Search:
@@ -80,6 +84,9 @@ class Search:
         if free is None:
             low, high = [log(FREE[0]), *low], [log(FREE[1]), *high]
         self._bounds = np.array([low, high])
+        # A change of one medium leaves the others as they were.
+        self._part = lru_cache(maxsize=_KEPT)(self._columns)
+        self._left = lru_cache(maxsize=_KEPT)(self._rest)
 
     def lengths(self, x: FloatArray) -> tuple[float, list[tuple[float, float]]]:
         """
@@ -120,20 +127,29 @@ class Search:
 
         """
         free, lengths = self.lengths(x)
-        found = []
-        for members, (length, skin) in zip(self.members.values(), lengths, strict=True):
-            rows, left = [], []
-            for k, at in enumerate(members):
-                one = self.recordings[at]
-                r = responses(one, free, length, skin, self.order)
-                n, known = len(one.depth), np.tile(one.known, 2)
-                offsets = np.zeros((2 * n, 2 * len(members)))
-                offsets[:n, 2 * k] = offsets[n:, 2 * k + 1] = 1.0
-                columns = np.hstack([*(drift(term, one, r) for term in self.terms), offsets])
-                rows.append(columns[known])
-                left.append((one.tip - r.guide).T.ravel()[known])
-            found.append((np.vstack(rows), np.concatenate(left)))
-        return found
+        return [self._part(k, free, *own) for k, own in enumerate(lengths)]
+
+    def _columns(
+        self, medium: int, free: float, length: float, skin: float
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return the linear columns of a medium, and what its guide does not explain."""
+        rows, left = [], []
+        members = self.members[self.media[medium]]
+        for k, at in enumerate(members):
+            one = self.recordings[at]
+            r = responses(one, free, length, skin, self.order)
+            n, known = len(one.depth), np.tile(one.known, 2)
+            offsets = np.zeros((2 * n, 2 * len(members)))
+            offsets[:n, 2 * k] = offsets[n:, 2 * k + 1] = 1.0
+            columns = np.hstack([*(drift(term, one, r) for term in self.terms), offsets])
+            rows.append(columns[known])
+            left.append((one.tip - r.guide).T.ravel()[known])
+        return np.vstack(rows), np.concatenate(left)
+
+    def _rest(self, medium: int, free: float, length: float, skin: float) -> FloatArray:
+        """Return what is left of a medium at the best linear parameters."""
+        columns, left = self._part(medium, free, length, skin)
+        return np.asarray(left - columns @ np.linalg.lstsq(columns, left)[0])
 
     def residual(self, x: FloatArray) -> FloatArray:
         """
@@ -150,8 +166,8 @@ class Search:
             Of all media [m].
 
         """
-        left = [y - a @ np.linalg.lstsq(a, y)[0] for a, y in self.design(x)]
-        return np.concatenate(left)
+        free, lengths = self.lengths(x)
+        return np.concatenate([self._left(k, free, *own) for k, own in enumerate(lengths)])
 
     def _search(self, first: FloatArray, free: Sequence[int]) -> tuple[FloatArray, float]:
         """Search over some of the variables from a start; return all, and the cost [m^2]."""
@@ -168,9 +184,14 @@ class Search:
         x[at] = found.x
         return x, _UNIT**2 * float(found.cost)
 
-    def best(self) -> tuple[FloatArray, float]:
+    def best(self, near: FloatArray | None = None) -> tuple[FloatArray, float]:
         """
-        Return the best lengths, from several starts.
+        Return the best lengths.
+
+        Parameters
+        ----------
+        near : ndarray, shape (k,), optional
+            Variables from which to search; otherwise from several starts.
 
         Returns
         -------
@@ -180,6 +201,8 @@ class Search:
             Half the sum of squares that they leave [m^2].
 
         """
+        if near is not None:
+            return self._search(near, range(len(near)))
         found = []
         for start in _STARTS:
             first = [log(start), _START_SKIN] * len(self.media)

@@ -198,4 +198,3 @@ def run_steering(options: argparse.Namespace) -> int:
     for path in options.output:
         sys.stdout.write(f'wrote {path}\n')
     return 0
-
