@@ -186,7 +186,7 @@ def empty_cut(length: float, element: float, layers: int) -> Cut:
     Returns
     -------
     Cut
-        Zeros; `needle_dynamics.compiled.cut.start` fills it.
+        Zeros; ``start`` fills it.
 
     """
     rows = _SPARE * (ceil(length / element) + layers) + 3

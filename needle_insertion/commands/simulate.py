@@ -51,10 +51,9 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
         ('depth', 'm', f'inserted length at the start (default {_DEPTH:g}; model steering: 0)'),
         ('force', 'N', f'insertion force (default {_FORCE:g})'),
         ('duration', 's', 'time to simulate (default: until the hub is at the skin)'),
-        ('interval', 's', f'time between samples (default: {_SAMPLES} of them; model steering: '
-         'a millimeter)'),
+        ('interval', 's', f'time between samples (default {_SAMPLES} of them, or 1 mm)'),
         ('tolerance', 'X', f'relative error of each interval (default {DEFAULT_TOLERANCE:g})'),
-    ):  # fmt: skip
+    ):
         parser.add_argument(f'--{name}', type=float, metavar=unit, help=words)
     start = parser.add_mutually_exclusive_group()
     start.add_argument(
