@@ -789,11 +789,11 @@ def test_a_clock_that_jumps_ahead_is_a_gap(ros_graph: RosGraph) -> None:
 
     def aimed() -> list[JointState]:
         bench.measure(0.0201)
-        return aims
+        return [one for one in aims if one.header.stamp.sec >= 200]
 
     ros_graph.spin_until(aimed, 'the reference')
     # Had it gone on, it would be at the target by now.
-    assert aims[0].position[0] < 0.021
+    assert aimed()[0].position[0] < 0.021
     assert 'continued after 1' in bench.value('last complaint')
     assert bench.value('stops latched') == '0'
     assert bench.value('target [m]') == '0.1'
