@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from math import inf
+from math import copysign, inf, sqrt
 from typing import Final, NamedTuple
 
 from needle_dynamics.arrays import BoolArray, FloatArray
@@ -152,7 +152,7 @@ def _arrive(a: Axis, state: FloatArray, punctured: BoolArray) -> None:
     for i in range(len(a.membranes)):
         if depth >= a.membranes[i] + a.strengths[i] / a.stiffness[i]:
             punctured[i] = True
-    if (depth >= a.reach and state[SPEED] > 0.0) or (depth <= 0.0 and state[SPEED] < 0.0):
+    if depth >= a.reach and state[SPEED] > 0.0:
         # The hub stops on the guide.
         state[SPEED] = 0.0
 
@@ -275,17 +275,10 @@ def carry_on(
         way = (before + 0.5 * rate * t) * t
         if not low < depth + way < high and way != 0.0:
             at = high if way > 0.0 else low
-            early, late = 0.0, t
-            for _ in range(_HALVINGS):
-                between = 0.5 * (early + late)
-                gone = (before + 0.5 * rate * between) * between
-                beyond = depth + gone >= at if way > 0.0 else depth + gone <= at
-                if beyond:
-                    late = between
-                else:
-                    early = between
-            t = late
             way = at - depth
+            # The root that does not cancel; rounding may take the square below zero.
+            root = sqrt(max(0.0, before * before + 2.0 * rate * way))
+            t = min(t, 2.0 * way / (before + copysign(root, way)))
             state[DEPTH] = at
         else:
             state[DEPTH] = depth + way

@@ -9,7 +9,7 @@ from needle_dynamics.arrays import FloatArray
 from needle_dynamics.compiled.axis import Axis, carry_on, DEPTH, push, SPEED
 from needle_dynamics.errors import InsertedLengthError
 from needle_dynamics.parameters import NeedleParameters
-from needle_dynamics.steering.needle import SteeredNeedle, triple
+from needle_dynamics.steering.needle import SteeredNeedle
 from needle_dynamics.steering.parameters import by_layer, SteeringParameters
 from needle_ros.errors import ParameterError
 import numpy as np
@@ -190,7 +190,8 @@ class Insertion:
 
         """
         self._check(duration, 'force', force)
-        shift = self._drifted(duration, tissue)
+        shift, _ = self.needle.checked(guide, tilt, roll, tissue)
+        self._drift_to(duration, shift)
         left = push(
             self.axis, self._state, self._punctured, float(force), float(duration), self._step
         )
@@ -232,7 +233,8 @@ class Insertion:
 
         """
         self._check(duration, 'velocity', velocity)
-        shift = self._drifted(duration, tissue)
+        shift, _ = self.needle.checked(guide, tilt, roll, tissue)
+        self._drift_to(duration, shift)
         left, force = carry_on(
             self.axis,
             self._state,
@@ -250,13 +252,11 @@ class Insertion:
         if not isfinite(value):
             raise ParameterError(f'{name} must be finite, got {value!r}')
 
-    def _drifted(self, duration: float, tissue: Sequence[float] | None) -> FloatArray:
+    def _drift_to(self, duration: float, shift: FloatArray) -> None:
         """Have the tissue move evenly to where it is wanted: the axis is in its frame."""
-        shift = self._tissue if tissue is None else triple(tissue)
         drift = float(shift[1] - self._tissue[1]) / duration
         self._state[SPEED] += self._drift - drift
         self._drift = drift
-        return shift
 
     def _across(
         self,

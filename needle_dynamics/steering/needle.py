@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import accumulate
 from math import ceil, exp, isfinite, sqrt
 from typing import Any, Final, NamedTuple
 
@@ -36,7 +37,6 @@ from needle_dynamics.steering.parameters import (
 from needle_ros.errors import ParameterError, ShapeError
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.signal import lfilter
 
 #: Nodes per element of the needle: a path that begins anew takes one more.
 _SPARE: Final = 2
@@ -160,7 +160,7 @@ def wandering(needle: NeedleParameters, steering: SteeringParameters, seed: int)
     keep = exp(-cell / steering.path_noise_length)
     draws = np.random.default_rng(seed).standard_normal((len(depths), 2))
     draws[1:] *= sqrt(1.0 - keep * keep)
-    turns = lfilter([1.0], [1.0, -keep], draws, axis=0)
+    turns = np.array(list(accumulate(draws, lambda last, draw: keep * last + draw)))
     ei, tissue = needle.bending_stiffness, needle.tissue
     # Where there is no tissue nothing turns the path.
     stiffness = [
@@ -319,21 +319,14 @@ class SteeredNeedle:
         """
         here = self.depth
         to = here if depth is None else _finite('depth', depth)
-        shift = self._shift if tissue is None else triple(tissue)
+        shift, given = self.checked(guide, tilt, roll, tissue)
         free = self.steering.free_length + float(shift[1])
         reach = self.needle.length - self.steering.free_length
-        if free < 0.0 or here < shift[1]:
-            raise ParameterError(f'tissue must stay between guide and tip, got {shift[1]:g} m')
         if not shift[1] <= to <= reach:
             raise ParameterError(
                 f'depth must be in [{shift[1]:g}, {reach:g}] m, the length of the needle '
                 f'without its free length, got {to!r} m'
             )
-        given = (
-            self._guide if guide is None else _pair('guide', guide),
-            self._tilt if tilt is None else _pair('tilt', tilt),
-            self._roll if roll is None else _finite('roll', roll),
-        )
         if (shift != self._shift).any():
             self._shift = shift
             if free != self._cut.pose[FREE]:
@@ -341,6 +334,43 @@ class SteeredNeedle:
             move(self._constants, self._cut, self._pose(here))
         self._guide, self._tilt, self._roll = given
         move(self._constants, self._cut, self._pose(to))
+
+    def checked(
+        self,
+        guide: Sequence[float] | None,
+        tilt: Sequence[float] | None,
+        roll: float | None,
+        tissue: ArrayLike | None,
+    ) -> tuple[FloatArray, tuple[tuple[float, float], tuple[float, float], float]]:
+        """
+        Check what `move` takes beside the depth.
+
+        Parameters
+        ----------
+        guide, tilt, roll, tissue : optional
+            As in `move`.
+
+        Returns
+        -------
+        shift : ndarray, shape (3,)
+            How far the tissue has moved [m].
+        given : tuple
+            Guide, tilt and roll; the present ones where they are not given.
+
+        Raises
+        ------
+        ShapeError, ParameterError
+            If a value is not valid.
+
+        """
+        shift = self._shift if tissue is None else _numbers('tissue', tissue, 3)
+        if self.steering.free_length + shift[1] < 0.0 or self.depth < shift[1]:
+            raise ParameterError(f'tissue must stay between guide and tip, got {shift[1]:g} m')
+        return shift, (
+            self._guide if guide is None else _pair('guide', guide),
+            self._tilt if tilt is None else _pair('tilt', tilt),
+            self._roll if roll is None else _finite('roll', roll),
+        )
 
     @property
     def depth(self) -> float:
@@ -442,29 +472,6 @@ def _finite(name: str, value: Any) -> float:
 def _pair(name: str, values: Sequence[float]) -> tuple[float, float]:
     x, z = _numbers(name, values, 2)
     return float(x), float(z)
-
-
-def triple(values: ArrayLike) -> FloatArray:
-    """
-    Return how far the tissue has moved as an array.
-
-    Parameters
-    ----------
-    values : array_like, shape (3,)
-        In x, y and z [m].
-
-    Returns
-    -------
-    ndarray, shape (3,)
-        The same.
-
-    Raises
-    ------
-    ShapeError, ParameterError
-        If there are other numbers of them, or they are not finite.
-
-    """
-    return _numbers('tissue', values, 3)
 
 
 def _numbers(name: str, values: ArrayLike, count: int) -> FloatArray:

@@ -37,6 +37,9 @@ _SHIFTED: Final = re.compile(r'^(.*?)\s*@\s*(\d{1,6})$')
 #: A first depth beyond this is that of another origin than the skin [m].
 _AT_THE_SKIN: Final = 0.03
 
+#: A robot at rest on the skin may be so far above it [m].
+_JITTER: Final = 1e-3
+
 
 def read_steering_table(
     path: Path | str, columns: Mapping[str, str], medium: str = ''
@@ -88,7 +91,12 @@ def read_steering_table(
     depth = values['depth']
     if not 0.0 <= depth[0] <= _AT_THE_SKIN or depth.min() < 0.0:
         losses.append(f'depths from the first, {1e3 * depth[0]:.4g} mm, which is at the skin')
-        depth = np.maximum(depth - depth[0], 0.0)
+        depth = depth - depth[0]
+    if depth.min() < -_JITTER:
+        raise RecordingError(
+            f'{path}: depth goes from the first row to {1e3 * depth.min():.4g} mm, out of the '
+            f'skin: if it counts out of the tissue, say --columns depth=-NAME'
+        )
     guide = np.column_stack([values['guide_x'], values['guide_z']])
     tip = np.column_stack([values['tip_x'], values['tip_z']])
     known = tip[np.isfinite(tip).all(axis=1)]
@@ -99,7 +107,7 @@ def read_steering_table(
     return SteeringRecording(
         name=str(path),
         medium=medium,
-        depth=depth,
+        depth=np.maximum(depth, 0.0),
         guide=guide,
         roll=values.get('roll', np.zeros(len(depth))),
         tip=tip,

@@ -15,7 +15,6 @@ from needle_identification.estimation.estimate import ParameterEstimate
 from needle_identification.estimation.formatting import between, measured
 from needle_identification.recordings.tables import column_roles
 from needle_identification.steering.estimate import SteeringEstimate
-from needle_identification.steering.identify import identify_steering, SteeringSettings
 from needle_identification.steering.recording import SteeringRecording
 from needle_identification.steering.response import ORDERS, TERMS
 from needle_identification.steering.tables import read_steering_table, STEERING_ROLES
@@ -118,6 +117,9 @@ def _read(
 
 
 def _run(options: argparse.Namespace) -> int:
+    # The search takes a large import, which other commands of this parser do not need.
+    from needle_identification import identify_steering, SteeringSettings
+
     terms = None
     if options.terms is not None:
         terms = tuple(word.strip() for word in options.terms.split(','))

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping
-from dataclasses import fields
+from dataclasses import asdict, fields
 import json
 from math import inf
 from pathlib import Path
 import sys
-from typing import Any
 
 from needle_dynamics import (
     FloatArray,
@@ -84,17 +82,13 @@ def _made(name: str, words: list[str]) -> tuple[NeedleParameters, SteeringParame
     }
     of_needle = {key: value for key, value in given.items() if key not in own}
     return (
-        from_values(NeedleParameters, {**_values(needle), **of_needle}),
-        from_values(SteeringParameters, {**_values(steering), **of_steering}),
+        from_values(NeedleParameters, {**asdict(needle), **of_needle}),
+        from_values(SteeringParameters, {**asdict(steering), **of_steering}),
     )
 
 
 def _single(value: object) -> bool:
     return isinstance(value, (int, float)) and not isinstance(value, bool)
-
-
-def _values(settings: Any) -> Mapping[str, Any]:
-    return {item.name: getattr(settings, item.name) for item in fields(settings)}
 
 
 def read_way(path: Path) -> dict[str, FloatArray]:

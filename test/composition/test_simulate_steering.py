@@ -31,13 +31,14 @@ def test_what_it_writes_is_identified_again(
     found, _ = said(
         capsys, *steering, '--way', str(way), '-o', str(run), '-o', str(picture), '--json'
     )
+    # Rounding, over two hundred intervals.
     assert found['depth at the end [m]'] == pytest.approx(0.1, abs=1e-12)
     assert picture.read_bytes().startswith(b'\x89PNG')
     with run.open(newline='') as stream:
         rows = list(csv.DictReader(stream))
     assert float(rows[-1]['tip_z [m]']) == found['tip at the end, z [m]']
     assert float(rows[-1]['guide_z [m]']) == pytest.approx(-2e-3)
-    # Friction of the preset, and what cuts.
+    # Friction of the preset, and what cuts; even within the interval, so that rounding is left.
     assert float(rows[50]['force [N]']) == pytest.approx(0.56 + 300.0 * 5e-3 + 0.8, rel=1e-9)
     assert main(['identify', 'steering', str(run), '--terms', 'bevel', '--json']) == 0
     identified = json.loads(capsys.readouterr().out)

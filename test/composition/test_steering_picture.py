@@ -16,8 +16,8 @@ def test_the_picture_is_the_present_one(tmp_path: Path) -> None:
     figure.savefig(tmp_path / 'now.png', dpi=120)
     now, kept = imread(tmp_path / 'now.png'), imread(SCRIPT.with_suffix('.png'))
     assert now.shape == kept.shape
-    # Another version of a font or of the drawing moves edges of letters, not lines and colors.
-    assert np.abs(now - kept).mean() < 0.01
+    # Rounding of colors on another machine; a needle with a tenth less curvature makes 0.001.
+    assert np.abs(now - kept).mean() < 3e-4
 
 
 def test_the_needles_bend_and_follow_their_paths() -> None:

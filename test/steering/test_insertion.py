@@ -205,12 +205,15 @@ def test_wrench_is_what_holds_the_needle() -> None:
         ({'duration': nan}, 'duration must be positive and finite, got nan s'),
         ({'force': inf}, 'force must be finite, got inf'),
         ({'guide': (nan, 0.0)}, 'guide must be finite'),
+        ({'tissue': (0.0, 0.06, 0.0)}, 'tissue must stay between guide and tip'),
     ],
 )
 def test_bad_inputs_are_named(values: dict[str, Any], words: str) -> None:
     one = Insertion(NEEDLE, STEERING, depth=0.05)
     with pytest.raises(ParameterError, match=words):
-        one.push(**{'duration': 0.01, 'force': 1.0} | values)
+        one.push(**{'duration': 0.01, 'force': 9.0} | values)
+    # Neither along nor across has anything moved.
+    assert (one.depth, one.needle.depth, one.velocity, one.time) == (0.05, 0.05, 0.0, 0.0)
 
 
 def test_bad_constants_are_named() -> None:
