@@ -37,7 +37,7 @@ from scipy.special import ndtr, ndtri
 _RATIOS: Final = np.geomspace(0.02, 2e6, 10)
 
 #: Number of times of correlation, from half a part to so many times the recording.
-_TIMES: Final = 12
+_TIMES: Final = 24
 _LONGEST: Final = 10.0
 
 #: Probability of white noise before anything is seen. Half is too much: a memory of a fifth of a

