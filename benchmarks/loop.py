@@ -16,7 +16,6 @@ from needle_controller import (
     Supervisor,
 )
 from needle_dynamics import NeedleParameters
-from needle_dynamics.simulated.plant import Sample
 from needle_dynamics.simulated.run import PlantRun
 from needle_ros.contract import BASE_WRENCH, JOINT_STATES, TIP_DEFLECTION
 from needle_ros.errors import MessageError
@@ -173,9 +172,7 @@ class Loop:
             self._arrive(name_, what, fault if topic == 'wrench_command' else None)
         self._answer(self.supervisor.watch(self.now, self.publishers), None)
         self.run.commands.count_commanders(self.publishers['wrench_command'])
-        sample = self.run.sample
-        if isinstance(sample, Sample):
-            self.depth = sample.depth
+        self.depth = self.run.plant.depth
         self.acting = self.run.commands.held.force
 
     def _written(self, name: str, sent: Sent) -> bytes:

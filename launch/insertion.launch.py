@@ -30,8 +30,13 @@ ARGUMENTS = {
     ),
     'preset': (
         '',
-        'constants of the model in plant and controller',
-        ['', 'phantom', 'paper_si', 'paper_mm'],
+        'constants of the model in plant and controller, such as phantom or bending_35mm',
+        [],
+    ),
+    'steered': (
+        '',
+        'the needle bends, cuts its own path, and has a guide that moves',
+        ['', 'true', 'false'],
     ),
     'law': ('', 'law of the controller', ['', 'adaptive', 'inverse_dynamics', 'pid']),
     'lockstep': (
@@ -60,6 +65,7 @@ PARAMETERS = {
     'plant': {
         'mode': 'mode',
         'preset': 'model.preset',
+        'steered': 'steered',
         'lockstep': 'lockstep',
         'real_time_factor': 'real_time_factor',
     },

@@ -45,6 +45,9 @@ _RETRACT = 'retract_depth'
 #: Where to retract to by default [m], or as near to it as the range of depths has.
 _RETRACT_DEPTH = 0.01
 
+#: Joints that no axis law moves.
+_GUIDE = {joint.name for joint in contract.STEERING_JOINTS}
+
 #: Sources of what is known of the bending.
 FEEDBACKS = ('observer', 'ground_truth', 'none')
 
@@ -260,6 +263,9 @@ class ControllerNode(ModelNode):
         )
 
     def _on_trajectory(self, message: JointTrajectory) -> None:
+        if message.joint_names and {*message.joint_names} <= _GUIDE:
+            # The guide of a needle that is steered: that is for the plant.
+            return
         # One more than may be is enough to refuse it.
         points = message.points[: MOST_POINTS + 1]
         self._act(

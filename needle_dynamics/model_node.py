@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from needle_dynamics.parameters import DEFAULT_PRESET, NeedleParameters, PRESETS
+from needle_dynamics.parameters import DEFAULT_PRESET, NeedleParameters
+from needle_dynamics.steering.parameters import NEEDLES
 from needle_ros.base_node import BaseNode
 from rcl_interfaces.msg import ParameterDescriptor
 
@@ -19,10 +20,10 @@ class ModelNode(BaseNode):
         self.declare_parameter(
             'model.preset',
             DEFAULT_PRESET,
-            ParameterDescriptor(description=f'one of {", ".join(PRESETS)}', read_only=True),
+            ParameterDescriptor(description=f'one of {", ".join(NEEDLES)}', read_only=True),
         )
         preset = self.get_parameter('model.preset').value
-        self.declare_settings('model.', PRESETS.get(preset, NeedleParameters()))
+        self.declare_settings('model.', NEEDLES.get(preset, NeedleParameters()))
 
     def model_parameters(self, changes: Mapping[str, Any] | None = None) -> NeedleParameters:
         """
@@ -44,5 +45,5 @@ class ModelNode(BaseNode):
             If a constant is not valid; the message names the parameter.
 
         """
-        self.text('model.preset', tuple(PRESETS))
+        self.text('model.preset', tuple(NEEDLES))
         return self.settings('model.', NeedleParameters, changes)

@@ -6,19 +6,19 @@ from collections.abc import Callable, Mapping
 from dataclasses import fields
 from functools import partial
 import json
-from math import cos, sin
+from math import hypot, sqrt
 import sys
 from time import monotonic_ns
 from typing import Any
 
 from builtin_interfaces.msg import Time as TimeMessage
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from geometry_msgs.msg import Point, Pose, PoseArray
+from geometry_msgs.msg import Point, Pose, PoseArray, Quaternion
 from needle_dynamics.compiled.cache import announce_compilation
 from needle_dynamics.model_node import ModelNode
-from needle_dynamics.simulated.assembly import LARGEST_SEED, MODES, SETTINGS
+from needle_dynamics.simulated.assembly import defaults_of, LARGEST_SEED, MODES, SETTINGS
 from needle_dynamics.simulated.faults import Fault, FaultParameters, FAULTS, FAULTY
-from needle_dynamics.simulated.plant import Plant, Sample
+from needle_dynamics.simulated.measured import Outline
 from needle_dynamics.simulated.run import Event, PARAMETERS, PlantRun, RESET, TARE, TRAJECTORY
 from needle_ros import contract
 from needle_ros.errors import JobError, NeedleError, ParameterError, printable
@@ -28,7 +28,6 @@ from needle_ros.sample_clock import SampleClock
 from needle_ros.timing import NANOSECONDS, RateCounter, seconds
 from needle_ros.trajectories import MOST_POINTS
 from needle_ros.wire import Reading
-import numpy as np
 from rcl_interfaces.msg import IntegerRange, ParameterDescriptor
 from rclpy.clock import Clock as NodeClock
 from rclpy.clock_type import ClockType
@@ -48,14 +47,34 @@ _TOO_MANY = 3.0
 
 _NO_FAULT = 'none'
 
-#: Pictures of the needle per second, points of each, and width of the line [m].
+#: Pictures of the needle per second, and width of its line and of that of its path [m].
 _PICTURES = 30.0
-_POINTS = 21
-_WIDTH = 1e-3
+_WIDTH, _PATH_WIDTH = 1e-3, 5e-4
 
 
 def _message(stamp: int) -> TimeMessage:
     return TimeMessage(sec=stamp // NANOSECONDS, nanosec=stamp % NANOSECONDS)
+
+
+def _line(name: str, width: float, shade: float) -> Marker:
+    """Return a line in the frame of the entry point."""
+    line = Marker(ns=name, type=Marker.LINE_STRIP)
+    line.header.frame_id = contract.ENTRY
+    line.pose.orientation.w = 1.0
+    line.scale.x = width
+    line.color.r = line.color.g = line.color.b = shade
+    line.color.a = 1.0
+    return line
+
+
+def _along(slope_x: float, slope_z: float) -> Quaternion:
+    """Return the shortest turn that brings y along a needle of these slopes."""
+    # From (0, 1, 0) to (slope_x, 1, slope_z): half the angle about their common normal.
+    across = hypot(slope_x, slope_z)
+    length = sqrt(1.0 + across * across)
+    cosine = sqrt(0.5 * (1.0 + 1.0 / length))
+    share = 0.5 / (length * cosine)
+    return Quaternion(x=share * slope_z, z=-share * slope_x, w=cosine)
 
 
 class PlantNode(ModelNode):
@@ -66,10 +85,11 @@ class PlantNode(ModelNode):
     the needle moves under ``wrench_command`` (force.y, torque.x); in mode `robot` the base
     follows ``joint_trajectory`` (joint `insertion`: positions, or efforts for a push). Both
     publish ``joint_states``, ``base_wrench``, ``tip_deflection`` and ``ground_truth``, and for
-    people ``needle_shape`` and ``needle_poses``. In mode `indenter` the end-effector presses the
-    tissue by ``joint_trajectory`` (efforts of the joints `x` and `z`) and publishes
-    ``base_wrench`` and ``end_effector_pose``. A trajectory begins when it comes, or with the
-    activation if it came before.
+    people ``needle_shape`` and ``needle_poses``. With ``steered`` the needle bends and cuts its
+    path, and its guide and roll follow ``joint_trajectory`` in both modes. In mode `indenter`
+    the end-effector presses the tissue by ``joint_trajectory`` (efforts of the joints `x` and
+    `z`) and publishes ``base_wrench`` and ``end_effector_pose``. A trajectory begins when it
+    comes, or with the activation if it came before.
 
     Samples are taken at exact multiples of the period of simulated time, see `SampleClock`; with
     ``publish_clock`` or ``lockstep`` it is /clock. `Commands` decides which command acts from one
@@ -105,10 +125,14 @@ class PlantNode(ModelNode):
                 integer_range=[IntegerRange(from_value=0, to_value=LARGEST_SEED)],
             ),
         )
+        self.declare_text(
+            'steered', False, 'the needle bends, cuts its own path, and has a guide that moves'
+        )
         self.declare_model()
-        for prefix, defaults in SETTINGS.items():
+        preset = str(self.get_parameter('model.preset').value)
+        for prefix in SETTINGS:
             if prefix != 'model.':
-                self.declare_settings(prefix, defaults)
+                self.declare_settings(prefix, defaults_of(prefix, preset))
         self.declare_text('fault.kind', _NO_FAULT, f'{_NO_FAULT}, or one of {", ".join(FAULTS)}')
         self.declare_text('fault.topic', 'joint_states', f'one of {", ".join(FAULTY)}')
         self.declare_settings('fault.', FaultParameters())
@@ -150,12 +174,8 @@ class PlantNode(ModelNode):
         self.create_service(Trigger, '~/step', self._on_step)
         self.create_service(Trigger, '~/reset', self._on_reset)
 
-        self._shape = Marker(ns='needle', type=Marker.LINE_STRIP)
-        self._shape.header.frame_id = contract.ENTRY
-        self._shape.pose.orientation.w = 1.0
-        self._shape.scale.x = _WIDTH
-        self._shape.color.r = self._shape.color.g = self._shape.color.b = 0.8
-        self._shape.color.a = 1.0
+        self._shape = _line('needle', _WIDTH, 0.8)
+        self._path = _line('path', _PATH_WIDTH, 0.4)
         self._poses = PoseArray()
         self._poses.header.frame_id = contract.ENTRY
 
@@ -195,7 +215,7 @@ class PlantNode(ModelNode):
         )
         self._set_fault({})
         # Compile, or load what was compiled, before time counts.
-        constants.make().advance()
+        constants.make().take(0.0, 0.0)
         self._publish = {
             name: partial(self._write, self._streams[name], topic.template().serialize)
             for name, topic in plant_run.topics.items()
@@ -212,8 +232,8 @@ class PlantNode(ModelNode):
         self._run = plant_run
         if publishes:
             self._clock_topic = self.publisher(contract.CLOCK, always=True)
-        if mode != 'simulation':
-            # There it is the reference of a controller.
+        if mode != 'simulation' or constants.steered:
+            # There `insertion` is the reference of a controller.
             self._trajectories = self.subscribe(contract.JOINT_TRAJECTORY, self._on_trajectory)
 
     @staticmethod
@@ -273,10 +293,14 @@ class PlantNode(ModelNode):
     def about(self) -> str:
         """Name mode, constants, rate and topics."""
         values = self.values()
-        takes = contract.JOINT_TRAJECTORY if self._trajectories else contract.WRENCH_COMMAND
+        takes = [contract.JOINT_TRAJECTORY.name] if self._trajectories else []
+        if values['mode'] == 'simulation':
+            takes.append(contract.WRENCH_COMMAND.name)
+        steered = ', steered' if values['steered'] else ''
         return (
-            f'mode {values["mode"]}, preset {values["model.preset"]}, {values["rate"]:g} Hz; '
-            f'takes {takes.name}, publishes {", ".join(self._publish)}'
+            f'mode {values["mode"]}{steered}, preset {values["model.preset"]}, '
+            f'{values["rate"]:g} Hz; takes {" and ".join(takes)}, publishes '
+            f'{", ".join(self._publish)}'
         )
 
     def deactivate(self) -> None:
@@ -470,28 +494,28 @@ class PlantNode(ModelNode):
         self._events.publish(array)
 
     def _draw(self, plant_run: PlantRun, stamp: int) -> None:
-        """Show the shape of the needle, from its base through the entry point to its tip."""
-        plant, sample = plant_run.plant, plant_run.sample
-        seen = self._needle_shape.get_subscription_count()
-        if not (seen or self._needle_poses.get_subscription_count()):
+        """Show the shape of the needle from its base to its tip, and the path that it cut."""
+        if not (
+            self._needle_shape.get_subscription_count()
+            or self._needle_poses.get_subscription_count()
+        ):
             return
-        if not isinstance(plant, Plant) or not isinstance(sample, Sample):
+        seen: Outline | None = plant_run.plant.outline()
+        if seen is None:
             return
-        model = plant.integrator.model
-        points = model.shape(sample.state, _POINTS)
-        slopes = np.gradient(points[:, 1], points[:, 0])
-        outside = model.parameters.length - sample.depth
-        shape, poses = self._shape, self._poses
-        shape.header.stamp = poses.header.stamp = _message(stamp)
-        shape.points = [Point(y=-outside), *(Point(y=y, z=z) for y, z in points.tolist())]
-        self._needle_shape.publish(shape)
-        poses.poses = []
-        for (y, z), slope in zip(points.tolist(), np.arctan(slopes).tolist(), strict=True):
-            pose = Pose(position=Point(y=y, z=z))
-            # Along the needle is y of the pose.
-            pose.orientation.x, pose.orientation.w = sin(0.5 * slope), cos(0.5 * slope)
-            poses.poses.append(pose)
-        self._needle_poses.publish(poses)
+        lines = [(self._shape, [seen.base.tolist(), *seen.points.tolist()])]
+        if len(seen.path):
+            lines.append((self._path, seen.path.tolist()))
+        for line, points in lines:
+            line.header.stamp = _message(stamp)
+            line.points = [Point(x=x, y=y, z=z) for x, y, z in points]
+            self._needle_shape.publish(line)
+        self._poses.header.stamp = _message(stamp)
+        self._poses.poses = [
+            Pose(position=Point(x=x, y=y, z=z), orientation=_along(*slopes))
+            for (x, y, z), slopes in zip(seen.points.tolist(), seen.slopes.tolist(), strict=True)
+        ]
+        self._needle_poses.publish(self._poses)
 
     def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
         """Say where the needle is, how time goes, and what went wrong."""

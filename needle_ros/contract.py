@@ -16,9 +16,16 @@ from needle_ros.wire import JOINT_STATE, POINT, POSE, Template, WRENCH
 ENTRY: Final = 'needle_entry'
 BASE: Final = 'needle_base'
 
-#: The joint along the needle, and the one about it.
+#: The joint along the needle, and that of the base about x.
 INSERTION: Final = 'insertion'
 ROTATION: Final = 'rotation'
+
+#: The joints of a robot that steers: the guide across the needle, its tilt, and the roll.
+GUIDE_X: Final = 'guide_x'
+GUIDE_Z: Final = 'guide_z'
+TILT_X: Final = 'guide_tilt_x'
+TILT_Z: Final = 'guide_tilt_z'
+ROLL: Final = 'roll'
 
 EVERY_NODE: Final = 'every node'
 USER: Final = 'user'
@@ -180,9 +187,30 @@ JOINT_STATES: Final = Topic(
     JOINT_STATE,
     'plant',
     'encoders of the robot: inserted length and rotation; effort: axial force and torque '
-    'on the needle',
+    'on the needle; steered: `insertion`, `guide_x`, `guide_z` [m], `guide_tilt_x`, '
+    '`guide_tilt_z`, `roll` [rad]',
     joints=(Joint(INSERTION, 'm', 'N'), Joint(ROTATION, 'rad', 'N m')),
 )
+
+#: The joints beside `insertion` of a needle that is steered.
+STEERING_JOINTS: Final = (
+    Joint(GUIDE_X, 'm', 'N'), Joint(GUIDE_Z, 'm', 'N'), Joint(TILT_X, 'rad', 'N m'),
+    Joint(TILT_Z, 'rad', 'N m'), Joint(ROLL, 'rad', 'N m'),
+)  # fmt: skip
+
+
+def steered_states() -> Topic:
+    """
+    Return `JOINT_STATES` of a needle that is steered.
+
+    Returns
+    -------
+    Topic
+        The topic with `insertion` and the joints of the guide.
+
+    """
+    return replace(JOINT_STATES, joints=(JOINT_STATES.joints[0], *STEERING_JOINTS))
+
 
 BASE_WRENCH: Final = Topic(
     'base_wrench',
@@ -197,7 +225,8 @@ TIP_DEFLECTION: Final = Topic(
     'tip_deflection',
     POINT,
     'plant',
-    'tracker or imager: `point.y` inserted length, `point.z` deflection of the tip [m]',
+    'tracker or imager: `point.y` inserted length, `point.z` deflection of the tip [m]; '
+    'steered: `point.x` too',
     frame=ENTRY,
 )
 
@@ -206,7 +235,8 @@ GROUND_TRUTH: Final = Topic(
     JOINT_STATE,
     'plant',
     'simulation only: d (length outside the tissue), theta and q1..qn, the whole state; '
-    'effort, in mode `simulation`: generalized forces that were applied since the sample before',
+    'steered: d, `tip_x`, `tip_z` [m], `tip_roll` [rad]; effort, in mode `simulation`: '
+    'generalized forces that were applied since the sample before',
     joints=(Joint('d', 'm'), Joint('theta', 'rad'), Joint('q1', 'm^1.5'), Joint('q2', 'm^1.5')),
 )
 
@@ -235,6 +265,30 @@ def ground_truth(modes: int, *, commanded: bool) -> Topic:
     return replace(GROUND_TRUTH, joints=joints)
 
 
+def steered_truth(*, commanded: bool) -> Topic:
+    """
+    Return `GROUND_TRUTH` of a needle that is steered.
+
+    Parameters
+    ----------
+    commanded : bool
+        As for `ground_truth`.
+
+    Returns
+    -------
+    Topic
+        The topic with where the tip is.
+
+    """
+    joints: tuple[Joint, ...] = (
+        Joint('d', 'm', 'N'), Joint('tip_x', 'm', 'N'), Joint('tip_z', 'm', 'N'),
+        Joint('tip_roll', 'rad', 'N m'),
+    )  # fmt: skip
+    if not commanded:
+        joints = tuple(joint._replace(effort='') for joint in joints)
+    return replace(GROUND_TRUTH, joints=joints)
+
+
 END_EFFECTOR_POSE: Final = Topic(
     'end_effector_pose',
     POSE,
@@ -247,7 +301,7 @@ NEEDLE_SHAPE: Final = Topic(
     'needle_shape',
     'visualization_msgs/msg/Marker',
     'plant',
-    'the needle as a line, 30 Hz while there is a subscriber',
+    'the needle as a line, and the path that it cut, 30 Hz while there is a subscriber',
     frame=ENTRY,
 )
 
@@ -328,8 +382,9 @@ JOINT_TRAJECTORY: Final = Topic(
     'trajectory_msgs/msg/JointTrajectory',
     USER,
     'to the controller: `insertion`, positions [m] to follow, and velocities [m/s] or '
-    'none; to a plant in mode `robot`: `insertion`, positions [m], or efforts [N] of a push; in '
-    'mode `indenter`: efforts of `x` and `z` [N]',
+    'none; to a plant in mode `robot`: `insertion`, positions [m], or efforts [N] of a push; '
+    'steered, in both modes: guide and roll [m, rad]; in mode `indenter`: efforts of `x` and '
+    '`z` [N]',
     qos=COMMAND,
 )
 

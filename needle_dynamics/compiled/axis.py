@@ -237,8 +237,14 @@ def push(
 
 @compiled
 def carry_on(
-    a: Axis, state: FloatArray, punctured: BoolArray, speed: float, duration: float, step: float
-) -> tuple[float, float]:
+    a: Axis,
+    state: FloatArray,
+    punctured: BoolArray,
+    speed: float,
+    duration: float,
+    step: float,
+    felt: FloatArray,
+) -> float:
     """
     Advance with the needle brought evenly to a velocity, whatever force that takes.
 
@@ -256,44 +262,46 @@ def carry_on(
         Time [s].
     step : float
         Longest step [s].
+    felt : ndarray, shape (parts,)
+        Overwritten with the mean force over each of the equal parts of the time [N].
 
     Returns
     -------
-    left : float
+    float
         Time that is left when the needle has left the tissue [s]; 0 otherwise.
-    force : float
-        Mean force over the time that it took [N].
 
     """
     rate = (speed - state[SPEED]) / duration
-    left, impulse = duration, 0.0
-    while left > 0.0:
-        t = min(step, left)
-        depth, before = state[DEPTH], state[SPEED]
-        low, high = _events(a, state, punctured)
-        touches = depth >= state[DEEPEST]
-        way = (before + 0.5 * rate * t) * t
-        if not low < depth + way < high and way != 0.0:
-            at = high if way > 0.0 else low
-            way = at - depth
-            # The root that does not cancel; rounding may take the square below zero.
-            root = sqrt(max(0.0, before * before + 2.0 * rate * way))
-            t = min(t, 2.0 * way / (before + copysign(root, way)))
-            state[DEPTH] = at
-        else:
-            state[DEPTH] = depth + way
-        state[SPEED] = speed if t == left else before + rate * t
-        r = resistance(a, min(max(depth + 0.5 * way, low), high), touches, punctured)
-        mean = before + 0.5 * rate * t
-        impulse += t * (a.mass * rate + r.elastic + _held(a, r, mean))
-        left -= t
-        if state[DEPTH] <= 0.0 and way < 0.0:
-            state[DEPTH] = 0.0
-            return max(left, 1e-300), impulse / (duration - left)
-        if state[DEPTH] >= a.reach and way > 0.0:
-            return max(left, 1e-300), impulse / (duration - left)
-        _arrive(a, state, punctured)
-    return 0.0, impulse / duration
+    left = duration
+    for k in range(len(felt)):
+        begin, end, impulse = left, duration * ((len(felt) - 1 - k) / len(felt)), 0.0
+        while left > end:
+            t = min(step, left - end)
+            depth, before = state[DEPTH], state[SPEED]
+            low, high = _events(a, state, punctured)
+            touches = depth >= state[DEEPEST]
+            way = (before + 0.5 * rate * t) * t
+            if not low < depth + way < high and way != 0.0:
+                at = high if way > 0.0 else low
+                way = at - depth
+                # The root that does not cancel; rounding may take the square below zero.
+                root = sqrt(max(0.0, before * before + 2.0 * rate * way))
+                t = min(t, 2.0 * way / (before + copysign(root, way)))
+                state[DEPTH] = at
+            else:
+                state[DEPTH] = depth + way
+            state[SPEED] = speed if t == left else before + rate * t
+            r = resistance(a, min(max(depth + 0.5 * way, low), high), touches, punctured)
+            mean = before + 0.5 * rate * t
+            impulse += t * (a.mass * rate + r.elastic + _held(a, r, mean))
+            left = end if t == left - end else left - t
+            state[DEPTH] = max(state[DEPTH], 0.0)
+            if (state[DEPTH] == 0.0 and way < 0.0) or (state[DEPTH] >= a.reach and way > 0.0):
+                felt[k:] = impulse / (begin - left)
+                return max(left, 1e-300)
+            _arrive(a, state, punctured)
+        felt[k] = impulse / (begin - end)
+    return 0.0
 
 
 @inlined

@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, field, fields
 from typing import Any, Final
 
 from needle_dynamics.model import NeedleModel
-from needle_dynamics.parameters import NeedleParameters, PRESETS
+from needle_dynamics.parameters import NeedleParameters
 from needle_dynamics.simulated.base import BaseMotion, BaseParameters
 from needle_dynamics.simulated.force_sensor import (
     ForceSensor,
@@ -16,8 +16,12 @@ from needle_dynamics.simulated.force_sensor import (
 )
 from needle_dynamics.simulated.indenter import Indenter, IndenterParameters
 from needle_dynamics.simulated.integrator import Integrator
+from needle_dynamics.simulated.measured import SimulatedPlant
 from needle_dynamics.simulated.plant import Plant
+from needle_dynamics.simulated.steered import GuideParameters, SteeredPlant
 from needle_dynamics.simulated.tip_sensor import TipParameters, TipSensor
+from needle_dynamics.steering.insertion import Insertion
+from needle_dynamics.steering.parameters import NEEDLES, STEERING_PRESETS, SteeringParameters
 from needle_ros.errors import ParameterError
 from needle_ros.settings import check_constants, constant, from_values
 
@@ -80,7 +84,33 @@ SETTINGS: Final[Mapping[str, Any]] = {
     'tip.': TipParameters(),
     'base.': BaseParameters(),
     'indenter.': IndenterParameters(),
+    'steering.': SteeringParameters(),
+    'guide.': GuideParameters(),
 }
+
+
+def defaults_of(prefix: str, preset: str) -> Any:
+    """
+    Return the settings of a namespace that a preset has.
+
+    Parameters
+    ----------
+    prefix : str
+        One of the namespaces of `SETTINGS`.
+    preset : str
+        Name of the needle and the tissue, ``model.preset``.
+
+    Returns
+    -------
+    object
+        The settings.
+
+    """
+    if prefix == 'model.' and preset in NEEDLES:
+        return NEEDLES[preset]
+    if prefix == 'steering.' and preset in STEERING_PRESETS:
+        return STEERING_PRESETS[preset].steering
+    return SETTINGS[prefix]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -106,17 +136,26 @@ class PlantConstants:
         Robot of mode `robot`.
     indenter : IndenterParameters
         Tissue and robot of mode `indenter`.
+    steered : bool
+        Whether the needle bends and cuts its own path.
+    steering : SteeringParameters
+        What such a needle has beyond `model`.
+    guide : GuideParameters
+        What moves its guide and turns it.
 
     """
 
     mode: str
     seed: int
+    steered: bool
     own: PlantSettings
     model: NeedleParameters
     sensor: ForceSensorParameters
     tip: TipParameters
     base: BaseParameters
     indenter: IndenterParameters
+    steering: SteeringParameters
+    guide: GuideParameters
 
     @classmethod
     def of(cls, values: Mapping[str, Any]) -> PlantConstants:
@@ -142,29 +181,33 @@ class PlantConstants:
 
         """
         mode, preset = values.get('mode', MODES[0]), values.get('model.preset', 'paper_si')
-        for name, value, valid in (('mode', mode, MODES), ('model.preset', preset, PRESETS)):
+        for name, value, valid in (('mode', mode, MODES), ('model.preset', preset, NEEDLES)):
             if not isinstance(value, str) or value not in valid:
                 raise ParameterError(f'{name} must be one of {", ".join(valid)}, got {value!r}')
         made = {}
         for prefix, defaults in SETTINGS.items():
             names = {item.name: f'{prefix}{item.name}' for item in fields(defaults)}
             given = {name: values[full] for name, full in names.items() if full in values}
-            if prefix == 'model.':
-                given = {**asdict(PRESETS[preset]), **given}
+            given = {**asdict(defaults_of(prefix, preset)), **given}
             made[prefix.rstrip('.') or 'own'] = from_values(type(defaults), given, prefix)
         seed = values.get('seed', 1)
         if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed <= LARGEST_SEED:
             raise ParameterError(f'seed must be an integer from 0 to 2^62, got {seed!r}')
-        return cls(mode=mode, seed=seed, **made)
+        steered = values.get('steered', False)
+        if not isinstance(steered, bool):
+            raise ParameterError(f'steered must be true or false, got {steered!r}')
+        if steered and mode == 'indenter':
+            raise ParameterError('steered must be false in mode indenter: there is no needle')
+        return cls(mode=mode, seed=seed, steered=steered, **made)
 
-    def make(self) -> Plant | Indenter:
+    def make(self) -> SimulatedPlant:
         """
         Make the plant at its start.
 
         Returns
         -------
-        Plant or Indenter
-            The plant.
+        SimulatedPlant
+            A `Plant`, a `SteeredPlant` or an `Indenter`.
 
         Raises
         ------
@@ -176,12 +219,32 @@ class PlantConstants:
         """
         own, rate = self.own, self.own.rate
         sensor = ForceSensor(self.sensor, rate, self.seed)
-        tip = TipSensor(self.tip, rate, self.seed)
+        tip = TipSensor(self.tip, rate, self.seed, spatial=self.steered)
         if self.mode == 'indenter':
             return Indenter(self.indenter, sensor, rate, self.seed, own.force_limit)
+        if self.steered:
+            return self._steered(sensor, tip)
         state = NeedleModel(self.model).state_at(own.depth, own.tip_deflection, own.modal)
-        base = None
-        if self.mode == 'robot':
-            depths = self.model.minimum_depth, self.model.length
-            base = BaseMotion(self.base, own.depth, depths, own.force_limit)
-        return Plant(Integrator(self.model, state, own.step), sensor, rate, base, tip)
+        integrator = Integrator(self.model, state, own.step)
+        return Plant(integrator, sensor, rate, self._base(self.model.length), tip)
+
+    def _steered(self, sensor: ForceSensor, tip: TipSensor) -> SteeredPlant:
+        own = self.own
+        if own.tip_deflection or own.modal:
+            raise ParameterError(
+                'tip_deflection must be 0 and modal empty for a needle that is steered: it begins '
+                'straight'
+            )
+        insertion = Insertion(
+            self.model, self.steering, depth=own.depth, step=own.step, seed=self.seed
+        )
+        # Short of the hub, on which a robot must not run.
+        base = self._base(insertion.axis.reach - self.model.minimum_depth)
+        return SteeredPlant(insertion, sensor, tip, own.rate, self.guide, self.base, base)
+
+    def _base(self, deepest: float) -> BaseMotion | None:
+        """Return the robot of mode `robot`."""
+        if self.mode != 'robot':
+            return None
+        depths = self.model.minimum_depth, deepest
+        return BaseMotion(self.base, self.own.depth, depths, self.own.force_limit)

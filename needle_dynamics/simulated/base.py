@@ -68,6 +68,8 @@ class BaseMotion:
         Least and largest inserted length [m].
     force_limit : float
         Largest force of a push [N].
+    what, unit : str
+        What follows a trajectory and its unit, for messages: it may be another joint.
 
     """
 
@@ -77,8 +79,11 @@ class BaseMotion:
         depth: float,
         reach: tuple[float, float],
         force_limit: float = inf,
+        what: str = 'trajectory',
+        unit: str = 'm',
     ) -> None:
         self.limits = parameters
+        self._what, self._unit = what, unit
         self._range = reach
         self._force_limit = force_limit
         #: Force of the push under way [N].
@@ -129,7 +134,8 @@ class BaseMotion:
         # Written so that NaN is refused too.
         if not all(low <= at <= high for at in depths if at is not None):
             raise ParameterError(
-                f'trajectory must stay in [{low:g}, {high:g}] m, got {list(depths)} m'
+                f'{self._what} must stay in [{low:g}, {high:g}] {self._unit}, got '
+                f'{list(depths)} {self._unit}'
             )
         if None in ends:
             raise ParameterError('each point needs a position or an effort')
@@ -146,6 +152,11 @@ class BaseMotion:
         columns = zip(*first, *points, strict=True)
         offsets, self._depths, self._forces, self._pushes = map(np.array, columns)
         self._times = start + offsets
+
+    @property
+    def end(self) -> float:
+        """Time of the last point [s], on the clock of `speed`."""
+        return float(self._times[-1])
 
     def push(self, time: float, depth: float, interval: float) -> float | None:
         """

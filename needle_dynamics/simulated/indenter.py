@@ -8,9 +8,12 @@ from itertools import pairwise
 from math import hypot
 
 from needle_dynamics.arrays import FloatArray
+from needle_dynamics.parameters import NeedleParameters
 from needle_dynamics.simulated.base import on_grid
 from needle_dynamics.simulated.force_sensor import ForceSensor
+from needle_dynamics.simulated.measured import Measurement
 from needle_dynamics.simulated.plant import AT_REST
+from needle_ros.contract import BASE_WRENCH, END_EFFECTOR_POSE, Topic
 from needle_ros.errors import JobError, ParameterError
 from needle_ros.settings import check_constants, constant
 from needle_ros.trajectories import check_times, joint_values
@@ -125,6 +128,11 @@ class Indenter:
 
     """
 
+    #: No needle is inserted.
+    depth = 0.0
+
+    topics: tuple[Topic, ...] = (BASE_WRENCH, END_EFFECTOR_POSE)
+
     def __init__(
         self,
         parameters: IndenterParameters,
@@ -210,6 +218,42 @@ class Indenter:
             raise JobError('the end-effector moves; it must rest')
         self._sensor.tare()
 
+    def change(self, _parameters: NeedleParameters) -> None:
+        """
+        Go on as before: there is no needle.
+
+        Parameters
+        ----------
+        _parameters : NeedleParameters
+            Constants of a needle.
+
+        """
+
+    def take(self, _force: float, _torque: float) -> list[Measurement]:
+        """
+        Advance by one sample interval, and say what is published of it.
+
+        Parameters
+        ----------
+        _force, _torque : float
+            Not used: commands do not act on the end-effector.
+
+        Returns
+        -------
+        list of Measurement
+            Of each topic.
+
+        """
+        press = self.advance()
+        pose = [*press.position.tolist(), 0.0, 0.0, 0.0, 1.0]
+        return [
+            (BASE_WRENCH.name, 0, press.wrench.tolist()),
+            (END_EFFECTOR_POSE.name, 0, pose),
+        ]
+
+    def outline(self) -> None:
+        """Return None: there is no needle to see."""
+
     def displacement(self, force: FloatArray) -> FloatArray:
         """
         Return where a force presses the tissue, ``F = K(|F|) d``.
@@ -237,14 +281,9 @@ class Indenter:
             ]
         )
 
-    def advance(self, _force: float = 0.0, _torque: float = 0.0) -> Press:
+    def advance(self) -> Press:
         """
-        Advance by one sample interval; commands do not act on the end-effector.
-
-        Parameters
-        ----------
-        _force, _torque : float
-            Not used: they let an indenter stand for a `Plant`.
+        Advance by one sample interval.
 
         Returns
         -------

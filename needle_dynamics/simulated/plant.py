@@ -9,11 +9,21 @@ from typing import Final, NamedTuple
 
 from needle_dynamics.arrays import FloatArray
 from needle_dynamics.friction import Friction
+from needle_dynamics.parameters import NeedleParameters
 from needle_dynamics.simulated.base import BaseMotion, on_grid
 from needle_dynamics.simulated.force_sensor import ForceSensor
 from needle_dynamics.simulated.integrator import Integrator, Interval
+from needle_dynamics.simulated.measured import Measurement, Outline
 from needle_dynamics.simulated.tip_sensor import TipParameters, TipReading, TipSensor
-from needle_ros.contract import INSERTION
+from needle_ros.contract import (
+    BASE_WRENCH,
+    GROUND_TRUTH,
+    ground_truth,
+    INSERTION,
+    JOINT_STATES,
+    TIP_DEFLECTION,
+    Topic,
+)
 from needle_ros.errors import JobError, ParameterError
 from needle_ros.trajectories import joint_values
 import numpy as np
@@ -22,6 +32,9 @@ import numpy as np
 #: velocity follow it at once, and a velocity of now beside a mean force would be half an interval
 #: late.
 _PUSHES: Final = 4
+
+#: Points of an outline.
+_POINTS: Final = 21
 
 #: Velocity below which the sensor may be zeroed [m/s].
 AT_REST: Final = 1e-6
@@ -106,6 +119,17 @@ class Plant:
         self._tip = tip or TipSensor(TipParameters(noise=0.0), rate, 0)
         self._felt = np.zeros((sensor.samples, 6))
         self._count = 0
+        modes = integrator.model.parameters.modes
+        #: Generalized forces on q1..qn: nothing commands them.
+        self._free = [0.0] * modes
+        self.topics: tuple[Topic, ...] = (
+            BASE_WRENCH, TIP_DEFLECTION, ground_truth(modes, commanded=base is None), JOINT_STATES,
+        )  # fmt: skip
+
+    @property
+    def depth(self) -> float:
+        """Inserted length [m]."""
+        return self.integrator.depth
 
     @property
     def report(self) -> dict[str, object]:
@@ -161,6 +185,83 @@ class Plant:
         if abs(speed) > AT_REST:
             raise JobError(f'the needle moves at {1e3 * speed:.3g} mm/s; it must rest')
         self._sensor.tare()
+
+    def change(self, parameters: NeedleParameters) -> None:
+        """
+        Go on with other constants from the present state.
+
+        Parameters
+        ----------
+        parameters : NeedleParameters
+            Constants.
+
+        Raises
+        ------
+        ShapeError, InsertedLengthError
+            If the state does not suit them; the old constants then stay.
+
+        """
+        self.integrator.change(parameters)
+
+    def take(self, force: float, torque: float) -> list[Measurement]:
+        """
+        Advance by one sample interval, and say what is published of it.
+
+        Parameters
+        ----------
+        force, torque : float
+            What acts [N, N m].
+
+        Returns
+        -------
+        list of Measurement
+            Of each topic, `joint_states` last: who answers it has all the others.
+
+        Raises
+        ------
+        InsertedLengthError
+            If the needle left the tissue.
+
+        """
+        sample = self.advance(force, torque)
+        measured: list[Measurement] = [(BASE_WRENCH.name, 0, sample.wrench.tolist())]
+        tip = sample.tip
+        if tip is not None:
+            measured.append(
+                (TIP_DEFLECTION.name, tip.age, [tip.across, tip.depth, tip.deflection])
+            )
+        state = sample.state.tolist()
+        middle = len(state) // 2
+        joints = [
+            sample.joint_position, state[1], sample.speed, state[middle + 1], sample.force, torque,
+        ]  # fmt: skip
+        if self.base is None:
+            # Insertion makes d smaller.
+            state += [-force, torque, *self._free]
+        measured.append((GROUND_TRUTH.name, 0, state))
+        measured.append((JOINT_STATES.name, 0, joints))
+        return measured
+
+    def outline(self) -> Outline:
+        """
+        Return the needle as people see it.
+
+        Returns
+        -------
+        Outline
+            From its base through the entry point to its tip.
+
+        """
+        model = self.integrator.model
+        along = model.shape(self.integrator.state, _POINTS)
+        slopes = np.zeros((_POINTS, 2))
+        slopes[:, 1] = np.gradient(along[:, 1], along[:, 0])
+        return Outline(
+            base=np.array([0.0, self.depth - model.parameters.length, 0.0]),
+            points=np.insert(along, 0, 0.0, axis=1),
+            slopes=slopes,
+            path=np.empty((0, 3)),
+        )
 
     def advance(self, force: float = 0.0, torque: float = 0.0) -> Sample:
         """

@@ -8,21 +8,12 @@ next sample on, and which a replay performs again.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Final, NamedTuple, TypeAlias
+from typing import Any, Final, NamedTuple
 
 from needle_dynamics.simulated.assembly import PlantConstants
 from needle_dynamics.simulated.commands import Command, Commands
-from needle_dynamics.simulated.indenter import Press
-from needle_dynamics.simulated.plant import Plant, Sample
-from needle_ros.contract import (
-    BASE_WRENCH,
-    END_EFFECTOR_POSE,
-    GROUND_TRUTH,
-    ground_truth,
-    JOINT_STATES,
-    TIP_DEFLECTION,
-    Topic,
-)
+from needle_dynamics.simulated.measured import Measurement, SimulatedPlant
+from needle_ros.contract import Topic
 from needle_ros.timing import NANOSECONDS
 
 #: Kinds of events.
@@ -57,11 +48,6 @@ class Event(NamedTuple):
     content: Mapping[str, Any] = {}
 
 
-#: What the plant publishes of a sample on one topic: name of the topic, sample intervals since the
-#: time of the stamp, and the numbers in the order of the message.
-Measurement: TypeAlias = tuple[str, int, list[float]]
-
-
 class PlantRun:
     """
     A simulated plant under commands and events.
@@ -77,14 +63,12 @@ class PlantRun:
     ----------
     constants : PlantConstants
         Its constants now.
-    plant : Plant or Indenter
+    plant : SimulatedPlant
         The plant.
     commands : Commands
         The commands.
     number : int
         Number of samples taken, with those before it.
-    sample : Sample, Press or None
-        The newest sample.
     topics : dict
         Topics that it publishes on, by name.
 
@@ -100,7 +84,7 @@ class PlantRun:
     def __init__(self, values: Mapping[str, Any], number: int = 0) -> None:
         self._values = dict(values)
         self.constants = PlantConstants.of(values)
-        self.plant = self.constants.make()
+        self.plant: SimulatedPlant = self.constants.make()
         own = self.constants.own
         self.commands = Commands(
             own.command_timeout,
@@ -111,15 +95,7 @@ class PlantRun:
             power_limit=own.power_limit,
         )
         self.number = number
-        self.sample: Sample | Press | None = None
-        topics = [BASE_WRENCH, END_EFFECTOR_POSE]
-        #: Generalized forces on q1..qn: nothing commands them.
-        self._free = [0.0] * self.constants.model.modes
-        self._commanded = self.constants.mode == 'simulation'
-        if isinstance(self.plant, Plant):
-            truth = ground_truth(self.constants.model.modes, commanded=self._commanded)
-            topics = [BASE_WRENCH, TIP_DEFLECTION, truth, JOINT_STATES]
-        self.topics: dict[str, Topic] = {topic.name: topic for topic in topics}
+        self.topics: dict[str, Topic] = {topic.name: topic for topic in self.plant.topics}
         self._period = NANOSECONDS / own.rate
         #: Time of the newest sample [ns].
         self._stamp = -NANOSECONDS
@@ -163,8 +139,7 @@ class PlantRun:
         self._values = values
         if self.constants.model == before.model:
             return False
-        if isinstance(self.plant, Plant):
-            self.plant.integrator.change(self.constants.model)
+        self.plant.change(self.constants.model)
         return True
 
     def events(self) -> list[Event]:
@@ -205,33 +180,12 @@ class PlantRun:
 
         """
         acting = self.commands.held if command is None else command
-        before = self.sample
-        self.sample = sample = self.plant.advance(acting.force, acting.torque)
+        before = self.plant.depth
+        measured = self.plant.take(acting.force, acting.torque)
         # Whole nanoseconds first: a float has too few digits for a stamp.
         if abs(stamp - self._stamp - self._period) > _ROUNDING:
             self._events.append(Event(TIME))
         self._stamp = stamp
         self.number += 1
-        moved = 0.0
-        if isinstance(before, Sample) and isinstance(sample, Sample):
-            moved = sample.depth - before.depth
-        self.commands.hold(stamp, moved)
-        measured: list[Measurement] = [(BASE_WRENCH.name, 0, sample.wrench.tolist())]
-        if isinstance(sample, Press):
-            pose = [*sample.position.tolist(), 0.0, 0.0, 0.0, 1.0]
-            return [*measured, (END_EFFECTOR_POSE.name, 0, pose)]
-        tip = sample.tip
-        if tip is not None:
-            measured.append((TIP_DEFLECTION.name, tip.age, [0.0, tip.depth, tip.deflection]))
-        state = sample.state.tolist()
-        middle = len(state) // 2
-        joints = [
-            sample.joint_position, state[1], sample.speed, state[middle + 1],
-            sample.force, acting.torque,
-        ]  # fmt: skip
-        if self._commanded:
-            # Insertion makes d smaller.
-            state += [-acting.force, acting.torque, *self._free]
-        measured.append((GROUND_TRUTH.name, 0, state))
-        measured.append((JOINT_STATES.name, 0, joints))
+        self.commands.hold(stamp, self.plant.depth - before)
         return measured

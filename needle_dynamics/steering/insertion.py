@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import inf, isfinite
+from math import copysign, inf, isfinite
 
-from needle_dynamics.arrays import FloatArray
+from needle_dynamics.arrays import BoolArray, FloatArray
 from needle_dynamics.compiled.axis import Axis, carry_on, DEPTH, push, SPEED
 from needle_dynamics.errors import InsertedLengthError
 from needle_dynamics.parameters import NeedleParameters
@@ -158,16 +158,34 @@ class Insertion:
         """Which membranes are punctured, by depth."""
         return tuple(bool(one) for one in self._punctured)
 
+    def change(self, needle: NeedleParameters) -> None:
+        """
+        Go on with other constants along the axis, such as friction.
+
+        Parameters
+        ----------
+        needle : NeedleParameters
+            Needle and tissue; across, the needle stays what it was.
+
+        Raises
+        ------
+        ParameterError
+            If a value is not valid.
+
+        """
+        self.axis = axis_of(needle, self.needle.steering)
+
     def push(
         self,
         duration: float,
         force: float,
         *,
+        speed_limit: float = inf,
         guide: Sequence[float] | None = None,
         tilt: Sequence[float] | None = None,
         roll: float | None = None,
         tissue: Sequence[float] | None = None,
-    ) -> None:
+    ) -> float:
         """
         Advance under a constant force.
 
@@ -177,9 +195,17 @@ class Insertion:
             Time [s].
         force : float
             Insertion force [N], positive into the tissue.
+        speed_limit : float
+            Highest speed of what pushes [m/s]; where the needle would go faster, it is carried
+            with that speed.
         guide, tilt, roll, tissue : optional
             Where these are at the end, as in `SteeredNeedle.move`. The tissue moves evenly, guide
             and roll evenly with the depth.
+
+        Returns
+        -------
+        float
+            Mean force of the base on the needle [N].
 
         Raises
         ------
@@ -192,16 +218,24 @@ class Insertion:
         self._check(duration, 'force', force)
         shift, _ = self.needle.checked(guide, tilt, roll, tissue)
         self._drift_to(duration, shift)
-        left = push(
-            self.axis, self._state, self._punctured, float(force), float(duration), self._step
-        )
+        state, punctured = self._state.copy(), self._punctured.copy()
+        felt = np.full(1, float(force))
+        left = push(self.axis, state, punctured, felt[0], float(duration), self._step)
+        speed = float(state[SPEED]) + self._drift
+        if abs(speed) > speed_limit:
+            state[:], punctured[:] = self._state, self._punctured
+            limited = copysign(speed_limit, speed)
+            left = self._carry(state, punctured, duration, limited, felt)
+        self._state, self._punctured = state, punctured
         self._across(duration, left, guide, tilt, roll, shift)
+        return float(felt[0])
 
     def carry(
         self,
         duration: float,
         velocity: float,
         *,
+        felt: FloatArray | None = None,
         guide: Sequence[float] | None = None,
         tilt: Sequence[float] | None = None,
         roll: float | None = None,
@@ -216,6 +250,8 @@ class Insertion:
             Time [s].
         velocity : float
             Insertion velocity at the end [m/s].
+        felt : ndarray, shape (parts,), optional
+            Overwritten with the mean force over each of the equal parts of the time [N].
         guide, tilt, roll, tissue : optional
             As in `push`.
 
@@ -235,16 +271,24 @@ class Insertion:
         self._check(duration, 'velocity', velocity)
         shift, _ = self.needle.checked(guide, tilt, roll, tissue)
         self._drift_to(duration, shift)
-        left, force = carry_on(
-            self.axis,
-            self._state,
-            self._punctured,
-            float(velocity) - self._drift,
-            float(duration),
-            self._step,
-        )
+        forces = np.empty(1) if felt is None else felt
+        left = self._carry(self._state, self._punctured, duration, velocity, forces)
         self._across(duration, left, guide, tilt, roll, shift)
-        return float(force)
+        return float(forces.mean())
+
+    def _carry(
+        self,
+        state: FloatArray,
+        punctured: BoolArray,
+        duration: float,
+        velocity: float,
+        felt: FloatArray,
+    ) -> float:
+        """Carry the axis on; return the time that is left when the needle left the tissue."""
+        speed = float(velocity) - self._drift
+        return float(
+            carry_on(self.axis, state, punctured, speed, float(duration), self._step, felt)
+        )
 
     def _check(self, duration: float, name: str, value: float) -> None:
         if not 0.0 < duration < inf:

@@ -270,3 +270,9 @@ STEERING_PRESETS: Final[Mapping[str, SteeringPreset]] = {
     'hollow_0.70mm': _literature(0.7e-3, 0.48e-3, 200e9, 2e4, 'ustk, needle of 22 gauge'),
     'hollow_1.05mm': _literature(1.05e-3, 0.838e-3, 200e9, 2e4, 'ustk, needle of 19 gauge'),
 }
+
+#: Needles and tissues of all presets by name.
+NEEDLES: Final[Mapping[str, NeedleParameters]] = {
+    **PRESETS,
+    **{name: preset.needle for name, preset in STEERING_PRESETS.items()},
+}

@@ -8,11 +8,11 @@ from typing import Any
 from needle_dynamics import JobError, NeedleModel, NeedleParameters, ParameterError
 from needle_dynamics.simulated.assembly import PlantConstants
 from needle_dynamics.simulated.commands import Command
+from needle_dynamics.simulated.measured import Measurement
 from needle_dynamics.simulated.plant import Plant
 from needle_dynamics.simulated.run import (
     CONFIGURED,
     Event,
-    Measurement,
     PARAMETERS,
     PlantRun,
     RESET,
@@ -48,12 +48,14 @@ def truth(measured: list[Measurement]) -> list[float]:
 
 def test_samples_say_what_the_contract_has() -> None:
     """Each topic with as many numbers as it has quantities, joint_states last."""
-    for mode, last in (
-        ('simulation', 'joint_states'),
-        ('robot', 'joint_states'),
-        ('indenter', 'end_effector_pose'),
+    for mode, steered, last in (
+        ('simulation', False, 'joint_states'),
+        ('robot', False, 'joint_states'),
+        ('simulation', True, 'joint_states'),
+        ('robot', True, 'joint_states'),
+        ('indenter', False, 'end_effector_pose'),
     ):
-        plant = PlantRun({**VALUES, 'mode': mode})
+        plant = PlantRun({**VALUES, 'mode': mode, 'steered': steered})
         measured = plant.take(stamp(1))
         assert (measured[0][0], measured[-1][0]) == ('base_wrench', last)
         assert {name for name, _, _ in measured} == plant.topics.keys()
@@ -153,7 +155,7 @@ def test_constants_are_those_of_the_parameters() -> None:
     ('values', 'complaint'),
     [
         ({'mode': 'dream'}, "mode must be one of simulation, robot, indenter, got 'dream'"),
-        ({'model.preset': 'steel'}, 'model.preset must be one of paper_si, paper_mm, phantom, g'),
+        ({'model.preset': 'steel'}, 'model.preset must be one of paper_si, paper_mm, phantom, p'),
         ({'sensor.rate': -1.0}, 'sensor.rate must be finite, > 0 and <= 8000 Hz, got -1.0'),
         ({'rate': 1e5}, 'rate must be finite, >= 1 and <= 8000 Hz, got 100000.0'),
     ],

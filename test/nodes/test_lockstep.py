@@ -5,6 +5,7 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
+from builtin_interfaces.msg import Duration
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PointStamped
 from needle_controller import ContinuousInverseDynamics
@@ -12,6 +13,7 @@ from needle_dynamics import FloatArray, NeedleModel, NeedleParameters
 from needle_identification import Bag, deserialize, encode
 from needle_identification.recorder_node import is_hidden
 from needle_insertion.experiment.ros_graph import Graph
+from needle_insertion.replay.rerun import verify
 from needle_ros.base_node import COMMAND, SENSOR
 from needle_ros.timing import seconds
 import numpy as np
@@ -23,6 +25,7 @@ from scipy.integrate import solve_ivp
 from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool
 from support.closed_loop import closed_loop
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 START, TARGET, DURATION, RATE = 0.02, 0.12, 10.0, 1000.0
 
@@ -50,6 +53,7 @@ def drive(
     controller: dict[str, Any],
     until: float,
     bag: Path | None = None,
+    course: JointTrajectory | None = None,
 ) -> list[JointState]:
     """
     Drive the needle to a target in lock-step; return what `tracking_error` said.
@@ -71,6 +75,7 @@ def drive(
         probe.create_subscription(JointState, 'tracking_error', errors.append, EVERY)
         clock = graph.latest(probe, Clock, '/clock', SENSOR)
         aim = probe.create_publisher(PointStamped, 'target', COMMAND)
+        move = probe.create_publisher(JointTrajectory, 'joint_trajectory', COMMAND)
         pause = probe.create_client(SetBool, 'plant/pause')
         graph.start('plant', {'lockstep': True, 'paused': True, **plant})
         graph.start('controller', {'use_sim_time': True, **controller})
@@ -92,6 +97,10 @@ def drive(
             return health.get('/controller', {}).get('target [m]') == str(target)
 
         graph.spin_until(aims, 'the target')
+        if course is not None:
+            # To the plant, and to the controller, which leaves it alone.
+            graph.spin_until(lambda: move.get_subscription_count() >= 2, 'who takes the course')
+            move.publish(course)
         graph.wait_for(probe, 'plant')
         answer = pause.call_async(SetBool.Request(data=False))
         graph.spin_until(answer.done, 'the beginning')
@@ -231,3 +240,48 @@ def test_two_runs_with_one_seed_are_the_same(tmp_path: Path) -> None:
     counts = {name: len(messages) for name, messages in one.items()}
     assert counts['/joint_states'] == counts['/wrench_command'] == 1400
     assert one == two
+
+
+def test_a_steered_run_is_the_same_run_computed_again(tmp_path: Path) -> None:
+    """
+    The guide moves and the needle turns while the controller inserts it, all recorded.
+
+    The controller knows neither the force that cuts nor the guide, and arrives all the same.
+    """
+    point = JointTrajectoryPoint(positions=[2e-3, -0.02, 1.5], time_from_start=Duration(sec=2))
+    course = JointTrajectory(joint_names=['guide_x', 'guide_tilt_z', 'roll'], points=[point])
+    bag, common = tmp_path / 'bag', {'model.preset': 'bending_35mm', 'rate': RATE}
+    drive(
+        tmp_path / 'logs',
+        0.05,
+        {
+            **common,
+            'steered': True,
+            'depth': START,
+            'real_time_factor': 0.0,
+            'steering.bevel_load': [0.3],
+            'steering.cutting_force': [1.0],
+            'steering.path_noise': 1e-3,
+            'tip.noise': 1.8e-4,
+            'tip.rate': 40.0,
+            'tip.delay': 0.02,
+        },
+        common,
+        6.0,
+        bag,
+        course,
+    )
+    (run,) = verify(bag)
+    assert run.verdict == 'identical', run.first
+    assert len(run.recorded.numbers) > 6000 - 10
+    rows = run.recorded.rows
+    assert len(rows['/tip_deflection'].values) > 6 * 40 - 10
+    depth, x, _, _, tilt, roll = rows['/joint_states'].values[-1, :6]
+    # Half a tenth of a millimeter is what the law leaves of a force that it does not know.
+    assert abs(depth - 0.05) < 5e-5
+    np.testing.assert_allclose([x, tilt, roll], [2e-3, -0.02, 1.5], rtol=1e-4)
+    _, tip_x, tip_z, tip_roll = rows['/ground_truth'].values[-1, :4]
+    assert abs(tip_x) > 2e-4
+    assert abs(tip_z) > 2e-4
+    assert tip_roll == roll
+    assert 'refused' not in (tmp_path / 'logs' / 'controller.log').read_text()

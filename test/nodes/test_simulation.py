@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import Any
 
+from builtin_interfaces.msg import Duration
 from builtin_interfaces.msg._time import Time
 from geometry_msgs.msg import PointStamped, PoseArray, WrenchStamped
 from needle_dynamics import NeedleModel, NeedleParameters
@@ -15,6 +16,7 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool, Trigger
 from support.ros_graph import RosGraph
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 from visualization_msgs.msg import Marker
 
 RATE = {'rate': 200.0}
@@ -312,6 +314,51 @@ def test_its_shape_is_that_of_the_model(ros_graph: RosGraph) -> None:
     rise = (tip.position.z - before.position.z) / (tip.position.y - before.position.y)
     assert np.tan(turn) == pytest.approx(rise, rel=1e-6)
     assert (shape.header.frame_id, line.header.frame_id) == ('needle_entry', 'needle_entry')
+
+
+def test_a_steered_needle_shows_its_path(ros_graph: RosGraph) -> None:
+    """Beside its shape; poses point along it in both planes, and wrong trajectories are said."""
+    values: dict[str, bool | float | str] = {
+        'mode': 'robot',
+        'steered': True,
+        'model.preset': 'bending_35mm',
+        'guide.position_limit': 0.01,
+        'tip.noise': 0.0,
+    }
+    bench = Bench(ros_graph, **values)
+    lines = ros_graph.listen(bench.probe, Marker, 'needle_shape', SENSOR)
+    poses = ros_graph.listen(bench.probe, PoseArray, 'needle_poses', SENSOR)
+    course = bench.probe.create_publisher(JointTrajectory, 'joint_trajectory', COMMAND)
+    bench.until(course.get_subscription_count, 'the plant')
+    message = JointTrajectory(joint_names=['insertion', 'guide_x', 'guide_z'])
+    soon = Duration(nanosec=500_000_000)
+    message.points = [JointTrajectoryPoint(positions=[0.03, 9e-3, -11e-3], time_from_start=soon)]
+    course.publish(message)
+    bench.until(lambda: bench.plant.diagnose()[2]['commands refused'] == 1, 'the refusal')
+    assert bench.states[-1].name == [
+        'insertion', 'guide_x', 'guide_z', 'guide_tilt_x', 'guide_tilt_z', 'roll',
+    ]  # fmt: skip
+    message.points[0].positions = [0.03, 9e-3, -5e-3]
+    course.publish(message)
+    bench.until(lambda: bench.states[-1].position[:3] == pytest.approx([0.03, 9e-3, -5e-3]), 'it')
+    seen = len(poses), len(lines)
+    bench.until(lambda: len(poses) > seen[0] and len(lines) > seen[1] + 2, 'pictures')
+    newest = {line.ns: [(p.x, p.y, p.z) for p in line.points] for line in lines[-2:]}
+    assert newest.keys() == {'needle', 'path'}
+    assert newest['needle'][1] == pytest.approx((9e-3, -0.04, -5e-3), abs=1e-7)
+    tip = bench.tips[-1].point
+    assert newest['needle'][-1] == pytest.approx((tip.x, tip.y, tip.z), abs=1e-6)
+    assert newest['path'][0][1] == 0.0
+    # Between two points the needle goes as the poses there say, to the square of the way.
+    along = [np.array([p.position.x, p.position.y, p.position.z]) for p in poses[-1].poses]
+    for k in (5, 15, 25):
+        turn = poses[-1].poses[k].orientation
+        # The y axis, turned by the quaternion.
+        x, z, w = turn.x, turn.z, turn.w
+        ahead = np.array([-2.0 * w * z, 1.0 - 2.0 * (x * x + z * z), 2.0 * w * x])
+        step = along[k + 1] - along[k - 1]
+        np.testing.assert_allclose(ahead, step / np.linalg.norm(step), atol=1e-4)
+        assert turn.y == 0.0
 
 
 def test_faults_may_come_and_go_while_it_runs(ros_graph: RosGraph) -> None:

@@ -1,0 +1,74 @@
+"""What all simulated plants have: what they take, and what they show."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple, Protocol, TypeAlias
+
+from needle_dynamics.arrays import FloatArray
+from needle_dynamics.parameters import NeedleParameters
+from needle_ros.contract import Topic
+
+#: What a plant publishes of a sample on one topic: name of the topic, sample intervals since the
+#: time of the stamp, and the numbers in the order of the message.
+Measurement: TypeAlias = tuple[str, int, list[float]]
+
+
+class Outline(NamedTuple):
+    """
+    A needle as people see it, in the frame of the entry point.
+
+    Attributes
+    ----------
+    base : ndarray, shape (3,)
+        Its base [m].
+    points : ndarray, shape (k, 3)
+        Points from where it bends to the tip [m].
+    slopes : ndarray, shape (k, 2)
+        Slopes in x and z there.
+    path : ndarray, shape (m, 3)
+        The path that it cut [m]; none for a needle that does not cut.
+
+    """
+
+    base: FloatArray
+    points: FloatArray
+    slopes: FloatArray
+    path: FloatArray
+
+
+class SimulatedPlant(Protocol):
+    """A plant that is advanced one sample at a time."""
+
+    @property
+    def topics(self) -> tuple[Topic, ...]:
+        """Topics that it publishes on."""
+
+    @property
+    def depth(self) -> float:
+        """Inserted length [m]."""
+
+    @property
+    def report(self) -> dict[str, object]:
+        """Where it is, for people."""
+
+    def follow(
+        self,
+        joints: Sequence[str],
+        times: Sequence[float],
+        positions: Sequence[Sequence[float]],
+        efforts: Sequence[Sequence[float]],
+    ) -> None:
+        """Follow a trajectory from now, or raise ParameterError."""
+
+    def tare(self) -> None:
+        """Zero the force sensor, or raise JobError."""
+
+    def change(self, parameters: NeedleParameters) -> None:
+        """Go on with other constants of the needle."""
+
+    def take(self, force: float, torque: float) -> list[Measurement]:
+        """Advance by one sample interval; return what is published, `joint_states` last."""
+
+    def outline(self) -> Outline | None:
+        """Return the needle as people see it; None if there is none."""

@@ -1,0 +1,378 @@
+"""The steered plant: a needle that bends and cuts, its guide, its roll, and its sensors."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from copy import copy
+from dataclasses import dataclass
+from typing import Any, Final
+
+from needle_dynamics.parameters import NeedleParameters
+from needle_dynamics.simulated.base import BaseMotion, BaseParameters, on_grid
+from needle_dynamics.simulated.force_sensor import ForceSensor
+from needle_dynamics.simulated.measured import Measurement, Outline
+from needle_dynamics.simulated.plant import AT_REST
+from needle_dynamics.simulated.tip_sensor import TipSensor
+from needle_dynamics.steering.insertion import Insertion
+from needle_ros.contract import (
+    BASE_WRENCH,
+    GROUND_TRUTH,
+    INSERTION,
+    JOINT_STATES,
+    ROLL,
+    steered_states,
+    steered_truth,
+    STEERING_JOINTS,
+    TIP_DEFLECTION,
+    Topic,
+)
+from needle_ros.errors import JobError, ParameterError
+from needle_ros.settings import check_constants, constant
+from needle_ros.trajectories import check_times, joint_values
+import numpy as np
+
+#: Parts of a sample interval in each of which the force of a push is constant, as in `Plant`.
+_PUSHES: Final = 4
+
+#: Names of the joints beside `insertion`, in the order of the message.
+_JOINTS: Final = tuple(joint.name for joint in STEERING_JOINTS)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GuideParameters:
+    """Limits of the robot that moves the guide of a steered needle across, tilts and turns it."""
+
+    position_limit: float = constant(
+        0.02, 'm', 'farthest position of the guide along x and along z', open_low=True
+    )
+    tilt_limit: float = constant(0.2, 'rad', 'largest tilt of the guide', open_low=True)
+    roll_limit: float = constant(100.0, 'rad', 'largest roll of the needle', open_low=True)
+    speed_limit: float = constant(0.02, 'm/s', 'highest speed of the guide', open_low=True)
+    tilt_speed_limit: float = constant(0.2, 'rad/s', 'fastest change of the tilt', open_low=True)
+    roll_speed_limit: float = constant(10.0, 'rad/s', 'fastest roll', open_low=True)
+    rise_time: float = constant(
+        0.1, 's', 'time in which each reaches its highest speed', open_low=True
+    )
+
+    def __post_init__(self) -> None:
+        check_constants(self)
+
+    def motion(self, joint: str, gain: float) -> BaseMotion:
+        """
+        Return what follows the trajectory of a joint.
+
+        Parameters
+        ----------
+        joint : str
+            One of `STEERING_JOINTS`.
+        gain : float
+            Rate at which a position error is closed [1/s].
+
+        Returns
+        -------
+        BaseMotion
+            At rest at zero.
+
+        """
+        unit = next(one.unit for one in STEERING_JOINTS if one.name == joint)
+        if joint == ROLL:
+            reach, speed = self.roll_limit, self.roll_speed_limit
+        elif unit == 'rad':
+            reach, speed = self.tilt_limit, self.tilt_speed_limit
+        else:
+            reach, speed = self.position_limit, self.speed_limit
+        limits = BaseParameters(
+            speed_limit=speed, acceleration_limit=speed / self.rise_time, position_gain=gain
+        )
+        return BaseMotion(limits, 0.0, (-reach, reach), what=joint, unit=unit)
+
+
+class SteeredPlant:
+    """
+    A steered needle under a commanded force, or carried by a robot, with its guide and sensors.
+
+    Parameters
+    ----------
+    insertion : Insertion
+        The needle in its tissue.
+    sensor : ForceSensor
+        Sensor at the needle base.
+    tip : TipSensor
+        Sensor of the tip.
+    rate : float
+        Samples per second [Hz].
+    guide : GuideParameters
+        Limits of the guide.
+    robot : BaseParameters
+        Limits of the robot along the needle.
+    base : BaseMotion, optional
+        The robot that moves the needle along its axis; without it the commanded force does.
+
+    """
+
+    def __init__(
+        self,
+        insertion: Insertion,
+        sensor: ForceSensor,
+        tip: TipSensor,
+        rate: float,
+        guide: GuideParameters,
+        robot: BaseParameters,
+        base: BaseMotion | None = None,
+    ) -> None:
+        self.insertion = insertion
+        self.base = base
+        self.interval = 1.0 / rate
+        self.time = 0.0
+        self.topics: tuple[Topic, ...] = (
+            BASE_WRENCH, TIP_DEFLECTION, steered_truth(commanded=base is None), steered_states(),
+        )  # fmt: skip
+        self._sensor, self._tip_sensor = sensor, tip
+        self._motions = {name: guide.motion(name, robot.position_gain) for name in _JOINTS}
+        #: Position and speed of the joints beside the insertion.
+        self._at = dict.fromkeys(_JOINTS, 0.0)
+        self._speed = dict.fromkeys(_JOINTS, 0.0)
+        #: Joints that have not come to rest.
+        self._moving: set[str] = set()
+        self._resolution = robot.encoder_resolution if base is not None else 0.0
+        self._felt = np.zeros((sensor.samples, 6))
+        self._tip = [*insertion.needle.tip.tolist(), insertion.needle.tip_roll]
+        #: What the guide does to the needle, in the order of its joints.
+        self._load = [0.0] * len(_JOINTS)
+        self._count = 0
+
+    @property
+    def depth(self) -> float:
+        """Inserted length [m]."""
+        return self.insertion.depth
+
+    @property
+    def report(self) -> dict[str, object]:
+        """Where the needle is, for people."""
+        x, y, z, roll = self._tip
+        return {
+            'inserted length [m]': f'{y:.6f}',
+            'tip x, z [m]': f'{x:.6f}, {z:.6f}',
+            'roll of the tip [rad]': f'{roll:.4f}',
+            **{
+                f'{joint.name} [{joint.unit}]': f'{self._at[joint.name]:.6f}'
+                for joint in STEERING_JOINTS
+            },
+        }
+
+    def follow(
+        self,
+        joints: Sequence[str],
+        times: Sequence[float],
+        positions: Sequence[Sequence[float]],
+        efforts: Sequence[Sequence[float]],
+    ) -> None:
+        """
+        Have guide, roll and base follow a trajectory, from now; joints that it lacks go on.
+
+        Parameters
+        ----------
+        joints : sequence of str
+            Names of the joints. `insertion` is that of the base, and nothing to a needle under
+            commands: there it is the reference of a controller.
+        times : sequence of float
+            Time of each point from now [s].
+        positions, efforts : sequence of sequence of float
+            Positions [m or rad] of each point; of `insertion`, or force [N] where a push ends.
+
+        Raises
+        ------
+        ParameterError
+            If there is another joint, or one cannot follow; then none does.
+
+        """
+        known = (INSERTION, *_JOINTS)
+        if not joints or not set(joints) <= {*known} or len({*joints}) < len(joints):
+            raise ParameterError(f'takes joints of {", ".join(known)}, got {list(joints)}')
+        check_times(times)
+        followed = {name: copy(self._motions[name]) for name in joints if name != INSERTION}
+        for name, motion in followed.items():
+            found = joint_values(name, joints, positions)
+            if None in found:
+                raise ParameterError(f'each point needs a position of {name}')
+            motion.follow(self.time, self._at[name], times, found)
+        if self.base is not None and INSERTION in joints:
+            self.base.follow(
+                self.time,
+                self.depth,
+                times,
+                joint_values(INSERTION, joints, positions),
+                joint_values(INSERTION, joints, efforts),
+            )
+        self._motions |= followed
+        self._moving |= {*followed}
+
+    def tare(self) -> None:
+        """
+        Zero the sensor on the mean of its latest readings.
+
+        Raises
+        ------
+        JobError
+            If the needle or its guide moves, or has not rested long enough.
+
+        """
+        speed = self.insertion.velocity
+        if abs(speed) > AT_REST:
+            raise JobError(f'the needle moves at {1e3 * speed:.3g} mm/s; it must rest')
+        if self._moving:
+            raise JobError(f'{", ".join(sorted(self._moving))} moves; it must rest')
+        self._sensor.tare()
+
+    def change(self, parameters: NeedleParameters) -> None:
+        """
+        Go on with other friction.
+
+        Parameters
+        ----------
+        parameters : NeedleParameters
+            Constants.
+
+        Raises
+        ------
+        ParameterError
+            If they do not suit the needle.
+
+        """
+        self.insertion.change(parameters)
+
+    def advance(self, force: float = 0.0) -> list[float]:
+        """
+        Advance by one sample interval.
+
+        Parameters
+        ----------
+        force : float
+            Commanded insertion force [N]; not used when a base moves the needle.
+
+        Returns
+        -------
+        list of float
+            Reading of the base sensor: force x y z [N], torque x y z [N m].
+
+        Raises
+        ------
+        InsertedLengthError
+            If the needle left the tissue.
+
+        """
+        across = self._move_guide() if self._moving else {}
+        felt = self._felt
+        if self.base is None:
+            self.insertion.push(self.interval, force, **across)
+            felt[:, 1] = force
+        else:
+            self._carry(self.base, across)
+        self._count += 1
+        self.time = self._count * self.interval
+        x, z, about_x, about_y, about_z = self.insertion.wrench.tolist()
+        felt[:, 0], felt[:, 2:] = x, (z, about_x, about_y, about_z)
+        # The slope in z turns about x, that in x about z the other way.
+        self._load = [x, z, -about_z, about_x, about_y]
+        moving = bool(self._moving) or abs(self.insertion.velocity) > AT_REST
+        return list(self._sensor.measure(felt, moving=moving).tolist())
+
+    def _carry(self, base: BaseMotion, across: dict[str, Any]) -> None:
+        """Have the base move the needle along its axis, or push it."""
+        insertion, interval = self.insertion, self.interval
+        part = interval / _PUSHES
+        push = base.push(self.time, self.depth, part)
+        if push is None:
+            speed = base.speed(self.time, self.depth, insertion.velocity, interval)
+            forces = np.empty(self._sensor.samples)
+            insertion.carry(interval, speed, felt=forces, **across)
+            self._felt[:, 1] = forces
+            return
+        for k, rows in enumerate(np.array_split(self._felt, _PUSHES)):
+            if k:
+                later = base.push(self.time + k * part, self.depth, part)
+                push = push if later is None else later
+            rows[:, 1] = insertion.push(
+                part, push, speed_limit=base.limits.speed_limit, **(across if k == 0 else {})
+            )
+
+    def _move_guide(self) -> dict[str, Any]:
+        """Move guide, tilt and roll on by an interval; return where they are then."""
+        at, speeds = self._at, self._speed
+        for name in sorted(self._moving):
+            motion, before = self._motions[name], speeds[name]
+            after = motion.speed(self.time, at[name], before, self.interval)
+            at[name] += 0.5 * (before + after) * self.interval
+            speeds[name] = after
+            if before == after == 0.0 and self.time >= motion.end:
+                self._moving.discard(name)
+        x, z, tilt_x, tilt_z, roll = at.values()
+        return {'guide': (x, z), 'tilt': (tilt_x, tilt_z), 'roll': roll}
+
+    def take(self, force: float, _torque: float) -> list[Measurement]:
+        """
+        Advance by one sample interval, and say what is published of it.
+
+        Parameters
+        ----------
+        force, _torque : float
+            What acts [N, N m]; a torque does nothing, the guide holds the needle.
+
+        Returns
+        -------
+        list of Measurement
+            Of each topic, `joint_states` last.
+
+        Raises
+        ------
+        InsertedLengthError
+            If the needle left the tissue.
+
+        """
+        wrench = self.advance(force)
+        needle, before = self.insertion.needle, self._tip
+        self._tip = tip = [*needle.tip.tolist(), needle.tip_roll]
+        measured: list[Measurement] = [(BASE_WRENCH.name, 0, wrench)]
+        x, depth, z, _ = tip
+        seen = self._tip_sensor.measure(depth, z, x)
+        if seen is not None:
+            place = [seen.across, seen.depth, seen.deflection]
+            measured.append((TIP_DEFLECTION.name, seen.age, place))
+        rates = [(b - a) / self.interval for a, b in zip(before, tip, strict=True)]
+        speed = self.insertion.velocity
+        outside = needle.needle.length - depth
+        truth = [outside, x, z, tip[3], -speed, rates[0], rates[2], rates[3]]
+        if self.base is None:
+            # Insertion makes d smaller; nothing commands the others.
+            truth += [-force, 0.0, 0.0, 0.0]
+        measured.append((GROUND_TRUTH.name, 0, truth))
+        joints = [
+            on_grid(depth, self._resolution), *self._at.values(),
+            speed, *self._speed.values(),
+            float(self._felt[-1, 1]), *self._load,
+        ]  # fmt: skip
+        measured.append((JOINT_STATES.name, 0, joints))
+        return measured
+
+    def outline(self) -> Outline:
+        """
+        Return the needle as people see it.
+
+        Returns
+        -------
+        Outline
+            From the base through the guide to the tip, and the path that it cut.
+
+        """
+        needle = self.insertion.needle
+        shape, path = needle.shape, needle.path
+        points = np.insert(shape.deflections, 1, shape.depths, axis=1)
+        # Behind the guide the needle is straight, as the guide holds it.
+        rest = max(0.0, needle.needle.length - needle.depth - needle.steering.free_length)
+        slope = np.array([shape.slopes[0, 0], 1.0, shape.slopes[0, 1]])
+        return Outline(
+            base=points[0] - rest * slope,
+            points=points,
+            slopes=shape.slopes,
+            path=np.insert(path.deflections, 1, path.depths, axis=1),
+        )

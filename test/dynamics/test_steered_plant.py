@@ -1,0 +1,339 @@
+"""The steered plant: what its robot, its guide and its sensors make of a needle that cuts."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from needle_dynamics import InsertedLengthError, JobError, ParameterError, SteeredNeedle
+from needle_dynamics.simulated.assembly import PlantConstants
+from needle_dynamics.simulated.commands import Command
+from needle_dynamics.simulated.measured import Measurement
+from needle_dynamics.simulated.run import Event, PARAMETERS, PlantRun, RESET, TARE, TRAJECTORY
+from needle_dynamics.simulated.steered import SteeredPlant
+from needle_dynamics.simulated.tip_sensor import TipParameters, TipSensor
+from needle_ros.contract import STEERING_JOINTS
+import numpy as np
+from numpy.testing import assert_allclose
+import pytest
+
+#: A period of 2 ms [ns].
+PERIOD = 2_000_000
+VALUES: dict[str, Any] = {
+    'steered': True,
+    'model.preset': 'bending_35mm',
+    'mode': 'robot',
+    'rate': 500.0,
+    'depth': 0.01,
+    'steering.bevel_load': [0.3],
+    'steering.skin_stiffness': 300.0,
+    'steering.cutting_force': [1.2],
+    'tip.noise': 0.0,
+}
+JOINTS = tuple(joint.name for joint in STEERING_JOINTS)
+
+
+def course(seconds: float, **ends: float) -> Event:
+    """Return a trajectory of one point."""
+    return Event(
+        TRAJECTORY,
+        {
+            'joints': [*ends],
+            'times': [seconds],
+            'positions': [[*ends.values()]],
+            'efforts': [[]],
+        },
+    )
+
+
+def run(
+    values: dict[str, Any], samples: int, *events: Event, force: float = 0.0
+) -> tuple[PlantRun, list[dict[str, list[float]]]]:
+    """Perform events, take samples; return the numbers by topic."""
+    plant = PlantRun(values)
+    for event in events:
+        plant.perform(event)
+    taken = [
+        {name: numbers for name, _, numbers in plant.take(k * PERIOD, Command(0, force))}
+        for k in range(1, samples + 1)
+    ]
+    return plant, taken
+
+
+def test_the_tip_is_that_of_a_needle_moved_by_what_the_joints_say() -> None:
+    """Along the joints of the message the library's needle ends where the plant's does."""
+    move = course(2.0, insertion=0.05, guide_x=2e-3, guide_z=-1e-3, guide_tilt_x=0.02, roll=1.0)
+    plant, taken = run({**VALUES, 'base.encoder_resolution': 0.0}, 1200, move)
+    assert isinstance(plant.plant, SteeredPlant)
+    told = plant.constants
+    alone = SteeredNeedle(told.model, told.steering)
+    alone.move(depth=0.01)
+    for sample in taken:
+        depth, x, z, tilt_x, tilt_z, roll = sample['joint_states'][:6]
+        alone.move(depth=depth, guide=(x, z), tilt=(tilt_x, tilt_z), roll=roll)
+    truth = taken[-1]['ground_truth']
+    assert_allclose(truth[0], told.model.length - 0.05, rtol=0.0, atol=1e-6)
+    # Rounding, of a thousand steps.
+    assert_allclose(truth[1:4], [alone.tip[0], alone.tip[2], alone.tip_roll], atol=1e-12)
+    assert_allclose(taken[-1]['tip_deflection'], alone.tip, atol=1e-12)
+    assert abs(truth[1]) > 1e-4
+    assert abs(truth[2]) > 1e-4
+    # It says so for people, too.
+    assert plant.plant.report['roll [rad]'] == '1.000000'
+
+
+def test_joints_keep_their_limits_and_arrive() -> None:
+    """Each no faster than its speed, none brought to it faster than said; the others rest."""
+    ends = {'guide_z': 6e-3, 'guide_tilt_z': -0.1, 'roll': 6.0}
+    plant, taken = run(VALUES, 1000, course(0.01, **ends))
+    states = np.array([sample['joint_states'] for sample in taken])
+    positions, speeds = states[:, 1:6], states[:, 7:12]
+    limits = {'guide_z': 0.02, 'guide_tilt_z': 0.2, 'roll': 10.0}
+    for k, name in enumerate(JOINTS):
+        speed = np.abs(speeds[:, k]).max()
+        if name not in ends:
+            assert speed == 0.0
+            continue
+        rate = np.abs(np.diff(speeds[:, k], prepend=0.0)).max() * 500.0
+        # Rounding.
+        assert 0.9 * limits[name] < speed <= limits[name]
+        assert rate <= limits[name] / 0.1 * (1.0 + 1e-9)
+        assert_allclose(positions[-1, k], ends[name], rtol=1e-5)
+        assert np.abs(positions[:, k]).max() <= abs(ends[name]) * (1.0 + 1e-3)
+    assert isinstance(plant.plant, SteeredPlant)
+
+
+def test_joints_that_a_trajectory_lacks_go_on() -> None:
+    """A roll does not stop the guide, nor the insertion."""
+    plant, taken = run(VALUES, 100, course(1.0, insertion=0.03, guide_x=2e-3))
+    plant.perform(course(0.5, roll=0.4))
+    for k in range(101, 801):
+        numbers = {name: values for name, _, values in plant.take(k * PERIOD)}
+    assert_allclose(numbers['joint_states'][:6], [0.03, 2e-3, 0.0, 0.0, 0.0, 0.4], atol=1e-6)
+    assert taken[-1]['joint_states'][5] == 0.0
+
+
+@pytest.mark.parametrize(
+    ('change', 'complaint'),
+    [
+        (
+            {'joints': ['gide_x']},
+            r"takes joints of insertion, guide_x, .*, roll, got \['gide_x'\]",
+        ),
+        ({'joints': []}, 'takes joints of'),
+        ({'joints': ['roll', 'roll'], 'positions': [[1.0, 2.0]]}, 'takes joints of'),
+        ({'positions': [[0.03]]}, r'guide_x must stay in \[-0\.02, 0\.02\] m, got \[0\.03\] m'),
+        ({'positions': [[float('nan')]]}, 'guide_x must stay in'),
+        ({'joints': ['roll'], 'positions': [[101.0]]}, r'roll must stay in \[-100, 100\] rad'),
+        ({'positions': [[]]}, 'each point needs a position of guide_x'),
+        ({'times': [-1.0]}, 'times must be >= 0 and increasing'),
+        ({'times': []}, 'trajectory has no points'),
+        (
+            {'joints': ['guide_x', 'insertion'], 'positions': [[1e-3, 0.161]]},
+            r'trajectory must stay in \[0\.001, 0\.159\] m, got \[0\.161\] m',
+        ),
+    ],
+)
+def test_what_cannot_be_followed_moves_nothing(change: dict[str, Any], complaint: str) -> None:
+    """Not even the joints that could: the message says what was found and what is valid."""
+    plant, _ = run(VALUES, 1)
+    content = {**course(1.0, guide_x=1e-3).content, **change}
+    with pytest.raises(ParameterError, match=complaint):
+        plant.perform(Event(TRAJECTORY, content))
+    before = plant.take(2 * PERIOD)
+    assert [v[:6] for n, _, v in before if n == 'joint_states'] == [[0.01, *[0.0] * 5]]
+
+
+def test_under_commands_the_insertion_is_the_controllers() -> None:
+    """A trajectory of it is left to the controller; the force moves the needle."""
+    values = {**VALUES, 'mode': 'simulation', 'sensor.force_noise': 0.0, 'sensor.filter': 0}
+    _, taken = run(values, 500, course(0.1, insertion=0.1, guide_z=1e-3), force=4.0)
+    depth, speed = (taken[-1]['joint_states'][k] for k in (0, 6))
+    told = PlantConstants.of(values).model
+    # Friction and cutting are what the force overcomes, at a speed that no longer changes.
+    held = told.coulomb_friction + 1.2
+    assert_allclose(speed, (4.0 - held) / told.viscous_friction, rtol=1e-9)
+    assert depth < 0.02
+    # Where the robot is content to rest.
+    assert taken[-1]['joint_states'][2] == pytest.approx(1e-3, abs=2e-8)
+    assert taken[-1]['ground_truth'][8] == -4.0
+    assert_allclose(taken[-1]['base_wrench'][1], 4.0, atol=0.003)
+
+
+def test_the_sensor_feels_what_carries_the_needle() -> None:
+    """At constant speed friction and cutting; back, friction alone; bent, the guide's load."""
+    values = {**VALUES, 'sensor.force_noise': 0.0, 'sensor.torque_noise': 0.0}
+    values |= {'sensor.force_resolution': 0.0, 'sensor.torque_resolution': 0.0, 'sensor.filter': 0}
+    plant, taken = run(values, 1000, course(2.0, insertion=0.05))
+    told = plant.constants.model
+    speed = taken[800]['joint_states'][6]
+    assert_allclose(speed, 0.02, rtol=1e-6)
+    expected = told.coulomb_friction + 1.2 + told.viscous_friction * speed
+    assert_allclose(taken[800]['base_wrench'][1], expected, rtol=1e-6)
+    # What the sensor says is what the joints say, in the order of the message.
+    x, y, z, about_x, about_y, about_z = taken[900]['base_wrench']
+    efforts = taken[900]['joint_states'][12:]
+    assert_allclose([y, x, z, -about_z, about_x, about_y], efforts, rtol=1e-12)
+    assert abs(z) > 0.01
+    plant.perform(course(2.0, insertion=0.03))
+    for k in range(1001, 1801):
+        numbers = {name: values for name, _, values in plant.take(k * PERIOD)}
+    back = numbers['joint_states'][6]
+    expected = told.withdrawal_friction * (told.viscous_friction * back - told.coulomb_friction)
+    assert_allclose(numbers['base_wrench'][1], expected, rtol=1e-5)
+
+
+def test_a_push_ramps_up_and_is_no_faster_than_the_robot() -> None:
+    """The force of a push is the one that was asked for, until the speed is at its limit."""
+    push = Event(
+        TRAJECTORY,
+        {'joints': ['insertion'], 'times': [1.0, 2.0], 'positions': [[], []],
+         'efforts': [[4.0], [4.0]]},
+    )  # fmt: skip
+    quiet = {'sensor.force_noise': 0.0, 'sensor.filter': 0}
+    _, taken = run({**VALUES, **quiet}, 800, push)
+    forces = [sample['base_wrench'][1] for sample in taken]
+    # A count, and the part of a period that a ramp takes.
+    assert_allclose(forces[:500], np.arange(500) * 4.0 / 500, atol=0.02)
+    _, fast = run({**VALUES, **quiet, 'base.speed_limit': 1e-3}, 800, push)
+    speeds = [sample['joint_states'][6] for sample in fast]
+    assert max(speeds) == pytest.approx(1e-3, rel=1e-12)
+    assert fast[-1]['base_wrench'][1] < 3.0
+
+
+def test_the_sensor_is_zeroed_only_at_rest() -> None:
+    """A guide that moves loads it, too."""
+    plant, _ = run(VALUES, 100)
+    plant.perform(Event(TARE))
+    plant.perform(course(1.0, roll=0.5))
+    plant.take(101 * PERIOD)
+    with pytest.raises(JobError, match='roll moves; it must rest'):
+        plant.perform(Event(TARE))
+    plant.perform(course(1.0, insertion=0.02))
+    for k in range(102, 152):
+        plant.take(k * PERIOD)
+    with pytest.raises(JobError, match='the needle moves at 1'):
+        plant.perform(Event(TARE))
+
+
+def test_a_recorded_run_is_the_same_run_again() -> None:
+    """Every number to the bit, after a way through JSON, with noise of path and sensors."""
+    noisy = {**VALUES, 'seed': 7, 'tip.noise': 1.8e-4, 'tip.rate': 40.0, 'tip.delay': 0.02}
+    noisy |= {'tip.dropout': 0.1, 'steering.path_noise': 1e-3}
+    done = {
+        1: [course(1.0, insertion=0.04, guide_x=2e-3)],
+        200: [Event(PARAMETERS, {'model.coulomb_friction': 0.9}), course(0.5, roll=2.0)],
+        400: [Event(RESET), course(1.0, guide_tilt_z=0.05, insertion=0.03)],
+    }
+    runs: list[list[list[Measurement]]] = []
+    for _ in range(2):
+        plant, samples = PlantRun(noisy), []
+        for k in range(1, 601):
+            for kind, content in done.get(k, []):
+                plant.perform(Event(kind, json.loads(json.dumps(content))))
+            samples.append(plant.take(k * PERIOD))
+        runs.append(samples)
+    assert runs[0] == runs[1]
+    lost = sum('tip_deflection' not in [name for name, _, _ in sample] for sample in runs[0])
+    # 40 of 500 a second, and a tenth of them lost.
+    assert 600 - 48 < lost < 600 - 30
+
+
+@pytest.mark.parametrize(
+    ('change', 'complaint'),
+    [
+        ({'steered': 1}, 'steered must be true or false, got 1'),
+        ({'mode': 'indenter'}, 'steered must be false in mode indenter'),
+        ({'tip_deflection': 1e-3}, 'tip_deflection must be 0'),
+        ({'modal': [1e-6, 0.0]}, 'modal empty'),
+        ({'steering.free_length': 0.2}, 'free_length must be < length = 0.2 m'),
+        ({'steering.bevel_load': [0.1, 0.2]}, 'one for each of the 1 layers'),
+        ({'model.friction_law': 'tanh'}, 'friction_law must be coulomb'),
+        ({'guide.rise_time': 0.0}, r'guide\.rise_time must be finite, > 0 s, got 0\.0'),
+        ({'tip.offset': [0.0]}, r'tip\.offset must be three numbers, x y z, got \[0\.0\]'),
+        ({'depth': 0.17}, r'depth must be in \[0, 0\.16\] m'),
+    ],
+)
+def test_constants_that_do_not_go_together_are_named(
+    change: dict[str, Any], complaint: str
+) -> None:
+    with pytest.raises(ParameterError, match=complaint):
+        PlantConstants.of({**VALUES, **change}).make()
+
+
+def test_a_preset_brings_its_steering() -> None:
+    """Constants that are given count, the others are those of the preset."""
+    constants = PlantConstants.of({'steered': True, 'model.preset': 'bending_50mm'})
+    assert constants.steering.free_length == 0.04
+    changed = {'steered': True, 'model.preset': 'bending_50mm', 'steering.free_length': 0.03}
+    assert PlantConstants.of(changed).steering.free_length == 0.03
+    assert PlantConstants.of({'steered': True}).steering.free_length == 0.02
+
+
+def test_a_needle_drawn_out_is_said() -> None:
+    """The skin is the end, as `Insertion` has it."""
+    with pytest.raises(InsertedLengthError, match='the needle reached the skin'):
+        run({**VALUES, 'mode': 'simulation'}, 500, force=-15.0)
+
+
+def test_the_outline_goes_from_the_base_to_the_tip() -> None:
+    """As long as the needle, along its slopes, with the path that it cut."""
+    plant, taken = run(VALUES, 1500, course(2.0, insertion=0.08, guide_z=4e-3))
+    seen = plant.plant.outline()
+    assert seen is not None
+    assert_allclose(seen.points[-1], taken[-1]['tip_deflection'], atol=1e-12)
+    whole = np.vstack([seen.base, seen.points])
+    length = np.linalg.norm(np.diff(whole, axis=0), axis=1).sum()
+    # Small slopes: along the needle it is longer than along y by half their square.
+    assert_allclose(length, 0.2, rtol=1e-3)
+    assert_allclose(seen.points[0], [0.0, -0.04, 4e-3], atol=1e-6)
+    # The robot went a little too far and back; the path ends where it turned.
+    deepest = max((sample['tip_deflection'] for sample in taken), key=lambda tip: tip[1])
+    assert_allclose(seen.path[-1], deepest, atol=1e-9)
+    middle = 0.5 * (seen.slopes[1:] + seen.slopes[:-1])
+    # In the tissue, where points are a millimeter apart.
+    steps = np.diff(seen.points, axis=0)[1:]
+    assert_allclose(steps[:, [0, 2]] / steps[:, [1]], middle[1:], atol=2e-3)
+
+
+def seen_by(readings: int = 2000, **constants: Any) -> np.ndarray:
+    """Return what a spatial sensor says of a tip at (2, 50, 1) mm; NaN where it says nothing."""
+    sensor = TipSensor(TipParameters(**{'noise': 0.0, **constants}), 100.0, 3, spatial=True)
+    found = [sensor.measure(0.05, 1e-3, 2e-3) for _ in range(readings)]
+    return np.array([(r.across, r.depth, r.deflection) if r else (np.nan,) * 3 for r in found])
+
+
+def test_a_tracker_has_noise_on_every_axis() -> None:
+    errors = seen_by(noise=1.8e-4) - (2e-3, 0.05, 1e-3)
+    # 2000 samples: a mean is known to 4 um, a deviation to 1.6 %, each taken four times.
+    assert_allclose(errors.mean(axis=0), 0.0, atol=1.6e-5)
+    assert_allclose(errors.std(axis=0), 1.8e-4, rtol=0.064)
+    # Independent: a correlation is known to 0.022.
+    assert np.abs(np.corrcoef(errors.T) - np.eye(3)).max() < 0.09
+
+
+def test_samples_get_lost_as_often_as_said() -> None:
+    lost = np.isnan(seen_by(dropout=0.05)[:, 0]).mean()
+    # A standard deviation of 0.005.
+    assert 0.03 < lost < 0.07
+    assert np.isnan(seen_by(dropout=1.0)).all()
+
+
+@settings(max_examples=50, deadline=None)
+@given(turn=st.floats(-3.1, 3.1), offset=st.tuples(*[st.floats(-0.01, 0.01)] * 3))
+def test_a_frame_of_its_own_is_a_turn_and_an_offset(
+    turn: float, offset: tuple[float, float, float]
+) -> None:
+    """Lengths across stay, and the way back gives the tip; an offset comes on top."""
+    ((x, y, z),) = seen_by(1, turn=turn, offset=offset) - offset
+    c, s = np.cos(turn), np.sin(turn)
+    # Rounding.
+    assert_allclose([c * x + s * z, y, c * z - s * x], [2e-3, 0.05, 1e-3], atol=1e-15)
+
+
+def test_an_imager_sees_its_slice_only() -> None:
+    """It says x = 0 there, and nothing of a tip beside it."""
+    assert_allclose(seen_by(3, slice=2.5e-3), [[0.0, 0.05, 1e-3]] * 3)
+    assert np.isnan(seen_by(3, slice=1.5e-3)).all()
