@@ -45,26 +45,28 @@ for k in range(tries):
 print(found)
 """
 
-#: Says for 2 s, once somebody listens, that the needle is elsewhere, with stamps that are ahead
-#: or not.
+#: Says for a time, once somebody listens, or until told to end, that the needle is elsewhere,
+#: with stamps that are ahead or not.
 LIAR: Final = """
-import sys, time
+import signal, sys, time
 import rclpy
 from rclpy.duration import Duration
 from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import JointState
-ahead = Duration(seconds=float(sys.argv[1]))
+ahead, stay = Duration(seconds=float(sys.argv[1])), float(sys.argv[2])
 rclpy.init()
+told = []
+signal.signal(signal.SIGTERM, lambda *_: told.append(True))
 node = rclpy.create_node('liar')
 publisher = node.create_publisher(JointState, 'joint_states', qos_profile_sensor_data)
 lie = JointState(name=['insertion', 'rotation'], velocity=[0.0, 0.0], effort=[0.0, 0.0])
 lie.position = [0.045, 0.0]
 found, end = 0, time.monotonic() + 30.0
-while time.monotonic() < end:
+while time.monotonic() < end and not told:
     lie.header.stamp = (node.get_clock().now() + ahead).to_msg()
     publisher.publish(lie)
     if not found and (found := publisher.get_subscription_count()):
-        end = time.monotonic() + 2.0
+        end = time.monotonic() + stay
     time.sleep(5e-4)
 print(found)
 """
@@ -158,7 +160,7 @@ class Bystander:
 
         self.until(rests, f'{depth} m')
 
-    def endures(self, script: str, *arguments: object) -> tuple[int, float]:
+    def endures(self, script: str, *arguments: object, word: str = '') -> tuple[int, float]:
         """
         Let a stranger in.
 
@@ -168,6 +170,8 @@ class Bystander:
             Program of the stranger.
         *arguments : object
             Its arguments.
+        word : str
+            Part of a message of diagnostics after which it is told to end.
 
         Returns
         -------
@@ -182,6 +186,11 @@ class Bystander:
             stdout=subprocess.PIPE,
             text=True,
         )
+        if word:
+            self.until(
+                lambda: self.was_told(word) or stranger.poll() is not None, f'the word {word!r}'
+            )
+            stranger.terminate()
         self.until(lambda: stranger.poll() is not None, 'the end of the stranger')
         said, _ = stranger.communicate()
         return int(said), self.moved
@@ -278,7 +287,7 @@ def _trials(tries: int) -> list[_Trial]:
         for when, words in (('found', 'for 6 to 48 ms'), ('blind', 'that lives for 80 ms'))
     ]
     liars = [
-        (f'joint_states from a second robot{words}', 1.0, 1, _visit(LIAR, ahead))
+        (f'joint_states from a second robot{words}', 1.0, 1, _visit(LIAR, ahead, 2.0))
         for ahead, words in ((0.0, ''), (0.09, ', 90 ms ahead'))
     ]
     return [

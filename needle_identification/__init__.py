@@ -49,8 +49,8 @@ if TYPE_CHECKING:
     from needle_identification.result import result_yaml, write_result
     from needle_identification.steering.estimate import MediumEstimate, SteeringEstimate
     from needle_identification.steering.identify import identify_steering, SteeringSettings
+    from needle_identification.steering.reading import read_steering_recording
     from needle_identification.steering.recording import SteeringRecording
-    from needle_identification.steering.tables import read_steering_table
     from needle_identification.stiffness.estimate import LevelEstimate, StiffnessEstimate
     from needle_identification.stiffness.identify import identify_stiffness
     from needle_identification.stiffness.presses import Presses
@@ -112,7 +112,7 @@ __all__ = [
     'message_type',
     'read_friction_recording',
     'read_indentation_recording',
-    'read_steering_table',
+    'read_steering_recording',
     'read_topic',
     'regress',
     'result_yaml',

@@ -59,16 +59,64 @@ class SimulatedPlant(Protocol):
         positions: Sequence[Sequence[float]],
         efforts: Sequence[Sequence[float]],
     ) -> None:
-        """Follow a trajectory from now, or raise ParameterError."""
+        """
+        Follow a trajectory from now.
+
+        Parameters
+        ----------
+        joints : sequence of str
+            Names of the joints.
+        times : sequence of float
+            Time of each point from now [s].
+        positions, efforts : sequence of sequence of float
+            Of each point, by joint [m or rad, N].
+
+        Raises
+        ------
+        ParameterError
+            If it cannot.
+
+        """
 
     def tare(self) -> None:
         """Zero the force sensor, or raise JobError."""
 
     def change(self, parameters: NeedleParameters) -> None:
-        """Go on with other constants of the needle."""
+        """
+        Go on with other constants of the needle.
+
+        Parameters
+        ----------
+        parameters : NeedleParameters
+            Constants.
+
+        Raises
+        ------
+        NeedleError
+            If they do not suit its state.
+
+        """
 
     def take(self, force: float, torque: float) -> list[Measurement]:
-        """Advance by one sample interval; return what is published, `joint_states` last."""
+        """
+        Advance by one sample interval.
+
+        Parameters
+        ----------
+        force, torque : float
+            What acts [N, N m].
+
+        Returns
+        -------
+        list of Measurement
+            What is published of it, `joint_states` last.
+
+        Raises
+        ------
+        InsertedLengthError
+            If the needle left the tissue.
+
+        """
 
     def outline(self) -> Outline | None:
         """Return the needle as people see it; None if there is none."""

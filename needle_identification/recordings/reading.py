@@ -37,21 +37,33 @@ from needle_ros.errors import MessageError
 _FIRST: Final = 50
 
 
-class _Wanted(NamedTuple):
-    """A topic: the option that names it, types it may have, and its usual last names."""
+class Wanted(NamedTuple):
+    """
+    A topic that is looked for in a bag.
+
+    Attributes
+    ----------
+    option : str
+        The option that names it.
+    types : tuple of str
+        Types it may have.
+    usual : tuple of str
+        Its usual last names.
+
+    """
 
     option: str
     types: tuple[str, ...]
     usual: tuple[str, ...]
 
 
-_WRENCH: Final = _Wanted('wrench_topic', (wire.WRENCH,), (BASE_WRENCH.name,))
-_FRICTION_MOTION: Final = _Wanted(
+_WRENCH: Final = Wanted('wrench_topic', (wire.WRENCH,), (BASE_WRENCH.name,))
+_FRICTION_MOTION: Final = Wanted(
     'motion_topic',
     (wire.JOINT_STATE, wire.POSE, wire.POINT, wire.TWIST, wire.ODOMETRY),
     (JOINT_STATES.name, END_EFFECTOR_POSE.name),
 )
-_INDENTATION_MOTION: Final = _Wanted(
+_INDENTATION_MOTION: Final = Wanted(
     'motion_topic',
     (wire.POSE, wire.POINT, wire.ODOMETRY, wire.JOINT_STATE),
     (END_EFFECTOR_POSE.name, JOINT_STATES.name),
@@ -130,11 +142,11 @@ def read_friction_recording(
     sign, axis = signed_axis(force_axis, 'force axis')
     bag = Bag(path)
     topics = bag.topics()
-    wrench = _chosen(bag, topics, _WRENCH, wrench_topic)
-    motion = _chosen(bag, topics, _FRICTION_MOTION, motion_topic)
+    wrench = chosen_topic(bag, topics, _WRENCH, wrench_topic)
+    motion = chosen_topic(bag, topics, _FRICTION_MOTION, motion_topic)
     source, direction = _motion_source(bag, motion, motion_axis)
     force_source = source_of(wrench.type_name, [axis])
-    gathered, configuration = _read(bag, {wrench: force_source, motion: source}, time)
+    gathered, configuration = read_samples(bag, {wrench: force_source, motion: source}, time)
     force = gathered[wrench].samples(bag)
     moved = gathered[motion].samples(bag)
     if motion.type_name in (wire.TWIST, wire.JOINT_STATE, wire.ODOMETRY):
@@ -193,13 +205,13 @@ def read_indentation_recording(
     across = next(axis for axis in AXES if axis not in plane)
     bag = Bag(path)
     topics = bag.topics()
-    wrench = _chosen(bag, topics, _WRENCH, wrench_topic)
-    motion = _chosen(bag, topics, _INDENTATION_MOTION, motion_topic)
+    wrench = chosen_topic(bag, topics, _WRENCH, wrench_topic)
+    motion = chosen_topic(bag, topics, _INDENTATION_MOTION, motion_topic)
     sources = {
         wrench: source_of(wrench.type_name, plane),
         motion: source_of(motion.type_name, (*plane, across)),
     }
-    gathered, configuration = _read(bag, sources, time)
+    gathered, configuration = read_samples(bag, sources, time)
     times, forces, positions, clock_offset = merge(
         bag, gathered[wrench].samples(bag), gathered[motion].samples(bag)
     )
@@ -291,8 +303,32 @@ def first_names(bag: Bag, topic: Topic) -> list[tuple[str, ...]]:
     return found
 
 
-def _chosen(bag: Bag, topics: Sequence[Topic], wanted: _Wanted, name: str | None) -> Topic:
-    """Return the topic of a name, or the one of the right type."""
+def chosen_topic(bag: Bag, topics: Sequence[Topic], wanted: Wanted, name: str | None) -> Topic:
+    """
+    Return the topic of a name, or the one of the right type.
+
+    Parameters
+    ----------
+    bag : Bag
+        The bag.
+    topics : sequence of Topic
+        Its topics.
+    wanted : Wanted
+        What is looked for.
+    name : str or None
+        Its name, if that is known.
+
+    Returns
+    -------
+    Topic
+        The topic.
+
+    Raises
+    ------
+    RecordingError
+        If there is none, or more than one.
+
+    """
     fitting = [topic for topic in topics if topic.type_name in wanted.types]
     short = ', '.join(type_name.rsplit('/', 1)[-1] for type_name in wanted.types)
     if name is not None:
@@ -316,10 +352,34 @@ def _chosen(bag: Bag, topics: Sequence[Topic], wanted: _Wanted, name: str | None
     )
 
 
-def _read(
+def read_samples(
     bag: Bag, sources: Mapping[Topic, Source], time: str
 ) -> tuple[Mapping[Topic, Gathering], str]:
-    """Go through a bag; return the samples of its topics, and the configuration of the plant."""
+    """
+    Go through a bag.
+
+    Parameters
+    ----------
+    bag : Bag
+        The bag.
+    sources : mapping of Topic to Source
+        What to take from each topic.
+    time : str
+        Stamps to use, one of `TIMES`.
+
+    Returns
+    -------
+    gathered : mapping of Topic to Gathering
+        Samples of each topic.
+    configuration : str
+        Configuration of the plant, '' if there is none.
+
+    Raises
+    ------
+    RecordingError
+        If the bag is not readable.
+
+    """
     if time not in TIMES:
         raise RecordingError(f'time must be one of {", ".join(TIMES)}, got {time!r}')
     gathered = {

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Final
 
 from needle_dynamics.arrays import BoolArray, FloatArray
+from needle_identification.errors import RecordingError
 from needle_ros.errors import ShapeError, shown
 import numpy as np
 
@@ -14,6 +17,12 @@ _FROZEN: Final = 3
 
 #: Depth that the tip must go in that time [m]: more than the noise of any robot.
 _GONE: Final = 5e-4
+
+#: A first depth beyond this is that of another origin than the skin [m].
+_AT_THE_SKIN: Final = 0.03
+
+#: A robot at rest on the skin may be so far above it [m].
+_JITTER: Final = 1e-3
 
 #: A tip this much further aside than the guide and half of its depth is not that of this needle.
 _ASIDE: Final = 0.03
@@ -129,3 +138,59 @@ def credible(depth: FloatArray, guide: FloatArray, tip: FloatArray) -> tuple[Boo
         if count
     ]
     return there & ~frozen & ~wild, losses
+
+
+def recorded_insertion(
+    path: Path, medium: str, values: Mapping[str, FloatArray], losses: Sequence[str]
+) -> SteeringRecording:
+    """
+    Make an insertion of what a file says, and leave out what cannot be.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    medium : str
+        Name of the tissue.
+    values : mapping of str to ndarray, shape (n,)
+        ``depth``, ``guide_x``, ``guide_z``, ``tip_x`` and ``tip_z`` [m], and perhaps ``roll``
+        [rad]; finite but for the tip.
+    losses : sequence of str
+        What was left out or repaired before.
+
+    Returns
+    -------
+    SteeringRecording
+        The insertion.
+
+    Raises
+    ------
+    RecordingError
+        If the depth counts out of the tissue, or the tip is never known.
+
+    """
+    losses, depth = list(losses), values['depth']
+    if not 0.0 <= depth[0] <= _AT_THE_SKIN or depth.min() < 0.0:
+        losses.append(f'depths from the first, {1e3 * depth[0]:.4g} mm, which is at the skin')
+        depth = depth - depth[0]
+    if depth.min() < -_JITTER:
+        raise RecordingError(
+            f'{path}: depth goes from the first row to {1e3 * depth.min():.4g} mm, out of the '
+            f'skin: if it counts out of the tissue, say --columns depth=-NAME'
+        )
+    guide = np.column_stack([values['guide_x'], values['guide_z']])
+    tip = np.column_stack([values['tip_x'], values['tip_z']])
+    known = tip[np.isfinite(tip).all(axis=1)]
+    if not len(known):
+        raise RecordingError(f'{path}: no row has a position of the tip')
+    good, wrong = credible(depth, guide - guide[0], tip - known[0])
+    tip[~good] = np.nan
+    return SteeringRecording(
+        name=str(path),
+        medium=medium,
+        depth=np.maximum(depth, 0.0),
+        guide=guide,
+        roll=values.get('roll', np.zeros(len(depth))),
+        tip=tip,
+        losses=(*losses, *wrong),
+    )

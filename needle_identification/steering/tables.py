@@ -16,7 +16,7 @@ from typing import Final
 from needle_dynamics.arrays import FloatArray
 from needle_identification.errors import RecordingError
 from needle_identification.recordings.tables import column_values, guessed, read_table, Table
-from needle_identification.steering.recording import credible, SteeringRecording
+from needle_identification.steering.recording import recorded_insertion, SteeringRecording
 import numpy as np
 
 #: Roles of the columns; without a roll the needle was not turned.
@@ -33,12 +33,6 @@ _USUAL: Final = {
 }
 
 _SHIFTED: Final = re.compile(r'^(.*?)\s*@\s*(\d{1,6})$')
-
-#: A first depth beyond this is that of another origin than the skin [m].
-_AT_THE_SKIN: Final = 0.03
-
-#: A robot at rest on the skin may be so far above it [m].
-_JITTER: Final = 1e-3
 
 
 def read_steering_table(
@@ -88,31 +82,7 @@ def read_steering_table(
     if np.count_nonzero(usable) < 2:
         raise RecordingError('; '.join([f'{path} has fewer than 2 usable rows', *losses]))
     values = {role: column[usable] for role, column in values.items()}
-    depth = values['depth']
-    if not 0.0 <= depth[0] <= _AT_THE_SKIN or depth.min() < 0.0:
-        losses.append(f'depths from the first, {1e3 * depth[0]:.4g} mm, which is at the skin')
-        depth = depth - depth[0]
-    if depth.min() < -_JITTER:
-        raise RecordingError(
-            f'{path}: depth goes from the first row to {1e3 * depth.min():.4g} mm, out of the '
-            f'skin: if it counts out of the tissue, say --columns depth=-NAME'
-        )
-    guide = np.column_stack([values['guide_x'], values['guide_z']])
-    tip = np.column_stack([values['tip_x'], values['tip_z']])
-    known = tip[np.isfinite(tip).all(axis=1)]
-    if not len(known):
-        raise RecordingError(f'{path}: no row has a position of the tip')
-    good, wrong = credible(depth, guide - guide[0], tip - known[0])
-    tip[~good] = np.nan
-    return SteeringRecording(
-        name=str(path),
-        medium=medium,
-        depth=np.maximum(depth, 0.0),
-        guide=guide,
-        roll=values.get('roll', np.zeros(len(depth))),
-        tip=tip,
-        losses=(*losses, *wrong),
-    )
+    return recorded_insertion(path, medium, values, losses)
 
 
 def _shifted(table: Table, role: str, spec: str, losses: list[str]) -> FloatArray:

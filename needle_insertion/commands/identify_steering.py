@@ -1,4 +1,4 @@
-"""`needle identify steering`: bending of a needle that cuts its path, from tables."""
+"""`needle identify steering`: bending of a needle that cuts its path, from recordings."""
 
 from __future__ import annotations
 
@@ -13,11 +13,13 @@ from typing import Any
 
 from needle_identification.estimation.estimate import ParameterEstimate
 from needle_identification.estimation.formatting import between, measured
+from needle_identification.recordings import TIMES
 from needle_identification.recordings.tables import column_roles
 from needle_identification.steering.estimate import SteeringEstimate
+from needle_identification.steering.reading import read_steering_recording
 from needle_identification.steering.recording import SteeringRecording
 from needle_identification.steering.response import ORDERS, TERMS
-from needle_identification.steering.tables import read_steering_table, STEERING_ROLES
+from needle_identification.steering.tables import STEERING_ROLES
 from needle_insertion.report.text import table
 from needle_ros.errors import NeedleError, ParameterError, shown
 from tqdm import tqdm
@@ -46,12 +48,12 @@ def add_steering(what: Any) -> None:
         "tip_z=tip.z[mm]'",
     )
     parser.add_argument(
-        'tables',
+        'recordings',
         type=Path,
         nargs='+',
-        metavar='TABLE',
-        help='insertions as tables (.csv, .tsv, .mat); one that cannot be used is named, the '
-        'others go on, and the exit status is 2',
+        metavar='BAG',
+        help='insertions as bags, or as tables (.csv, .tsv, .mat); one that cannot be used is '
+        'named, the others go on, and the exit status is 2',
     )
     parser.add_argument('--json', action='store_true', help='print JSON instead of tables')
     reading = parser.add_argument_group('what to read')
@@ -59,14 +61,32 @@ def add_steering(what: Any) -> None:
         '--columns',
         metavar='ROLE=[-]NAME[*FACTOR][UNIT][@ROWS],...',
         help=f'columns by role, of {", ".join(STEERING_ROLES)}; @1: the value of one row before '
-        '(default by usual names)',
+        '(default by usual names); of a bag, the joints of depth, guide and roll, and the axes '
+        'of the tip',
+    )
+    reading.add_argument(
+        '--tip-topic',
+        metavar='TOPIC',
+        help='topic of the tip, a PointStamped or PoseStamped (default the only one, or '
+        'tip_deflection)',
+    )
+    reading.add_argument(
+        '--motion-topic',
+        metavar='TOPIC',
+        help='topic of the joints, a JointState (default the only one, or joint_states)',
+    )
+    reading.add_argument(
+        '--time',
+        choices=TIMES,
+        default='header',
+        help='go by the stamps of the messages or by when they were received (default header)',
     )
     reading.add_argument(
         '--medium',
         type=_pattern,
         metavar='REGEX',
-        help='what in the path of a table names its medium, a regular expression with one group '
-        '(default its folder)',
+        help='what in the path of a recording names its medium, a regular expression with one '
+        'group (default its folder)',
     )
     fitting = parser.add_argument_group('how to identify')
     fitting.add_argument(
@@ -106,11 +126,18 @@ def _medium_of(path: Path, pattern: re.Pattern[str] | None) -> str:
 
 
 def _read(
-    path: Path, columns: Mapping[str, str], pattern: re.Pattern[str] | None
+    path: Path, columns: Mapping[str, str], options: argparse.Namespace
 ) -> SteeringRecording | None:
-    """Read a table; say why if that is not possible."""
+    """Read a recording; say why if that is not possible."""
     try:
-        return read_steering_table(path, columns, _medium_of(path, pattern))
+        return read_steering_recording(
+            path,
+            medium=_medium_of(path, options.medium),
+            tip_topic=options.tip_topic,
+            motion_topic=options.motion_topic,
+            time=options.time,
+            columns=columns,
+        )
     except (NeedleError, OSError) as error:
         sys.stderr.write(shown(f'error: {error}') + '\n')
         return None
@@ -125,7 +152,7 @@ def _run(options: argparse.Namespace) -> int:
         terms = tuple(word.strip() for word in options.terms.split(','))
     settings = SteeringSettings(terms=terms, order=options.order, free_length=options.free_length)
     columns = column_roles(options.columns, STEERING_ROLES) if options.columns else {}
-    read = [_read(path, columns, options.medium) for path in options.tables]
+    read = [_read(path, columns, options) for path in options.recordings]
     recordings = [one for one in read if one is not None]
     if not recordings:
         return 2

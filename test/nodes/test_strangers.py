@@ -28,10 +28,11 @@ def test_a_second_commander_moves_nothing(ros_graph: RosGraph, force: float, whe
 def test_a_second_robot_moves_nothing(ros_graph: RosGraph, ahead: float) -> None:
     """What it measures is nobody's needle; its stamps do not make those of the first late."""
     bystander = Bystander(ros_graph)
-    found, moved = bystander.endures(LIAR, ahead)
+    word = '2 nodes publish joint_states'
+    found, moved = bystander.endures(LIAR, ahead, 30.0, word=word)
     assert found > 0
     assert moved < 1e-3
-    bystander.until(lambda: bystander.was_told('2 nodes publish joint_states'), 'the word of it')
+    bystander.until(lambda: bystander.was_told(word), 'the word of it')
     bystander.goes_to(NEXT)
     assert bystander.stops == {'0'}
 

@@ -1,0 +1,147 @@
+"""Steered insertions from bags, and from tables: `tables`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from math import ceil
+from pathlib import Path
+from typing import Final
+
+from needle_dynamics.arrays import FloatArray
+from needle_identification.bags.bag import Bag
+from needle_identification.errors import RecordingError
+from needle_identification.recordings.reading import (
+    chosen_topic,
+    first_names,
+    read_samples,
+    signed_axis,
+    Wanted,
+)
+from needle_identification.recordings.samples import each_joint, source_of
+from needle_identification.recordings.tables import is_table
+from needle_identification.recordings.timebase import merge
+from needle_identification.steering.recording import recorded_insertion, SteeringRecording
+from needle_identification.steering.tables import read_steering_table
+from needle_ros import wire
+from needle_ros.contract import (
+    GUIDE_X,
+    GUIDE_Z,
+    INSERTION,
+    JOINT_STATES,
+    ROLL,
+    TILT_X,
+    TILT_Z,
+    TIP_DEFLECTION,
+)
+import numpy as np
+
+_TIP: Final = Wanted('tip_topic', (wire.POINT, wire.POSE), (TIP_DEFLECTION.name,))
+_MOTION: Final = Wanted('motion_topic', (wire.JOINT_STATE,), (JOINT_STATES.name,))
+
+#: Joints by role, and components of the tip.
+_JOINTS: Final = {'depth': INSERTION, 'guide_x': GUIDE_X, 'guide_z': GUIDE_Z, 'roll': ROLL}
+_TIPS: Final = {'tip_x': 'x', 'tip_z': 'z'}
+_TILTS: Final = (TILT_X, TILT_Z)
+
+#: A tilt that changes by more has moved [rad].
+_MOVED: Final = 1e-4
+
+#: Readings of the tip that are kept: of more, neighbors are averaged. A path of a hundred
+#: millimeters then has one each fifth of a millimeter.
+_MOST: Final = 500
+
+
+def read_steering_recording(
+    path: Path | str,
+    *,
+    medium: str = '',
+    tip_topic: str | None = None,
+    motion_topic: str | None = None,
+    time: str = 'header',
+    columns: Mapping[str, str] | None = None,
+) -> SteeringRecording:
+    """
+    Read an insertion in which the guide moved, or the needle was turned.
+
+    Parameters
+    ----------
+    path : Path or str
+        A bag, as in `read_friction_recording`, or a table.
+    medium : str
+        Name of the tissue.
+    tip_topic : str, optional
+        Topic of the tip, PointStamped or PoseStamped; default the only one, or else that with the
+        last name tip_deflection.
+    motion_topic : str, optional
+        Topic of the joints, a JointState; default the only one, or that with the last name
+        joint_states.
+    time : str
+        Stamps to use, one of `TIMES`.
+    columns : mapping of str to str, optional
+        By role, of `STEERING_ROLES`: columns of a table, see `tables`; of a bag the joints of
+        depth, guide and roll, and the axes x, y or z of the tip, each perhaps after ``-``.
+
+    Returns
+    -------
+    SteeringRecording
+        The insertion; its ``losses`` say what was left out or repaired.
+
+    Raises
+    ------
+    RecordingError
+        If the file is not readable, or lacks a topic, a joint or a column.
+
+    """
+    path, columns = Path(path), columns or {}
+    if is_table(path):
+        for option, given in (('--tip-topic', tip_topic), ('--motion-topic', motion_topic)):
+            if given is not None:
+                raise RecordingError(f'{path} is a table: --columns takes the place of {option}')
+        return read_steering_table(path, columns, medium)
+    bag = Bag(path)
+    topics = bag.topics()
+    tip = chosen_topic(bag, topics, _TIP, tip_topic)
+    motion = chosen_topic(bag, topics, _MOTION, motion_topic)
+    seen = {name for names in first_names(bag, motion) for name in names}
+    joints = {role: _signed(columns.get(role, name)) for role, name in _JOINTS.items()}
+    if 'roll' not in columns and ROLL not in seen:
+        del joints['roll']
+    if missing := {name for _, name in joints.values()} - seen:
+        raise RecordingError(
+            f'{path}: {motion.name} has no joint {" nor ".join(sorted(missing))}, it has '
+            f'{", ".join(sorted(seen)) or "none"}: say --columns guide_x=JOINT,...'
+        )
+    axes = {role: signed_axis(columns.get(role, axis), role) for role, axis in _TIPS.items()}
+    tilts = [name for name in _TILTS if name in seen]
+    sources = {
+        tip: source_of(tip.type_name, [axis for _, axis in axes.values()]),
+        motion: each_joint([*(name for _, name in joints.values()), *tilts]),
+    }
+    gathered, _ = read_samples(bag, sources, time)
+    _, tips, moved, _ = merge(bag, gathered[tip].samples(bag), gathered[motion].samples(bag))
+    losses = list(bag.losses)
+    for name, column in zip(tilts, moved[:, len(joints) :].T, strict=True):
+        if (change := float(np.ptp(column))) > _MOVED:
+            losses.append(f'{name} moves by {change:.3g} rad, which is not taken into account')
+    both = np.hstack([tips, moved[:, : len(joints)]])
+    signs = [sign for sign, _ in (*axes.values(), *joints.values())]
+    values = dict(zip([*axes, *joints], (both * signs).T, strict=True))
+    return recorded_insertion(path, medium, _thinned(values, losses), losses)
+
+
+def _signed(text: str) -> tuple[float, str]:
+    """Split the name of a joint from its sign."""
+    return (-1.0, text[1:]) if text.startswith('-') else (1.0, text)
+
+
+def _thinned(values: Mapping[str, FloatArray], losses: list[str]) -> dict[str, FloatArray]:
+    """Average neighbors where there are more samples than a fit needs."""
+    count = len(values['depth'])
+    group = ceil(count / _MOST)
+    if group == 1:
+        return dict(values)
+    losses.append(f'of {count} readings of the tip each {group} are averaged')
+    whole = count - count % group
+    return {
+        role: column[:whole].reshape(-1, group).mean(axis=1) for role, column in values.items()
+    }
