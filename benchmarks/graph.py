@@ -1,9 +1,9 @@
 """
 What the nodes cost beside bare rclpy nodes that send the same messages at the same rate.
 
-Three pairs of a plant and a controller take turns, each on a domain of its own: the nodes of this
+Four pairs of a plant and a controller take turns, each on a domain of its own: the nodes of this
 package; bare nodes on the events executor, which this package uses too; bare nodes on the default
-executor of rclpy. First the plants publish without commands, then the loops are closed, then the
+executor of rclpy; and ours with a needle that bends. First the plants publish without commands, then the loops are closed, then the
 controllers answer a probe in this process that takes the place of the plant. A ratio is the
 median over the rounds of the ratios within a round, so that other work on the machine affects all
 alike.
@@ -270,10 +270,10 @@ def side_by_side(found: Mapping[str, list[Figures]], plan: Plan) -> tuple[Sectio
     section : Section
         Medians, and ratios of ours to the others.
     bars : list of Bar
-        Round trip, sample to command, and CPU of the plant.
+        Round trip, sample to command, and CPU of the plants.
 
     """
-    ours, bare, usual = (found[name] for name in PAIRS)
+    ours, bare, usual, steered = (found[name] for name in PAIRS)
 
     def median(figures: Sequence[Figures], what: str) -> str:
         values = [one[what] for one in figures]
@@ -290,6 +290,8 @@ def side_by_side(found: Mapping[str, list[Figures]], plan: Plan) -> tuple[Sectio
             times(ratio(ours, bare, what)),
             median(usual, what),
             times(ratio(ours, usual, what)),
+            median(steered, what),
+            times(ratio(steered, bare, what)),
         )
         for what in ours[0]
     ]
@@ -305,9 +307,17 @@ def side_by_side(found: Mapping[str, list[Figures]], plan: Plan) -> tuple[Sectio
         Bar(f'{what.partition(" [")[0]}, over bare', ratio(ours, bare, what), limit, 'x')
         for what, limit in limits.items()
     ]
+    bars.append(
+        Bar(
+            'CPU of the plant that bends, over bare',
+            ratio(steered, bare, 'CPU of the plant [%]'),
+            PLANT_CPU,
+            'x',
+        )
+    )
     section = Section(
         'Nodes beside bare nodes',
-        (f'{RATE} Hz', PAIRS[0], PAIRS[1], 'ratio', PAIRS[2], 'ratio'),
+        (f'{RATE} Hz', PAIRS[0], PAIRS[1], 'ratio', PAIRS[2], 'ratio', PAIRS[3], 'over bare'),
         rows,
         f'{plan.rounds} rounds of {plan.turn:g} s. Each figure is the median over the rounds, '
         'and each ratio the median of the ratios within the rounds. A worst value is the largest '

@@ -27,8 +27,18 @@ Seen: TypeAlias = Mapping[str, list[tuple[int, int]]]
 #: Executors of the pairs of bare nodes, by name.
 _BARE: Final = {'bare': 'events', 'bare, usual executor': 'single'}
 
+#: Parameters of our plants, by name of the pair: the needle of the paper, and one that bends.
+_OURS: Final[Mapping[str, dict[str, object]]] = {
+    'needle': {},
+    'needle, steered': {
+        'steered': True,
+        'model.preset': 'bending_35mm',
+        'steering.bevel_load': [0.3],
+    },
+}
+
 #: Names of the pairs; the first is that of this package.
-PAIRS: Final = ('needle', *_BARE)
+PAIRS: Final = ('needle', *_BARE, 'needle, steered')
 
 #: Roles of the bare nodes that stand for a plant and a controller.
 _ROLES: Final = {'plant': 'plant', 'controller': 'echo'}
@@ -86,6 +96,7 @@ class Pair:
         self._kill: dict[str, Callable[[], None]] = {}
         self._bare: list[subprocess.Popen[bytes]] = []
         self._executor = _BARE.get(name)
+        self._plant = _OURS.get(name, {})
         self._run = self.node.create_publisher(Bool, 'run', LATCHED)
         self._target = self.node.create_publisher(PointStamped, 'target', COMMAND)
         self._targets = 0
@@ -101,7 +112,8 @@ class Pair:
 
         """
         if self._executor is None:
-            node = self.graph.start(what, {'autostart': False})
+            given = self._plant if what == 'plant' else {}
+            node = self.graph.start(what, {'autostart': False, **given})
             self.pids[what], self._kill[what] = node.process.pid, node.kill
         else:
             bare = self.start_bare(_ROLES[what], self._executor)

@@ -216,7 +216,7 @@ class Insertion:
 
         """
         self._check(duration, 'force', force)
-        shift, _ = self.needle.checked(guide, tilt, roll, tissue)
+        shift, given = self.needle.checked(guide, tilt, roll, tissue)
         self._drift_to(duration, shift)
         state, punctured = self._state.copy(), self._punctured.copy()
         felt = np.full(1, float(force))
@@ -227,7 +227,7 @@ class Insertion:
             limited = copysign(speed_limit, speed)
             left = self._carry(state, punctured, duration, limited, felt)
         self._state, self._punctured = state, punctured
-        self._across(duration, left, guide, tilt, roll, shift)
+        self._across(duration, left, shift, given)
         return float(felt[0])
 
     def carry(
@@ -269,11 +269,11 @@ class Insertion:
 
         """
         self._check(duration, 'velocity', velocity)
-        shift, _ = self.needle.checked(guide, tilt, roll, tissue)
+        shift, given = self.needle.checked(guide, tilt, roll, tissue)
         self._drift_to(duration, shift)
         forces = np.empty(1) if felt is None else felt
         left = self._carry(self._state, self._punctured, duration, velocity, forces)
-        self._across(duration, left, guide, tilt, roll, shift)
+        self._across(duration, left, shift, given)
         return float(forces.mean())
 
     def _carry(
@@ -306,21 +306,13 @@ class Insertion:
         self,
         duration: float,
         left: float,
-        guide: Sequence[float] | None,
-        tilt: Sequence[float] | None,
-        roll: float | None,
         shift: FloatArray,
+        given: tuple[tuple[float, float], tuple[float, float], float],
     ) -> None:
         self._tissue = shift
         self.time += duration - left
         depth = self.depth
-        self.needle.move(
-            depth=min(max(depth, float(shift[1])), self.axis.reach),
-            guide=guide,
-            tilt=tilt,
-            roll=roll,
-            tissue=shift,
-        )
+        self.needle.bring(min(max(depth, float(shift[1])), self.axis.reach), shift, given)
         if left > 0.0:
             limit = (
                 f'{1e3 * self.axis.reach:.4g} mm, where its hub stops on the guide'

@@ -317,23 +317,42 @@ class SteeredNeedle:
             If a value is not finite, or the needle does not reach so deep.
 
         """
-        here = self.depth
-        to = here if depth is None else _finite('depth', depth)
+        to = self.depth if depth is None else _finite('depth', depth)
         shift, given = self.checked(guide, tilt, roll, tissue)
-        free = self.steering.free_length + float(shift[1])
         reach = self.needle.length - self.steering.free_length
         if not shift[1] <= to <= reach:
             raise ParameterError(
                 f'depth must be in [{shift[1]:g}, {reach:g}] m, the length of the needle '
                 f'without its free length, got {to!r} m'
             )
-        if (shift != self._shift).any():
+        self.bring(to, shift, given)
+
+    def bring(
+        self,
+        depth: float,
+        shift: FloatArray,
+        given: tuple[tuple[float, float], tuple[float, float], float],
+    ) -> None:
+        """
+        Bring the needle to a pose that is valid.
+
+        Parameters
+        ----------
+        depth : float
+            Depth s of the tip [m], within its reach.
+        shift, given
+            As `checked` returns them.
+
+        """
+        if shift is not self._shift and (shift != self._shift).any():
+            here = self.depth
             self._shift = shift
+            free = self.steering.free_length + float(shift[1])
             if free != self._cut.pose[FREE]:
                 set_free(self._constants, self._cut, free)
             move(self._constants, self._cut, self._pose(here))
         self._guide, self._tilt, self._roll = given
-        move(self._constants, self._cut, self._pose(to))
+        move(self._constants, self._cut, self._pose(depth))
 
     def checked(
         self,

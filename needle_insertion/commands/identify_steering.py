@@ -11,6 +11,7 @@ import re
 import sys
 from typing import Any
 
+from needle_identification.errors import IdentificationError
 from needle_identification.estimation.estimate import ParameterEstimate
 from needle_identification.estimation.formatting import between, measured
 from needle_identification.recordings import TIMES
@@ -20,6 +21,7 @@ from needle_identification.steering.reading import read_steering_recording
 from needle_identification.steering.recording import SteeringRecording
 from needle_identification.steering.response import ORDERS, TERMS
 from needle_identification.steering.tables import STEERING_ROLES
+from needle_insertion.commands.common import check_file
 from needle_insertion.report.text import table
 from needle_ros.errors import NeedleError, ParameterError, shown
 from tqdm import tqdm
@@ -54,6 +56,13 @@ def add_steering(what: Any) -> None:
         metavar='BAG',
         help='insertions as bags, or as tables (.csv, .tsv, .mat); one that cannot be used is '
         'named, the others go on, and the exit status is 2',
+    )
+    parser.add_argument(
+        '-o',
+        '--output',
+        type=Path,
+        metavar='FILE',
+        help='ROS parameter file with the result for a plant that is steered; of one medium',
     )
     parser.add_argument('--json', action='store_true', help='print JSON instead of tables')
     reading = parser.add_argument_group('what to read')
@@ -146,7 +155,10 @@ def _read(
 def _run(options: argparse.Namespace) -> int:
     # The search takes a large import, which other commands of this parser do not need.
     from needle_identification import identify_steering, SteeringSettings
+    from needle_identification.steering.result import write_steering
 
+    if options.output is not None:
+        check_file(options.output)
     terms = None
     if options.terms is not None:
         terms = tuple(word.strip() for word in options.terms.split(','))
@@ -167,6 +179,14 @@ def _run(options: argparse.Namespace) -> int:
         sys.stdout.write(f'{json.dumps(document, indent=2, allow_nan=False)}\n')
     else:
         sys.stdout.write(f'{steering_text(found)}\n')
+    if options.output is not None:
+        try:
+            write_steering(options.output, found)
+        except IdentificationError as error:
+            sys.stderr.write(shown(f'error: {options.output} is not written: {error}') + '\n')
+            return 2
+        if not options.json:
+            sys.stdout.write(f'wrote {options.output}\n')
     return 0 if len(recordings) == len(read) else 2
 
 

@@ -20,6 +20,7 @@ from needle_identification import (
     summarize_stiffness,
     write_result,
 )
+from needle_insertion.experiment.bending import bending_checks, draw_bending, record_bending
 from needle_insertion.experiment.campaign import Campaign
 from needle_insertion.experiment.insertion import (
     draw_insertions,
@@ -92,7 +93,9 @@ def run(output: Path, bags: Path) -> int:
     """
     shipped = {name: _shipped(bags, name) for name in PROTOCOLS}
     _clear(output)
-    insertions = []
+    insertions, bent = [], output / 'bending'
+    with _progress('insertion, bent needle') as show:
+        record_bending(bent, output / 'logs' / 'bending', show)
     for law in ('adaptive', 'pid'):
         with _progress(f'insertion, {law}') as show:
             record_insertion(law, output / law, output / 'logs' / law, show)
@@ -124,7 +127,8 @@ def run(output: Path, bags: Path) -> int:
         output / 'result.yaml', summarize(friction[:-1]), summarize_stiffness(stiffness[:-1])
     )
 
-    checks = [check for insertion in insertions for check in insertion_checks(insertion)]
+    checks = bending_checks(bent)
+    checks += [check for insertion in insertions for check in insertion_checks(insertion)]
     for *recorded, fresh in compared.values():
         checks += _shipped_checks(f'{len(recorded)} shipped bags', recorded)
         checks += _fresh_checks(fresh)
@@ -145,7 +149,7 @@ def run(output: Path, bags: Path) -> int:
         ],
         rows=rows,
         heads=CHECK_HEADS,
-        pictures=_pictures(insertions, friction[-1], stiffness[-1]),
+        pictures=_pictures(bent, insertions, friction[-1], stiffness[-1]),
     )
     sys.stdout.write(f'{table(rows, CHECK_HEADS)}\n\nreport: {page}\n')
     return 0 if all(check.passed for check in checks) else 1
@@ -178,9 +182,19 @@ def _progress(what: str) -> Iterator[Callable[[float], None]]:
 
 
 def _pictures(
-    insertions: Sequence[Insertion], friction: FrictionEstimate, stiffness: StiffnessEstimate
+    bent: Path,
+    insertions: Sequence[Insertion],
+    friction: FrictionEstimate,
+    stiffness: StiffnessEstimate,
 ) -> list[Picture]:
     return [
+        Picture(
+            'bending',
+            'A needle that bends about the path that it cuts, on its way, to scale: the bevel '
+            'pushes the tip along z until the needle is turned half way, and the guide has gone '
+            'aside along x.',
+            draw_bending(bent),
+        ),
         Picture(
             'insertion',
             'Insertion under both controllers. At the bottom, the tip sensor after the start: '

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -18,6 +18,7 @@ from needle_ros.timing import seconds
 import numpy as np
 from rclpy.duration import Duration
 from sensor_msgs.msg import JointState
+from trajectory_msgs.msg import JointTrajectory
 
 #: The insertion: inserted length at the start and at the end [m], speed [m/s], sample rate [Hz].
 START_DEPTH, TARGET_DEPTH, SPEED, RATE = 0.02, 0.12, 0.010, 1000.0
@@ -27,6 +28,10 @@ START_DEFLECTION: Final = 5e-4
 
 #: Topics sampled at `RATE`, whose messages are counted.
 COUNTED: Final = ('joint_states', 'base_wrench', 'tip_deflection', 'ground_truth')
+
+
+#: Who takes a trajectory: controller, steered plant and recorder.
+_TAKERS: Final = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +59,14 @@ class Insertion:
     completeness: dict[str, float]
 
 
-def record_insertion(law: str, bag: Path, logs: Path, progress: Callable[[float], None]) -> None:
+def record_insertion(
+    law: str,
+    bag: Path,
+    logs: Path,
+    progress: Callable[[float], None],
+    plant: Mapping[str, object] | None = None,
+    course: JointTrajectory | None = None,
+) -> None:
     """
     Drive the simulated needle to the target under a law and record everything.
 
@@ -68,6 +80,11 @@ def record_insertion(law: str, bag: Path, logs: Path, progress: Callable[[float]
         Folder for what the nodes print.
     progress : callable
         Called with the fraction done.
+    plant : mapping of str to object, optional
+        Parameters of the plant, and of the controller as far as they are of the model; default
+        the needle of the paper, bent at the start.
+    course : JointTrajectory, optional
+        Where the guide of a steered needle goes from the beginning.
 
     Raises
     ------
@@ -80,12 +97,15 @@ def record_insertion(law: str, bag: Path, logs: Path, progress: Callable[[float]
         state = graph.latest(node, JointState, 'joint_states', SENSOR)
         reference = graph.latest(node, JointState, 'reference', SENSOR)
         target = node.create_publisher(PointStamped, 'target', COMMAND)
+        moves = node.create_publisher(JointTrajectory, 'joint_trajectory', COMMAND)
         recorder = graph.start('recorder', {'path': str(bag)})
+        given = {'tip_deflection': START_DEFLECTION} if plant is None else plant
+        model = {name: value for name, value in given.items() if name.startswith('model.')}
         controller = graph.start(
-            'controller', {'law': law, 'rate': RATE, 'reference.speed': SPEED}
+            'controller', {'law': law, 'rate': RATE, 'reference.speed': SPEED, **model}
         )
-        start = {'depth': START_DEPTH, 'tip_deflection': START_DEFLECTION, 'rate': RATE}
-        plant = graph.start('plant', {'autostart': False, **start})
+        start = {'depth': START_DEPTH, 'rate': RATE, **given}
+        plant_node = graph.start('plant', {'autostart': False, **start})
         # The plant starts when the recorder listens to everything: the bag holds every sample.
         listeners = {'target': 2, 'wrench_command': 2, 'reference': 2, 'joint_states': 3}
         graph.spin_until(
@@ -102,6 +122,9 @@ def record_insertion(law: str, bag: Path, logs: Path, progress: Callable[[float]
         message.header.stamp = node.get_clock().now().to_msg()
         message.point.y = TARGET_DEPTH
         target.publish(message)
+        if course is not None:
+            graph.spin_until(lambda: moves.get_subscription_count() >= _TAKERS, 'the plant')
+            moves.publish(course)
 
         def arrived() -> bool:
             done = (state.message.position[0] - START_DEPTH) / (TARGET_DEPTH - START_DEPTH)
@@ -115,7 +138,7 @@ def record_insertion(law: str, bag: Path, logs: Path, progress: Callable[[float]
         graph.spin_until(lambda: node.get_clock().now() > end, 'the end of the recording')
         recorder.interrupt()
         controller.interrupt()
-        plant.interrupt()
+        plant_node.interrupt()
 
 
 def read_insertion(law: str, bag: Path) -> Insertion:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 import csv
 from io import StringIO
 from pathlib import Path
@@ -28,6 +29,9 @@ _DRAWN: Final = 4
 
 #: Width of the picture [in].
 _WIDTH: Final = 9.0
+
+#: What is shown around a needle [mm].
+_MARGIN: Final = 4.0
 
 
 class InsertionRecord:
@@ -145,40 +149,57 @@ def write(path: Path, record: InsertionRecord) -> None:
         writer.writerows(record.table.tolist())
         write_whole(path, text.getvalue().encode())
     else:
-        write_whole(path, png(_figure(record)))
+        shapes = [np.insert(one.deflections, 1, one.depths, axis=1) for one in record.shapes]
+        cut = np.insert(record.path.deflections, 1, record.path.depths, axis=1)
+        write_whole(path, png(draw_needle(shapes, cut)))
 
 
-def _figure(record: InsertionRecord) -> Figure:
-    """Draw the needle on its way in both planes, to scale, with the path that it cut."""
+def draw_needle(needles: Sequence[FloatArray], path: FloatArray) -> Figure:
+    """
+    Draw a needle on its way in both planes, to scale, with the path that it cut.
+
+    Parameters
+    ----------
+    needles : sequence of ndarray, shape (k, 3)
+        Points x, y, z along the needle [m], now and then; the last one is drawn bold.
+    path : ndarray, shape (m, 3)
+        Points of the path [m].
+
+    Returns
+    -------
+    Figure
+        The picture.
+
+    """
     from matplotlib.figure import Figure
 
-    shapes, path = record.shapes, record.path
-    begin = 1e3 * min(float(one.depths[0]) for one in shapes)
-    end = 1e3 * max(float(one.depths[-1]) for one in shapes) + 5.0
-    aside = 1.2e3 * max(float(np.abs(one.deflections).max()) for one in shapes) + 2.0
+    begin = 1e3 * min(float(one[:, 1].min()) for one in needles)
+    end = 1e3 * max(float(one[:, 1].max()) for one in needles) + 5.0
+    whole = 1e3 * np.vstack([*needles, path])[:, [0, 2]]
+    limits = np.array([whole.min(axis=0) - _MARGIN, whole.max(axis=0) + _MARGIN]).T
+    spans = np.diff(limits)[:, 0]
     # As high as the scale asks for, with room for the words.
-    height = _WIDTH * 2.0 * aside / (end - begin)
-    figure = Figure(figsize=(_WIDTH, 2.0 * height + 1.5), layout='constrained')
-    for k, (axes, name) in enumerate(zip(figure.subplots(2, 1, sharex=True), 'xz', strict=True)):
+    height = _WIDTH * float(spans.sum()) / (end - begin)
+    figure = Figure(figsize=(_WIDTH, height + 1.5), layout='constrained')
+    planes = figure.subplots(2, 1, sharex=True, height_ratios=spans.tolist())
+    for k, axes, limit in zip((0, 2), planes, limits.tolist(), strict=True):
         axes.axvspan(0.0, end, color='#f3d9d0', lw=0)
         axes.axvline(0.0, color='#b07060', lw=2.0)
-        for j, shape in enumerate(shapes):
-            last = j == len(shapes) - 1
+        for needle in needles:
+            last = needle is needles[-1]
             axes.plot(
-                1e3 * shape.depths,
-                1e3 * shape.deflections[:, k],
+                1e3 * needle[:, 1],
+                1e3 * needle[:, k],
                 color='tab:blue',
                 lw=2.0 if last else 0.8,
                 alpha=1.0 if last else 0.5,
                 label='needle' if last else None,
             )
-        axes.plot(
-            1e3 * path.depths, 1e3 * path.deflections[:, k], 'k--', lw=0.8, label='path it cut'
-        )
+        axes.plot(1e3 * path[:, 1], 1e3 * path[:, k], 'k--', lw=0.8, label='path it cut')
         axes.set(
-            ylabel=f'{name} [mm]',
+            ylabel=f'{"xyz"[k]} [mm]',
             xlim=(begin, end),
-            ylim=(-aside, aside),
+            ylim=limit,
             aspect='equal',
         )
         axes.grid(visible=True, alpha=0.3)

@@ -1,4 +1,4 @@
-"""The picture of steering is drawn by the present code, and shows what it says."""
+"""The pictures of steering are drawn by the present code, and show what they say."""
 
 from __future__ import annotations
 
@@ -7,14 +7,18 @@ import runpy
 
 from matplotlib.image import imread
 import numpy as np
+import pytest
 
-SCRIPT = Path(__file__).parents[2] / 'docs' / 'images' / 'steering.py'
+IMAGES = Path(__file__).parents[2] / 'docs' / 'images'
+SCRIPT = IMAGES / 'steering.py'
 
 
-def test_the_picture_is_the_present_one(tmp_path: Path) -> None:
-    figure = runpy.run_path(str(SCRIPT))['draw']()
+@pytest.mark.parametrize('name', ['steering', 'bending'])
+def test_the_picture_is_the_present_one(tmp_path: Path, name: str) -> None:
+    script = IMAGES / f'{name}.py'
+    figure = runpy.run_path(str(script))['draw']()
     figure.savefig(tmp_path / 'now.png', dpi=120)
-    now, kept = imread(tmp_path / 'now.png'), imread(SCRIPT.with_suffix('.png'))
+    now, kept = imread(tmp_path / 'now.png'), imread(script.with_suffix('.png'))
     assert now.shape == kept.shape
     # Rounding of colors on another machine; a needle with a tenth less curvature makes 0.001.
     assert np.abs(now - kept).mean() < 3e-4
@@ -37,3 +41,11 @@ def test_the_needles_bend_and_follow_their_paths() -> None:
     assert above.get_aspect() == 1.0
     assert 'depth' in above.get_xlabel()
     assert 'lambda' in below.get_ylabel()
+
+
+def test_the_first_picture_has_a_needle_that_bends() -> None:
+    """By a centimeter in both planes: the guide goes one way, the tip the other."""
+    one, shapes = runpy.run_path(str(IMAGES / 'bending.py'))['insert']()
+    assert one.tip[0] < -0.01
+    assert one.tip[2] > 0.01
+    assert shapes[-1][0].tolist() == [8e-3, -0.04, 0.0]

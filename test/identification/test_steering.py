@@ -9,6 +9,8 @@ from math import pi
 from pathlib import Path
 
 from benchmarks.steering_fit import insertion, NOISE, Truth
+from needle_dynamics import bending_length
+from needle_dynamics.simulated.assembly import PlantConstants
 from needle_dynamics.simulated.run import Event, PlantRun, TRAJECTORY
 from needle_identification import (
     BagWriter,
@@ -21,12 +23,14 @@ from needle_identification import (
 from needle_identification.errors import RecordingError
 from needle_identification.recordings.tables import column_roles
 from needle_identification.steering.recording import credible
+from needle_identification.steering.result import steering_yaml
 from needle_identification.steering.tables import STEERING_ROLES
 from needle_insertion.cli import main
 from needle_ros.errors import ParameterError, ShapeError
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest
+import yaml
 
 PLAIN = Truth()
 
@@ -288,7 +292,9 @@ def test_a_bag_of_the_plant_reads_without_options(
 ) -> None:
     """Of ten insertions with a tracker: intervals hold the truth, and only noise is left."""
     bags = [recorded_plant(tmp_path / 'gel', seed) for seed in range(10)]
-    assert main(['identify', 'steering', '--json', '--terms', 'tilt', *map(str, bags)]) == 0
+    result = tmp_path / 'result.yaml'
+    words = ['--json', '--terms', 'tilt', '-o', str(result), *map(str, bags)]
+    assert main(['identify', 'steering', *words]) == 0
     found = json.loads(capsys.readouterr().out)
     gel = found['media']['gel']
     low, high = gel['parameters']['bending_length']['interval']
@@ -301,33 +307,47 @@ def test_a_bag_of_the_plant_reads_without_options(
     assert gel['rms'] == pytest.approx(NOISE, rel=0.044)
     assert gel['recordings'] == 10
     assert 10 * 400 < gel['samples'] < 10 * 480
+    # The file starts a plant with what was found, and a controller with the same tissue.
+    sections = yaml.safe_load(result.read_text())
+    values = sections['/**/plant']['ros__parameters']
+    constants = PlantConstants.of(values)
+    assert constants.steered
+    length = bending_length(constants.model.bending_stiffness, constants.model.tissue_stiffness)
+    # Seven digits, and their fourth root.
+    assert length == pytest.approx(gel['parameters']['bending_length']['value'], rel=1e-6)
+    assert constants.steering.free_length == pytest.approx(found['free_length']['value'], rel=1e-6)
+    # The skin of the plant, by its interval: 300 N/m over the stiffness of the tissue.
+    low, high = gel['parameters']['skin']['interval']
+    tissue = constants.model.tissue_stiffness
+    assert low < 300.0 / tissue < high
+    assert constants.steering.skin_stiffness == pytest.approx(
+        gel['parameters']['skin']['value'] * tissue, rel=1e-6
+    )
+    assert sections['/**/controller']['ros__parameters'] == {
+        name: value for name, value in values.items() if name.startswith('model.')
+    }
 
 
-def test_a_bag_of_another_robot_reads_with_options(
+def test_a_parameter_file_is_of_one_medium(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Joints by name and sign; what is missing, or moves unseen, is said."""
-    names = {'insertion': 'slide', 'guide_x': 'gx', 'guide_z': 'gz', 'roll': 'spin'}
-    plain, other = recorded_plant(tmp_path, 1), recorded_plant(tmp_path / 'b', 1, names)
-    with pytest.raises(
-        RecordingError,
-        match='/joint_states has no joint guide_x nor guide_z nor insertion, it has guide_tilt_x, '
-        'guide_tilt_z, gx, gz, slide, spin: say --columns',
-    ):
-        read_steering_recording(other)
-    columns = column_roles('depth=-slide,guide_x=gx,guide_z=gz,roll=spin,tip_x=-x', STEERING_ROLES)
-    one, two = read_steering_recording(plain), read_steering_recording(other, columns=columns)
-    assert_allclose(one.depth, two.depth, atol=1e-15)
-    assert_allclose(one.tip, two.tip * [-1.0, 1.0], atol=1e-15)
-    assert np.array_equal(one.guide, two.guide)
-    with pytest.raises(RecordingError, match='has no topic /tracker of type PointStamped'):
-        read_steering_recording(plain, tip_topic='/tracker')
-    with pytest.raises(RecordingError, match='tip_x must be x, y, z, -x, -y or -z'):
-        read_steering_recording(plain, columns={'tip_x': 'q'})
-    friction = Path(__file__).parents[2] / 'bags' / 'friction_01'
-    assert main(['identify', 'steering', str(friction)]) == 2
-    assert 'has no topic of type PointStamped, PoseStamped' in capsys.readouterr().err
-    table = tmp_path / 'one.csv'
-    table.write_text('depth,guide_x\n1,2\n')
-    assert main(['identify', 'steering', str(table), '--tip-topic', '/tip']) == 2
-    assert '--columns takes the place of --tip-topic' in capsys.readouterr().err
+    for name in ('gel', 'liver'):
+        (tmp_path / name).mkdir()
+        write_table(tmp_path / name / 'run.csv', insertion(1, replace(PLAIN, noise=1e-5)))
+    tables = [str(tmp_path / name / 'run.csv') for name in ('gel', 'liver')]
+    words = ['identify', 'steering', *tables, '--columns', COLUMNS, '--terms', 'tilt']
+    assert main([*words, '-o', str(tmp_path / 'both.yaml')]) == 2
+    assert 'a parameter file is of one medium, these are gel, liver' in capsys.readouterr().err
+    assert not (tmp_path / 'both.yaml').exists()
+
+
+def test_a_bevel_gives_its_load() -> None:
+    """By the stiffness of the default needle, and with the roll at which it pushes along z."""
+    truth = replace(PLAIN, noise=1e-7, tilt=(0.0, 0.0), curvature=0.8)
+    bevel = SteeringSettings(terms=('bevel',), order='together')
+    text = steering_yaml(identify_steering([insertion(2, truth)], bevel))
+    values = yaml.safe_load(text)['/**/plant']['ros__parameters']
+    # What elements of different lengths differ by.
+    assert values['steering.bevel_load'] == [pytest.approx(0.8 * 0.0256 / 0.035, rel=2e-3)]
+    (line,) = (line for line in text.splitlines() if 'pushes along z' in line)
+    assert abs(float(line.split()[-2])) < 1e-3

@@ -1,0 +1,100 @@
+"""An identified needle that bends as a ROS parameter file."""
+
+from __future__ import annotations
+
+from math import atan2, hypot, isfinite
+from pathlib import Path
+from typing import Final
+
+from needle_dynamics.parameters import DEFAULT_PRESET, NeedleParameters
+from needle_dynamics.steering.parameters import tissue_of
+from needle_identification.errors import IdentificationError
+from needle_identification.estimation.formatting import UNKNOWN
+from needle_identification.result import write_whole
+from needle_identification.steering.estimate import SteeringEstimate
+import yaml
+
+#: Digits that are written: more than any experiment gives.
+_DIGITS: Final = '.7g'
+
+
+def steering_yaml(found: SteeringEstimate) -> str:
+    """
+    Return a ROS parameter file for a plant that is steered, and its controller.
+
+    Motion tells lengths, not forces: the bending stiffness is that of the default needle.
+
+    Parameters
+    ----------
+    found : SteeringEstimate
+        Result of insertions into one medium.
+
+    Returns
+    -------
+    str
+        YAML, with the errors in comments.
+
+    Raises
+    ------
+    IdentificationError
+        If there are several media, or the bending length is not determined.
+
+    """
+    if len(found.media) > 1:
+        raise IdentificationError(
+            'a parameter file is of one medium, these are '
+            f'{", ".join(medium.medium for medium in found.media)}'
+        )
+    (medium,) = found.media
+    length = medium['bending_length']
+    if not length.determined:
+        raise IdentificationError('the data do not determine the bending length')
+    stiffness = NeedleParameters.preset(DEFAULT_PRESET).bending_stiffness
+    tissue = tissue_of(stiffness, length.value)
+    lines = ['# A needle that bends, identified by needle_identification.']
+    for one in (found.free_length, *medium.parameters):
+        unit = '' if one.unit == '1' else f' {one.unit}'
+        value = f'{one.value:.6g}{unit}, SE {one.error:.2g}' if one.determined else UNKNOWN
+        lines.append(f'# {one.symbol} ({one.name}) = {value}')
+    lines.append(f'# E I = {stiffness:g} N m^2 is that of the preset {DEFAULT_PRESET}')
+    steering: dict[str, object] = {'steered': True}
+    if found.free_length.determined and isfinite(found.free_length.value):
+        steering['steering.free_length'] = _short(found.free_length.value)
+    if medium['skin'].determined:
+        steering['steering.skin_stiffness'] = _short(max(0.0, medium['skin'].value) * tissue)
+    if 'bevel' in found.terms:
+        z, x = (medium[f'curvature_{axis}'].value for axis in 'zx')
+        steering['steering.bevel_load'] = [_short(hypot(x, z) * stiffness / length.value)]
+        lines.append(f'# the bevel pushes along z at a roll of {-atan2(x, z):.4g} rad')
+    model = {'model.preset': DEFAULT_PRESET, 'model.tissue_stiffness': _short(tissue)}
+    sections = {
+        '/**/plant': {'ros__parameters': {**model, **steering}},
+        '/**/controller': {'ros__parameters': model},
+    }
+    return '\n'.join([*lines, yaml.safe_dump(sections, sort_keys=False)])
+
+
+def _short(value: float) -> float:
+    return float(format(value, _DIGITS))
+
+
+def write_steering(path: Path, found: SteeringEstimate) -> None:
+    """
+    Write the parameter file of `steering_yaml`.
+
+    Parameters
+    ----------
+    path : Path
+        File to write.
+    found : SteeringEstimate
+        The result.
+
+    Raises
+    ------
+    IdentificationError
+        If there are several media, or the bending length is not determined.
+    ParameterError
+        If the file cannot be written.
+
+    """
+    write_whole(path, steering_yaml(found).encode())
