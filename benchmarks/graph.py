@@ -3,10 +3,10 @@ What the nodes cost beside bare rclpy nodes that send the same messages at the s
 
 Four pairs of a plant and a controller take turns, each on a domain of its own: the nodes of this
 package; bare nodes on the events executor, which this package uses too; bare nodes on the default
-executor of rclpy; and ours with a needle that bends. First the plants publish without commands, then the loops are closed, then the
-controllers answer a probe in this process that takes the place of the plant. A ratio is the
-median over the rounds of the ratios within a round, so that other work on the machine affects all
-alike.
+executor of rclpy; and ours with a needle that bends. First the plants publish without commands,
+then the loops are closed, then the controllers answer a probe in this process that takes the place
+of the plant. A ratio is the median over the rounds of the ratios within a round, so that other
+work on the machine affects all alike.
 
 After that the recorder takes numbered messages, and the memory of the nodes is watched.
 """

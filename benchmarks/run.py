@@ -27,6 +27,7 @@ MODULES = {
     'control': ('control',),
     'steering-model': ('steering_model',),
     'steering-fit': ('steering_fit',),
+    'steering': ('steering',),
     'laws': ('laws',),
     'safety': ('safety',),
     'graph': ('graph',),
@@ -63,6 +64,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('steering-model', help='a needle that cuts its path, beside NumPy and SciPy')
     fit = add('steering-fit', help='how well recorded insertions tell how a needle bends')
     fit.add_argument('--recordings', type=int, metavar='N', help='fits of each kind')
+    steering = add('steering', help='controllers that steer the tip to a target')
+    steering.add_argument('--needles', type=int, metavar='N', help='needles of each case')
     laws = add('laws', help='control laws on needles, robots and tissues that they do not know')
     laws.add_argument('--needles', type=int, metavar='N', help='needles in a cell')
     safety = add('safety', help='what faults, strangers and kills do to a motion')

@@ -44,6 +44,14 @@ from needle_controller.stability import (
     stability_limit,
     transition_matrix,
 )
+from needle_controller.steering.belief import SteeringBelief
+from needle_controller.steering.controller import (
+    OutOfReachError,
+    SteeringController,
+    SteeringFaultError,
+    TipEstimate,
+)
+from needle_controller.steering.responses import SteeringModel
 from needle_controller.supervisor import Supervisor
 from needle_controller.uncertainty import Uncertainty
 
@@ -74,6 +82,7 @@ __all__ = [
     'MinimumJerk',
     'Observer',
     'ObserverSettings',
+    'OutOfReachError',
     'Pid',
     'PidGains',
     'Reference',
@@ -82,8 +91,13 @@ __all__ = [
     'SafetyLimits',
     'SampledLoop',
     'Setpoint',
+    'SteeringBelief',
+    'SteeringController',
+    'SteeringFaultError',
+    'SteeringModel',
     'Stream',
     'Supervisor',
+    'TipEstimate',
     'Trapezoid',
     'Uncertainty',
     'check_stability',

@@ -12,6 +12,7 @@ import sys
 from typing import NamedTuple
 
 from lxml import etree
+from needle_insertion.experiment.node_process import GraphError
 from needle_insertion.experiment.protocol import SHIPPED_BAGS
 from needle_insertion.nodes import NODES
 from needle_ros.base_node import BaseNode
@@ -100,23 +101,45 @@ def is_seen(node: BaseNode) -> bool:
     return all(map(frozenset.issubset, made(node), used(node)))
 
 
+def filled(settings: Mapping[str, object], folder: Path) -> dict[str, object]:
+    """Return parameters with the name of a bag that may be made."""
+    return {
+        key: str(folder / 'bag') if value == 'bag' else value for key, value in settings.items()
+    }
+
+
+def seen_in_graph(folder: Path, name: str) -> Profile:
+    """
+    Return what a node uses with what rcl makes for every node, which the graph alone knows.
+
+    On a machine that is busy Fast DDS 2.14 may lose one of a node's own topics for good, so that
+    another node has to show it.
+    """
+    for last in (False, False, True):
+        with RosGraph(folder) as graph:
+            node = graph.add(node_class(name), parameters=filled(SETTINGS[name][0], folder))
+            try:
+                graph.spin_until(partial(is_seen, node), 'all that it has made', timeout=20.0)
+            except GraphError:
+                if last:
+                    raise
+            else:
+                return used(node)
+            finally:
+                node.stop()
+                shutil.rmtree(folder / 'bag', ignore_errors=True)
+    raise AssertionError
+
+
 @pytest.mark.parametrize('name', NODES)
 def test_each_node_may_do_what_it_does_and_no_more(
     ros_graph: RosGraph, tmp_path: Path, name: str
 ) -> None:
     """The policy names every topic and service that the node has, and none that it never has."""
-    uses = []
+    uses = [seen_in_graph(tmp_path, name)]
     for settings in SETTINGS[name]:
-        parameters = {
-            key: str(tmp_path / 'bag') if value == 'bag' else value
-            for key, value in settings.items()
-        }
-        node = ros_graph.add(node_class(name), parameters=parameters)
+        node = ros_graph.add(node_class(name), parameters=filled(settings, tmp_path))
         uses.append(made(node))
-        if len(uses) == 1:
-            # What rcl makes for every node is known to the graph only.
-            ros_graph.spin_until(partial(is_seen, node), 'its topics and services in the graph')
-            uses.append(used(node))
         node.stop()
     together = Profile(*map(frozenset().union, *uses))
     for rule, allowed, there in zip(Profile._fields, POLICY[name], together, strict=True):

@@ -1,0 +1,185 @@
+"""
+How others steer by the guide, after what they published, with the interface of our controller.
+
+`Broyden` is after [Bernardes2023]_: the tip is taken to move by a matrix times the motion of the
+guide and of the depth, which is corrected after each step. `Springs` is after [Glozman2007]_: the
+inverse of a beam on springs that pull it to the axis. Both are as they are described, not the
+code of their authors.
+
+References
+----------
+.. [Bernardes2023] M. C. Bernardes, P. Moreira, D. Lezcano, L. Foley, K. Tuncali, C. Tempany,
+   J. S. Kim, N. Hata, I. Iordachita, J. Tokuda, "In vivo feasibility study: evaluating autonomous
+   data-driven robotic needle trajectory correction in MRI-guided transperineal procedures", and
+   "Data-driven adaptive needle insertion assist for transperineal prostate interventions",
+   Physics in Medicine and Biology 68, 2023.
+.. [Glozman2007] D. Glozman, M. Shoham, "Image-guided robotic flexible needle steering", IEEE
+   Transactions on Robotics 23, 2007.
+
+"""
+
+from __future__ import annotations
+
+from math import sin
+from typing import Final
+
+from needle_dynamics.arrays import FloatArray
+from needle_dynamics.parameters import NeedleParameters
+from needle_dynamics.steering.needle import SteeredNeedle
+from needle_dynamics.steering.parameters import SteeringParameters
+from needle_dynamics.steering.reference_models import springs
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.optimize import lsq_linear
+
+#: Part of an error of the prediction by which the matrix of Broyden is corrected.
+_ALPHA: Final = 0.65
+
+#: Depth at which tissue holds the needle [m].
+_HELD: Final = 0.02
+
+#: A response of the springs below which their inverse says nothing.
+_LEAST: Final = 1e-3
+
+
+class OpenLoop:
+    """
+    A guide that stays where it is.
+
+    Parameters
+    ----------
+    depths : array_like, shape (n + 1,)
+        Depths of the looks [m].
+    target : array_like, shape (2,)
+        Where the tip shall be at the end, x and z [m].
+    position_limit : float
+        Farthest position of the guide along each axis [m].
+
+    """
+
+    def __init__(self, depths: ArrayLike, target: ArrayLike, position_limit: float = 6e-3) -> None:
+        self.depths, self.target = np.array(depths), np.array(target)
+        self.limit = position_limit
+        self.step = 0
+        self.guide = np.zeros(2)
+
+    def next(self, tip: FloatArray | None) -> tuple[float, float]:
+        """
+        Take a look at the tip, and return where the guide shall be at the end of the next step.
+
+        Parameters
+        ----------
+        tip : ndarray of shape (2,) or None
+            Position of the tip in x and z [m]; None if it was not seen.
+
+        Returns
+        -------
+        tuple of float
+            Position of the guide in x and z [m].
+
+        """
+        if tip is not None and self.step < len(self.depths) - 1:
+            self.guide = np.clip(self._choose(tip), -self.limit, self.limit)
+        self.step += 1
+        x, z = self.guide.tolist()
+        return x, z
+
+    def _choose(self, _tip: FloatArray) -> FloatArray:
+        return self.guide
+
+
+class Broyden(OpenLoop):
+    """
+    A matrix from motions of guide and depth to those of the tip, corrected after each step.
+
+    Each step brings the tip as near to the target as the matrix says that the guide can. In the
+    source this is a horizon of four steps; without a price of motion the first of them is the
+    same for any horizon. The first matrix comes from an insertion before, of the believed needle,
+    and the guide rests until the needle is held by tissue: near the skin the tip goes with the
+    guide, deeper against it, and a wrong sign drives the guide to its limit, where nothing is
+    learned.
+
+    Parameters
+    ----------
+    needle : NeedleParameters
+        Needle and tissue as they are believed.
+    steering : SteeringParameters
+        What they have beyond.
+    depths, target, position_limit
+        As for `OpenLoop`.
+
+    """
+
+    def __init__(
+        self,
+        needle: NeedleParameters,
+        steering: SteeringParameters,
+        depths: ArrayLike,
+        target: ArrayLike,
+        position_limit: float = 6e-3,
+    ) -> None:
+        super().__init__(depths, target, position_limit)
+        #: Of x and z of the tip, by x and z of the guide and the depth.
+        self._matrix = np.zeros((2, 3))
+        self._before: tuple[FloatArray, FloatArray] | None = None
+        earlier = SteeredNeedle(needle, steering)
+        for k, depth in enumerate(self.depths.tolist()):
+            guide = 0.5 * position_limit * np.array([sin(2.0 * k), sin(3.0 * k)])
+            earlier.move(depth=depth, guide=guide.tolist())
+            self._learn(earlier.tip[[0, 2]], np.array([*guide, depth]))
+        self._before = None
+
+    def _learn(self, tip: FloatArray, at: FloatArray) -> None:
+        if self._before is not None:
+            seen, was = self._before
+            moved = at - was
+            off = (tip - seen) - self._matrix @ moved
+            self._matrix += _ALPHA * np.outer(off, moved) / (moved @ moved)
+        self._before = tip.copy(), at
+
+    def _choose(self, tip: FloatArray) -> FloatArray:
+        depth = self.depths[self.step]
+        self._learn(tip, np.array([*self.guide, depth]))
+        if depth < _HELD:
+            return self.guide
+        ahead = self.depths[self.step + 1] - depth
+        across, along = self._matrix[:, :2], self._matrix[:, 2]
+        wanted = self.target - tip - along * ahead + across @ self.guide
+        return np.asarray(lsq_linear(across, wanted, (-self.limit, self.limit)).x)
+
+
+class Springs(OpenLoop):
+    """
+    The inverse of a beam on springs, along a straight line to the target.
+
+    Parameters
+    ----------
+    needle : NeedleParameters
+        Needle and tissue as they are believed.
+    steering : SteeringParameters
+        What they have beyond.
+    depths, target, position_limit
+        As for `OpenLoop`.
+
+    """
+
+    def __init__(
+        self,
+        needle: NeedleParameters,
+        steering: SteeringParameters,
+        depths: ArrayLike,
+        target: ArrayLike,
+        position_limit: float = 6e-3,
+    ) -> None:
+        super().__init__(depths, target, position_limit)
+        self._responses = [
+            float(springs(needle, steering, float(depth))[0][0, 0]) for depth in self.depths
+        ]
+
+    def _choose(self, tip: FloatArray) -> FloatArray:
+        now, then = self._responses[self.step : self.step + 2]
+        if abs(then) < _LEAST:
+            return self.guide
+        wanted = self.target * self.depths[self.step + 1] / self.depths[-1]
+        # What the springs do not explain stays.
+        return np.asarray((wanted - (tip - now * self.guide)) / then)

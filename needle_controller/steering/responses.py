@@ -1,0 +1,189 @@
+r"""
+What the tip does for all that may happen, in each of the tissues that may be true.
+
+At given depths the tip is linear in the positions of the guide, in its tilt, in the load of the
+bevel, and in the loads with which the path strays from what is expected:
+
+.. math:: z_k = \sum_j A_{kj} b_j + H_k \theta
+
+with positions :math:`b_j` of the guide at the ends of the steps, and unknown constants
+:math:`\theta`: origin and turn of the sensor's frame, tilt, bevel, and a curvature of the path
+at each depth, with straight lines between. A and H depend on the bending length and on the skin,
+and so there is one of them for each of a grid of these: the hypotheses. What is between two of
+them is two more unknown constants, with how A changes from one to the next. Both planes have the
+same.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from math import ceil
+from typing import Final
+
+from needle_controller.steering.belief import SteeringBelief
+from needle_dynamics.arrays import FloatArray
+from needle_dynamics.compiled.cut import insert
+from needle_dynamics.parameters import NeedleParameters
+from needle_dynamics.steering.needle import empty_cut, steered
+from needle_dynamics.steering.parameters import bending_length, SteeringParameters
+from needle_ros.errors import ParameterError
+import numpy as np
+from numpy.typing import ArrayLike
+
+#: Hypotheses of the bending length and of the skin.
+_LENGTHS, _SKINS = 13, 4
+
+#: The grid goes so much farther than the spread.
+_BEYOND: Final = 1.1
+
+#: Longest element [m]: good to a few micrometers.
+_ELEMENT: Final = 1.25e-3
+
+#: Standard deviation of what is anywhere within a cell of the grid.
+_EVEN: Final = 12.0**-0.5
+
+
+class SteeringModel:
+    """
+    Responses of the tip at the ends of the steps, one for each hypothesis.
+
+    Parameters
+    ----------
+    needle : NeedleParameters
+        Needle and tissue as they are believed.
+    steering : SteeringParameters
+        What they have beyond; path noise and bevel are those of the belief.
+    depths : array_like, shape (n + 1,)
+        Depths at which the tip is looked at [m], increasing; the first one is reached straight.
+    belief : SteeringBelief, optional
+        How far all that may be wrong.
+
+    Attributes
+    ----------
+    depths : ndarray, shape (n + 1,)
+        The depths [m].
+    belief : SteeringBelief
+        As given.
+    lengths, skins : ndarray, shape (h,)
+        Bending length and skin of each hypothesis, over the believed ones.
+    guide : ndarray, shape (h, n + 1, n)
+        Shift of the tip at each depth per position of the guide at the end of each step; between
+        the ends the guide moves evenly with the depth.
+    causes : ndarray, shape (h, n + 1, 5 + n)
+        The same per origin [m], turn of the frame [rad], tilt, load of the bevel [N], and
+        curvature of the path at each depth [1/m].
+    between : ndarray, shape (2, h, n + 1, n)
+        Change of `guide` from one hypothesis to the next in bending length, and in skin.
+    prior : ndarray, shape (7 + n, 7 + n)
+        Covariance of the causes, before anything is seen, and of the places between two
+        hypotheses.
+
+    Raises
+    ------
+    ParameterError
+        If the depths do not increase, or the needle does not reach so deep.
+
+    """
+
+    def __init__(
+        self,
+        needle: NeedleParameters,
+        steering: SteeringParameters,
+        depths: ArrayLike,
+        belief: SteeringBelief | None = None,
+    ) -> None:
+        at = np.array(depths, dtype=np.float64)
+        if at.ndim != 1 or len(at) < 2 or not np.isfinite(at).all() or (np.diff(at) <= 0.0).any():
+            raise ParameterError(
+                'depths must be numbers that increase, two at least, got '
+                f'{np.array2string(at, threshold=6)} m'
+            )
+        reach = needle.length - steering.free_length
+        if not (at[0] >= 0.0 and at[-1] <= reach):
+            raise ParameterError(
+                f'depths must be in [0, {reach:g}] m, the length of the needle without its free '
+                f'length, got {at[0]:g} to {at[-1]:g} m'
+            )
+        self.depths, self.belief = at, belief or SteeringBelief()
+        width = _BEYOND * self.belief.spread
+        lengths = np.geomspace(1.0 - width, 1.0 + width, _LENGTHS if width else 1)
+        skins = np.ones(1)
+        if width and steering.skin_stiffness > 0.0:
+            skins = np.linspace(1.0 - width, 1.0 + width, _SKINS)
+        self.lengths, self.skins = (grid.ravel() for grid in np.meshgrid(lengths, skins))
+        pairs = zip(self.lengths.tolist(), self.skins.tolist(), strict=True)
+        found = [self._respond(needle, steering, *pair) for pair in pairs]
+        self.guide = np.array([guide for guide, _ in found])
+        self.causes = np.array([causes for _, causes in found])
+        grid = self.guide.reshape(len(skins), len(lengths), *self.guide.shape[1:])
+        self.between = np.array(
+            [
+                (np.gradient(grid, axis=axis) if grid.shape[axis] > 1 else 0.0 * grid).reshape(
+                    self.guide.shape
+                )
+                for axis in (1, 0)
+            ]
+        )
+        b = self.belief
+        size = 7 + self.steps
+        self.prior = np.diag(
+            np.array([b.offset, b.frame, b.tilt, b.bevel, *[0.0] * (size - 6), _EVEN, _EVEN]) ** 2
+        )
+        apart = np.abs(at[:, np.newaxis] - at) / b.path_noise_length
+        self.prior[4:-2, 4:-2] = b.path_noise / (2.0 * b.path_noise_length) * np.exp(-apart)
+
+    @property
+    def steps(self) -> int:
+        """Number of steps n."""
+        return len(self.depths) - 1
+
+    def _respond(
+        self, needle: NeedleParameters, steering: SteeringParameters, length: float, skin: float
+    ) -> tuple[FloatArray, FloatArray]:
+        """Insert a needle once for each cause."""
+        n, at = self.steps, self.depths
+        smallest = float(np.diff(at).min())
+        wanted = smallest / ceil(smallest / _ELEMENT - 1e-9)
+        beyond = replace(steering, element=wanted, bevel_load=(0.0,), path_noise=0.0)
+        base = steered(needle, beyond)
+        stiffer = length**-4.0
+        tissue = base.stiffness * stiffer
+        reach = at[-1] + steering.free_length
+        stiffest = float(tissue.max())
+        element = min(base.element, bending_length(base.ei, stiffest) if stiffest else wanted)
+        runs = 2 * n + 3
+        poses = np.zeros((runs, n + 1, 6))
+        poses[:, :, 0] = at
+        poses[np.arange(n), np.arange(n) + 1, 1] = 1.0
+        poses[n, :, 2] = 1.0
+        layers = np.zeros((runs, 3, len(tissue)))
+        layers[:, 0], layers[:, 1] = base.starts, tissue
+        # At zero roll the bevel pushes along z.
+        layers[n + 1, 2] = 1.0
+        cell = element
+        cells = ceil(reach / cell) + 2
+        middle = (np.arange(cells) + 0.5) * cell
+        loads = np.array([_load(base.ei, needle.tissue.stiffness(y) * stiffer) for y in middle])
+        wander = np.zeros((runs, cells, 2))
+        hats = [np.interp(middle, at, one) for one in np.eye(n + 1)]
+        wander[n + 2 :, :, 0] = hats * loads
+        numbers = [base.ei, element, base.skin * skin * stiffer, 0.0, 0.0, reach]
+        tips = np.empty((runs, n + 1, 2))
+        insert(
+            np.array([[*numbers, steering.free_length]]),
+            layers,
+            cell,
+            wander,
+            poses,
+            np.arange(runs),
+            empty_cut(reach, element, len(tissue)),
+            tips,
+        )
+        x = tips[:, :, 0].T
+        causes = [np.ones(n + 1), at, x[:, n], tips[n + 1, :, 1], *x[:, n + 2 :].T]
+        return x[:, :n], np.array(causes).T
+
+
+def _load(ei: float, stiffness: float) -> float:
+    """Return the load that turns the path of a long needle with 1/m."""
+    return ei / bending_length(ei, stiffness) if stiffness > 0.0 else 0.0

@@ -1,0 +1,268 @@
+"""The controller that steers the tip: what it predicts, where it hits, and what it refuses."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from needle_controller import (
+    OutOfReachError,
+    SteeringBelief,
+    SteeringController,
+    SteeringFaultError,
+    SteeringModel,
+)
+from needle_controller.steering.baselines import Broyden, OpenLoop, Springs
+from needle_dynamics import (
+    FloatArray,
+    JobError,
+    NeedleParameters,
+    ParameterError,
+    ShapeError,
+    SteeredNeedle,
+    STEERING_PRESETS,
+    SteeringParameters,
+)
+import numpy as np
+from numpy.testing import assert_allclose
+import pytest
+
+NEEDLE, _STEERING, _ = STEERING_PRESETS['bending_35mm']
+STEERING = replace(_STEERING, skin_stiffness=0.02 * NEEDLE.tissue_stiffness)
+DEPTHS = np.linspace(0.0, 0.1, 21)
+#: What may be true: made once, it takes a fifth of a second.
+MODEL = SteeringModel(NEEDLE, STEERING, DEPTHS)
+
+
+def other(length: float, skin: float = 1.0) -> tuple[NeedleParameters, SteeringParameters]:
+    """Return the needle with another bending length and another skin."""
+    stiffer = length**-4.0
+    return (
+        replace(NEEDLE, tissue_stiffness=NEEDLE.tissue_stiffness * stiffer),
+        replace(STEERING, skin_stiffness=STEERING.skin_stiffness * stiffer * skin),
+    )
+
+
+def steer(
+    controller: SteeringController | OpenLoop,
+    needle: SteeredNeedle,
+    noise: float = 1e-7,
+    seed: int = 0,
+) -> FloatArray:
+    """Insert a needle; return where its tip ends. No sensor says the same twice."""
+    rng = np.random.default_rng(seed)
+    guide = (0.0, 0.0)
+    for k, depth in enumerate(DEPTHS.tolist()):
+        if k:
+            needle.move(depth=depth, guide=guide)
+        guide = controller.next(needle.tip[[0, 2]] + noise * rng.standard_normal(2))
+    return needle.tip[[0, 2]]
+
+
+@pytest.mark.parametrize(('length', 'skin'), [(1.0, 1.0), (0.8, 1.2)])
+def test_what_it_predicts_is_what_the_needle_does(length: float, skin: float) -> None:
+    """The tip at each depth is that of `SteeredNeedle`, for any guide, tilt and bevel."""
+    needle, steering = other(length, skin)
+    alone = SteeringModel(needle, steering, DEPTHS, SteeringBelief(spread=0.0))
+    assert alone.guide.shape == (1, 21, 20)
+    rng = np.random.default_rng(2)
+    guide, tilt = 3e-3 * rng.standard_normal((20, 2)), np.array([0.02, -0.01])
+    one = SteeredNeedle(needle, replace(steering, bevel_load=(0.3,)), tilt=tilt.tolist(), roll=0.7)
+    causes = np.array([[0.0, 0.0], [0.0, 0.0], tilt, 0.3 * np.array([np.sin(0.7), np.cos(0.7)])])
+    expected = alone.guide[0] @ guide + alone.causes[0, :, :4] @ causes
+    for k, depth in enumerate(DEPTHS[1:].tolist()):
+        one.move(depth=depth, guide=guide[k].tolist())
+        # Elements of 1 and 1.25 mm.
+        assert_allclose(one.tip[[0, 2]], expected[k + 1], atol=5e-6)
+
+
+def test_a_path_that_strays_is_a_line_between_its_curvatures() -> None:
+    """An even curvature of the path is that of a bevel whose load makes it."""
+    alone = SteeringModel(NEEDLE, STEERING, DEPTHS, SteeringBelief(spread=0.0))
+    load = NEEDLE.bending_stiffness / 0.035
+    # Loads by cells of 1.25 mm, beside one of all cells.
+    assert_allclose(alone.causes[0, :, 4:].sum(axis=1), load * alone.causes[0, :, 3], atol=2e-5)
+
+
+@settings(max_examples=12, deadline=None)
+@given(
+    length=st.floats(0.72, 1.28),
+    skin=st.floats(0.72, 1.28),
+    tilt=st.tuples(*[st.floats(-0.02, 0.02)] * 2),
+    bevel=st.floats(0.0, 0.15),
+    roll=st.floats(-3.0, 3.0),
+    target=st.tuples(*[st.floats(-3e-3, 3e-3)] * 2),
+)
+def test_it_hits_whatever_of_its_belief_is_true(
+    length: float,
+    skin: float,
+    tilt: tuple[float, float],
+    bevel: float,
+    roll: float,
+    target: tuple[float, float],
+) -> None:
+    """With next to no noise within 0.2 mm; open loop misses by millimeters."""
+    needle, steering = other(length, skin)
+    one = SteeredNeedle(needle, replace(steering, bevel_load=(bevel,)), tilt=tilt, roll=roll)
+    controller = SteeringController(MODEL, target)
+    tip = steer(controller, one)
+    # Between two of the positions that are compared, and what is left of the unknown.
+    assert np.hypot(*(tip - target)) < 2e-4
+    assert np.abs(one.guide).max() <= 6e-3
+    there = controller.expected()
+    assert np.hypot(*(there.mean - tip)) < 1e-4
+
+
+def test_planes_are_alike() -> None:
+    """What is swapped, or mirrored, gives the same motion, swapped or mirrored."""
+    tips = {}
+    turns: dict[str, Callable[[Sequence[float]], tuple[float, float]]] = {
+        'as it is': lambda v: (v[0], v[1]),
+        'swapped': lambda v: (v[1], v[0]),
+        'mirrored': lambda v: (-v[0], v[1]),
+    }
+    for name, turn in turns.items():
+        one = SteeredNeedle(*other(0.9), tilt=turn((0.01, -0.02)))
+        tips[name] = turn(steer(SteeringController(MODEL, turn((2e-3, 1e-3))), one).tolist())
+    # What the noise makes of it.
+    assert_allclose(tips['swapped'], tips['as it is'], atol=2e-5)
+    assert_allclose(tips['mirrored'], tips['as it is'], atol=2e-5)
+
+
+def test_it_learns_how_the_needle_bends() -> None:
+    """The hypotheses that are left are near the truth, and weights are a distribution."""
+    controller = SteeringController(MODEL, (3e-3, -2e-3))
+    assert_allclose(controller.weights, 1.0 / len(MODEL.lengths))
+    steer(controller, SteeredNeedle(*other(1.2)), noise=4e-5)
+    weights = controller.weights
+    assert weights.sum() == pytest.approx(1.0, rel=1e-12)
+    # A cell of the grid is 5 %.
+    assert weights @ MODEL.lengths == pytest.approx(1.2, abs=0.05)
+
+
+def test_a_target_out_of_reach_is_refused_with_what_is_within_it() -> None:
+    with pytest.raises(
+        OutOfReachError, match=r'x = 40\.00 mm, z = 0\.00 mm is out of reach: from'
+    ):
+        SteeringController(MODEL, (0.04, 0.0))
+    with pytest.raises(OutOfReachError, match=r'a tip within \d+\.\d\d mm of x = 0\.00 mm'):
+        SteeringController(MODEL, (8e-3, 0.0), position_limit=1e-4)
+
+
+def test_it_warns_as_soon_as_the_target_leaves_the_reach() -> None:
+    """A guide that is stuck leaves the needle to its drift; it is said before the end."""
+    controller = SteeringController(MODEL, (0.0, 4e-3))
+    assert controller.warning == ''
+    one = SteeredNeedle(*other(1.0), tilt=(0.0, -0.05))
+    first = None
+    for k, depth in enumerate(DEPTHS.tolist()):
+        if k:
+            one.move(depth=depth)
+        try:
+            controller.next(one.tip[[0, 2]])
+        except SteeringFaultError:
+            # Or it does not believe that the guide goes where it is sent.
+            first = first or k
+            break
+        if controller.warning and first is None:
+            first = k
+    assert first is not None
+    assert first < 16
+
+
+def faulty(change: dict[int, Any]) -> tuple[SteeringController, SteeredNeedle]:
+    """Steer with some looks replaced; a number is how far a look is off in x [m]."""
+    controller, one = SteeringController(MODEL, (2e-3, 1e-3)), SteeredNeedle(*other(0.9))
+    guide, rng = (0.0, 0.0), np.random.default_rng(4)
+    before: Any = None
+    for k, depth in enumerate(DEPTHS.tolist()):
+        if k:
+            one.move(depth=depth, guide=guide)
+        look: Any = one.tip[[0, 2]] + 4e-5 * rng.standard_normal(2)
+        if k in change:
+            what = change[k]
+            look = {'lost': None, 'same': before, 'nan': [np.nan, 0.0]}.get(what, look)
+            if isinstance(what, float):
+                look = look + np.array([what, 0.0])
+        before = look
+        guide = controller.next(look)
+    return controller, one
+
+
+@pytest.mark.parametrize(
+    'change',
+    [
+        {9: 0.02},
+        {9: 'same'},
+        dict.fromkeys(range(8, 14), 'lost'),
+        dict.fromkeys(range(8, 14), 'nan'),
+    ],
+)
+def test_a_fault_that_passes_does_no_harm(change: dict[int, Any]) -> None:
+    """One jump, one look that is repeated, 30 mm without a tip."""
+    controller, one = faulty(change)
+    assert np.hypot(*(one.tip[[0, 2]] - controller.target)) < 4e-4
+
+
+@pytest.mark.parametrize(
+    ('change', 'complaint'),
+    [
+        (dict.fromkeys(range(8, 21), 'same'), 'the sensor of the tip is frozen: 3 looks are'),
+        (dict.fromkeys(range(8, 21), 'lost'), 'the tip was not seen in 7 looks'),
+        (
+            dict.fromkeys(range(8, 21), 0.02),
+            r'the tip is \+\d+\.\d\d mm in x and .* from where any',
+        ),
+    ],
+)
+def test_a_fault_that_stays_ends_it(change: dict[int, Any], complaint: str) -> None:
+    with pytest.raises(SteeringFaultError, match=complaint):
+        faulty(change)
+
+
+def test_bad_input_is_named() -> None:
+    for depths in ([0.0, 0.05, 0.05], [0.05], [[0.0, 0.1]], [0.0, np.nan]):
+        with pytest.raises(ParameterError, match='depths must be numbers that increase'):
+            SteeringModel(NEEDLE, STEERING, depths)
+    with pytest.raises(ParameterError, match=r'depths must be in \[0, 0\.16\] m'):
+        SteeringModel(NEEDLE, STEERING, [0.0, 0.17])
+    with pytest.raises(ShapeError, match=r'target must be x and z, got shape \(3,\)'):
+        SteeringController(MODEL, (0.0, 0.1, 0.0))
+    with pytest.raises(ParameterError, match='target must be finite'):
+        SteeringController(MODEL, (0.0, np.inf))
+    with pytest.raises(ParameterError, match='position_limit must be positive'):
+        SteeringController(MODEL, (0.0, 0.0), position_limit=0.0)
+    with pytest.raises(ParameterError, match='spread must be finite'):
+        SteeringBelief(spread=-0.1)
+    controller = SteeringController(MODEL, (0.0, 0.0))
+    with pytest.raises(ShapeError, match='a look must be x and z'):
+        controller.next([0.0, 0.0, 0.0])
+    done = SteeringController(MODEL, (0.0, 0.0))
+    steer(done, SteeredNeedle(*other(1.0)))
+    with pytest.raises(JobError, match='all 20 steps are done'):
+        done.next([0.0, 0.0])
+
+
+def test_others_do_what_they_say() -> None:
+    """Open loop rests; the others come nearer, and keep the limit."""
+    target = (3e-3, -2e-3)
+    miss = {}
+    controllers: Mapping[str, SteeringController | OpenLoop] = {
+        'open': OpenLoop(DEPTHS, target),
+        'springs': Springs(NEEDLE, STEERING, DEPTHS, target),
+        'Broyden': Broyden(NEEDLE, STEERING, DEPTHS, target),
+        'ours': SteeringController(MODEL, target),
+    }
+    for name, controller in controllers.items():
+        one = SteeredNeedle(*other(0.9), tilt=(0.02, 0.01))
+        miss[name] = float(np.hypot(*(steer(controller, one) - target)))
+        assert np.abs(one.guide).max() <= 6e-3
+        assert (np.abs(one.guide).max() == 0.0) == (name == 'open')
+    assert miss['ours'] < 1e-4 < miss['springs'] < miss['open']
+    assert miss['Broyden'] < miss['open']
+    # A tip that was not seen moves nothing.
+    rests = Broyden(NEEDLE, STEERING, DEPTHS, target)
+    assert rests.next(None) == (0.0, 0.0)
