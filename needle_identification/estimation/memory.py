@@ -261,20 +261,17 @@ def memory_of(
     own, both = white[some], np.column_stack([x, r])[some]
     weighed = both / own[:, np.newaxis]
     free = len(some) - k
-    # Of each model: time and ratio; log|V|; (x, r)' V^-1 (x, r); the diagonal of a' V a.
+    # Of each model: time and ratio; log|V|; (x, r)' V^-1 (x, r).
     models, sizes = [(0.0, 0.0)], [float(np.log(own).sum())]
-    products, spreads = [both.T @ weighed], [plain]
+    products = [both.T @ weighed]
     longest = _LONGEST * max(float(time[-1] - time[0]), 1.0)
     for length in np.geomspace(0.5 * parts.length, longest, _TIMES):
-        d, e, _ = dpttrf(*_precision(time, length)[:2])
-        correlated = (a * dpttrs(d, e, a)[0]).sum(axis=0)
         diagonal, beside, log_chain = _precision(time[some], length)
         for ratio in _RATIOS.tolist():
             d, e, _ = dpttrf(diagonal / ratio + 1.0 / own, beside / ratio)
             models.append((float(length), ratio))
             sizes.append(sizes[0] + log_chain + len(some) * np.log(ratio) + float(np.log(d).sum()))
             products.append(products[0] - weighed.T @ dpttrs(d, e, weighed)[0])
-            spreads.append(plain + ratio * correlated)
     table = np.array(products)
     # The determinant of a block times what it leaves of r is that of the whole.
     within = np.linalg.slogdet(table[:, :k, :k])[1]
@@ -283,11 +280,20 @@ def memory_of(
     logs[1:] += np.log((1.0 - _WHITE) / _WHITE / (len(logs) - 1))
     weights = np.exp(logs - logs.max())
     weights /= weights.sum()
-    deviations = np.sqrt((left / free)[:, np.newaxis] * np.array(spreads))
+    counts = np.flatnonzero(weights > _NEGLIGIBLE).tolist()
+    # The diagonal of a' V a, of the models that count.
+    spreads, deviations = {0.0: np.zeros_like(plain)}, []
+    for k in counts:
+        length, ratio = models[k]
+        if length not in spreads:
+            d, e, _ = dpttrf(*_precision(time, length)[:2])
+            spreads[length] = (a * dpttrs(d, e, a)[0]).sum(axis=0)
+        deviations.append(np.sqrt(left[k] / free * (plain + ratio * spreads[length])))
     length, ratio = models[int(np.argmax(weights))]
+    white, found = np.sqrt(left[0] / free * plain), np.array(deviations)
     return Memory(
-        inflation=_growth(weights, deviations, 0.05),
-        far=_growth(weights, deviations, 0.004),
+        inflation=_growth(weights[counts], found, white, 0.05),
+        far=_growth(weights[counts], found, white, 0.004),
         length=length,
         ratio=ratio,
     )
@@ -311,11 +317,11 @@ def _precision(time: FloatArray, length: float) -> tuple[FloatArray, FloatArray,
     return diagonal, np.asarray(-kept / new), float(np.log(new).sum())
 
 
-def _growth(weights: FloatArray, deviations: FloatArray, outside: float) -> FloatArray:
+def _growth(
+    weights: FloatArray, deviations: FloatArray, white: FloatArray, outside: float
+) -> FloatArray:
     """Return the intervals of mixtures of normal distributions over those of white noise."""
     normal = float(ndtri(1.0 - 0.5 * outside))
-    counts = weights > _NEGLIGIBLE
-    white, weights, deviations = deviations[0], weights[counts], deviations[counts]
     low, high = (normal * limit(deviations, axis=0) for limit in (np.min, np.max))
     for _ in range(_BISECTIONS):
         middle = 0.5 * (low + high)

@@ -141,9 +141,10 @@ def run(output: Path, bags: Path) -> int:
         'checks.html',
         title='Needle insertion: demo',
         introduction=f'Nodes over DDS at {RATE:g} Hz: insertion from {START_DEPTH * 100:g} cm to '
-        f'{TARGET_DEPTH * 100:g} cm at {SPEED * 1000:g} mm/s under each controller, recorded to '
-        'MCAP; friction and tissue stiffness identified from the shipped simulated recordings '
-        f'and one fresh recording each, made at {EXPERIMENT_SPEED:g} times real time.',
+        f'{TARGET_DEPTH * 100:g} cm at {SPEED * 1000:g} mm/s, of a needle that bends and under '
+        'two control laws, recorded to MCAP; friction and tissue stiffness identified from the '
+        'shipped simulated recordings and one fresh recording each, made at '
+        f'{EXPERIMENT_SPEED:g} times real time.',
         cards=[
             ('Checks', f'{passed} of {len(checks)} pass', 'true values beside what was found'),
         ],
@@ -190,9 +191,9 @@ def _pictures(
     return [
         Picture(
             'bending',
-            'A needle that bends about the path that it cuts, on its way, to scale: the bevel '
-            'pushes the tip along z until the needle is turned half way, and the guide has gone '
-            'aside along x.',
+            'A needle that bends. On its way, about the path that it cuts, to scale: the bevel '
+            'pushes the tip along z until the needle is turned, and the guide has gone aside '
+            'along x.',
             draw_bending(bent),
         ),
         Picture(
