@@ -27,6 +27,7 @@ COMMANDS: Final[Mapping[str, str]] = {
     'experiment': 'record an experiment on the simulated robot',
     'reproduce': "compute the paper's results and compare them with the paper",
     'simulate': 'simulate the needle in open loop, without ROS',
+    'steer': 'bring the tip of a simulated needle to a target, without ROS',
     'analyze': 'controllability and observability',
     'verify': 'compute recorded runs again and compare',
     'bench': 'measure speed and accuracy (from a clone)',

@@ -66,8 +66,28 @@ def add_steering(parser: argparse.ArgumentParser) -> None:
     group.add_argument('--seed', type=int, help='seed of the noise of the path (default 0)')
 
 
-def _made(name: str, words: list[str]) -> tuple[NeedleParameters, SteeringParameters]:
-    """Return needle and steering with changes; a name is of one of them."""
+def made(name: str, words: list[str]) -> tuple[NeedleParameters, SteeringParameters]:
+    """
+    Return a needle that is steered, with changes.
+
+    Parameters
+    ----------
+    name : str
+        One of `STEERING_PRESETS`.
+    words : list of str
+        ``name=value`` each; the name is of one of the two.
+
+    Returns
+    -------
+    NeedleParameters, SteeringParameters
+        Constants.
+
+    Raises
+    ------
+    ParameterError
+        If a name is unknown, or a value is not valid.
+
+    """
     needle, steering, _ = STEERING_PRESETS[name]
     own = [item.name for item in fields(steering)]
     given = constants(words)
@@ -146,7 +166,7 @@ def run_steering(options: argparse.Namespace) -> int:
         if path.suffix not in ('.csv', '.png'):
             raise ParameterError(f'{path}: output of --model steering must be .csv or .png')
     name = options.needle or 'bending_35mm'
-    needle, steering = _made(name, options.set)
+    needle, steering = made(name, options.set)
     to = TO if options.to is None else options.to
     speed = SPEED if options.speed is None else options.speed
     if not 0.0 < speed < inf:

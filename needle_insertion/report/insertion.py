@@ -154,7 +154,12 @@ def write(path: Path, record: InsertionRecord) -> None:
         write_whole(path, png(draw_needle(shapes, cut)))
 
 
-def draw_needle(needles: Sequence[FloatArray], path: FloatArray) -> Figure:
+def draw_needle(
+    needles: Sequence[FloatArray],
+    path: FloatArray,
+    target: FloatArray | None = None,
+    beside: FloatArray | None = None,
+) -> Figure:
     """
     Draw a needle on its way in both planes, to scale, with the path that it cut.
 
@@ -164,6 +169,10 @@ def draw_needle(needles: Sequence[FloatArray], path: FloatArray) -> Figure:
         Points x, y, z along the needle [m], now and then; the last one is drawn bold.
     path : ndarray, shape (m, 3)
         Points of the path [m].
+    target : ndarray, shape (3,), optional
+        A target [m].
+    beside : ndarray, shape (k, 3), optional
+        The needle that nobody steered [m].
 
     Returns
     -------
@@ -175,7 +184,8 @@ def draw_needle(needles: Sequence[FloatArray], path: FloatArray) -> Figure:
 
     begin = 1e3 * min(float(one[:, 1].min()) for one in needles)
     end = 1e3 * max(float(one[:, 1].max()) for one in needles) + 5.0
-    whole = 1e3 * np.vstack([*needles, path])[:, [0, 2]]
+    others = [one for one in (target, beside) if one is not None]
+    whole = 1e3 * np.vstack([*needles, path, *others])[:, [0, 2]]
     limits = np.array([whole.min(axis=0) - _MARGIN, whole.max(axis=0) + _MARGIN]).T
     spans = np.diff(limits)[:, 0]
     # As high as the scale asks for, with room for the words.
@@ -196,6 +206,10 @@ def draw_needle(needles: Sequence[FloatArray], path: FloatArray) -> Figure:
                 label='needle' if last else None,
             )
         axes.plot(1e3 * path[:, 1], 1e3 * path[:, k], 'k--', lw=0.8, label='path it cut')
+        if beside is not None:
+            axes.plot(1e3 * beside[:, 1], 1e3 * beside[:, k], color='gray', label='open loop')
+        if target is not None:
+            axes.plot(1e3 * target[1], 1e3 * target[k], 'x', color='tab:red', label='target')
         axes.set(
             ylabel=f'{"xyz"[k]} [mm]',
             xlim=(begin, end),
@@ -204,5 +218,5 @@ def draw_needle(needles: Sequence[FloatArray], path: FloatArray) -> Figure:
         )
         axes.grid(visible=True, alpha=0.3)
     axes.set_xlabel('depth y [mm]')
-    figure.legend(*axes.get_legend_handles_labels(), loc='outside upper right', ncols=2)
+    figure.legend(*axes.get_legend_handles_labels(), loc='outside upper right', ncols=4)
     return figure

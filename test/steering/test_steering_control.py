@@ -223,6 +223,28 @@ def test_a_fault_that_stays_ends_it(change: dict[int, Any], complaint: str) -> N
         faulty(change)
 
 
+@pytest.mark.parametrize('seed', range(6))
+def test_a_frame_that_is_wrong_by_ten_degrees_hits_or_is_said(seed: int) -> None:
+    """About the needle: the tip goes aside of where the guide sends it."""
+    rng = np.random.default_rng(seed)
+    target = 3e-3 * rng.uniform(-1.0, 1.0, 2)
+    tilt = (0.02 * rng.standard_normal(2)).tolist()
+    one = SteeredNeedle(*other(1.0 + 0.25 * rng.uniform(-1.0, 1.0)), tilt=tilt)
+    turn = np.array([[np.cos(0.1745), -np.sin(0.1745)], [np.sin(0.1745), np.cos(0.1745)]])
+    controller, guide = SteeringController(MODEL, target), (0.0, 0.0)
+    for k, depth in enumerate(DEPTHS.tolist()):
+        if k:
+            one.move(depth=depth, guide=guide)
+        tip = turn @ one.tip[[0, 2]]
+        try:
+            guide = controller.next(tip + 4e-5 * rng.standard_normal(2))
+        except SteeringFaultError as error:
+            assert 'from where any needle of the belief can be' in str(error)
+            assert depth <= 0.05
+            return
+    assert np.hypot(*(tip - target)) < 5e-4
+
+
 def test_bad_input_is_named() -> None:
     for depths in ([0.0, 0.05, 0.05], [0.05], [[0.0, 0.1]], [0.0, np.nan]):
         with pytest.raises(ParameterError, match='depths must be numbers that increase'):

@@ -1,0 +1,78 @@
+"""`needle steer`: it hits, it says what it expects, and it names bad input."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from needle_insertion.cli import main
+import numpy as np
+import pytest
+
+
+def steered(capsys: pytest.CaptureFixture[str], *words: str, status: int = 0) -> tuple[Any, str]:
+    """Run the command; return its JSON, if it succeeds, and what it complains of."""
+    assert main(['steer', '--json', *words]) == status
+    said = capsys.readouterr()
+    return (json.loads(said.out) if status == 0 else None), said.err
+
+
+def test_it_hits_where_open_loop_misses(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """By millimeters, and says how far to trust that; twice the same."""
+    picture = tmp_path / 'steer.png'
+    found, said = steered(capsys, '-o', str(picture))
+    assert found['miss [m]'] < 4e-4 < 2e-3 < found['miss open loop [m]']
+    assert said == ''
+    off = np.array(found['tip [m]']) - found['expected tip [m]']
+    # One seed: within three times the half interval.
+    assert (np.abs(off) < 3.0 * np.array(found['its interval of 95 % [m]'])).all()
+    assert picture.read_bytes().startswith(b'\x89PNG')
+    assert steered(capsys)[0] == found
+    other, _ = steered(capsys, '--seed', '1', '--target=-0.003,0.08,0.001', '--step', '0.004')
+    assert other['target [m]'] == [-0.003, 0.001]
+    assert other['miss [m]'] < 4e-4
+    assert main(['steer']) == 0
+    assert 'open loop' in capsys.readouterr().out
+
+
+def test_what_is_known_hits_nearer(capsys: pytest.CaptureFixture[str]) -> None:
+    """A path that does not stray and a sensor without noise leave next to nothing."""
+    exact = ['--belief', 'path_noise=1e-9', '--belief', 'noise=1e-7']
+    found, _ = steered(capsys, *exact)
+    assert found['miss [m]'] < 6e-5
+
+
+def test_out_of_reach_is_said_before_or_on_the_way(capsys: pytest.CaptureFixture[str]) -> None:
+    _, said = steered(capsys, '--target=0.05,0.1,0', status=1)
+    assert 'the target x = 50.00 mm, z = 0.00 mm is out of reach: from here a tip within' in said
+    found, said = steered(capsys, '--target=-0.02,0.1,0')
+    assert found['miss [m]'] > 1e-3
+    assert found['warnings']
+    assert 'warning: at a depth of' in said
+
+
+@pytest.mark.parametrize(
+    ('words', 'complaint'),
+    [
+        (['--target', '0.1'], '--target takes X,Y,Z in m, got'),
+        (['--target', 'a,b,c'], '--target takes X,Y,Z in m, got'),
+        (['--target=0,nan,0'], '--target takes X,Y,Z in m, got'),
+        (['--target=0,0.3,0'], r'depths must be in [0, 0.16] m'),
+        (['--step', '0'], '--step must be in (0, 0.1] m'),
+        (['--limit', '-1'], 'position_limit must be positive and finite'),
+        (['--belief', 'spread=2'], 'spread must be finite'),
+        (['--belief', 'sprad=0.1'], 'sprad'),
+        (['--set', 'colour=1'], 'colour'),
+        (['-o', 'needle.csv'], 'the picture must be .png'),
+        (['-o', '/no/such/folder/x.png'], 'the folder it is in does not exist'),
+    ],
+)
+def test_bad_input_is_one_line(
+    capsys: pytest.CaptureFixture[str], words: list[str], complaint: str
+) -> None:
+    _, said = steered(capsys, *words, status=2)
+    assert complaint in said
+    assert len(said.strip().splitlines()) == 1
