@@ -12,6 +12,7 @@ EXAMPLES = Path(__file__).parents[1] / 'examples'
 
 #: What each script must print, as a pattern.
 PRINTED = {
+    'aiming': r'steered: 0\.0\d mm from the target\nopen loop: 6\.\d\d mm',
     'batch': r'median \d+\.\d mm, 95 % of them between',
     'fit_from_arrays': r'coulomb_friction: 0\.50\d* N',
     'observer': r'1\.00 s: estimate -?0\.0\d\d mm, true -?0\.000 mm',
