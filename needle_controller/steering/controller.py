@@ -271,6 +271,8 @@ class SteeringController:
         ------
         ShapeError
             If the look does not have two numbers.
+        JobError
+            If all steps are done.
         SteeringFaultError
             If the tip has not been seen for too long, has frozen, or cannot be that of this
             needle. Then the needle shall stop.
@@ -311,7 +313,9 @@ class SteeringController:
         there = self.expected(self.step)
         off = seen - there.mean
         noise = self._model.belief.noise**2 * np.eye(2)
-        distance = float(off @ np.linalg.solve(there.covariance + noise, off))
+        # What is absurd is infinitely far.
+        with np.errstate(over='ignore', invalid='ignore'):
+            distance = float(off @ np.linalg.solve(there.covariance + noise, off))
         if distance <= _IMPOSSIBLE:
             self._impossible = 0
             return seen
