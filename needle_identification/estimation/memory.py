@@ -9,7 +9,9 @@ Their mean residuals are modeled as white noise and exponentially correlated noi
 
 with :math:`w_i` one over the relative length of part i. White noise alone is one of the models;
 the others are a grid of :math:`g` and :math:`\tau`, up to times longer than the recording, where
-the model is a random walk. Each has its restricted likelihood [Patterson1971]_, which knows that
+the model is a random walk. A third kind is white noise with differences of white noise, as the
+speed has it that comes from noisy positions: what it adds to one part it takes from the next, and
+errors shrink. Each has its restricted likelihood [Patterson1971]_, which knows that
 the fit has taken a part of slow noise away. The error of a parameter is such that its 95 %
 interval is that of all models, each weighted by its probability. So errors widen with what the
 data show, and also with what they cannot exclude.
@@ -39,6 +41,12 @@ _RATIOS: Final = np.geomspace(0.02, 2e6, 10)
 #: Number of times of correlation, from half a part to so many times the recording.
 _TIMES: Final = 24
 _LONGEST: Final = 10.0
+
+#: Variances of differences over that of white noise in a part.
+_DIFFERENCES: Final = np.geomspace(0.05, 3.0, 5)
+
+#: Their probability before anything is seen.
+_DIFFERENCED: Final = 0.1
 
 #: Probability of white noise before anything is seen. Half is too much: a memory of a fifth of a
 #: part went unseen, and 89 % of the intervals held the truth.
@@ -261,9 +269,14 @@ def memory_of(
     own, both = white[some], np.column_stack([x, r])[some]
     weighed = both / own[:, np.newaxis]
     free = len(some) - k
-    # Of each model: time and ratio; log|V|; (x, r)' V^-1 (x, r).
+    # Of each model: time and ratio; log|V|; (x, r)' V^-1 (x, r). Differences have a time < 0.
     models, sizes = [(0.0, 0.0)], [float(np.log(own).sum())]
     products = [both.T @ weighed]
+    for ratio in _DIFFERENCES.tolist():
+        d, e, _ = dpttrf(own + ratio, _shared(time[some], parts.length) * ratio)
+        models.append((-1.0, ratio))
+        sizes.append(float(np.log(d).sum()))
+        products.append(both.T @ dpttrs(d, e, both)[0])
     longest = _LONGEST * max(float(time[-1] - time[0]), 1.0)
     for length in np.geomspace(0.5 * parts.length, longest, _TIMES):
         diagonal, beside, log_chain = _precision(time[some], length)
@@ -277,12 +290,16 @@ def memory_of(
     within = np.linalg.slogdet(table[:, :k, :k])[1]
     left = np.exp(np.linalg.slogdet(table)[1] - within)
     logs = -0.5 * (np.array(sizes) + free * np.log(left) + within)
-    logs[1:] += np.log((1.0 - _WHITE) / _WHITE / (len(logs) - 1))
+    few = 1 + len(_DIFFERENCES)
+    logs[1:few] += np.log(_DIFFERENCED / _WHITE / len(_DIFFERENCES))
+    logs[few:] += np.log((1.0 - _WHITE - _DIFFERENCED) / _WHITE / (len(logs) - few))
     weights = np.exp(logs - logs.max())
     weights /= weights.sum()
     counts = np.flatnonzero(weights > _NEGLIGIBLE).tolist()
     # The diagonal of a' V a, of the models that count.
-    spreads, deviations = {0.0: np.zeros_like(plain)}, []
+    beside = (a[:-1] * a[1:] * _shared(time, parts.length)[:, np.newaxis]).sum(axis=0)
+    spreads = {0.0: np.zeros_like(plain), -1.0: (a**2).sum(axis=0) + 2.0 * beside}
+    deviations = []
     for k in counts:
         length, ratio = models[k]
         if length not in spreads:
@@ -290,6 +307,8 @@ def memory_of(
             spreads[length] = (a * dpttrs(d, e, a)[0]).sum(axis=0)
         deviations.append(np.sqrt(left[k] / free * (plain + ratio * spreads[length])))
     length, ratio = models[int(np.argmax(weights))]
+    if length < 0.0:
+        length = ratio = 0.0
     white, found = np.sqrt(left[0] / free * plain), np.array(deviations)
     return Memory(
         inflation=_growth(weights[counts], found, white, 0.05),
@@ -305,6 +324,11 @@ def _spread_out(count: int) -> IntArray:
         return np.arange(count)
     starts = np.linspace(0, count - _RUN, _MOST_PARTS // _RUN).astype(np.int_)
     return np.asarray((starts[:, np.newaxis] + np.arange(_RUN)).ravel())
+
+
+def _shared(time: FloatArray, length: float) -> FloatArray:
+    """Return the covariance of differences in neighbors: none where there is a gap."""
+    return np.where(np.diff(time) < 1.5 * length, -0.5, 0.0)
 
 
 def _precision(time: FloatArray, length: float) -> tuple[FloatArray, FloatArray, float]:
