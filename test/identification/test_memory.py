@@ -60,14 +60,19 @@ def dense(
 ) -> FloatArray:
     """Return the inflation with whole matrices, models one by one, and intervals by search."""
     m, k = x.shape
-    models = [(0.0, 0.0)]
+    models = [(0.0, 0.0), *((-1.0, g) for g in memory._DIFFERENCES)]
+    apart = np.abs(np.subtract.outer(centers, centers))
+    beside = np.eye(m, k=1) + np.eye(m, k=-1)
+    differences = np.eye(m) - 0.5 * np.where(apart < 1.5 * LENGTH, beside, 0.0)
     times = np.geomspace(0.5 * LENGTH, memory._LONGEST * (centers[-1] - centers[0]), memory._TIMES)
     models += [(t, g) for t in times for g in memory._RATIOS]
     logs, deviations = [], []
     for t, g in models:
         v = np.diag(white)
-        if t:
-            v = v + g * np.exp(-np.abs(np.subtract.outer(centers, centers)) / t)
+        if t > 0.0:
+            v = v + g * np.exp(-apart / t)
+        elif t < 0.0:
+            v = v + g * differences
         inverse = np.linalg.inv(v)
         normal = x.T @ inverse @ x
         p = inverse - inverse @ x @ np.linalg.solve(normal, x.T @ inverse)
@@ -83,7 +88,9 @@ def dense(
         deviations.append(np.sqrt(scale * np.einsum('ik,ij,jk->k', a, v, a)))
     weights = np.exp(np.array(logs) - max(logs))
     weights[0] *= memory._WHITE
-    weights[1:] *= (1.0 - memory._WHITE) / (len(weights) - 1)
+    few = 1 + len(memory._DIFFERENCES)
+    weights[1:few] *= memory._DIFFERENCED / (few - 1)
+    weights[few:] *= (1.0 - memory._WHITE - memory._DIFFERENCED) / (len(weights) - few)
     weights /= weights.sum()
     table = np.array(deviations)
     found = []
@@ -118,6 +125,25 @@ def test_the_chain_gives_what_whole_matrices_give(length: float) -> None:
     # Rounding of the sums, and models of less than a millionth that are left out.
     assert_allclose(found.inflation, expected, rtol=1e-4)
     assert (found.length > 0.0) == (length > 0.0)
+
+
+def test_what_a_part_takes_from_the_next_shrinks_errors() -> None:
+    """
+    Differences of white noise, as the speed of noisy positions has them.
+
+    Over a part they are the difference of its ends, so that of a long mean nearly nothing is left.
+    """
+    rng, n = np.random.default_rng(6), 20_000
+    parts = divided(np.ones(n, dtype=np.bool_), LENGTH)
+    # Strokes there and back: a slow drift does nothing to them.
+    x = np.sign(np.sin(2.0 * np.pi * np.arange(n) / 500.0 + 0.1))[:, np.newaxis]
+    steps = 5.0 * np.diff(rng.standard_normal(n + 1))
+    found = memory_of(steps, x, x / n, parts)
+    # All of it is differences: the largest share of them that is tried leaves half.
+    assert found.inflation[0] < 0.6
+    assert found.length == 0.0
+    white = rng.standard_normal(n)
+    assert_allclose(memory_of(white, x, x / n, parts).inflation, 1.0, atol=0.1)
 
 
 def test_whitened_noise_is_white() -> None:
