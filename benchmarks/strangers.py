@@ -62,7 +62,7 @@ publisher = node.create_publisher(JointState, 'joint_states', qos_profile_sensor
 lie = JointState(name=['insertion', 'rotation'], velocity=[0.0, 0.0], effort=[0.0, 0.0])
 lie.position = [0.045, 0.0]
 found, end = 0, time.monotonic() + 30.0
-while time.monotonic() < end and not told:
+while time.monotonic() < end and not (told and found):
     lie.header.stamp = (node.get_clock().now() + ahead).to_msg()
     publisher.publish(lie)
     if not found and (found := publisher.get_subscription_count()):
