@@ -695,8 +695,9 @@ def test_a_command_ages_in_simulated_time(ros_graph: RosGraph) -> None:
     bench.until(lambda: any(m.velocity[0] > 0.0 for m in bench.states), 'motion')
     bench.until(lambda: bench.states[-1].velocity[0] == 0.0, 'rest')
     moving = [stamp_ns(m) for m in bench.states if m.velocity[0] > 0.0]
-    # By the node's clock it would be 0.5 s; a busy machine stalls for tens of milliseconds.
-    assert 0.08e9 < moving[-1] - moving[0] < 0.3e9
+    # By the node's clock it would be 0.5 s. When it comes, samples of a stall may still be due:
+    # those of the backlog, 0.05 s of five times the pace.
+    assert 0.08e9 < moving[-1] - moving[0] < 0.1e9 + 5.0 * 0.05e9 + 0.02e9
 
 
 def test_friction_may_change_while_it_moves(ros_graph: RosGraph) -> None:
