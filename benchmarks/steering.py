@@ -6,13 +6,14 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from functools import lru_cache, partial
-from math import cos, hypot, pi, sin, sqrt
+from math import cos, pi, sin, sqrt
 from multiprocessing import get_context
 from time import perf_counter
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, TypeAlias
 
 from benchmarks.measure import Bar
 from benchmarks.page import Answer, Section, Tick
+from needle_controller.steering import trial
 from needle_controller.steering.baselines import Broyden, OpenLoop, Springs
 from needle_controller.steering.belief import SteeringBelief
 from needle_controller.steering.controller import (
@@ -21,7 +22,8 @@ from needle_controller.steering.controller import (
     SteeringFaultError,
 )
 from needle_controller.steering.responses import SteeringModel
-from needle_dynamics import FloatArray, NeedleParameters, SteeredNeedle, SteeringParameters
+from needle_controller.steering.trial import drawn
+from needle_dynamics import FloatArray, NeedleParameters, SteeringParameters
 from needle_dynamics.steering.parameters import NEEDLES, tissue_of
 import numpy as np
 
@@ -43,9 +45,8 @@ MEDIA: Final[Mapping[str, tuple[tuple[float, float], ...]]] = {
 #: Repeated insertions then differ by 0.3 mm along each axis at 100 mm.
 PATH_NOISE: Final = 1e-4
 
-#: Standard deviations of what nobody knows: tilt and turn of the frame [rad], bevel [N]. Together
-#: a needle that nobody steers drifts by some 5 mm in 100 mm.
-TILT, FRAME, BEVEL = 0.02, 0.03, 0.1
+#: What nobody knows of the needles: they drift by some 6 mm if nobody steers them.
+TRUE: Final = SteeringBelief(tilt=0.02, frame=0.03, bevel=0.1, path_noise=PATH_NOISE)
 
 #: Deviation of a reading of the tip [m], readings while the needle rests, and part that is lost.
 SENSORS: Final = {'EM': (1.8e-4, 20, 0.0), 'ultrasound': (3e-4, 12, 0.05)}
@@ -60,6 +61,9 @@ _ELLIPSE: Final = 5.991
 
 #: A target that is missed by more [m] must not have been missed without a word.
 _MISSED: Final = 2e-3
+
+
+_Controller: TypeAlias = Callable[[FloatArray | None], tuple[float, float]]
 
 
 class Outcome(NamedTuple):
@@ -155,30 +159,19 @@ def insert(sensor: str, spread: float, seed: int) -> Outcome:
     medium = list(MEDIA)[seed % len(MEDIA)]
     needle, steering = believed(medium)
     steps = int(rng.integers(DEPTHS[0], DEPTHS[1] + 1))
-    longer, skin = 1.0 + spread * rng.uniform(-1.0, 1.0, 2)
-    stiffer = float(longer**-4.0)
-    tilt, frame = (size * rng.standard_normal(2) for size in (TILT, FRAME))
-    bevel = BEVEL * rng.standard_normal(2)
+    depths: FloatArray = STEP * np.arange(steps + 1.0)
+    truth = drawn(needle, steering, replace(TRUE, spread=spread), rng, seed)
     aside, angle = ASIDE * sqrt(rng.uniform()), rng.uniform(0.0, 2.0 * pi)
     target = aside * np.array([sin(angle), cos(angle)])
-    true = replace(
-        needle,
-        tissue_stiffness=needle.tissue_stiffness * stiffer,
-        layer_stiffnesses=tuple(k * stiffer for k in needle.layer_stiffnesses),
-    )
-    own = replace(
-        steering,
-        skin_stiffness=float(steering.skin_stiffness * skin * stiffer),
-        bevel_load=(hypot(*bevel),),
-        path_noise=PATH_NOISE,
-    )
-    roll = float(np.arctan2(*bevel))
-    depths: FloatArray = STEP * np.arange(steps + 1.0)
-    alone = SteeringModel(true, own, depths, SteeringBelief(spread=0.0))
-    causes = np.array([np.zeros(2), frame, tilt, bevel])
+    alone = SteeringModel(truth.needle, truth.steering, depths, SteeringBelief(spread=0.0))
+    causes = np.array([np.zeros(2), truth.frame, truth.tilt, truth.bevel])
     drift = alone.causes[0, -1, :4] @ causes
     could = LIMIT * np.abs(alone.guide[0, -1]).sum()
-    run = partial(_run, true, own, depths, tilt, frame, roll, sensor, seed)
+
+    def run(controller: _Controller) -> tuple[FloatArray, float]:
+        one, way = trial.insert(truth, depths, _look(sensor, seed), controller)
+        return truth.tip(one), way
+
     found: dict[str, float] = {}
     travel = plan = look = 0.0
     refused = warned = held = False
@@ -201,7 +194,8 @@ def insert(sensor: str, spread: float, seed: int) -> Outcome:
         try:
             tip, way = run(look_at)
         except SteeringFaultError:
-            tip, way, said = np.full(2, np.nan), 0.0, ['a fault']
+            # It has stopped short of the target.
+            tip, way, said = np.full(2, np.inf), 0.0, ['a fault']
         found['ours'] = float(np.hypot(*(tip - target)))
         there = ours.expected()
         off = tip - there.mean
@@ -220,32 +214,17 @@ def insert(sensor: str, spread: float, seed: int) -> Outcome:
     return Outcome(medium, reachable, found, travel, refused, warned, held, plan, look)
 
 
-def _run(
-    needle: NeedleParameters,
-    steering: SteeringParameters,
-    depths: FloatArray,
-    tilt: FloatArray,
-    frame: FloatArray,
-    roll: float,
-    sensor: str,
-    seed: int,
-    controller: Callable[[FloatArray | None], tuple[float, float]],
-) -> tuple[FloatArray, float]:
-    """Insert a needle; return where its tip ends as its sensor has it, and the guide's way."""
-    one = SteeredNeedle(needle, steering, tilt=tilt.tolist(), roll=roll, seed=seed)
+def _look(sensor: str, seed: int) -> Callable[[FloatArray], FloatArray | None]:
+    """Return what takes the mean of the readings of a sensor; None if all are lost."""
     rng = np.random.default_rng([seed, 1])
     sigma, count, lost = SENSORS[sensor]
-    guide, way = (0.0, 0.0), 0.0
-    for k, depth in enumerate(depths.tolist()):
-        if k:
-            one.move(depth=depth, guide=guide)
-        tip = one.tip[[0, 2]] + frame * depth
+
+    def look(tip: FloatArray) -> FloatArray | None:
         seen = int(rng.binomial(count, 1.0 - lost))
         noise = sigma / sqrt(max(seen, 1)) * rng.standard_normal(2)
-        to = controller(tip + noise if seen else None)
-        way += hypot(to[0] - guide[0], to[1] - guide[1])
-        guide = to
-    return tip, way
+        return np.asarray(tip + noise) if seen else None
+
+    return look
 
 
 def compare(tick: Tick, needles: int = 1000) -> Answer:

@@ -21,7 +21,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import inf, isfinite
-from typing import Final
+from typing import Final, NamedTuple
 
 from needle_controller.steering.responses import SteeringModel
 from needle_dynamics.arrays import FloatArray
@@ -83,6 +83,24 @@ class TipEstimate:
 
     mean: FloatArray
     covariance: FloatArray
+
+
+class _Predicted(NamedTuple):
+    """
+    Where the tip is by each hypothesis.
+
+    Attributes
+    ----------
+    means, variances : ndarray, shape (h, 2)
+        Mean [m] and variance [m^2] in x and z.
+    shared : ndarray, shape (h, 2, constants)
+        Covariance with each of the unknown constants.
+
+    """
+
+    means: FloatArray
+    variances: FloatArray
+    shared: FloatArray
 
 
 class SteeringController:
@@ -185,11 +203,14 @@ class SteeringController:
             Mean and covariance over all hypotheses.
 
         """
-        means, variances = self._tip(at, self._held())[:2]
+        return self._over_all(self._tip(at, self._held()))
+
+    def _over_all(self, predicted: _Predicted) -> TipEstimate:
         w = self.weights
-        mean = w @ means
-        apart = means - mean
-        return TipEstimate(mean, (w[:, np.newaxis] * apart).T @ apart + np.diag(w @ variances))
+        mean = w @ predicted.means
+        apart = predicted.means - mean
+        spread = (w[:, np.newaxis] * apart).T @ apart
+        return TipEstimate(mean, spread + np.diag(w @ predicted.variances))
 
     def _held(self) -> FloatArray:
         """Return where the guide was, and is if it rests from now on, shape (n, 2)."""
@@ -197,19 +218,15 @@ class SteeringController:
         guide[done:] = guide[done - 1] if done else 0.0
         return guide
 
-    def _tip(self, at: int, guide: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """
-        Return the tip by each hypothesis, its variance, and how the unknown constants move it.
-
-        Shapes (h, 2), (h, 2) and (h, 2, constants).
-        """
+    def _tip(self, at: int, guide: FloatArray) -> _Predicted:
+        """Return where the tip is at a depth by each hypothesis."""
         model = self._model
         rows = np.empty_like(self._mean)
         rows[:, :, :-2] = model.causes[:, np.newaxis, at]
         rows[:, :, -2:] = (model.between[:, :, at] @ guide).transpose(1, 2, 0)
         means = model.guide[:, at] @ guide + (self._mean * rows).sum(axis=2)
-        felt = np.matmul(self._covariance, rows[..., np.newaxis])[..., 0]
-        return means, (felt * rows).sum(axis=2), rows
+        shared = np.matmul(self._covariance, rows[..., np.newaxis])[..., 0]
+        return _Predicted(means, (shared * rows).sum(axis=2), shared)
 
     @property
     def chance(self) -> float:
@@ -237,8 +254,8 @@ class SteeringController:
         k = self.step
         guide = self._guide.copy()
         guide[k:] = 0.0
-        begin, variances, _ = self._tip(-1, guide)
-        return begin, np.sqrt(variances), self._model.guide[:, -1, k:]
+        end = self._tip(-1, guide)
+        return end.means, np.sqrt(end.variances), self._model.guide[:, -1, k:]
 
     def _unreachable(self) -> str:
         begin, _, shifts = self._ends()
@@ -280,9 +297,10 @@ class SteeringController:
         """
         if self.step > self._model.steps:
             raise JobError(f'all {self._model.steps} steps are done')
-        seen = self._checked(tip)
+        predicted = self._tip(self.step, self._held())
+        seen = self._checked(tip, self._over_all(predicted))
         if seen is not None:
-            self._learn(seen)
+            self._learn(seen, predicted)
         k = self.step
         if k < self._model.steps:
             self._guide[k] = self._choose()
@@ -290,7 +308,9 @@ class SteeringController:
         x, z = self._guide[min(k, self._model.steps - 1)].tolist()
         return x, z
 
-    def _checked(self, tip: Sequence[float] | FloatArray | None) -> FloatArray | None:
+    def _checked(
+        self, tip: Sequence[float] | FloatArray | None, there: TipEstimate
+    ) -> FloatArray | None:
         """Return a look that counts; None if there is none."""
         if tip is None or not all(map(isfinite, np.ravel(tip))):
             self._missing += 1
@@ -310,7 +330,6 @@ class SteeringController:
             )
         if same:
             return None
-        there = self.expected(self.step)
         off = seen - there.mean
         noise = self._model.belief.noise**2 * np.eye(2)
         # What is absurd is infinitely far.
@@ -328,15 +347,13 @@ class SteeringController:
             )
         return None
 
-    def _learn(self, seen: FloatArray) -> None:
+    def _learn(self, seen: FloatArray, predicted: _Predicted) -> None:
         """Update each hypothesis, and their probabilities."""
-        means, variances, rows = self._tip(self.step, self._held())
-        whole = variances + self._model.belief.noise**2
-        off = seen - means
-        shared = np.matmul(self._covariance, rows[..., np.newaxis])[..., 0]
-        gain = shared / whole[..., np.newaxis]
+        whole = predicted.variances + self._model.belief.noise**2
+        off = seen - predicted.means
+        gain = predicted.shared / whole[..., np.newaxis]
         self._mean += off[..., np.newaxis] * gain
-        self._covariance -= gain[..., np.newaxis] * shared[..., np.newaxis, :]
+        self._covariance -= gain[..., np.newaxis] * predicted.shared[..., np.newaxis, :]
         self._logs -= 0.5 * (off**2 / whole + np.log(whole)).sum(axis=1)
 
     def _choose(self) -> FloatArray:

@@ -25,7 +25,7 @@ from needle_dynamics.arrays import FloatArray
 from needle_dynamics.compiled.cut import insert
 from needle_dynamics.parameters import NeedleParameters
 from needle_dynamics.steering.needle import empty_cut, steered
-from needle_dynamics.steering.parameters import bending_length, SteeringParameters
+from needle_dynamics.steering.parameters import SteeringParameters, turning_load, with_lengths
 from needle_ros.errors import ParameterError
 import numpy as np
 from numpy.typing import ArrayLike
@@ -145,45 +145,36 @@ class SteeringModel:
         smallest = float(np.diff(at).min())
         wanted = smallest / ceil(smallest / _ELEMENT - 1e-9)
         beyond = replace(steering, element=wanted, bevel_load=(0.0,), path_noise=0.0)
-        base = steered(needle, beyond)
-        stiffer = length**-4.0
-        tissue = base.stiffness * stiffer
+        other, beyond = with_lengths(needle, beyond, length, skin)
+        base = steered(other, beyond)
         reach = at[-1] + steering.free_length
-        stiffest = float(tissue.max())
-        element = min(base.element, bending_length(base.ei, stiffest) if stiffest else wanted)
         runs = 2 * n + 3
         poses = np.zeros((runs, n + 1, 6))
         poses[:, :, 0] = at
         poses[np.arange(n), np.arange(n) + 1, 1] = 1.0
         poses[n, :, 2] = 1.0
-        layers = np.zeros((runs, 3, len(tissue)))
-        layers[:, 0], layers[:, 1] = base.starts, tissue
+        layers = np.zeros((runs, 3, len(base.starts)))
+        layers[:, 0], layers[:, 1] = base.starts, base.stiffness
         # At zero roll the bevel pushes along z.
         layers[n + 1, 2] = 1.0
-        cell = element
-        cells = ceil(reach / cell) + 2
-        middle = (np.arange(cells) + 0.5) * cell
-        loads = np.array([_load(base.ei, needle.tissue.stiffness(y) * stiffer) for y in middle])
+        cells = ceil(reach / base.element) + 2
+        middle = (np.arange(cells) + 0.5) * base.element
+        loads = np.array([turning_load(base.ei, other.tissue.stiffness(y)) for y in middle])
         wander = np.zeros((runs, cells, 2))
         hats = [np.interp(middle, at, one) for one in np.eye(n + 1)]
         wander[n + 2 :, :, 0] = hats * loads
-        numbers = [base.ei, element, base.skin * skin * stiffer, 0.0, 0.0, reach]
+        numbers = [base.ei, base.element, base.skin, 0.0, 0.0, reach]
         tips = np.empty((runs, n + 1, 2))
         insert(
             np.array([[*numbers, steering.free_length]]),
             layers,
-            cell,
+            base.element,
             wander,
             poses,
             np.arange(runs),
-            empty_cut(reach, element, len(tissue)),
+            empty_cut(reach, base.element, len(base.starts)),
             tips,
         )
         x = tips[:, :, 0].T
         causes = [np.ones(n + 1), at, x[:, n], tips[n + 1, :, 1], *x[:, n + 2 :].T]
         return x[:, :n], np.array(causes).T
-
-
-def _load(ei: float, stiffness: float) -> float:
-    """Return the load that turns the path of a long needle with 1/m."""
-    return ei / bending_length(ei, stiffness) if stiffness > 0.0 else 0.0

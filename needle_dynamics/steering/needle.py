@@ -28,11 +28,11 @@ from needle_dynamics.compiled.cut import (
 )
 from needle_dynamics.parameters import NeedleParameters
 from needle_dynamics.steering.parameters import (
-    bending_length,
     by_layer,
     longest_element,
     noise_cell,
     SteeringParameters,
+    turning_load,
 )
 from needle_ros.errors import ParameterError, ShapeError
 import numpy as np
@@ -152,7 +152,14 @@ def wandering(needle: NeedleParameters, steering: SteeringParameters, seed: int)
     ndarray, shape (cells, 2)
         Loads in x and z by depth, `noise_cell` apart [N]; none without noise.
 
+    Raises
+    ------
+    ParameterError
+        If the seed is not an integer from 0 on.
+
     """
+    if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
+        raise ParameterError(f'seed must be an integer >= 0, got {seed!r}')
     if steering.path_noise == 0.0:
         return np.zeros((0, 2))
     cell = noise_cell(steering)
@@ -162,12 +169,9 @@ def wandering(needle: NeedleParameters, steering: SteeringParameters, seed: int)
     draws[1:] *= sqrt(1.0 - keep * keep)
     turns = np.array(list(accumulate(draws, lambda last, draw: keep * last + draw)))
     ei, tissue = needle.bending_stiffness, needle.tissue
-    # Where there is no tissue nothing turns the path.
-    stiffness = [
-        ei / bending_length(ei, k) if k > 0.0 else 0.0 for k in map(tissue.stiffness, depths)
-    ]
+    loads = np.array([turning_load(ei, k) for k in map(tissue.stiffness, depths)])
     size = sqrt(steering.path_noise / (2.0 * steering.path_noise_length))
-    return np.asarray(size * turns * np.array(stiffness)[:, np.newaxis])
+    return np.asarray(size * turns * loads[:, np.newaxis])
 
 
 def empty_cut(length: float, element: float, layers: int) -> Cut:

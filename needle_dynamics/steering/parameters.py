@@ -131,6 +131,60 @@ def tissue_of(stiffness: float, length: float) -> float:
     return 4.0 * stiffness / length**4
 
 
+def turning_load(stiffness: float, tissue: float) -> float:
+    """
+    Return the lateral load on the tip that turns the path of a long needle with 1/m.
+
+    Parameters
+    ----------
+    stiffness : float
+        Bending stiffness E I [N m^2].
+    tissue : float
+        Stiffness k of the tissue per length [N/m^2].
+
+    Returns
+    -------
+    float
+        The load E I / lambda [N]; none where there is no tissue to turn in.
+
+    """
+    return stiffness / bending_length(stiffness, tissue) if tissue > 0.0 else 0.0
+
+
+def with_lengths(
+    needle: NeedleParameters, steering: SteeringParameters, length: float, skin: float = 1.0
+) -> tuple[NeedleParameters, SteeringParameters]:
+    """
+    Return a needle that bends over other lengths, all layers alike.
+
+    Parameters
+    ----------
+    needle : NeedleParameters
+        Needle and tissue.
+    steering : SteeringParameters
+        What they have beyond.
+    length : float
+        Bending length over the present one.
+    skin : float
+        Stiffness of the skin over that of the tissue, over the present one.
+
+    Returns
+    -------
+    NeedleParameters, SteeringParameters
+        The needle in other tissue.
+
+    """
+    stiffer = length**-4.0
+    return (
+        replace(
+            needle,
+            tissue_stiffness=needle.tissue_stiffness * stiffer,
+            layer_stiffnesses=tuple(k * stiffer for k in needle.layer_stiffnesses),
+        ),
+        replace(steering, skin_stiffness=steering.skin_stiffness * stiffer * skin),
+    )
+
+
 def by_layer(name: str, values: tuple[float, ...], layers: int) -> FloatArray:
     """
     Return one value for each layer.

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import argparse
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Mapping
+from dataclasses import asdict, replace
 import json
-from math import hypot, isfinite, sqrt
+from math import isfinite
 from pathlib import Path
 import sys
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from needle_controller import SteeringBelief, SteeringController, SteeringModel
+from needle_controller.steering.trial import drawn, insert
 from needle_dynamics import (
     FloatArray,
     NeedleParameters,
-    SteeredNeedle,
+    NeedlePath,
+    NeedleShape,
     STEERING_PRESETS,
     SteeringParameters,
 )
@@ -25,11 +28,17 @@ from needle_insertion.report.content import png
 from needle_insertion.report.insertion import draw_needle
 from needle_insertion.report.text import table
 from needle_ros.errors import ParameterError
-from needle_ros.settings import from_values
+from needle_ros.settings import from_values, unknown_name
 import numpy as np
 
 #: Target [m], step [m] and limit of the guide [m] by default.
 TARGET, STEP, LIMIT = '0.004,0.1,-0.002', 5e-3, 6e-3
+
+#: Constants of needle and tissue that matter here; what nobody knows is of the belief.
+CONSTANTS: Final = (
+    'length', 'youngs_modulus', 'area_moment', 'tissue_stiffness', 'layer_depths',
+    'layer_stiffnesses', 'free_length', 'skin_stiffness',
+)  # fmt: skip
 
 #: What nobody knows is drawn with this part of the deviations that are believed.
 _DRAWN: Final = 0.5
@@ -64,7 +73,7 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
         action='append',
         default=[],
         metavar='NAME=VALUE',
-        help='any constant of these, SI units; repeatable',
+        help=f'a constant of these, of {", ".join(CONSTANTS)}, SI units; repeatable',
     )
     parser.add_argument(
         '--belief',
@@ -93,56 +102,9 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--json', action='store_true', help='print JSON instead of tables')
 
 
-@dataclass(frozen=True, slots=True)
-class _Truth:
-    """The needle as it is, and the turn of the sensor's frame."""
-
-    needle: NeedleParameters
-    steering: SteeringParameters
-    tilt: tuple[float, float]
-    roll: float
-    frame: FloatArray
-    seed: int
-
-    def start(self) -> SteeredNeedle:
-        return SteeredNeedle(
-            self.needle, self.steering, tilt=self.tilt, roll=self.roll, seed=self.seed
-        )
-
-    def seen(self, one: SteeredNeedle) -> FloatArray:
-        """Return where the tip is in the frame of the sensor."""
-        return np.asarray(one.tip[[0, 2]] + self.frame * one.depth)
-
-
-def _drawn(
-    needle: NeedleParameters, steering: SteeringParameters, belief: SteeringBelief, seed: int
-) -> _Truth:
-    """Draw a needle of the belief."""
-    rng = np.random.default_rng(seed)
-    longer, skin = 1.0 + belief.spread * rng.uniform(-1.0, 1.0, 2)
-    stiffer = float(longer**-4.0)
-    tilt, frame, bevel = (
-        _DRAWN * size * rng.standard_normal(2)
-        for size in (belief.tilt, belief.frame, belief.bevel)
-    )
-    return _Truth(
-        replace(
-            needle,
-            tissue_stiffness=needle.tissue_stiffness * stiffer,
-            layer_stiffnesses=tuple(k * stiffer for k in needle.layer_stiffnesses),
-        ),
-        replace(
-            steering,
-            skin_stiffness=float(steering.skin_stiffness * skin * stiffer),
-            bevel_load=(hypot(*bevel),),
-            path_noise=belief.path_noise,
-            path_noise_length=belief.path_noise_length,
-        ),
-        (float(tilt[0]), float(tilt[1])),
-        float(np.arctan2(*bevel)),
-        frame,
-        seed,
-    )
+def _line(seen: NeedleShape | NeedlePath) -> FloatArray:
+    """Return a needle or its path as points x, y, z, shape (k, 3) [m]."""
+    return np.insert(seen.deflections, 1, seen.depths, axis=1)
 
 
 def _target(text: str) -> FloatArray:
@@ -150,53 +112,81 @@ def _target(text: str) -> FloatArray:
         found = [float(word) for word in text.split(',')]
     except ValueError:
         found = []
-    if len(found) != 3 or not all(map(isfinite, found)):
-        raise ParameterError(f'--target takes X,Y,Z in m, got {text!r}')
+    if len(found) != 3 or not all(map(isfinite, found)) or found[1] <= 0.0:
+        raise ParameterError(f'--target takes X,Y,Z in m with a depth Y > 0, got {text!r}')
     return np.array(found)
 
 
-def _run(options: argparse.Namespace) -> int:
-    """Steer, write the picture, and print where both needles end."""
+class _Task(NamedTuple):
+    """What the options ask for."""
+
+    target: FloatArray
+    needle: NeedleParameters
+    steering: SteeringParameters
+    belief: SteeringBelief
+    depths: FloatArray
+
+
+def _task(options: argparse.Namespace) -> _Task:
+    """Read the options, or say which of them is not valid."""
     if options.output is not None:
         if options.output.suffix != '.png':
             raise ParameterError(f'{options.output}: the picture must be .png')
         check_file(options.output)
+    if options.seed < 0:
+        raise ParameterError(f'--seed must be >= 0, got {options.seed}')
     target = _target(options.target)
-    needle, steering = made(options.needle, options.set)
-    given = {**asdict(SteeringBelief()), **constants(options.belief)}
-    belief: SteeringBelief = from_values(SteeringBelief, given)
     if not 0.0 < options.step <= target[1]:
         raise ParameterError(
             f'--step must be in (0, {target[1]:g}] m, the depth of the target, got '
             f'{options.step!r} m'
         )
-    depths = np.linspace(0.0, target[1], max(1, round(target[1] / options.step)) + 1)
+    for name in constants(options.set):
+        if name not in CONSTANTS:
+            raise ParameterError(unknown_name(name, CONSTANTS))
+    given = {**asdict(SteeringBelief()), **constants(options.belief)}
+    steps = max(1, round(target[1] / options.step))
+    return _Task(
+        target,
+        *made(options.needle, options.set),
+        from_values(SteeringBelief, given),
+        np.linspace(0.0, target[1], steps + 1),
+    )
+
+
+def _run(options: argparse.Namespace) -> int:
+    """Steer, write the picture, and print where both needles end."""
+    target, needle, steering, belief, depths = _task(options)
+    aim = target[[0, 2]]
     model = SteeringModel(needle, steering, depths, belief)
-    controller = SteeringController(model, target[[0, 2]], options.limit)
-    truth = _drawn(needle, steering, belief, options.seed)
-    ours, warnings = truth.start(), list[str]()
-    rng = np.random.default_rng([options.seed, 1])
-    guide, way, shapes = (0.0, 0.0), 0.0, []
-    for k, depth in enumerate(depths.tolist()):
-        if k:
-            ours.move(depth=depth, guide=guide)
-            shapes.append(np.insert(ours.shape.deflections, 1, ours.shape.depths, axis=1))
-        to = controller.next(truth.seen(ours) + belief.noise * rng.standard_normal(2))
-        way += hypot(to[0] - guide[0], to[1] - guide[1])
-        guide = to
-        if controller.warning and not warnings and k < len(depths) - 1:
+    controller = SteeringController(model, aim, options.limit)
+    nearer = {name: _DRAWN * getattr(belief, name) for name in ('tilt', 'frame', 'bevel')}
+    drawing = np.random.default_rng(options.seed)
+    truth = drawn(needle, steering, replace(belief, **nearer), drawing, options.seed)
+    noise = np.random.default_rng([options.seed, 1])
+    shapes, warnings = list[FloatArray](), list[str]()
+
+    def look(tip: FloatArray) -> FloatArray:
+        return np.asarray(tip + belief.noise * noise.standard_normal(2))
+
+    def follow(tip: FloatArray | None) -> tuple[float, float]:
+        depth, to = depths[controller.step], controller.next(tip)
+        if controller.warning and not warnings and depth < target[1]:
             warnings.append(f'at a depth of {1e3 * depth:.4g} mm: {controller.warning}')
+        return to
+
+    ours, way = insert(truth, depths, look, follow, lambda one: shapes.append(_line(one.shape)))
     alone = truth.start()
     alone.move(depth=float(target[1]))
-    there = controller.expected()
+    tip, other, there = truth.tip(ours), truth.tip(alone), controller.expected()
     found: dict[str, Any] = {
-        'target [m]': target[[0, 2]].tolist(),
-        'tip [m]': truth.seen(ours).tolist(),
-        'tip open loop [m]': truth.seen(alone).tolist(),
+        'target [m]': aim.tolist(),
+        'tip [m]': tip.tolist(),
+        'tip open loop [m]': other.tolist(),
         'expected tip [m]': there.mean.tolist(),
-        'its interval of 95 % [m]': [_NORMAL * sqrt(there.covariance[k, k]) for k in range(2)],
-        'miss [m]': float(np.hypot(*(truth.seen(ours) - target[[0, 2]]))),
-        'miss open loop [m]': float(np.hypot(*(truth.seen(alone) - target[[0, 2]]))),
+        'its interval of 95 % [m]': (_NORMAL * np.sqrt(np.diag(there.covariance))).tolist(),
+        'miss [m]': float(np.hypot(*(tip - aim))),
+        'miss open loop [m]': float(np.hypot(*(other - aim))),
         'way of the guide [m]': way,
         'bending length over the believed one': float(controller.weights @ model.lengths),
         'warnings': warnings,
@@ -205,15 +195,27 @@ def _run(options: argparse.Namespace) -> int:
         sys.stderr.write(f'warning: {words}\n')
     if options.output is not None:
         at = np.linspace(0, len(shapes) - 1, min(_SHOWN, len(shapes))).round().astype(int)
-        path = np.insert(ours.path.deflections, 1, ours.path.depths, axis=1)
-        beside = np.insert(alone.shape.deflections, 1, alone.shape.depths, axis=1)
         # In the frame of the needle: the sensor's is turned against it.
         mark = target - np.array([truth.frame[0], 0.0, truth.frame[1]]) * target[1]
-        drawn = draw_needle([shapes[k] for k in at.tolist()], path, mark, beside)
-        write_whole(options.output, png(drawn))
+        figure = draw_needle(
+            [shapes[k] for k in at.tolist()], _line(ours.path), mark, _line(alone.shape)
+        )
+        write_whole(options.output, png(figure))
     if options.json:
         sys.stdout.write(f'{json.dumps(found, indent=2)}\n')
         return 0
+    sys.stdout.write(
+        f'{options.needle}, seed {options.seed}: {len(depths) - 1} steps to '
+        f'{1e3 * target[1]:g} mm, the guide moved by {1e3 * way:.1f} mm in all\n\n'
+        f'{_text(found)}\n'
+    )
+    if options.output is not None:
+        sys.stdout.write(f'wrote {options.output}\n')
+    return 0
+
+
+def _text(found: Mapping[str, Any]) -> str:
+    """Return where the needles end as a table."""
     rows = [
         (name, f'{1e3 * x:.3f}', f'{1e3 * z:.3f}', '' if miss is None else f'{1e3 * miss:.3f}')
         for name, (x, z), miss in (
@@ -224,14 +226,7 @@ def _run(options: argparse.Namespace) -> int:
             ('open loop', found['tip open loop [m]'], found['miss open loop [m]']),
         )
     ]
-    sys.stdout.write(
-        f'{options.needle}, seed {options.seed}: {len(depths) - 1} steps to '
-        f'{1e3 * target[1]:g} mm, the guide moved by {1e3 * way:.1f} mm in all\n\n'
-        f'{table(rows, ("", "x [mm]", "z [mm]", "miss [mm]"))}\n'
-    )
-    if options.output is not None:
-        sys.stdout.write(f'wrote {options.output}\n')
-    return 0
+    return table(rows, ('', 'x [mm]', 'z [mm]', 'miss [mm]'))
 
 
 COMMAND = Command(_add_arguments, _run, signed=('--target',))
