@@ -6,7 +6,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import fields
 from functools import partial
 import json
-from math import hypot, sqrt
 import sys
 from time import monotonic_ns
 from typing import Any
@@ -18,7 +17,6 @@ from needle_dynamics.compiled.cache import announce_compilation
 from needle_dynamics.model_node import ModelNode
 from needle_dynamics.simulated.assembly import defaults_of, LARGEST_SEED, MODES, SETTINGS
 from needle_dynamics.simulated.faults import Fault, FaultParameters, FAULTS, FAULTY
-from needle_dynamics.simulated.measured import Outline
 from needle_dynamics.simulated.run import Event, PARAMETERS, PlantRun, RESET, TARE, TRAJECTORY
 from needle_ros import contract
 from needle_ros.errors import JobError, NeedleError, ParameterError, printable
@@ -65,16 +63,6 @@ def _line(name: str, width: float, shade: float) -> Marker:
     line.color.r = line.color.g = line.color.b = shade
     line.color.a = 1.0
     return line
-
-
-def _along(slope_x: float, slope_z: float) -> Quaternion:
-    """Return the shortest turn that brings y along a needle of these slopes."""
-    # From (0, 1, 0) to (slope_x, 1, slope_z): half the angle about their common normal.
-    across = hypot(slope_x, slope_z)
-    length = sqrt(1.0 + across * across)
-    cosine = sqrt(0.5 * (1.0 + 1.0 / length))
-    share = 0.5 / (length * cosine)
-    return Quaternion(x=share * slope_z, z=-share * slope_x, w=cosine)
 
 
 class PlantNode(ModelNode):
@@ -500,7 +488,7 @@ class PlantNode(ModelNode):
             or self._needle_poses.get_subscription_count()
         ):
             return
-        seen: Outline | None = plant_run.plant.outline()
+        seen = plant_run.plant.outline()
         if seen is None:
             return
         lines = [(self._shape, [seen.base.tolist(), *seen.points.tolist()])]
@@ -512,8 +500,10 @@ class PlantNode(ModelNode):
             self._needle_shape.publish(line)
         self._poses.header.stamp = _message(stamp)
         self._poses.poses = [
-            Pose(position=Point(x=x, y=y, z=z), orientation=_along(*slopes))
-            for (x, y, z), slopes in zip(seen.points.tolist(), seen.slopes.tolist(), strict=True)
+            Pose(position=Point(x=x, y=y, z=z), orientation=Quaternion(x=i, y=j, z=k, w=w))
+            for (x, y, z), (i, j, k, w) in zip(
+                seen.points.tolist(), seen.turns.tolist(), strict=True
+            )
         ]
         self._needle_poses.publish(self._poses)
 

@@ -3,16 +3,14 @@ How others steer by the guide, after what they published, with the interface of 
 
 `Broyden` is after [Bernardes2023]_: the tip is taken to move by a matrix times the motion of the
 guide and of the depth, which is corrected after each step. `Springs` is after [Glozman2007]_: the
-inverse of a beam on springs that pull it to the axis. Both are as they are described, not the
-code of their authors.
+inverse of a beam on springs that pull it to the axis. Both are written anew from what is
+published, not the code of their authors.
 
 References
 ----------
-.. [Bernardes2023] M. C. Bernardes, P. Moreira, D. Lezcano, L. Foley, K. Tuncali, C. Tempany,
-   J. S. Kim, N. Hata, I. Iordachita, J. Tokuda, "In vivo feasibility study: evaluating autonomous
-   data-driven robotic needle trajectory correction in MRI-guided transperineal procedures", and
-   "Data-driven adaptive needle insertion assist for transperineal prostate interventions",
-   Physics in Medicine and Biology 68, 2023.
+.. [Bernardes2023] M. C. Bernardes, P. Moreira, L. Mareschal, C. Tempany, K. Tuncali, N. Hata,
+   J. Tokuda, "Data-driven adaptive needle insertion assist for transperineal prostate
+   interventions", Physics in Medicine and Biology 68(10), 2023, doi:10.1088/1361-6560/accefa.
 .. [Glozman2007] D. Glozman, M. Shoham, "Image-guided robotic flexible needle steering", IEEE
    Transactions on Robotics 23, 2007.
 
@@ -94,10 +92,10 @@ class Broyden(OpenLoop):
 
     Each step brings the tip as near to the target as the matrix says that the guide can. In the
     source this is a horizon of four steps; without a price of motion the first of them is the
-    same for any horizon. The first matrix comes from an insertion before, of the believed needle,
-    and the guide rests until the needle is held by tissue: near the skin the tip goes with the
-    guide, deeper against it, and a wrong sign drives the guide to its limit, where nothing is
-    learned.
+    same for any horizon. Two things are ours: the first matrix comes from a simulated insertion of
+    the believed needle, and the guide rests until the needle is held by tissue. Near the skin the
+    tip goes with the guide, deeper against it, and a wrong sign drives the guide to its limit,
+    where nothing is learned.
 
     Parameters
     ----------

@@ -8,6 +8,7 @@ from typing import NamedTuple, Protocol, TypeAlias
 from needle_dynamics.arrays import FloatArray
 from needle_dynamics.parameters import NeedleParameters
 from needle_ros.contract import Topic
+import numpy as np
 
 #: What a plant publishes of a sample on one topic: name of the topic, sample intervals since the
 #: time of the stamp, and the numbers in the order of the message.
@@ -35,6 +36,16 @@ class Outline(NamedTuple):
     points: FloatArray
     slopes: FloatArray
     path: FloatArray
+
+    @property
+    def turns(self) -> FloatArray:
+        """Shortest turns that bring y along the needle, quaternions x, y, z, w; shape (k, 4)."""
+        # From (0, 1, 0) to (slope_x, 1, slope_z): half the angle about their common normal.
+        x, z = self.slopes.T
+        length = np.sqrt(1.0 + x * x + z * z)
+        cosine = np.sqrt(0.5 * (1.0 + 1.0 / length))
+        share = 0.5 / (length * cosine)
+        return np.column_stack([share * z, np.zeros_like(share), -share * x, cosine])
 
 
 class SimulatedPlant(Protocol):

@@ -336,8 +336,7 @@ class SteeredPlant:
         x, depth, z, _ = tip
         seen = self._tip_sensor.measure(depth, z, x)
         if seen is not None:
-            place = [seen.across, seen.depth, seen.deflection]
-            measured.append((TIP_DEFLECTION.name, seen.age, place))
+            measured.append((TIP_DEFLECTION.name, seen.age, seen.point))
         rates = [(b - a) / self.interval for a, b in zip(before, tip, strict=True)]
         speed = self.insertion.velocity
         outside = needle.needle.length - depth

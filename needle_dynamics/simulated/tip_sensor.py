@@ -60,6 +60,11 @@ class TipReading(NamedTuple):
     deflection: float
     across: float = 0.0
 
+    @property
+    def point(self) -> list[float]:
+        """Where the tip is, x, y, z [m]."""
+        return [self.across, self.depth, self.deflection]
+
 
 class TipSensor:
     """

@@ -187,7 +187,7 @@ class Memory:
     length : float
         Time of correlation of the most probable model [samples]; 0 for white noise.
     ratio : float
-        Variance of correlated over that of white noise in that model.
+        Variance of correlated noise, or of differences, over that of white noise in that model.
 
     """
 
@@ -269,12 +269,12 @@ def memory_of(
     own, both = white[some], np.column_stack([x, r])[some]
     weighed = both / own[:, np.newaxis]
     free = len(some) - k
-    # Of each model: time and ratio; log|V|; (x, r)' V^-1 (x, r). Differences have a time < 0.
-    models, sizes = [(0.0, 0.0)], [float(np.log(own).sum())]
-    products = [both.T @ weighed]
-    for ratio in _DIFFERENCES.tolist():
+    # Of each model: time and ratio; log|V|; (x, r)' V^-1 (x, r). Without a time it is white noise
+    # with so much of differences, the first one with none.
+    models, sizes, products = [], [], []
+    for ratio in (0.0, *_DIFFERENCES.tolist()):
         d, e, _ = dpttrf(own + ratio, _shared(time[some], parts.length) * ratio)
-        models.append((-1.0, ratio))
+        models.append((0.0, ratio))
         sizes.append(float(np.log(d).sum()))
         products.append(both.T @ dpttrs(d, e, both)[0])
     longest = _LONGEST * max(float(time[-1] - time[0]), 1.0)
@@ -298,7 +298,7 @@ def memory_of(
     counts = np.flatnonzero(weights > _NEGLIGIBLE).tolist()
     # The diagonal of a' V a, of the models that count.
     beside = (a[:-1] * a[1:] * _shared(time, parts.length)[:, np.newaxis]).sum(axis=0)
-    spreads = {0.0: np.zeros_like(plain), -1.0: (a**2).sum(axis=0) + 2.0 * beside}
+    spreads = {0.0: (a**2).sum(axis=0) + 2.0 * beside}
     deviations = []
     for k in counts:
         length, ratio = models[k]
@@ -307,8 +307,6 @@ def memory_of(
             spreads[length] = (a * dpttrs(d, e, a)[0]).sum(axis=0)
         deviations.append(np.sqrt(left[k] / free * (plain + ratio * spreads[length])))
     length, ratio = models[int(np.argmax(weights))]
-    if length < 0.0:
-        length = ratio = 0.0
     white, found = np.sqrt(left[0] / free * plain), np.array(deviations)
     return Memory(
         inflation=_growth(weights[counts], found, white, 0.05),

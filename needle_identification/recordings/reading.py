@@ -227,6 +227,26 @@ def read_indentation_recording(
     )
 
 
+def signed(text: str) -> tuple[float, str]:
+    """
+    Split a name from its sign.
+
+    Parameters
+    ----------
+    text : str
+        A name, perhaps after ``-``.
+
+    Returns
+    -------
+    sign : float
+        1 or -1.
+    name : str
+        The name.
+
+    """
+    return (-1.0, text[1:]) if text.startswith('-') else (1.0, text)
+
+
 def signed_axis(text: str, what: str) -> tuple[float, str]:
     """
     Split an axis into its sign and its name.
@@ -251,7 +271,7 @@ def signed_axis(text: str, what: str) -> tuple[float, str]:
         If it is another.
 
     """
-    sign, axis = (-1.0, text[1:]) if text.startswith('-') else (1.0, text)
+    sign, axis = signed(text)
     if axis not in AXES:
         raise RecordingError(f'{what} must be x, y, z, -x, -y or -z, got {text!r}')
     return sign, axis
@@ -260,9 +280,8 @@ def signed_axis(text: str, what: str) -> tuple[float, str]:
 def _motion_source(bag: Bag, topic: Topic, axis: str | None) -> tuple[Source, float]:
     """Return what to take for a motion along an axis or of a joint, and its sign."""
     if topic.type_name == wire.JOINT_STATE:
-        backward = axis is not None and axis.startswith('-')
-        joint = axis[1:] if axis and backward else axis or _only_joint(bag, topic)
-        return source_of(topic.type_name, 'y', joint), -1.0 if backward else 1.0
+        sign, joint = signed(axis or '')
+        return source_of(topic.type_name, 'y', joint or _only_joint(bag, topic)), sign
     sign, name = signed_axis('y' if axis is None else axis, 'motion axis')
     return source_of(topic.type_name, [name]), sign
 

@@ -14,6 +14,7 @@ from needle_identification.recordings.reading import (
     chosen_topic,
     first_names,
     read_samples,
+    signed,
     signed_axis,
     Wanted,
 )
@@ -103,7 +104,7 @@ def read_steering_recording(
     tip = chosen_topic(bag, topics, _TIP, tip_topic)
     motion = chosen_topic(bag, topics, _MOTION, motion_topic)
     seen = {name for names in first_names(bag, motion) for name in names}
-    joints = {role: _signed(columns.get(role, name)) for role, name in _JOINTS.items()}
+    joints = {role: signed(columns.get(role, name)) for role, name in _JOINTS.items()}
     if 'roll' not in columns and ROLL not in seen:
         del joints['roll']
     if missing := {name for _, name in joints.values()} - seen:
@@ -127,11 +128,6 @@ def read_steering_recording(
     signs = [sign for sign, _ in (*axes.values(), *joints.values())]
     values = dict(zip([*axes, *joints], (both * signs).T, strict=True))
     return recorded_insertion(path, medium, _thinned(values, losses), losses)
-
-
-def _signed(text: str) -> tuple[float, str]:
-    """Split the name of a joint from its sign."""
-    return (-1.0, text[1:]) if text.startswith('-') else (1.0, text)
 
 
 def _thinned(values: Mapping[str, FloatArray], losses: list[str]) -> dict[str, FloatArray]:

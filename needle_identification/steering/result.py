@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from math import atan2, hypot, isfinite
-from pathlib import Path
 from typing import Final
 
 from needle_dynamics.parameters import DEFAULT_PRESET, NeedleParameters
 from needle_dynamics.steering.parameters import tissue_of
 from needle_identification.errors import IdentificationError
 from needle_identification.estimation.formatting import UNKNOWN
-from needle_identification.result import write_whole
 from needle_identification.steering.estimate import SteeringEstimate
 import yaml
 
@@ -76,25 +74,3 @@ def steering_yaml(found: SteeringEstimate) -> str:
 
 def _short(value: float) -> float:
     return float(format(value, _DIGITS))
-
-
-def write_steering(path: Path, found: SteeringEstimate) -> None:
-    """
-    Write the parameter file of `steering_yaml`.
-
-    Parameters
-    ----------
-    path : Path
-        File to write.
-    found : SteeringEstimate
-        The result.
-
-    Raises
-    ------
-    IdentificationError
-        If there are several media, or the bending length is not determined.
-    ParameterError
-        If the file cannot be written.
-
-    """
-    write_whole(path, steering_yaml(found).encode())

@@ -16,6 +16,7 @@ from needle_identification.estimation.estimate import ParameterEstimate
 from needle_identification.estimation.formatting import between, measured
 from needle_identification.recordings import TIMES
 from needle_identification.recordings.tables import column_roles
+from needle_identification.result import write_whole
 from needle_identification.steering.estimate import SteeringEstimate
 from needle_identification.steering.reading import read_steering_recording
 from needle_identification.steering.recording import SteeringRecording
@@ -155,7 +156,7 @@ def _read(
 def _run(options: argparse.Namespace) -> int:
     # The search takes a large import, which other commands of this parser do not need.
     from needle_identification import identify_steering, SteeringSettings
-    from needle_identification.steering.result import write_steering
+    from needle_identification.steering.result import steering_yaml
 
     if options.output is not None:
         check_file(options.output)
@@ -181,7 +182,7 @@ def _run(options: argparse.Namespace) -> int:
         sys.stdout.write(f'{steering_text(found)}\n')
     if options.output is not None:
         try:
-            write_steering(options.output, found)
+            write_whole(options.output, steering_yaml(found).encode())
         except IdentificationError as error:
             sys.stderr.write(shown(f'error: {options.output} is not written: {error}') + '\n')
             return 2

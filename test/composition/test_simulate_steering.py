@@ -73,6 +73,7 @@ def test_a_membrane_and_a_start_on_the_way(capsys: pytest.CaptureFixture[str]) -
         (['--model', 'steering', '--speed', '0'], '--speed must be positive and finite'),
         (['--model', 'steering', '--depth', '0.2'], '--to must be beyond --depth'),
         (['--model', 'steering', '--interval', '1e-9'], 'with at most 1000000 samples'),
+        (['--model', 'steering', '--seed', '-1'], 'seed must be an integer >= 0, got -1'),
         (['--model', 'steering', '--set', 'modes=3'], "unknown parameter 'modes'; valid: area"),
         (['--model', 'steering', '-o', 'bag'], 'must be .csv or .png'),
         (['--model', 'steering', '--way', 'none.csv'], 'none.csv cannot be read'),

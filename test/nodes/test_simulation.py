@@ -341,6 +341,7 @@ def test_a_steered_needle_shows_its_path(ros_graph: RosGraph) -> None:
     ]  # fmt: skip
     message.points[0].positions = [0.03, 9e-3, -5e-3]
     course.publish(message)
+    # The robot is content to rest within 10 nm of the end, taken ten times.
     there = pytest.approx([0.03, 9e-3, -5e-3], abs=1e-7)
     bench.until(lambda: bench.states[-1].position.tolist()[:3] == there, 'the end of the course')
     seen = len(poses), len(lines)
