@@ -51,6 +51,7 @@ from needle_controller.steering.controller import (
     SteeringFaultError,
     TipEstimate,
 )
+from needle_controller.steering.outer_loop import OuterLoop, OuterLoopSettings
 from needle_controller.steering.responses import SteeringModel
 from needle_controller.supervisor import Supervisor
 from needle_controller.uncertainty import Uncertainty
@@ -83,6 +84,8 @@ __all__ = [
     'Observer',
     'ObserverSettings',
     'OutOfReachError',
+    'OuterLoop',
+    'OuterLoopSettings',
     'Pid',
     'PidGains',
     'Reference',

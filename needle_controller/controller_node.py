@@ -63,7 +63,8 @@ class ControllerNode(ModelNode):
     Answers each ``joint_states`` with a ``wrench_command`` (force.y [N], torque.x [N m]).
 
     ``target`` (point.y [m]) is the inserted length to reach, ``joint_trajectory`` (joint
-    `insertion`: positions, and velocities or none) a path to follow. The command is zero before
+    `insertion`: positions, and velocities or none) a path to follow. With ``steered`` a target is
+    for the node `steering`, and only paths are followed. The command is zero before
     the first of them, while measurements are stale, jump or are not finite, and while another node
     commands too. It is also zero from ``~/emergency_stop`` or a measurement beyond a limit until
     ``~/clear_stop``. It carries the stamp of the measurement that it answers; one that answers
@@ -101,6 +102,9 @@ class ControllerNode(ModelNode):
             'deflection_feedback',
             FEEDBACKS[0],
             f'one of {", ".join(FEEDBACKS)} (ground_truth: simulation only)',
+        )
+        self.declare_text(
+            'steered', False, 'the target is for the node steering: only paths are followed'
         )
         self.declare_parameter(
             _RETRACT,
@@ -255,6 +259,8 @@ class ControllerNode(ModelNode):
         self.create_service(kind, f'~/{name}', on_request)
 
     def _on_target(self, message: PointStamped) -> None:
+        if self.get_parameter('steered').value:
+            return
         header, point = message.header, message.point
         self._act(
             self._supervisor.target(

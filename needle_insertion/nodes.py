@@ -12,6 +12,7 @@ from typing import Final
 NODES: Final = {
     'plant': 'needle_dynamics.plant_node',
     'controller': 'needle_controller.controller_node',
+    'steering': 'needle_controller.steering_node',
     'identification': 'needle_identification.identification_node',
     'recorder': 'needle_identification.recorder_node',
     'player': 'needle_identification.player_node',

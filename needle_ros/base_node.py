@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from array import array
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from contextlib import suppress
 from dataclasses import fields
 from importlib import import_module
@@ -373,7 +373,7 @@ class BaseNode(LifecycleNode):
         descriptor = ParameterDescriptor(description=description, dynamic_typing=dynamic)
         self.declare_parameter(name, default, descriptor)
 
-    def declare_settings(self, prefix: str, defaults: object) -> None:
+    def declare_settings(self, prefix: str, defaults: object, names: Collection[str] = ()) -> None:
         """
         Declare one parameter per field of a dataclass.
 
@@ -383,9 +383,13 @@ class BaseNode(LifecycleNode):
             Namespace of the parameters, ``''`` for none.
         defaults : object
             Instance of the dataclass that holds the default values.
+        names : collection of str
+            The fields; all if empty.
 
         """
         for item in fields(defaults):  # type: ignore[arg-type]
+            if names and item.name not in names:
+                continue
             meta = item.metadata
             unit = f' [{meta["unit"]}]' if meta.get('unit') else ''
             descriptor = ParameterDescriptor(

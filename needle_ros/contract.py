@@ -132,7 +132,7 @@ class Topic:
     type_name : str
         Message type.
     publisher : str
-        Node that publishes it, `EVERY_NODE`, or `USER`.
+        Who publishes it: nodes, `EVERY_NODE`, or `USER`.
     meaning : str
         What its messages hold, for people.
     qos : Qos
@@ -374,13 +374,28 @@ TRACKING_ERROR: Final = Topic(
 )
 
 TARGET: Final = Topic(
-    'target', POINT, USER, '`point.y`: inserted length to reach [m]', qos=COMMAND, frame=ENTRY
+    'target',
+    POINT,
+    USER,
+    '`point.y`: inserted length to reach [m]; to the node `steering`: where the tip shall be, '
+    'x, y, z [m]',
+    qos=COMMAND,
+    frame=ENTRY,
+)
+
+TIP_EXPECTED: Final = Topic(
+    'tip_expected',
+    'geometry_msgs/msg/PoseWithCovarianceStamped',
+    'steering',
+    'where the tip will be at the target depth, with covariance, after each look',
+    qos=COMMAND,
+    frame=ENTRY,
 )
 
 JOINT_TRAJECTORY: Final = Topic(
     'joint_trajectory',
     'trajectory_msgs/msg/JointTrajectory',
-    USER,
+    f'{USER}, steering',
     'to the controller: `insertion`, positions [m] to follow, and velocities [m/s] or '
     'none; to a plant in mode `robot`: `insertion`, positions [m], or efforts [N] of a push; '
     'steered, in both modes: guide and roll [m, rad]; in mode `indenter`: efforts of `x` and '

@@ -63,7 +63,7 @@ class OpenLoop:
 
     def next(self, tip: FloatArray | None) -> tuple[float, float]:
         """
-        Take a look at the tip, and return where the guide shall be at the end of the next step.
+        Take a look at the tip, and return where the guide shall be in the next step.
 
         Parameters
         ----------

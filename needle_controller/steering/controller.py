@@ -147,7 +147,8 @@ class SteeringController:
     >>> softer = replace(believed, tissue_stiffness=0.8 * believed.tissue_stiffness)
     >>> needle = SteeredNeedle(softer, steering, tilt=(0.02, 0.01))
     >>> for depth in depths[1:]:
-    ...     needle.move(depth=depth, guide=control.next(needle.tip[[0, 2]]))
+    ...     needle.move(guide=control.next(needle.tip[[0, 2]]))
+    ...     needle.move(depth=depth)
     >>> miss = np.hypot(*(needle.tip[[0, 2]] - control.target))
     >>> print(f'{1e3 * miss:.1f} mm')
     0.0 mm
@@ -157,11 +158,6 @@ class SteeringController:
     def __init__(
         self, model: SteeringModel, target: ArrayLike, position_limit: float = 6e-3
     ) -> None:
-        self.target = np.array(target, dtype=np.float64)
-        if self.target.shape != (2,):
-            raise ShapeError(f'target must be x and z, got shape {self.target.shape}')
-        if not np.isfinite(self.target).all():
-            raise ParameterError(f'target must be finite, got {self.target.tolist()} m')
         if not 0.0 < position_limit < inf:
             raise ParameterError(
                 f'position_limit must be positive and finite, got {position_limit!r} m'
@@ -176,8 +172,36 @@ class SteeringController:
         self._logs = np.zeros(count)
         self._last: FloatArray | None = None
         self._same = self._impossible = self._missing = 0
+        self.target = np.zeros(2)
+        self.aim(target)
+
+    def aim(self, target: ArrayLike) -> None:
+        """
+        Go on to another target at the same depth.
+
+        Parameters
+        ----------
+        target : array_like, shape (2,)
+            Where the tip shall be at the last depth, x and z in the frame of the sensor [m].
+
+        Raises
+        ------
+        ShapeError, ParameterError
+            If the target is not two finite numbers.
+        OutOfReachError
+            If the guide cannot bring the tip there. The target stays as it was then.
+
+        """
+        new = np.array(target, dtype=np.float64)
+        if new.shape != (2,):
+            raise ShapeError(f'target must be x and z, got shape {new.shape}')
+        if not np.isfinite(new).all():
+            raise ParameterError(f'target must be finite, got {new.tolist()} m')
+        before, self.target = self.target, new
         if self.chance < _REFUSED:
-            raise OutOfReachError(self._unreachable())
+            why = self._unreachable()
+            self.target = before
+            raise OutOfReachError(why)
 
     # What is known.
 
@@ -186,6 +210,11 @@ class SteeringController:
         """Probability of each hypothesis, shape (h,)."""
         found = np.exp(self._logs - self._logs.max())
         return np.asarray(found / found.sum())
+
+    @property
+    def bending(self) -> float:
+        """Bending length over the believed one, as far as it is known."""
+        return float(self.weights @ self._model.lengths)
 
     def expected(self, at: int = -1) -> TipEstimate:
         """
@@ -272,7 +301,7 @@ class SteeringController:
 
     def next(self, tip: Sequence[float] | FloatArray | None) -> tuple[float, float]:
         """
-        Take a look at the tip, and return where the guide shall be at the end of the next step.
+        Take a look at the tip, and return where the guide shall be in the next step.
 
         Parameters
         ----------

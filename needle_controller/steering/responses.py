@@ -6,7 +6,7 @@ bevel, and in the loads with which the path strays from what is expected:
 
 .. math:: z_k = \sum_j A_{kj} b_j + H_k \theta
 
-with positions :math:`b_j` of the guide at the ends of the steps, and unknown constants
+with positions :math:`b_j` of the guide in the steps, and unknown constants
 :math:`\theta`: origin and turn of the sensor's frame, tilt, bevel, and a curvature of the path
 at each depth, with straight lines between. A and H depend on the bending length and on the skin,
 and so there is one of them for each of a grid of these: the hypotheses. What is between two of
@@ -29,6 +29,14 @@ from needle_dynamics.steering.parameters import SteeringParameters, turning_load
 from needle_ros.errors import ParameterError
 import numpy as np
 from numpy.typing import ArrayLike
+
+#: Constants of `NeedleParameters` and of `SteeringParameters` that count here; what nobody knows
+#: is of the belief.
+OF_NEEDLE: Final = (
+    'length', 'youngs_modulus', 'area_moment', 'tissue_stiffness', 'layer_depths',
+    'layer_stiffnesses',
+)  # fmt: skip
+OF_STEERING: Final = ('free_length', 'skin_stiffness')
 
 #: Hypotheses of the bending length and of the skin.
 _LENGTHS, _SKINS = 13, 4
@@ -67,8 +75,8 @@ class SteeringModel:
     lengths, skins : ndarray, shape (h,)
         Bending length and skin of each hypothesis, over the believed ones.
     guide : ndarray, shape (h, n + 1, n)
-        Shift of the tip at each depth per position of the guide at the end of each step; between
-        the ends the guide moves evenly with the depth.
+        Shift of the tip at each depth per position of the guide in each step: it moves there while
+        the needle rests, and stays while the needle goes in.
     causes : ndarray, shape (h, n + 1, 5 + n)
         The same per origin [m], turn of the frame [rad], tilt, load of the bevel [N], and
         curvature of the path at each depth [1/m].
@@ -149,9 +157,11 @@ class SteeringModel:
         base = steered(other, beyond)
         reach = at[-1] + steering.free_length
         runs = 2 * n + 3
-        poses = np.zeros((runs, n + 1, 6))
-        poses[:, :, 0] = at
-        poses[np.arange(n), np.arange(n) + 1, 1] = 1.0
+        # First the guide, then the needle: so it does not matter how fast either is.
+        poses = np.zeros((runs, 2 * n + 1, 6))
+        poses[:, ::2, 0], poses[:, 1::2, 0] = at, at[:-1]
+        for k in range(n):
+            poses[k, 2 * k + 1 : 2 * k + 3, 1] = 1.0
         poses[n, :, 2] = 1.0
         layers = np.zeros((runs, 3, len(base.starts)))
         layers[:, 0], layers[:, 1] = base.starts, base.stiffness
@@ -164,7 +174,7 @@ class SteeringModel:
         hats = [np.interp(middle, at, one) for one in np.eye(n + 1)]
         wander[n + 2 :, :, 0] = hats * loads
         numbers = [base.ei, base.element, base.skin, 0.0, 0.0, reach]
-        tips = np.empty((runs, n + 1, 2))
+        tips = np.empty((runs, 2 * n + 1, 2))
         insert(
             np.array([[*numbers, steering.free_length]]),
             layers,
@@ -175,6 +185,6 @@ class SteeringModel:
             empty_cut(reach, base.element, len(base.starts)),
             tips,
         )
-        x = tips[:, :, 0].T
-        causes = [np.ones(n + 1), at, x[:, n], tips[n + 1, :, 1], *x[:, n + 2 :].T]
+        x, bent = tips[:, ::2, 0].T, tips[n + 1, ::2, 1]
+        causes = [np.ones(n + 1), at, x[:, n], bent, *x[:, n + 2 :].T]
         return x[:, :n], np.array(causes).T

@@ -127,7 +127,7 @@ def insert(
     watch: Callable[[SteeredNeedle], object] | None = None,
 ) -> tuple[SteeredNeedle, float]:
     """
-    Insert a needle in steps: look at the tip, move the guide, go on.
+    Insert a needle in steps: look at the tip, move the guide, then the needle.
 
     Parameters
     ----------
@@ -139,7 +139,7 @@ def insert(
         Takes the tip in the frame of the sensor, shape (2,), and returns what it says of it, or
         None.
     controller : callable
-        Takes that, and returns where the guide shall be at the end of the next step [m].
+        Takes that, and returns where the guide shall be in the next step [m].
     watch : callable, optional
         Called with the needle after each step.
 
@@ -155,7 +155,8 @@ def insert(
     guide, way = (0.0, 0.0), 0.0
     for k, depth in enumerate(depths.tolist()):
         if k:
-            one.move(depth=depth, guide=guide)
+            one.move(guide=guide)
+            one.move(depth=depth)
             if watch is not None:
                 watch(one)
         to = controller(look(truth.tip(one)))

@@ -12,6 +12,7 @@ import sys
 from typing import Any, Final, NamedTuple
 
 from needle_controller import SteeringBelief, SteeringController, SteeringModel
+from needle_controller.steering.responses import OF_NEEDLE, OF_STEERING
 from needle_controller.steering.trial import drawn, insert
 from needle_dynamics import (
     FloatArray,
@@ -35,10 +36,7 @@ import numpy as np
 TARGET, STEP, LIMIT = '0.004,0.1,-0.002', 5e-3, 6e-3
 
 #: Constants of needle and tissue that matter here; what nobody knows is of the belief.
-CONSTANTS: Final = (
-    'length', 'youngs_modulus', 'area_moment', 'tissue_stiffness', 'layer_depths',
-    'layer_stiffnesses', 'free_length', 'skin_stiffness',
-)  # fmt: skip
+CONSTANTS: Final = (*OF_NEEDLE, *OF_STEERING)
 
 #: What nobody knows is drawn with this part of the deviations that are believed.
 _DRAWN: Final = 0.5
@@ -188,7 +186,7 @@ def _run(options: argparse.Namespace) -> int:
         'miss [m]': float(np.hypot(*(tip - aim))),
         'miss open loop [m]': float(np.hypot(*(other - aim))),
         'way of the guide [m]': way,
-        'bending length over the believed one': float(controller.weights @ model.lengths),
+        'bending length over the believed one': controller.bending,
         'warnings': warnings,
     }
     for words in warnings:

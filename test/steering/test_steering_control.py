@@ -57,7 +57,8 @@ def steer(
     guide = (0.0, 0.0)
     for k, depth in enumerate(DEPTHS.tolist()):
         if k:
-            needle.move(depth=depth, guide=guide)
+            needle.move(guide=guide)
+            needle.move(depth=depth)
         guide = controller.next(needle.tip[[0, 2]] + noise * rng.standard_normal(2))
     return needle.tip[[0, 2]]
 
@@ -74,7 +75,8 @@ def test_what_it_predicts_is_what_the_needle_does(length: float, skin: float) ->
     causes = np.array([[0.0, 0.0], [0.0, 0.0], tilt, 0.3 * np.array([np.sin(0.7), np.cos(0.7)])])
     expected = alone.guide[0] @ guide + alone.causes[0, :, :4] @ causes
     for k, depth in enumerate(DEPTHS[1:].tolist()):
-        one.move(depth=depth, guide=guide[k].tolist())
+        one.move(guide=guide[k].tolist())
+        one.move(depth=depth)
         # Elements of 1 and 1.25 mm.
         assert_allclose(one.tip[[0, 2]], expected[k + 1], atol=5e-6)
 

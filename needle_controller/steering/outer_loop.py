@@ -1,0 +1,638 @@
+"""
+The outer loop that steers: look at the tip, move the guide, insert the needle; without ROS.
+
+It asks for motions of needle and guide, whoever makes them: a robot that follows positions, or an
+axis law that turns the insertion into forces. The guide moves while the needle rests, and the
+needle once the guide has arrived: so the path does not depend on how fast either is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import Enum
+from math import ceil
+from time import monotonic
+from typing import Final, NamedTuple
+
+from needle_controller.journal import Journal, Severity
+from needle_controller.safety.stream import Stream
+from needle_controller.steering.belief import SteeringBelief
+from needle_controller.steering.controller import (
+    SteeringController,
+    SteeringFaultError,
+    TipEstimate,
+)
+from needle_controller.steering.look import Look, Seen
+from needle_controller.steering.responses import SteeringModel
+from needle_dynamics.arrays import FloatArray
+from needle_dynamics.parameters import NeedleParameters
+from needle_dynamics.steering.parameters import SteeringParameters
+from needle_ros.contract import ENTRY, GUIDE_X, GUIDE_Z, INSERTION, JOINT_STATES, TIP_DEFLECTION
+from needle_ros.errors import JobError, NeedleError, ParameterError
+from needle_ros.settings import check_constants, constant
+from needle_ros.timing import NANOSECONDS
+from needle_ros.wire import Reading
+import numpy as np
+
+#: Joints that are moved.
+JOINTS: Final = (INSERTION, GUIDE_X, GUIDE_Z)
+
+#: Highest speed of a smooth motion from rest to rest over its mean.
+_PEAK: Final = 1.875
+
+#: Time from one point of a motion to the next [s].
+_INTERVAL: Final = 0.05
+
+#: Time in which needle and guide come to rest where something is wrong [s].
+_BRAKING: Final = 0.2
+
+#: A needle that moves by less while it settles, rests [m].
+_STILL: Final = 1e-4
+
+#: The needle counts as outside tissue up to this depth: there the guide may move at will [m].
+_OUTSIDE: Final = 1e-3
+
+#: Depths that are the same [m].
+_SAME: Final = 1e-6
+
+#: Readings that scatter so much more than is believed are worth a word.
+_SCATTERED: Final = 3.0
+
+#: Half of an interval of 95 % over the standard deviation.
+_NORMAL: Final = 1.96
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OuterLoopSettings:
+    """Steps, looks and limits of a needle that is steered."""
+
+    step: float = constant(
+        5e-3, 'm', 'way of the needle from one look at the tip to the next', open_low=True
+    )
+    speed: float = constant(0.01, 'm/s', 'highest insertion speed', open_low=True)
+    guide_limit: float = constant(
+        6e-3, 'm', 'farthest position of the guide along x and along z', open_low=True
+    )
+    guide_speed: float = constant(0.02, 'm/s', 'highest speed of the guide', open_low=True)
+    settle_time: float = constant(0.1, 's', 'time at rest before a look')
+    look_time: float = constant(
+        0.5, 's', 'duration of a look, whose readings are averaged', open_low=True
+    )
+    depth_tolerance: float = constant(
+        3e-4, 'm', 'how far from the end of a step the needle may rest', open_low=True
+    )
+    guide_tolerance: float = constant(
+        1e-4, 'm', 'how far the guide may be from where it was sent', open_low=True
+    )
+    slip_tolerance: float = constant(
+        3e-3, 'm', 'how much the depth of the tip may differ from the inserted length, beyond '
+        'the first look', open_low=True,
+    )  # fmt: skip
+    patience: float = constant(
+        5.0, 's', 'how much longer than planned a step may take', open_low=True
+    )
+    measurement_timeout: float = constant(
+        0.5, 's', 'age at which joint_states, tip_deflection and stamped targets no longer '
+        'count; how late a reading of a look may be', open_low=True,
+    )  # fmt: skip
+
+    def __post_init__(self) -> None:
+        check_constants(self)
+
+
+class Phase(Enum):
+    """What the loop does."""
+
+    IDLE = 'waits for a target'
+    GUIDING = 'the guide moves'
+    INSERTING = 'the needle goes in'
+    LOOKING = 'looks at the tip'
+    DONE = 'is at the target depth'
+    STOPPED = 'has stopped'
+
+
+class Move(NamedTuple):
+    """
+    A motion to rest, for whoever moves needle and guide.
+
+    Attributes
+    ----------
+    times : ndarray, shape (n,)
+        Times from now [s].
+    positions, velocities : ndarray, shape (n, 3)
+        Of `JOINTS` [m, m/s].
+
+    """
+
+    times: FloatArray
+    positions: FloatArray
+    velocities: FloatArray
+
+
+def smooth(begin: FloatArray, end: FloatArray, duration: float) -> Move:
+    """
+    Return a motion from rest to rest, in which all joints go in proportion.
+
+    Parameters
+    ----------
+    begin, end : ndarray, shape (3,)
+        Positions of `JOINTS` [m].
+    duration : float
+        Its duration [s].
+
+    Returns
+    -------
+    Move
+        A polynomial of fifth order, of least jerk.
+
+    """
+    count = max(2, ceil(duration / _INTERVAL))
+    part = np.arange(1, count + 1) / count
+    gone = part**3 * (10.0 - 15.0 * part + 6.0 * part**2)
+    rate = 30.0 * (part * (1.0 - part)) ** 2 / duration
+    way = end - begin
+    # Exactly where it shall end.
+    positions = np.vstack([begin + np.outer(gone[:-1], way), end])
+    return Move(duration * part, positions, np.outer(rate, way))
+
+
+class OuterLoop:
+    """
+    Brings the tip to a target in steps, as long as all is well.
+
+    Every event is a method: it takes the time now [ns] of the clock that stamps the messages, and
+    returns how needle and guide shall move because of it; None leaves them to what was asked for
+    last. `journal` has what there is to say.
+
+    Parameters
+    ----------
+    needle : NeedleParameters
+        Needle and tissue as they are believed.
+    steering : SteeringParameters
+        What they have beyond.
+    belief : SteeringBelief
+        How far all that may be wrong.
+    settings : OuterLoopSettings
+        Steps, looks and limits.
+    steady : callable
+        As for `Journal`.
+
+    Attributes
+    ----------
+    settings : OuterLoopSettings
+        As given.
+    journal : Journal
+        What there is to say.
+    phase : Phase
+        What it does.
+    fault : str
+        Why it has stopped, '' if it has not.
+    control : SteeringController or None
+        The controller of the latest insertion.
+    expected : TipEstimate or None
+        Where the tip will be at the target depth; a new one after each look.
+
+    """
+
+    def __init__(
+        self,
+        needle: NeedleParameters,
+        steering: SteeringParameters,
+        belief: SteeringBelief,
+        settings: OuterLoopSettings,
+        steady: Callable[[], float] = monotonic,
+    ) -> None:
+        self._needle, self._steering, self._belief = needle, steering, belief
+        self.settings = settings
+        self.journal = Journal(steady)
+        timeout = settings.measurement_timeout
+        frames = ('', ENTRY)
+        self._joint_stream = Stream(JOINT_STATES.name, timeout)
+        self._tip_stream = Stream(TIP_DEFLECTION.name, timeout, frames=frames)
+        self._target_stream = Stream('target', timeout, frames=frames, stamped=False)
+        self.phase, self.fault = Phase.IDLE, ''
+        self.control: SteeringController | None = None
+        self.expected: TipEstimate | None = None
+        self._depths = np.zeros(1)
+        #: Inserted length where the latest insertion began [m].
+        self._begun = 0.0
+        #: Where the joints are, were sent, and when they shall be there.
+        self._at: FloatArray | None = None
+        self._goal = np.zeros(3)
+        self._due = 0
+        #: Stamp [ns] and inserted length [m] since which the needle rests.
+        self._rest: tuple[int, float] | None = None
+        self._look: Look | None = None
+        self._seen: Seen | None = None
+        #: Depth of the tip less the inserted length, at the first look [m].
+        self._ahead: float | None = None
+        self._warned = False
+        self._time = 0
+        #: A plan takes a moment, in which messages wait.
+        self._planned = False
+
+    @property
+    def steers(self) -> bool:
+        """Whether an insertion is under way."""
+        return self.phase in (Phase.GUIDING, Phase.INSERTING, Phase.LOOKING)
+
+    @property
+    def depth(self) -> float:
+        """Depth of the target of the latest insertion [m]."""
+        return float(self._depths[-1])
+
+    # Wishes of the user.
+
+    def target(
+        self, stamp: int, frame: str, point: tuple[float, float, float], now: int
+    ) -> Move | None:
+        """
+        Begin to steer to a target; while steering to its depth, go on to the new one.
+
+        Parameters
+        ----------
+        stamp : int
+            Stamp of the message [ns]; 0 if it has none.
+        frame : str
+            Its frame.
+        point : tuple of float
+            Where the tip shall be, x, y, z [m].
+        now : int
+            Time [ns].
+
+        Returns
+        -------
+        Move or None
+            How to move.
+
+        """
+        refusal = self._target_stream.check(stamp, now, frame, point)
+        try:
+            if refusal is not None:
+                raise ParameterError(refusal.line)
+            if self.steers:
+                self._aim(point)
+                return None
+            return self._begin(point, now)
+        except NeedleError as error:
+            self.journal.refuse(f'target refused: {error}')
+            return None
+
+    def _aim(self, point: tuple[float, float, float]) -> None:
+        depth = self.depth
+        if abs(point[1] - depth) > _SAME or self.control is None:
+            raise ParameterError(
+                f'it steers to a depth of {1e3 * depth:.2f} mm, got {1e3 * point[1]:.2f} mm; '
+                '~/stop ends that'
+            )
+        self.control.aim((point[0], point[2]))
+        self._warned = False
+        self.journal.say(Severity.INFO, f'steers to {_words(point)} from now on')
+
+    def _begin(self, point: tuple[float, float, float], now: int) -> Move | None:
+        settings = self.settings
+        for stream in (self._joint_stream, self._tip_stream):
+            if stream.publishers > 1:
+                raise JobError(f'{stream.publishers} nodes publish {stream.name}')
+            if stream.counted is None or stream.silence(now) > settings.measurement_timeout:
+                raise JobError(f'{stream.name} does not come')
+        if self._at is None:
+            raise JobError('where needle and guide are is not known')
+        depth = max(0.0, float(self._at[0]))
+        if self.control is not None and depth > self._begun + _OUTSIDE:
+            raise JobError(
+                f'the needle is at {1e3 * depth:.2f} mm and has been steered; retract it to '
+                f'{1e3 * self._begun:.2f} mm first'
+            )
+        off = np.abs(self._at[1:]).max()
+        if depth > _OUTSIDE and off > settings.guide_tolerance:
+            raise JobError(
+                f'the guide is {1e3 * off:.2f} mm off its zero with the needle at '
+                f'{1e3 * depth:.2f} mm; a needle has to be straight at the start'
+            )
+        if point[1] < depth + min(settings.step, _OUTSIDE):
+            raise ParameterError(
+                f'the needle is at {1e3 * depth:.2f} mm already, the target at '
+                f'{1e3 * point[1]:.2f} mm'
+            )
+        steps = max(1, round((point[1] - depth) / settings.step))
+        depths = np.linspace(depth, point[1], steps + 1)
+        model = SteeringModel(self._needle, self._steering, depths, self._belief)
+        self.control = SteeringController(model, (point[0], point[2]), settings.guide_limit)
+        self._planned = True
+        self._depths, self._begun = depths, depth
+        self.expected, self.fault = None, ''
+        self._ahead, self._warned = None, False
+        self.journal.say(Severity.INFO, f'steers to {_words(point)} in {steps} steps')
+        self._goal = np.array([depth, *self._at[1:]])
+        return self._send(Phase.GUIDING, np.array([depth, 0.0, 0.0]), now)
+
+    def stop(self, why: str) -> Move | None:
+        """
+        End the insertion: needle and guide come to rest where they are.
+
+        Parameters
+        ----------
+        why : str
+            For people.
+
+        Returns
+        -------
+        Move or None
+            How to move; None if nothing was under way.
+
+        """
+        if not self.steers:
+            return None
+        moves = self.phase is not Phase.LOOKING
+        self.phase, self.fault, self._look = Phase.STOPPED, why, None
+        self.journal.say(Severity.ERROR, f'stopped: {why}')
+        if not moves or self._at is None:
+            return None
+        end = self._at.copy()
+        # It cannot rest at once where it is.
+        ahead = min(0.5 * _BRAKING * self.settings.speed, max(0.0, self._goal[0] - end[0]))
+        end[0] += ahead
+        return Move(np.array([_BRAKING]), end[np.newaxis], np.zeros((1, 3)))
+
+    # What is measured.
+
+    def joints(self, reading: Reading, now: int) -> Move | None:
+        """
+        Take in `joint_states`.
+
+        Parameters
+        ----------
+        reading : Reading
+            The message.
+        now : int
+            Time [ns].
+
+        Returns
+        -------
+        Move or None
+            How to move.
+
+        """
+        names, (positions, *_) = reading.names, reading.values
+        found = dict(zip(names, positions, strict=False))
+        missing = [name for name in JOINTS if name not in found]
+        if missing:
+            self.journal.refuse(
+                f'joint_states lacks a position of {", ".join(missing)}, got names {list(names)}'
+            )
+            return None
+        at = [found[name] for name in JOINTS]
+        refusal = self._joint_stream.check(reading.stamp, now, values=at)
+        if refusal is not None:
+            if not refusal.harmless:
+                self.journal.refuse(f'joint_states refused: {refusal.line}')
+            return None
+        self._at = np.array(at)
+        if self.phase in (Phase.GUIDING, Phase.INSERTING):
+            return self._wait(reading.stamp, now)
+        if self.phase is Phase.LOOKING and self._missed():
+            return self.stop(f'while it looks at the tip {self._missed()}')
+        return None
+
+    def _missed(self) -> str:
+        """Say which joint is not where it was sent, '' if all are."""
+        settings, at, goal = self.settings, self._at, self._goal
+        if at is None:
+            return ''
+        off = np.abs(at - goal)
+        limits = settings.depth_tolerance, settings.guide_tolerance, settings.guide_tolerance
+        return ' and '.join(
+            f'{name} is at {1e3 * at[k]:.3f} mm, not at {1e3 * goal[k]:.3f} mm'
+            for k, name in enumerate(JOINTS)
+            if off[k] > limits[k]
+        )
+
+    def _wait(self, stamp: int, now: int) -> Move | None:
+        """Wait until needle and guide rest where they were sent."""
+        if stamp < self._due or self._at is None:
+            return None
+        missed, depth = self._missed(), float(self._at[0])
+        if missed:
+            self._rest = None
+            late = (stamp - self._due) / NANOSECONDS
+            if late > self.settings.patience:
+                return self.stop(
+                    f'{missed}, {late:.1f} s after it should be; does what moves it take '
+                    'joint_trajectory?'
+                )
+        elif self.phase is Phase.GUIDING and self.control is not None and self.control.step:
+            depth = float(self._depths[self.control.step])
+            return self._send(Phase.INSERTING, np.array([depth, *self._goal[1:]]), now)
+        elif self._rest is None or abs(depth - self._rest[1]) > _STILL:
+            self._rest = stamp, depth
+        elif stamp - self._rest[0] >= self.settings.settle_time * NANOSECONDS:
+            self.phase = Phase.LOOKING
+            length = round(self.settings.look_time * NANOSECONDS)
+            self._look = Look(stamp, stamp + length)
+        return None
+
+    def tip(self, reading: Reading, now: int) -> Move | None:
+        """
+        Take in `tip_deflection`.
+
+        Parameters
+        ----------
+        reading, now
+            As for `joints`.
+
+        Returns
+        -------
+        Move or None
+            How to move.
+
+        """
+        tip = reading.values[0]
+        refusal = self._tip_stream.check(reading.stamp, now, reading.frame, tip)
+        if refusal is not None:
+            if not refusal.harmless:
+                self.journal.refuse(f'tip_deflection refused: {refusal.line}')
+            return None
+        if self._look is not None and self._look.take(reading.stamp, tip):
+            return self._step(now)
+        return None
+
+    def watch(self, now: int) -> Move | None:
+        """
+        Look for what does not come, ten times a second or so.
+
+        Parameters
+        ----------
+        now : int
+            Time [ns].
+
+        Returns
+        -------
+        Move or None
+            How to move.
+
+        """
+        timeout = self.settings.measurement_timeout
+        back, self._time = (self._time - now) / NANOSECONDS, now
+        if back > timeout:
+            for stream in (self._joint_stream, self._tip_stream):
+                stream.forget()
+            return self.stop(f'the clock went back by {back:.3f} s')
+        if self._planned or not self.steers:
+            # What has waited comes first.
+            self._planned = False
+            return None
+        for stream in (self._joint_stream, self._tip_stream):
+            if stream.publishers > 1:
+                return self.stop(f'{stream.publishers} nodes publish {stream.name}')
+        silence = self._joint_stream.silence(now)
+        if silence > timeout:
+            return self.stop(f'no joint_states for {silence:.2f} s')
+        if self._look is not None and now > self._look.until + timeout * NANOSECONDS:
+            return self._step(now)
+        return None
+
+    def count_publishers(self, joint_states: int, tip_deflection: int) -> None:
+        """
+        Take note of how many nodes publish what may have one source only.
+
+        Parameters
+        ----------
+        joint_states, tip_deflection : int
+            Publishers of each.
+
+        """
+        self._joint_stream.publishers = joint_states
+        self._tip_stream.publishers = tip_deflection
+
+    # Steps.
+
+    def _step(self, now: int) -> Move | None:
+        """End a look, and go on by a step."""
+        control, look, self._look = self.control, self._look, None
+        if control is None or look is None or self._at is None:
+            return None
+        self._seen = seen = look.seen(self._belief.noise)
+        slip = self._slip(seen)
+        if slip:
+            return self.stop(slip)
+        k = control.step
+        try:
+            x, z = control.next(None if seen is None else seen.tip[[0, 2]])
+        except SteeringFaultError as error:
+            return self.stop(str(error))
+        self.expected = control.expected()
+        if k == len(self._depths) - 1:
+            self.phase = Phase.DONE
+            self.journal.say(Severity.INFO, f'done: {self._outcome()}')
+            return None
+        if control.warning and not self._warned:
+            self._warned = True
+            depth = 1e3 * self._depths[k]
+            self.journal.say(Severity.WARNING, f'at {depth:.2f} mm: {control.warning}')
+        return self._send(Phase.GUIDING, np.array([self._goal[0], x, z]), now)
+
+    def _slip(self, seen: Seen | None) -> str:
+        """Say that the tip is not as deep as the needle is inserted, '' if it is."""
+        if seen is None or self._at is None:
+            return ''
+        ahead = float(seen.tip[1] - self._at[0])
+        if self._ahead is None:
+            self._ahead = ahead
+        slipped = ahead - self._ahead
+        if abs(slipped) <= self.settings.slip_tolerance:
+            return ''
+        return (
+            f'the tip is {1e3 * abs(slipped):.2f} mm {"less" if slipped < 0.0 else "more"} deep '
+            'than the needle was inserted: it slips, or the sensor is not that of this needle'
+        )
+
+    def _send(self, phase: Phase, goal: FloatArray, now: int) -> Move | None:
+        """Send needle and guide somewhere."""
+        begin, self._goal = self._goal, goal
+        self.phase, self._rest = phase, None
+        way = np.abs(goal - begin)
+        settings = self.settings
+        duration = _PEAK * max(
+            way[0] / settings.speed, float(np.hypot(way[1], way[2])) / settings.guide_speed
+        )
+        self._due = now + round(duration * NANOSECONDS)
+        return smooth(begin, goal, duration) if duration > 0.0 else None
+
+    # What is said.
+
+    def _outcome(self) -> str:
+        """Say where the tip is thought to be at the end."""
+        control, there = self.control, self.expected
+        if control is None or there is None:
+            return ''
+        half = _NORMAL * np.sqrt(np.diag(there.covariance))
+        (x, z), off = there.mean, float(np.hypot(*(there.mean - control.target)))
+        return (
+            f'the tip is at x = {1e3 * x:.2f} ± {1e3 * half[0]:.2f} mm, z = {1e3 * z:.2f} ± '
+            f'{1e3 * half[1]:.2f} mm (95 %), {1e3 * off:.2f} mm from the target'
+        )
+
+    def diagnose(self, now: int) -> tuple[Severity, str, dict[str, object]]:
+        """
+        Return how bad it is, the state in one line, and values by name.
+
+        Parameters
+        ----------
+        now : int
+            Time [ns].
+
+        Returns
+        -------
+        severity : Severity
+            How bad it is.
+        state : str
+            For people.
+        values : dict
+            Values by name.
+
+        """
+        values: dict[str, object] = {}
+        control, warning = self.control, ''
+        if control is not None:
+            x, z = control.target.tolist()
+            values['target x, y, z [m]'] = f'{x:.6f}, {self.depth:.6f}, {z:.6f}'
+            steps = len(self._depths) - 1
+            values['step'] = f'{min(control.step, steps)} of {steps}'
+            values['guide x, z [m]'] = f'{self._goal[1]:.6f}, {self._goal[2]:.6f}'
+            values['chance to come within 1 mm'] = f'{control.chance:.3f}'
+            values['bending length over the believed one'] = f'{control.bending:.3f}'
+            if self.expected is not None:
+                half = _NORMAL * np.sqrt(np.diag(self.expected.covariance))
+                for name, mean, wide in zip('xz', self.expected.mean, half, strict=True):
+                    values[f'{name} expected at the target depth [m]'] = (
+                        f'{mean:.6f} +- {wide:.6f}'
+                    )
+            if self.steers:
+                warning = control.warning
+        if self._seen is not None:
+            seen, noise = self._seen, self._belief.noise
+            values['readings of the last look'] = seen.readings
+            values['standard error of the last look [m]'] = f'{seen.error:.2g}'
+            if not warning and seen.error > _SCATTERED * noise:
+                warning = (
+                    f'readings of the tip scatter: a look is good to {1e3 * seen.error:.2f} mm, '
+                    f'believed are {1e3 * noise:.2f} mm (belief.noise)'
+                )
+        values['inputs refused'] = self.journal.refused
+        values['last complaint'] = self.journal.complaint
+        for stream in (self._joint_stream, self._tip_stream):
+            values[stream.name] = stream.describe(now)
+        if self.phase is Phase.STOPPED:
+            return Severity.ERROR, f'stopped: {self.fault}', values
+        if warning:
+            return Severity.WARNING, warning, values
+        if self.phase is Phase.DONE:
+            return Severity.INFO, f'done: {self._outcome()}', values
+        return Severity.INFO, self.phase.value, values
+
+
+def _words(point: tuple[float, float, float]) -> str:
+    x, y, z = (1e3 * one for one in point)
+    return f'x = {x:.2f} mm, z = {z:.2f} mm at a depth of {y:.2f} mm'

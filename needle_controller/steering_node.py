@@ -1,0 +1,252 @@
+"""Node `steering`: brings the tip to a target by moving the guide, one step at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection
+from dataclasses import asdict
+import sys
+from typing import Any
+
+from builtin_interfaces.msg import Duration
+from diagnostic_msgs.msg import DiagnosticStatus
+from geometry_msgs.msg import PointStamped, PoseWithCovarianceStamped
+from needle_controller.journal import Severity
+from needle_controller.steering.belief import SteeringBelief
+from needle_controller.steering.controller import TipEstimate
+from needle_controller.steering.outer_loop import JOINTS, Move, OuterLoop, OuterLoopSettings
+from needle_controller.steering.responses import OF_NEEDLE, OF_STEERING
+from needle_dynamics.compiled.cache import announce_compilation
+from needle_dynamics.parameters import NeedleParameters
+from needle_dynamics.simulated.assembly import defaults_of
+from needle_dynamics.steering.parameters import NEEDLES, SteeringParameters
+from needle_ros import contract
+from needle_ros.base_node import BaseNode
+from needle_ros.publishers_node import Publishers
+from needle_ros.run_node import run
+from needle_ros.settings import from_values
+from needle_ros.timing import NANOSECONDS, nanoseconds
+from needle_ros.wire import Reading
+import numpy as np
+from rcl_interfaces.msg import ParameterDescriptor
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from std_srvs.srv import Trigger
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+
+#: Needle and tissue that are believed by default.
+_PRESET = 'bending_35mm'
+
+#: Time between two looks for what does not come [s].
+_WATCH = 0.05
+
+_LEVELS = {
+    Severity.INFO: DiagnosticStatus.OK,
+    Severity.WARNING: DiagnosticStatus.WARN,
+    Severity.ERROR: DiagnosticStatus.ERROR,
+}
+
+
+class SteeringNode(BaseNode):
+    """
+    Brings the tip to a ``target`` (point x, y, z [m]; y is the depth) by moving the guide.
+
+    The needle goes in by steps. At the end of each it rests, the readings of ``tip_deflection``
+    that come then are a look at the tip, and the next step begins: a ``joint_trajectory`` of
+    `insertion`, `guide_x` and `guide_z`. A robot follows all of it; where a controller moves the
+    needle, with its parameter ``steered``, it follows the insertion. ``joint_states`` must have
+    these joints.
+
+    What is believed of needle and tissue is ``model.*`` and ``steering.*``, how far it may be
+    wrong ``belief.*``. A target out of reach is refused, with what is within it. The needle stops
+    when the tip freezes, is lost, slips or cannot be that of this needle, when a joint does not
+    get to where it was sent, and by ``~/stop``. ``tip_expected`` says where the tip will be at
+    the target depth.
+
+    The node passes messages to an `OuterLoop`, which decides, and publishes what comes back.
+    """
+
+    def __init__(self, **node_options: Any) -> None:
+        super().__init__('steering', **node_options)
+        self.declare_settings('', OuterLoopSettings())
+        self.declare_settings('belief.', SteeringBelief())
+        # Fixed at start: the other defaults follow from it.
+        self.declare_parameter(
+            'model.preset',
+            _PRESET,
+            ParameterDescriptor(description=f'one of {", ".join(NEEDLES)}', read_only=True),
+        )
+        preset = str(self.get_parameter('model.preset').value)
+        for prefix, names in (('model.', OF_NEEDLE), ('steering.', OF_STEERING)):
+            self.declare_settings(prefix, defaults_of(prefix, preset), names)
+
+        self._loop: OuterLoop | None = None
+        #: What was last said of the tip.
+        self._told: TipEstimate | None = None
+        self._measurers = Publishers(self, contract.MEASURER, self._watch)
+        self._trajectory = self.publisher(contract.JOINT_TRAJECTORY)
+        self._tip_expected = self.publisher(contract.TIP_EXPECTED)
+        for topic, take in (
+            (contract.JOINT_STATES, OuterLoop.joints),
+            (contract.TIP_DEFLECTION, OuterLoop.tip),
+        ):
+            self.listen(topic, self._passing(take), self._watch)
+        self.subscribe(contract.TARGET, self._on_target)
+        self.create_service(Trigger, '~/stop', self._on_stop)
+        #: A clock that stands still or jumps does not stop the watch.
+        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
+
+    # Transitions.
+
+    def configure(self) -> None:
+        """Make the loop from the parameters."""
+        preset, values = self.text('model.preset', tuple(NEEDLES)), self.values()
+
+        def given(prefix: str, names: Collection[str]) -> dict[str, Any]:
+            own = {name: values[f'{prefix}{name}'] for name in names}
+            return {**asdict(defaults_of(prefix, preset)), **own}
+
+        self._loop = OuterLoop(
+            from_values(NeedleParameters, given('model.', OF_NEEDLE), 'model.'),
+            from_values(SteeringParameters, given('steering.', OF_STEERING), 'steering.'),
+            self.settings('belief.', SteeringBelief),
+            self.settings('', OuterLoopSettings),
+        )
+
+    def cleanup(self) -> None:
+        """Forget the loop."""
+        self._loop = self._told = None
+
+    def activate(self) -> None:
+        """Begin to listen, and to watch for what does not come."""
+        self._timer = self.create_timer(_WATCH, self._watch, clock=self._steady)
+
+    def deactivate(self) -> None:
+        """Bring needle and guide to rest."""
+        if self._loop is not None:
+            self._act(self._loop.stop('the node was deactivated'))
+        self.destroy_timer(self._timer)
+
+    def about(self) -> str:
+        """Name constants, steps and topics."""
+        values = self.values()
+        return (
+            f'preset {values["model.preset"]}, steps of {1e3 * values["step"]:g} mm; takes '
+            f'{contract.TARGET.name}, {contract.JOINT_STATES.name} and '
+            f'{contract.TIP_DEFLECTION.name}, publishes {contract.JOINT_TRAJECTORY.name} and '
+            f'{contract.TIP_EXPECTED.name}'
+        )
+
+    # What comes in.
+
+    def _passing(
+        self, take: Callable[[OuterLoop, Reading, int], Move | None]
+    ) -> Callable[[Reading], None]:
+        """Return what passes a reading on, and does what comes of it."""
+
+        def on_reading(reading: Reading) -> None:
+            if self._loop is not None and self.is_active:
+                self._act(take(self._loop, reading, self.now()))
+
+        return on_reading
+
+    def _on_target(self, message: PointStamped) -> None:
+        if self._loop is None or not self.is_active:
+            self.get_logger().error(
+                'target refused: the node is not active', throttle_duration_sec=1.0
+            )
+            return
+        header, point = message.header, message.point
+        at = (point.x, point.y, point.z)
+        stamp = nanoseconds(header.stamp)
+        self._act(self._loop.target(stamp, header.frame_id, at, self.now()))
+
+    def _on_stop(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        if self._loop is not None and self._loop.steers:
+            self._act(self._loop.stop('~/stop'))
+            response.message = 'stopped; a target begins a new insertion'
+        else:
+            response.message = 'nothing was under way'
+        response.success = True
+        return response
+
+    def _watch(self, _came: int = 0) -> None:
+        """Look for what does not come, and who publishes what there may be one source of."""
+        if self._loop is None or not self.is_active:
+            return
+        count = self._measurers.count
+        self._loop.count_publishers(count(contract.JOINT_STATES), count(contract.TIP_DEFLECTION))
+        self._act(self._loop.watch(self.now()))
+
+    # What goes out.
+
+    def _act(self, move: Move | None) -> None:
+        """Publish a motion, and what there is to say."""
+        loop = self._loop
+        if loop is None:
+            return
+        if move is not None:
+            self._trajectory.publish(self._message(move))
+        if loop.expected is not self._told:
+            self._told = loop.expected
+            if loop.expected is not None:
+                self._tell_tip(loop.expected, loop.depth)
+        if loop.journal.changed:
+            self._tell()
+
+    def _message(self, move: Move) -> JointTrajectory:
+        message = JointTrajectory(joint_names=list(JOINTS))
+        message.header.stamp = self.get_clock().now().to_msg()
+        rows = zip(move.times.tolist(), move.positions, move.velocities, strict=True)
+        for time, positions, velocities in rows:
+            whole, part = divmod(round(time * NANOSECONDS), NANOSECONDS)
+            message.points.append(
+                JointTrajectoryPoint(
+                    positions=positions.tolist(),
+                    velocities=velocities.tolist(),
+                    time_from_start=Duration(sec=whole, nanosec=part),
+                )
+            )
+        return message
+
+    def _tell_tip(self, there: TipEstimate, depth: float) -> None:
+        message = PoseWithCovarianceStamped()
+        message.header.frame_id = contract.ENTRY
+        message.header.stamp = self.get_clock().now().to_msg()
+        position, (x, z) = message.pose.pose.position, there.mean.tolist()
+        position.x, position.y, position.z = x, depth, z
+        message.pose.pose.orientation.w = 1.0
+        covariance = np.zeros((6, 6))
+        covariance[np.ix_((0, 2), (0, 2))] = there.covariance
+        message.pose.covariance = covariance.ravel()
+        self._tip_expected.publish(message)
+
+    def _tell(self) -> None:
+        log, loop = self.get_logger(), self._loop
+        if loop is None:
+            return
+        for severity, line in loop.journal.take():
+            # rclpy refuses another severity from the same place.
+            if severity is Severity.ERROR:
+                log.error(line)
+            elif severity is Severity.WARNING:
+                log.warning(line)
+            else:
+                log.info(line)
+        self.publish_diagnostics()
+
+    def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
+        """Say what it does, what it expects and what is wrong."""
+        if self._loop is None or not self.is_active:
+            return super().diagnose()
+        severity, state, values = self._loop.diagnose(self.now())
+        return _LEVELS[severity], state, values
+
+
+def main() -> int:
+    """Run the node; return its exit status."""
+    announce_compilation()
+    return run(SteeringNode)
+
+
+if __name__ == '__main__':
+    sys.exit(main())
