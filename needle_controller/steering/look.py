@@ -30,12 +30,15 @@ class Seen(NamedTuple):
         Standard error of the mean along x or z, as the readings scatter [m]; 0 for few of them.
     readings : int
         How many count.
+    frozen : bool
+        Whether they are all the same, and more than a few.
 
     """
 
     tip: FloatArray
     error: float
     readings: int
+    frozen: bool
 
 
 class Look:
@@ -103,4 +106,5 @@ class Look:
         error = 0.0
         if count >= _FEW:
             error = float(tips[:, [0, 2]].std(axis=0, ddof=1).max()) / sqrt(count)
-        return Seen(tips.mean(axis=0), error, count)
+        frozen = count >= _FEW and bool((tips == tips[0]).all())
+        return Seen(tips.mean(axis=0), error, count, frozen)

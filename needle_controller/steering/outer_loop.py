@@ -543,6 +543,8 @@ class OuterLoop:
         slipped = ahead - self._ahead
         if abs(slipped) <= self.settings.slip_tolerance:
             return ''
+        if seen.frozen:
+            return f'the sensor of the tip is frozen: {seen.readings} readings are the same'
         return (
             f'the tip is {1e3 * abs(slipped):.2f} mm {"less" if slipped < 0.0 else "more"} deep '
             'than the needle was inserted: it slips, or the sensor is not that of this needle'
