@@ -1,0 +1,425 @@
+"""The loop that steers, with a robot that does what it is told, or does not; without a graph."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from needle_controller import OuterLoop, OuterLoopSettings, SteeringBelief
+from needle_controller.journal import Severity
+from needle_controller.steering.look import Look
+from needle_controller.steering.outer_loop import Move, Phase, smooth
+from needle_dynamics import SteeredNeedle, STEERING_PRESETS
+from needle_ros.wire import Reading
+import numpy as np
+from numpy.testing import assert_allclose
+import pytest
+
+NEEDLE, STEERING, _ = STEERING_PRESETS['bending_35mm']
+SETTINGS = OuterLoopSettings(look_time=0.2)
+#: A step of time of the robot, and of its tracker [ns].
+PERIOD = 10_000_000
+SECOND = 100 * PERIOD
+TARGET = (2e-3, 0.06, -1e-3)
+NAMES = ('insertion', 'guide_x', 'guide_z')
+
+
+class Robot:
+    """A loop, a robot and its needle in tissue that is softer than believed, and their time."""
+
+    def __init__(
+        self, own: OuterLoopSettings = SETTINGS, belief: SteeringBelief | None = None
+    ) -> None:
+        self.seconds = 0.0
+        self.loop = OuterLoop(
+            NEEDLE, STEERING, belief or SteeringBelief(), own, steady=lambda: self.seconds
+        )
+        softer = replace(NEEDLE, tissue_stiffness=0.6 * NEEDLE.tissue_stiffness)
+        self.needle = SteeredNeedle(softer, STEERING, tilt=(0.01, 0.02))
+        self.now = 1000 * SECOND
+        self.at = np.zeros(3)
+        self.began, self.move = 0, Move(np.zeros(1), np.zeros((1, 3)), np.zeros((1, 3)))
+        self.start = self.at
+        self.noise = np.random.default_rng(3)
+        #: What goes wrong: how the joints move, and what is said of them and of the tip.
+        self.moves: Callable[[np.ndarray[Any, Any]], np.ndarray[Any, Any]] = lambda at: at
+        self.says: Callable[[Any], Any] = lambda at: at
+        self.sees: Callable[[Any], Any] = lambda tip: tip
+        self.late = 0
+        self.waiting: list[tuple[int, Any]] = []
+        self.tracked: list[np.ndarray[Any, Any]] = []
+
+    def tick(self, count: int = 1) -> None:
+        """Let time pass."""
+        for _ in range(count):
+            self.now += PERIOD
+            self.seconds += 1e-9 * PERIOD
+            passed = 1e-9 * (self.now - self.began)
+            times = np.concatenate([[0.0], self.move.times])
+            rows = np.vstack([self.start, self.move.positions])
+            self.at = self.moves(np.array([np.interp(passed, times, row) for row in rows.T]))
+            self.needle.move(depth=float(self.at[0]), guide=self.at[1:].tolist())
+            self.tracked.append(self.at)
+            x, y, z = self.needle.tip
+            tip = np.array([x, y, z]) + 1.8e-4 * self.noise.standard_normal(3)
+            self.waiting.append((self.now, self.sees(tip)))
+            said = self.says(self.at)
+            if said is not None:
+                self.follow(self.loop.joints(self.joints(self.now, said), self.now))
+            while self.waiting and self.waiting[0][0] <= self.now - self.late:
+                stamp, seen = self.waiting.pop(0)
+                if seen is not None:
+                    reading = Reading(stamp, 'needle_entry', (), (tuple(seen),))
+                    self.follow(self.loop.tip(reading, self.now))
+            self.follow(self.loop.watch(self.now))
+
+    @staticmethod
+    def joints(stamp: int, at: Any) -> Reading:
+        return Reading(stamp, '', NAMES, (tuple(at), (0.0,) * 3, ()))
+
+    def follow(self, move: Move | None) -> None:
+        """Begin a motion, from where the joints are."""
+        if move is not None:
+            self.began, self.start, self.move = self.now, self.at, move
+
+    def aim(self, point: tuple[float, float, float] = TARGET, frame: str = '') -> str:
+        """Send a target; return why it was refused."""
+        before = self.loop.journal.refused
+        self.follow(self.loop.target(0, frame, point, self.now))
+        return self.loop.journal.complaint if self.loop.journal.refused > before else ''
+
+    def steer(self, ticks: int = 6000) -> None:
+        """Aim, and go on until the loop has nothing more to do."""
+        self.tick(20)
+        assert self.aim() == ''
+        for _ in range(ticks):
+            self.tick()
+            if not self.loop.steers:
+                return
+        pytest.fail(f'it steers for ever: {self.loop.phase}')
+
+    @property
+    def miss(self) -> float:
+        """Distance of the tip from the target [m]."""
+        return float(np.hypot(*(self.needle.tip[[0, 2]] - np.array(TARGET)[[0, 2]])))
+
+
+@settings(max_examples=50, deadline=None)
+@given(
+    begin=st.tuples(st.floats(0.0, 0.1), *[st.floats(-6e-3, 6e-3)] * 2),
+    end=st.tuples(st.floats(0.0, 0.1), *[st.floats(-6e-3, 6e-3)] * 2),
+    duration=st.floats(0.01, 20.0),
+)
+def test_a_motion_is_smooth_and_goes_in_proportion(
+    begin: tuple[float, ...], end: tuple[float, ...], duration: float
+) -> None:
+    """It ends at rest exactly where it shall, is as fast as it says, and never turns back."""
+    one, other = np.array(begin), np.array(end)
+    move = smooth(one, other, duration)
+    assert (move.positions[-1] == other).all()
+    assert (move.velocities[-1] == 0.0).all()
+    assert move.times[-1] == pytest.approx(duration)
+    way = other - one
+    gone = (move.positions - one) @ way / max(way @ way, 1e-300)
+    assert (np.diff(gone) >= -1e-12).all()
+    assert_allclose(move.positions, one + np.outer(gone, way), atol=1e-15)
+    # The highest speed of a polynomial of least jerk is 15/8 of the mean.
+    assert (np.abs(move.velocities) <= 1.8751 * np.abs(way) / duration + 1e-15).all()
+
+
+def test_it_hits_and_says_how_well() -> None:
+    """Within what it says of the tip; the guide rests while the needle goes in, within limits."""
+    robot = Robot()
+    robot.steer()
+    assert robot.loop.phase is Phase.DONE
+    # 16 readings of 0.18 mm a look, the last of which decides: three deviations.
+    assert robot.miss < 3.0 * 1.8e-4 / np.sqrt(16.0) + 1e-4
+    there = robot.loop.expected
+    off = robot.needle.tip[[0, 2]] - there.mean
+    # 99.9 % of draws of two normal numbers.
+    assert off @ np.linalg.solve(there.covariance, off) < 13.8
+    ways = np.abs(np.diff(robot.tracked, axis=0))
+    assert not ((ways[:, 0] > 1e-9) & (ways[:, 1:].max(axis=1) > 1e-9)).any()
+    speeds = ways.max(axis=0) / (1e-9 * PERIOD)
+    # A reading of positions is rounded to 10 ms.
+    assert (speeds <= [0.0101, 0.0202, 0.0202]).all()
+    assert np.abs(robot.tracked).max(axis=0)[1:].max() <= SETTINGS.guide_limit
+    assert 'mm from the target' in robot.loop.diagnose(robot.now)[1]
+
+
+def test_late_and_lost_readings_do_no_harm() -> None:
+    """Ultrasound: 66 ms late, one in four ticks, 5 % lost."""
+    robot = Robot(replace(SETTINGS, look_time=0.5))
+    robot.late = 66_000_000
+    lost = np.random.default_rng(5)
+    robot.sees = lambda tip: tip if robot.now // PERIOD % 4 == 0 and lost.random() > 0.05 else None
+    robot.steer()
+    assert robot.loop.phase is Phase.DONE
+    assert robot.miss < 4e-4
+
+
+def stuck(robot: Robot, joint: int) -> None:
+    at = 5e-4 if joint else 0.03
+
+    def moves(wanted: Any) -> Any:
+        wanted[joint] = np.clip(wanted[joint], -at, at)
+        return wanted
+
+    robot.moves = moves
+
+
+def frozen(robot: Robot) -> None:
+    held: list[Any] = []
+
+    def sees(tip: Any) -> Any:
+        if robot.at[0] > 0.03:
+            held.append(tip)
+            return held[0]
+        return tip
+
+    robot.sees = sees
+
+
+def lost(robot: Robot) -> None:
+    robot.sees = lambda tip: tip if robot.at[0] < 0.02 else None
+
+
+def slips(robot: Robot) -> None:
+    """The tip stays behind: the guide does not hold the needle."""
+
+    def sees(tip: Any) -> Any:
+        tip[1] -= max(0.0, 0.5 * (robot.at[0] - 0.02))
+        return tip
+
+    robot.sees = sees
+
+
+def silent(robot: Robot) -> None:
+    robot.says = lambda at: at if at[0] < 0.03 else None
+
+
+def creeps(robot: Robot) -> None:
+    """Somebody else moves the needle while the loop looks at its tip."""
+
+    def moves(wanted: Any) -> Any:
+        if robot.loop.phase is Phase.LOOKING and wanted[0] > 0.03:
+            wanted[0] += 1e-3
+        return wanted
+
+    robot.moves = moves
+
+
+@pytest.mark.parametrize(
+    ('fault', 'said', 'deepest'),
+    [
+        (lambda robot: stuck(robot, 1), r'guide_x is at -?0\.500 mm, not at', 0.03),
+        (
+            lambda robot: stuck(robot, 0),
+            'insertion is at 30.000 mm, not at 35.000 mm, 5.0 s after it should be; does what',
+            0.031,
+        ),
+        (frozen, 'the sensor of the tip is frozen: 20 readings are the same', 0.036),
+        (lost, 'the tip was not seen in 7 looks', 0.056),
+        (slips, 'mm less deep than the needle was inserted: it slips', 0.031),
+        (silent, r'no joint_states for 0\.5\d s', 0.036),
+        (creeps, r'while it looks at the tip insertion is at 3.\.000 mm', 0.037),
+    ],
+)
+def test_what_goes_wrong_stops_it_and_is_said(
+    fault: Callable[[Robot], None], said: str, deepest: float
+) -> None:
+    """The needle rests soon after, and no step follows."""
+    robot = Robot()
+    fault(robot)
+    robot.steer()
+    assert robot.loop.phase is Phase.STOPPED
+    severity, state, _ = robot.loop.diagnose(robot.now)
+    assert severity is Severity.ERROR
+    assert state.startswith('stopped: ')
+    with pytest.raises(AssertionError, match=said):
+        raise AssertionError(robot.loop.fault)
+    robot.tick(300)
+    # At most 10 mm beyond where it was found: the step under way.
+    assert robot.at[0] <= deepest + 1e-9
+    before = robot.at
+    robot.tick(100)
+    assert_allclose(robot.at, before, atol=1e-9)
+
+
+def test_one_source_of_each_sensor() -> None:
+    for counts in ((2, 1), (1, 2)):
+        robot = Robot()
+        robot.tick(5)
+        robot.loop.count_publishers(*counts)
+        assert '2 nodes publish' in robot.aim()
+        robot.loop.count_publishers(1, 1)
+        assert robot.aim() == ''
+        robot.tick(10)
+        robot.loop.count_publishers(*counts)
+        robot.tick(2)
+        assert '2 nodes publish' in robot.loop.fault
+
+
+def test_a_clock_that_is_set_back_stops_it() -> None:
+    robot = Robot()
+    robot.tick(5)
+    robot.aim()
+    robot.tick(100)
+    robot.now -= 10 * SECOND
+    robot.tick(2)
+    assert robot.loop.fault == 'the clock went back by 9.990 s'
+
+
+@pytest.mark.parametrize(
+    ('point', 'frame', 'complaint'),
+    [
+        ((np.nan, 0.06, 0.0), '', 'target must be finite'),
+        (TARGET, 'needle_base', "target must be in frame '' or 'needle_entry', got 'needle_base'"),
+        ((0.05, 0.06, 0.0), '', 'x = 50.00 mm, z = 0.00 mm is out of reach'),
+        ((0.0, 0.2, 0.0), '', r'depths must be in \[0, 0.16\] m'),
+        ((0.0, 0.0, 0.0), '', 'the needle is at 0.00 mm already'),
+    ],
+)
+def test_a_target_that_cannot_be_is_refused(
+    point: tuple[float, float, float], frame: str, complaint: str
+) -> None:
+    """Nothing moves, and another target is taken."""
+    robot = Robot()
+    assert robot.aim() == 'target refused: joint_states does not come'
+    robot.tick(5)
+    with pytest.raises(AssertionError, match=complaint):
+        raise AssertionError(robot.aim(point, frame))
+    assert robot.loop.phase is Phase.IDLE
+    robot.tick(5)
+    assert not robot.at.any()
+    assert robot.aim() == ''
+
+
+def test_a_needle_must_be_straight_at_the_start() -> None:
+    """Outside tissue the guide goes to its zero first; in tissue it must be there."""
+    robot = Robot()
+    robot.start = robot.at = np.array([0.0, 3e-3, 0.0])
+    robot.move = Move(np.array([0.1]), robot.at[np.newaxis], np.zeros((1, 3)))
+    robot.tick(20)
+    assert robot.aim() == ''
+    robot.tick(35)
+    assert_allclose(robot.at, 0.0, atol=1e-12)
+    assert robot.loop.control.step == 0
+
+    robot = Robot()
+    robot.at = np.array([0.02, 3e-3, 0.0])
+    robot.start = robot.at
+    robot.move = Move(np.array([0.1]), robot.at[np.newaxis], np.zeros((1, 3)))
+    robot.tick(20)
+    assert 'the guide is 3.00 mm off its zero with the needle at 20.00 mm' in robot.aim()
+
+
+def test_a_target_may_move_but_not_its_depth() -> None:
+    robot = Robot()
+    robot.tick(5)
+    robot.aim((0.0, 0.06, 0.0))
+    robot.tick(600)
+    assert robot.loop.steers
+    assert 'it steers to a depth of 60.00 mm, got 70.00 mm' in robot.aim((0.0, 0.07, 0.0))
+    assert 'out of reach' in robot.aim((0.06, 0.06, 0.0))
+    assert_allclose(robot.loop.control.target, 0.0)
+    assert robot.aim() == ''
+    while robot.loop.steers:
+        robot.tick()
+    assert robot.miss < 4e-4
+
+
+def test_stop_brings_needle_and_guide_to_rest() -> None:
+    """On its way within 3 mm; afterwards it has to be retracted before another insertion."""
+    robot = Robot()
+    robot.tick(5)
+    robot.aim()
+    while robot.loop.phase is not Phase.INSERTING or robot.at[0] < 0.032:
+        robot.tick()
+    depth = robot.at[0]
+    robot.follow(robot.loop.stop('~/stop'))
+    robot.tick(200)
+    assert depth <= robot.at[0] <= depth + 3e-3
+    assert robot.loop.stop('~/stop') is None
+    assert 'has been steered; retract it to 0.00 mm first' in robot.aim()
+
+
+def test_readings_that_scatter_are_said() -> None:
+    """Five times the noise that is believed."""
+    robot = Robot(belief=SteeringBelief(noise=8e-6))
+    robot.tick(5)
+    robot.aim()
+    robot.tick(60)
+    severity, state, _ = robot.loop.diagnose(robot.now)
+    assert severity is Severity.WARNING
+    assert 'readings of the tip scatter: a look is good to 0.0' in state
+
+
+def test_a_look_leaves_out_what_is_absurd() -> None:
+    """Few readings, one of them elsewhere; none; and those outside its time."""
+    look = Look(0, 100)
+    assert look.seen(1e-5) is None
+    rng = np.random.default_rng(1)
+    tips = np.array([1e-3, 0.05, -2e-3]) + 1e-4 * rng.standard_normal((20, 3))
+    for k, tip in enumerate(tips):
+        assert not look.take(1 + k, tuple(tip))
+    look.take(50, (0.02, 0.05, 0.0))
+    look.take(60, (1e300, 0.05, 0.0))
+    look.take(0, (1.0, 1.0, 1.0))
+    assert look.take(101, (1.0, 1.0, 1.0))
+    seen = look.seen(1e-5)
+    assert seen.readings == 20
+    assert_allclose(seen.tip, tips.mean(axis=0), atol=1e-12)
+    assert seen.error == pytest.approx(1e-4 / np.sqrt(20.0), rel=0.5)
+
+
+numbers = st.floats(allow_nan=True, allow_infinity=True) | st.floats(-0.1, 0.1)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    said=st.lists(
+        st.tuples(
+            st.sampled_from(['joints', 'tip', 'names', 'late']),
+            st.tuples(numbers, numbers, numbers),
+        ),
+        max_size=12,
+    )
+)
+def test_whatever_is_said_no_motion_leaves_the_limits(
+    said: list[tuple[str, tuple[float, float, float]]],
+) -> None:
+    """Between sane messages: each motion ends within guide and target, never nan."""
+    robot = Robot(replace(SETTINGS, look_time=0.05, step=0.02, settle_time=0.0))
+    moves: list[Move] = []
+    follow = robot.follow
+
+    def keep(move: Move | None) -> None:
+        if move is not None:
+            moves.append(move)
+        follow(move)
+
+    setattr(robot, 'follow', keep)  # noqa: B010
+    robot.tick(5)
+    robot.aim()
+    for what, values in said:
+        robot.tick(20)
+        if what == 'tip':
+            reading = Reading(robot.now + 1, 'needle_entry', (), (values,))
+            keep(robot.loop.tip(reading, robot.now))
+        elif what == 'names':
+            reading = Reading(robot.now + 1, '', NAMES[:2], (values[:2], (), ()))
+            keep(robot.loop.joints(reading, robot.now))
+        else:
+            stamp = robot.now + (1 if what == 'joints' else -10 * SECOND)
+            keep(robot.loop.joints(robot.joints(stamp, values), robot.now))
+    robot.tick(50)
+    for move in moves:
+        assert np.isfinite(move.positions).all()
+        assert np.isfinite(move.velocities).all()
+        if robot.loop.phase is not Phase.STOPPED:
+            assert np.abs(move.positions[:, 1:]).max() <= SETTINGS.guide_limit + 1e-12
+            assert move.positions[:, 0].max() <= TARGET[1] + 1e-12
