@@ -130,7 +130,7 @@ class SteeringNode(BaseNode):
         """Name constants, steps and topics."""
         values = self.values()
         return (
-            f'preset {values["model.preset"]}, steps of {1e3 * values["step"]:g} mm; takes '
+            f'preset {values["model.preset"]}, steps of {1e3 * values["step_length"]:g} mm; takes '
             f'{contract.TARGET.name}, {contract.JOINT_STATES.name} and '
             f'{contract.TIP_DEFLECTION.name}, publishes {contract.JOINT_TRAJECTORY.name} and '
             f'{contract.TIP_EXPECTED.name}'

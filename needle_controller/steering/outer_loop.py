@@ -67,7 +67,7 @@ _NORMAL: Final = 1.96
 class OuterLoopSettings:
     """Steps, looks and limits of a needle that is steered."""
 
-    step: float = constant(
+    step_length: float = constant(
         5e-3, 'm', 'way of the needle from one look at the tip to the next', open_low=True
     )
     speed: float = constant(0.01, 'm/s', 'highest insertion speed', open_low=True)
@@ -311,12 +311,12 @@ class OuterLoop:
                 f'the guide is {1e3 * off:.2f} mm off its zero with the needle at '
                 f'{1e3 * depth:.2f} mm; a needle has to be straight at the start'
             )
-        if point[1] < depth + min(settings.step, _OUTSIDE):
+        if point[1] < depth + min(settings.step_length, _OUTSIDE):
             raise ParameterError(
                 f'the needle is at {1e3 * depth:.2f} mm already, the target at '
                 f'{1e3 * point[1]:.2f} mm'
             )
-        steps = max(1, round((point[1] - depth) / settings.step))
+        steps = max(1, round((point[1] - depth) / settings.step_length))
         depths = np.linspace(depth, point[1], steps + 1)
         model = SteeringModel(self._needle, self._steering, depths, self._belief)
         self.control = SteeringController(model, (point[0], point[2]), settings.guide_limit)

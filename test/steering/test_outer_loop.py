@@ -393,7 +393,7 @@ def test_whatever_is_said_no_motion_leaves_the_limits(
     said: list[tuple[str, tuple[float, float, float]]],
 ) -> None:
     """Between sane messages: each motion ends within guide and target, never nan."""
-    robot = Robot(replace(SETTINGS, look_time=0.05, step=0.02, settle_time=0.0))
+    robot = Robot(replace(SETTINGS, look_time=0.05, step_length=0.02, settle_time=0.0))
     moves: list[Move] = []
     follow = robot.follow
 
