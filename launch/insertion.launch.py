@@ -1,4 +1,4 @@
-"""Plant and controller, and optionally a recorder and RViz."""
+"""Plant and controller, and optionally what aims the tip, a recorder and RViz."""
 
 import os
 from pathlib import Path
@@ -22,7 +22,11 @@ import yaml
 #: Default, meaning and values of each argument; an empty one leaves the value of the parameter
 #: file. Without a list of values all are allowed.
 ARGUMENTS = {
-    'params_file': ('', 'ROS parameter file; empty: config/insertion.yaml of this package', []),
+    'params_file': (
+        '',
+        'ROS parameter file; empty: the one for it in config/ of this package',
+        [],
+    ),
     'mode': (
         '',
         'mode of the plant; the controller runs only in simulation',
@@ -37,6 +41,11 @@ ARGUMENTS = {
         '',
         'the needle bends, cuts its own path, and has a guide that moves',
         ['', 'true', 'false'],
+    ),
+    'steering': (
+        'false',
+        'the node steering aims the tip: needle steered, target for that node',
+        ['true', 'false'],
     ),
     'law': ('', 'law of the controller', ['', 'adaptive', 'inverse_dynamics', 'pid']),
     'lockstep': (
@@ -70,6 +79,7 @@ PARAMETERS = {
         'real_time_factor': 'real_time_factor',
     },
     'controller': {'preset': 'model.preset', 'law': 'law', 'use_sim_time': 'use_sim_time'},
+    'steering': {'preset': 'model.preset', 'use_sim_time': 'use_sim_time'},
     'recorder': {'bag': 'path', 'use_sim_time': 'use_sim_time'},
 }
 
@@ -99,7 +109,8 @@ def start(context: LaunchContext) -> list[Action]:
     given = {name: LaunchConfiguration(name).perform(context) for name in ARGUMENTS}
     config = share('needle_insertion', 'this launch file') / 'config'
     file = Path(given['params_file']).expanduser() if given['params_file'] else None
-    file = file or config / 'insertion.yaml'
+    steering = given['steering'] == 'true'
+    file = file or config / ('steering.yaml' if steering else 'insertion.yaml')
     if not file.is_file():
         raise RuntimeError(f'params_file {file} does not exist')
     values = {
@@ -110,12 +121,17 @@ def start(context: LaunchContext) -> list[Action]:
     names = ['plant']
     if given['mode'] in ('', 'simulation'):
         names.append('controller')
+    if steering:
+        names.append('steering')
+        values['plant'].setdefault('steered', True)
+        values['controller']['steered'] = True
     if given['bag']:
         names.append('recorder')
         values['recorder']['path'] = str(Path(given['bag']).expanduser())
     if values['plant'].get('lockstep') or given['real_time_factor']:
         values['plant']['publish_clock'] = True
-        values['controller'].setdefault('use_sim_time', True)
+        for name in ('controller', 'steering'):
+            values[name].setdefault('use_sim_time', True)
     common = {
         'namespace': given['namespace'],
         'on_exit': ended,

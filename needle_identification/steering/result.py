@@ -18,7 +18,7 @@ _DIGITS: Final = '.7g'
 
 def steering_yaml(found: SteeringEstimate) -> str:
     """
-    Return a ROS parameter file for a plant that is steered, and its controller.
+    Return a ROS parameter file for a plant that is steered, its controller and what aims it.
 
     Motion tells lengths, not forces: the bending stiffness is that of the default needle.
 
@@ -55,11 +55,12 @@ def steering_yaml(found: SteeringEstimate) -> str:
         value = f'{one.value:.6g}{unit}, SE {one.error:.2g}' if one.determined else UNKNOWN
         lines.append(f'# {one.symbol} ({one.name}) = {value}')
     lines.append(f'# E I = {stiffness:g} N m^2 is that of the preset {DEFAULT_PRESET}')
-    steering: dict[str, object] = {'steered': True}
+    lengths: dict[str, object] = {}
     if found.free_length.determined and isfinite(found.free_length.value):
-        steering['steering.free_length'] = _short(found.free_length.value)
+        lengths['steering.free_length'] = _short(found.free_length.value)
     if medium['skin'].determined:
-        steering['steering.skin_stiffness'] = _short(max(0.0, medium['skin'].value) * tissue)
+        lengths['steering.skin_stiffness'] = _short(max(0.0, medium['skin'].value) * tissue)
+    steering = {'steered': True, **lengths}
     if 'bevel' in found.terms:
         z, x = (medium[f'curvature_{axis}'].value for axis in 'zx')
         steering['steering.bevel_load'] = [_short(hypot(x, z) * stiffness / length.value)]
@@ -68,6 +69,7 @@ def steering_yaml(found: SteeringEstimate) -> str:
     sections = {
         '/**/plant': {'ros__parameters': {**model, **steering}},
         '/**/controller': {'ros__parameters': model},
+        '/**/steering': {'ros__parameters': {**model, **lengths}},
     }
     return '\n'.join([*lines, yaml.safe_dump(sections, sort_keys=False)])
 

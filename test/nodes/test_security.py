@@ -27,6 +27,7 @@ POLICIES = ROOT / 'config/security/policies.xml'
 SETTINGS: Mapping[str, list[dict[str, object]]] = {
     'plant': [{'publish_clock': True}, {'use_sim_time': True, 'mode': 'robot'}],
     'controller': [{'use_sim_time': True}, {'deflection_feedback': 'ground_truth'}],
+    'steering': [{'use_sim_time': True}],
     'identification': [{'live': True, 'use_sim_time': True}],
     'recorder': [{'path': 'bag', 'use_sim_time': True}],
     'player': [{'path': str(SHIPPED_BAGS / 'friction_01'), 'use_sim_time': True}],

@@ -15,6 +15,7 @@ import pytest
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
+from support.installed import ROOT
 from support.ros_graph import RosGraph
 from trajectory_msgs.msg import JointTrajectory
 
@@ -47,9 +48,7 @@ class Bench:
         self.graph, self.user = graph, graph.node('user')
         self.states = graph.latest(self.user, JointState, 'joint_states', SENSOR)
         self.truth = graph.latest(self.user, JointState, 'ground_truth', SENSOR)
-        self.expected = graph.listen(
-            self.user, PoseWithCovarianceStamped, 'tip_expected', COMMAND
-        )
+        self.expected = graph.listen(self.user, PoseWithCovarianceStamped, 'tip_expected', COMMAND)
         self.moves = graph.listen(self.user, JointTrajectory, 'joint_trajectory', COMMAND)
         self.target = self.user.create_publisher(PointStamped, 'target', COMMAND)
         self.stop = self.user.create_client(Trigger, 'steering/stop')
@@ -107,7 +106,9 @@ class Bench:
     def tip(self) -> Any:
         """Where the tip is, x and z [m]."""
         message = self.truth.message
-        return np.array([message.position[message.name.index(name)] for name in ('tip_x', 'tip_z')])
+        return np.array(
+            [message.position[message.name.index(name)] for name in ('tip_x', 'tip_z')]
+        )
 
 
 def test_it_brings_the_tip_to_its_target(ros_graph: RosGraph) -> None:
@@ -240,3 +241,24 @@ def test_what_cannot_be_is_refused_by_name(ros_graph: RosGraph) -> None:
         node = ros_graph.add(SteeringNode, start=False, parameters={name: value})
         assert not node.start()
         assert complaint in node.failure
+
+
+def test_the_shipped_parameters_are_those_of_the_three_nodes(ros_graph: RosGraph) -> None:
+    """Each takes its part of config/steering.yaml, and together they begin to steer."""
+    file = ['--ros-args', '--params-file', str(ROOT / 'config/steering.yaml')]
+    user = ros_graph.node('user')
+    target = user.create_publisher(PointStamped, 'target', COMMAND)
+    moves = ros_graph.listen(user, JointTrajectory, 'joint_trajectory', COMMAND)
+    nodes = [ros_graph.add(kind, cli_args=file) for kind in (PlantNode, ControllerNode)]
+    steering = ros_graph.add(SteeringNode, cli_args=file)
+    assert all(node.get_parameter('steered').value for node in nodes)
+    message = PointStamped()
+    message.point.x, message.point.y = 3e-3, 0.1
+
+    def begins() -> bool:
+        if not moves:
+            target.publish(message)
+        return bool(moves)
+
+    ros_graph.spin_until(begins, 'the first step')
+    assert 'refused' not in steering.diagnose()[1]

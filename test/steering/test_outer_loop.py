@@ -188,7 +188,7 @@ def lost(robot: Robot) -> None:
 
 
 def slips(robot: Robot) -> None:
-    """The tip stays behind: the guide does not hold the needle."""
+    """Leave the tip behind: the guide does not hold the needle."""
 
     def sees(tip: Any) -> Any:
         tip[1] -= max(0.0, 0.5 * (robot.at[0] - 0.02))
@@ -202,7 +202,7 @@ def silent(robot: Robot) -> None:
 
 
 def creeps(robot: Robot) -> None:
-    """Somebody else moves the needle while the loop looks at its tip."""
+    """Move the needle by somebody else, while the loop looks at its tip."""
 
     def moves(wanted: Any) -> Any:
         if robot.loop.phase is Phase.LOOKING and wanted[0] > 0.03:
