@@ -227,10 +227,11 @@ class ControllerNode(ModelNode):
     def about(self) -> str:
         """Name law, constants, rate and topics."""
         values = self.values()
+        target = '' if values['steered'] else f'{contract.TARGET.name}, '
         return (
             f'law {values["law"]}, preset {values["model.preset"]}, {values["rate"]:g} Hz, delay '
-            f'{values["delay"]:g}; takes {contract.TARGET.name}, {contract.JOINT_TRAJECTORY.name} '
-            f'and {contract.JOINT_STATES.name}, publishes {contract.WRENCH_COMMAND.name}'
+            f'{values["delay"]:g}; takes {target}{contract.JOINT_TRAJECTORY.name} and '
+            f'{contract.JOINT_STATES.name}, publishes {contract.WRENCH_COMMAND.name}'
         )
 
     def deactivate(self) -> None:

@@ -103,7 +103,7 @@ def bending_checks(bag: Path) -> list[Check]:
     """
     needle = NEEDLES[PRESET]
     truth = bending_length(needle.bending_stiffness, needle.tissue_stiffness)
-    (tip, _) = _lines(bag)
+    (tip, _) = read_needles(bag)
     aside = float(np.hypot(tip[-1][-1, 0], tip[-1][-1, 2]))
     (run,) = verify(bag)
     found = identify_steering(
@@ -149,13 +149,33 @@ def draw_bending(bag: Path) -> Figure:
         Both planes, to scale.
 
     """
-    needles, path = _lines(bag)
+    needles, path = read_needles(bag)
     at = np.linspace(0, len(needles) - 1, _DRAWN).round().astype(int).tolist()
     return draw_needle([needles[k] for k in at], path)
 
 
-def _lines(bag: Path) -> tuple[list[FloatArray], FloatArray]:
-    """Return the needles without their straight part outside, and the last path."""
+def read_needles(bag: Path) -> tuple[list[FloatArray], FloatArray]:
+    """
+    Read the needle as its plant has shown it.
+
+    Parameters
+    ----------
+    bag : Path
+        The bag.
+
+    Returns
+    -------
+    list of ndarray, shape (k, 3)
+        The needle now and then, without its straight part outside [m].
+    ndarray, shape (m, 3)
+        The path that it cut [m].
+
+    Raises
+    ------
+    NeedleError
+        If the bag has none.
+
+    """
     needles, path = [], None
     for _, message in read_topic(bag, '/needle_shape'):
         points = _points(message)

@@ -20,6 +20,12 @@ from needle_identification import (
     summarize_stiffness,
     write_result,
 )
+from needle_insertion.experiment.aiming import (
+    aiming_checks,
+    draw_aiming,
+    read_aimed,
+    record_aimed,
+)
 from needle_insertion.experiment.bending import bending_checks, draw_bending, record_bending
 from needle_insertion.experiment.campaign import Campaign
 from needle_insertion.experiment.insertion import (
@@ -100,6 +106,10 @@ def run(output: Path, bags: Path) -> int:
         with _progress(f'insertion, {law}') as show:
             record_insertion(law, output / law, output / 'logs' / law, show)
         insertions.append(read_insertion(law, output / law))
+    aimed, alone = output / 'steered', output / 'guide_at_rest'
+    for folder, steered in ((alone, False), (aimed, True)):
+        with _progress(f'insertion, {folder.name.replace("_", " ")}') as show:
+            record_aimed(folder, output / 'logs' / folder.name, show, steered=steered)
     for name, protocol in PROTOCOLS.items():
         # The same noise in each demo: the verdict does not depend on luck.
         campaign = Campaign(protocol=protocol, repeats=1, seed=1, fixed=True)
@@ -127,7 +137,7 @@ def run(output: Path, bags: Path) -> int:
         output / 'result.yaml', summarize(friction[:-1]), summarize_stiffness(stiffness[:-1])
     )
 
-    checks = bending_checks(bent)
+    checks = [*bending_checks(bent), *aiming_checks(aimed, alone)]
     checks += [check for insertion in insertions for check in insertion_checks(insertion)]
     for *recorded, fresh in compared.values():
         checks += _shipped_checks(f'{len(recorded)} shipped bags', recorded)
@@ -142,15 +152,21 @@ def run(output: Path, bags: Path) -> int:
         title='Needle insertion: demo',
         introduction=f'Nodes over DDS at {RATE:g} Hz: insertion from {START_DEPTH * 100:g} cm to '
         f'{TARGET_DEPTH * 100:g} cm at {SPEED * 1000:g} mm/s, of a needle that bends and under '
-        'two control laws, recorded to MCAP; friction and tissue stiffness identified from the '
+        'two control laws, and of one that is steered to a target, recorded to MCAP; friction and '
+        'tissue stiffness identified from the '
         'shipped simulated recordings and one fresh recording each, made at '
         f'{EXPERIMENT_SPEED:g} times real time.',
         cards=[
             ('Checks', f'{passed} of {len(checks)} pass', 'true values beside what was found'),
+            (
+                'Steered',
+                f'{1e3 * read_aimed(aimed).miss:.2f} mm from its target',
+                f'the tip is said to be at {read_aimed(aimed).said} (95 %)',
+            ),
         ],
         rows=rows,
         heads=CHECK_HEADS,
-        pictures=_pictures(bent, insertions, friction[-1], stiffness[-1]),
+        pictures=_pictures(bent, (aimed, alone), insertions, friction[-1], stiffness[-1]),
     )
     sys.stdout.write(f'{table(rows, CHECK_HEADS)}\n\nreport: {page}\n')
     return 0 if all(check.passed for check in checks) else 1
@@ -184,6 +200,7 @@ def _progress(what: str) -> Iterator[Callable[[float], None]]:
 
 def _pictures(
     bent: Path,
+    aimed: tuple[Path, Path],
     insertions: Sequence[Insertion],
     friction: FrictionEstimate,
     stiffness: StiffnessEstimate,
@@ -195,6 +212,13 @@ def _pictures(
             'pushes the tip along z until the needle is turned, and the guide has gone aside '
             'along x.',
             draw_bending(bent),
+        ),
+        Picture(
+            'steered',
+            'A needle that is steered to a target off the axis, in tissue that is softer than '
+            'believed, beside the same insertion with a guide at rest. To scale: the needle on '
+            'its way, about the path that it cuts, and its target.',
+            draw_aiming(*aimed),
         ),
         Picture(
             'insertion',

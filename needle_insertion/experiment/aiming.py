@@ -1,0 +1,316 @@
+"""An insertion that is steered to a target beside the same one with a guide at rest."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from math import inf
+from pathlib import Path
+from time import monotonic
+from typing import Final
+
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PointStamped
+from matplotlib.figure import Figure
+from needle_dynamics import FloatArray
+from needle_identification import read_topic
+from needle_insertion.experiment.bending import read_needles
+from needle_insertion.experiment.insertion import COUNTED, RATE
+from needle_insertion.experiment.node_process import GraphError, NodeProcess
+from needle_insertion.experiment.ros_graph import ACTIVATE, CONFIGURE, Graph
+from needle_insertion.replay.rerun import verify
+from needle_insertion.report.insertion import draw_needle
+from needle_insertion.report.text import Check
+from needle_ros.base_node import COMMAND, SENSOR
+from needle_ros.timing import seconds
+import numpy as np
+from sensor_msgs.msg import JointState
+
+#: Where the tip shall go, x, y, z [m], and inserted length at the start [m].
+TARGET: Final = (4e-3, 0.1, -2e-3)
+START: Final = 5e-3
+
+#: What is believed: needle and tissue.
+PRESET: Final = {'model.preset': 'bending_35mm'}
+
+#: The plant: softer tissue than believed, a bevel, a path that strays, an EM tracker.
+PLANT: Final[dict[str, object]] = {
+    **PRESET,
+    'steered': True,
+    'rate': RATE,
+    'depth': START,
+    'model.tissue_stiffness': 45e3,
+    'steering.bevel_load': [0.15],
+    'steering.cutting_force': [1.0],
+    'steering.path_noise': 1e-4,
+    'tip.rate': 40.0,
+    'tip.noise': 1.8e-4,
+    'tip.delay': 0.02,
+}
+
+#: The node that steers: half a look of the default, so that the demo is short.
+STEERING: Final[dict[str, object]] = {
+    **PRESET,
+    'speed': 0.02,
+    'guide_speed': 0.02,
+    'settle_time': 0.05,
+    'look_time': 0.25,
+    'belief.noise': 6e-5,
+}
+
+#: The axis law.
+CONTROLLER: Final[dict[str, object]] = {
+    **PRESET,
+    'rate': RATE,
+    'deflection_feedback': 'none',
+    'reference.speed': 0.02,
+    'reference.acceleration': 0.5,
+}
+
+#: A steered needle ends within this of its target [m]; one that nobody steers does not.
+LARGEST_MISS: Final = 5e-4
+
+#: Largest squared distance of the tip from where it is said to be, in standard deviations: by
+#: chance one in a thousand is farther.
+_LARGEST: Final = 13.8
+
+#: Needles that are drawn.
+_DRAWN: Final = 5
+
+#: Longest time that the insertion may take, and time after which a target is sent again [s].
+_LONGEST, _AGAIN = 180.0, 2.0
+
+#: A reference that is farther from the start has a target [m].
+_MOVED: Final = 1e-3
+
+#: Half of an interval of 95 % over the standard deviation.
+_NORMAL: Final = 1.96
+
+
+def record_aimed(
+    bag: Path, logs: Path, progress: Callable[[float], None], *, steered: bool
+) -> None:
+    """
+    Insert a needle to the target through real nodes, and record everything.
+
+    Parameters
+    ----------
+    bag : Path
+        Bag to write.
+    logs : Path
+        Folder for what the nodes print.
+    progress : callable
+        Called with the fraction done.
+    steered : bool
+        Whether the node `steering` aims the tip; else the guide rests.
+
+    Raises
+    ------
+    GraphError
+        If a node fails, stops, or the target is not reached in time.
+
+    """
+    with Graph(logs) as graph:
+        node = graph.node('demo')
+        state = graph.latest(node, JointState, 'joint_states', SENSOR)
+        reference = graph.latest(node, JointState, 'reference', SENSOR)
+        target = node.create_publisher(PointStamped, 'target', COMMAND)
+        said: dict[str, str] = {}
+        sent = -inf
+
+        def hear(array: DiagnosticArray) -> None:
+            said.update({status.name: status.message for status in array.status})
+
+        node.create_subscription(DiagnosticArray, '/diagnostics', hear, 10)
+        nodes: list[NodeProcess] = [graph.start('recorder', {'path': str(bag)})]
+        if steered:
+            nodes.append(graph.start('steering', STEERING))
+        nodes.append(graph.start('controller', {**CONTROLLER, 'steered': steered}))
+        nodes.append(graph.start('plant', {**PLANT, 'autostart': False}))
+        # The plant starts when the recorder listens to everything: the bag holds every sample.
+        takers = {'target': 2 + steered, 'joint_states': 3 + steered}
+        graph.spin_until(
+            lambda: all(
+                node.count_subscribers(name) >= takers.get(name, 1)
+                for name in (*takers, *COUNTED, 'wrench_command')
+            ),
+            'the nodes',
+        )
+        graph.change(node, 'plant', CONFIGURE, ACTIVATE)
+        # Of the guide: the plant once it is configured, the controller, the recorder.
+        followers = 3 if steered else 0
+        graph.spin_until(
+            lambda: (
+                state.message and said and node.count_subscribers('joint_trajectory') >= followers
+            ),
+            'the plant',
+        )
+        message = PointStamped()
+        message.header.frame_id = 'needle_entry'
+        message.point.x, message.point.y, message.point.z = TARGET
+
+        def arrived() -> bool:
+            done = (state.message.position[0] - START) / (TARGET[1] - START)
+            progress(min(max(done, 0.0), 1.0))
+            nonlocal sent
+            words = said.get('/steering', '')
+            if words.startswith('stopped'):
+                raise GraphError(f'steering {words}')
+            aimed_at = reference.message.position[0] if reference.message else START
+            # What comes before the sensors is refused.
+            idle = words == 'waits for a target' if steered else abs(aimed_at - START) < _MOVED
+            if idle and monotonic() - sent > _AGAIN:
+                sent = monotonic()
+                target.publish(message)
+            return words.startswith('done') if steered else aimed_at == TARGET[1]
+
+        graph.spin_until(arrived, 'the end of the insertion', timeout=_LONGEST)
+        # The loop settles within a second; the recording shows that it stays there.
+        settled = seconds(state.message.header.stamp) + 1.0
+        graph.spin_until(
+            lambda: seconds(state.message.header.stamp) > settled, 'the end of the recording'
+        )
+        for one in nodes:
+            one.interrupt()
+
+
+@dataclass(frozen=True, eq=False)
+class Aimed:
+    """
+    How an insertion ended.
+
+    Attributes
+    ----------
+    tip : ndarray, shape (2,)
+        Where the tip is, x and z [m].
+    expected : ndarray, shape (2,)
+        Where it is said to be [m].
+    covariance : ndarray, shape (2, 2)
+        Covariance of that [m^2].
+
+    """
+
+    tip: FloatArray
+    expected: FloatArray
+    covariance: FloatArray
+
+    @property
+    def miss(self) -> float:
+        """Distance of the tip from the target [m]."""
+        return float(np.hypot(*(self.tip - np.array(TARGET)[[0, 2]])))
+
+    @property
+    def said(self) -> str:
+        """Where the tip is said to be, with an interval of 95 %."""
+        half = _NORMAL * np.sqrt(np.diag(self.covariance))
+        return ', '.join(
+            f'{name} = {1e3 * at:.2f} ± {1e3 * wide:.2f} mm'
+            for name, at, wide in zip('xz', self.expected, half, strict=True)
+        )
+
+
+def _tip(bag: Path) -> FloatArray:
+    """Return where the tip was at the end, x and z [m]."""
+    *_, (_, last) = read_topic(bag, '/ground_truth')
+    at = dict(zip(last.name, last.position, strict=True))
+    return np.array([at['tip_x'], at['tip_z']])
+
+
+def read_aimed(bag: Path) -> Aimed:
+    """
+    Read how a steered insertion ended.
+
+    Parameters
+    ----------
+    bag : Path
+        The bag.
+
+    Returns
+    -------
+    Aimed
+        Tip, and what was said of it.
+
+    Raises
+    ------
+    RecordingError
+        If the bag is not readable or lacks a topic.
+
+    """
+    *_, (_, last) = read_topic(bag, '/tip_expected')
+    pose = last.pose
+    at = np.array([pose.pose.position.x, pose.pose.position.z])
+    whole = np.array(pose.covariance).reshape(6, 6)
+    return Aimed(_tip(bag), at, whole[np.ix_((0, 2), (0, 2))])
+
+
+def aiming_checks(bag: Path, other: Path) -> list[Check]:
+    """
+    Check that the needle hits, that what is said of it holds, and that its run can be repeated.
+
+    Parameters
+    ----------
+    bag, other : Path
+        Bags of the steered insertion, and of that with a guide at rest.
+
+    Returns
+    -------
+    list of Check
+        One for each.
+
+    Raises
+    ------
+    NeedleError
+        If a bag cannot be used.
+
+    """
+    found = read_aimed(bag)
+    off = found.tip - found.expected
+    held = float(off @ np.linalg.solve(found.covariance, off)) <= _LARGEST
+    alone = float(np.hypot(*(_tip(other) - np.array(TARGET)[[0, 2]])))
+    (run,) = verify(bag)
+    x, z = 1e3 * found.tip
+    return [
+        Check(
+            'tip from its target, steered',
+            f'< {1e3 * LARGEST_MISS:g} mm',
+            f'{1e3 * found.miss:.2f} mm',
+            found.miss < LARGEST_MISS,
+        ),
+        Check(
+            'tip from its target, guide at rest',
+            f'> {1e3 * LARGEST_MISS:g} mm',
+            f'{1e3 * alone:.2f} mm',
+            alone > LARGEST_MISS,
+        ),
+        Check(
+            'what is said of the tip, steered', f'x = {x:.2f} mm, z = {z:.2f} mm', found.said, held
+        ),
+        Check(
+            'computed again from its bag, steered',
+            'identical or within tolerance',
+            run.verdict,
+            run.verdict != 'differs',
+        ),
+    ]
+
+
+def draw_aiming(bag: Path, other: Path) -> Figure:
+    """
+    Draw the steered needle on its way, its target, and the needle of a guide at rest.
+
+    Parameters
+    ----------
+    bag, other
+        As for `aiming_checks`.
+
+    Returns
+    -------
+    Figure
+        Both planes, to scale.
+
+    """
+    needles, path = read_needles(bag)
+    at = np.linspace(0, len(needles) - 1, _DRAWN).round().astype(int).tolist()
+    return draw_needle(
+        [needles[k] for k in at], path, np.array(TARGET), read_needles(other)[0][-1]
+    )
