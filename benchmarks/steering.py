@@ -6,17 +6,18 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from functools import lru_cache, partial
-from math import cos, pi, sin, sqrt
+from math import cos, inf, pi, sin, sqrt
 from multiprocessing import get_context
 from time import perf_counter
-from typing import Final, NamedTuple, TypeAlias
+from typing import Final, NamedTuple
 
 from benchmarks.measure import Bar
 from benchmarks.page import Answer, Section, Tick
 from needle_controller.steering import trial
-from needle_controller.steering.baselines import Broyden, OpenLoop, Springs
+from needle_controller.steering.baselines import Broyden, OpenLoop, RollTowards, Springs
 from needle_controller.steering.belief import SteeringBelief
 from needle_controller.steering.controller import (
+    Guidance,
     OutOfReachError,
     SteeringController,
     SteeringFaultError,
@@ -56,6 +57,13 @@ CASES: Final = (('EM', 0.3), ('EM', 0.5), ('ultrasound', 0.3))
 
 CONTROLLERS: Final = ('ours', 'springs', 'Broyden', 'open loop')
 
+#: Load of a bevel that is turned [N], error of its direction [rad], how often it may be turned,
+#: and part of its reach within which targets count.
+BEVEL, MOUNTED, TURNS, WITHIN = 0.8, 0.1, 6, 0.9
+
+#: Controllers of a needle with a bevel.
+TURNING: Final = ('guide and roll', 'roll', 'roll towards the target', 'open loop')
+
 #: Squared distance within which 95 of 100 draws of two normal numbers are.
 _ELLIPSE: Final = 5.991
 
@@ -63,44 +71,63 @@ _ELLIPSE: Final = 5.991
 _MISSED: Final = 2e-3
 
 
-_Controller: TypeAlias = Callable[[FloatArray | None], tuple[float, float]]
+class End(NamedTuple):
+    """
+    How an insertion under a controller ended.
+
+    Attributes
+    ----------
+    miss : float
+        Distance of the tip from the target [m].
+    way : float
+        Way of the guide [m].
+    turns : int
+        How often the needle was turned.
+    load : float
+        Largest lateral force on the guide [N].
+    time : float
+        Median time of a step of the controller [s].
+
+    """
+
+    miss: float
+    way: float
+    turns: int
+    load: float
+    time: float
 
 
 class Outcome(NamedTuple):
     """
-    What became of an insertion.
+    What became of a needle.
 
     Attributes
     ----------
     medium : str
         Medium.
     reachable : bool
-        Whether the guide could have reached the target, if all but the path had been known.
-    miss : dict
-        Distance of the tip from the target at the end [m], by controller.
-    travel : float
-        Way of the guide under our controller [m].
+        Whether the target could have been reached, if all but the path had been known.
+    ends : dict
+        How the insertion ended, by controller.
     refused, warned, held : bool
         Whether ours refused the target, said on the way that it is out of reach, and whether its
         interval held the tip.
-    plan, look : float
-        Time of a step of ours, and of the look alone [s].
+    look : float
+        Time of a look of ours alone [s].
 
     """
 
     medium: str
     reachable: bool
-    miss: dict[str, float]
-    travel: float
+    ends: dict[str, End]
     refused: bool
     warned: bool
     held: bool
-    plan: float
     look: float
 
 
 @lru_cache
-def believed(medium: str) -> tuple[NeedleParameters, SteeringParameters]:
+def believed(medium: str, bevel: float = 0.0) -> tuple[NeedleParameters, SteeringParameters]:
     """
     Return needle and tissue as they are believed.
 
@@ -108,6 +135,8 @@ def believed(medium: str) -> tuple[NeedleParameters, SteeringParameters]:
     ----------
     medium : str
         One of `MEDIA`.
+    bevel : float
+        Load of the bevel [N].
 
     Returns
     -------
@@ -125,20 +154,82 @@ def believed(medium: str) -> tuple[NeedleParameters, SteeringParameters]:
         layer_stiffnesses=tuple(tissue_of(ei, length) for _, length in others),
     )
     skin = SKIN * needle.tissue_stiffness
-    return needle, SteeringParameters(free_length=FREE, skin_stiffness=skin)
+    return needle, SteeringParameters(free_length=FREE, skin_stiffness=skin, bevel_load=(bevel,))
 
 
 @lru_cache(maxsize=256)
-def _model(medium: str, steps: int, sensor: str, spread: float) -> SteeringModel:
+def _model(
+    medium: str, steps: int, sensor: str, spread: float, bevel: float = 0.0
+) -> SteeringModel:
     sigma, count, lost = SENSORS[sensor]
     noise = sigma / sqrt(count * (1.0 - lost))
     belief = SteeringBelief(spread=spread, path_noise=PATH_NOISE, noise=noise)
-    return SteeringModel(*believed(medium), STEP * np.arange(steps + 1), belief)
+    return SteeringModel(*believed(medium, bevel), STEP * np.arange(steps + 1), belief)
+
+
+class _Trial:
+    """A needle with its target, inserted under one controller after the other."""
+
+    def __init__(self, truth: trial.Truth, depths: FloatArray, sensor: str, seed: int) -> None:
+        self.truth, self.depths = truth, depths
+        self._sensor, self._seed = sensor, seed
+        self.target = np.zeros(2)
+        self.look = inf
+        self.said = ''
+
+    def known(self) -> SteeringModel:
+        """Return what is true of it, but for its path."""
+        truth, known = self.truth, SteeringBelief(spread=0.0)
+        return SteeringModel(truth.needle, truth.steering, self.depths, known)
+
+    def end(self, controller: SteeringController | OpenLoop) -> tuple[FloatArray, End]:
+        """Return where the tip ends, and how."""
+        times, said = list[float](), list[str]()
+
+        def follow(tip: FloatArray | None) -> Guidance:
+            begin = perf_counter()
+            to = controller.next(tip)
+            times.append(perf_counter() - begin)
+            if isinstance(controller, SteeringController) and controller.step < len(self.depths):
+                said.append(controller.warning)
+            return to
+
+        look = _look(self._sensor, self._seed)
+        try:
+            done = trial.insert(self.truth, self.depths, look, follow)
+        except SteeringFaultError as error:
+            # It has stopped short of the target.
+            self.said = str(error)
+            return np.full(2, inf), End(inf, 0.0, 0, 0.0, inf)
+        self.look, self.said = times[-1], next(filter(None, said), '')
+        tip = self.truth.tip(done.needle)
+        miss = float(np.hypot(*(tip - self.target)))
+        return tip, End(miss, done.way, done.turns, done.load, float(np.median(times[:-1])))
+
+
+def _drawn(spread: float, sensor: str, seed: int, bevel: float = 0.0) -> tuple[str, _Trial]:
+    """Return the medium and the needle of a seed; a bevel of known direction has a load [N]."""
+    rng = np.random.default_rng(seed)
+    medium = list(MEDIA)[seed % len(MEDIA)]
+    steps = int(rng.integers(DEPTHS[0], DEPTHS[1] + 1))
+    truth = drawn(*believed(medium), replace(TRUE, spread=spread), rng, seed)
+    aside, angle = ASIDE * sqrt(rng.uniform()), rng.uniform(0.0, 2.0 * pi)
+    if bevel:
+        load = bevel * (1.0 + spread * rng.uniform(-1.0, 1.0))
+        off = MOUNTED * rng.standard_normal()
+        truth = replace(
+            truth,
+            bevel=load * np.array([sin(off), cos(off)]),
+            steering=replace(truth.steering, bevel_load=(load,)),
+        )
+    found = _Trial(truth, STEP * np.arange(steps + 1.0), sensor, seed)
+    found.target = aside * np.array([sin(angle), cos(angle)])
+    return medium, found
 
 
 def insert(sensor: str, spread: float, seed: int) -> Outcome:
     """
-    Insert one needle under each controller.
+    Insert one needle under each controller that moves the guide.
 
     Parameters
     ----------
@@ -155,63 +246,74 @@ def insert(sensor: str, spread: float, seed: int) -> Outcome:
         What became of it.
 
     """
-    rng = np.random.default_rng(seed)
-    medium = list(MEDIA)[seed % len(MEDIA)]
-    needle, steering = believed(medium)
-    steps = int(rng.integers(DEPTHS[0], DEPTHS[1] + 1))
-    depths: FloatArray = STEP * np.arange(steps + 1.0)
-    truth = drawn(needle, steering, replace(TRUE, spread=spread), rng, seed)
-    aside, angle = ASIDE * sqrt(rng.uniform()), rng.uniform(0.0, 2.0 * pi)
-    target = aside * np.array([sin(angle), cos(angle)])
-    alone = SteeringModel(truth.needle, truth.steering, depths, SteeringBelief(spread=0.0))
+    medium, one = _drawn(spread, sensor, seed)
+    (needle, steering), truth = believed(medium), one.truth
+    depths, target = one.depths, one.target
+    alone = one.known()
     causes = np.array([np.zeros(2), truth.frame, truth.tilt, truth.bevel])
     drift = alone.causes[0, -1, :4] @ causes
     could = LIMIT * np.abs(alone.guide[0, -1]).sum()
-
-    def run(controller: _Controller) -> tuple[FloatArray, float]:
-        one, way = trial.insert(truth, depths, _look(sensor, seed), controller)
-        return truth.tip(one), way
-
-    found: dict[str, float] = {}
-    travel = plan = look = 0.0
-    refused = warned = held = False
+    ends: dict[str, End] = {}
+    warned = held = refused = False
     try:
-        ours = SteeringController(_model(medium, steps, sensor, spread), target, LIMIT)
+        ours = SteeringController(_model(medium, len(depths) - 1, sensor, spread), target, LIMIT)
     except OutOfReachError:
         refused = True
     else:
-        said: list[str] = []
-        times: list[float] = []
-
-        def look_at(tip: FloatArray | None) -> tuple[float, float]:
-            begin = perf_counter()
-            to = ours.next(tip)
-            times.append(perf_counter() - begin)
-            if ours.step <= steps:
-                said.append(ours.warning)
-            return to
-
-        try:
-            tip, way = run(look_at)
-        except SteeringFaultError:
-            # It has stopped short of the target.
-            tip, way, said = np.full(2, np.inf), 0.0, ['a fault']
-        found['ours'] = float(np.hypot(*(tip - target)))
+        tip, ends['ours'] = one.end(ours)
         there = ours.expected()
         off = tip - there.mean
+        warned = bool(one.said)
         held = bool(off @ np.linalg.solve(there.covariance, off) <= _ELLIPSE)
-        warned, travel = any(said), way
-        plan, look = float(np.median(times[:-1])), times[-1]
-    others: Mapping[str, Callable[[], OpenLoop]] = {
-        'springs': lambda: Springs(needle, steering, depths, target, LIMIT),
-        'Broyden': lambda: Broyden(needle, steering, depths, target, LIMIT),
-        'open loop': lambda: OpenLoop(depths, target, LIMIT),
+    look = one.look
+    others: Mapping[str, OpenLoop] = {
+        'springs': Springs(needle, steering, depths, target, LIMIT),
+        'Broyden': Broyden(needle, steering, depths, target, LIMIT),
+        'open loop': OpenLoop(depths, target, LIMIT),
     }
-    for name, make in others.items():
-        tip, _ = run(make().next)
-        found[name] = float(np.hypot(*(tip - target)))
+    ends |= {name: one.end(controller)[1] for name, controller in others.items()}
     reachable = bool((np.abs(target - drift) <= could).all())
-    return Outcome(medium, reachable, found, travel, refused, warned, held, plan, look)
+    return Outcome(medium, reachable, ends, refused, warned, held, look)
+
+
+def turn(seed: int) -> Outcome:
+    """
+    Insert one needle with a bevel under each controller that turns it, and some that do not.
+
+    Parameters
+    ----------
+    seed : int
+        Seed of the needle, its target and all noise.
+
+    Returns
+    -------
+    Outcome
+        What became of it.
+
+    """
+    sensor, spread = CASES[0]
+    medium, one = _drawn(spread, sensor, seed, BEVEL)
+    truth, depths = one.truth, one.depths
+    alone = one.known()
+    # What the bevel can do if it always pushes to one side.
+    could = float(np.hypot(*truth.bevel)) * np.abs(alone.bevel[0, -1]).sum()
+    one.target *= could / ASIDE
+    causes = np.array([np.zeros(2), truth.frame, truth.tilt])
+    drift = alone.causes[0, -1, :3] @ causes
+    model = _model(medium, len(depths) - 1, sensor, spread, BEVEL)
+    controllers: dict[str, SteeringController | OpenLoop] = {
+        TURNING[2]: RollTowards(depths, one.target),
+        TURNING[3]: OpenLoop(depths, one.target),
+    }
+    refused = False
+    try:
+        controllers[TURNING[0]] = SteeringController(model, one.target, LIMIT, TURNS)
+        controllers[TURNING[1]] = SteeringController(model, one.target, 0.0, TURNS)
+    except OutOfReachError:
+        refused = True
+    ends = {name: one.end(controller)[1] for name, controller in controllers.items()}
+    reachable = bool(np.hypot(*(one.target - drift)) <= WITHIN * could)
+    return Outcome(medium, reachable, ends, refused, False, False, one.look)
 
 
 def _look(sensor: str, seed: int) -> Callable[[FloatArray], FloatArray | None]:
@@ -263,7 +365,7 @@ def compare(tick: Tick, needles: int = 1000) -> Answer:
                 rows += [(case, medium, name, *_figures(of, name)) for name in CONTROLLERS]
                 if medium != 'all' and (sensor, spread) == CASES[0]:
                     bars += _best(of, medium)
-            ours = np.array([1e3 * one.miss['ours'] for one in counted])
+            ours = _misses(counted, 'ours')
             bars += [
                 Bar(f'{what} of ours, {case}', _statistic(ours, what), limit, 'mm')
                 for what, limit in limits[sensor, spread].items()
@@ -272,8 +374,9 @@ def compare(tick: Tick, needles: int = 1000) -> Answer:
             bars.append(Bar(f'coverage, {case}', held, 0.93, '', at_least=True))
             bars.append(Bar(f'coverage, {case}', held, 0.97))
             taken = [one for one in found if not one.refused]
-            silent = sum(one.miss['ours'] > _MISSED and not one.warned for one in taken)
+            silent = sum(one.ends['ours'].miss > _MISSED and not one.warned for one in taken)
             bars.append(Bar(f'missed by more than 2 mm without a word, {case}', silent, 0.0))
+            step, look = _times(counted, 'ours')
             others.append(
                 (
                     case,
@@ -282,34 +385,55 @@ def compare(tick: Tick, needles: int = 1000) -> Answer:
                     f'{sum(one.refused and one.reachable for one in found)}',
                     f'{sum(one.warned for one in counted)}',
                     f'{100.0 * held:.1f} %',
-                    f'{1e3 * np.mean([one.travel for one in counted]):.0f} mm',
-                    f'{1e3 * np.median([one.plan for one in counted]):.2f} ms',
-                    f'{1e3 * np.median([one.look for one in counted]):.2f} ms',
+                    f'{look:.2f} ms',
                 )
             )
-            bars.append(
-                Bar(
-                    f'a step, {case}', 1e3 * float(np.median([c.plan for c in counted])), 2.0, 'ms'
-                )
-            )
+            bars.append(Bar(f'a step, {case}', step, 2.0, 'ms'))
+            bars.append(Bar(f'a look, {case}', look, 0.2, 'ms'))
+        tick('roll')
+        turned = list(pool.map(turn, range(needles), chunksize=5))
+    every = [one for one in turned if one.reachable and not one.refused]
+    bars.append(
+        Bar(
+            'mean of roll over roll towards the target',
+            float(_misses(every, TURNING[1]).mean() / _misses(every, TURNING[2]).mean()),
+            1.0,
+        )
+    )
+    bars.append(Bar('a step, guide and roll', _times(every, TURNING[0])[0], 2.0, 'ms'))
+    heads = (
+        'controller', 'mean', 'STD', 'median', '95 %', 'within 1 mm', 'way of the guide [mm]',
+        'turns', 'load on the guide [N]', 'a step [ms]',
+    )  # fmt: skip
     return [
         Section(
             'Distance of the tip from its target [mm]',
-            ('case', 'medium', 'controller', 'mean', 'STD', 'median', '95 %', 'within 1 mm'),
+            ('case', 'medium', *heads),
             rows,
             f'{needles} needles of each case, evenly of four media, seeds 0 to {needles - 1}; '
             f'targets within {1e3 * ASIDE:g} mm of the axis, {1e3 * STEP * DEPTHS[0]:g} to '
             f'{1e3 * STEP * DEPTHS[1]:g} mm deep; guide within {1e3 * LIMIT:g} mm, steps of '
             f'{1e3 * STEP:g} mm. Counted are targets that the guide can reach if all but the path '
-            'is known, and that ours did not refuse.',
+            'is known, and that ours did not refuse. Way, turns and load are means, the load of '
+            'the largest in each insertion.',
         ),
         Section(
             'Ours',
             (
                 'case', 'within reach', 'refused', 'refused within reach', 'warned',
-                'intervals that hold the tip', 'way of the guide', 'a step', 'a look',
+                'intervals that hold the tip', 'a look',
             ),
             others,
+        ),
+        Section(
+            'With a bevel: distance of the tip from its target [mm]',
+            heads,
+            [(name, *_figures(every, name)) for name in TURNING],
+            f'Needles as in the first case, whose bevel pushes with {BEVEL:g} N +-30 %, in a '
+            f'direction that is known to {MOUNTED:g} rad. Ours turns it {TURNS} times at most. '
+            'Targets are within what the bevel can do if it always pushes to one side; counted '
+            f'are the {len(every)} of which what drifts leaves {100.0 * WITHIN:g} %, and that '
+            'none of ours refused.',
         ),
     ], bars  # fmt: skip
 
@@ -321,14 +445,29 @@ def _statistic(values: FloatArray, what: str) -> float:
     return float(np.quantile(values, 0.95 if what == '95 %' else 0.5))
 
 
+def _misses(of: Sequence[Outcome], name: str) -> FloatArray:
+    return np.array([1e3 * one.ends[name].miss for one in of])
+
+
+def _times(of: Sequence[Outcome], name: str) -> tuple[float, float]:
+    """Return the median times of a step and of a look [ms]."""
+    step = float(np.median([1e3 * one.ends[name].time for one in of]))
+    return step, float(np.median([1e3 * one.look for one in of]))
+
+
 def _figures(of: Sequence[Outcome], name: str) -> tuple[str, ...]:
-    miss = np.array([1e3 * one.miss[name] for one in of])
+    miss = _misses(of, name)
+    ends = [one.ends[name] for one in of]
     return (
         f'{miss.mean():.3f}',
         f'{miss.std():.3f}',
         f'{_statistic(miss, "median"):.3f}',
         f'{_statistic(miss, "95 %"):.3f}',
         f'{100.0 * np.mean(miss <= 1.0):.1f} %',
+        f'{1e3 * np.mean([end.way for end in ends]):.0f}',
+        f'{np.mean([end.turns for end in ends]):.1f}',
+        f'{np.mean([end.load for end in ends]):.1f}',
+        f'{1e3 * np.median([end.time for end in ends]):.2f}',
     )
 
 
@@ -336,10 +475,7 @@ def _best(of: Sequence[Outcome], medium: str) -> list[Bar]:
     """Return the bars of ours beside the best of the others."""
     bars = []
     for what in ('mean', '95 %'):
-        found = {
-            name: _statistic(np.array([1e3 * one.miss[name] for one in of]), what)
-            for name in CONTROLLERS
-        }
+        found = {name: _statistic(_misses(of, name), what) for name in CONTROLLERS}
         ours = found.pop('ours')
         bars.append(
             Bar(f'{what} over the best baseline, {medium}', ours / min(found.values()), 1.0)

@@ -138,7 +138,7 @@ class Bystander:
             What is waited for.
 
         """
-        self._graph.spin_until(condition, what, timeout=60.0)
+        self._graph.spin_until(condition, what, timeout=180.0)
 
     def goes_to(self, depth: float) -> None:
         """

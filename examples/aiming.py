@@ -25,14 +25,14 @@ def main() -> None:
     noise = np.random.default_rng(1)
     guide = (0.0, 0.0)
     for depth in DEPTHS:
-        one.move(depth=float(depth), guide=guide)
-        guide = controller.next(one.tip[[0, 2]] + 4e-5 * noise.standard_normal(2))
+        one.move(guide=guide)
+        one.move(depth=float(depth))
+        guide = controller.next(one.tip[[0, 2]] + 4e-5 * noise.standard_normal(2))[:2]
     alone.move(depth=0.1)
 
     for name, tip in (('steered', one.tip), ('open loop', alone.tip)):
         print(f'{name}: {1e3 * np.hypot(*(tip[[0, 2]] - TARGET)):.2f} mm from the target')
-    length = controller.weights @ model.lengths
-    print(f'bending length found: {100.0 * length:.0f} % of the believed one')
+    print(f'bending length found: {100.0 * controller.bending:.0f} % of the believed one')
 
 
 if __name__ == '__main__':

@@ -46,6 +46,7 @@ from needle_controller.stability import (
 )
 from needle_controller.steering.belief import SteeringBelief
 from needle_controller.steering.controller import (
+    Guidance,
     OutOfReachError,
     SteeringController,
     SteeringFaultError,
@@ -73,6 +74,7 @@ __all__ = [
     'Controller',
     'ControllerSettings',
     'Guard',
+    'Guidance',
     'InverseDynamics',
     'InverseDynamicsGains',
     'Law',

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import asdict
 import sys
 from typing import Any
@@ -13,8 +13,8 @@ from geometry_msgs.msg import PointStamped, PoseWithCovarianceStamped
 from needle_controller.journal import Severity
 from needle_controller.steering.belief import SteeringBelief
 from needle_controller.steering.controller import TipEstimate
-from needle_controller.steering.outer_loop import JOINTS, Move, OuterLoop, OuterLoopSettings
-from needle_controller.steering.responses import OF_NEEDLE, OF_STEERING
+from needle_controller.steering.outer_loop import Move, OuterLoop, OuterLoopSettings
+from needle_controller.steering.responses import OF_NEEDLE, OF_STEERING, SteeringModel
 from needle_dynamics.compiled.cache import announce_compilation
 from needle_dynamics.parameters import NeedleParameters
 from needle_dynamics.simulated.assembly import defaults_of
@@ -48,11 +48,12 @@ _LEVELS = {
 
 class SteeringNode(BaseNode):
     """
-    Brings the tip to a ``target`` (point x, y, z [m]; y is the depth) by moving the guide.
+    Brings the tip to a ``target`` (point x, y, z [m]; y is the depth) by guide and roll.
 
     The needle goes in by steps. At the end of each it rests, the readings of ``tip_deflection``
-    that come then are a look at the tip, and the next step begins: a ``joint_trajectory`` of
-    `insertion`, `guide_x` and `guide_z`. A robot follows all of it; where a controller moves the
+    that come then are a look at the tip. Then the guide moves, by a ``joint_trajectory`` of
+    `insertion`, `guide_x` and `guide_z`, with ``turns`` also `roll`; when it has arrived the next
+    step begins. A robot follows all of it; where a controller moves the
     needle, with its parameter ``steered``, it follows the insertion. ``joint_states`` must have
     these joints.
 
@@ -105,12 +106,12 @@ class SteeringNode(BaseNode):
             own = {name: values[f'{prefix}{name}'] for name in names}
             return {**asdict(defaults_of(prefix, preset)), **own}
 
-        self._loop = OuterLoop(
-            from_values(NeedleParameters, given('model.', OF_NEEDLE), 'model.'),
-            from_values(SteeringParameters, given('steering.', OF_STEERING), 'steering.'),
-            self.settings('belief.', SteeringBelief),
-            self.settings('', OuterLoopSettings),
-        )
+        needle = from_values(NeedleParameters, given('model.', OF_NEEDLE), 'model.')
+        steering = from_values(SteeringParameters, given('steering.', OF_STEERING), 'steering.')
+        belief = self.settings('belief.', SteeringBelief)
+        # Compile, or load what was compiled, before anything moves; and refuse what cannot be.
+        SteeringModel(needle, steering, [0.0, 1e-3], belief)
+        self._loop = OuterLoop(needle, steering, belief, self.settings('', OuterLoopSettings))
 
     def cleanup(self) -> None:
         """Forget the loop."""
@@ -185,7 +186,7 @@ class SteeringNode(BaseNode):
         if loop is None:
             return
         if move is not None:
-            self._trajectory.publish(self._message(move))
+            self._trajectory.publish(self._message(move, loop.settings.joints))
         if loop.expected is not self._told:
             self._told = loop.expected
             if loop.expected is not None:
@@ -193,8 +194,8 @@ class SteeringNode(BaseNode):
         if loop.journal.changed:
             self._tell()
 
-    def _message(self, move: Move) -> JointTrajectory:
-        message = JointTrajectory(joint_names=list(JOINTS))
+    def _message(self, move: Move, joints: Sequence[str]) -> JointTrajectory:
+        message = JointTrajectory(joint_names=list(joints))
         message.header.stamp = self.get_clock().now().to_msg()
         rows = zip(move.times.tolist(), move.positions, move.velocities, strict=True)
         for time, positions, velocities in rows:

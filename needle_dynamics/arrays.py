@@ -10,6 +10,9 @@ from numpy.typing import NDArray
 #: NumPy array of doubles.
 FloatArray: TypeAlias = NDArray[np.float64]
 
+#: NumPy array of complex numbers.
+ComplexArray: TypeAlias = NDArray[np.complex128]
+
 #: NumPy array of truth values.
 BoolArray: TypeAlias = NDArray[np.bool_]
 

@@ -1,9 +1,10 @@
 """
-How others steer by the guide, after what they published, with the interface of our controller.
+How others steer, after what they published, with the interface of our controller.
 
 `Broyden` is after [Bernardes2023]_: the tip is taken to move by a matrix times the motion of the
 guide and of the depth, which is corrected after each step. `Springs` is after [Glozman2007]_: the
-inverse of a beam on springs that pull it to the axis. Both are written anew from what is
+inverse of a beam on springs that pull it to the axis. `RollTowards` is after [Rucker2013]_: a
+guide that rests, and a bevel that is turned towards the target. All are written anew from what is
 published, not the code of their authors.
 
 References
@@ -13,14 +14,18 @@ References
    interventions", Physics in Medicine and Biology 68(10), 2023, doi:10.1088/1361-6560/accefa.
 .. [Glozman2007] D. Glozman, M. Shoham, "Image-guided robotic flexible needle steering", IEEE
    Transactions on Robotics 23, 2007.
+.. [Rucker2013] D. C. Rucker, J. Das, H. B. Gilbert, P. J. Swaney, M. I. Miga, N. Sarkar,
+   R. J. Webster, "Sliding mode control of steerable needles", IEEE Transactions on Robotics
+   29(5), 2013.
 
 """
 
 from __future__ import annotations
 
-from math import sin
+from math import atan2, pi, remainder, sin, tau
 from typing import Final
 
+from needle_controller.steering.controller import Guidance
 from needle_dynamics.arrays import FloatArray
 from needle_dynamics.parameters import NeedleParameters
 from needle_dynamics.steering.needle import SteeredNeedle
@@ -60,10 +65,11 @@ class OpenLoop:
         self.limit = position_limit
         self.step = 0
         self.guide = np.zeros(2)
+        self.roll = 0.0
 
-    def next(self, tip: FloatArray | None) -> tuple[float, float]:
+    def next(self, tip: FloatArray | None) -> Guidance:
         """
-        Take a look at the tip, and return where the guide shall be in the next step.
+        Take a look at the tip, and return where guide and roll shall be in the next step.
 
         Parameters
         ----------
@@ -72,15 +78,15 @@ class OpenLoop:
 
         Returns
         -------
-        tuple of float
-            Position of the guide in x and z [m].
+        Guidance
+            Guide and roll.
 
         """
         if tip is not None and self.step < len(self.depths) - 1:
             self.guide = np.clip(self._choose(tip), -self.limit, self.limit)
         self.step += 1
         x, z = self.guide.tolist()
-        return x, z
+        return Guidance(x, z, self.roll)
 
     def _choose(self, _tip: FloatArray) -> FloatArray:
         return self.guide
@@ -181,3 +187,33 @@ class Springs(OpenLoop):
         wanted = self.target * self.depths[self.step + 1] / self.depths[-1]
         # What the springs do not explain stays.
         return np.asarray((wanted - (tip - now * self.guide)) / then)
+
+
+class RollTowards(OpenLoop):
+    """
+    A bevel that is turned so that it pushes towards the target, as the needle now goes.
+
+    In the source the needle turns all the time, the faster the farther the target is from the
+    plane in which it bends; in steps that is a turn into that plane. The heading of the tip comes
+    from two looks. At zero roll the bevel pushes along z.
+
+    Parameters
+    ----------
+    depths, target, position_limit
+        As for `OpenLoop`.
+
+    """
+
+    def __init__(self, depths: ArrayLike, target: ArrayLike, position_limit: float = 6e-3) -> None:
+        super().__init__(depths, target, position_limit)
+        self._before: tuple[float, FloatArray] | None = None
+
+    def _choose(self, tip: FloatArray) -> FloatArray:
+        depth = float(self.depths[self.step])
+        before, self._before = self._before, (depth, tip)
+        if before is not None:
+            heading = (tip - before[1]) / (depth - before[0])
+            x, z = (self.target - tip) - heading * (self.depths[-1] - depth)
+            # At a roll of phi it pushes along (sin phi, cos phi).
+            self.roll += remainder(0.5 * pi - atan2(z, x) - self.roll, tau)
+        return self.guide

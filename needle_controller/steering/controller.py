@@ -1,5 +1,5 @@
 r"""
-The controller that steers the tip to a target by moving the guide, one step at a time.
+The controller that steers the tip to a target by guide and roll, one step at a time.
 
 **What it knows.** Each hypothesis of `SteeringModel` is linear, so that what a look at the tip
 says of its constants is a Kalman update, and what it says of the hypothesis is the likelihood of
@@ -14,17 +14,19 @@ later positions can still add. The next position is the one that leaves least of
 reach, in the mean square over all hypotheses and their errors: **what any of the tissues that may
 be true would need later must stay possible**, since it is later that the tissue is known. Where
 many positions do that equally, it is the one nearest to a plan for the mean, of least motion.
+The needle is turned only if that leaves less out of reach than the guide alone can. As long as a
+turn is left, the bevel may later push wherever it has to.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import inf, isfinite
+from math import inf, isfinite, sqrt, tau
 from typing import Final, NamedTuple
 
 from needle_controller.steering.responses import SteeringModel
-from needle_dynamics.arrays import FloatArray
+from needle_dynamics.arrays import ComplexArray, FloatArray
 from needle_ros.errors import JobError, ParameterError, ShapeError
 import numpy as np
 from numpy.typing import ArrayLike
@@ -34,6 +36,21 @@ _COUNTED: Final = 0.8
 
 #: Positions of the guide that are compared.
 _TRIED: Final = 121
+
+#: Directions in which the bevel may push, and positions of the guide with each that are compared.
+_ROLLS, _COARSE = 16, 13
+
+#: Mean square of what is out of reach that a turn must be worth [m^2].
+_TURN: Final = 1e-4**2
+
+#: Cost of a load on the guide beyond its limit [m^2/N^2]: more than any distance.
+_OVERLOAD: Final = 1.0
+
+#: Standard deviation of the part of the bevel's load that a robot at rest takes away.
+_LET_GO: Final = 0.1
+
+#: Place of the load of the bevel among the causes.
+_BEVEL: Final = 3
 
 #: Abscissas and weights of a normal distribution.
 _ABSCISSAS: Final = np.array([-(3.0**0.5), 0.0, 3.0**0.5])
@@ -59,8 +76,42 @@ _REFUSED, _WARNED = 0.05, 0.5
 _REACHED: Final = 1e-3
 
 
+class Reach(NamedTuple):
+    """
+    Where the tip can be brought, by each hypothesis.
+
+    Attributes
+    ----------
+    middles : ndarray of complex, shape (h,)
+        Where it goes without further motion, x + i z [m].
+    sizes : ndarray, shape (h,)
+        How far it can be brought from there along each axis [m].
+    weights : ndarray, shape (h,)
+        Probability of each hypothesis.
+
+    """
+
+    middles: ComplexArray
+    sizes: FloatArray
+    weights: FloatArray
+
+
 class OutOfReachError(JobError):
-    """No motion of the guide brings the tip to the target."""
+    """
+    No motion of guide and roll brings the tip to the target.
+
+    Parameters
+    ----------
+    why : str
+        For people.
+    reach : Reach
+        What is within reach.
+
+    """
+
+    def __init__(self, why: str, reach: Reach) -> None:
+        super().__init__(why)
+        self.reach = reach
 
 
 class SteeringFaultError(JobError):
@@ -85,27 +136,77 @@ class TipEstimate:
     covariance: FloatArray
 
 
+class Guidance(NamedTuple):
+    """
+    What to do before the next step: guide and needle move while the tip rests.
+
+    Attributes
+    ----------
+    x, z : float
+        Where the guide shall be [m].
+    roll : float
+        Roll of the needle [rad].
+
+    """
+
+    x: float
+    z: float
+    roll: float = 0.0
+
+
 class _Predicted(NamedTuple):
     """
     Where the tip is by each hypothesis.
 
     Attributes
     ----------
-    means, variances : ndarray, shape (h, 2)
-        Mean [m] and variance [m^2] in x and z.
-    shared : ndarray, shape (h, 2, constants)
+    means : ndarray of complex, shape (h,)
+        Mean, x + i z [m].
+    variances : ndarray, shape (h,)
+        Variance along each axis [m^2].
+    shared : ndarray of complex, shape (h, constants)
         Covariance with each of the unknown constants.
 
     """
 
-    means: FloatArray
+    means: ComplexArray
     variances: FloatArray
-    shared: FloatArray
+    shared: ComplexArray
+
+
+class _Ends(NamedTuple):
+    """
+    Where the tip ends by each hypothesis without further positions of the guide.
+
+    Attributes
+    ----------
+    means : ndarray of complex, shape (h,)
+        Mean, x + i z [m].
+    errors : ndarray, shape (h,)
+        Standard deviation along each axis [m].
+    shifts : ndarray, shape (h, positions)
+        What each further position of the guide does.
+    turned : ndarray, shape (h,)
+        How far later turns can push it along each axis [m].
+
+    """
+
+    means: ComplexArray
+    errors: FloatArray
+    shifts: FloatArray
+    turned: FloatArray
+
+
+class _Choice(NamedTuple):
+    """A position of the guide, x + i z [m], and what it leaves out of reach [m^2]."""
+
+    cost: float
+    guide: complex
 
 
 class SteeringController:
     """
-    Steers the tip to a target: takes a look at each depth, and returns where the guide shall go.
+    Steers the tip to a target: takes a look at each depth, and returns what to do next.
 
     Parameters
     ----------
@@ -114,7 +215,13 @@ class SteeringController:
     target : array_like, shape (2,)
         Where the tip shall be at the last depth, x and z in the frame of the sensor [m].
     position_limit : float
-        Farthest position of the guide along x and along z [m].
+        Farthest position of the guide along x and along z [m]; 0 for a guide that cannot move.
+    turns : int
+        How often the needle may be turned.
+    load_limit : float
+        Largest force of the guide on needle and tissue that is planned, along x and along z [N].
+    roll : float
+        Roll of the needle at the start [rad].
 
     Attributes
     ----------
@@ -122,15 +229,17 @@ class SteeringController:
         The target [m].
     step : int
         Number of looks so far.
+    turns : int
+        Turns that are left.
     weights : ndarray, shape (h,)
         Probability of each hypothesis.
 
     Raises
     ------
     ShapeError, ParameterError
-        If the target is not two finite numbers, or the limit is not positive.
+        If the target is not two finite numbers, or a limit is not valid.
     OutOfReachError
-        If the guide cannot bring the tip there; the message says what is within reach.
+        If the tip cannot be brought there; the message says what is within reach.
 
     Examples
     --------
@@ -147,7 +256,8 @@ class SteeringController:
     >>> softer = replace(believed, tissue_stiffness=0.8 * believed.tissue_stiffness)
     >>> needle = SteeredNeedle(softer, steering, tilt=(0.02, 0.01))
     >>> for depth in depths[1:]:
-    ...     needle.move(guide=control.next(needle.tip[[0, 2]]))
+    ...     x, z, _ = control.next(needle.tip[[0, 2]])
+    ...     needle.move(guide=(x, z))
     ...     needle.move(depth=depth)
     >>> miss = np.hypot(*(needle.tip[[0, 2]] - control.target))
     >>> print(f'{1e3 * miss:.1f} mm')
@@ -156,18 +266,35 @@ class SteeringController:
     """
 
     def __init__(
-        self, model: SteeringModel, target: ArrayLike, position_limit: float = 6e-3
+        self,
+        model: SteeringModel,
+        target: ArrayLike,
+        position_limit: float = 6e-3,
+        turns: int = 0,
+        load_limit: float = inf,
+        roll: float = 0.0,
     ) -> None:
-        if not 0.0 < position_limit < inf:
+        if not 0.0 <= position_limit < inf:
             raise ParameterError(
-                f'position_limit must be positive and finite, got {position_limit!r} m'
+                f'position_limit must be finite and >= 0, got {position_limit!r} m'
             )
-        self._model, self._limit = model, position_limit
+        if not load_limit > 0.0:
+            raise ParameterError(f'load_limit must be > 0, got {load_limit!r} N')
+        if turns < 0:
+            raise ParameterError(f'turns must be >= 0, got {turns!r}')
+        if position_limit == 0.0 and turns == 0:
+            raise ParameterError('position_limit and turns cannot both be 0: nothing would move')
+        self._model, self._limit, self._load_limit = model, position_limit, load_limit
+        self.step, self.turns = 0, turns
         count, size = len(model.lengths), len(model.prior)
-        self.step = 0
-        self._guide = np.zeros((model.steps, 2))
-        self._mean = np.zeros((count, 2, size))
-        self._covariance = np.empty((count, 2, size, size))
+        #: Position of the guide, x + i z, and direction of the bevel over that at zero roll, in
+        #: each step; the latter on the skin, too.
+        self._guide = np.zeros(model.steps, dtype=np.complex128)
+        self._turned = np.full(model.steps + 1, np.exp(-1j * roll))
+        self._roll = roll
+        self._mean = np.zeros((count, size), dtype=np.complex128)
+        self._mean[:, _BEVEL] = 1j * model.push
+        self._covariance = np.empty((count, size, size), dtype=np.complex128)
         self._covariance[:] = model.prior
         self._logs = np.zeros(count)
         self._last: FloatArray | None = None
@@ -189,7 +316,7 @@ class SteeringController:
         ShapeError, ParameterError
             If the target is not two finite numbers.
         OutOfReachError
-            If the guide cannot bring the tip there. The target stays as it was then.
+            If the tip cannot be brought there. The target stays as it was then.
 
         """
         new = np.array(target, dtype=np.float64)
@@ -199,9 +326,9 @@ class SteeringController:
             raise ParameterError(f'target must be finite, got {new.tolist()} m')
         before, self.target = self.target, new
         if self.chance < _REFUSED:
-            why = self._unreachable()
+            error = OutOfReachError(self._unreachable(), self.reach)
             self.target = before
-            raise OutOfReachError(why)
+            raise error
 
     # What is known.
 
@@ -223,8 +350,8 @@ class SteeringController:
         Parameters
         ----------
         at : int
-            Number of the depth; by default the last one. The guide is expected to stay where it
-            was last sent.
+            Number of the depth; by default the last one. Guide and roll are expected to stay as
+            they were last sent.
 
         Returns
         -------
@@ -236,72 +363,88 @@ class SteeringController:
 
     def _over_all(self, predicted: _Predicted) -> TipEstimate:
         w = self.weights
-        mean = w @ predicted.means
+        mean = complex(w @ predicted.means)
         apart = predicted.means - mean
-        spread = (w[:, np.newaxis] * apart).T @ apart
-        return TipEstimate(mean, spread + np.diag(w @ predicted.variances))
+        planes = np.array([apart.real, apart.imag])
+        spread = (w * planes) @ planes.T
+        return TipEstimate(_planes(mean), spread + w @ predicted.variances * np.eye(2))
 
-    def _held(self) -> FloatArray:
-        """Return where the guide was, and is if it rests from now on, shape (n, 2)."""
+    def _held(self) -> ComplexArray:
+        """Return where the guide was, and is if it rests from now on, shape (n,)."""
         guide, done = self._guide.copy(), min(self.step, self._model.steps)
         guide[done:] = guide[done - 1] if done else 0.0
         return guide
 
-    def _tip(self, at: int, guide: FloatArray) -> _Predicted:
+    def _tip(self, at: int, guide: ComplexArray) -> _Predicted:
         """Return where the tip is at a depth by each hypothesis."""
         model = self._model
         rows = np.empty_like(self._mean)
-        rows[:, :, :-2] = model.causes[:, np.newaxis, at]
-        rows[:, :, -2:] = (model.between[:, :, at] @ guide).transpose(1, 2, 0)
-        means = model.guide[:, at] @ guide + (self._mean * rows).sum(axis=2)
-        shared = np.matmul(self._covariance, rows[..., np.newaxis])[..., 0]
-        return _Predicted(means, (shared * rows).sum(axis=2), shared)
+        rows[:, :-2] = model.causes[:, at]
+        rows[:, _BEVEL] = model.bevel[:, at] @ self._turned
+        rows[:, -2:] = (model.between[:, :, at] @ guide).T
+        means = model.guide[:, at] @ guide + (self._mean * rows).sum(axis=1)
+        shared = np.matmul(self._covariance, rows.conj()[..., np.newaxis])[..., 0]
+        let_go = _LET_GO * model.elastic[:, at] * np.abs(self._mean[:, _BEVEL])
+        return _Predicted(means, (shared * rows).sum(axis=1).real + let_go**2, shared)
 
     @property
     def chance(self) -> float:
         """How probable it is that the tip can still come within a millimeter of the target."""
-        w, chance = self.weights, 1.0
-        begin, errors, shifts = self._ends()
-        reach = _REACHED + self._limit * np.abs(shifts).sum(axis=1)
-        for plane in range(2):
-            need = (self.target[plane] - begin[:, plane])[:, np.newaxis]
-            need = np.abs(need + errors[:, plane, np.newaxis] * _ABSCISSAS)
-            chance *= float(w @ ((need <= reach[:, np.newaxis]) @ _WEIGHTS))
+        chance, ends = 1.0, self._ends(self.turns, self.step + 1)
+        sizes = (_REACHED + self._sizes(ends))[:, np.newaxis]
+        need = self._goal - ends.means
+        for plane in (need.real, need.imag):
+            off = np.abs(plane[:, np.newaxis] + ends.errors[:, np.newaxis] * _ABSCISSAS)
+            chance *= float(self.weights @ ((off <= sizes) @ _WEIGHTS))
         return chance
+
+    @property
+    def reach(self) -> Reach:
+        """Where the tip can be brought from here."""
+        ends = self._ends(self.turns, self.step + 1)
+        return Reach(ends.means, self._sizes(ends), self.weights)
+
+    def _sizes(self, ends: _Ends) -> FloatArray:
+        return np.asarray(self._limit * np.abs(ends.shifts).sum(axis=1) + ends.turned)
+
+    @property
+    def _goal(self) -> complex:
+        return complex(*self.target)
 
     @property
     def warning(self) -> str:
         """What is to be said of the target now, '' for nothing."""
         return '' if self.chance >= _WARNED else self._unreachable()
 
-    def _ends(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """
-        Return where the tip ends without further positions, its error, and what these do.
-
-        Shapes (h, 2), (h, 2) and (h, positions).
-        """
-        k = self.step
+    def _ends(self, turns: int, first: int) -> _Ends:
+        """Return where the tip ends with so many turns from a step on, counted from 1."""
+        k, model = self.step, self._model
         guide = self._guide.copy()
         guide[k:] = 0.0
         end = self._tip(-1, guide)
-        return end.means, np.sqrt(end.variances), self._model.guide[:, -1, k:]
+        means, turned = end.means, np.zeros(len(end.means))
+        if turns:
+            later = model.bevel[:, -1, first:]
+            load = self._mean[:, _BEVEL]
+            means = means - load * (later @ self._turned[first:])
+            turned = _COUNTED * sqrt(0.5) * np.abs(load) * np.abs(later).sum(axis=1)
+        return _Ends(means, np.sqrt(end.variances), model.guide[:, -1, k:], turned)
 
     def _unreachable(self) -> str:
-        begin, _, shifts = self._ends()
-        w = self.weights
-        middle = 1e3 * (w @ begin)
-        reach = 1e3 * self._limit * float(w @ np.abs(shifts).sum(axis=1))
+        middles, sizes, w = self.reach
+        middle, size = 1e3 * complex(w @ middles), 1e3 * float(w @ sizes)
         x, z = 1e3 * self.target
         return (
             f'the target x = {x:.2f} mm, z = {z:.2f} mm is out of reach: from here a tip within '
-            f'{reach:.2f} mm of x = {middle[0]:.2f} mm, z = {middle[1]:.2f} mm, along each axis'
+            f'{size:.2f} mm of x = {middle.real:.2f} mm, z = {middle.imag:.2f} '
+            f'mm, along each axis'
         )
 
     # What is done.
 
-    def next(self, tip: Sequence[float] | FloatArray | None) -> tuple[float, float]:
+    def next(self, tip: Sequence[float] | FloatArray | None) -> Guidance:
         """
-        Take a look at the tip, and return where the guide shall be in the next step.
+        Take a look at the tip, and return where guide and roll shall be in the next step.
 
         Parameters
         ----------
@@ -310,8 +453,8 @@ class SteeringController:
 
         Returns
         -------
-        tuple of float
-            Position of the guide in x and z [m]; after the last look where it is.
+        Guidance
+            Guide and roll; after the last look as they are.
 
         Raises
         ------
@@ -329,13 +472,13 @@ class SteeringController:
         predicted = self._tip(self.step, self._held())
         seen = self._checked(tip, self._over_all(predicted))
         if seen is not None:
-            self._learn(seen, predicted)
+            self._learn(complex(*seen), predicted)
         k = self.step
         if k < self._model.steps:
             self._guide[k] = self._choose()
         self.step += 1
-        x, z = self._guide[min(k, self._model.steps - 1)].tolist()
-        return x, z
+        there = self._guide[min(k, self._model.steps - 1)]
+        return Guidance(float(there.real), float(there.imag), self._roll)
 
     def _checked(
         self, tip: Sequence[float] | FloatArray | None, there: TipEstimate
@@ -376,34 +519,87 @@ class SteeringController:
             )
         return None
 
-    def _learn(self, seen: FloatArray, predicted: _Predicted) -> None:
+    def _learn(self, seen: complex, predicted: _Predicted) -> None:
         """Update each hypothesis, and their probabilities."""
         whole = predicted.variances + self._model.belief.noise**2
         off = seen - predicted.means
-        gain = predicted.shared / whole[..., np.newaxis]
-        self._mean += off[..., np.newaxis] * gain
-        self._covariance -= gain[..., np.newaxis] * predicted.shared[..., np.newaxis, :]
-        self._logs -= 0.5 * (off**2 / whole + np.log(whole)).sum(axis=1)
+        gain = predicted.shared / whole[:, np.newaxis]
+        self._mean += off[:, np.newaxis] * gain
+        self._covariance -= gain[..., np.newaxis] * predicted.shared.conj()[:, np.newaxis]
+        self._logs -= 0.5 * np.abs(off) ** 2 / whole + np.log(whole)
 
-    def _choose(self) -> FloatArray:
-        """Return the next position of the guide."""
-        w, limit = self.weights, self._limit
-        begin, errors, shifts = self._ends()
-        later = _COUNTED * limit * np.abs(shifts[:, 1:]).sum(axis=1)
+    def _choose(self) -> complex:
+        """Return the next position of the guide, and turn the needle if that is worth it."""
+        ends = self._ends(self.turns, self.step + 2)
+        tried = np.linspace(-self._limit, self._limit, _TRIED if self._limit else 1)
+        best = self._best(ends, tried)
+        if self.turns == 0 or best.cost < _TURN:
+            return best.guide
+        # As it is, but for a turn now.
+        left = self.turns - 1
+        base = self._ends(left, self.step + 2)
+        columns = slice(self.step + 1, self.step + 2 if left else None)
+        load = self._mean[:, _BEVEL] * self._model.bevel[:, -1, columns].sum(axis=1)
+        few = tried[:: max(1, len(tried) // _COARSE)]
+        rolls = self._roll + tau * np.arange(1 - _ROLLS // 2, _ROLLS // 2 + 1) / _ROLLS
+        ways = np.exp(-1j * rolls)
+        others = [base._replace(means=base.means + load * (way - self._way)) for way in ways]
+        costs = [sum(float(cost.min()) for cost in self._costs(one, few)) for one in others]
+        k = int(np.argmin(costs))
+        if costs[k] + _TURN > best.cost:
+            return best.guide
+        self._roll, self.turns = float(rolls[k]), left
+        self._turned[self.step + 1 :] = ways[k]
+        return self._best(others[k], tried).guide
+
+    @property
+    def _way(self) -> complex:
+        """Direction of the bevel now over that at zero roll."""
+        return complex(np.exp(-1j * self._roll))
+
+    def _costs(self, ends: _Ends, tried: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the mean square of what positions leave out of reach, in x and in z [m^2]."""
+        w, shifts = self.weights, ends.shifts
+        later = _COUNTED * self._limit * np.abs(shifts[:, 1:]).sum(axis=1) + ends.turned
+        need = self._goal - ends.means
+        spread = ends.errors[:, np.newaxis, np.newaxis] * _ABSCISSAS
+        felt, stiffness = self._felt()
+        found = []
+        for plane, force in ((need.real, felt.real), (need.imag, felt.imag)):
+            left = plane[:, np.newaxis] - shifts[:, :1] * tried
+            off = np.abs(left[:, :, np.newaxis] + spread)
+            short = np.maximum(0.0, off - later[:, np.newaxis, np.newaxis])
+            over = np.maximum(0.0, np.abs(force + stiffness * tried) - self._load_limit)
+            found.append(w @ (short**2 @ _WEIGHTS) + _OVERLOAD * over**2)
+        return found[0], found[1]
+
+    def _felt(self) -> tuple[complex, float]:
+        """Return the load on a guide that goes to zero [N], and what a shift adds [N/m]."""
+        if self._load_limit == inf:
+            return 0j, 0.0
+        k, w, model = self.step, self.weights, self._model
+        guide = self._guide.copy()
+        guide[k:] = 0.0
+        loads = model.causes_load[:, k] * self._mean[:, :-2]
+        loads[:, _BEVEL] = (model.bevel_load[:, k] @ self._turned) * self._mean[:, _BEVEL]
+        force = w @ (model.guide_load[:, k] @ guide + loads.sum(axis=1))
+        return complex(force), float(w @ model.guide_load[:, k, k])
+
+    def _best(self, ends: _Ends, tried: FloatArray) -> _Choice:
+        """Return the best of positions along each axis."""
+        w, shifts, limit = self.weights, ends.shifts, self._limit
         # The plan for the mean: least squares, with a price of motion.
         weighted = w[:, np.newaxis] * shifts
         normal = weighted.T @ shifts + _MOTION * np.eye(shifts.shape[1])
-        plan = np.linalg.solve(normal, weighted.T @ (self.target - begin))[0]
-        tried = np.linspace(-limit, limit, _TRIED)
-        found = np.empty(2)
-        for plane in range(2):
-            need = (self.target[plane] - begin[:, plane])[:, np.newaxis]
-            need = need - shifts[:, :1] * tried
-            need = np.abs(
-                need[:, :, np.newaxis] + errors[:, plane, np.newaxis, np.newaxis] * _ABSCISSAS
-            )
-            short = np.maximum(0.0, need - later[:, np.newaxis, np.newaxis])
-            cost = w @ (short**2 @ _WEIGHTS)
-            cost += _AWAY * (tried - np.clip(plan[plane], -limit, limit)) ** 2
-            found[plane] = tried[int(np.argmin(cost))]
-        return found
+        plan = np.linalg.solve(normal, weighted.T @ (self._goal - ends.means))[0]
+        whole, found = 0.0, list[float]()
+        for cost, wanted in zip(self._costs(ends, tried), (plan.real, plan.imag), strict=True):
+            away = _AWAY * (tried - np.clip(wanted, -limit, limit)) ** 2
+            at = int(np.argmin(cost + away))
+            whole += float(cost[at])
+            found.append(float(tried[at]))
+        return _Choice(whole, complex(*found))
+
+
+def _planes(value: complex) -> FloatArray:
+    return np.array([value.real, value.imag])

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
-from math import ceil
+from math import ceil, sqrt
 from time import monotonic
 from typing import Final, NamedTuple
 
@@ -28,18 +28,29 @@ from needle_controller.steering.responses import SteeringModel
 from needle_dynamics.arrays import FloatArray
 from needle_dynamics.parameters import NeedleParameters
 from needle_dynamics.steering.parameters import SteeringParameters
-from needle_ros.contract import ENTRY, GUIDE_X, GUIDE_Z, INSERTION, JOINT_STATES, TIP_DEFLECTION
+from needle_ros.contract import (
+    ENTRY,
+    GUIDE_X,
+    GUIDE_Z,
+    INSERTION,
+    JOINT_STATES,
+    ROLL,
+    TIP_DEFLECTION,
+)
 from needle_ros.errors import JobError, NeedleError, ParameterError
 from needle_ros.settings import check_constants, constant
 from needle_ros.timing import NANOSECONDS
 from needle_ros.wire import Reading
 import numpy as np
 
-#: Joints that are moved.
-JOINTS: Final = (INSERTION, GUIDE_X, GUIDE_Z)
+#: Joints that are moved; the last one only if the needle may be turned.
+JOINTS: Final = (INSERTION, GUIDE_X, GUIDE_Z, ROLL)
 
 #: Highest speed of a smooth motion from rest to rest over its mean.
 _PEAK: Final = 1.875
+
+#: Highest acceleration of such a motion by its way over its squared duration.
+_STEEPEST: Final = 10.0 / sqrt(3.0)
 
 #: Time from one point of a motion to the next [s].
 _INTERVAL: Final = 0.05
@@ -72,9 +83,18 @@ class OuterLoopSettings:
     )
     speed: float = constant(0.01, 'm/s', 'highest insertion speed', open_low=True)
     guide_limit: float = constant(
-        6e-3, 'm', 'farthest position of the guide along x and along z', open_low=True
+        6e-3, 'm', 'farthest position of the guide along x and along z; 0: it stays'
     )
     guide_speed: float = constant(0.02, 'm/s', 'highest speed of the guide', open_low=True)
+    acceleration: float = constant(
+        0.1, 'm/s^2', 'highest acceleration of needle and guide', open_low=True
+    )
+    turns: int = constant(0, '1', 'how often the needle may be turned')
+    roll_speed: float = constant(2.0, 'rad/s', 'fastest roll', open_low=True)
+    load_limit: float = constant(
+        8.0, 'N', 'largest lateral force of the guide that is planned, along x and along z',
+        open_low=True,
+    )  # fmt: skip
     settle_time: float = constant(0.1, 's', 'time at rest before a look')
     look_time: float = constant(
         0.5, 's', 'duration of a look, whose readings are averaged', open_low=True
@@ -84,6 +104,9 @@ class OuterLoopSettings:
     )
     guide_tolerance: float = constant(
         1e-4, 'm', 'how far the guide may be from where it was sent', open_low=True
+    )
+    roll_tolerance: float = constant(
+        0.02, 'rad', 'how far the roll may be from where it was sent', open_low=True
     )
     slip_tolerance: float = constant(
         3e-3, 'm', 'how much the depth of the tip may differ from the inserted length, beyond '
@@ -99,6 +122,23 @@ class OuterLoopSettings:
 
     def __post_init__(self) -> None:
         check_constants(self)
+        if self.turns != int(self.turns):
+            raise ParameterError(f'turns must be a whole number, got {self.turns!r}')
+        object.__setattr__(self, 'turns', int(self.turns))
+        if self.guide_limit == 0.0 and self.turns == 0:
+            raise ParameterError('guide_limit and turns cannot both be 0: nothing would move')
+
+    @property
+    def joints(self) -> tuple[str, ...]:
+        """Joints that are moved."""
+        return JOINTS if self.turns else JOINTS[:-1]
+
+    @property
+    def tolerances(self) -> FloatArray:
+        """How far each of them may be from where it was sent [m, rad]."""
+        guide = self.guide_tolerance
+        every = [self.depth_tolerance, guide, guide, self.roll_tolerance]
+        return np.array(every[: len(self.joints)])
 
 
 class Phase(Enum):
@@ -120,8 +160,8 @@ class Move(NamedTuple):
     ----------
     times : ndarray, shape (n,)
         Times from now [s].
-    positions, velocities : ndarray, shape (n, 3)
-        Of `JOINTS` [m, m/s].
+    positions, velocities : ndarray, shape (n, joints)
+        Of `OuterLoopSettings.joints` [m, rad, and these per s].
 
     """
 
@@ -136,8 +176,8 @@ def smooth(begin: FloatArray, end: FloatArray, duration: float) -> Move:
 
     Parameters
     ----------
-    begin, end : ndarray, shape (3,)
-        Positions of `JOINTS` [m].
+    begin, end : ndarray, shape (joints,)
+        Positions [m, rad].
     duration : float
         Its duration [s].
 
@@ -219,7 +259,7 @@ class OuterLoop:
         self._begun = 0.0
         #: Where the joints are, were sent, and when they shall be there.
         self._at: FloatArray | None = None
-        self._goal = np.zeros(3)
+        self._goal = np.zeros(len(settings.joints))
         self._due = 0
         #: Stamp [ns] and inserted length [m] since which the needle rests.
         self._rest: tuple[int, float] | None = None
@@ -229,8 +269,8 @@ class OuterLoop:
         self._ahead: float | None = None
         self._warned = False
         self._time = 0
-        #: A plan takes a moment, in which messages wait.
-        self._planned = False
+        #: A plan takes a moment, in which messages wait: when the first look after it was [ns].
+        self._planned: int | None = 0
 
     @property
     def steers(self) -> bool:
@@ -305,7 +345,7 @@ class OuterLoop:
                 f'the needle is at {1e3 * depth:.2f} mm and has been steered; retract it to '
                 f'{1e3 * self._begun:.2f} mm first'
             )
-        off = np.abs(self._at[1:]).max()
+        off = np.abs(self._at[1:3]).max()
         if depth > _OUTSIDE and off > settings.guide_tolerance:
             raise JobError(
                 f'the guide is {1e3 * off:.2f} mm off its zero with the needle at '
@@ -319,14 +359,24 @@ class OuterLoop:
         steps = max(1, round((point[1] - depth) / settings.step_length))
         depths = np.linspace(depth, point[1], steps + 1)
         model = SteeringModel(self._needle, self._steering, depths, self._belief)
-        self.control = SteeringController(model, (point[0], point[2]), settings.guide_limit)
-        self._planned = True
+        roll = float(self._at[3]) if settings.turns else 0.0
+        self.control = SteeringController(
+            model,
+            (point[0], point[2]),
+            settings.guide_limit,
+            settings.turns,
+            settings.load_limit,
+            roll,
+        )
+        self._planned = None
         self._depths, self._begun = depths, depth
         self.expected, self.fault = None, ''
         self._ahead, self._warned = None, False
         self.journal.say(Severity.INFO, f'steers to {_words(point)} in {steps} steps')
         self._goal = np.array([depth, *self._at[1:]])
-        return self._send(Phase.GUIDING, np.array([depth, 0.0, 0.0]), now)
+        straight = self._goal.copy()
+        straight[1:3] = 0.0
+        return self._send(Phase.GUIDING, straight, now)
 
     def stop(self, why: str) -> Move | None:
         """
@@ -354,7 +404,7 @@ class OuterLoop:
         # It cannot rest at once where it is.
         ahead = min(0.5 * _BRAKING * self.settings.speed, max(0.0, self._goal[0] - end[0]))
         end[0] += ahead
-        return Move(np.array([_BRAKING]), end[np.newaxis], np.zeros((1, 3)))
+        return Move(np.array([_BRAKING]), end[np.newaxis], np.zeros((1, len(end))))
 
     # What is measured.
 
@@ -377,13 +427,14 @@ class OuterLoop:
         """
         names, (positions, *_) = reading.names, reading.values
         found = dict(zip(names, positions, strict=False))
-        missing = [name for name in JOINTS if name not in found]
+        joints = self.settings.joints
+        missing = [name for name in joints if name not in found]
         if missing:
             self.journal.refuse(
                 f'joint_states lacks a position of {", ".join(missing)}, got names {list(names)}'
             )
             return None
-        at = [found[name] for name in JOINTS]
+        at = [found[name] for name in joints]
         refusal = self._joint_stream.check(reading.stamp, now, values=at)
         if refusal is not None:
             if not refusal.harmless:
@@ -401,13 +452,15 @@ class OuterLoop:
         settings, at, goal = self.settings, self._at, self._goal
         if at is None:
             return ''
-        off = np.abs(at - goal)
-        limits = settings.depth_tolerance, settings.guide_tolerance, settings.guide_tolerance
-        return ' and '.join(
-            f'{name} is at {1e3 * at[k]:.3f} mm, not at {1e3 * goal[k]:.3f} mm'
-            for k, name in enumerate(JOINTS)
-            if off[k] > limits[k]
-        )
+        far = np.abs(at - goal) > settings.tolerances
+        missed = []
+        for k, name in enumerate(settings.joints):
+            scale, unit = (1.0, 'rad') if name == ROLL else (1e3, 'mm')
+            if far[k]:
+                missed.append(
+                    f'{name} is at {scale * at[k]:.3f} {unit}, not at {scale * goal[k]:.3f} {unit}'
+                )
+        return ' and '.join(missed)
 
     def _wait(self, stamp: int, now: int) -> Move | None:
         """Wait until needle and guide rest where they were sent."""
@@ -479,14 +532,14 @@ class OuterLoop:
             for stream in (self._joint_stream, self._tip_stream):
                 stream.forget()
             return self.stop(f'the clock went back by {back:.3f} s')
-        if self._planned or not self.steers:
-            # What has waited comes first.
-            self._planned = False
+        if self._planned is None:
+            self._planned = now
+        if not self.steers:
             return None
         for stream in (self._joint_stream, self._tip_stream):
             if stream.publishers > 1:
                 return self.stop(f'{stream.publishers} nodes publish {stream.name}')
-        silence = self._joint_stream.silence(now)
+        silence = min(self._joint_stream.silence(now), (now - self._planned) / NANOSECONDS)
         if silence > timeout:
             return self.stop(f'no joint_states for {silence:.2f} s')
         if self._look is not None and now > self._look.until + timeout * NANOSECONDS:
@@ -519,7 +572,7 @@ class OuterLoop:
             return self.stop(slip)
         k = control.step
         try:
-            x, z = control.next(None if seen is None else seen.tip[[0, 2]])
+            to = control.next(None if seen is None else seen.tip[[0, 2]])
         except SteeringFaultError as error:
             return self.stop(str(error))
         self.expected = control.expected()
@@ -531,7 +584,8 @@ class OuterLoop:
             self._warned = True
             depth = 1e3 * self._depths[k]
             self.journal.say(Severity.WARNING, f'at {depth:.2f} mm: {control.warning}')
-        return self._send(Phase.GUIDING, np.array([self._goal[0], x, z]), now)
+        goal = np.array([self._goal[0], to.x, to.z, to.roll])[: len(self._goal)]
+        return self._send(Phase.GUIDING, goal, now)
 
     def _slip(self, seen: Seen | None) -> str:
         """Say that the tip is not as deep as the needle is inserted, '' if it is."""
@@ -554,10 +608,13 @@ class OuterLoop:
         """Send needle and guide somewhere."""
         begin, self._goal = self._goal, goal
         self.phase, self._rest = phase, None
-        way = np.abs(goal - begin)
-        settings = self.settings
-        duration = _PEAK * max(
-            way[0] / settings.speed, float(np.hypot(way[1], way[2])) / settings.guide_speed
+        way, settings = np.abs(goal - begin), self.settings
+        along, across, around = float(way[0]), float(np.hypot(way[1], way[2])), float(sum(way[3:]))
+        duration = max(
+            _PEAK * along / settings.speed,
+            _PEAK * across / settings.guide_speed,
+            _PEAK * around / settings.roll_speed,
+            sqrt(_STEEPEST * max(along, across) / settings.acceleration),
         )
         self._due = now + round(duration * NANOSECONDS)
         return smooth(begin, goal, duration) if duration > 0.0 else None
@@ -603,6 +660,7 @@ class OuterLoop:
             steps = len(self._depths) - 1
             values['step'] = f'{min(control.step, steps)} of {steps}'
             values['guide x, z [m]'] = f'{self._goal[1]:.6f}, {self._goal[2]:.6f}'
+            values['turns left'] = control.turns
             values['chance to come within 1 mm'] = f'{control.chance:.3f}'
             values['bending length over the believed one'] = f'{control.bending:.3f}'
             if self.expected is not None:

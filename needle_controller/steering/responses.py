@@ -10,14 +10,16 @@ with positions :math:`b_j` of the guide in the steps, and unknown constants
 :math:`\theta`: origin and turn of the sensor's frame, tilt, bevel, and a curvature of the path
 at each depth, with straight lines between. A and H depend on the bending length and on the skin,
 and so there is one of them for each of a grid of these: the hypotheses. What is between two of
-them is two more unknown constants, with how A changes from one to the next. Both planes have the
-same.
+them is two more unknown constants, with how A changes from one to the next.
+
+Both planes have the same, so that everything is a complex number, x + i z. At a roll
+:math:`\varphi` the bevel pushes along :math:`i e^{-i \varphi}`.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
-from math import ceil
+from math import ceil, pi
 from typing import Final
 
 from needle_controller.steering.belief import SteeringBelief
@@ -36,7 +38,7 @@ OF_NEEDLE: Final = (
     'length', 'youngs_modulus', 'area_moment', 'tissue_stiffness', 'layer_depths',
     'layer_stiffnesses',
 )  # fmt: skip
-OF_STEERING: Final = ('free_length', 'skin_stiffness')
+OF_STEERING: Final = ('free_length', 'skin_stiffness', 'bevel_load')
 
 #: Hypotheses of the bending length and of the skin.
 _LENGTHS, _SKINS = 13, 4
@@ -78,8 +80,16 @@ class SteeringModel:
         Shift of the tip at each depth per position of the guide in each step: it moves there while
         the needle rests, and stays while the needle goes in.
     causes : ndarray, shape (h, n + 1, 5 + n)
-        The same per origin [m], turn of the frame [rad], tilt, load of the bevel [N], and
-        curvature of the path at each depth [1/m].
+        The same per origin [m], turn of the frame [rad], tilt, load of the bevel [N] without
+        roll, and curvature of the path at each depth [1/m].
+    bevel : ndarray, shape (h, n + 1, n + 1)
+        The same per load of the bevel [N] on the skin, and in each step.
+    elastic : ndarray, shape (h, n + 1)
+        What a load of the bevel on the resting tip adds at once [m/N].
+    guide_load, causes_load, bevel_load : ndarray, shape (h, n, n), (h, n, 5 + n), (h, n, n + 1)
+        What the guide feels [N] after its motion in each step, of the same.
+    push : float
+        Believed load of the bevel, along z at zero roll [N].
     between : ndarray, shape (2, h, n + 1, n)
         Change of `guide` from one hypothesis to the next in bending length, and in skin.
     prior : ndarray, shape (7 + n, 7 + n)
@@ -121,8 +131,11 @@ class SteeringModel:
         self.lengths, self.skins = (grid.ravel() for grid in np.meshgrid(lengths, skins))
         pairs = zip(self.lengths.tolist(), self.skins.tolist(), strict=True)
         found = [self._respond(needle, steering, *pair) for pair in pairs]
-        self.guide = np.array([guide for guide, _ in found])
-        self.causes = np.array([causes for _, causes in found])
+        (
+            self.guide, self.causes, self.bevel, self.elastic,
+            self.guide_load, self.causes_load, self.bevel_load,
+        ) = map(np.array, zip(*found, strict=True))  # fmt: skip
+        self.push = max(steering.bevel_load)
         grid = self.guide.reshape(len(skins), len(lengths), *self.guide.shape[1:])
         self.between = np.array(
             [
@@ -147,34 +160,42 @@ class SteeringModel:
 
     def _respond(
         self, needle: NeedleParameters, steering: SteeringParameters, length: float, skin: float
-    ) -> tuple[FloatArray, FloatArray]:
+    ) -> tuple[FloatArray, ...]:
         """Insert a needle once for each cause."""
         n, at = self.steps, self.depths
         smallest = float(np.diff(at).min())
         wanted = smallest / ceil(smallest / _ELEMENT - 1e-9)
-        beyond = replace(steering, element=wanted, bevel_load=(0.0,), path_noise=0.0)
+        # Of layers with different loads of the bevel their ratio is believed.
+        most = max(steering.bevel_load)
+        loads = tuple(one / most for one in steering.bevel_load) if most else (1.0,)
+        beyond = replace(steering, element=wanted, bevel_load=loads, path_noise=0.0)
         other, beyond = with_lengths(needle, beyond, length, skin)
         base = steered(other, beyond)
         reach = at[-1] + steering.free_length
-        runs = 2 * n + 3
+        runs = 3 * n + 3
         # First the guide, then the needle: so it does not matter how fast either is.
         poses = np.zeros((runs, 2 * n + 1, 6))
         poses[:, ::2, 0], poses[:, 1::2, 0] = at, at[:-1]
         for k in range(n):
             poses[k, 2 * k + 1 : 2 * k + 3, 1] = 1.0
         poses[n, :, 2] = 1.0
+        # A bevel that pushes along z in one step, and along x in all others.
+        bevels = slice(n + 1, 2 * n + 2)
+        poses[bevels, :, 5] = 0.5 * pi
+        poses[n + 1, 0, 5] = 0.0
+        for k in range(n):
+            poses[n + 2 + k, 2 * k + 1 : 2 * k + 3, 5] = 0.0
         layers = np.zeros((runs, 3, len(base.starts)))
         layers[:, 0], layers[:, 1] = base.starts, base.stiffness
-        # At zero roll the bevel pushes along z.
-        layers[n + 1, 2] = 1.0
+        layers[bevels, 2] = base.bevel
         cells = ceil(reach / base.element) + 2
         middle = (np.arange(cells) + 0.5) * base.element
-        loads = np.array([turning_load(base.ei, other.tissue.stiffness(y)) for y in middle])
+        turning = np.array([turning_load(base.ei, other.tissue.stiffness(y)) for y in middle])
         wander = np.zeros((runs, cells, 2))
         hats = [np.interp(middle, at, one) for one in np.eye(n + 1)]
-        wander[n + 2 :, :, 0] = hats * loads
+        wander[2 * n + 2 :, :, 0] = hats * turning
         numbers = [base.ei, base.element, base.skin, 0.0, 0.0, reach]
-        tips = np.empty((runs, 2 * n + 1, 2))
+        tips, felt = np.empty((2, runs, 2 * n + 1, 2))
         insert(
             np.array([[*numbers, steering.free_length]]),
             layers,
@@ -184,7 +205,24 @@ class SteeringModel:
             np.arange(runs),
             empty_cut(reach, base.element, len(base.starts)),
             tips,
+            felt,
         )
-        x, bent = tips[:, ::2, 0].T, tips[n + 1, ::2, 1]
-        causes = [np.ones(n + 1), at, x[:, n], bent, *x[:, n + 2 :].T]
-        return x[:, :n], np.array(causes).T
+
+        def sorted_by_cause(
+            found: FloatArray, origin: FloatArray, turn: FloatArray
+        ) -> tuple[FloatArray, FloatArray, FloatArray]:
+            x, bevel = found[:, :, 0].T, found[bevels, :, 1].T
+            causes = [origin, turn, x[:, n], bevel.sum(axis=1), *x[:, 2 * n + 2 :].T]
+            return x[:, :n], np.array(causes).T, bevel
+
+        # A bevel that is turned at rest moves the tip at once.
+        rests = np.arange(n)
+        own = tips[n + 2 + rests, :, 1]
+        elastic = own[rests, 2 * rests + 1] - own[rests, 2 * rests]
+        # The sensor has no part in what the guide feels.
+        none = np.zeros(n)
+        return (
+            *sorted_by_cause(tips[:, ::2], np.ones(n + 1), at),
+            np.append(elastic, elastic[-1]),
+            *sorted_by_cause(felt[:, 1::2], none, none),
+        )

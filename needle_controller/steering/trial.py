@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from math import hypot
+from typing import NamedTuple
 
 from needle_controller.steering.belief import SteeringBelief
+from needle_controller.steering.controller import Guidance
 from needle_dynamics.arrays import FloatArray
 from needle_dynamics.parameters import NeedleParameters
 from needle_dynamics.steering.needle import SteeredNeedle
@@ -119,15 +121,38 @@ def drawn(
     )
 
 
+class Inserted(NamedTuple):
+    """
+    An insertion that has ended.
+
+    Attributes
+    ----------
+    needle : SteeredNeedle
+        The needle at the end.
+    way : float
+        Way of the guide [m].
+    turns : int
+        How often the needle was turned.
+    load : float
+        Largest force on the guide after a motion of it [N].
+
+    """
+
+    needle: SteeredNeedle
+    way: float
+    turns: int
+    load: float
+
+
 def insert(
     truth: Truth,
     depths: FloatArray,
     look: Callable[[FloatArray], FloatArray | None],
-    controller: Callable[[FloatArray | None], tuple[float, float]],
+    controller: Callable[[FloatArray | None], Guidance],
     watch: Callable[[SteeredNeedle], object] | None = None,
-) -> tuple[SteeredNeedle, float]:
+) -> Inserted:
     """
-    Insert a needle in steps: look at the tip, move the guide, then the needle.
+    Insert a needle in steps: look at the tip, move the guide and turn the needle, then insert it.
 
     Parameters
     ----------
@@ -139,27 +164,26 @@ def insert(
         Takes the tip in the frame of the sensor, shape (2,), and returns what it says of it, or
         None.
     controller : callable
-        Takes that, and returns where the guide shall be in the next step [m].
+        Takes that, and returns where guide and roll shall be in the next step.
     watch : callable, optional
         Called with the needle after each step.
 
     Returns
     -------
-    SteeredNeedle
-        The needle at the end.
-    float
-        Way of the guide [m].
+    Inserted
+        The needle at the end, and what it took.
 
     """
     one = truth.start()
-    guide, way = (0.0, 0.0), 0.0
+    begun, to, way, turns, load = one.roll, Guidance(0.0, 0.0), 0.0, 0, 0.0
     for k, depth in enumerate(depths.tolist()):
         if k:
-            one.move(guide=guide)
+            one.move(guide=to[:2], roll=begun + to.roll)
+            load = max(load, float(np.hypot(*one.guide_load[0])))
             one.move(depth=depth)
             if watch is not None:
                 watch(one)
-        to = controller(look(truth.tip(one)))
-        way += hypot(to[0] - guide[0], to[1] - guide[1])
-        guide = to
-    return one, way
+        before, to = to, controller(look(truth.tip(one)))
+        way += hypot(to.x - before.x, to.z - before.z)
+        turns += to.roll != before.roll
+    return Inserted(one, way, turns, load)

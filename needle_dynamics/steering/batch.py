@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 import os
 
 from needle_dynamics.arrays import FloatArray
-from needle_dynamics.compiled.cut import insert
+from needle_dynamics.compiled.cut import insert, NOT_FELT
 from needle_dynamics.parameters import NeedleParameters
 from needle_dynamics.simulated.trajectory import floats
 from needle_dynamics.steering.needle import empty_cut, steered, wandering
@@ -118,7 +118,7 @@ def insert_batch(
 
     def take(worker: int) -> None:
         share = np.arange(worker, runs, workers)
-        insert(values, layers, cell, wander, poses, share, rooms[worker], tips)
+        insert(values, layers, cell, wander, poses, share, rooms[worker], tips, NOT_FELT)
 
     with ThreadPoolExecutor(workers) as pool:
         list(pool.map(take, range(workers)))

@@ -6,14 +6,20 @@ import argparse
 from collections.abc import Mapping
 from dataclasses import asdict, replace
 import json
-from math import isfinite
+from math import inf, isfinite
 from pathlib import Path
 import sys
 from typing import Any, Final, NamedTuple
 
-from needle_controller import SteeringBelief, SteeringController, SteeringModel
+from needle_controller import (
+    OutOfReachError,
+    SteeringBelief,
+    SteeringController,
+    SteeringModel,
+)
+from needle_controller.steering.controller import Guidance
 from needle_controller.steering.responses import OF_NEEDLE, OF_STEERING
-from needle_controller.steering.trial import drawn, insert
+from needle_controller.steering.trial import drawn, insert, Truth
 from needle_dynamics import (
     FloatArray,
     NeedleParameters,
@@ -26,7 +32,7 @@ from needle_identification.result import write_whole
 from needle_insertion.commands.common import check_file, Command, constants
 from needle_insertion.commands.simulate_steering import made
 from needle_insertion.report.content import png
-from needle_insertion.report.insertion import draw_needle
+from needle_insertion.report.insertion import draw_needle, draw_reach
 from needle_insertion.report.text import table
 from needle_ros.errors import ParameterError
 from needle_ros.settings import from_values, unknown_name
@@ -92,6 +98,16 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
         help=f'farthest position of the guide along x and z (default {LIMIT:g} m)',
     )
     parser.add_argument(
+        '--turns', type=int, default=0, help='how often the needle may be turned (default 0)'
+    )
+    parser.add_argument(
+        '--load-limit',
+        type=float,
+        default=inf,
+        metavar='N',
+        help='largest lateral force of the guide that is planned (default: none)',
+    )
+    parser.add_argument(
         '--seed', type=int, default=0, help='seed of the true needle and of all noise (default 0)'
     )
     parser.add_argument(
@@ -152,28 +168,44 @@ def _task(options: argparse.Namespace) -> _Task:
     )
 
 
+def _truth(
+    needle: NeedleParameters, steering: SteeringParameters, belief: SteeringBelief, seed: int
+) -> Truth:
+    """Draw the true needle; its bevel is the believed one with what nobody knows."""
+    nearer = {name: _DRAWN * getattr(belief, name) for name in ('tilt', 'frame', 'bevel')}
+    found = drawn(needle, steering, replace(belief, **nearer), np.random.default_rng(seed), seed)
+    bevel = found.bevel + np.array([0.0, max(steering.bevel_load)])
+    load = float(np.hypot(*bevel))
+    return replace(found, bevel=bevel, steering=replace(found.steering, bevel_load=(load,)))
+
+
 def _run(options: argparse.Namespace) -> int:
     """Steer, write the picture, and print where both needles end."""
     target, needle, steering, belief, depths = _task(options)
     aim = target[[0, 2]]
     model = SteeringModel(needle, steering, depths, belief)
-    controller = SteeringController(model, aim, options.limit)
-    nearer = {name: _DRAWN * getattr(belief, name) for name in ('tilt', 'frame', 'bevel')}
-    drawing = np.random.default_rng(options.seed)
-    truth = drawn(needle, steering, replace(belief, **nearer), drawing, options.seed)
+    limits = options.limit, options.turns, options.load_limit
+    try:
+        controller = SteeringController(model, aim, *limits)
+    except OutOfReachError as error:
+        if options.output is not None:
+            write_whole(options.output, png(draw_reach(error.reach, aim)))
+        raise
+    truth = _truth(needle, steering, belief, options.seed)
     noise = np.random.default_rng([options.seed, 1])
     shapes, warnings = list[FloatArray](), list[str]()
 
     def look(tip: FloatArray) -> FloatArray:
         return np.asarray(tip + belief.noise * noise.standard_normal(2))
 
-    def follow(tip: FloatArray | None) -> tuple[float, float]:
+    def follow(tip: FloatArray | None) -> Guidance:
         depth, to = depths[controller.step], controller.next(tip)
         if controller.warning and not warnings and depth < target[1]:
             warnings.append(f'at a depth of {1e3 * depth:.4g} mm: {controller.warning}')
         return to
 
-    ours, way = insert(truth, depths, look, follow, lambda one: shapes.append(_line(one.shape)))
+    done = insert(truth, depths, look, follow, lambda one: shapes.append(_line(one.shape)))
+    ours = done.needle
     alone = truth.start()
     alone.move(depth=float(target[1]))
     tip, other, there = truth.tip(ours), truth.tip(alone), controller.expected()
@@ -185,7 +217,9 @@ def _run(options: argparse.Namespace) -> int:
         'its interval of 95 % [m]': (_NORMAL * np.sqrt(np.diag(there.covariance))).tolist(),
         'miss [m]': float(np.hypot(*(tip - aim))),
         'miss open loop [m]': float(np.hypot(*(other - aim))),
-        'way of the guide [m]': way,
+        'way of the guide [m]': done.way,
+        'turns': done.turns,
+        'largest load on the guide [N]': done.load,
         'bending length over the believed one': controller.bending,
         'warnings': warnings,
     }
@@ -204,7 +238,8 @@ def _run(options: argparse.Namespace) -> int:
         return 0
     sys.stdout.write(
         f'{options.needle}, seed {options.seed}: {len(depths) - 1} steps to '
-        f'{1e3 * target[1]:g} mm, the guide moved by {1e3 * way:.1f} mm in all\n\n'
+        f'{1e3 * target[1]:g} mm, the guide moved by {1e3 * done.way:.1f} mm in all '
+        f'with {done.load:.1f} N at most, the needle turned {done.turns} times\n\n'
         f'{_text(found)}\n'
     )
     if options.output is not None:

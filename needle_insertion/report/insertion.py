@@ -8,6 +8,7 @@ from io import StringIO
 from pathlib import Path
 from typing import Final, TYPE_CHECKING
 
+from needle_controller.steering.controller import Reach
 from needle_dynamics import FloatArray, Insertion, NeedlePath, NeedleShape
 from needle_identification.result import write_whole
 from needle_insertion.report.content import png
@@ -219,4 +220,42 @@ def draw_needle(
         axes.grid(visible=True, alpha=0.3)
     axes.set_xlabel('depth y [mm]')
     figure.legend(*axes.get_legend_handles_labels(), loc='outside upper right', ncols=4)
+    return figure
+
+
+def draw_reach(reach: Reach, target: FloatArray) -> Figure:
+    """
+    Draw where the tip can be brought, at the depth of a target that is out of reach.
+
+    Parameters
+    ----------
+    reach : Reach
+        What is within reach, by what may be true: the more probable, the darker.
+    target : ndarray, shape (2,)
+        The target, x and z [m].
+
+    Returns
+    -------
+    Figure
+        The picture.
+
+    """
+    from matplotlib.figure import Figure
+    from matplotlib.patches import Rectangle
+
+    figure = Figure(figsize=(6.0, 6.0), layout='constrained')
+    axes = figure.subplots()
+    for middle, size, weight in zip(*reach, strict=True):
+        low = 1e3 * (middle - size * (1.0 + 1.0j))
+        shade = min(1.0, 2.0 * weight)
+        axes.add_patch(
+            Rectangle((low.real, low.imag), 2e3 * size, 2e3 * size, color='tab:blue', alpha=shade)
+        )
+    axes.plot(*(1e3 * target), 'rx', ms=10.0, mew=2.0, label='target')
+    axes.plot(0.0, 0.0, 'k+', ms=10.0, label='axis of the guide')
+    axes.set(
+        xlabel='x [mm]', ylabel='z [mm]', title='Where the tip can be brought', aspect='equal'
+    )
+    axes.margins(0.1)
+    axes.legend()
     return figure

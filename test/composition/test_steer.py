@@ -45,10 +45,29 @@ def test_what_is_known_hits_nearer(capsys: pytest.CaptureFixture[str]) -> None:
     assert found['miss [m]'] < 6e-5
 
 
-def test_out_of_reach_is_said_before_or_on_the_way(capsys: pytest.CaptureFixture[str]) -> None:
-    _, said = steered(capsys, '--target=0.05,0.1,0', status=1)
+def test_roll_and_loads_are_counted(capsys: pytest.CaptureFixture[str]) -> None:
+    """A bevel is turned by roll alone; with the guide, whose load has a limit."""
+    bevel = ['--set', 'bevel_load=0.8', '--belief', 'tilt=0.01', '--belief', 'frame=0.01']
+    near = '--target=0.001,0.1,0.003'
+    rolled, _ = steered(capsys, near, *bevel, '--turns', '6', '--limit', '0')
+    assert rolled['miss [m]'] < 1.5e-3 < 5e-3 < rolled['miss open loop [m]']
+    assert 1 <= rolled['turns'] <= 6
+    assert rolled['way of the guide [m]'] == 0.0
+    free, _ = steered(capsys)
+    bound, _ = steered(capsys, '--load-limit', '1')
+    assert bound['largest load on the guide [N]'] < 1.3 < free['largest load on the guide [N]']
+    assert bound['miss [m]'] < 4e-4
+
+
+def test_out_of_reach_is_said_before_or_on_the_way(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    picture = tmp_path / 'reach.png'
+    _, said = steered(capsys, '--target=0.05,0.1,0', '-o', str(picture), status=1)
+    # Beside the words a picture of what is within reach.
+    assert picture.read_bytes().startswith(b'\x89PNG')
     assert 'the target x = 50.00 mm, z = 0.00 mm is out of reach: from here a tip within' in said
-    found, said = steered(capsys, '--target=-0.02,0.1,0')
+    found, said = steered(capsys, '--target=-0.026,0.1,0')
     assert found['miss [m]'] > 1e-3
     assert found['warnings']
     assert 'warning: at a depth of' in said
@@ -62,11 +81,14 @@ def test_out_of_reach_is_said_before_or_on_the_way(capsys: pytest.CaptureFixture
         (['--target=0,nan,0'], '--target takes X,Y,Z in m with a depth Y > 0, got'),
         (['--target=0,0.3,0'], r'depths must be in [0, 0.16] m'),
         (['--step', '0'], '--step must be in (0, 0.1] m'),
-        (['--limit', '-1'], 'position_limit must be positive and finite'),
+        (['--limit', '-1'], 'position_limit must be finite and >= 0'),
         (['--belief', 'spread=2'], 'spread must be finite'),
         (['--belief', 'sprad=0.1'], 'sprad'),
         (['--set', 'colour=1'], 'colour'),
-        (['--set', 'bevel_load=1'], 'bevel_load'),
+        (['--set', 'cutting_force=1'], 'cutting_force'),
+        (['--turns', '-1'], 'turns must be >= 0, got -1'),
+        (['--limit', '0'], 'position_limit and turns cannot both be 0: nothing would move'),
+        (['--load-limit', '0'], 'load_limit must be > 0, got 0.0 N'),
         (['--seed', '-1'], '--seed must be >= 0, got -1'),
         (['--target=0,-0.1,0'], 'with a depth Y > 0, got'),
         (['-o', 'needle.csv'], 'the picture must be .png'),

@@ -26,7 +26,6 @@ PLANT = {
     'rate': 200.0,
     'depth': 0.001,
     'model.tissue_stiffness': 5e4,
-    'steering.bevel_load': [0.1],
     'tip.noise': 1e-4,
     'guide.speed_limit': 0.1,
 }
@@ -35,6 +34,7 @@ STEERING = {
     'step_length': 0.01,
     'speed': 0.05,
     'guide_speed': 0.05,
+    'acceleration': 0.4,
     'look_time': 0.15,
     'settle_time': 0.02,
 }
@@ -44,7 +44,9 @@ TARGET = (1.5e-3, 0.051, -1e-3)
 class Bench:
     """A plant and the node in this process, and a user."""
 
-    def __init__(self, graph: RosGraph, mode: str = 'robot', **steering: Any) -> None:
+    def __init__(
+        self, graph: RosGraph, mode: str = 'robot', bevel: float = 0.1, **steering: Any
+    ) -> None:
         self.graph, self.user = graph, graph.node('user')
         self.states = graph.latest(self.user, JointState, 'joint_states', SENSOR)
         self.truth = graph.latest(self.user, JointState, 'ground_truth', SENSOR)
@@ -52,8 +54,10 @@ class Bench:
         self.moves = graph.listen(self.user, JointTrajectory, 'joint_trajectory', COMMAND)
         self.target = self.user.create_publisher(PointStamped, 'target', COMMAND)
         self.stop = self.user.create_client(Trigger, 'steering/stop')
-        self.plant = graph.add(PlantNode, parameters={**PLANT, 'mode': mode})
-        self.steering = graph.add(SteeringNode, parameters={**STEERING, **steering})
+        own = {'mode': mode, 'steering.bevel_load': [bevel]}
+        self.plant = graph.add(PlantNode, parameters={**PLANT, **own})
+        given = {name.replace('__', '.'): value for name, value in steering.items()}
+        self.steering = graph.add(SteeringNode, parameters={**STEERING, **given})
         self.takers = 1
         self.until(
             lambda: (
@@ -132,6 +136,25 @@ def test_it_brings_the_tip_to_its_target(ros_graph: RosGraph) -> None:
     assert {tuple(move.joint_names) for move in bench.moves} == {
         ('insertion', 'guide_x', 'guide_z')
     }
+
+
+def test_a_bevel_is_turned_by_roll_alone(ros_graph: RosGraph) -> None:
+    """The guide rests, the joint roll goes to and fro."""
+    bench = Bench(
+        ros_graph, bevel=1.0, guide_limit=0.0, turns=4, roll_speed=20.0, step_length=0.005,
+        steering__bevel_load=[1.0], belief__tilt=5e-3, belief__frame=5e-3,
+    )  # fmt: skip
+    bench.aim((1e-3, 0.051, 0.0))
+    bench.until(lambda: bench.said.startswith(('done', 'stopped')), 'the end')
+    assert bench.said.startswith('done: the tip is at x = ')
+    # A bevel that always pushes to one side would bring it 5 mm aside.
+    assert np.hypot(*(bench.tip - [1e-3, 0.0])) < 1.5e-3
+    rolls = {move.positions[3] for message in bench.moves for move in message.points[-1:]}
+    assert 2 <= len(rolls) <= 5
+    assert {tuple(move.joint_names) for move in bench.moves} == {
+        ('insertion', 'guide_x', 'guide_z', 'roll')
+    }
+    assert bench.at('guide_x') == bench.at('guide_z') == 0.0
 
 
 def test_an_axis_law_moves_the_needle(ros_graph: RosGraph) -> None:
@@ -235,7 +258,8 @@ def test_what_cannot_be_is_refused_by_name(ros_graph: RosGraph) -> None:
         ('speed', 0.0, 'speed must be finite, > 0 m/s, got 0.0'),
         ('belief.noise', 0.0, 'belief.noise must be finite, > 0 m, got 0.0'),
         ('model.tissue_stiffness', 'soft', "model.tissue_stiffness must be a number, got 'soft'"),
-        ('steering.bevel_load', [0.1], "unknown parameter 'steering.bevel_load'"),
+        ('steering.path_noise', 0.1, "unknown parameter 'steering.path_noise'"),
+        ('turns', 0.5, 'turns must be a whole number, got 0.5'),
         ('model.preset', 'bone', 'model.preset must be one of paper_si'),
     ):
         node = ros_graph.add(SteeringNode, start=False, parameters={name: value})

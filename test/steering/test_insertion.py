@@ -119,13 +119,14 @@ def test_withdrawn_and_in_again_it_does_not_cut() -> None:
     while one.depth > 0.04:
         one.carry(0.01, -0.02)
     one.carry(0.1, 4e-3)
-    while one.depth < 0.0499:
+    while one.depth < 0.0489:
         before = one.depth
         force = one.carry(0.01, 4e-3)
         middle = 0.5 * (before + one.depth)
         expected = force_at(middle, 4e-3) - 2.0
         assert one.depth >= 0.05 or force == pytest.approx(expected, rel=1e-9)
-    assert (one.needle.load == 0.0).all() or one.depth >= 0.05
+    # Uncut tissue is felt from 1 mm before it.
+    assert (one.needle.load == 0.0).all()
     while one.depth < 0.05:
         force = one.carry(0.01, 4e-3)
     force = one.carry(0.01, 4e-3)

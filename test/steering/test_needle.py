@@ -153,6 +153,21 @@ def test_planes_may_be_turned() -> None:
     assert_allclose(np.array(second)[:, 2], -x, atol=1e-15)
 
 
+def test_the_bevel_lets_go_gradually_on_the_way_back() -> None:
+    """Over a millimeter, in proportion; a needle that comes back by nanometers does not jump."""
+    one = SteeredNeedle(PAPER, SteeringParameters(bevel_load=(0.5,)))
+    one.move(depth=0.05)
+    tip, load = one.tip, one.load
+    one.move(depth=0.05 - 1e-9)
+    assert_allclose(one.load, load, rtol=2e-6)
+    assert_allclose(one.tip[[0, 2]], tip[[0, 2]], atol=1e-8)
+    for part in (0.25, 0.5, 1.0, 3.0):
+        one.move(depth=0.05 - 1e-3 * part)
+        assert_allclose(one.load, max(0.0, 1.0 - part) * load, atol=1e-12)
+    one.move(depth=0.05)
+    assert (one.tip == tip).all()
+
+
 def test_out_and_in_again_follows_the_path() -> None:
     one = steered(0.3)
     way(one)

@@ -9,13 +9,14 @@ from typing import Any
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from needle_controller import (
+    Guidance,
     OutOfReachError,
     SteeringBelief,
     SteeringController,
     SteeringFaultError,
     SteeringModel,
 )
-from needle_controller.steering.baselines import Broyden, OpenLoop, Springs
+from needle_controller.steering.baselines import Broyden, OpenLoop, RollTowards, Springs
 from needle_dynamics import (
     FloatArray,
     JobError,
@@ -54,12 +55,13 @@ def steer(
 ) -> FloatArray:
     """Insert a needle; return where its tip ends. No sensor says the same twice."""
     rng = np.random.default_rng(seed)
-    guide = (0.0, 0.0)
+    to = Guidance(0.0, 0.0)
+    begun = needle.roll
     for k, depth in enumerate(DEPTHS.tolist()):
         if k:
-            needle.move(guide=guide)
+            needle.move(guide=to[:2], roll=begun + to.roll)
             needle.move(depth=depth)
-        guide = controller.next(needle.tip[[0, 2]] + noise * rng.standard_normal(2))
+        to = controller.next(needle.tip[[0, 2]] + noise * rng.standard_normal(2))
     return needle.tip[[0, 2]]
 
 
@@ -182,7 +184,8 @@ def faulty(change: dict[int, Any]) -> tuple[SteeringController, SteeredNeedle]:
     before: Any = None
     for k, depth in enumerate(DEPTHS.tolist()):
         if k:
-            one.move(depth=depth, guide=guide)
+            one.move(guide=guide)
+            one.move(depth=depth)
         look: Any = one.tip[[0, 2]] + 4e-5 * rng.standard_normal(2)
         if k in change:
             what = change[k]
@@ -190,7 +193,7 @@ def faulty(change: dict[int, Any]) -> tuple[SteeringController, SteeredNeedle]:
             if isinstance(what, float):
                 look = look + np.array([what, 0.0])
         before = look
-        guide = controller.next(look)
+        guide = controller.next(look)[:2]
     return controller, one
 
 
@@ -237,11 +240,12 @@ def test_a_frame_that_is_wrong_by_ten_degrees_hits_or_is_said(seed: int) -> None
     controller, guide = SteeringController(MODEL, target), (0.0, 0.0)
     for k, depth in enumerate(DEPTHS.tolist()):
         if k:
-            one.move(depth=depth, guide=guide)
+            one.move(guide=guide)
+            one.move(depth=depth)
         tip = turn @ one.tip[[0, 2]]
         said = ''
         try:
-            guide = controller.next(tip + 4e-5 * rng.standard_normal(2))
+            guide = controller.next(tip + 4e-5 * rng.standard_normal(2))[:2]
         except SteeringFaultError as error:
             said = str(error)
             break
@@ -262,8 +266,14 @@ def test_bad_input_is_named() -> None:
         SteeringController(MODEL, (0.0, 0.1, 0.0))
     with pytest.raises(ParameterError, match='target must be finite'):
         SteeringController(MODEL, (0.0, np.inf))
-    with pytest.raises(ParameterError, match='position_limit must be positive'):
+    with pytest.raises(ParameterError, match='position_limit must be finite and >= 0'):
+        SteeringController(MODEL, (0.0, 0.0), position_limit=-1.0)
+    with pytest.raises(ParameterError, match='position_limit and turns cannot both be 0'):
         SteeringController(MODEL, (0.0, 0.0), position_limit=0.0)
+    with pytest.raises(ParameterError, match='turns must be >= 0'):
+        SteeringController(MODEL, (0.0, 0.0), turns=-1)
+    with pytest.raises(ParameterError, match='load_limit must be > 0'):
+        SteeringController(MODEL, (0.0, 0.0), load_limit=0.0)
     with pytest.raises(ParameterError, match='spread must be finite'):
         SteeringBelief(spread=-0.1)
     controller = SteeringController(MODEL, (0.0, 0.0))
@@ -294,4 +304,81 @@ def test_others_do_what_they_say() -> None:
     assert miss['Broyden'] < miss['open']
     # A tip that was not seen moves nothing.
     rests = Broyden(NEEDLE, STEERING, DEPTHS, target)
-    assert rests.next(None) == (0.0, 0.0)
+    assert rests.next(None) == Guidance(0.0, 0.0)
+
+
+#: A needle with a bevel, as it is believed.
+BEVELED = replace(STEERING, bevel_load=(0.8,))
+BEVEL_MODEL = SteeringModel(NEEDLE, BEVELED, DEPTHS)
+
+
+def test_tip_and_load_are_linear_in_guide_roll_and_bevel() -> None:
+    """Those of `SteeredNeedle` that is turned in every step; the load after each motion."""
+    alone = SteeringModel(NEEDLE, STEERING, DEPTHS, SteeringBelief(spread=0.0))
+    rng = np.random.default_rng(2)
+    guide, rolls = 3e-3 * rng.standard_normal((20, 2)), np.cumsum(rng.standard_normal(20))
+    one = SteeredNeedle(NEEDLE, replace(STEERING, bevel_load=(0.3,)), tilt=(0.02, -0.01))
+    at, tilt = guide @ [1.0, 1.0j], 0.02 - 0.01j
+    push = 0.3j * np.concatenate([[1.0], np.exp(-1j * rolls)])
+    for k, depth in enumerate(DEPTHS[1:].tolist()):
+        one.move(guide=guide[k].tolist(), roll=float(rolls[k]))
+        load = alone.guide_load[0, k] @ at + alone.causes_load[0, k, 2] * tilt
+        load += alone.bevel_load[0, k] @ push
+        # Elements of 1 and 1.25 mm; loads are newtons.
+        assert load == pytest.approx(complex(*one.guide_load[0]), abs=2e-3)
+        one.move(depth=depth)
+        tip = alone.guide[0, k + 1] @ at + alone.causes[0, k + 1, 2] * tilt
+        tip += alone.bevel[0, k + 1] @ push
+        assert tip == pytest.approx(complex(*one.tip[[0, 2]]), abs=5e-6)
+
+
+@pytest.mark.parametrize(('limit', 'turns', 'within'), [(0.0, 6, 1.5e-3), (6e-3, 6, 8e-4)])
+@pytest.mark.parametrize('seed', range(4))
+def test_a_bevel_is_turned_towards_the_target(
+    limit: float, turns: int, within: float, seed: int
+) -> None:
+    """
+    By roll alone, and with the guide; as often as it may be.
+
+    95 % of such needles end within 2.8 and 0.6 mm (`needle bench steering`), with targets that are
+    twice as far and a sensor that is turned.
+    """
+    rng = np.random.default_rng(seed)
+    reach = 0.8 * np.abs(BEVEL_MODEL.bevel[26, -1]).sum()
+    target = 0.5 * reach * rng.uniform(-1.0, 1.0, 2)
+    needle, steering = other(1.0 + 0.2 * rng.uniform(-1.0, 1.0))
+    steering = replace(steering, bevel_load=(0.8 * (1.0 + 0.2 * rng.uniform(-1.0, 1.0)),))
+    miss = {}
+    controllers: dict[str, SteeringController | OpenLoop] = {
+        'ours': SteeringController(BEVEL_MODEL, target, limit, turns),
+        'towards': RollTowards(DEPTHS, target),
+        'rests': OpenLoop(DEPTHS, target),
+    }
+    for name, controller in controllers.items():
+        one = SteeredNeedle(needle, steering, tilt=(5e-3, -5e-3))
+        miss[name] = float(np.hypot(*(steer(controller, one, noise=4e-5, seed=seed) - target)))
+        if isinstance(controller, SteeringController):
+            assert 0 <= controller.turns <= turns
+            assert np.abs(one.guide).max() <= limit
+    assert miss['ours'] < within
+    assert max(miss['ours'], miss['towards']) < miss['rests']
+
+
+def test_the_load_on_the_guide_stays_within_its_limit() -> None:
+    """Where no limit is, the guide would push twice as hard; the target is still hit."""
+    target, loads, miss = (3e-3, 2e-3), {}, {}
+    for limit in (np.inf, 2.0):
+        controller = SteeringController(MODEL, target, load_limit=limit)
+        one, to, felt = SteeredNeedle(*other(1.0), tilt=(0.01, 0.0)), Guidance(0.0, 0.0), [0.0]
+        rng = np.random.default_rng(1)
+        for k, depth in enumerate(DEPTHS.tolist()):
+            if k:
+                one.move(guide=to[:2])
+                felt.append(float(np.abs(one.guide_load[0]).max()))
+                one.move(depth=depth)
+            to = controller.next(one.tip[[0, 2]] + 1e-5 * rng.standard_normal(2))
+        loads[limit], miss[limit] = max(felt), np.hypot(*(one.tip[[0, 2]] - target))
+    assert loads[np.inf] > 3.5
+    # Until it is learned how the needle bends, what is planned is what is believed.
+    assert loads[2.0] < 3.0
+    assert miss[2.0] < 1e-3
