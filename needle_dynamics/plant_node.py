@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import fields
 from functools import partial
 import json
+from math import ceil
 import sys
 from time import monotonic_ns
 from typing import Any
@@ -212,6 +214,8 @@ class PlantNode(ModelNode):
         # Rounding to counts may leave a saturated reading just below.
         self._full_scale = [limit * (1.0 - 1e-9) for limit in limits]
         self._period = NANOSECONDS / own.rate
+        #: Of the latest samples: what is measured may leave later.
+        self._stamps: deque[int] = deque(maxlen=ceil(constants.tip.delay * own.rate) + 1)
         self._patience = 0.25 * own.backlog * NANOSECONDS
         self._exhausted = (
             f'commands have put in more than {own.power_limit:g} J within a second (power_limit); '
@@ -456,8 +460,11 @@ class PlantNode(ModelNode):
             self._draw(plant_run, stamp)
         self._last = stamp, measured[-1]
         fault, faulty, publish = self._fault, self._faulty, self._publish
+        stamps = self._stamps
+        stamps.append(stamp)
         for topic, age, values in measured:
-            at = stamp - round(age * self._period) if age else stamp
+            # Its own, also if time has jumped since: after a stall samples are given up.
+            at = stamps[-1 - age] if age < len(stamps) else stamp - round(age * self._period)
             if fault is None or topic != faulty:
                 publish[topic](at, values)
             else:

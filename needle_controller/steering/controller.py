@@ -47,7 +47,7 @@ _TURN: Final = 1e-4**2
 _OVERLOAD: Final = 1.0
 
 #: Standard deviation of the part of the bevel's load that a robot at rest takes away.
-_LET_GO: Final = 0.1
+_LET_GO: Final = 0.03
 
 #: Place of the load of the bevel among the causes.
 _BEVEL: Final = 3
@@ -84,15 +84,15 @@ class Reach(NamedTuple):
     ----------
     middles : ndarray of complex, shape (h,)
         Where it goes without further motion, x + i z [m].
-    sizes : ndarray, shape (h,)
-        How far it can be brought from there along each axis [m].
+    sizes : ndarray of complex, shape (h,)
+        How far it can be brought from there, along x + i along z [m].
     weights : ndarray, shape (h,)
         Probability of each hypothesis.
 
     """
 
     middles: ComplexArray
-    sizes: FloatArray
+    sizes: ComplexArray
     weights: FloatArray
 
 
@@ -222,6 +222,8 @@ class SteeringController:
         Largest force of the guide on needle and tissue that is planned, along x and along z [N].
     roll : float
         Roll of the needle at the start [rad].
+    step_limit : float
+        Farthest that the guide may go from one step to the next along x and along z [m].
 
     Attributes
     ----------
@@ -273,6 +275,7 @@ class SteeringController:
         turns: int = 0,
         load_limit: float = inf,
         roll: float = 0.0,
+        step_limit: float = inf,
     ) -> None:
         if not 0.0 <= position_limit < inf:
             raise ParameterError(
@@ -280,11 +283,17 @@ class SteeringController:
             )
         if not load_limit > 0.0:
             raise ParameterError(f'load_limit must be > 0, got {load_limit!r} N')
+        if not step_limit > 0.0:
+            raise ParameterError(f'step_limit must be > 0, got {step_limit!r} m')
         if turns < 0:
             raise ParameterError(f'turns must be >= 0, got {turns!r}')
         if position_limit == 0.0 and turns == 0:
             raise ParameterError('position_limit and turns cannot both be 0: nothing would move')
         self._model, self._limit, self._load_limit = model, position_limit, load_limit
+        #: Farthest that the guide may have gone after so many steps, from 1 [m].
+        self._ways = np.minimum(
+            step_limit * np.arange(1.0, model.steps + 1.0), 2.0 * position_limit
+        )
         self.step, self.turns = 0, turns
         count, size = len(model.lengths), len(model.prior)
         #: Position of the guide, x + i z, and direction of the bevel over that at zero roll, in
@@ -390,22 +399,33 @@ class SteeringController:
     @property
     def chance(self) -> float:
         """How probable it is that the tip can still come within a millimeter of the target."""
-        chance, ends = 1.0, self._ends(self.turns, self.step + 1)
-        sizes = (_REACHED + self._sizes(ends))[:, np.newaxis]
-        need = self._goal - ends.means
-        for plane in (need.real, need.imag):
-            off = np.abs(plane[:, np.newaxis] + ends.errors[:, np.newaxis] * _ABSCISSAS)
-            chance *= float(self.weights @ ((off <= sizes) @ _WEIGHTS))
+        chance, errors = 1.0, self._ends(self.turns, self.step + 1).errors[:, np.newaxis]
+        middles, sizes, w = self.reach
+        need = self._goal - middles
+        for plane, size in ((need.real, sizes.real), (need.imag, sizes.imag)):
+            off = np.abs(plane[:, np.newaxis] + errors * _ABSCISSAS)
+            chance *= float(w @ ((off <= _REACHED + size[:, np.newaxis]) @ _WEIGHTS))
         return chance
 
     @property
     def reach(self) -> Reach:
         """Where the tip can be brought from here."""
-        ends = self._ends(self.turns, self.step + 1)
-        return Reach(ends.means, self._sizes(ends), self.weights)
+        ends, k = self._ends(self.turns, self.step + 1), self.step
+        middles = ends.means.copy()
+        sizes = np.array(ends.turned * (1.0 + 1.0j), dtype=np.complex128)
+        there = self._guide[k - 1] if 0 < k <= self._model.steps else 0j
+        for unit, at in ((1.0, there.real), (1.0j, there.imag)):
+            center, half = self._room(np.array([at]), ends.shifts.shape[1])
+            middles += unit * (ends.shifts @ center[0])
+            sizes += unit * (np.abs(ends.shifts) @ half[0])
+        return Reach(middles, sizes, self.weights)
 
-    def _sizes(self, ends: _Ends) -> FloatArray:
-        return np.asarray(self._limit * np.abs(ends.shifts).sum(axis=1) + ends.turned)
+    def _room(self, begin: FloatArray, count: int) -> tuple[FloatArray, FloatArray]:
+        """Return middle and half width of where the guide can go from positions, (m, count)."""
+        ways, limit = self._ways[:count], self._limit
+        low = np.maximum(begin[:, np.newaxis] - ways, -limit)
+        high = np.minimum(begin[:, np.newaxis] + ways, limit)
+        return 0.5 * (low + high), 0.5 * (high - low)
 
     @property
     def _goal(self) -> complex:
@@ -432,12 +452,12 @@ class SteeringController:
 
     def _unreachable(self) -> str:
         middles, sizes, w = self.reach
-        middle, size = 1e3 * complex(w @ middles), 1e3 * float(w @ sizes)
+        middle, size = 1e3 * complex(w @ middles), 1e3 * complex(w @ sizes)
         x, z = 1e3 * self.target
         return (
-            f'the target x = {x:.2f} mm, z = {z:.2f} mm is out of reach: from here a tip within '
-            f'{size:.2f} mm of x = {middle.real:.2f} mm, z = {middle.imag:.2f} '
-            f'mm, along each axis'
+            f'the target x = {x:.2f} mm, z = {z:.2f} mm is out of reach: from here a tip at '
+            f'x = {middle.real:.2f} ± {size.real:.2f} mm, z = {middle.imag:.2f} ± '
+            f'{size.imag:.2f} mm'
         )
 
     # What is done.
@@ -531,7 +551,7 @@ class SteeringController:
     def _choose(self) -> complex:
         """Return the next position of the guide, and turn the needle if that is worth it."""
         ends = self._ends(self.turns, self.step + 2)
-        tried = np.linspace(-self._limit, self._limit, _TRIED if self._limit else 1)
+        tried = self._tried(_TRIED)
         best = self._best(ends, tried)
         if self.turns == 0 or best.cost < _TURN:
             return best.guide
@@ -540,10 +560,10 @@ class SteeringController:
         base = self._ends(left, self.step + 2)
         columns = slice(self.step + 1, self.step + 2 if left else None)
         load = self._mean[:, _BEVEL] * self._model.bevel[:, -1, columns].sum(axis=1)
-        few = tried[:: max(1, len(tried) // _COARSE)]
         rolls = self._roll + tau * np.arange(1 - _ROLLS // 2, _ROLLS // 2 + 1) / _ROLLS
         ways = np.exp(-1j * rolls)
         others = [base._replace(means=base.means + load * (way - self._way)) for way in ways]
+        few = self._tried(_COARSE)
         costs = [sum(float(cost.min()) for cost in self._costs(one, few)) for one in others]
         k = int(np.argmin(costs))
         if costs[k] + _TURN > best.cost:
@@ -552,24 +572,38 @@ class SteeringController:
         self._turned[self.step + 1 :] = ways[k]
         return self._best(others[k], tried).guide
 
+    def _tried(self, count: int) -> tuple[FloatArray, FloatArray]:
+        """Return positions that the guide may have next, in x and in z [m]."""
+        there = complex(self._guide[self.step - 1]) if self.step else 0j
+        found = []
+        for at in (there.real, there.imag):
+            (middle,), (half,) = (one[0] for one in self._room(np.array([at]), 1))
+            found.append(middle + half * np.linspace(-1.0, 1.0, count if half else 1))
+        return found[0], found[1]
+
     @property
     def _way(self) -> complex:
         """Direction of the bevel now over that at zero roll."""
         return complex(np.exp(-1j * self._roll))
 
-    def _costs(self, ends: _Ends, tried: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def _costs(
+        self, ends: _Ends, tried: tuple[FloatArray, FloatArray]
+    ) -> tuple[FloatArray, FloatArray]:
         """Return the mean square of what positions leave out of reach, in x and in z [m^2]."""
-        w, shifts = self.weights, ends.shifts
-        later = _COUNTED * self._limit * np.abs(shifts[:, 1:]).sum(axis=1) + ends.turned
-        need = self._goal - ends.means
+        w, now, after = self.weights, ends.shifts[:, :1], ends.shifts[:, 1:]
+        sizes, need = np.abs(after), self._goal - ends.means
         spread = ends.errors[:, np.newaxis, np.newaxis] * _ABSCISSAS
         felt, stiffness = self._felt()
         found = []
-        for plane, force in ((need.real, felt.real), (need.imag, felt.imag)):
-            left = plane[:, np.newaxis] - shifts[:, :1] * tried
-            off = np.abs(left[:, :, np.newaxis] + spread)
-            short = np.maximum(0.0, off - later[:, np.newaxis, np.newaxis])
-            over = np.maximum(0.0, np.abs(force + stiffness * tried) - self._load_limit)
+        for plane, force, to in (
+            (need.real, felt.real, tried[0]), (need.imag, felt.imag, tried[1]),
+        ):  # fmt: skip
+            center, half = self._room(to, after.shape[1])
+            left = plane[:, np.newaxis] - now * to - after @ center.T
+            later = _COUNTED * (sizes @ half.T) + ends.turned[:, np.newaxis]
+            off = np.abs(left[..., np.newaxis] + spread)
+            short = np.maximum(0.0, off - later[..., np.newaxis])
+            over = np.maximum(0.0, np.abs(force + stiffness * to) - self._load_limit)
             found.append(w @ (short**2 @ _WEIGHTS) + _OVERLOAD * over**2)
         return found[0], found[1]
 
@@ -585,7 +619,7 @@ class SteeringController:
         force = w @ (model.guide_load[:, k] @ guide + loads.sum(axis=1))
         return complex(force), float(w @ model.guide_load[:, k, k])
 
-    def _best(self, ends: _Ends, tried: FloatArray) -> _Choice:
+    def _best(self, ends: _Ends, tried: tuple[FloatArray, FloatArray]) -> _Choice:
         """Return the best of positions along each axis."""
         w, shifts, limit = self.weights, ends.shifts, self._limit
         # The plan for the mean: least squares, with a price of motion.
@@ -593,11 +627,12 @@ class SteeringController:
         normal = weighted.T @ shifts + _MOTION * np.eye(shifts.shape[1])
         plan = np.linalg.solve(normal, weighted.T @ (self._goal - ends.means))[0]
         whole, found = 0.0, list[float]()
-        for cost, wanted in zip(self._costs(ends, tried), (plan.real, plan.imag), strict=True):
-            away = _AWAY * (tried - np.clip(wanted, -limit, limit)) ** 2
+        wants = plan.real, plan.imag
+        for cost, to, wanted in zip(self._costs(ends, tried), tried, wants, strict=True):
+            away = _AWAY * (to - np.clip(wanted, -limit, limit)) ** 2
             at = int(np.argmin(cost + away))
             whole += float(cost[at])
-            found.append(float(tried[at]))
+            found.append(float(to[at]))
         return _Choice(whole, complex(*found))
 
 

@@ -85,6 +85,10 @@ class OuterLoopSettings:
     guide_limit: float = constant(
         6e-3, 'm', 'farthest position of the guide along x and along z; 0: it stays'
     )
+    guide_step: float = constant(
+        2e-3, 'm', 'farthest that the guide goes from one step to the next along x and along z',
+        open_low=True,
+    )  # fmt: skip
     guide_speed: float = constant(0.02, 'm/s', 'highest speed of the guide', open_low=True)
     acceleration: float = constant(
         0.1, 'm/s^2', 'highest acceleration of needle and guide', open_low=True
@@ -367,6 +371,7 @@ class OuterLoop:
             settings.turns,
             settings.load_limit,
             roll,
+            settings.guide_step,
         )
         self._planned = None
         self._depths, self._begun = depths, depth

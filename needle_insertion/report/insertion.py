@@ -246,10 +246,16 @@ def draw_reach(reach: Reach, target: FloatArray) -> Figure:
     figure = Figure(figsize=(6.0, 6.0), layout='constrained')
     axes = figure.subplots()
     for middle, size, weight in zip(*reach, strict=True):
-        low = 1e3 * (middle - size * (1.0 + 1.0j))
+        low = 1e3 * (middle - size)
         shade = min(1.0, 2.0 * weight)
         axes.add_patch(
-            Rectangle((low.real, low.imag), 2e3 * size, 2e3 * size, color='tab:blue', alpha=shade)
+            Rectangle(
+                (low.real, low.imag),
+                2e3 * size.real,
+                2e3 * size.imag,
+                color='tab:blue',
+                alpha=shade,
+            )
         )
     axes.plot(*(1e3 * target), 'rx', ms=10.0, mew=2.0, label='target')
     axes.plot(0.0, 0.0, 'k+', ms=10.0, label='axis of the guide')

@@ -1,6 +1,7 @@
 """Manners of the simulated plant: pause, step, reset, lock-step, stamps of commands, faults."""
 
 from collections.abc import Callable
+from time import sleep
 from typing import Any
 
 from builtin_interfaces.msg import Duration
@@ -383,3 +384,19 @@ def test_faults_may_come_and_go_while_it_runs(ros_graph: RosGraph) -> None:
     bench.set(fault__kind='none')
     bench.until(lambda: len(bench.tips) > dropped + 10, 'the tip')
     assert 'fault' not in bench.plant.diagnose()[1]
+
+
+def test_a_late_reading_has_the_stamp_of_its_sample_also_over_a_stall(
+    ros_graph: RosGraph,
+) -> None:
+    """After a stall samples are given up, and time jumps: stamps follow it."""
+    bench = Bench(ros_graph, **{'tip.delay': 0.1})
+    bench.further(40)
+    sleep(0.5)
+    bench.further(40)
+    assert bench.counts('samples given up') > 0
+    samples = {stamp_ns(message) for message in bench.states}
+    first = min(samples)
+    late = [stamp_ns(message) for message in bench.tips if stamp_ns(message) >= first]
+    assert len(late) > 40
+    assert set(late) <= samples

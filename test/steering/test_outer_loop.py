@@ -305,7 +305,7 @@ def test_a_needle_must_be_straight_at_the_start() -> None:
     robot.move = Move(np.array([0.1]), robot.at[np.newaxis], np.zeros((1, 3)))
     robot.tick(20)
     assert robot.aim() == ''
-    robot.tick(35)
+    robot.tick(55)
     assert_allclose(robot.at, 0.0, atol=1e-12)
     assert robot.loop.control.step == 0
 

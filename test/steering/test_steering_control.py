@@ -152,7 +152,7 @@ def test_a_target_out_of_reach_is_refused_with_what_is_within_it() -> None:
         OutOfReachError, match=r'x = 40\.00 mm, z = 0\.00 mm is out of reach: from'
     ):
         SteeringController(MODEL, (0.04, 0.0))
-    with pytest.raises(OutOfReachError, match=r'a tip within \d+\.\d\d mm of x = 0\.00 mm'):
+    with pytest.raises(OutOfReachError, match=r'a tip at x = 0\.00 ± \d'):
         SteeringController(MODEL, (8e-3, 0.0), position_limit=1e-4)
 
 
@@ -270,6 +270,8 @@ def test_bad_input_is_named() -> None:
         SteeringController(MODEL, (0.0, 0.0), position_limit=-1.0)
     with pytest.raises(ParameterError, match='position_limit and turns cannot both be 0'):
         SteeringController(MODEL, (0.0, 0.0), position_limit=0.0)
+    with pytest.raises(ParameterError, match='step_limit must be > 0'):
+        SteeringController(MODEL, (0.0, 0.0), step_limit=0.0)
     with pytest.raises(ParameterError, match='turns must be >= 0'):
         SteeringController(MODEL, (0.0, 0.0), turns=-1)
     with pytest.raises(ParameterError, match='load_limit must be > 0'):
@@ -362,6 +364,24 @@ def test_a_bevel_is_turned_towards_the_target(
             assert np.abs(one.guide).max() <= limit
     assert miss['ours'] < within
     assert max(miss['ours'], miss['towards']) < miss['rests']
+
+
+def test_the_guide_goes_by_small_steps_and_still_hits() -> None:
+    """A third of its range; what it cannot reach then is refused."""
+    controller = SteeringController(MODEL, (3e-3, 2e-3), step_limit=2e-3)
+    one, to, ways = SteeredNeedle(*other(1.2), tilt=(0.01, 0.0)), Guidance(0.0, 0.0), [0.0]
+    rng = np.random.default_rng(1)
+    for k, depth in enumerate(DEPTHS.tolist()):
+        if k:
+            one.move(guide=to[:2])
+            one.move(depth=depth)
+        before, to = to, controller.next(one.tip[[0, 2]] + 1e-5 * rng.standard_normal(2))
+        ways += [abs(to.x - before.x), abs(to.z - before.z)]
+    # What is rounded.
+    assert max(ways) <= 2e-3 * (1.0 + 1e-12)
+    assert np.hypot(*(one.tip[[0, 2]] - controller.target)) < 3e-4
+    with pytest.raises(OutOfReachError):
+        SteeringController(MODEL, (0.02, 0.0), step_limit=1e-4)
 
 
 def test_the_load_on_the_guide_stays_within_its_limit() -> None:
