@@ -13,7 +13,7 @@ IMAGES = Path(__file__).parents[2] / 'docs' / 'images'
 SCRIPT = IMAGES / 'steering.py'
 
 
-@pytest.mark.parametrize('name', ['steering', 'bending'])
+@pytest.mark.parametrize('name', ['steering', 'bending', 'targets'])
 def test_the_picture_is_the_present_one(tmp_path: Path, name: str) -> None:
     script = IMAGES / f'{name}.py'
     figure = runpy.run_path(str(script))['draw']()
