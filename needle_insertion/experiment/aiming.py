@@ -68,7 +68,7 @@ CONTROLLER: Final[dict[str, object]] = {
 }
 
 #: A steered needle ends within this of its target [m]; one that nobody steers does not.
-LARGEST_MISS: Final = 5e-4
+LARGEST_MISS: Final = 1e-3
 
 #: Largest squared distance of the tip from where it is said to be, in standard deviations: by
 #: chance one in a thousand is farther.
