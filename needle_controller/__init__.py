@@ -52,8 +52,9 @@ from needle_controller.steering.controller import (
     SteeringFaultError,
     TipEstimate,
 )
-from needle_controller.steering.outer_loop import OuterLoop, OuterLoopSettings
+from needle_controller.steering.outer_loop import OuterLoop
 from needle_controller.steering.responses import SteeringModel
+from needle_controller.steering.settings import OuterLoopSettings
 from needle_controller.supervisor import Supervisor
 from needle_controller.uncertainty import Uncertainty
 

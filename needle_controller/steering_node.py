@@ -13,8 +13,10 @@ from geometry_msgs.msg import PointStamped, PoseWithCovarianceStamped
 from needle_controller.journal import Severity
 from needle_controller.steering.belief import SteeringBelief
 from needle_controller.steering.controller import TipEstimate
-from needle_controller.steering.outer_loop import Move, OuterLoop, OuterLoopSettings
+from needle_controller.steering.motion import Move
+from needle_controller.steering.outer_loop import OuterLoop
 from needle_controller.steering.responses import OF_NEEDLE, OF_STEERING, SteeringModel
+from needle_controller.steering.settings import OuterLoopSettings
 from needle_dynamics.compiled.cache import announce_compilation
 from needle_dynamics.parameters import NeedleParameters
 from needle_dynamics.simulated.assembly import defaults_of

@@ -9,11 +9,9 @@ needle once the guide has arrived: so the path does not depend on how fast eithe
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from enum import Enum
-from math import ceil, sqrt
 from time import monotonic
-from typing import Final, NamedTuple
+from typing import Final
 
 from needle_controller.journal import Journal, Severity
 from needle_controller.safety.stream import Stream
@@ -24,36 +22,17 @@ from needle_controller.steering.controller import (
     TipEstimate,
 )
 from needle_controller.steering.look import Look, Seen
+from needle_controller.steering.motion import duration_of, Move, smooth
 from needle_controller.steering.responses import SteeringModel
+from needle_controller.steering.settings import OuterLoopSettings
 from needle_dynamics.arrays import FloatArray
 from needle_dynamics.parameters import NeedleParameters
 from needle_dynamics.steering.parameters import SteeringParameters
-from needle_ros.contract import (
-    ENTRY,
-    GUIDE_X,
-    GUIDE_Z,
-    INSERTION,
-    JOINT_STATES,
-    ROLL,
-    TIP_DEFLECTION,
-)
+from needle_ros.contract import ENTRY, JOINT_STATES, ROLL, TIP_DEFLECTION
 from needle_ros.errors import JobError, NeedleError, ParameterError
-from needle_ros.settings import check_constants, constant
 from needle_ros.timing import NANOSECONDS
 from needle_ros.wire import Reading
 import numpy as np
-
-#: Joints that are moved; the last one only if the needle may be turned.
-JOINTS: Final = (INSERTION, GUIDE_X, GUIDE_Z, ROLL)
-
-#: Highest speed of a smooth motion from rest to rest over its mean.
-_PEAK: Final = 1.875
-
-#: Highest acceleration of such a motion by its way over its squared duration.
-_STEEPEST: Final = 10.0 / sqrt(3.0)
-
-#: Time from one point of a motion to the next [s].
-_INTERVAL: Final = 0.05
 
 #: Time in which needle and guide come to rest where something is wrong [s].
 _BRAKING: Final = 0.2
@@ -67,82 +46,14 @@ _OUTSIDE: Final = 1e-3
 #: Depths that are the same [m].
 _SAME: Final = 1e-6
 
+#: A plan of so many steps takes some seconds.
+_MOST_STEPS: Final = 200
+
 #: Readings that scatter so much more than is believed are worth a word.
 _SCATTERED: Final = 3.0
 
 #: Half of an interval of 95 % over the standard deviation.
 _NORMAL: Final = 1.96
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class OuterLoopSettings:
-    """Steps, looks and limits of a needle that is steered."""
-
-    step_length: float = constant(
-        5e-3, 'm', 'way of the needle from one look at the tip to the next', open_low=True
-    )
-    speed: float = constant(0.01, 'm/s', 'highest insertion speed', open_low=True)
-    guide_limit: float = constant(
-        6e-3, 'm', 'farthest position of the guide along x and along z; 0: it stays'
-    )
-    guide_step: float = constant(
-        2e-3, 'm', 'farthest that the guide goes from one step to the next along x and along z',
-        open_low=True,
-    )  # fmt: skip
-    guide_speed: float = constant(0.02, 'm/s', 'highest speed of the guide', open_low=True)
-    acceleration: float = constant(
-        0.1, 'm/s^2', 'highest acceleration of needle and guide', open_low=True
-    )
-    turns: int = constant(0, '1', 'how often the needle may be turned')
-    roll_speed: float = constant(2.0, 'rad/s', 'fastest roll', open_low=True)
-    load_limit: float = constant(
-        8.0, 'N', 'largest lateral force of the guide that is planned, along x and along z',
-        open_low=True,
-    )  # fmt: skip
-    settle_time: float = constant(0.1, 's', 'time at rest before a look')
-    look_time: float = constant(
-        0.5, 's', 'duration of a look, whose readings are averaged', open_low=True
-    )
-    depth_tolerance: float = constant(
-        3e-4, 'm', 'how far from the end of a step the needle may rest', open_low=True
-    )
-    guide_tolerance: float = constant(
-        1e-4, 'm', 'how far the guide may be from where it was sent', open_low=True
-    )
-    roll_tolerance: float = constant(
-        0.02, 'rad', 'how far the roll may be from where it was sent', open_low=True
-    )
-    slip_tolerance: float = constant(
-        3e-3, 'm', 'how much the depth of the tip may differ from the inserted length, beyond '
-        'the first look', open_low=True,
-    )  # fmt: skip
-    patience: float = constant(
-        5.0, 's', 'how much longer than planned a step may take', open_low=True
-    )
-    measurement_timeout: float = constant(
-        0.5, 's', 'age at which joint_states, tip_deflection and stamped targets no longer '
-        'count; how late a reading of a look may be', open_low=True,
-    )  # fmt: skip
-
-    def __post_init__(self) -> None:
-        check_constants(self)
-        if self.turns != int(self.turns):
-            raise ParameterError(f'turns must be a whole number, got {self.turns!r}')
-        object.__setattr__(self, 'turns', int(self.turns))
-        if self.guide_limit == 0.0 and self.turns == 0:
-            raise ParameterError('guide_limit and turns cannot both be 0: nothing would move')
-
-    @property
-    def joints(self) -> tuple[str, ...]:
-        """Joints that are moved."""
-        return JOINTS if self.turns else JOINTS[:-1]
-
-    @property
-    def tolerances(self) -> FloatArray:
-        """How far each of them may be from where it was sent [m, rad]."""
-        guide = self.guide_tolerance
-        every = [self.depth_tolerance, guide, guide, self.roll_tolerance]
-        return np.array(every[: len(self.joints)])
 
 
 class Phase(Enum):
@@ -154,51 +65,6 @@ class Phase(Enum):
     LOOKING = 'looks at the tip'
     DONE = 'is at the target depth'
     STOPPED = 'has stopped'
-
-
-class Move(NamedTuple):
-    """
-    A motion to rest, for whoever moves needle and guide.
-
-    Attributes
-    ----------
-    times : ndarray, shape (n,)
-        Times from now [s].
-    positions, velocities : ndarray, shape (n, joints)
-        Of `OuterLoopSettings.joints` [m, rad, and these per s].
-
-    """
-
-    times: FloatArray
-    positions: FloatArray
-    velocities: FloatArray
-
-
-def smooth(begin: FloatArray, end: FloatArray, duration: float) -> Move:
-    """
-    Return a motion from rest to rest, in which all joints go in proportion.
-
-    Parameters
-    ----------
-    begin, end : ndarray, shape (joints,)
-        Positions [m, rad].
-    duration : float
-        Its duration [s].
-
-    Returns
-    -------
-    Move
-        A polynomial of fifth order, of least jerk.
-
-    """
-    count = max(2, ceil(duration / _INTERVAL))
-    part = np.arange(1, count + 1) / count
-    gone = part**3 * (10.0 - 15.0 * part + 6.0 * part**2)
-    rate = 30.0 * (part * (1.0 - part)) ** 2 / duration
-    way = end - begin
-    # Exactly where it shall end.
-    positions = np.vstack([begin + np.outer(gone[:-1], way), end])
-    return Move(duration * part, positions, np.outer(rate, way))
 
 
 class OuterLoop:
@@ -361,6 +227,11 @@ class OuterLoop:
                 f'{1e3 * point[1]:.2f} mm'
             )
         steps = max(1, round((point[1] - depth) / settings.step_length))
+        if steps > _MOST_STEPS:
+            raise ParameterError(
+                f'it would take {steps} steps of {1e3 * settings.step_length:g} mm; {_MOST_STEPS} '
+                'may be: make step_length larger'
+            )
         depths = np.linspace(depth, point[1], steps + 1)
         model = SteeringModel(self._needle, self._steering, depths, self._belief)
         roll = float(self._at[3]) if settings.turns else 0.0
@@ -613,14 +484,7 @@ class OuterLoop:
         """Send needle and guide somewhere."""
         begin, self._goal = self._goal, goal
         self.phase, self._rest = phase, None
-        way, settings = np.abs(goal - begin), self.settings
-        along, across, around = float(way[0]), float(np.hypot(way[1], way[2])), float(sum(way[3:]))
-        duration = max(
-            _PEAK * along / settings.speed,
-            _PEAK * across / settings.guide_speed,
-            _PEAK * around / settings.roll_speed,
-            sqrt(_STEEPEST * max(along, across) / settings.acceleration),
-        )
+        duration = duration_of(goal - begin, self.settings)
         self._due = now + round(duration * NANOSECONDS)
         return smooth(begin, goal, duration) if duration > 0.0 else None
 

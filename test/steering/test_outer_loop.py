@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 from needle_controller import OuterLoop, OuterLoopSettings, SteeringBelief
 from needle_controller.journal import Severity
 from needle_controller.steering.look import Look
-from needle_controller.steering.outer_loop import Move, Phase, smooth
+from needle_controller.steering.motion import Move, smooth
+from needle_controller.steering.outer_loop import Phase
 from needle_dynamics import SteeredNeedle, STEERING_PRESETS
 from needle_ros.wire import Reading
 import numpy as np
@@ -296,6 +297,13 @@ def test_a_target_that_cannot_be_is_refused(
     robot.tick(5)
     assert not robot.at.any()
     assert robot.aim() == ''
+
+
+def test_too_many_steps_are_refused() -> None:
+    """A plan of them would take the memory of the machine."""
+    robot = Robot(replace(SETTINGS, step_length=1e-6))
+    robot.tick(5)
+    assert 'it would take 60000 steps of 0.001 mm; 200 may be' in robot.aim()
 
 
 def test_a_needle_must_be_straight_at_the_start() -> None:

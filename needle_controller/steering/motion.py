@@ -1,0 +1,90 @@
+"""Motions of needle and guide from rest to rest."""
+
+from __future__ import annotations
+
+from math import ceil, sqrt
+from typing import Final, NamedTuple
+
+from needle_controller.steering.settings import OuterLoopSettings
+from needle_dynamics.arrays import FloatArray
+import numpy as np
+
+#: Highest speed of a smooth motion from rest to rest over its mean.
+_PEAK: Final = 1.875
+
+#: Highest acceleration of such a motion by its way over its squared duration.
+_STEEPEST: Final = 10.0 / sqrt(3.0)
+
+#: Time from one point of a motion to the next [s].
+_INTERVAL: Final = 0.05
+
+
+class Move(NamedTuple):
+    """
+    A motion to rest, for whoever moves needle and guide.
+
+    Attributes
+    ----------
+    times : ndarray, shape (n,)
+        Times from now [s].
+    positions, velocities : ndarray, shape (n, joints)
+        Of `OuterLoopSettings.joints` [m, rad, and these per s].
+
+    """
+
+    times: FloatArray
+    positions: FloatArray
+    velocities: FloatArray
+
+
+def smooth(begin: FloatArray, end: FloatArray, duration: float) -> Move:
+    """
+    Return a motion from rest to rest, in which all joints go in proportion.
+
+    Parameters
+    ----------
+    begin, end : ndarray, shape (joints,)
+        Positions [m, rad].
+    duration : float
+        Its duration [s].
+
+    Returns
+    -------
+    Move
+        A polynomial of fifth order, of least jerk.
+
+    """
+    count = max(2, ceil(duration / _INTERVAL))
+    part = np.arange(1, count + 1) / count
+    gone = part**3 * (10.0 - 15.0 * part + 6.0 * part**2)
+    rate = 30.0 * (part * (1.0 - part)) ** 2 / duration
+    way = end - begin
+    # Exactly where it shall end.
+    positions = np.vstack([begin + np.outer(gone[:-1], way), end])
+    return Move(duration * part, positions, np.outer(rate, way))
+
+
+def duration_of(way: FloatArray, settings: OuterLoopSettings) -> float:
+    """
+    Return the shortest duration of a smooth motion within the limits.
+
+    Parameters
+    ----------
+    way : ndarray, shape (joints,)
+        How far the joints go [m, rad].
+    settings : OuterLoopSettings
+        Limits of speed and acceleration.
+
+    Returns
+    -------
+    float
+        The duration [s].
+
+    """
+    along, across = float(abs(way[0])), float(np.hypot(way[1], way[2]))
+    return max(
+        _PEAK * along / settings.speed,
+        _PEAK * across / settings.guide_speed,
+        _PEAK * float(np.abs(way[3:]).sum()) / settings.roll_speed,
+        sqrt(_STEEPEST * max(along, across) / settings.acceleration),
+    )

@@ -1,0 +1,86 @@
+"""Steps, looks and limits of a needle that is steered, as parameters."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+from needle_dynamics.arrays import FloatArray
+from needle_ros.contract import GUIDE_X, GUIDE_Z, INSERTION, ROLL
+from needle_ros.errors import ParameterError
+from needle_ros.settings import check_constants, constant
+import numpy as np
+
+#: Joints that are moved; the last one only if the needle may be turned.
+JOINTS: Final = (INSERTION, GUIDE_X, GUIDE_Z, ROLL)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OuterLoopSettings:
+    """Steps, looks and limits of a needle that is steered."""
+
+    step_length: float = constant(
+        5e-3, 'm', 'way of the needle from one look at the tip to the next', open_low=True
+    )
+    speed: float = constant(0.01, 'm/s', 'highest insertion speed', open_low=True)
+    guide_limit: float = constant(
+        6e-3, 'm', 'farthest position of the guide along x and along z; 0: it stays'
+    )
+    guide_step: float = constant(
+        2e-3, 'm', 'farthest that the guide goes from one step to the next along x and along z',
+        open_low=True,
+    )  # fmt: skip
+    guide_speed: float = constant(0.02, 'm/s', 'highest speed of the guide', open_low=True)
+    acceleration: float = constant(
+        0.1, 'm/s^2', 'highest acceleration of needle and guide', open_low=True
+    )
+    turns: int = constant(0, '1', 'how often the needle may be turned')
+    roll_speed: float = constant(2.0, 'rad/s', 'fastest roll', open_low=True)
+    load_limit: float = constant(
+        8.0, 'N', 'largest lateral force of the guide that is planned, along x and along z',
+        open_low=True,
+    )  # fmt: skip
+    settle_time: float = constant(0.1, 's', 'time at rest before a look')
+    look_time: float = constant(
+        0.5, 's', 'duration of a look, whose readings are averaged', open_low=True
+    )
+    depth_tolerance: float = constant(
+        3e-4, 'm', 'how far from the end of a step the needle may rest', open_low=True
+    )
+    guide_tolerance: float = constant(
+        1e-4, 'm', 'how far the guide may be from where it was sent', open_low=True
+    )
+    roll_tolerance: float = constant(
+        0.02, 'rad', 'how far the roll may be from where it was sent', open_low=True
+    )
+    slip_tolerance: float = constant(
+        3e-3, 'm', 'how much the depth of the tip may differ from the inserted length, beyond '
+        'the first look', open_low=True,
+    )  # fmt: skip
+    patience: float = constant(
+        5.0, 's', 'how much longer than planned a step may take', open_low=True
+    )
+    measurement_timeout: float = constant(
+        0.5, 's', 'age at which joint_states, tip_deflection and stamped targets no longer '
+        'count; how late a reading of a look may be', open_low=True,
+    )  # fmt: skip
+
+    def __post_init__(self) -> None:
+        check_constants(self)
+        if self.turns != int(self.turns):
+            raise ParameterError(f'turns must be a whole number, got {self.turns!r}')
+        object.__setattr__(self, 'turns', int(self.turns))
+        if self.guide_limit == 0.0 and self.turns == 0:
+            raise ParameterError('guide_limit and turns cannot both be 0: nothing would move')
+
+    @property
+    def joints(self) -> tuple[str, ...]:
+        """Joints that are moved."""
+        return JOINTS if self.turns else JOINTS[:-1]
+
+    @property
+    def tolerances(self) -> FloatArray:
+        """How far each of them may be from where it was sent [m, rad]."""
+        guide = self.guide_tolerance
+        every = [self.depth_tolerance, guide, guide, self.roll_tolerance]
+        return np.array(every[: len(self.joints)])
