@@ -27,6 +27,7 @@ from needle_controller.steering.trial import drawn
 from needle_dynamics import FloatArray, NeedleParameters, SteeringParameters
 from needle_dynamics.steering.parameters import NEEDLES, tissue_of
 import numpy as np
+from scipy.optimize import lsq_linear
 
 #: Steps [m], limit of the guide [m], depths of targets [steps], and their distance from the axis
 #: [m].
@@ -55,7 +56,7 @@ SENSORS: Final = {'EM': (1.8e-4, 20, 0.0), 'ultrasound': (3e-4, 12, 0.05)}
 #: Sensor, and part by which needles differ from what is believed.
 CASES: Final = (('EM', 0.3), ('EM', 0.5), ('ultrasound', 0.3))
 
-CONTROLLERS: Final = ('ours', 'springs', 'Broyden', 'open loop')
+CONTROLLERS: Final = ('ours', 'plan for the mean', 'springs', 'Broyden', 'open loop')
 
 #: Load of a bevel that is turned [N], error of its direction [rad], how often it may be turned,
 #: and part of its reach within which targets count.
@@ -167,6 +168,22 @@ def _model(
     return SteeringModel(*believed(medium, bevel), STEP * np.arange(steps + 1), belief)
 
 
+class MeanPlan(SteeringController):
+    """Ours, but for the plan: a quadratic program for the mean of what may be true."""
+
+    def _choose(self) -> complex:
+        ends = self._ends(0, self.step + 2)
+        w, shifts, limit = self.weights, ends.shifts, self._limit
+        rows = np.sqrt(w)[:, np.newaxis] * shifts
+        rows = np.vstack([rows, 0.1 * np.eye(shifts.shape[1])])
+        found = []
+        need = np.sqrt(w) * (self._goal - ends.means)
+        for plane in (need.real, need.imag):
+            wanted = np.concatenate([plane, np.zeros(shifts.shape[1])])
+            found.append(float(lsq_linear(rows, wanted, (-limit, limit), method='bvls').x[0]))
+        return complex(*found)
+
+
 class _Trial:
     """A needle with its target, inserted under one controller after the other."""
 
@@ -255,17 +272,19 @@ def insert(sensor: str, spread: float, seed: int) -> Outcome:
     could = LIMIT * np.abs(alone.guide[0, -1]).sum()
     ends: dict[str, End] = {}
     warned = held = refused = False
+    look = inf
     try:
-        ours = SteeringController(_model(medium, len(depths) - 1, sensor, spread), target, LIMIT)
+        model = _model(medium, len(depths) - 1, sensor, spread)
+        ours = SteeringController(model, target, LIMIT)
     except OutOfReachError:
         refused = True
     else:
         tip, ends['ours'] = one.end(ours)
         there = ours.expected()
         off = tip - there.mean
-        warned = bool(one.said)
+        warned, look = bool(one.said), one.look
         held = bool(off @ np.linalg.solve(there.covariance, off) <= _ELLIPSE)
-    look = one.look
+        ends['plan for the mean'] = one.end(MeanPlan(model, target, LIMIT))[1]
     others: Mapping[str, OpenLoop] = {
         'springs': Springs(needle, steering, depths, target, LIMIT),
         'Broyden': Broyden(needle, steering, depths, target, LIMIT),
@@ -477,6 +496,8 @@ def _best(of: Sequence[Outcome], medium: str) -> list[Bar]:
     for what in ('mean', '95 %'):
         found = {name: _statistic(_misses(of, name), what) for name in CONTROLLERS}
         ours = found.pop('ours')
+        # It is ours, too.
+        del found['plan for the mean']
         bars.append(
             Bar(f'{what} over the best baseline, {medium}', ours / min(found.values()), 1.0)
         )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection
 from dataclasses import asdict
 import sys
 from typing import Any
@@ -188,7 +188,7 @@ class SteeringNode(BaseNode):
         if loop is None:
             return
         if move is not None:
-            self._trajectory.publish(self._message(move, loop.settings.joints))
+            self._trajectory.publish(self._message(move))
         if loop.expected is not self._told:
             self._told = loop.expected
             if loop.expected is not None:
@@ -196,8 +196,8 @@ class SteeringNode(BaseNode):
         if loop.journal.changed:
             self._tell()
 
-    def _message(self, move: Move, joints: Sequence[str]) -> JointTrajectory:
-        message = JointTrajectory(joint_names=list(joints))
+    def _message(self, move: Move) -> JointTrajectory:
+        message = JointTrajectory(joint_names=list(move.joints))
         message.header.stamp = self.get_clock().now().to_msg()
         rows = zip(move.times.tolist(), move.positions, move.velocities, strict=True)
         for time, positions, velocities in rows:

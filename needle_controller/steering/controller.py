@@ -487,12 +487,43 @@ class SteeringController:
             needle. Then the needle shall stop.
 
         """
+        self.see(tip, self.step)
+        return self.plan()
+
+    def see(self, tip: Sequence[float] | FloatArray | None, at: int) -> None:
+        """
+        Take a look at the tip, of now or of an earlier depth.
+
+        Parameters
+        ----------
+        tip : array_like of shape (2,) or None
+            As for `next`.
+        at : int
+            Number of the depth, not greater than `step`.
+
+        Raises
+        ------
+        ShapeError, JobError, SteeringFaultError
+            As for `next`.
+
+        """
         if self.step > self._model.steps:
             raise JobError(f'all {self._model.steps} steps are done')
-        predicted = self._tip(self.step, self._held())
+        predicted = self._tip(at, self._held())
         seen = self._checked(tip, self._over_all(predicted))
         if seen is not None:
             self._learn(complex(*seen), predicted)
+
+    def plan(self) -> Guidance:
+        """
+        Return where guide and roll shall be in the next step, and go on to it.
+
+        Returns
+        -------
+        Guidance
+            As from `next`.
+
+        """
         k = self.step
         if k < self._model.steps:
             self._guide[k] = self._choose()

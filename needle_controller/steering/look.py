@@ -1,11 +1,11 @@
-"""A look at the tip while the needle rests: many readings, one position."""
+"""A look at the tip, while the needle rests or on its way: many readings, one position."""
 
 from __future__ import annotations
 
 from math import sqrt
 from typing import Final, NamedTuple
 
-from needle_dynamics.arrays import FloatArray
+from needle_dynamics.arrays import BoolArray, FloatArray
 import numpy as np
 
 #: A reading farther than this from the median, in standard deviations, is an outlier.
@@ -25,9 +25,9 @@ class Seen(NamedTuple):
     Attributes
     ----------
     tip : ndarray, shape (3,)
-        Mean position of the tip, x, y, z [m].
+        Position of the tip, x, y, z [m].
     error : float
-        Standard error of the mean along x or z, as the readings scatter [m]; 0 for few of them.
+        Standard error of it along x or z, as the readings scatter [m]; 0 for few of them.
     readings : int
         How many count.
     frozen : bool
@@ -42,44 +42,28 @@ class Seen(NamedTuple):
 
 
 class Look:
-    """
-    Collects the readings of a look.
+    """Readings of the tip at a depth, or on the way to it."""
 
-    Parameters
-    ----------
-    since, until : int
-        Stamps from which on, and up to which, readings belong to it [ns].
-
-    """
-
-    def __init__(self, since: int, until: int) -> None:
-        self.since, self.until = since, until
+    def __init__(self) -> None:
         self._readings: list[tuple[float, ...]] = []
 
-    def take(self, stamp: int, tip: tuple[float, ...]) -> bool:
+    def take(self, tip: tuple[float, ...], before: float = 0.0) -> None:
         """
-        Take a reading if it belongs to the look.
+        Take a reading.
 
         Parameters
         ----------
-        stamp : int
-            Its stamp [ns].
         tip : tuple of float
             Position of the tip, x, y, z [m].
-
-        Returns
-        -------
-        bool
-            Whether the look has ended with it.
+        before : float
+            How far before the depth the needle was then [m].
 
         """
-        if self.since < stamp <= self.until:
-            self._readings.append(tip)
-        return stamp >= self.until
+        self._readings.append((*tip, before))
 
     def seen(self, noise: float) -> Seen | None:
         """
-        Return the mean without outliers.
+        Return the mean without outliers; on the way, a line through them at the depth.
 
         Parameters
         ----------
@@ -89,22 +73,42 @@ class Look:
         Returns
         -------
         Seen or None
-            The mean; None if there are no readings.
+            The position; None if there are no readings.
 
         """
         if not self._readings:
             return None
-        tips = np.array(self._readings)
+        rows = np.array(self._readings)
+        tips, before = rows[:, :3], rows[:, 3]
+        basis = np.ones((len(tips), 1))
+        if len(tips) > _FEW and np.ptp(before) > 0.0:
+            basis = np.column_stack([basis, before])
+        kept: BoolArray = np.ones(len(tips), dtype=np.bool_)
         if len(tips) >= _FEW:
-            middle = np.median(tips, axis=0)
-            off = np.abs(tips - middle)
+            off = np.abs(tips - basis @ _fitted(basis, tips))
             scatter = np.maximum(_NORMAL * np.median(off, axis=0), noise * sqrt(len(tips)))
-            tips = tips[(off <= _OUTLIER * scatter).all(axis=1)]
-            if len(tips) == 0:
-                tips = middle[np.newaxis]
-        count = len(tips)
-        error = 0.0
-        if count >= _FEW:
-            error = float(tips[:, [0, 2]].std(axis=0, ddof=1).max()) / sqrt(count)
+            kept = np.asarray((off <= _OUTLIER * scatter).all(axis=1))
+            if kept.sum() < basis.shape[1]:
+                return Seen(_fitted(basis, tips)[0], 0.0, 1, frozen=False)
+        tips, basis = tips[kept], basis[kept]
+        found, count = np.linalg.lstsq(basis, tips, rcond=None)[0], len(tips)
+        left, error = tips - basis @ found, 0.0
+        free = count - basis.shape[1]
+        if free > 1:
+            # At the end of a line it is twice as far as of a mean.
+            scale = basis.shape[1] / sqrt(free * count)
+            error = float(np.sqrt((left[:, [0, 2]] ** 2).sum(axis=0)).max()) * scale
         frozen = count >= _FEW and bool((tips == tips[0]).all())
-        return Seen(tips.mean(axis=0), error, count, frozen)
+        return Seen(found[0], error, count, frozen)
+
+
+def _fitted(basis: FloatArray, tips: FloatArray) -> FloatArray:
+    """Return median, or a line by medians: through those of the first and of the last half."""
+    if basis.shape[1] == 1:
+        return np.median(tips, axis=0)[np.newaxis]
+    order = np.argsort(basis[:, 1])
+    halves = np.array_split(order, 2)
+    (one, other) = (np.median(tips[half], axis=0) for half in halves)
+    (at, to) = (float(np.median(basis[half, 1])) for half in halves)
+    slope = (other - one) / (to - at) if to > at else np.zeros(3)
+    return np.array([one - at * slope, slope])

@@ -21,28 +21,33 @@ _INTERVAL: Final = 0.05
 
 class Move(NamedTuple):
     """
-    A motion to rest, for whoever moves needle and guide.
+    A motion, for whoever moves needle and guide.
 
     Attributes
     ----------
+    joints : tuple of str
+        What moves.
     times : ndarray, shape (n,)
         Times from now [s].
     positions, velocities : ndarray, shape (n, joints)
-        Of `OuterLoopSettings.joints` [m, rad, and these per s].
+        Where to and how fast [m, rad, and these per s].
 
     """
 
+    joints: tuple[str, ...]
     times: FloatArray
     positions: FloatArray
     velocities: FloatArray
 
 
-def smooth(begin: FloatArray, end: FloatArray, duration: float) -> Move:
+def smooth(joints: tuple[str, ...], begin: FloatArray, end: FloatArray, duration: float) -> Move:
     """
     Return a motion from rest to rest, in which all joints go in proportion.
 
     Parameters
     ----------
+    joints : tuple of str
+        What moves.
     begin, end : ndarray, shape (joints,)
         Positions [m, rad].
     duration : float
@@ -61,7 +66,7 @@ def smooth(begin: FloatArray, end: FloatArray, duration: float) -> Move:
     way = end - begin
     # Exactly where it shall end.
     positions = np.vstack([begin + np.outer(gone[:-1], way), end])
-    return Move(duration * part, positions, np.outer(rate, way))
+    return Move(joints, duration * part, positions, np.outer(rate, way))
 
 
 def duration_of(way: FloatArray, settings: OuterLoopSettings) -> float:

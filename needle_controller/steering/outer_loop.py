@@ -3,7 +3,8 @@ The outer loop that steers: look at the tip, move the guide, insert the needle; 
 
 It asks for motions of needle and guide, whoever makes them: a robot that follows positions, or an
 axis law that turns the insertion into forces. The guide moves while the needle rests, and the
-needle once the guide has arrived: so the path does not depend on how fast either is.
+needle once the guide has arrived: so the path does not depend on how fast either is. If it is
+continuous, the needle goes in without rests, and the guide follows its measured depth.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from needle_controller.journal import Journal, Severity
 from needle_controller.safety.stream import Stream
 from needle_controller.steering.belief import SteeringBelief
 from needle_controller.steering.controller import (
+    Guidance,
     SteeringController,
     SteeringFaultError,
     TipEstimate,
@@ -37,6 +39,15 @@ import numpy as np
 #: Time in which needle and guide come to rest where something is wrong [s].
 _BRAKING: Final = 0.2
 
+#: Time over which the insertion speed is measured [s].
+_SPAN: Final = 0.05
+
+#: Time after which a needle that rests is sent again [s], and how often it is sent.
+_AGAIN, _TRIES = 1.0, 3
+
+#: How many times the tolerance of a guide at rest one on its way may be behind.
+_LAGGING: Final = 5.0
+
 #: A needle that moves by less while it settles, rests [m].
 _STILL: Final = 1e-4
 
@@ -48,6 +59,9 @@ _SAME: Final = 1e-6
 
 #: A plan of so many steps takes some seconds.
 _MOST_STEPS: Final = 200
+
+#: What to look at when nothing moves.
+_ASKED: Final = 'does what moves it take joint_trajectory?'
 
 #: Readings that scatter so much more than is believed are worth a word.
 _SCATTERED: Final = 3.0
@@ -134,6 +148,17 @@ class OuterLoop:
         #: Stamp [ns] and inserted length [m] since which the needle rests.
         self._rest: tuple[int, float] | None = None
         self._look: Look | None = None
+        #: Stamps between which readings belong to it [ns].
+        self._span = 0, 0
+        #: On the way: looks at the depths, the last depth that was passed, where the guide is
+        #: before and after the next one [m], and when it was sent on [ns].
+        self._passing: dict[int, Look] = {}
+        self._passed = self._tries = 0
+        self._between = np.zeros((2, 2))
+        self._sent = 0
+        #: Stamp [ns] and inserted length [m] of some time ago, and insertion speed [m/s].
+        self._before: tuple[int, float] | None = None
+        self._speed = 0.0
         self._seen: Seen | None = None
         #: Depth of the tip less the inserted length, at the first look [m].
         self._ahead: float | None = None
@@ -233,7 +258,13 @@ class OuterLoop:
                 'may be: make step_length larger'
             )
         depths = np.linspace(depth, point[1], steps + 1)
-        model = SteeringModel(self._needle, self._steering, depths, self._belief)
+        model = SteeringModel(
+            self._needle,
+            self._steering,
+            depths,
+            self._belief,
+            together=settings.continuous,
+        )
         roll = float(self._at[3]) if settings.turns else 0.0
         self.control = SteeringController(
             model,
@@ -242,7 +273,7 @@ class OuterLoop:
             settings.turns,
             settings.load_limit,
             roll,
-            settings.guide_step,
+            settings.farthest,
         )
         self._planned = None
         self._depths, self._begun = depths, depth
@@ -280,7 +311,8 @@ class OuterLoop:
         # It cannot rest at once where it is.
         ahead = min(0.5 * _BRAKING * self.settings.speed, max(0.0, self._goal[0] - end[0]))
         end[0] += ahead
-        return Move(np.array([_BRAKING]), end[np.newaxis], np.zeros((1, len(end))))
+        joints = self.settings.joints
+        return Move(joints, np.array([_BRAKING]), end[np.newaxis], np.zeros((1, len(end))))
 
     # What is measured.
 
@@ -317,6 +349,8 @@ class OuterLoop:
                 self.journal.refuse(f'joint_states refused: {refusal.line}')
             return None
         self._at = np.array(at)
+        if self.phase is Phase.INSERTING and self.settings.continuous:
+            return self._follow(reading.stamp, now)
         if self.phase in (Phase.GUIDING, Phase.INSERTING):
             return self._wait(reading.stamp, now)
         if self.phase is Phase.LOOKING and self._missed():
@@ -347,10 +381,7 @@ class OuterLoop:
             self._rest = None
             late = (stamp - self._due) / NANOSECONDS
             if late > self.settings.patience:
-                return self.stop(
-                    f'{missed}, {late:.1f} s after it should be; does what moves it take '
-                    'joint_trajectory?'
-                )
+                return self.stop(f'{missed}, {late:.1f} s after it should be; {_ASKED}')
         elif self.phase is Phase.GUIDING and self.control is not None and self.control.step:
             depth = float(self._depths[self.control.step])
             return self._send(Phase.INSERTING, np.array([depth, *self._goal[1:]]), now)
@@ -358,8 +389,8 @@ class OuterLoop:
             self._rest = stamp, depth
         elif stamp - self._rest[0] >= self.settings.settle_time * NANOSECONDS:
             self.phase = Phase.LOOKING
-            length = round(self.settings.look_time * NANOSECONDS)
-            self._look = Look(stamp, stamp + length)
+            self._look = Look()
+            self._span = stamp, stamp + round(self.settings.look_time * NANOSECONDS)
         return None
 
     def tip(self, reading: Reading, now: int) -> Move | None:
@@ -383,8 +414,18 @@ class OuterLoop:
             if not refusal.harmless:
                 self.journal.refuse(f'tip_deflection refused: {refusal.line}')
             return None
-        if self._look is not None and self._look.take(reading.stamp, tip):
-            return self._step(now)
+        if self._look is not None:
+            since, until = self._span
+            if since < reading.stamp <= until:
+                self._look.take(tip)
+            return self._step(now) if reading.stamp >= until else None
+        if self.phase is Phase.INSERTING and self.settings.continuous and self._at is not None:
+            # Where the needle was then.
+            depth = float(self._at[0]) - self._speed * (now - reading.stamp) / NANOSECONDS
+            at = int(np.searchsorted(self._depths, depth))
+            if 0 < at < len(self._depths):
+                look = self._passing.setdefault(at, Look())
+                look.take(tip, float(self._depths[at]) - depth)
         return None
 
     def watch(self, now: int) -> Move | None:
@@ -418,7 +459,7 @@ class OuterLoop:
         silence = min(self._joint_stream.silence(now), (now - self._planned) / NANOSECONDS)
         if silence > timeout:
             return self.stop(f'no joint_states for {silence:.2f} s')
-        if self._look is not None and now > self._look.until + timeout * NANOSECONDS:
+        if self._look is not None and now > self._span[1] + timeout * NANOSECONDS:
             return self._step(now)
         return None
 
@@ -442,32 +483,140 @@ class OuterLoop:
         control, look, self._look = self.control, self._look, None
         if control is None or look is None or self._at is None:
             return None
-        self._seen = seen = look.seen(self._belief.noise)
-        slip = self._slip(seen)
-        if slip:
-            return self.stop(slip)
         k = control.step
         try:
-            to = control.next(None if seen is None else seen.tip[[0, 2]])
+            # What came late on the way.
+            self._take(control, self._passing.pop(k - 1, None), k - 1)
+            self._take(control, look, k, depth=float(self._at[0]))
         except SteeringFaultError as error:
             return self.stop(str(error))
-        self.expected = control.expected()
+        to = self._planned_at(control, k)
         if k == len(self._depths) - 1:
             self.phase = Phase.DONE
             self.journal.say(Severity.INFO, f'done: {self._outcome()}')
             return None
-        if control.warning and not self._warned:
-            self._warned = True
-            depth = 1e3 * self._depths[k]
-            self.journal.say(Severity.WARNING, f'at {depth:.2f} mm: {control.warning}')
+        if self.settings.continuous:
+            self._between = np.array([[0.0, 0.0], [to.x, to.z]])
+            self._tries = _TRIES
+            return self._set_out(now)
         goal = np.array([self._goal[0], to.x, to.z, to.roll])[: len(self._goal)]
         return self._send(Phase.GUIDING, goal, now)
 
-    def _slip(self, seen: Seen | None) -> str:
+    def _take(
+        self, control: SteeringController, look: Look | None, at: int, depth: float | None = None
+    ) -> None:
+        """Pass a look on, if there is one; without readings it is one that saw nothing."""
+        if look is None:
+            return
+        self._seen = seen = look.seen(self._belief.noise)
+        slip = self._slip(seen, float(self._depths[at]) if depth is None else depth)
+        if slip:
+            raise SteeringFaultError(slip)
+        control.see(None if seen is None else seen.tip[[0, 2]], at)
+
+    def _planned_at(self, control: SteeringController, k: int) -> Guidance:
+        """Plan the next step, and say what is to be said of it."""
+        to = control.plan()
+        self.expected = control.expected()
+        if k < len(self._depths) - 1 and control.warning and not self._warned:
+            self._warned = True
+            depth = 1e3 * self._depths[k]
+            self.journal.say(Severity.WARNING, f'at {depth:.2f} mm: {control.warning}')
+        return to
+
+    # On the way, if it is continuous.
+
+    def _set_out(self, now: int) -> Move:
+        """Send the needle to the target depth."""
+        begin, end = self._depths[[0]], self._depths[[-1]]
+        self.phase, self._rest, self._sent = Phase.INSERTING, None, now
+        self._passing, self._passed, self._before = {}, 0, None
+        self._goal = np.array([end[0], *self._between[1]])
+        duration = duration_of(np.array([end[0] - begin[0], 0.0, 0.0]), self.settings)
+        self._due = now + round(duration * NANOSECONDS)
+        return smooth(self.settings.joints[:1], begin, end, duration)
+
+    def _set_out_again(self, stamp: int, now: int) -> Move | None:
+        """Send a needle that does not move again: the message may have been lost."""
+        if stamp - self._sent < _AGAIN * NANOSECONDS:
+            return None
+        self._tries -= 1
+        if self._tries:
+            return self._set_out(now)
+        return self.stop(f'the needle does not move; {_ASKED}')
+
+    def _follow(self, stamp: int, now: int) -> Move | None:
+        """Send the guide on as the needle goes, and plan at each depth that it passes."""
+        control, at = self.control, self._at
+        if control is None or at is None:
+            return None
+        depth, last = float(at[0]), len(self._depths) - 1
+        if self._before is None:
+            if depth < self._begun + _STILL:
+                return self._set_out_again(stamp, now)
+            self._before = stamp, depth
+        since = (stamp - self._before[0]) / NANOSECONDS
+        if since >= _SPAN:
+            self._speed, self._before = (depth - self._before[1]) / since, (stamp, depth)
+        while self._passed < last - 1 and depth >= self._depths[self._passed + 1]:
+            self._passed += 1
+            fault = self._pass(control, at)
+            if fault:
+                return self.stop(fault)
+        if depth >= self._depths[last] - self.settings.depth_tolerance:
+            if self._passed < last:
+                # To the end of the last step, once.
+                self._passed, self._due = last, stamp
+                return self._guide_to(self._between[1], np.zeros(2), _BRAKING)
+            return self._wait(stamp, now)
+        if self._passed == last or stamp > self._due + self.settings.patience * NANOSECONDS:
+            # The guide is where this depth has it.
+            self._goal[1:] = at[1:]
+            return self._wait(stamp, now)
+        interval = 1.0 / self.settings.rate
+        if stamp - self._sent < interval * NANOSECONDS:
+            return None
+        self._sent = stamp
+        low, high = self._depths[self._passed : self._passed + 2].tolist()
+        begin, end = self._between
+        part = min(max((depth + self._speed * interval - low) / (high - low), 0.0), 1.0)
+        way = end - begin
+        return self._guide_to(begin + part * way, way * self._speed / (high - low), interval)
+
+    def _guide_to(self, position: FloatArray, velocity: FloatArray, duration: float) -> Move:
+        return Move(
+            self.settings.joints[1:3],
+            np.array([duration]),
+            position[np.newaxis],
+            velocity[np.newaxis],
+        )
+
+    def _pass(self, control: SteeringController, at: FloatArray) -> str:
+        """Look back at the depth before one that is passed, and plan; return what is wrong."""
+        k, there = self._passed, self._between[1]
+        if np.abs(at[1:3] - there).max() > _LAGGING * self.settings.guide_tolerance:
+            x, z = 1e3 * at[1:3]
+            return (
+                f'the guide is at x = {x:.3f} mm, z = {z:.3f} mm at a depth of '
+                f'{1e3 * at[0]:.2f} mm, not at {1e3 * there[0]:.3f} mm, {1e3 * there[1]:.3f} mm'
+            )
+        try:
+            if k > 1:
+                self._take(control, self._passing.pop(k - 1, Look()), k - 1)
+        except SteeringFaultError as error:
+            return str(error)
+        to = self._planned_at(control, k)
+        self._between = np.array([there, [to.x, to.z]])
+        self._goal[1:] = to.x, to.z
+        return ''
+
+    # What is wrong, and where to.
+
+    def _slip(self, seen: Seen | None, depth: float) -> str:
         """Say that the tip is not as deep as the needle is inserted, '' if it is."""
-        if seen is None or self._at is None:
+        if seen is None:
             return ''
-        ahead = float(seen.tip[1] - self._at[0])
+        ahead = float(seen.tip[1]) - depth
         if self._ahead is None:
             self._ahead = ahead
         slipped = ahead - self._ahead
@@ -486,7 +635,7 @@ class OuterLoop:
         self.phase, self._rest = phase, None
         duration = duration_of(goal - begin, self.settings)
         self._due = now + round(duration * NANOSECONDS)
-        return smooth(begin, goal, duration) if duration > 0.0 else None
+        return smooth(self.settings.joints, begin, goal, duration) if duration > 0.0 else None
 
     # What is said.
 

@@ -67,6 +67,9 @@ class SteeringModel:
         Depths at which the tip is looked at [m], increasing; the first one is reached straight.
     belief : SteeringBelief, optional
         How far all that may be wrong.
+    together : bool
+        Whether the guide goes evenly with the depth, to be at the position of a step at its end;
+        else it moves there while the needle rests, and stays while the needle goes in.
 
     Attributes
     ----------
@@ -77,8 +80,7 @@ class SteeringModel:
     lengths, skins : ndarray, shape (h,)
         Bending length and skin of each hypothesis, over the believed ones.
     guide : ndarray, shape (h, n + 1, n)
-        Shift of the tip at each depth per position of the guide in each step: it moves there while
-        the needle rests, and stays while the needle goes in.
+        Shift of the tip at each depth per position of the guide in each step.
     causes : ndarray, shape (h, n + 1, 5 + n)
         The same per origin [m], turn of the frame [rad], tilt, load of the bevel [N] without
         roll, and curvature of the path at each depth [1/m].
@@ -87,7 +89,7 @@ class SteeringModel:
     elastic : ndarray, shape (h, n + 1)
         What a load of the bevel on the resting tip adds at once [m/N].
     guide_load, causes_load, bevel_load : ndarray, shape (h, n, n), (h, n, 5 + n), (h, n, n + 1)
-        What the guide feels [N] after its motion in each step, of the same.
+        What the guide feels [N] when it is where it shall be in each step, of the same.
     push : float
         Believed load of the bevel, along z at zero roll [N].
     between : ndarray, shape (2, h, n + 1, n)
@@ -109,6 +111,8 @@ class SteeringModel:
         steering: SteeringParameters,
         depths: ArrayLike,
         belief: SteeringBelief | None = None,
+        *,
+        together: bool = False,
     ) -> None:
         at = np.array(depths, dtype=np.float64)
         if at.ndim != 1 or len(at) < 2 or not np.isfinite(at).all() or (np.diff(at) <= 0.0).any():
@@ -123,6 +127,7 @@ class SteeringModel:
                 f'length, got {at[0]:g} to {at[-1]:g} m'
             )
         self.depths, self.belief = at, belief or SteeringBelief()
+        self._together = together
         width = _BEYOND * self.belief.spread
         lengths = np.geomspace(1.0 - width, 1.0 + width, _LENGTHS if width else 1)
         skins = np.ones(1)
@@ -173,11 +178,12 @@ class SteeringModel:
         base = steered(other, beyond)
         reach = at[-1] + steering.free_length
         runs = 3 * n + 3
-        # First the guide, then the needle: so it does not matter how fast either is.
+        # First the guide, then the needle.
         poses = np.zeros((runs, 2 * n + 1, 6))
         poses[:, ::2, 0], poses[:, 1::2, 0] = at, at[:-1]
         for k in range(n):
-            poses[k, 2 * k + 1 : 2 * k + 3, 1] = 1.0
+            first = 2 * k + (2 if self._together else 1)
+            poses[k, first : first + 2, 1] = 1.0
         poses[n, :, 2] = 1.0
         # A bevel that pushes along z in one step, and along x in all others.
         bevels = slice(n + 1, 2 * n + 2)
@@ -224,5 +230,5 @@ class SteeringModel:
         return (
             *sorted_by_cause(tips[:, ::2], np.ones(n + 1), at),
             np.append(elastic, elastic[-1]),
-            *sorted_by_cause(felt[:, 1::2], none, none),
+            *sorted_by_cause(felt[:, 2 if self._together else 1 :: 2], none, none),
         )

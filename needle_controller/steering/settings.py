@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final
 
 from needle_dynamics.arrays import FloatArray
@@ -10,6 +10,9 @@ from needle_ros.contract import GUIDE_X, GUIDE_Z, INSERTION, ROLL
 from needle_ros.errors import ParameterError
 from needle_ros.settings import check_constants, constant
 import numpy as np
+
+#: How often the guide is sent on within a step, at least.
+_PER_STEP: Final = 4.0
 
 #: Joints that are moved; the last one only if the needle may be turned.
 JOINTS: Final = (INSERTION, GUIDE_X, GUIDE_Z, ROLL)
@@ -40,6 +43,16 @@ class OuterLoopSettings:
         8.0, 'N', 'largest lateral force of the guide that is planned, along x and along z',
         open_low=True,
     )  # fmt: skip
+    continuous: bool = field(
+        default=False,
+        metadata={
+            'description': 'the needle goes in without rests, and the guide with it; else it '
+            'rests at the end of each step'
+        },
+    )
+    rate: float = constant(
+        20.0, 'Hz', 'continuous: how often the guide is sent on', low=1.0, high=50.0
+    )
     settle_time: float = constant(0.1, 's', 'time at rest before a look')
     look_time: float = constant(
         0.5, 's', 'duration of a look, whose readings are averaged', open_low=True
@@ -70,6 +83,16 @@ class OuterLoopSettings:
         if self.turns != int(self.turns):
             raise ParameterError(f'turns must be a whole number, got {self.turns!r}')
         object.__setattr__(self, 'turns', int(self.turns))
+        if not isinstance(self.continuous, bool):
+            raise ParameterError(f'continuous must be true or false, got {self.continuous!r}')
+        if self.continuous and self.turns:
+            raise ParameterError('turns must be 0 if continuous: a needle is turned at rest')
+        least = _PER_STEP * self.speed / self.step_length
+        if self.continuous and self.rate < least:
+            raise ParameterError(
+                f'rate must be at least {least:g} Hz if continuous, {_PER_STEP:g} times in a '
+                f'step, got {self.rate:g} Hz'
+            )
         if self.guide_limit == 0.0 and self.turns == 0:
             raise ParameterError('guide_limit and turns cannot both be 0: nothing would move')
 
@@ -77,6 +100,13 @@ class OuterLoopSettings:
     def joints(self) -> tuple[str, ...]:
         """Joints that are moved."""
         return JOINTS if self.turns else JOINTS[:-1]
+
+    @property
+    def farthest(self) -> float:
+        """How far the guide can go from one step to the next [m]."""
+        if not self.continuous:
+            return self.guide_step
+        return min(self.guide_step, self.guide_speed * self.step_length / self.speed)
 
     @property
     def tolerances(self) -> FloatArray:

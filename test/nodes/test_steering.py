@@ -157,9 +157,10 @@ def test_a_bevel_is_turned_by_roll_alone(ros_graph: RosGraph) -> None:
     assert bench.at('guide_x') == bench.at('guide_z') == 0.0
 
 
-def test_an_axis_law_moves_the_needle(ros_graph: RosGraph) -> None:
-    """A controller that is steered follows the node and leaves targets to it."""
-    bench = Bench(ros_graph, mode='simulation')
+@pytest.mark.parametrize('continuous', [False, True])
+def test_an_axis_law_moves_the_needle(ros_graph: RosGraph, continuous: bool) -> None:
+    """A controller that is steered follows the node, with or without rests, and no targets."""
+    bench = Bench(ros_graph, mode='simulation', continuous=continuous, rate=50.0)
     controller = ros_graph.add(
         ControllerNode,
         parameters={

@@ -13,7 +13,7 @@ from needle_controller.journal import Severity
 from needle_controller.steering.look import Look
 from needle_controller.steering.motion import Move, smooth
 from needle_controller.steering.outer_loop import Phase
-from needle_dynamics import SteeredNeedle, STEERING_PRESETS
+from needle_dynamics import ParameterError, SteeredNeedle, STEERING_PRESETS
 from needle_ros.wire import Reading
 import numpy as np
 from numpy.testing import assert_allclose
@@ -42,8 +42,8 @@ class Robot:
         self.needle = SteeredNeedle(softer, STEERING, tilt=(0.01, 0.02))
         self.now = 1000 * SECOND
         self.at = np.zeros(3)
-        self.began, self.move = 0, Move(np.zeros(1), np.zeros((1, 3)), np.zeros((1, 3)))
-        self.start = self.at
+        #: How each joint moves: times [ns] and positions.
+        self.ways = [(np.zeros(1), np.zeros(1)) for _ in NAMES]
         self.noise = np.random.default_rng(3)
         #: What goes wrong: how the joints move, and what is said of them and of the tip.
         self.moves: Callable[[np.ndarray[Any, Any]], np.ndarray[Any, Any]] = lambda at: at
@@ -58,10 +58,7 @@ class Robot:
         for _ in range(count):
             self.now += PERIOD
             self.seconds += 1e-9 * PERIOD
-            passed = 1e-9 * (self.now - self.began)
-            times = np.concatenate([[0.0], self.move.times])
-            rows = np.vstack([self.start, self.move.positions])
-            self.at = self.moves(np.array([np.interp(passed, times, row) for row in rows.T]))
+            self.at = self.moves(np.array([np.interp(self.now, *way) for way in self.ways]))
             self.needle.move(depth=float(self.at[0]), guide=self.at[1:].tolist())
             self.tracked.append(self.at)
             x, y, z = self.needle.tip
@@ -84,7 +81,10 @@ class Robot:
     def follow(self, move: Move | None) -> None:
         """Begin a motion, from where the joints are."""
         if move is not None:
-            self.began, self.start, self.move = self.now, self.at, move
+            times = self.now + 1e9 * np.concatenate([[0.0], move.times])
+            for name, column in zip(move.joints, move.positions.T, strict=True):
+                k = NAMES.index(name)
+                self.ways[k] = times, np.concatenate([[self.at[k]], column])
 
     def aim(self, point: tuple[float, float, float] = TARGET, frame: str = '') -> str:
         """Send a target; return why it was refused."""
@@ -119,7 +119,7 @@ def test_a_motion_is_smooth_and_goes_in_proportion(
 ) -> None:
     """It ends at rest exactly where it shall, is as fast as it says, and never turns back."""
     one, other = np.array(begin), np.array(end)
-    move = smooth(one, other, duration)
+    move = smooth(NAMES, one, other, duration)
     assert (move.positions[-1] == other).all()
     assert (move.velocities[-1] == 0.0).all()
     assert move.times[-1] == pytest.approx(duration)
@@ -162,8 +162,8 @@ def test_late_and_lost_readings_do_no_harm() -> None:
     assert robot.miss < 4e-4
 
 
-def stuck(robot: Robot, joint: int) -> None:
-    at = 5e-4 if joint else 0.03
+def stuck(robot: Robot, joint: int, depth: float = 0.03) -> None:
+    at = 5e-4 if joint else depth
 
     def moves(wanted: Any) -> Any:
         wanted[joint] = np.clip(wanted[joint], -at, at)
@@ -250,6 +250,95 @@ def test_what_goes_wrong_stops_it_and_is_said(
     assert_allclose(robot.at, before, atol=1e-9)
 
 
+CONTINUOUS = replace(SETTINGS, continuous=True)
+
+
+@pytest.mark.parametrize(
+    ('step', 'rate', 'late'),
+    [(5e-3, 20.0, 0), (5e-3, 8.0, 0), (2.5e-3, 50.0, 20_000_000), (2.5e-3, 20.0, 66_000_000)],
+)
+def test_without_rests_it_hits_too(step: float, rate: float, late: int) -> None:
+    """In 12 s instead of 20, with readings of the way, also late ones; the guide never jumps."""
+    robot = Robot(replace(CONTINUOUS, step_length=step, rate=rate))
+    robot.late = late
+    robot.steer()
+    assert robot.loop.phase is Phase.DONE
+    assert robot.miss < 4e-4
+    assert robot.seconds < 14.0
+    tracked = np.array(robot.tracked)
+    going = (tracked[:, 0] > 1e-3) & (tracked[:, 0] < 0.059)
+    # It does not rest on its way.
+    assert (np.diff(tracked[going, 0]) > 0.0).all()
+    ways = np.abs(np.diff(tracked[:, 1:], axis=0)).max(axis=0) / (1e-9 * PERIOD)
+    # Twice the even speed of the largest step, at the peak of the insertion speed.
+    assert (ways <= 2.0 * CONTINUOUS.guide_step / step * CONTINUOUS.speed).all()
+
+
+def test_the_guide_waits_for_a_needle_that_stalls() -> None:
+    """For two seconds in the midst of a step; then the same guide at the same depth."""
+    robot, held = Robot(CONTINUOUS), 0
+
+    def moves(wanted: Any) -> Any:
+        nonlocal held
+        if wanted[0] > 0.0325 and held < 200:
+            held += 1
+            robot.ways[0] = robot.ways[0][0] + PERIOD, robot.ways[0][1]
+            wanted[0] = 0.0325
+        return wanted
+
+    robot.moves = moves
+    robot.steer()
+    assert robot.loop.phase is Phase.DONE
+    assert robot.miss < 4e-4
+    tracked = np.array(robot.tracked)
+    stalled = tracked[np.abs(tracked[:, 0] - 0.0325) < 1e-9][20:, 1:]
+    assert len(stalled) > 150
+    assert_allclose(stalled, np.tile(stalled[-1], (len(stalled), 1)), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ('fault', 'said', 'deepest'),
+    [
+        (lambda robot: stuck(robot, 1), r'the guide is at x = -?0\.500 mm', 0.02),
+        (lambda robot: stuck(robot, 0), 'insertion is at 30.000 mm, not at 60.000 mm', 0.031),
+        (lambda robot: stuck(robot, 0, 0.0), 'the needle does not move; does what', 0.0),
+        (frozen, 'the sensor of the tip is frozen', 0.048),
+        (lost, 'the tip was not seen in 7 looks', 0.061),
+        (slips, 'deep than the needle was inserted: it slips', 0.04),
+        (silent, r'no joint_states for 0\.5\d s', 0.061),
+    ],
+)
+def test_what_goes_wrong_on_the_way_stops_it_and_is_said(
+    fault: Callable[[Robot], None], said: str, deepest: float
+) -> None:
+    """
+    The needle rests soon after.
+
+    But when `joint_states` end: then nobody knows where it is, and what moves it goes on to the
+    target depth, unless it stops itself without them, as our controller does.
+    """
+    robot = Robot(CONTINUOUS)
+    fault(robot)
+    robot.steer()
+    assert robot.loop.phase is Phase.STOPPED
+    with pytest.raises(AssertionError, match=said):
+        raise AssertionError(robot.loop.fault)
+    robot.tick(1000)
+    assert robot.at[0] <= deepest
+    before = robot.at
+    robot.tick(100)
+    assert_allclose(robot.at, before, atol=1e-9)
+
+
+def test_what_cannot_be_continuous_is_named() -> None:
+    with pytest.raises(ParameterError, match='turns must be 0 if continuous'):
+        OuterLoopSettings(continuous=True, turns=2)
+    with pytest.raises(ParameterError, match='continuous must be true or false'):
+        OuterLoopSettings(continuous=2.0)  # type: ignore[arg-type]
+    with pytest.raises(ParameterError, match='rate must be at least 8 Hz if continuous'):
+        OuterLoopSettings(continuous=True, rate=5.0)
+
+
 def test_one_source_of_each_sensor() -> None:
     for counts in ((2, 1), (1, 2)):
         robot = Robot()
@@ -309,8 +398,7 @@ def test_too_many_steps_are_refused() -> None:
 def test_a_needle_must_be_straight_at_the_start() -> None:
     """Outside tissue the guide goes to its zero first; in tissue it must be there."""
     robot = Robot()
-    robot.start = robot.at = np.array([0.0, 3e-3, 0.0])
-    robot.move = Move(np.array([0.1]), robot.at[np.newaxis], np.zeros((1, 3)))
+    robot.ways[1] = np.zeros(1), np.array([3e-3])
     robot.tick(20)
     assert robot.aim() == ''
     robot.tick(55)
@@ -318,9 +406,7 @@ def test_a_needle_must_be_straight_at_the_start() -> None:
     assert robot.loop.control.step == 0
 
     robot = Robot()
-    robot.at = np.array([0.02, 3e-3, 0.0])
-    robot.start = robot.at
-    robot.move = Move(np.array([0.1]), robot.at[np.newaxis], np.zeros((1, 3)))
+    robot.ways[:2] = [(np.zeros(1), np.array([at])) for at in (0.02, 3e-3)]
     robot.tick(20)
     assert 'the guide is 3.00 mm off its zero with the needle at 20.00 mm' in robot.aim()
 
@@ -367,17 +453,15 @@ def test_readings_that_scatter_are_said() -> None:
 
 
 def test_a_look_leaves_out_what_is_absurd() -> None:
-    """Few readings, one of them elsewhere; none; and those outside its time."""
-    look = Look(0, 100)
+    """Many readings, two of them elsewhere; and none."""
+    look = Look()
     assert look.seen(1e-5) is None
     rng = np.random.default_rng(1)
     tips = np.array([1e-3, 0.05, -2e-3]) + 1e-4 * rng.standard_normal((20, 3))
-    for k, tip in enumerate(tips):
-        assert not look.take(1 + k, tuple(tip))
-    look.take(50, (0.02, 0.05, 0.0))
-    look.take(60, (1e300, 0.05, 0.0))
-    look.take(0, (1.0, 1.0, 1.0))
-    assert look.take(101, (1.0, 1.0, 1.0))
+    for tip in tips:
+        look.take(tuple(tip))
+    look.take((0.02, 0.05, 0.0))
+    look.take((1e300, 0.05, 0.0))
     seen = look.seen(1e-5)
     assert seen.readings == 20
     assert_allclose(seen.tip, tips.mean(axis=0), atol=1e-12)
