@@ -52,12 +52,12 @@ class SteeringNode(BaseNode):
     """
     Brings the tip to a ``target`` (point x, y, z [m]; y is the depth) by guide and roll.
 
-    The needle goes in by steps. At the end of each it rests, the readings of ``tip_deflection``
-    that come then are a look at the tip. Then the guide moves, by a ``joint_trajectory`` of
-    `insertion`, `guide_x` and `guide_z`, with ``turns`` also `roll`; when it has arrived the next
-    step begins. A robot follows all of it; where a controller moves the
-    needle, with its parameter ``steered``, it follows the insertion. ``joint_states`` must have
-    these joints.
+    The needle goes in by steps. At the end of each it rests, and the readings of
+    ``tip_deflection`` that come then are a look at the tip. Then the guide moves, by a
+    ``joint_trajectory`` of `insertion`, `guide_x` and `guide_z`, with ``turns`` also `roll`; when
+    it has arrived the next step begins. If it is ``continuous`` the needle does not rest, and the
+    guide follows its depth. A robot follows all of it; where a controller moves the needle, with
+    its parameter ``steered``, it follows the insertion. ``joint_states`` must have these joints.
 
     What is believed of needle and tissue is ``model.*`` and ``steering.*``, how far it may be
     wrong ``belief.*``. A target out of reach is refused, with what is within it. The needle stops

@@ -258,7 +258,7 @@ CONTINUOUS = replace(SETTINGS, continuous=True)
     [(5e-3, 20.0, 0), (5e-3, 8.0, 0), (2.5e-3, 50.0, 20_000_000), (2.5e-3, 20.0, 66_000_000)],
 )
 def test_without_rests_it_hits_too(step: float, rate: float, late: int) -> None:
-    """In 12 s instead of 20, with readings of the way, also late ones; the guide never jumps."""
+    """In 12 s instead of 18, with readings of the way, also late ones; the guide never jumps."""
     robot = Robot(replace(CONTINUOUS, step_length=step, rate=rate))
     robot.late = late
     robot.steer()
