@@ -56,6 +56,9 @@ STEERING: Final[dict[str, object]] = {
     'settle_time': 0.05,
     'look_time': 0.25,
     'belief.noise': 6e-5,
+    # A machine that is busy takes its time.
+    'patience': 60.0,
+    'measurement_timeout': 2.0,
 }
 
 #: The axis law.
