@@ -122,6 +122,8 @@ def start(context: LaunchContext) -> list[Action]:
     if given['mode'] in ('', 'simulation'):
         names.append('controller')
     if steering:
+        if given['mode'] == 'indenter' or given['steered'] == 'false':
+            raise RuntimeError('steering:=true needs a needle that is steered')
         names.append('steering')
         values['plant'].setdefault('steered', True)
         values['controller']['steered'] = True

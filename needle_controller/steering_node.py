@@ -166,7 +166,7 @@ class SteeringNode(BaseNode):
     def _on_stop(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         if self._loop is not None and self._loop.steers:
             self._act(self._loop.stop('~/stop'))
-            response.message = 'stopped; a target begins a new insertion'
+            response.message = 'stopped; retract the needle before the next target'
         else:
             response.message = 'nothing was under way'
         response.success = True

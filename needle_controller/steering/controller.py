@@ -285,8 +285,10 @@ class SteeringController:
             raise ParameterError(f'load_limit must be > 0, got {load_limit!r} N')
         if not step_limit > 0.0:
             raise ParameterError(f'step_limit must be > 0, got {step_limit!r} m')
-        if turns < 0:
-            raise ParameterError(f'turns must be >= 0, got {turns!r}')
+        if isinstance(turns, float) or turns < 0:
+            raise ParameterError(f'turns must be a whole number >= 0, got {turns!r}')
+        if not isfinite(roll):
+            raise ParameterError(f'roll must be finite, got {roll!r} rad')
         if position_limit == 0.0 and turns == 0:
             raise ParameterError('position_limit and turns cannot both be 0: nothing would move')
         self._model, self._limit, self._load_limit = model, position_limit, load_limit
@@ -490,7 +492,7 @@ class SteeringController:
         self.see(tip, self.step)
         return self.plan()
 
-    def see(self, tip: Sequence[float] | FloatArray | None, at: int) -> None:
+    def see(self, tip: Sequence[float] | FloatArray | None, at: int, noise: float = 0.0) -> None:
         """
         Take a look at the tip, of now or of an earlier depth.
 
@@ -500,19 +502,26 @@ class SteeringController:
             As for `next`.
         at : int
             Number of the depth, not greater than `step`.
+        noise : float
+            Its standard deviation along each axis, if that is more than is believed [m].
 
         Raises
         ------
+        ParameterError
+            If there is no such depth yet.
         ShapeError, JobError, SteeringFaultError
             As for `next`.
 
         """
         if self.step > self._model.steps:
             raise JobError(f'all {self._model.steps} steps are done')
-        predicted = self._tip(at, self._held())
-        seen = self._checked(tip, self._over_all(predicted))
+        if not 0 <= at <= self.step:
+            raise ParameterError(f'at must be in [0, {self.step}], got {at!r}')
+        predicted, variance = self._tip(at, self._held()), self._model.belief.noise**2
+        variance = max(variance, noise**2)
+        seen = self._checked(tip, self._over_all(predicted), variance)
         if seen is not None:
-            self._learn(complex(*seen), predicted)
+            self._learn(complex(*seen), predicted, variance)
 
     def plan(self) -> Guidance:
         """
@@ -532,7 +541,7 @@ class SteeringController:
         return Guidance(float(there.real), float(there.imag), self._roll)
 
     def _checked(
-        self, tip: Sequence[float] | FloatArray | None, there: TipEstimate
+        self, tip: Sequence[float] | FloatArray | None, there: TipEstimate, variance: float
     ) -> FloatArray | None:
         """Return a look that counts; None if there is none."""
         if tip is None or not all(map(isfinite, np.ravel(tip))):
@@ -554,10 +563,9 @@ class SteeringController:
         if same:
             return None
         off = seen - there.mean
-        noise = self._model.belief.noise**2 * np.eye(2)
         # What is absurd is infinitely far.
         with np.errstate(over='ignore', invalid='ignore'):
-            distance = float(off @ np.linalg.solve(there.covariance + noise, off))
+            distance = float(off @ np.linalg.solve(there.covariance + variance * np.eye(2), off))
         if distance <= _IMPOSSIBLE:
             self._impossible = 0
             return seen
@@ -570,9 +578,9 @@ class SteeringController:
             )
         return None
 
-    def _learn(self, seen: complex, predicted: _Predicted) -> None:
+    def _learn(self, seen: complex, predicted: _Predicted, variance: float) -> None:
         """Update each hypothesis, and their probabilities."""
-        whole = predicted.variances + self._model.belief.noise**2
+        whole = predicted.variances + variance
         off = seen - predicted.means
         gain = predicted.shared / whole[:, np.newaxis]
         self._mean += off[:, np.newaxis] * gain

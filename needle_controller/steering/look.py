@@ -31,7 +31,7 @@ class Seen(NamedTuple):
     readings : int
         How many count.
     frozen : bool
-        Whether they are all the same, and more than a few.
+        Whether they are all the same in x and z, and more than a few.
 
     """
 
@@ -98,8 +98,13 @@ class Look:
             # At the end of a line it is twice as far as of a mean.
             scale = basis.shape[1] / sqrt(free * count)
             error = float(np.sqrt((left[:, [0, 2]] ** 2).sum(axis=0)).max()) * scale
-        frozen = count >= _FEW and bool((tips == tips[0]).all())
-        return Seen(found[0], error, count, frozen)
+        across = tips[:, [0, 2]]
+        frozen = count >= _FEW and bool((across == across[0]).all())
+        tip = found[0]
+        if frozen:
+            # Exactly, so that looks can be compared.
+            tip[[0, 2]] = across[0]
+        return Seen(tip, error, count, frozen)
 
 
 def _fitted(basis: FloatArray, tips: FloatArray) -> FloatArray:

@@ -12,10 +12,14 @@ import numpy as np
 #: Highest speed of a smooth motion from rest to rest over its mean.
 _PEAK: Final = 1.875
 
-#: Highest acceleration of such a motion by its way over its squared duration.
-_STEEPEST: Final = 10.0 / sqrt(3.0)
+#: Highest acceleration of such a motion by its way over its squared duration; with what cubics
+#: between its points add.
+_STEEPEST: Final = 1.05 * 10.0 / sqrt(3.0)
 
-#: Time from one point of a motion to the next [s].
+#: Fewest points of a motion.
+_POINTS: Final = 20
+
+#: Longest time from one point of a motion to the next [s].
 _INTERVAL: Final = 0.05
 
 
@@ -59,7 +63,7 @@ def smooth(joints: tuple[str, ...], begin: FloatArray, end: FloatArray, duration
         A polynomial of fifth order, of least jerk.
 
     """
-    count = max(2, ceil(duration / _INTERVAL))
+    count = max(_POINTS, ceil(duration / _INTERVAL))
     part = np.arange(1, count + 1) / count
     gone = part**3 * (10.0 - 15.0 * part + 6.0 * part**2)
     rate = 30.0 * (part * (1.0 - part)) ** 2 / duration

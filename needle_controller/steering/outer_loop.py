@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from enum import Enum
+from math import ceil, sqrt
 from time import monotonic
 from typing import Final
 
@@ -45,7 +46,10 @@ _SPAN: Final = 0.05
 #: Time after which a needle that rests is sent again [s], and how often it is sent.
 _AGAIN, _TRIES = 1.0, 3
 
-#: How many times the tolerance of a guide at rest one on its way may be behind.
+#: Changes from one message to the next that are not believed [m, rad].
+_JUMPS: Final = (5e-3, 5e-3, 5e-3, 1.0)
+
+#: How many times the tolerance of a joint at rest one on its way may be off.
 _LAGGING: Final = 5.0
 
 #: A needle that moves by less while it settles, rests [m].
@@ -132,7 +136,7 @@ class OuterLoop:
         self.journal = Journal(steady)
         timeout = settings.measurement_timeout
         frames = ('', ENTRY)
-        self._joint_stream = Stream(JOINT_STATES.name, timeout)
+        self._joint_stream = Stream(JOINT_STATES.name, timeout, jumps=_JUMPS)
         self._tip_stream = Stream(TIP_DEFLECTION.name, timeout, frames=frames)
         self._target_stream = Stream('target', timeout, frames=frames, stamped=False)
         self.phase, self.fault = Phase.IDLE, ''
@@ -143,19 +147,25 @@ class OuterLoop:
         self._begun = 0.0
         #: Where the joints are, were sent, and when they shall be there.
         self._at: FloatArray | None = None
-        self._goal = np.zeros(len(settings.joints))
+        self._origin = self._goal = np.zeros(len(settings.joints))
         self._due = 0
+        #: How it was asked to rest, and stamp [ns] and inserted length [m] since then.
+        self._halt: Move | None = None
+        self._halted: tuple[int, float] | None = None
+        #: Largest deviation of a reading of the tip that was seen [m].
+        self._scatter = 0.0
         #: Stamp [ns] and inserted length [m] since which the needle rests.
         self._rest: tuple[int, float] | None = None
         self._look: Look | None = None
         #: Stamps between which readings belong to it [ns].
         self._span = 0, 0
         #: On the way: looks at the depths, the last depth that was passed, where the guide is
-        #: before and after the next one [m], and when it was sent on [ns].
+        #: before and after the next one [m], and when it was sent on, and
+        #: when the needle should have gone some way [ns].
         self._passing: dict[int, Look] = {}
         self._passed = self._tries = 0
         self._between = np.zeros((2, 2))
-        self._sent = 0
+        self._sent = self._overdue = 0
         #: Stamp [ns] and inserted length [m] of some time ago, and insertion speed [m/s].
         self._before: tuple[int, float] | None = None
         self._speed = 0.0
@@ -234,6 +244,8 @@ class OuterLoop:
                 raise JobError(f'{stream.name} does not come')
         if self._at is None:
             raise JobError('where needle and guide are is not known')
+        if self._at[0] < -_OUTSIDE:
+            raise JobError(f'the needle is {-1e3 * self._at[0]:.2f} mm before the skin')
         depth = max(0.0, float(self._at[0]))
         if self.control is not None and depth > self._begun + _OUTSIDE:
             raise JobError(
@@ -241,7 +253,8 @@ class OuterLoop:
                 f'{1e3 * self._begun:.2f} mm first'
             )
         off = np.abs(self._at[1:3]).max()
-        if depth > _OUTSIDE and off > settings.guide_tolerance:
+        begun = self._begun if self.control is not None else 0.0
+        if depth > begun + _OUTSIDE and off > settings.guide_tolerance:
             raise JobError(
                 f'the guide is {1e3 * off:.2f} mm off its zero with the needle at '
                 f'{1e3 * depth:.2f} mm; a needle has to be straight at the start'
@@ -251,13 +264,14 @@ class OuterLoop:
                 f'the needle is at {1e3 * depth:.2f} mm already, the target at '
                 f'{1e3 * point[1]:.2f} mm'
             )
-        steps = max(1, round((point[1] - depth) / settings.step_length))
+        steps = max(1, ceil((point[1] - depth) / settings.step_length - _SAME))
         if steps > _MOST_STEPS:
             raise ParameterError(
                 f'it would take {steps} steps of {1e3 * settings.step_length:g} mm; {_MOST_STEPS} '
                 'may be: make step_length larger'
             )
         depths = np.linspace(depth, point[1], steps + 1)
+        asked = monotonic()
         model = SteeringModel(
             self._needle,
             self._steering,
@@ -273,19 +287,20 @@ class OuterLoop:
             settings.turns,
             settings.load_limit,
             roll,
-            settings.farthest,
+            settings.farthest((point[1] - depth) / steps),
         )
         self._planned = None
         self._depths, self._begun = depths, depth
         self.expected, self.fault = None, ''
-        self._ahead, self._warned = None, False
+        self._ahead, self._warned, self._scatter = None, False, 0.0
         self.journal.say(Severity.INFO, f'steers to {_words(point)} in {steps} steps')
         self._goal = np.array([depth, *self._at[1:]])
         straight = self._goal.copy()
         straight[1:3] = 0.0
-        return self._send(Phase.GUIDING, straight, now)
+        # Time has gone on since.
+        return self._send(Phase.GUIDING, straight, now + round(1e9 * (monotonic() - asked)))
 
-    def stop(self, why: str) -> Move | None:
+    def stop(self, why: str, silence: float = 0.0) -> Move | None:
         """
         End the insertion: needle and guide come to rest where they are.
 
@@ -293,6 +308,8 @@ class OuterLoop:
         ----------
         why : str
             For people.
+        silence : float
+            Age of what is known of where they are [s].
 
         Returns
         -------
@@ -307,12 +324,30 @@ class OuterLoop:
         self.journal.say(Severity.ERROR, f'stopped: {why}')
         if not moves or self._at is None:
             return None
-        end = self._at.copy()
-        # It cannot rest at once where it is.
-        ahead = min(0.5 * _BRAKING * self.settings.speed, max(0.0, self._goal[0] - end[0]))
-        end[0] += ahead
+        end, limit = self._at.copy(), self.settings.guide_limit
+        # It cannot rest at once where it is, and what is said of it may be absurd.
+        end[0] += (0.5 * _BRAKING + silence) * self.settings.speed
+        end[0] = min(max(end[0], self._origin[0]), self._goal[0])
+        end[1:3] = np.clip(end[1:3], -limit, limit)
         joints = self.settings.joints
-        return Move(joints, np.array([_BRAKING]), end[np.newaxis], np.zeros((1, len(end))))
+        self._halt = Move(joints, np.array([_BRAKING]), end[np.newaxis], np.zeros((1, len(end))))
+        self._halted, self._tries = None, _TRIES
+        return self._halt
+
+    def _still_moves(self, stamp: int, depth: float) -> Move | None:
+        """Ask a needle to rest again that goes on after a stop."""
+        if self._halted is None:
+            self._halted = stamp, depth
+        since, before = self._halted
+        if self._halt is None or stamp - since < _AGAIN * NANOSECONDS:
+            return None
+        self._halted, halt = (stamp, depth), self._halt
+        self._tries -= 1
+        if abs(depth - before) < _STILL or not self._tries:
+            self._halt = None
+            return None
+        self.journal.say(Severity.ERROR, 'the needle goes on after the stop; it is asked again')
+        return halt
 
     # What is measured.
 
@@ -349,6 +384,10 @@ class OuterLoop:
                 self.journal.refuse(f'joint_states refused: {refusal.line}')
             return None
         self._at = np.array(at)
+        if self.phase is Phase.STOPPED:
+            return self._still_moves(reading.stamp, float(self._at[0]))
+        if self._astray():
+            return self.stop(self._astray())
         if self.phase is Phase.INSERTING and self.settings.continuous:
             return self._follow(reading.stamp, now)
         if self.phase in (Phase.GUIDING, Phase.INSERTING):
@@ -356,6 +395,20 @@ class OuterLoop:
         if self.phase is Phase.LOOKING and self._missed():
             return self.stop(f'while it looks at the tip {self._missed()}')
         return None
+
+    def _astray(self) -> str:
+        """Say which joint has left its way, '' if none has."""
+        if not self.steers or self._at is None:
+            return ''
+        low, high = np.minimum(self._origin, self._goal), np.maximum(self._origin, self._goal)
+        room = _LAGGING * self.settings.tolerances
+        for k, name in enumerate(self.settings.joints[:3]):
+            if not low[k] - room[k] <= self._at[k] <= high[k] + room[k]:
+                return (
+                    f'{name} is at {1e3 * self._at[k]:.3f} mm, and was sent from '
+                    f'{1e3 * self._origin[k]:.3f} to {1e3 * self._goal[k]:.3f} mm'
+                )
+        return ''
 
     def _missed(self) -> str:
         """Say which joint is not where it was sent, '' if all are."""
@@ -446,7 +499,7 @@ class OuterLoop:
         timeout = self.settings.measurement_timeout
         back, self._time = (self._time - now) / NANOSECONDS, now
         if back > timeout:
-            for stream in (self._joint_stream, self._tip_stream):
+            for stream in (self._joint_stream, self._tip_stream, self._target_stream):
                 stream.forget()
             return self.stop(f'the clock went back by {back:.3f} s')
         if self._planned is None:
@@ -458,7 +511,7 @@ class OuterLoop:
                 return self.stop(f'{stream.publishers} nodes publish {stream.name}')
         silence = min(self._joint_stream.silence(now), (now - self._planned) / NANOSECONDS)
         if silence > timeout:
-            return self.stop(f'no joint_states for {silence:.2f} s')
+            return self.stop(f'no joint_states for {silence:.2f} s', silence)
         if self._look is not None and now > self._span[1] + timeout * NANOSECONDS:
             return self._step(now)
         return None
@@ -512,7 +565,11 @@ class OuterLoop:
         slip = self._slip(seen, float(self._depths[at]) if depth is None else depth)
         if slip:
             raise SteeringFaultError(slip)
-        control.see(None if seen is None else seen.tip[[0, 2]], at)
+        if seen is None:
+            control.see(None, at)
+            return
+        self._scatter = max(self._scatter, seen.error * sqrt(seen.readings))
+        control.see(seen.tip[[0, 2]], at, max(seen.error, self._scatter / sqrt(seen.readings)))
 
     def _planned_at(self, control: SteeringController, k: int) -> Guidance:
         """Plan the next step, and say what is to be said of it."""
@@ -529,16 +586,20 @@ class OuterLoop:
     def _set_out(self, now: int) -> Move:
         """Send the needle to the target depth."""
         begin, end = self._depths[[0]], self._depths[[-1]]
-        self.phase, self._rest, self._sent = Phase.INSERTING, None, now
-        self._passing, self._passed, self._before = {}, 0, None
+        self.phase, self._rest, self._sent = Phase.INSERTING, None, 0
+        self._passing, self._passed, self._before, self._speed = {}, 0, None, 0.0
         self._goal = np.array([end[0], *self._between[1]])
         duration = duration_of(np.array([end[0] - begin[0], 0.0, 0.0]), self.settings)
+        self._origin = np.array([begin[0], *self._between[0]])
         self._due = now + round(duration * NANOSECONDS)
+        # A smooth motion begins slowly: when it should have gone some way.
+        part = (10.0 * _STILL / (10.0 * float(end[0] - begin[0]))) ** (1.0 / 3.0)
+        self._overdue = now + round((_AGAIN + min(part, 1.0) * duration) * NANOSECONDS)
         return smooth(self.settings.joints[:1], begin, end, duration)
 
     def _set_out_again(self, stamp: int, now: int) -> Move | None:
         """Send a needle that does not move again: the message may have been lost."""
-        if stamp - self._sent < _AGAIN * NANOSECONDS:
+        if stamp < self._overdue:
             return None
         self._tries -= 1
         if self._tries:
@@ -563,13 +624,13 @@ class OuterLoop:
             fault = self._pass(control, at)
             if fault:
                 return self.stop(fault)
-        if depth >= self._depths[last] - self.settings.depth_tolerance:
-            if self._passed < last:
-                # To the end of the last step, once.
-                self._passed, self._due = last, stamp
-                return self._guide_to(self._between[1], np.zeros(2), _BRAKING)
+        if self._passed == last:
             return self._wait(stamp, now)
-        if self._passed == last or stamp > self._due + self.settings.patience * NANOSECONDS:
+        if depth >= self._depths[last] - self.settings.depth_tolerance:
+            # To the end of the last step, once.
+            self._passed, self._due = last, stamp
+            return self._guide_to(self._between[1], np.zeros(2), _BRAKING)
+        if stamp > self._due + self.settings.patience * NANOSECONDS:
             # The guide is where this depth has it.
             self._goal[1:] = at[1:]
             return self._wait(stamp, now)
@@ -607,7 +668,7 @@ class OuterLoop:
             return str(error)
         to = self._planned_at(control, k)
         self._between = np.array([there, [to.x, to.z]])
-        self._goal[1:] = to.x, to.z
+        self._origin[1:], self._goal[1:] = there, self._between[1]
         return ''
 
     # What is wrong, and where to.
@@ -631,7 +692,8 @@ class OuterLoop:
 
     def _send(self, phase: Phase, goal: FloatArray, now: int) -> Move | None:
         """Send needle and guide somewhere."""
-        begin, self._goal = self._goal, goal
+        self._origin = begin = self._goal
+        self._goal = goal
         self.phase, self._rest = phase, None
         duration = duration_of(goal - begin, self.settings)
         self._due = now + round(duration * NANOSECONDS)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from math import sqrt
 from typing import Final
 
 from needle_dynamics.arrays import FloatArray
@@ -27,7 +28,7 @@ class OuterLoopSettings:
     )
     speed: float = constant(0.01, 'm/s', 'highest insertion speed', open_low=True)
     guide_limit: float = constant(
-        6e-3, 'm', 'farthest position of the guide along x and along z; 0: it stays'
+        6e-3, 'm', 'farthest position of the guide along x and along z; 0: it stays at 0'
     )
     guide_step: float = constant(
         2e-3, 'm', 'farthest that the guide goes from one step to the next along x and along z',
@@ -35,12 +36,16 @@ class OuterLoopSettings:
     )  # fmt: skip
     guide_speed: float = constant(0.02, 'm/s', 'highest speed of the guide', open_low=True)
     acceleration: float = constant(
-        0.1, 'm/s^2', 'highest acceleration of needle and guide', open_low=True
+        0.1,
+        'm/s^2',
+        'highest acceleration of needle and guide; not of a guide that is continuous',
+        open_low=True,
     )
     turns: int = constant(0, '1', 'how often the needle may be turned')
     roll_speed: float = constant(2.0, 'rad/s', 'fastest roll', open_low=True)
     load_limit: float = constant(
-        8.0, 'N', 'largest lateral force of the guide that is planned, along x and along z',
+        8.0, 'N', 'largest lateral force of the guide that is planned, along x and along z; reach '
+        'does not know it',
         open_low=True,
     )  # fmt: skip
     continuous: bool = field(
@@ -71,7 +76,10 @@ class OuterLoopSettings:
         'the first look', open_low=True,
     )  # fmt: skip
     patience: float = constant(
-        5.0, 's', 'how much longer than planned a step may take', open_low=True
+        5.0,
+        's',
+        'how much longer than planned a step, or the whole way if continuous, may take',
+        open_low=True,
     )
     measurement_timeout: float = constant(
         0.5, 's', 'age at which joint_states, tip_deflection and stamped targets no longer '
@@ -80,6 +88,11 @@ class OuterLoopSettings:
 
     def __post_init__(self) -> None:
         check_constants(self)
+        if self.depth_tolerance >= 0.5 * self.step_length:
+            raise ParameterError(
+                f'depth_tolerance must be < half of step_length {self.step_length:g} m, got '
+                f'{self.depth_tolerance:g} m'
+            )
         if self.turns != int(self.turns):
             raise ParameterError(f'turns must be a whole number, got {self.turns!r}')
         object.__setattr__(self, 'turns', int(self.turns))
@@ -101,12 +114,25 @@ class OuterLoopSettings:
         """Joints that are moved."""
         return JOINTS if self.turns else JOINTS[:-1]
 
-    @property
-    def farthest(self) -> float:
-        """How far the guide can go from one step to the next [m]."""
+    def farthest(self, step: float) -> float:
+        """
+        Return how far the guide may go from one step to the next along each axis.
+
+        Parameters
+        ----------
+        step : float
+            Way of the needle in a step [m].
+
+        Returns
+        -------
+        float
+            The way of the guide [m].
+
+        """
         if not self.continuous:
             return self.guide_step
-        return min(self.guide_step, self.guide_speed * self.step_length / self.speed)
+        # Both axes at once, at the peak of the insertion speed.
+        return min(self.guide_step, sqrt(0.5) * self.guide_speed * step / self.speed)
 
     @property
     def tolerances(self) -> FloatArray:

@@ -86,7 +86,7 @@ def test_out_of_reach_is_said_before_or_on_the_way(
         (['--belief', 'sprad=0.1'], 'sprad'),
         (['--set', 'colour=1'], 'colour'),
         (['--set', 'cutting_force=1'], 'cutting_force'),
-        (['--turns', '-1'], 'turns must be >= 0, got -1'),
+        (['--turns', '-1'], 'turns must be a whole number >= 0, got -1'),
         (['--limit', '0'], 'position_limit and turns cannot both be 0: nothing would move'),
         (['--load-limit', '0'], 'load_limit must be > 0, got 0.0 N'),
         (['--seed', '-1'], '--seed must be >= 0, got -1'),

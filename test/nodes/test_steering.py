@@ -237,7 +237,7 @@ def test_it_can_be_stopped(ros_graph: RosGraph, how: str) -> None:
     if how == 'service':
         answer = bench.stop.call_async(Trigger.Request())
         bench.until(answer.done, 'the answer')
-        assert answer.result().message == 'stopped; a target begins a new insertion'
+        assert answer.result().message == 'stopped; retract the needle before the next target'
         assert bench.said == 'stopped: ~/stop'
     else:
         bench.steering.stop()

@@ -8,10 +8,11 @@ from typing import Any
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from needle_controller import OuterLoop, OuterLoopSettings, SteeringBelief
+from needle_controller import OuterLoop, OuterLoopSettings, ReferenceLimits, SteeringBelief
 from needle_controller.journal import Severity
+from needle_controller.reference.path import Path
 from needle_controller.steering.look import Look
-from needle_controller.steering.motion import Move, smooth
+from needle_controller.steering.motion import duration_of, Move, smooth
 from needle_controller.steering.outer_loop import Phase
 from needle_dynamics import ParameterError, SteeredNeedle, STEERING_PRESETS
 from needle_ros.wire import Reading
@@ -330,6 +331,100 @@ def test_what_goes_wrong_on_the_way_stops_it_and_is_said(
     assert_allclose(robot.at, before, atol=1e-9)
 
 
+@settings(max_examples=50, deadline=None)
+@given(
+    speed=st.floats(1e-3, 0.05),
+    acceleration=st.floats(0.01, 1.0),
+    way=st.floats(5e-4, 0.1),
+)
+def test_an_axis_law_with_the_same_limits_takes_every_motion(
+    speed: float, acceleration: float, way: float
+) -> None:
+    """It joins the points by cubics, whose speed and acceleration it checks."""
+    own = OuterLoopSettings(speed=speed, acceleration=acceleration)
+    begin, end = np.array([0.01, 0.0, 0.0]), np.array([0.01 + way, 0.0, 0.0])
+    move = smooth(own.joints, begin, end, duration_of(end - begin, own))
+    limits = ReferenceLimits(speed=1.001 * speed, acceleration=acceleration)
+    times = np.concatenate([[0.0], move.times])
+    positions = np.concatenate([[0.01], move.positions[:, 0]])
+    speeds = np.concatenate([[0.0], move.velocities[:, 0]])
+    path = Path(times.tolist(), positions.tolist(), speeds.tolist(), limits, (0.0, 0.2))
+    assert path.last == end[0]
+
+
+@pytest.mark.parametrize('continuous', [False, True])
+def test_a_single_absurd_reading_moves_nothing(continuous: bool) -> None:
+    """An encoder that says 150 mm once, and a guide that is at 50 mm for one message."""
+    robot = Robot(replace(SETTINGS, continuous=continuous))
+    robot.tick(20)
+    robot.aim()
+    while robot.at[0] < 0.0301:
+        robot.tick()
+    for absurd in ((0.15, *robot.at[1:]), (robot.at[0], 0.05, 0.0)):
+        reading = robot.joints(robot.now + 1, absurd)
+        assert robot.loop.joints(reading, robot.now + 1) is None
+    while robot.loop.steers:
+        robot.tick()
+    assert robot.loop.phase is Phase.DONE
+    assert robot.miss < 4e-4
+
+
+@pytest.mark.parametrize('continuous', [False, True])
+def test_a_needle_that_runs_on_is_stopped_at_once_and_asked_again(continuous: bool) -> None:
+    """By 20 mm/s, whatever it was asked for; the robot hears the second stop."""
+    robot = Robot(replace(SETTINGS, continuous=continuous))
+    runs, asked = False, 0
+
+    def moves(wanted: Any) -> Any:
+        if runs:
+            wanted[0] = robot.at[0] + 2e-4
+        return wanted
+
+    follow = robot.follow
+
+    def hear(move: Move | None) -> None:
+        nonlocal runs, asked
+        if move is not None and robot.loop.phase is Phase.STOPPED:
+            asked += 1
+            runs = runs and asked < 2
+        follow(move)
+
+    robot.moves = moves
+    setattr(robot, 'follow', hear)  # noqa: B010
+    robot.tick(20)
+    robot.aim()
+    robot.tick(500)
+    runs, begun = True, robot.at[0]
+    while robot.loop.steers:
+        robot.tick()
+    # Within the step under way, or the way, and 1.5 mm beyond.
+    assert robot.at[0] <= (TARGET[1] if continuous else begun + SETTINGS.step_length) + 2e-3
+    assert 'insertion is at' in robot.loop.fault
+    robot.tick(400)
+    assert 2 <= asked <= 3
+    before = robot.at
+    robot.tick(100)
+    assert_allclose(robot.at, before, atol=1e-9)
+
+
+def test_a_slow_needle_is_not_one_that_does_not_move() -> None:
+    robot = Robot(replace(CONTINUOUS, speed=5e-3))
+    robot.steer()
+    assert robot.loop.phase is Phase.DONE
+
+
+def test_after_a_retraction_the_next_target_is_taken() -> None:
+    """With the guide wherever it was: it goes to its zero first."""
+    robot = Robot()
+    robot.steer()
+    assert np.abs(robot.at[1:]).max() > 1e-4
+    robot.ways[0] = robot.now + np.array([0.0, 1e9]), np.array([robot.at[0], 0.0])
+    robot.tick(120)
+    assert robot.aim() == ''
+    robot.tick(20)
+    assert robot.loop.steers
+
+
 def test_what_cannot_be_continuous_is_named() -> None:
     with pytest.raises(ParameterError, match='turns must be 0 if continuous'):
         OuterLoopSettings(continuous=True, turns=2)
@@ -390,9 +485,9 @@ def test_a_target_that_cannot_be_is_refused(
 
 def test_too_many_steps_are_refused() -> None:
     """A plan of them would take the memory of the machine."""
-    robot = Robot(replace(SETTINGS, step_length=1e-6))
+    robot = Robot(replace(SETTINGS, step_length=1e-4, depth_tolerance=1e-5))
     robot.tick(5)
-    assert 'it would take 60000 steps of 0.001 mm; 200 may be' in robot.aim()
+    assert 'it would take 600 steps of 0.1 mm; 200 may be' in robot.aim()
 
 
 def test_a_needle_must_be_straight_at_the_start() -> None:
@@ -479,13 +574,17 @@ numbers = st.floats(allow_nan=True, allow_infinity=True) | st.floats(-0.1, 0.1)
             st.tuples(numbers, numbers, numbers),
         ),
         max_size=12,
-    )
+    ),
+    continuous=st.booleans(),
 )
 def test_whatever_is_said_no_motion_leaves_the_limits(
     said: list[tuple[str, tuple[float, float, float]]],
+    continuous: bool,
 ) -> None:
     """Between sane messages: each motion ends within guide and target, never nan."""
-    robot = Robot(replace(SETTINGS, look_time=0.05, step_length=0.02, settle_time=0.0))
+    robot = Robot(
+        replace(SETTINGS, look_time=0.05, step_length=0.02, settle_time=0.0, continuous=continuous)
+    )
     moves: list[Move] = []
     follow = robot.follow
 
@@ -512,6 +611,6 @@ def test_whatever_is_said_no_motion_leaves_the_limits(
     for move in moves:
         assert np.isfinite(move.positions).all()
         assert np.isfinite(move.velocities).all()
-        if robot.loop.phase is not Phase.STOPPED:
-            assert np.abs(move.positions[:, 1:]).max() <= SETTINGS.guide_limit + 1e-12
-            assert move.positions[:, 0].max() <= TARGET[1] + 1e-12
+        for name, column in zip(move.joints, move.positions.T, strict=True):
+            low, high = (0.0, TARGET[1]) if name == 'insertion' else (-6e-3, 6e-3)
+            assert low - 1e-12 <= column.min() <= column.max() <= high + 1e-12

@@ -147,6 +147,18 @@ def test_it_learns_how_the_needle_bends() -> None:
     assert weights @ MODEL.lengths == pytest.approx(1.2, abs=0.05)
 
 
+def test_a_look_that_is_noisier_says_less() -> None:
+    """The same look with four times its noise leaves more open; there is none of the future."""
+    left = []
+    for noise in (0.0, 1.6e-4):
+        controller = SteeringController(MODEL, (0.0, 0.0))
+        controller.see((1e-4, 0.0), 0, noise)
+        left.append(controller.expected(0).covariance[0, 0])
+    assert left[1] > 8.0 * left[0]
+    with pytest.raises(ParameterError, match=r'at must be in \[0, 0\], got 1'):
+        controller.see((0.0, 0.0), 1)
+
+
 def test_a_target_out_of_reach_is_refused_with_what_is_within_it() -> None:
     with pytest.raises(
         OutOfReachError, match=r'x = 40\.00 mm, z = 0\.00 mm is out of reach: from'
@@ -272,8 +284,10 @@ def test_bad_input_is_named() -> None:
         SteeringController(MODEL, (0.0, 0.0), position_limit=0.0)
     with pytest.raises(ParameterError, match='step_limit must be > 0'):
         SteeringController(MODEL, (0.0, 0.0), step_limit=0.0)
-    with pytest.raises(ParameterError, match='turns must be >= 0'):
+    with pytest.raises(ParameterError, match='turns must be a whole number >= 0, got -1'):
         SteeringController(MODEL, (0.0, 0.0), turns=-1)
+    with pytest.raises(ParameterError, match='roll must be finite'):
+        SteeringController(MODEL, (0.0, 0.0), roll=np.nan)
     with pytest.raises(ParameterError, match='load_limit must be > 0'):
         SteeringController(MODEL, (0.0, 0.0), load_limit=0.0)
     with pytest.raises(ParameterError, match='spread must be finite'):
