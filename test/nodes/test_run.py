@@ -238,18 +238,22 @@ def test_ctrl_c_ends_all_and_the_recording_is_whole(ros_graph: RosGraph, tmp_pat
     assert (tmp_path / 'run' / 'bag' / 'metadata.yaml').is_file()
 
 
+def children(pid: int) -> list[int]:
+    """Return the processes that a process has started."""
+    return [int(one) for one in Path(f'/proc/{pid}/task/{pid}/children').read_text().split()]
+
+
+def words_of(pid: int) -> str:
+    """Return the command line of a process."""
+    return Path(f'/proc/{pid}/cmdline').read_text()
+
+
 def test_a_node_that_dies_ends_the_session(ros_graph: RosGraph, tmp_path: Path) -> None:
     """With status 1 and the node's name; also while nothing is typed."""
     typed = Typed(ros_graph, tmp_path / 'run')
     typed.expect('needle> ')
-    found = subprocess.run(
-        ['ps', '--ppid', str(typed.process.pid), '-o', 'pid=,args='],
-        capture_output=True,
-        text=True,
-        check=True,
-    ).stdout
-    (pid,) = [line.split()[0] for line in found.splitlines() if 'controller_node' in line]
-    os.kill(int(pid), signal.SIGKILL)
+    (pid,) = [one for one in children(typed.process.pid) if 'controller_node' in words_of(one)]
+    os.kill(pid, signal.SIGKILL)
     typed.expect('error: controller ended early with status -9')
     assert typed.process.wait(60.0) == 1
 
