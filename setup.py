@@ -41,6 +41,8 @@ setup(
         (f'share/{NAME}', ['package.xml']),
         (f'share/{NAME}/config', files('config', '*.*')),
         (f'share/{NAME}/config/security', files('config/security', '*.xml')),
+        (f'share/{NAME}/description', files('description', '*.*')),
+        (f'share/{NAME}/description/meshes', files('description/meshes', '*.stl')),
         (f'share/{NAME}/launch', files('launch', '*.launch.py')),
         # ros2 run looks here; pip puts the same nodes on PATH as needle-<name>.
         (f'lib/{NAME}', [f'scripts/{node}' for node in NODES]),
@@ -77,6 +79,7 @@ setup(
             'mypy>=1.14',
             'pytest-xdist>=3.5',
             'ruff>=0.9',
+            'xacro>=2.1',
         ],
         # `make docs`; locked apart from the rest, in requirements-docs.lock.
         'docs': ['furo>=2024.8', 'myst-parser>=4.0', 'numpydoc>=1.8', 'sphinx>=8.1,<9'],
