@@ -1,4 +1,4 @@
-"""The robot description: it expands, its files exist, and it is the robot that the plant simulates."""
+"""The robot description: it expands, its files exist, and it is the robot of the plant."""
 
 from __future__ import annotations
 

