@@ -8,12 +8,14 @@ of interface, NaN for what nobody has set.
 
 from __future__ import annotations
 
+import ast
 from collections.abc import Callable, Iterator, Mapping
 from importlib import import_module
 from importlib.util import find_spec
 from math import nan
 import os
 from pathlib import Path
+import re
 import shutil
 import signal
 import subprocess
@@ -31,12 +33,12 @@ from needle_ros.base_node import COMMAND, message_class, SENSOR
 import pytest
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState
+from support.installed import ROOT
 from support.ros_graph import RosGraph
 import yaml
 
-CONTROLLERS = yaml.safe_load(
-    (Path(__file__).parents[2] / 'config/ros2_control.yaml').read_text(encoding='utf-8')
-)
+CONTROLLERS = yaml.safe_load((ROOT / 'config/ros2_control.yaml').read_text(encoding='utf-8'))
+LAUNCH = ast.parse((ROOT / 'launch/ros2_control.launch.py').read_text(encoding='utf-8'))
 #: rclcpp::QoS(1) and rclcpp::SensorDataQoS().
 SENT = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE)
 HEARD = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -144,6 +146,40 @@ class Trajectory:
 
 PUSHED = {'insertion': ('effort',), 'rotation': ('effort',)}
 CARRIED = {'insertion': ('position',)}
+
+
+# The launch file, read: what it starts is not in the wheels.
+
+
+def table(name: str) -> dict[str, ast.expr]:
+    """Return the entries of a dictionary of the launch file, by key."""
+    (made,) = (
+        item.value
+        for item in ast.walk(LAUNCH)
+        if isinstance(item, ast.Assign) and ast.unparse(item.targets[0]) == name
+    )
+    assert isinstance(made, ast.Dict)
+    return {
+        ast.literal_eval(key): value for key, value in zip(made.keys, made.values, strict=True)
+    }
+
+
+def test_the_launch_file_asks_for_what_there_is(ros_graph: RosGraph) -> None:
+    """Each argument has a use; parameters, arguments of xacro and files exist."""
+    asked = {
+        ast.literal_eval(item.slice)
+        for item in ast.walk(LAUNCH)
+        if isinstance(item, ast.Subscript) and ast.unparse(item.value) == 'given'
+        if isinstance(item.slice, ast.Constant)
+    }
+    assert asked == table('ARGUMENTS').keys()
+    plant = ros_graph.add(PlantNode, start=False)
+    assert [name for name in table('plant') if not plant.has_parameter(name)] == []
+    text = (ROOT / 'description/needle_insertion.urdf.xacro').read_text(encoding='utf-8')
+    assert [name for name in table('described') if f'<xacro:arg name="{name}"' not in text] == []
+    files = re.findall(r"share / '([^']+)'", ast.unparse(LAUNCH))
+    assert len(files) == 2
+    assert [name for name in files if not (ROOT / name).is_file()] == []
 
 
 # Mode simulation: efforts.
