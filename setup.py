@@ -11,7 +11,14 @@ ROOT = Path(__file__).resolve().parent
 MANIFEST = ET.parse(ROOT / 'package.xml').getroot()  # noqa: S314
 NAME = MANIFEST.findtext('name')
 NODES = runpy.run_path(str(ROOT / 'needle_insertion/nodes.py'))['NODES']
-TEST = ['hypothesis>=6.100', 'lxml>=5.0', 'mpmath>=1.3', 'pytest>=8.0', 'sympy>=1.12']
+TEST = [
+    'hypothesis>=6.100',
+    'lxml>=5.0',
+    'mpmath>=1.3',
+    'pytest>=8.0',
+    'sympy>=1.12',
+    'xacro>=2.1',
+]
 
 
 def files(folder: str, pattern: str) -> list[str]:
@@ -79,7 +86,6 @@ setup(
             'mypy>=1.14',
             'pytest-xdist>=3.5',
             'ruff>=0.9',
-            'xacro>=2.1',
         ],
         # `make docs`; locked apart from the rest, in requirements-docs.lock.
         'docs': ['furo>=2024.8', 'myst-parser>=4.0', 'numpydoc>=1.8', 'sphinx>=8.1,<9'],
