@@ -554,7 +554,8 @@ class PlantNode(ModelNode):
         if seen is None:
             return
         if self._tf is not None:
-            self._tf.publish(self._tf.msg_type(transforms=[_transform(seen, stamp)]))
+            kind: Any = self._tf.msg_type
+            self._tf.publish(kind(transforms=[_transform(seen, stamp)]))
         lines = [(self._shape, [seen.base.tolist(), *seen.points.tolist()])]
         if len(seen.path):
             lines.append((self._path, seen.path.tolist()))

@@ -66,7 +66,9 @@ def test_a_position_is_reached_when_the_next_may_come() -> None:
     for k, (after, within) in enumerate(steps):
         goal = {'insertion': 0.05 + 1e-4 * k}
         _, _, motions = asked(commands, START + after, ('insertion',), tuple(goal.values()))
-        assert motions == [Motion(goal, pytest.approx(within))]
+        (motion,) = motions
+        assert motion.goals == goal
+        assert motion.within == pytest.approx(within)
     # The same again asks for nothing new.
     assert asked(commands, START + 901 * PERIOD, ('insertion',), (0.05 + 3e-4,))[2] == []
 
@@ -77,7 +79,9 @@ def test_a_velocity_without_a_position_lasts_for_the_timeout() -> None:
     assert asked(commands, START, ('insertion',), (), (0.0,))[2] == []
     for _ in range(2):
         _, _, motions = asked(commands, START, ('insertion',), (), (0.01,))
-        assert motions == [Motion({'insertion': pytest.approx(0.051)}, 0.1)]
+        (motion,) = motions
+        assert motion.goals == pytest.approx({'insertion': 0.051})
+        assert motion.within == 0.1
     _, _, motions = asked(commands, START, ('insertion',), (), (0.0,))
     assert motions == [Motion({'insertion': 0.05}, 0.1)]
     assert asked(commands, START, ('insertion',), (), (0.0,))[2] == []

@@ -47,11 +47,11 @@ def generate(folder: Path) -> Path:
     described.generate_type_hashes(*what)
     json = [f'{made}/msg/{MESSAGE}.json']
     of('rosidl_generator_c.cli', 'GenerateC')('c').generate(*what, type_description_files=json)
-    # The only one: it needs no look-up of libraries by name.
-    fast = 'rosidl_typesupport_fastrtps_c'
+    fast, looks = 'rosidl_typesupport_fastrtps_c', 'rosidl_typesupport_introspection_c'
     of(f'{fast}.cli', 'GenerateFastRTPSCTypesupport')('fast').generate(*what)
+    of(f'{looks}.cli', 'GenerateIntrospectionCTypesupport')('looks').generate(*what)
     for module, name, supports in (
-        ('rosidl_typesupport_c', 'GenerateCTypesupport', [fast]),
+        ('rosidl_typesupport_c', 'GenerateCTypesupport', [fast, looks]),
         ('rosidl_generator_py', 'GeneratePython', ['rosidl_typesupport_c']),
     ):
         kind = of(f'{module}.cli', name)
@@ -60,25 +60,41 @@ def generate(folder: Path) -> Path:
 
 
 def compile_all(folder: Path, made: Path) -> None:
-    """Compile the sources into the extension that the package imports."""
-    includes = [folder, sysconfig.get_paths()['include'], np.get_include()]
-    includes += [PREFIX / 'include']
+    """Compile the sources into the extension that the package imports, and its libraries."""
+    includes = [folder, sysconfig.get_paths()['include'], np.get_include(), PREFIX / 'include']
     includes += [path for path in (PREFIX / 'include').iterdir() if path.is_dir()]
     options = ['-O1', '-fPIC', '-w', *(f'-I{path}' for path in includes)]
-    objects = []
+    objects = {}
     for source in sorted(made.rglob('*.c*')):
         if source.suffix in COMPILERS:
             target = folder / f'{source.name}.o'
-            words = (*COMPILERS[source.suffix], *options, '-c', source, '-o', target)
-            subprocess.run(words, check=True)
-            objects.append(target)
-    own = ('generator_c', 'generator_py', 'typesupport_c', 'typesupport_fastrtps_c')
-    libraries = [f'-lgeometry_msgs__rosidl_{name}' for name in own]
-    libraries += [f'-lrosidl_{name}' for name in ('runtime_c', *own[2:])]
-    name = f'{PACKAGE}_s__rosidl_typesupport_c{sysconfig.get_config_var("EXT_SUFFIX")}'
-    places = [f'-L{PREFIX / "lib"}', f'-Wl,-rpath,{PREFIX / "lib"}']
-    words = (*COMPILERS['.cpp'], '-shared', '-o', made / name, *objects, *places, *libraries)
-    subprocess.run(words, check=True)
+            words = [*COMPILERS[source.suffix], *options, '-c', source, '-o', target]
+            subprocess.run(list(map(str, words)), check=True)
+            objects[source.name] = target
+    # The middleware looks type supports up by the names of libraries: those that are loaded count.
+    stem = 'tf_message__'
+    parts = {
+        'generator_c': [f'{stem}functions.c', f'{stem}description.c'],
+        'typesupport_fastrtps_c': [f'{stem}type_support_c.cpp'],
+        'typesupport_introspection_c': [f'{stem}type_support.c'],
+    }
+    names = ('generator_c', 'generator_py', 'typesupport_c', *list(parts)[1:])
+    libraries = [f'-lgeometry_msgs__rosidl_{name}' for name in names]
+    libraries += [f'-lrosidl_{name}' for name in ('runtime_c', *names[2:])]
+    places = [f'-L{PREFIX / "lib"}', f'-L{made}', '-Wl,-rpath,$ORIGIN', '-Wl,--no-as-needed']
+    places.append(f'-Wl,-rpath,{PREFIX / "lib"}')
+    own: list[str] = []
+
+    def link(name: str, files: list[str]) -> None:
+        words = ['-shared', f'-Wl,-soname,{name}', '-o', made / name, *map(objects.pop, files)]
+        words = [*COMPILERS['.cpp'], *words, *places, *own, *libraries]
+        subprocess.run(list(map(str, words)), check=True)
+
+    for part, files in parts.items():
+        link(f'lib{PACKAGE}__rosidl_{part}.so', files)
+        own.append(f'-l{PACKAGE}__rosidl_{part}')
+    ending = sysconfig.get_config_var('EXT_SUFFIX')
+    link(f'{PACKAGE}_s__rosidl_typesupport_c{ending}', [*objects])
 
 
 if __name__ == '__main__':
