@@ -11,7 +11,14 @@ ROOT = Path(__file__).resolve().parent
 MANIFEST = ET.parse(ROOT / 'package.xml').getroot()  # noqa: S314
 NAME = MANIFEST.findtext('name')
 NODES = runpy.run_path(str(ROOT / 'needle_insertion/nodes.py'))['NODES']
-TEST = ['hypothesis>=6.100', 'lxml>=5.0', 'mpmath>=1.3', 'pytest>=8.0', 'sympy>=1.12']
+TEST = [
+    'hypothesis>=6.100',
+    'lxml>=5.0',
+    'mpmath>=1.3',
+    'pytest>=8.0',
+    'sympy>=1.12',
+    'xacro>=2.1',
+]
 
 
 def files(folder: str, pattern: str) -> list[str]:
@@ -41,6 +48,8 @@ setup(
         (f'share/{NAME}', ['package.xml']),
         (f'share/{NAME}/config', files('config', '*.*')),
         (f'share/{NAME}/config/security', files('config/security', '*.xml')),
+        (f'share/{NAME}/description', files('description', '*.*')),
+        (f'share/{NAME}/description/meshes', files('description/meshes', '*.stl')),
         (f'share/{NAME}/launch', files('launch', '*.launch.py')),
         # ros2 run looks here; pip puts the same nodes on PATH as needle-<name>.
         (f'lib/{NAME}', [f'scripts/{node}' for node in NODES]),

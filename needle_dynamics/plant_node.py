@@ -14,14 +14,15 @@ from typing import Any
 
 from builtin_interfaces.msg import Time as TimeMessage
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from geometry_msgs.msg import Point, Pose, PoseArray, Quaternion
+from geometry_msgs.msg import Point, Pose, PoseArray, Quaternion, TransformStamped, Vector3
 from needle_dynamics.compiled.cache import announce_compilation
 from needle_dynamics.model_node import ModelNode
 from needle_dynamics.simulated.assembly import defaults_of, LARGEST_SEED, MODES, SETTINGS
 from needle_dynamics.simulated.faults import Fault, FaultParameters, FAULTS, FAULTY
+from needle_dynamics.simulated.measured import Outline
 from needle_dynamics.simulated.run import Event, PARAMETERS, PlantRun, RESET, TARE, TRAJECTORY
 from needle_ros import contract
-from needle_ros.errors import JobError, NeedleError, ParameterError, printable
+from needle_ros.errors import JobError, MessageError, NeedleError, ParameterError, printable
 from needle_ros.publishers_node import offer_lease, Publishers
 from needle_ros.run_node import run
 from needle_ros.sample_clock import SampleClock
@@ -67,6 +68,16 @@ def _line(name: str, width: float, shade: float) -> Marker:
     return line
 
 
+def _transform(seen: Outline, stamp: int) -> TransformStamped:
+    """Return where the tip is from the base."""
+    (x, y, z), (i, j, k, w) = seen.tip
+    made = TransformStamped(child_frame_id=contract.TIP)
+    made.header.frame_id, made.header.stamp = contract.BASE, _message(stamp)
+    made.transform.translation = Vector3(x=x, y=y, z=z)
+    made.transform.rotation = Quaternion(x=i, y=j, z=k, w=w)
+    return made
+
+
 class PlantNode(ModelNode):
     """
     The needle, or the end-effector, with its sensors.
@@ -79,7 +90,9 @@ class PlantNode(ModelNode):
     path, and its guide and roll follow ``joint_trajectory`` in both modes. In mode `indenter`
     the end-effector presses the tissue by ``joint_trajectory`` (efforts of the joints `x` and
     `z`) and publishes ``base_wrench`` and ``end_effector_pose``. A trajectory begins when it
-    comes, or with the activation if it came before.
+    comes, or with the activation if it came before. ``joint_commands`` are those of a driver of
+    ros2_control: efforts in mode `simulation`, positions in mode `robot`. One node may command,
+    on either topic.
 
     Samples are taken at exact multiples of the period of simulated time, see `SampleClock`; with
     ``publish_clock`` or ``lockstep`` it is /clock. `Commands` decides which command acts from one
@@ -107,6 +120,9 @@ class PlantNode(ModelNode):
             'lockstep', False, 'each sample waits for the command that answers the one before it'
         )
         self.declare_text('paused', False, 'begin with time paused')
+        self.declare_text(
+            'publish_tf', False, f'publish {contract.TIP} in {contract.BASE} on {contract.TF.name}'
+        )
         self.declare_parameter(
             'seed',
             1,
@@ -152,9 +168,13 @@ class PlantNode(ModelNode):
         self._needle_poses = self.publisher(contract.NEEDLE_POSES)
         self._events = self.publisher(contract.EVENTS)
         self._clock_topic: Publisher | None = None
+        self._tf: Publisher | None = None
         self._commanders = Publishers(self, contract.COMMANDER, self._look_who_commands)
         self._commands = self.listen(
             contract.WRENCH_COMMAND, self._on_command, self._look_who_commands
+        )
+        self._joint_commands = self.listen(
+            contract.JOINT_COMMANDS, self._on_joint_commands, self._look_who_commands
         )
         #: Publishers of commands that DDS has matched, dead ones too.
         self._matched, self._matched_at = 0, 0
@@ -221,12 +241,23 @@ class PlantNode(ModelNode):
             f'commands have put in more than {own.power_limit:g} J within a second (power_limit); '
             'no force is applied until it is half of that'
         )
+        if self.get_parameter('publish_tf').value:
+            self._tf = self._offer_tf(mode)
         self._run = plant_run
         if publishes:
             self._clock_topic = self.publisher(contract.CLOCK, always=True)
         if mode != 'simulation' or constants.steered:
             # There `insertion` is the reference of a controller.
             self._trajectories = self.subscribe(contract.JOINT_TRAJECTORY, self._on_trajectory)
+
+    def _offer_tf(self, mode: str) -> Publisher:
+        """Offer transforms, or say why not; no wheel has their message."""
+        try:
+            if mode == 'indenter':
+                raise MessageError('there is no needle in mode indenter')
+            return self.publisher(contract.TF)
+        except MessageError as error:
+            raise ParameterError(f'publish_tf must be false: {error}') from error
 
     @staticmethod
     def _write(
@@ -245,6 +276,9 @@ class PlantNode(ModelNode):
         if self._clock_topic is not None:
             self.destroy_publisher(self._clock_topic)
             self._clock_topic = None
+        if self._tf is not None:
+            self.destroy_publisher(self._tf)
+            self._tf = None
         if self._trajectories is not None:
             self.destroy_subscription(self._trajectories)
             self._trajectories = None
@@ -272,7 +306,7 @@ class PlantNode(ModelNode):
             return
         self._halted = None
         self._sampled = self._made_up = self._saturated = 0
-        self._run.commands.begin()
+        self._run.begin()
         self._look_who_commands()
         own = self._run.constants.own
         #: Samples from one picture to the next.
@@ -288,6 +322,8 @@ class PlantNode(ModelNode):
         takes = [contract.JOINT_TRAJECTORY.name] if self._trajectories else []
         if values['mode'] == 'simulation':
             takes.append(contract.WRENCH_COMMAND.name)
+        if values['mode'] != 'indenter':
+            takes.append(contract.JOINT_COMMANDS.name)
         steered = ', steered' if values['steered'] else ''
         return (
             f'mode {values["mode"]}{steered}, preset {values["model.preset"]}, '
@@ -303,20 +339,34 @@ class PlantNode(ModelNode):
     # Commands.
 
     def _on_command(self, reading: Reading) -> None:
-        if self._run is None or not self.is_active:
+        def offer(plant_run: PlantRun, now: int) -> tuple[bool, str]:
+            _, force, _, torque, _, _ = reading.values[0]
+            return plant_run.commands.offer(reading.stamp, reading.frame, force, torque, now)
+
+        self._take_command(offer)
+
+    def _on_joint_commands(self, reading: Reading) -> None:
+        self._take_command(lambda plant_run, now: plant_run.command_joints(reading, now))
+
+    def _take_command(self, offer: Callable[[PlantRun, int], tuple[bool, str]]) -> None:
+        """Take in a command of either topic."""
+        plant_run = self._run
+        if plant_run is None or not self.is_active:
             return
         self._command_rate.add(monotonic_ns())
-        if self._commands.get_publisher_count() != self._matched:
+        if sum(self._count_matched()) != self._matched:
             # Before its event, it seems: not one command of a second node may act.
             self._look_who_commands()
-        _, force, _, torque, _, _ = reading.values[0]
-        commands, now = self._run.commands, self._time.simulated(self.now())
-        counts, complaint = commands.offer(reading.stamp, reading.frame, force, torque, now)
+        counts, complaint = offer(plant_run, self._time.simulated(self.now()))
         if complaint:
-            self.get_logger().error(complaint, throttle_duration_sec=1.0)
+            self.get_logger().error(printable(complaint), throttle_duration_sec=1.0)
         if counts and self._time.awaited is not None:
-            self._time.answered(commands.newest.stamp)
+            self._time.answered(plant_run.commands.newest.stamp)
             self._on_timer()
+
+    def _count_matched(self) -> tuple[int, int]:
+        """Return how many publishers of each topic of commands DDS has matched, dead ones too."""
+        return self._commands.get_publisher_count(), self._joint_commands.get_publisher_count()
 
     def _on_trajectory(self, message: JointTrajectory) -> None:
         try:
@@ -411,7 +461,7 @@ class PlantNode(ModelNode):
 
     def _look_who_commands(self, came: int = 0) -> None:
         """Let no force act while several nodes command."""
-        matched, now = self._commands.get_publisher_count(), monotonic_ns()
+        matched, now = sum(self._count_matched()), monotonic_ns()
         before, several = self._matched, max(self._matched, matched) > 1
         if matched != before:
             self._matched, self._matched_at = matched, now
@@ -422,7 +472,11 @@ class PlantNode(ModelNode):
             self._run.commands.hush(self._time.simulated(self.now()))
         # What came and went at once may be counted for ever; the graph knows better by then.
         fresh = now - self._matched_at < NANOSECONDS
-        count = self._commanders.count(contract.WRENCH_COMMAND, matched if fresh else 0)
+        wrenches, joints = self._count_matched() if fresh else (0, 0)
+        # A driver has no lease: it counts as long as the graph has it.
+        drivers = self.get_publishers_info_by_topic(contract.JOINT_COMMANDS.name)
+        count = self._commanders.count(contract.WRENCH_COMMAND, wrenches)
+        count += max(len(drivers), joints)
         if self._run.commands.count_commanders(count):
             if self._run.commands.rivals:
                 self.get_logger().error(
@@ -493,11 +547,15 @@ class PlantNode(ModelNode):
         if not (
             self._needle_shape.get_subscription_count()
             or self._needle_poses.get_subscription_count()
+            or self._tf is not None
         ):
             return
         seen = plant_run.plant.outline()
         if seen is None:
             return
+        if self._tf is not None:
+            kind: Any = self._tf.msg_type
+            self._tf.publish(kind(transforms=[_transform(seen, stamp)]))
         lines = [(self._shape, [seen.base.tolist(), *seen.points.tolist()])]
         if len(seen.path):
             lines.append((self._path, seen.path.tolist()))

@@ -37,7 +37,7 @@ from std_msgs.msg import String
 import yaml
 
 
-def profile(qos: Qos) -> QoSProfile:
+def profile(qos: Qos, *, request: bool = False) -> QoSProfile:
     """
     Return a quality of service of the contract as rclpy takes it.
 
@@ -45,6 +45,8 @@ def profile(qos: Qos) -> QoSProfile:
     ----------
     qos : Qos
         Quality of service.
+    request : bool
+        Whether it is for a reader; else for who publishes.
 
     Returns
     -------
@@ -52,7 +54,7 @@ def profile(qos: Qos) -> QoSProfile:
         The profile.
 
     """
-    reliable, latched = qos.reliable, qos.latched
+    reliable, latched = qos.reliable and not (request and qos.lossy), qos.latched
     lease = {'liveliness_lease_duration': Duration(seconds=qos.lease)} if qos.lease else {}
     return QoSProfile(
         depth=qos.depth,
@@ -94,9 +96,9 @@ def message_class(*type_names: str) -> Any:
         raise MessageError(f'{type_names[0]} is not installed') from error
 
 
-#: The qualities of service of the contract.
+#: The qualities of service of the contract, as our nodes request them.
 LATCHED, COMMAND, SENSOR = (
-    profile(qos) for qos in (contract.LATCHED, contract.COMMAND, contract.SENSOR)
+    profile(qos, request=True) for qos in (contract.LATCHED, contract.COMMAND, contract.SENSOR)
 )
 
 #: Text that rcl takes for true and false in a parameter file.
@@ -298,7 +300,7 @@ class BaseNode(LifecycleNode):
 
         """
         kind = message_class(topic.type_name)
-        return self.create_subscription(kind, topic.name, take, profile(topic.qos))
+        return self.create_subscription(kind, topic.name, take, profile(topic.qos, request=True))
 
     def listen(
         self,
@@ -347,7 +349,7 @@ class BaseNode(LifecycleNode):
             message_class(topic.type_name),
             name,
             on_bytes,
-            profile(topic.qos),
+            profile(topic.qos, request=True),
             raw=True,
             event_callbacks=events,
         )

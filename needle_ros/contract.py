@@ -15,6 +15,8 @@ from needle_ros.wire import JOINT_STATE, POINT, POSE, Template, WRENCH
 #: Frames: at rest at the entry point, and parallel to it at the needle base.
 ENTRY: Final = 'needle_entry'
 BASE: Final = 'needle_base'
+#: At the tip, y along the needle.
+TIP: Final = 'needle_tip'
 
 #: The joint along the needle, and that of the base about x.
 INSERTION: Final = 'insertion'
@@ -45,6 +47,8 @@ class Qos(NamedTuple):
         Whether readers that come late get the messages of before.
     depth : int
         Messages kept for a reader that is busy or comes late.
+    lossy : bool
+        Whether our own nodes take what comes: they request best effort from who offers more.
     lease : float
         Time after which a publisher that has died counts as dead [s]; 0 leaves it to DDS, which
         takes 20 s.
@@ -55,11 +59,13 @@ class Qos(NamedTuple):
     reliable: bool
     latched: bool
     depth: int
+    lossy: bool = False
     lease: float = 0.0
 
 
-#: A burst after a stall of the reader is not lost.
-SENSOR: Final = Qos('best effort', reliable=False, latched=False, depth=50)
+#: A reader with default settings gets it; for our nodes a late sample is worth no second try. A
+#: burst after a stall of the reader is not lost.
+SENSOR: Final = Qos('reliable or best effort', reliable=True, latched=False, depth=50, lossy=True)
 
 #: Only the newest counts, and it must arrive.
 COMMAND: Final = Qos('reliable', reliable=True, latched=False, depth=1)
@@ -342,6 +348,17 @@ WRENCH_COMMAND: Final = Topic(
     frame=BASE,
 )
 
+JOINT_COMMANDS: Final = Topic(
+    'joint_commands',
+    JOINT_STATE,
+    'ros2_control',
+    'from the hardware interface of ros2_control, NaN where nobody commands; mode `simulation`: '
+    'efforts, in the place of `wrench_command`; mode `robot`: positions, or velocities; steered, '
+    'in both modes: guide and roll: [howto/ros2-control.md](howto/ros2-control.md)',
+    qos=COMMAND,
+    joints=(Joint(INSERTION, 'm', 'N'), Joint(ROTATION, 'rad', 'N m')),
+)
+
 COMMANDER: Final = Topic(
     'wrench_command/alive',
     'std_msgs/msg/Empty',
@@ -401,6 +418,23 @@ JOINT_TRAJECTORY: Final = Topic(
     'steered, in both modes: guide and roll [m, rad]; in mode `indenter`: efforts of `x` and '
     '`z` [N]',
     qos=COMMAND,
+)
+
+ROBOT_DESCRIPTION: Final = Topic(
+    'robot_description',
+    'std_msgs/msg/String',
+    'robot_state_publisher',
+    'URDF of the robot, made of `description/`, with `ros2_control.launch.py`',
+    qos=LATCHED,
+)
+
+TF: Final = Topic(
+    '/tf',
+    'tf2_msgs/msg/TFMessage',
+    'robot_state_publisher; with `publish_tf`: plant',
+    'robot_state_publisher: the joints, with `ros2_control.launch.py`; plant: `needle_tip` in '
+    '`needle_base`, 30 Hz',
+    qos=COMMAND._replace(depth=100),
 )
 
 FRICTION: Final = Topic(

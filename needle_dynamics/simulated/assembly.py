@@ -16,6 +16,7 @@ from needle_dynamics.simulated.force_sensor import (
 )
 from needle_dynamics.simulated.indenter import Indenter, IndenterParameters
 from needle_dynamics.simulated.integrator import Integrator
+from needle_dynamics.simulated.joint_commands import JointCommands
 from needle_dynamics.simulated.measured import SimulatedPlant
 from needle_dynamics.simulated.plant import Plant
 from needle_dynamics.simulated.steered import GuideParameters, SteeredPlant
@@ -227,6 +228,21 @@ class PlantConstants:
         state = NeedleModel(self.model).state_at(own.depth, own.tip_deflection, own.modal)
         integrator = Integrator(self.model, state, own.step)
         return Plant(integrator, sensor, rate, self._base(self.model.length), tip)
+
+    def joint_commands(self) -> JointCommands:
+        """
+        Return what reads the messages of `joint_commands`.
+
+        Returns
+        -------
+        JointCommands
+            It knows the joints.
+
+        """
+        own = self.own
+        return JointCommands(
+            self.mode, steered=self.steered, shortest=1.0 / own.rate, longest=own.command_timeout
+        )
 
     def _steered(self, sensor: ForceSensor, tip: TipSensor) -> SteeredPlant:
         own = self.own

@@ -163,23 +163,44 @@ class Commands:
         if complaint:
             self.refused += 1
         # While several nodes command none of them may; then what they said must be over.
-        acts = not complaint and not self.rivals and now >= self._quiet
+        acts = not complaint and self.may_move(now)
         self.newest = Command(stamp, force, torque) if acts else Command(stamp)
         return True, complaint
 
     def _complaint(self, frame: str, force: float, torque: float) -> str:
         """Return what is wrong with a command."""
         if frame not in ('', BASE):
-            return f'wrench_command must be in {BASE}, got {frame!r}; no force is applied'
+            return f'a command must be in {BASE}, got {frame!r}; no force is applied'
         largest, strongest = self._limits
         # Written so that NaN is refused too.
         if not (abs(force) <= largest and abs(torque) <= strongest):
             return (
-                f'wrench_command must be within force_limit, {largest:g} N, and torque_limit, '
-                f'{strongest:g} N m, got force.y = {force}, torque.x = {torque}; no force is '
-                'applied'
+                f'a command must be within force_limit, {largest:g} N, and torque_limit, '
+                f'{strongest:g} N m, got {force} N and {torque} N m; no force is applied'
             )
         return ''
+
+    def refuse(self) -> None:
+        """Count a command that is invalid but for its force, which then does not act either."""
+        self.refused += 1
+        self.newest = Command(self.newest.stamp)
+
+    def may_move(self, now: int) -> bool:
+        """
+        Tell whether what a command asks for may happen: who commands is alone.
+
+        Parameters
+        ----------
+        now : int
+            Simulated time [ns].
+
+        Returns
+        -------
+        bool
+            Whether nobody else commands, and nobody has come and gone within the timeout.
+
+        """
+        return not self.rivals and now >= self._quiet
 
     def hush(self, now: int) -> None:
         """

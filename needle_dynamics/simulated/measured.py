@@ -47,6 +47,11 @@ class Outline(NamedTuple):
         share = 0.5 / (length * cosine)
         return np.column_stack([share * z, np.zeros_like(share), -share * x, cosine])
 
+    @property
+    def tip(self) -> tuple[list[float], list[float]]:
+        """Where the tip is from the base [m], and how it is turned: x, y, z and x, y, z, w."""
+        return (self.points[-1] - self.base).tolist(), self.turns[-1].tolist()
+
 
 class SimulatedPlant(Protocol):
     """A plant that is advanced one sample at a time."""

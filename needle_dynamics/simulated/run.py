@@ -13,13 +13,16 @@ from typing import Any, Final, NamedTuple
 from needle_dynamics.simulated.assembly import PlantConstants
 from needle_dynamics.simulated.commands import Command, Commands
 from needle_dynamics.simulated.measured import Measurement, SimulatedPlant
-from needle_ros.contract import Topic
+from needle_ros.contract import INSERTION, JOINT_COMMANDS, JOINT_STATES, Topic
+from needle_ros.errors import ParameterError
 from needle_ros.timing import NANOSECONDS
+from needle_ros.wire import Reading
 
 #: Kinds of events.
 CONFIGURED: Final = 'configured'
 TIME: Final = 'time'
 TRAJECTORY: Final = 'trajectory'
+MOTION: Final = 'motion'
 PARAMETERS: Final = 'parameters'
 TARE: Final = 'tare'
 RESET: Final = 'reset'
@@ -37,8 +40,9 @@ class Event(NamedTuple):
     kind : str
         ``configured``: the plant was made from the parameters in ``content``. ``time``: the
         sample is not one period after the one before. ``trajectory``: ``content`` has the
-        arguments of `Plant.follow`. ``parameters``: those in ``content`` changed. ``tare``: the
-        force sensor was zeroed. ``reset``: state, sensor and noise are at their start.
+        arguments of `Plant.follow`. ``motion``: likewise, from `joint_commands`.
+        ``parameters``: those in ``content`` changed. ``tare``: the force sensor was zeroed.
+        ``reset``: state, sensor and noise are at their start.
     content : Mapping[str, Any]
         Values that JSON can hold.
 
@@ -94,12 +98,69 @@ class PlantRun:
             force_rate_limit=own.force_rate_limit,
             power_limit=own.power_limit,
         )
+        self._joint_commands = self.constants.joint_commands()
         self.number = number
         self.topics: dict[str, Topic] = {topic.name: topic for topic in self.plant.topics}
         self._period = NANOSECONDS / own.rate
         #: Time of the newest sample [ns].
         self._stamp = -NANOSECONDS
         self._events = [Event(CONFIGURED, self._values)]
+        #: What was measured last.
+        self._measured: list[Measurement] = []
+
+    # Commands.
+
+    def begin(self) -> None:
+        """Forget commands and who gave them, as at an activation."""
+        self.commands.begin()
+        self._joint_commands.forget()
+
+    def command_joints(self, reading: Reading, now: int) -> tuple[bool, str]:
+        """
+        Take in a message of `joint_commands`, by the rules of all commands.
+
+        Parameters
+        ----------
+        reading : Reading
+            The message.
+        now : int
+            Simulated time [ns].
+
+        Returns
+        -------
+        counts : bool
+            Whether it counts; an invalid one counts as no force and no motion.
+        complaint : str
+            What is wrong with it, '' for nothing.
+
+        """
+        commands = self.commands
+        try:
+            asked = self._joint_commands.read(reading, self._positions(), now)
+            counts, complaint = commands.offer(asked.stamp, '', asked.force, asked.torque, now)
+            if counts and not complaint and commands.may_move(now):
+                for goals, within in asked.motions:
+                    content = {
+                        'joints': list(goals),
+                        'times': [within],
+                        'positions': [list(goals.values())],
+                        'efforts': [[]],
+                    }
+                    self.perform(Event(MOTION, content))
+                self._joint_commands.accept(asked)
+        except ParameterError as error:
+            commands.refuse()
+            return True, f'{JOINT_COMMANDS.name}: {error}; no force is applied'
+        return counts, complaint
+
+    def _positions(self) -> dict[str, float]:
+        """Return where the joints are [m or rad], as the encoders have it."""
+        if not self._measured or JOINT_STATES.name not in self.topics:
+            return {INSERTION: self.plant.depth}
+        joints = self.topics[JOINT_STATES.name].joints
+        # It is the last measurement, with the positions first.
+        values = self._measured[-1][2]
+        return {joint.name: value for joint, value in zip(joints, values, strict=False)}
 
     # Events.
 
@@ -120,7 +181,7 @@ class PlantRun:
             If the plant moves, or has not rested long enough, for a tare.
 
         """
-        if event.kind == TRAJECTORY:
+        if event.kind in (TRAJECTORY, MOTION):
             self.plant.follow(**event.content)
         elif event.kind == PARAMETERS:
             if not self._change(event.content):
@@ -130,6 +191,7 @@ class PlantRun:
         elif event.kind == RESET:
             self.plant = self.constants.make()
             self.commands.forget()
+            self._joint_commands.forget()
         self._events.append(event)
 
     def _change(self, changes: Mapping[str, Any]) -> bool:
@@ -188,4 +250,5 @@ class PlantRun:
         self._stamp = stamp
         self.number += 1
         self.commands.hold(stamp, self.plant.depth - before)
+        self._measured = measured
         return measured

@@ -9,7 +9,7 @@ from contextlib import suppress
 from dataclasses import fields
 from itertools import chain, pairwise
 import json
-from math import inf
+from math import inf, nan
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -19,7 +19,7 @@ from needle_dynamics.simulated.run import CONFIGURED, Event, PARAMETERS, PlantRu
 from needle_identification import Bag, deserialize, RecordingError, Topic
 from needle_ros.contract import TIP_DEFLECTION, TOPICS
 from needle_ros.documents import DocumentError, read_document
-from needle_ros.errors import MessageError
+from needle_ros.errors import MessageError, ParameterError
 from needle_ros.timing import NANOSECONDS, nanoseconds, seconds
 from needle_ros.wire import Reader, TYPES
 import numpy as np
@@ -229,6 +229,8 @@ class RecordedRun:
         for received, (stamp, frame, _, (values,)) in messages.get(f'{space}/wrench_command', []):
             number = self._number(stamp) if stamp else self._newest(received)
             self.commands[number].append((stamp, frame, values[1], values[3]))
+        for stamp, force, torque in self._efforts(messages.get(f'{space}/joint_commands', [])):
+            self.commands[self._number(stamp)].append((stamp, '', force, torque))
         faults = {
             f'fault.kind = {values["fault.kind"]} on {values.get("fault.topic")}'
             for _, values in configurations
@@ -271,6 +273,19 @@ class RecordedRun:
         """Return the number of the sample of a stamp [ns]."""
         begin, number = self._anchors[max(bisect_right(self._anchors, (stamp, inf)) - 1, 0)]
         return number + round((stamp - begin) / self._period)
+
+    def _efforts(self, messages: _Messages) -> Iterator[tuple[int, float, float]]:
+        """Yield stamp [ns], force and torque of messages of `joint_commands`."""
+        reader = self.constants.joint_commands()
+        for received, reading in messages:
+            # One that a plant refuses is no force.
+            force = torque = nan
+            stamp = reading.stamp or self.stamp(self._newest(received))
+            with suppress(ParameterError):
+                asked = reader.read(reading, {}, stamp)
+                reader.accept(asked)
+                force, torque = asked.force, asked.torque
+            yield stamp, force, torque
 
     def stamp(self, number: int) -> int:
         """

@@ -12,6 +12,7 @@ from needle_dynamics.simulated.commands import Command
 from needle_dynamics.simulated.run import (
     CONFIGURED,
     Event,
+    MOTION,
     PARAMETERS,
     PlantRun,
     RESET,
@@ -35,6 +36,7 @@ TOLERANCE: Final = 1e-6
 
 #: What is said of events, by kind.
 _WORDS: Final = {
+    MOTION: 'joint_commands from sample {number} on',
     TRAJECTORY: 'joint_trajectory from sample {number} on',
     PARAMETERS: '{names} changed before sample {number}',
     TARE: 'the sensor was zeroed (~/tare) before sample {number}',
@@ -111,6 +113,8 @@ class Rerun:
         self.notes = [*recorded.notes]
         #: Why the computed plant gives no more samples.
         self._halted = ''
+        #: Whether a motion of `joint_commands` has been noted.
+        self._driven = False
         self._told = self._commands()
         numbers = recorded.numbers
         #: Samples before which it is not known which command acted.
@@ -207,7 +211,10 @@ class Rerun:
         if event.kind in (CONFIGURED, TIME) and number == 1:
             return plant
         names = ', '.join(sorted(event.content))
-        self.notes.append(_WORDS[event.kind].format(number=number, names=names))
+        # A driver says where to go many times a second.
+        if event.kind != MOTION or not self._driven:
+            self.notes.append(_WORDS[event.kind].format(number=number, names=names))
+        self._driven |= event.kind == MOTION
         if event.kind == CONFIGURED:
             return PlantRun(event.content, number - 1)
         plant.perform(event)
@@ -279,11 +286,11 @@ class Rerun:
             'the rest is as computed: this one was altered on its way or in the bag': (
                 sum(differing.values()) == 1
             ),
-            'the bag holds no wrench_command: record it with the rest': (
+            'the bag holds no wrench_command and no joint_commands: record them with the rest': (
                 self._untold and not recorded.commands
             ),
             'the bag holds no joint_trajectory: record it with the rest': (
-                not simulated and TRAJECTORY not in kinds
+                not simulated and not kinds & {MOTION, TRAJECTORY}
             ),
             f'the bag begins with sample {start}: the commands before it are not known': (
                 simulated and start > 1

@@ -555,7 +555,9 @@ def test_a_bag_without_commands_says_what_to_record(tmp_path: Path) -> None:
     silent = [m for m in simulated() if m.topic not in ('/wrench_command', '/ground_truth')]
     result = only(written(tmp_path / 'bag', silent))
     assert result.verdict == 'differs'
-    assert result.reason == 'the bag holds no wrench_command: record it with the rest'
+    assert result.reason == (
+        'the bag holds no wrench_command and no joint_commands: record them with the rest'
+    )
     still = [m for m in without_events(carried(40, 40)) if m.topic != '/joint_trajectory']
     result = only(written(tmp_path / 'still', still))
     assert result.reason == 'the bag holds no joint_trajectory: record it with the rest'

@@ -82,9 +82,9 @@ def test_a_command_that_was_overtaken_does_not_count() -> None:
     ('frame', 'force', 'torque', 'complaint'),
     [
         ('needle_entry', 1.0, 0.0, "must be in needle_base, got 'needle_entry'"),
-        ('', nan, 0.0, f'{BEYOND}, got force.y = nan, torque.x = 0.0'),
-        ('', 0.0, inf, f'{BEYOND}, got force.y = 0.0, torque.x = inf'),
-        ('', -10.1, 0.0, f'{BEYOND}, got force.y = -10.1, torque.x = 0.0'),
+        ('', nan, 0.0, f'{BEYOND}, got nan N and 0.0 N m'),
+        ('', 0.0, inf, f'{BEYOND}, got 0.0 N and inf N m'),
+        ('', -10.1, 0.0, f'{BEYOND}, got -10.1 N and 0.0 N m'),
     ],
 )
 def test_an_invalid_command_is_no_force(
@@ -93,7 +93,7 @@ def test_an_invalid_command_is_no_force(
     """It counts, so that an older one does not act any longer."""
     commands = made()
     commands.offer(NOW, '', 1.0, 0.0, NOW)
-    said = f'wrench_command {complaint}; no force is applied'
+    said = f'a command {complaint}; no force is applied'
     assert commands.offer(NOW + 1, frame, force, torque, NOW) == (True, said)
     commands.hold(NOW + PERIOD)
     assert commands.held == Command(NOW + 1)

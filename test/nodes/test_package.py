@@ -138,7 +138,7 @@ def test_rosdep_knows_every_name() -> None:
 def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a copy of the tracked files of this tree, in a colcon workspace."""
     folder = tmp_path_factory.mktemp('workspace') / 'src/needle_insertion'
-    for pattern in ('needle_*', 'config', 'launch', 'resource', 'scripts', 'test'):
+    for pattern in ('needle_*', 'config', 'description', 'launch', 'resource', 'scripts', 'test'):
         for item in ROOT.glob(pattern):
             if not item.name.endswith('.egg-info'):
                 shutil.copytree(item, folder / item.name)
@@ -249,7 +249,7 @@ SHARED = [
     'needle_insertion/package.xml',
     *(
         f'needle_insertion/{path.relative_to(ROOT).as_posix()}'
-        for folder in ('config', 'launch')
+        for folder in ('config', 'description', 'launch')
         for path in sorted((ROOT / folder).rglob('*.*'))
         if '__pycache__' not in path.parts
     ),

@@ -1,0 +1,510 @@
+"""
+The plant as hardware: driven over DDS by what sends the messages of ros2_control's interface.
+
+ros2_control itself is in no wheel. `Driver` publishes what the source of
+joint_state_topic_hardware_interface 1.1.0 publishes: at a rate of its own, one array for each kind
+of interface, NaN for what nobody has set.
+"""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Callable, Iterator, Mapping
+from importlib import import_module
+from importlib.util import find_spec
+from math import nan
+import os
+from pathlib import Path
+import re
+import shutil
+import signal
+import subprocess
+import sys
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PointStamped, PoseArray, WrenchStamped
+from needle_controller.controller_node import ControllerNode
+from needle_dynamics.plant_node import PlantNode
+from needle_identification.recorder_node import is_hidden
+from needle_insertion.replay.rerun import verify
+from needle_ros import contract
+from needle_ros.base_node import COMMAND, message_class, SENSOR
+import pytest
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import JointState
+from support.installed import ROOT
+from support.ros_graph import RosGraph
+import yaml
+
+CONTROLLERS = yaml.safe_load((ROOT / 'config/ros2_control.yaml').read_text(encoding='utf-8'))
+LAUNCH = ast.parse((ROOT / 'launch/ros2_control.launch.py').read_text(encoding='utf-8'))
+#: rclcpp::QoS(1) and rclcpp::SensorDataQoS().
+SENT = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE)
+HEARD = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
+
+GUIDE = ('guide_x', 'guide_z', 'guide_tilt_x', 'guide_tilt_z', 'roll')
+STEERED: dict[str, Any] = {'steered': True, 'model.preset': 'bending_35mm', 'depth': 0.02}
+
+
+class Driver:
+    """Sends what controllers set, at its own rate, and knows the latest state of the joints."""
+
+    def __init__(
+        self,
+        graph: RosGraph,
+        folder: Path,
+        interfaces: Mapping[str, tuple[str, ...]],
+        rate: float = 100.0,
+        **plant: Any,
+    ) -> None:
+        self.graph, self.node = graph, graph.node('needle_hardware')
+        self.logs = folder / 'logs'
+        self.interfaces = interfaces
+        #: What controllers have set, by joint and interface.
+        self.set: dict[tuple[str, str], float] = {}
+        self.active, self.update = True, lambda: None
+        self.state: dict[tuple[str, str], float] = {}
+        self.health: dict[str, str] = {}
+        self.complaint = ''
+        #: Every word of the plant on /diagnostics.
+        self.words: set[str] = set()
+        self.node.create_subscription(JointState, 'joint_states', self._on_state, HEARD)
+        self.node.create_subscription(DiagnosticArray, '/diagnostics', self._on_health, 10)
+        self.commands = self.node.create_publisher(JointState, 'joint_commands', SENT)
+        graph.start('plant', {'rate': 1000.0, **plant})
+        self.node.create_timer(1.0 / rate, self.write)
+        self.until(lambda: self.state and self.commands.get_subscription_count(), 'the plant')
+
+    def _on_state(self, message: JointState) -> None:
+        for k, name in enumerate(message.name):
+            for kind in ('position', 'velocity', 'effort'):
+                self.state[name, kind] = getattr(message, kind)[k]
+
+    def _on_health(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            if status.name == '/plant':
+                self.words.add(status.message)
+                self.complaint = status.message
+                self.health = {item.key: item.value for item in status.values}
+
+    def write(self) -> None:
+        """Send a message as `JointStateTopicSystem::write` does with a threshold of -1."""
+        self.update()
+        if not self.active:
+            return
+        message = JointState()
+        message.header.stamp = self.node.get_clock().now().to_msg()
+        for joint, kinds in self.interfaces.items():
+            message.name.append(joint)
+            for kind in kinds:
+                getattr(message, kind).append(self.set.get((joint, kind), nan))
+        self.commands.publish(message)
+
+    def said(self) -> str:
+        """Return the log of the plant."""
+        return (self.logs / 'plant.log').read_text(encoding='utf-8')
+
+    def until(self, condition: Callable[[], Any], what: str) -> None:
+        self.graph.spin_until(condition, what)
+
+    @property
+    def refused(self) -> int:
+        """How many commands the plant says that it has refused."""
+        return int(self.health.get('commands refused', 0))
+
+    def at(self, joint: str = 'insertion') -> float:
+        return self.state[joint, 'position']
+
+    def further(self, seconds: float) -> None:
+        """Let time of this machine pass, with everything that happens."""
+        end = self.node.get_clock().now().nanoseconds + seconds * 1e9
+        self.until(lambda: self.node.get_clock().now().nanoseconds > end, 'that time')
+
+
+class Trajectory:
+    """Goes to a goal at a speed and sets an effort as insertion_effort does."""
+
+    def __init__(self, driver: Driver, goal: float, speed: float) -> None:
+        own = CONTROLLERS['/**/insertion_effort']['ros__parameters']['gains']['insertion']
+        self.gains = own
+        self.driver, self.goal, self.speed = driver, goal, speed
+        self.wanted, self.integral = driver.at(), 0.0
+        self.before = driver.node.get_clock().now().nanoseconds
+
+    def __call__(self) -> None:
+        now = self.driver.node.get_clock().now().nanoseconds
+        passed, self.before = 1e-9 * (now - self.before), now
+        left = self.goal - self.wanted
+        step = max(-self.speed * passed, min(self.speed * passed, left))
+        self.wanted += step
+        error = self.wanted - self.driver.at()
+        speed = self.speed if abs(left) > abs(step) else 0.0
+        slower = (speed if left > 0.0 else -speed) - self.driver.state['insertion', 'velocity']
+        own = self.gains
+        self.integral += own['i'] * error * passed
+        self.integral = max(own['i_clamp_min'], min(own['i_clamp_max'], self.integral))
+        force = own['p'] * error + self.integral + own['d'] * slower
+        force = max(own['u_clamp_min'], min(own['u_clamp_max'], force))
+        self.driver.set['insertion', 'effort'] = force
+
+
+PUSHED: dict[str, tuple[str, ...]] = {'insertion': ('effort',), 'rotation': ('effort',)}
+CARRIED: dict[str, tuple[str, ...]] = {'insertion': ('position',)}
+
+
+# The launch file, read: what it starts is not in the wheels.
+
+
+def table(name: str) -> dict[str, ast.expr]:
+    """Return the entries of a dictionary of the launch file, by key."""
+    (made,) = (
+        item.value
+        for item in ast.walk(LAUNCH)
+        if isinstance(item, ast.Assign) and ast.unparse(item.targets[0]) == name
+    )
+    assert isinstance(made, ast.Dict)
+    return {
+        ast.literal_eval(key): value for key, value in zip(made.keys, made.values, strict=True)
+    }
+
+
+def test_the_launch_file_asks_for_what_there_is(ros_graph: RosGraph) -> None:
+    """Each argument has a use; parameters, arguments of xacro and files exist."""
+    asked = {
+        ast.literal_eval(item.slice)
+        for item in ast.walk(LAUNCH)
+        if isinstance(item, ast.Subscript) and ast.unparse(item.value) == 'given'
+        if isinstance(item.slice, ast.Constant)
+    }
+    assert asked == table('ARGUMENTS').keys()
+    plant = ros_graph.add(PlantNode, start=False)
+    assert [name for name in table('plant') if not plant.has_parameter(name)] == []
+    text = (ROOT / 'description/needle_insertion.urdf.xacro').read_text(encoding='utf-8')
+    assert [name for name in table('described') if f'<xacro:arg name="{name}"' not in text] == []
+    files = re.findall(r"share / '([^']+)'", ast.unparse(LAUNCH))
+    assert len(files) == 2
+    assert [name for name in files if not (ROOT / name).is_file()] == []
+
+
+# Mode simulation: efforts.
+
+
+@pytest.mark.parametrize('rate', [100.0, 200.0])
+def test_a_controller_of_efforts_brings_the_needle_to_its_goal(
+    ros_graph: RosGraph, tmp_path: Path, rate: float
+) -> None:
+    """With the gains that are shipped, slower than the plant samples; silence ends the force."""
+    driver = Driver(ros_graph, tmp_path, PUSHED, rate, mode='simulation', depth=0.02)
+    start = driver.at()
+    driver.further(0.3)
+    # What nobody has set is no force, and no fault.
+    assert driver.at() == start
+    driver.update = Trajectory(driver, 0.026, 0.01)
+    driver.until(lambda: abs(driver.at() - 0.026) < 2e-4, 'the goal')
+    driver.until(lambda: abs(driver.state['insertion', 'velocity']) < 1e-5, 'rest')
+    assert abs(driver.at() - 0.026) < 5e-4
+    assert driver.refused == 0
+    driver.update = lambda: None
+    driver.set['insertion', 'effort'] = 2.0
+    driver.until(lambda: driver.state['insertion', 'velocity'] > 1e-3, 'a push')
+    driver.active = False
+    driver.until(lambda: driver.state['insertion', 'velocity'] == 0.0, 'the end of the push')
+    assert driver.state['insertion', 'effort'] == 0.0
+
+
+def test_two_that_command_move_nothing(ros_graph: RosGraph, tmp_path: Path) -> None:
+    """Whichever topic the second one has; the first goes on when it is alone again."""
+    driver = Driver(ros_graph, tmp_path, PUSHED, mode='simulation', depth=0.02)
+    driver.set['insertion', 'effort'] = 1.0
+    driver.until(lambda: driver.state['insertion', 'velocity'] > 1e-3, 'the push')
+    for kind, topic in ((WrenchStamped, 'wrench_command'), (JointState, 'joint_commands')):
+        rival = driver.node.create_publisher(kind, topic, COMMAND)
+        driver.until(lambda: driver.complaint == '2 nodes command', 'the word of it')
+        driver.until(lambda: driver.state['insertion', 'velocity'] == 0.0, 'rest')
+        before = driver.at()
+        driver.further(0.3)
+        assert driver.at() == before
+        driver.node.destroy_publisher(rival)
+        driver.until(lambda: driver.state['insertion', 'velocity'] > 1e-3, 'the push')
+
+
+@pytest.mark.parametrize('value', [nan, float('inf'), 16.0])
+def test_an_effort_that_is_none_is_refused(
+    ros_graph: RosGraph, tmp_path: Path, value: float
+) -> None:
+    """After it has been a number; it is said, and no force acts until it is one again."""
+    driver = Driver(ros_graph, tmp_path, PUSHED, mode='simulation', depth=0.02)
+    driver.set['insertion', 'effort'] = 1.0
+    driver.until(lambda: driver.state['insertion', 'velocity'] > 1e-3, 'the push')
+    driver.set['insertion', 'effort'] = value
+    driver.until(lambda: driver.state['insertion', 'velocity'] == 0.0, 'rest')
+    driver.until(lambda: driver.refused > 0, 'the count')
+    assert 'must be within force_limit, 15 N' in driver.said()
+    driver.set['insertion', 'effort'] = 1.0
+    driver.until(lambda: driver.state['insertion', 'velocity'] > 1e-3, 'the push')
+
+
+def test_arrays_with_gaps_are_refused(ros_graph: RosGraph, tmp_path: Path) -> None:
+    """Which joint an entry is of cannot be told; the line says what to declare."""
+    driver = Driver(
+        ros_graph, tmp_path, {'insertion': ('effort',), 'guide_x': ('position',)}, **STEERED
+    )
+    before = driver.at()
+    driver.set |= {('insertion', 'effort'): 2.0, ('guide_x', 'position'): 1e-3}
+    driver.until(lambda: driver.refused > 10, 'the refusals')
+    assert (driver.at(), driver.at('guide_x')) == (before, 0.0)
+    said = driver.said()
+    assert 'declare the same command interfaces for all joints of the hardware' in said
+
+
+# Mode robot, and the guide: positions.
+
+
+def test_a_controller_of_positions_is_followed(ros_graph: RosGraph, tmp_path: Path) -> None:
+    """One message behind at 100 Hz, to the end; then it rests, whoever goes on sending."""
+    driver = Driver(ros_graph, tmp_path, CARRIED, mode='robot', depth=0.03)
+    driver.further(0.3)
+    assert driver.at() == pytest.approx(0.03, abs=1e-6)
+    course = Trajectory(driver, 0.04, 0.01)
+
+    def follow() -> None:
+        course()
+        driver.set['insertion', 'position'] = course.wanted
+
+    driver.update = follow
+    driver.until(lambda: abs(driver.at() - 0.04) < 2e-6, 'the goal')
+    driver.until(lambda: driver.state['insertion', 'velocity'] == 0.0, 'rest')
+    driver.update = lambda: None
+    driver.set['insertion', 'position'] = 0.3
+    driver.until(lambda: driver.refused > 0, 'the refusal')
+    assert driver.at() == pytest.approx(0.04, abs=2e-6)
+    said = driver.said()
+    assert 'joint_commands: trajectory must stay in [0.001, 0.2] m, got [0.3] m' in said
+
+
+def test_two_that_say_where_to_go_are_not_followed(ros_graph: RosGraph, tmp_path: Path) -> None:
+    driver = Driver(ros_graph, tmp_path, CARRIED, mode='robot', depth=0.03)
+    rival = driver.node.create_publisher(JointState, 'joint_commands', COMMAND)
+    driver.until(lambda: driver.complaint == '2 nodes command', 'the word of it')
+    driver.set['insertion', 'position'] = 0.031
+    driver.further(0.5)
+    assert driver.at() == pytest.approx(0.03, abs=1e-6)
+    driver.node.destroy_publisher(rival)
+    driver.until(lambda: driver.at() > 0.0309, 'the goal')
+
+
+# What is recorded can be computed again.
+
+
+@pytest.mark.parametrize('mode', ['robot', 'simulation', 'steered'])
+def test_a_run_that_was_driven_is_computed_anew(
+    ros_graph: RosGraph, tmp_path: Path, mode: str
+) -> None:
+    """To the last bit: forces are in `ground_truth`, positions in the events of the plant."""
+    probe = ros_graph.node('probe')
+    recorder = ros_graph.start('recorder', {'path': str(tmp_path / 'bag')})
+    kinds: dict[str, dict[str, tuple[str, ...]]] = {
+        'robot': CARRIED,
+        'simulation': PUSHED,
+        'steered': dict.fromkeys(('insertion', *GUIDE), ('position', 'effort')),
+    }
+    driver = Driver(
+        ros_graph,
+        tmp_path,
+        kinds[mode],
+        **(STEERED if mode == 'steered' else {'mode': mode, 'depth': 0.02}),
+    )
+
+    def recorded() -> bool:
+        published = [
+            name
+            for name, _ in probe.get_topic_names_and_types()
+            if probe.count_publishers(name) and not is_hidden(name)
+        ]
+        return {'/joint_commands', '/plant/events', '/ground_truth'} <= set(published) and all(
+            'recorder' in [one.node_name for one in probe.get_subscriptions_info_by_topic(name)]
+            for name in published
+        )
+
+    ros_graph.spin_until(recorded, 'the recorder')
+    course = Trajectory(driver, 0.024, 0.01)
+
+    def follow() -> None:
+        course()
+        if mode == 'robot':
+            driver.set['insertion', 'position'] = course.wanted
+        if mode == 'steered':
+            driver.set['guide_x', 'position'] = 0.1 * (course.wanted - 0.02)
+            driver.set['roll', 'position'] = 1e2 * (course.wanted - 0.02)
+
+    driver.update = follow
+    driver.until(lambda: driver.at() > 0.0235, 'the goal')
+    driver.further(0.3)
+    driver.active = False
+    driver.further(0.3)
+    recorder.interrupt()
+    (run,) = verify(tmp_path / 'bag')
+    assert run.verdict == 'identical', (run.first, run.reason, run.notes)
+    assert set(run.topics) == {'/joint_states', '/base_wrench', '/tip_deflection', '/ground_truth'}
+    assert run.recorded.rows['/joint_states'].values[-1, 0] > 0.0235
+    driven = [note for note in run.notes if 'joint_commands' in note]
+    # Said once, of hundreds.
+    assert len(driven) == (mode != 'simulation')
+    assert sum(map(len, run.recorded.commands.values())) > 50
+
+
+# Who listens.
+
+
+@pytest.mark.parametrize('mode', ['simulation', 'indenter'])
+def test_a_reader_with_default_settings_gets_every_topic(ros_graph: RosGraph, mode: str) -> None:
+    """`create_subscription(type, topic, callback, 10)` asks for reliable delivery."""
+    node = ros_graph.node('reader')
+    indents = mode == 'indenter'
+    there = {'base_wrench', 'end_effector_pose', '/clock'}
+    topics = [
+        topic
+        for topic in contract.TOPICS
+        if topic.qos.lossy
+        and (topic.name in there if indents else topic.name != 'end_effector_pose')
+    ]
+    heard = {
+        topic.name: ros_graph.listen(node, message_class(topic.type_name), topic.name, 10)
+        for topic in topics
+    }
+    ros_graph.add(PlantNode, parameters={'rate': 200.0, 'mode': mode, 'publish_clock': True})
+    if not indents:
+        ros_graph.add(ControllerNode, parameters={'rate': 200.0, 'use_sim_time': True})
+        target = node.create_publisher(PointStamped, 'target', COMMAND)
+        message = PointStamped()
+        message.point.y = 0.021
+
+        def aimed() -> bool:
+            target.publish(message)
+            return bool(heard['tracking_error'])
+
+        ros_graph.spin_until(aimed, 'the motion')
+    ros_graph.spin_until(lambda: all(heard.values()), 'all topics')
+    assert len(heard) == (3 if indents else 9)
+
+
+#: Subscribes to a topic as most do, and says when the first message has come.
+READER = """
+import rclpy, sys
+from sensor_msgs.msg import JointState
+from geometry_msgs.msg import WrenchStamped
+rclpy.init()
+node = rclpy.create_node('slow')
+heard = set()
+def take(message):
+    if type(message) not in heard:
+        heard.add(type(message))
+        print('heard', flush=True)
+for kind, topic in ((JointState, 'joint_states'), (WrenchStamped, 'base_wrench')):
+    node.create_subscription(kind, topic, take, 10)
+rclpy.spin(node)
+"""
+
+
+def test_a_reader_that_stops_does_not_stop_the_plant(ros_graph: RosGraph) -> None:
+    """It asks for every message, and takes none: the plant does not wait for it."""
+    probe = ros_graph.node('probe')
+    stamps: list[int] = []
+
+    def take(message: Any) -> None:
+        stamps.append(message.header.stamp.nanosec)
+
+    probe.create_subscription(JointState, 'joint_states', take, SENSOR)
+    ros_graph.start('plant', {'rate': 500.0})
+    ros_graph.spin_until(lambda: len(stamps) > 100, 'samples')
+    reader = subprocess.Popen(
+        [sys.executable, '-c', READER],
+        env=ros_graph.environment,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        assert [reader.stdout.readline() for _ in range(2)] == ['heard\n'] * 2
+        reader.send_signal(signal.SIGSTOP)
+        seen = len(stamps)
+        # 6 s, far more than a publisher keeps. If it waited for the default 0.1 s at each, or at
+        # every tenth message, this would take minutes.
+        ros_graph.spin_until(lambda: len(stamps) > seen + 3000, 'further samples', timeout=120.0)
+        assert reader.poll() is None
+    finally:
+        reader.kill()
+        reader.communicate()
+
+
+# Transforms.
+
+
+def test_without_tf2_msgs_it_says_so(ros_graph: RosGraph) -> None:
+    """One line, and the process ends; a machine that has it publishes."""
+    if find_spec('tf2_msgs'):
+        pytest.skip('tf2_msgs is installed here')
+    plant = ros_graph.start('plant', {'publish_tf': True})
+    assert plant.process.wait(60) == 2
+    reason = 'publish_tf must be false: tf2_msgs/msg/TFMessage is not installed'
+    assert plant.last_line.endswith(reason)
+
+
+def test_where_there_is_no_needle_there_is_no_tip(ros_graph: RosGraph) -> None:
+    parameters = {'publish_tf': True, 'mode': 'indenter'}
+    node = ros_graph.add(PlantNode, parameters=parameters, start=False)
+    assert not node.start()
+    assert node.failure == 'publish_tf must be false: there is no needle in mode indenter'
+
+
+@pytest.fixture(scope='module')
+def transforms(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """Have tf2_msgs: made from its definition where it is not installed. Return its folder."""
+    if find_spec('tf2_msgs'):
+        yield ''
+        return
+    if not (shutil.which('gcc') and shutil.which('g++')):
+        pytest.skip('neither tf2_msgs nor a compiler to make it')
+    folder = tmp_path_factory.mktemp('tf2')
+    words = [sys.executable, '-m', 'support.tf2_messages', str(folder)]
+    subprocess.run(words, cwd=Path(__file__).parents[1], check=True, stdout=subprocess.DEVNULL)
+    sys.path.insert(0, str(folder))
+    yield str(folder)
+    sys.path.remove(str(folder))
+
+
+@pytest.mark.parametrize('steered', [False, True])
+def test_it_publishes_where_the_tip_is(
+    ros_graph: RosGraph, transforms: str, steered: bool
+) -> None:
+    """In `needle_base`, where `needle_poses` has its last pose; heard as tf listeners ask."""
+    kind = import_module('tf2_msgs.msg').TFMessage
+    reader = ros_graph.node('reader')
+    heard = ros_graph.listen(reader, kind, '/tf', 100)
+    poses = ros_graph.listen(reader, PoseArray, 'needle_poses', 10)
+    more = STEERED if steered else {'depth': 0.05, 'tip_deflection': 5e-3}
+    ros_graph.environment['PYTHONPATH'] = os.pathsep.join(
+        filter(None, (transforms, os.environ.get('PYTHONPATH')))
+    )
+    ros_graph.start('plant', {'rate': 200.0, 'publish_tf': True, **more})
+    found: list[tuple[Any, Any]] = []
+
+    def matched() -> bool:
+        by_stamp = {(p.header.stamp.sec, p.header.stamp.nanosec): p for p in poses}
+        for message in heard:
+            (one,) = message.transforms
+            stamp = one.header.stamp
+            if (stamp.sec, stamp.nanosec) in by_stamp:
+                found.append((one, by_stamp[stamp.sec, stamp.nanosec].poses[-1]))
+        return bool(found)
+
+    ros_graph.spin_until(matched, 'a transform and a picture of one sample')
+    one, tip = found[0]
+    assert (one.header.frame_id, one.child_frame_id) == (contract.BASE, contract.TIP)
+    depth = STEERED['depth'] if steered else 0.05
+    place, turn = one.transform.translation, one.transform.rotation
+    assert (place.x, place.z) == (tip.position.x, tip.position.z)
+    # The base is at s - l; a needle that is bent moves it by some nanometers.
+    assert place.y == pytest.approx(tip.position.y - (depth - 0.2), abs=1e-6)
+    assert turn == tip.orientation
+    assert steered or place.z != 0.0

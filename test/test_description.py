@@ -1,0 +1,299 @@
+"""The robot description: it expands, its files exist, and it is the robot of the plant."""
+
+from __future__ import annotations
+
+from collections import Counter
+from itertools import product
+from math import cos, sin
+from pathlib import Path
+import runpy
+import struct
+from typing import Any
+import xml.etree.ElementTree as ET
+
+from needle_dynamics import FloatArray
+from needle_dynamics.simulated.assembly import PlantSettings
+from needle_dynamics.simulated.base import BaseParameters
+from needle_dynamics.simulated.run import PlantRun
+from needle_dynamics.simulated.steered import GuideParameters
+from needle_dynamics.steering.parameters import NEEDLES, STEERING_PRESETS, SteeringParameters
+from needle_ros.contract import (
+    BASE,
+    ENTRY,
+    INSERTION,
+    JOINT_COMMANDS,
+    JOINT_STATES,
+    steered_states,
+    TIP,
+)
+from needle_ros.wire import Reading
+import numpy as np
+import pytest
+import xacro
+import yaml
+
+ROOT = Path(__file__).resolve().parents[1]
+FOLDER = ROOT / 'description'
+CONTROLLERS = yaml.safe_load((ROOT / 'config/ros2_control.yaml').read_text(encoding='utf-8'))
+MAKER = runpy.run_path(str(FOLDER / 'make_meshes.py'))
+KINDS = [*product(('simulation', 'robot'), (False, True))]
+Point = tuple[float, float, float]
+
+
+def described(mode: str, steered: bool, **others: object) -> ET.Element:
+    """Return the URDF as the launch file has it made."""
+    given = {'mode': mode, 'steered': str(steered).lower(), **others}
+    file = str(FOLDER / 'needle_insertion.urdf.xacro')
+    made = xacro.process_file(file, mappings={name: str(value) for name, value in given.items()})
+    return ET.fromstring(made.toxml())  # noqa: S314
+
+
+def numbers(text: str) -> FloatArray:
+    return np.array([float(word) for word in text.split()])
+
+
+def movable(urdf: ET.Element) -> dict[str, ET.Element]:
+    """Return the joints that `joint_states` must have, by name."""
+    joints = {joint.get('name'): joint for joint in urdf.iter('joint') if joint.get('type')}
+    return {name: joint for name, joint in joints.items() if joint.find('mimic') is None}
+
+
+def turn(axis: FloatArray, angle: float) -> FloatArray:
+    """Return the matrix of a turn about an axis of unit length."""
+    x, y, z = axis
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.asarray(np.eye(3) + sin(angle) * cross + (1.0 - cos(angle)) * cross @ cross)
+
+
+def pose(urdf: ET.Element, link: str, at: dict[str, float]) -> tuple[FloatArray, FloatArray]:
+    """Return where a link is in `needle_entry`, and how it is turned."""
+    joints = {j.find('child').get('link'): j for j in urdf.iter('joint') if j.get('type')}
+    if link not in joints:
+        assert link == ENTRY
+        return np.zeros(3), np.eye(3)
+    joint = joints[link]
+    place, turned = pose(urdf, joint.find('parent').get('link'), at)
+    origin, axis = joint.find('origin'), numbers(joint.find('axis').get('xyz'))
+    if origin is not None:
+        place = place + turned @ numbers(origin.get('xyz'))
+    mimic = joint.find('mimic')
+    value = at[joint.get('name') if mimic is None else mimic.get('joint')]
+    value *= 1.0 if mimic is None else float(mimic.get('multiplier'))
+    if joint.get('type') == 'prismatic':
+        return place + value * turned @ axis, turned
+    return place, turned @ turn(axis, value)
+
+
+@pytest.mark.parametrize(('mode', 'steered'), KINDS)
+def test_its_joints_are_those_of_joint_states(mode: str, steered: bool) -> None:
+    """robot_state_publisher needs each of them; one that is missing leaves a gap in the tree."""
+    urdf = described(mode, steered)
+    states = steered_states() if steered else JOINT_STATES
+    joints = movable(urdf)
+    assert sorted(joints) == sorted(joint.name for joint in states.joints)
+    units = {'prismatic': 'm', 'revolute': 'rad', 'continuous': 'rad'}
+    assert {name: units[joint.get('type')] for name, joint in joints.items()} == {
+        joint.name: joint.unit for joint in states.joints
+    }
+    links = Counter(link.get('name') for link in urdf.findall('link'))
+    assert set(links.values()) == {1}
+    assert {ENTRY, BASE} <= links.keys()
+    # A frame has one parent: that of the tip is said by the plant.
+    assert TIP not in links
+    for link in links:
+        pose(urdf, link, dict.fromkeys(joints, 0.0))
+
+
+@pytest.mark.parametrize('preset', NEEDLES)
+@pytest.mark.parametrize(('mode', 'steered'), KINDS)
+def test_its_limits_are_those_of_the_plant(mode: str, steered: bool, preset: str) -> None:
+    needle = NEEDLES[preset]
+    known = STEERING_PRESETS.get(preset)
+    free = (known.steering if known else SteeringParameters()).free_length
+    lengths = {'length': needle.length, 'minimum_depth': needle.minimum_depth, 'free_length': free}
+    joints = movable(described(mode, steered, **lengths))
+    limits = {
+        name: {key: float(value) for key, value in joint.find('limit').attrib.items()}
+        for name, joint in joints.items()
+    }
+    own, base, guide = PlantSettings(), BaseParameters(), GuideParameters()
+    low, high = needle.minimum_depth, needle.length
+    if steered:
+        high -= free + needle.minimum_depth
+    insertion = limits.pop(INSERTION)
+    assert insertion == {
+        'lower': pytest.approx(low),
+        'upper': pytest.approx(high),
+        'velocity': base.speed_limit,
+        'effort': own.force_limit,
+    }
+    if not steered:
+        assert limits['rotation']['effort'] == own.torque_limit
+        return
+    # The plant takes what lies within the limits, and refuses what does not.
+    plant = PlantRun({'mode': mode, 'steered': True, 'model.preset': preset, 'depth': 0.05})
+    plant.take(10**9)
+    for name, limit in limits.items():
+        assert limit['lower'] == -limit['upper']
+        for share in (1.0, -1.0, 1.001, -1.001):
+            reading = Reading(10**9, '', (name,), ((share * limit['upper'],), (), ()))
+            _, complaint = plant.command_joints(reading, 10**9)
+            assert bool(complaint) == (abs(share) > 1.0), complaint
+    speeds = {name: limit['velocity'] for name, limit in limits.items()}
+    assert speeds == {
+        'guide_x': guide.speed_limit,
+        'guide_z': guide.speed_limit,
+        'guide_tilt_x': guide.tilt_speed_limit,
+        'guide_tilt_z': guide.tilt_speed_limit,
+        'roll': guide.roll_speed_limit,
+    }
+
+
+def test_its_base_is_where_that_of_the_model_is() -> None:
+    """At y = s - l, parallel to the entry point."""
+    urdf = described('simulation', False, length=0.25)
+    for depth in (0.001, 0.02, 0.2):
+        place, turned = pose(urdf, BASE, {INSERTION: depth, 'rotation': 1.0})
+        np.testing.assert_allclose(place, [0.0, depth - 0.25, 0.0], atol=1e-15)
+        np.testing.assert_array_equal(turned, np.eye(3))
+        plant = PlantRun({'model.preset': 'phantom', 'model.length': 0.25, 'depth': depth})
+        np.testing.assert_allclose(place, plant.plant.outline().base, atol=1e-15)
+
+
+def test_a_steered_base_is_where_that_of_the_plant_is() -> None:
+    """The guide carries it; a tilt is small in the plant and a turn here."""
+    preset, depth = 'bending_35mm', 0.06
+    free = STEERING_PRESETS[preset].steering.free_length
+    urdf = described('robot', True, free_length=free)
+    plant = PlantRun({'mode': 'robot', 'steered': True, 'model.preset': preset, 'depth': depth})
+    goals = {'guide_x': 2e-3, 'guide_z': -1e-3, 'guide_tilt_x': 0.02, 'guide_tilt_z': -0.03}
+    plant.take(10**9)
+    reading = Reading(10**9, '', tuple(goals), (tuple(goals.values()), (), ()))
+    assert plant.command_joints(reading, 10**9) == (True, '')
+    for k in range(1, 1500):
+        (*_, (_, _, values)) = plant.take(10**9 + k * 10**6)
+    states = steered_states().joints
+    at = {joint.name: value for joint, value in zip(states, values, strict=False)}
+    assert {name: at[name] for name in goals} == pytest.approx(goals, abs=1e-7)
+    place, turned = pose(urdf, BASE, at)
+    np.testing.assert_allclose(turned, np.eye(3), atol=1e-15)
+    # Behind the guide, 0.1 m of it: by half the square of the tilt, and less across.
+    np.testing.assert_allclose(place, plant.plant.outline().base, atol=0.1 * 0.5 * 0.05**2)
+    guide, tilted = pose(urdf, 'needle_guide', at)
+    points = plant.plant.outline()
+    np.testing.assert_allclose(guide, points.points[0], atol=1e-8)
+    # A tilt is a slope: it leans to where x and z are positive.
+    slope = tilted[:, 1] / tilted[1, 1]
+    np.testing.assert_allclose(slope[[0, 2]], points.slopes[0], rtol=1e-2)
+
+
+def test_the_tip_is_where_the_last_pose_of_the_needle_is() -> None:
+    """Seen from the base; the turn brings y along the needle."""
+    values = {'model.preset': 'phantom', 'depth': 0.12, 'tip_deflection': 5e-3}
+    outline = PlantRun(values).plant.outline()
+    place, (i, j, k, w) = outline.tip
+    np.testing.assert_allclose(outline.base + place, outline.points[-1], atol=1e-15)
+    np.testing.assert_allclose(place, [0.0, 0.2, 5e-3], atol=1e-12)
+    assert i * i + j * j + k * k + w * w == pytest.approx(1.0)
+    # The quaternion turned about: y becomes the direction of the needle at its tip.
+    along = [2.0 * (i * j - w * k), 1.0 - 2.0 * (i * i + k * k), 2.0 * (j * k + w * i)]
+    x, z = outline.slopes[-1]
+    np.testing.assert_allclose(along, np.array([x, 1.0, z]) / np.sqrt(1.0 + x * x + z * z))
+    assert z > 0.0
+
+
+@pytest.mark.parametrize(('mode', 'steered'), KINDS)
+def test_its_hardware_sends_what_the_plant_takes(mode: str, steered: bool) -> None:
+    """Topics are named, all is sent, and no array has gaps."""
+    (system,) = described(mode, steered).findall('ros2_control')
+    hardware = system.find('hardware')
+    assert hardware.findtext('plugin') == (
+        'joint_state_topic_hardware_interface/JointStateTopicSystem'
+    )
+    assert {param.get('name'): param.text for param in hardware.iter('param')} == {
+        'joint_commands_topic': JOINT_COMMANDS.name,
+        'joint_states_topic': JOINT_STATES.name,
+        'trigger_joint_command_threshold': '-1',
+    }
+    commanded = {
+        joint.get('name'): [item.get('name') for item in joint.iter('command_interface')]
+        for joint in system.iter('joint')
+    }
+    (interfaces,) = {tuple(names) for names in commanded.values()}
+    expected = {
+        ('simulation', False): ('effort',),
+        ('simulation', True): ('position', 'effort'),
+        ('robot', False): ('position',),
+        ('robot', True): ('position',),
+    }
+    assert interfaces == expected[mode, steered]
+    for joint in system.iter('joint'):
+        states = [item.get('name') for item in joint.iter('state_interface')]
+        assert states == ['position', 'velocity', 'effort']
+    # What it sends before a controller is active, and after: at rest, without a force.
+    plant = PlantRun({'mode': mode, 'steered': steered, 'model.preset': 'bending_35mm'})
+    names = tuple(commanded)
+    sent = [
+        tuple([np.nan] * len(names)) if k in interfaces else () for k in ('position', 'effort')
+    ]
+    reading = Reading(10**9, '', names, (sent[0], (), sent[1]))
+    assert plant.command_joints(reading, 10**9) == (True, '')
+
+
+@pytest.mark.parametrize(('mode', 'steered'), KINDS)
+def test_the_controllers_claim_what_the_hardware_has(mode: str, steered: bool) -> None:
+    """Those that the launch file starts in this mode, with parameters for each."""
+    launch = (ROOT / 'launch/ros2_control.launch.py').read_text(encoding='utf-8')
+    space: dict[str, Any] = {}
+    begin = launch.index('def spawned')
+    exec(launch[begin : launch.index('\n\n\n', begin)], space)  # noqa: S102
+    active, ready = space['spawned'](mode, steered=steered)
+    manager = CONTROLLERS['/**/controller_manager']['ros__parameters']
+    assert manager['update_rate'] >= 20
+    (system,) = described(mode, steered).findall('ros2_control')
+    offered = {
+        f'{joint.get("name")}/{item.get("name")}'
+        for joint in system.iter('joint')
+        for item in joint.iter('command_interface')
+    }
+    claimed: list[str] = []
+    for name in [*active, *ready]:
+        own = CONTROLLERS[f'/**/{name}']['ros__parameters']
+        assert manager[name]['type'].partition('/')[0] in (
+            'joint_trajectory_controller', 'effort_controllers',
+        )  # fmt: skip
+        claims = [
+            f'{joint}/{kind}'
+            for joint in own['joints']
+            for kind in own.get('command_interfaces', ['effort'])
+        ]
+        assert set(claims) <= offered
+        claimed += claims if name in active else []
+    # Two that are active cannot claim the same.
+    assert len(claimed) == len({*claimed})
+
+
+def test_the_meshes_are_those_of_the_script_and_all_are_used() -> None:
+    """Made again they are the same, byte for byte."""
+    files = {path.stem: path.read_bytes() for path in (FOLDER / 'meshes').iterdir()}
+    assert files == {name: MAKER['stl'](make()) for name, make in MAKER['MESHES'].items()}
+    used = {mesh.get('filename') for kind in KINDS for mesh in described(*kind).iter('mesh')}
+    assert used == {f'package://needle_insertion/description/meshes/{name}.stl' for name in files}
+    assert max(map(len, files.values())) < 10_000
+
+
+@pytest.mark.parametrize('name', MAKER['MESHES'])
+def test_a_mesh_is_closed_and_seen_from_outside(name: str) -> None:
+    """Each edge is that of two triangles, one in each direction; the volume is positive."""
+    data = (FOLDER / f'meshes/{name}.stl').read_bytes()
+    (count,) = struct.unpack_from('<I', data, 80)
+    assert len(data) == 84 + 50 * count
+    edges: Counter[tuple[Point, Point]] = Counter()
+    volume = 0.0
+    for k in range(count):
+        found = np.array(struct.unpack_from('<9f', data, 84 + 50 * k + 12)).reshape(3, 3)
+        a, b, c = (tuple(row.tolist()) for row in found)
+        edges.update([(a, b), (b, c), (c, a)])
+        volume += np.linalg.det(found) / 6.0
+    assert edges == Counter({(b, a): number for (a, b), number in edges.items()})
+    assert volume > 0.0
