@@ -253,6 +253,7 @@ class Robot:
         """Forget what was measured and commanded."""
         self.estimates = False
         self._speed = _Speed()
+        #: Inserted length that was last read [m].
         self._depth = nan
         #: Where the other joints of a command stay, in the unit of the robot.
         self._others: dict[str, float] = {}
@@ -367,7 +368,8 @@ class Robot:
                 j = names.index(ROTATION)
                 if j < min(len(positions), len(velocities)):
                     angle, angular_velocity = positions[j], velocities[j]
-        self._depth = depth
+        if isfinite(depth):
+            self._depth = depth
         return Measurement(
             time=time, depth=depth, speed=velocity, angle=angle, angular_speed=angular_velocity,
             force=force,
@@ -437,7 +439,7 @@ class Robot:
             effort = self._gain * answer.force
             return [effort if joint == settings.joint else 0.0 for joint in settings.joints]
         base, length = self._base, None
-        if base is not None:
+        if base is not None and isfinite(self._depth):
             # Without a reference nothing is wanted, beside a message that came twice.
             if stopped:
                 length = base.give_way()

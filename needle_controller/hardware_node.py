@@ -32,14 +32,14 @@ from std_msgs.msg import Float64MultiArray
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 
-def _named(topic: Topic, setting: str, name: str, type_name: str) -> Topic:
+def _named(topic: Topic, name: str, type_name: str) -> Topic:
     """Return a topic of the contract as the driver has it."""
     if name:
         try:
             validate_topic_name(name)
         except InvalidTopicNameException as error:
             reason = ' '.join(str(error).split())
-            raise ParameterError(f'hardware.{setting}: {reason}') from error
+            raise ParameterError(f'hardware: the topic {name!r}: {reason}') from error
     return replace(topic, name=name or topic.name, type_name=type_name)
 
 
@@ -109,20 +109,24 @@ class Driver:
         self.robot = Robot(settings)
         self._node, self._settings = node, settings
         state, wrench, command = (
-            _named(topic, setting, getattr(settings, setting), type_name)
-            for topic, setting, type_name in (
-                (contract.JOINT_STATES, 'state_topic', STATE_TYPES[settings.state_type]),
-                (contract.BASE_WRENCH, 'wrench_topic', contract.BASE_WRENCH.type_name),
-                (contract.WRENCH_COMMAND, 'command_topic', COMMAND_TYPES[settings.command_type]),
+            _named(topic, name, type_name)
+            for topic, name, type_name in (
+                (contract.JOINT_STATES, settings.state_topic, STATE_TYPES[settings.state_type]),
+                (contract.BASE_WRENCH, settings.wrench_topic, contract.BASE_WRENCH.type_name),
+                (
+                    contract.WRENCH_COMMAND,
+                    settings.command_topic,
+                    COMMAND_TYPES[settings.command_type],
+                ),
             )
         )
         self.topics = Topics(
             state, wrench, command, _of(contract.MEASURER, state), _of(contract.COMMANDER, command)
         )
         self._dynamic: Any = None
-        if self.topics.state.type_name != contract.JOINT_STATES.type_name:
+        if state.type_name != contract.JOINT_STATES.type_name:
             try:
-                self._dynamic = message_class(self.topics.state.type_name)
+                self._dynamic = message_class(state.type_name)
             except MessageError as error:
                 raise MessageError(
                     f'hardware.state_type {settings.state_type}: {error}'

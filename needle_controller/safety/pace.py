@@ -14,7 +14,7 @@ _FEWEST: Final = 20
 
 #: How far a period may be off, and which share of the periods must be for a word.
 _BORNE: Final = 0.2
-_SHARE: Final = 0.75
+_SHARE: Final = 0.9
 
 
 class Pace:
