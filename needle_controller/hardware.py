@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from math import isfinite, isnan, nan
 from typing import Any, Final
 
@@ -110,6 +110,10 @@ class HardwareSettings:
 
     def __post_init__(self) -> None:
         check_constants(self)
+        for item in fields(self):
+            value = getattr(self, item.name)
+            if isinstance(item.default, str) and not isinstance(value, str):
+                raise ParameterError(f'{item.name} must be text, got {value!r}')
         for name, valid in (
             ('state_type', tuple(STATE_TYPES)),
             ('stamps', STAMPS),
