@@ -211,7 +211,7 @@ class ControllerNode(ModelNode):
             observed = self.settings('observer.', ObserverSettings)
         robot = None
         if self._driver is not None:
-            self._driver.believe(controller)
+            self._driver.configure(controller)
             robot = self._driver.robot
         self._supervisor.configure(controller, limits, observed, robot)
         if feedback == 'ground_truth':
@@ -249,8 +249,8 @@ class ControllerNode(ModelNode):
             self._tell()
             raise
         self._supervisor.retract_depth = depth
-        if self._driver is not None and self._supervisor.controller is not None:
-            self._driver.believe(self._supervisor.controller)
+        if self._driver is not None:
+            self._driver.robot.believe(parameters)
 
     def cleanup(self) -> None:
         """Forget the controller, the bending and who tells of it."""

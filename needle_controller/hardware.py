@@ -11,6 +11,7 @@ from needle_controller.admittance import Admittance
 from needle_controller.answer import Answer
 from needle_controller.controller import Controller, Measurement
 from needle_controller.laws.axis import Axis
+from needle_dynamics import NeedleParameters
 from needle_ros.contract import INSERTION, ROTATION
 from needle_ros.errors import ParameterError
 from needle_ros.settings import check_constants, constant
@@ -265,7 +266,7 @@ class Robot:
             self._base.hold()
             self._base.position = None
 
-    def believe(self, controller: Controller) -> None:
+    def configure(self, controller: Controller) -> None:
         """
         Take over what a controller believes of the needle, for commands of positions.
 
@@ -275,17 +276,26 @@ class Robot:
             The controller.
 
         """
-        axis = Axis.insertion(controller.parameters)
-        if self._base is not None:
-            self._base.axis = axis
-            return
         self._base = Admittance(
-            axis,
+            Axis.insertion(controller.parameters),
             period=controller.period,
             speed=self.settings.speed,
             lead=self.settings.lead,
             depths=controller.settings.depths(controller.parameters),
         )
+
+    def believe(self, parameters: NeedleParameters) -> None:
+        """
+        Go on with another friction.
+
+        Parameters
+        ----------
+        parameters : NeedleParameters
+            Needle and tissue.
+
+        """
+        if self._base is not None:
+            self._base.axis = Axis.insertion(parameters)
 
     # From the robot.
 

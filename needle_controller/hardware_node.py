@@ -230,7 +230,7 @@ class Driver:
 
     # To the robot.
 
-    def believe(self, controller: Controller) -> None:
+    def configure(self, controller: Controller) -> None:
         """
         Take over what a controller believes of the needle, and its period.
 
@@ -240,7 +240,7 @@ class Driver:
             The controller.
 
         """
-        self.robot.believe(controller)
+        self.robot.configure(controller)
         whole, part = divmod(round(controller.period * NANOSECONDS), NANOSECONDS)
         self._period = Duration(sec=whole, nanosec=part)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import product
 from math import isnan, nan
 from typing import Any
@@ -49,7 +50,7 @@ def forces(**settings: Any) -> Robot:
 def moves(**settings: Any) -> Robot:
     """Return a robot that takes positions, and that a controller believes in."""
     robot = Robot(HardwareSettings(**{**MOVES, **settings}))
-    robot.believe(Controller(NeedleParameters.preset('phantom')))
+    robot.configure(Controller(NeedleParameters.preset('phantom')))
     return robot
 
 
@@ -70,7 +71,7 @@ def test_there_and_back(robot: Robot, position: float) -> None:
     # Within the lead of a command that rests.
     sent = Robot(HardwareSettings(**MOVES, sign=settings.sign, scale=settings.scale,
                                   zero=settings.zero))  # fmt: skip
-    sent.believe(Controller(NeedleParameters.preset('phantom')))
+    sent.configure(Controller(NeedleParameters.preset('phantom')))
     sent.measurement(state(['insertion'], [position], [0.0]))
     assert sent.command(push(SECOND, 0.0)) == pytest.approx([position], abs=1e-9)
 
@@ -228,6 +229,20 @@ def test_a_position_rests_when_nothing_is_wanted() -> None:
     robot.measurement(state(['insertion'], [1e9], [0.0], stamp=stamp + 2))
     assert robot.command(Answer(stamp + 2), stopped=True) == pytest.approx([20.0])
     assert robot.command(Answer(stamp + 3), stopped=True) == pytest.approx([20.0])
+
+
+def test_another_friction_counts_at_once() -> None:
+    """What the law is told while it runs, its virtual base has too, and goes on from where it is."""
+    robot, ways, phantom = moves(), [], NeedleParameters.preset('phantom')
+    for k, share in enumerate((1.0, 1.0, 2.0)):
+        viscous = share * phantom.viscous_friction
+        robot.believe(replace(phantom, coulomb_friction=0.0, viscous_friction=viscous))
+        for n in range(50):
+            stamp = SECOND + (50 * k + n) * 1_000_000
+            robot.measurement(state(['insertion'], [0.02], [0.0], stamp=stamp))
+            ways.append((robot.command(push(stamp, 3.0)) or [])[0])
+    assert ways[99] - ways[98] == pytest.approx(3.0 / phantom.viscous_friction * 1e-3, rel=1e-6)
+    assert ways[149] - ways[148] == pytest.approx(0.5 * (ways[99] - ways[98]), rel=1e-6)
 
 
 def test_a_known_load_does_not_move_the_base() -> None:
