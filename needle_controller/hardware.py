@@ -144,6 +144,11 @@ class HardwareSettings:
                 f"command_type must be one of {others} for the command position, got 'wrench'"
             )
 
+        if self.command_type != 'wrench' and not self.command_topic:
+            raise ParameterError(
+                f"command_topic must be that of the driver for {self.command_type}, got ''"
+            )
+
     @property
     def joints(self) -> tuple[str, ...]:
         """Joints of a command, in their order."""

@@ -28,7 +28,8 @@ ROBOTS = st.builds(
     st.floats(-100.0, 100.0),
 )
 SIGNED = ['x', 'y', 'z', '-x', '-y', '-z']
-MOVES = {'command': 'position', 'command_type': 'joint_trajectory'}
+MOVES = {'command': 'position', 'command_type': 'joint_trajectory', 'command_topic': 'go'}
+PUSHES = {'command_type': 'float64_multi_array', 'command_topic': 'push'}
 
 
 def state(
@@ -44,7 +45,7 @@ def state(
 
 def forces(**settings: Any) -> Robot:
     """Return a robot that takes efforts."""
-    return Robot(HardwareSettings(**{'command_type': 'float64_multi_array', **settings}))
+    return Robot(HardwareSettings(**{**PUSHES, **settings}))
 
 
 def moves(**settings: Any) -> Robot:
@@ -94,8 +95,10 @@ def test_the_joint_is_found_by_name(names: list[str]) -> None:
     """Whatever the order and the other joints; only a torque turns the needle."""
     place = {'slide': 0.03, 'a': 1.0, 'b': nan, 'rotation': 0.5}
     reading = state(names, [place[n] for n in names], [place[n] / 3.0 for n in names])
-    for command_type, angle in (('float64_multi_array', 0.0), ('wrench', 0.5)):
-        robot = Robot(HardwareSettings(joint='slide', command_type=command_type))
+    for robot, angle in (
+        (forces(joint='slide'), 0.0),
+        (Robot(HardwareSettings(joint='slide')), 0.5),
+    ):
         found = robot.measurement(reading)
         assert (found.depth, found.speed, found.angle) == (0.03, 0.01, angle)
         assert isnan(found.force)
@@ -232,8 +235,9 @@ def test_a_position_rests_when_nothing_is_wanted() -> None:
 
 
 def test_another_friction_counts_at_once() -> None:
-    """What the law is told while it runs, its virtual base has too, and goes on from where it is."""
-    robot, ways, phantom = moves(), [], NeedleParameters.preset('phantom')
+    """What the law is told while it runs, its virtual base has too."""
+    phantom, robot = NeedleParameters.preset('phantom'), moves()
+    ways = []
     for k, share in enumerate((1.0, 1.0, 2.0)):
         viscous = share * phantom.viscous_friction
         robot.believe(replace(phantom, coulomb_friction=0.0, viscous_friction=viscous))
@@ -263,6 +267,7 @@ def test_a_known_load_does_not_move_the_base() -> None:
         ({'command': 'velocity'}, 'hardware.command must be one of effort, position, got'),
         ({'command_type': 'twist'}, 'hardware.command_type must be one of wrench, float64'),
         ({'command': 'position'}, 'hardware.command_type must be one of float64_multi'),
+        (PUSHES | {'command_topic': ''}, 'hardware.command_topic must be that of the driver'),
         ({'state_type': 'x'}, 'hardware.state_type must be one of joint_state, dynamic'),
         ({'stamps': 'now'}, "hardware.stamps must be one of header, receive, got 'now'"),
         ({'command_joints': ['a']}, "hardware.command_joints must have the joint 'insertion'"),
