@@ -153,7 +153,7 @@ def test_a_robot_may_have_its_own_topics(ros_graph: RosGraph) -> None:
     bench.aim()
     bench.until(lambda: bench.said.startswith(('done', 'stopped')), 'the end')
     assert bench.said.startswith('done: the tip is at x = ')
-    assert bench.steering.count_publishers('joint_trajectory') == 0
+    assert bench.user.count_publishers('joint_trajectory') == 0
     for move in bench.moves:
         assert move.joint_names == ['insertion', 'guide_x', 'guide_z']
         assert list(move.points[-1].velocities) == [0.0, 0.0, 0.0]
