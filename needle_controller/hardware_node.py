@@ -218,10 +218,15 @@ class Driver:
                 f'{topic.name} is published as {", ".join(sorted(types))}, and read as '
                 f'{topic.type_name} (hardware.state_topic, hardware.state_type)'
             )
+        own = node.get_name(), node.get_namespace()
         others = [
             name
             for name, kinds in node.get_topic_names_and_types()
-            if topic.type_name in kinds and node.get_publishers_info_by_topic(name)
+            if topic.type_name in kinds
+            and any(
+                (one.node_name, one.node_namespace) != own
+                for one in node.get_publishers_info_by_topic(name)
+            )
         ]
         return (
             f'nobody publishes {topic.name}; {topic.type_name} is published on '

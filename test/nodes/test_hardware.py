@@ -199,10 +199,10 @@ def test_a_position_robot_gives_way_in_a_stop(ros_graph: RosGraph) -> None:
     bench.until(press, 'the stop')
     assert str(bench.stop).startswith('axial force 40 N is beyond the limit of 30 N')
     count = len(bench.commands)
-    bench.until(lambda: len(bench.commands) > count + 5, 'commands after it')
-    (rest,) = {*bench.values()[count + 1 :]}
+    bench.until(lambda: len(bench.commands) > count + 20, 'commands after it')
+    (rest,) = {*bench.values()[-10:]}
     # Back from the lead, to where it was measured.
-    assert rest <= max(bench.values()[:count])
+    assert rest < max(bench.values()[:count])
     bench.until(lambda: abs(bench.robot.position - rest) < 1e-3, 'rest')
     assert 0.025 < bench.depth < 0.05
 
@@ -279,7 +279,7 @@ def test_it_says_why_nothing_comes(ros_graph: RosGraph) -> None:
     ros_graph.spin_until(
         lambda: said() == (
             'no joint_states yet: nobody publishes arm/states; sensor_msgs/msg/JointState is '
-            'published on /arm/joint_states, /reference, /tracking_error (hardware.state_topic)'
+            'published on /arm/joint_states (hardware.state_topic)'
         ),
         'the topics that there are',
     )  # fmt: skip
@@ -326,8 +326,8 @@ def test_zero_is_sent_again_and_again_when_measurements_end(ros_graph: RosGraph)
         bench.robot.destroy_timer(timer)
     bench.until(lambda: 'joint_states is stale' in bench.said, 'the watchdog')
     count = len(bench.commands)
-    bench.until(lambda: len(bench.commands) > count + 10, 'more of them')
-    assert {*bench.values()[count:]} == {0.0}
+    bench.until(lambda: len(bench.commands) > count + 15, 'more of them')
+    assert {*bench.values()[-10:]} == {0.0}
 
 
 @pytest.mark.parametrize('which', ROBOTS)
@@ -445,4 +445,4 @@ def test_an_emergency_stop_reaches_a_foreign_driver(ros_graph: RosGraph) -> None
     bench.until(lambda: bench.robot.mass.effort == 0.0, 'no effort')
     count = len(bench.commands)
     bench.until(lambda: len(bench.commands) > count + 20, 'more answers')
-    assert {*bench.values()[count:]} == {0.0}
+    assert {*bench.values()[-10:]} == {0.0}
