@@ -232,8 +232,8 @@ class Robot:
     A robot in the terms of the contract.
 
     With the position p of its joint, the inserted length is :math:`s = g (p - p_0)` with
-    :math:`g` = sign * scale. Velocities go with g, and efforts with 1 / g, so that power is the
-    same on both sides: :math:`e \dot{p} = f \dot{s}`.
+    :math:`g` = sign * scale. Velocities go with g, and the effort of the joint is :math:`e = g f`,
+    so that power is the same on both sides: :math:`e \dot{p} = f \dot{s}`.
 
     Where positions are commanded, a velocity that the driver does not report is estimated: by
     differences of positions, through a filter of first order with 5 ms.
