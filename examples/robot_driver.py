@@ -7,6 +7,7 @@ positions. Run one of them, and the controller with the parameters in docs/howto
 
 from math import copysign, exp
 import sys
+from typing import Any
 
 from geometry_msgs.msg import WrenchStamped
 import rclpy
@@ -23,7 +24,7 @@ class Mass:
 
     position, velocity, effort = 0.18, 0.0, 0.0
 
-    def move(self, h):
+    def move(self, h: float) -> None:
         """Move for a time [s]."""
         push = self.velocity + self.effort * h / 0.5
         self.velocity = copysign(max(abs(push) - 0.5 * h / 0.5, 0.0), push) / (1 + 300 * h / 0.5)
@@ -33,7 +34,7 @@ class Mass:
 class ForceRobot(Node):
     """Drives the mass by efforts; a force sensor that looks out of the tissue feels the needle."""
 
-    def __init__(self, **options):
+    def __init__(self, **options: Any) -> None:
         super().__init__('force_robot', **options)
         self.mass, self.last = Mass(), self.get_clock().now()
         self.states = self.create_publisher(JointState, 'joint_states', 10)
@@ -41,11 +42,11 @@ class ForceRobot(Node):
         self.create_subscription(Float64MultiArray, 'slide/commands', self.on_command, 10)
         self.create_timer(PERIOD, self.sample)
 
-    def on_command(self, message):
+    def on_command(self, message: Float64MultiArray) -> None:
         """Take a command."""
         self.mass.effort = message.data[0]
 
-    def sample(self):
+    def sample(self) -> None:
         """Move, and say what is measured."""
         mass, now = self.mass, self.get_clock().now()
         mass.move((now - self.last).nanoseconds * 1e-9)
@@ -62,7 +63,7 @@ class ForceRobot(Node):
 class PositionRobot(Node):
     """A stage that counts in mm and follows positions with a lag of 20 ms; nothing else."""
 
-    def __init__(self, **options):
+    def __init__(self, **options: Any) -> None:
         super().__init__('position_robot', **options)
         self.position = self.goal = 120.0
         self.states = self.create_publisher(JointState, 'joint_states', 10)
@@ -70,11 +71,11 @@ class PositionRobot(Node):
         self.create_timer(PERIOD, self.sample)
         self.last = self.get_clock().now()
 
-    def on_command(self, message):
+    def on_command(self, message: JointTrajectory) -> None:
         """Take a command."""
         self.goal = message.points[-1].positions[0]
 
-    def sample(self):
+    def sample(self) -> None:
         """Move, and say what is measured."""
         now = self.get_clock().now()
         h, self.last = (now - self.last).nanoseconds * 1e-9, now

@@ -180,14 +180,15 @@ class Driver:
                 )
             )
 
+        def on_match(event: Any) -> None:
+            matched(event.total_count_change)
+
         self._node.create_subscription(
             self._dynamic,
             self.topics.state.name,
             on_message,
             SENSOR,
-            event_callbacks=SubscriptionEventCallbacks(
-                matched=lambda event: matched(event.total_count_change)
-            ),
+            event_callbacks=SubscriptionEventCallbacks(matched=on_match),
         )
 
     def describe(self) -> dict[str, object]:

@@ -28,8 +28,12 @@ ROBOTS = st.builds(
     st.floats(-100.0, 100.0),
 )
 SIGNED = ['x', 'y', 'z', '-x', '-y', '-z']
-MOVES = {'command': 'position', 'command_type': 'joint_trajectory', 'command_topic': 'go'}
-PUSHES = {'command_type': 'float64_multi_array', 'command_topic': 'push'}
+MOVES: dict[str, Any] = {
+    'command': 'position',
+    'command_type': 'joint_trajectory',
+    'command_topic': 'go',
+}
+PUSHES: dict[str, Any] = {'command_type': 'float64_multi_array', 'command_topic': 'push'}
 
 
 def state(
@@ -83,7 +87,7 @@ def test_power_is_preserved(robot: Robot, force: float, velocity: float) -> None
     settings = robot.settings
     measured = robot.measurement(state(['insertion'], [0.0], [velocity]))
     told = forces(sign=settings.sign, scale=settings.scale, zero=settings.zero)
-    (effort,) = told.command(Answer(0, force)) or ()
+    (effort,) = told.command(Answer(0, force)) or [nan]
     assert effort * velocity == pytest.approx(force * measured.speed, rel=1e-9, abs=1e-12)
     assert told.force(effort) == pytest.approx(force, rel=1e-12, abs=1e-12)
     read = robot.measurement(state(['insertion'], [0.0], [velocity], [effort]))
@@ -208,7 +212,7 @@ def test_other_joints_hold_their_position() -> None:
     assert robot.command(push(SECOND)) is None
     robot.measurement(state(['slide', 'a'], [0.02, 1.0], [0.0, 0.0]))
     robot.measurement(state(['slide', 'a'], [0.02, 1.5], [0.0, 0.0]))
-    first, second = robot.command(push(SECOND)) or ()
+    first, second = robot.command(push(SECOND)) or [nan, nan]
     assert first == 1.0
     assert 0.02 < second < 0.0201
     robot.begin()
@@ -223,7 +227,7 @@ def test_a_position_rests_when_nothing_is_wanted() -> None:
     for k in range(1, 100):
         stamp = SECOND + k * 1_000_000
         robot.measurement(state(['insertion'], [20.0], [0.0], stamp=stamp))
-        (last,) = robot.command(push(stamp)) or ()
+        (last,) = robot.command(push(stamp)) or [nan]
     assert last == pytest.approx(22.0)
     # The same measurement again is no reason to rest.
     assert robot.command(Answer(stamp, 10.0)) == [last]
