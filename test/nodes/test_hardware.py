@@ -303,8 +303,8 @@ def test_it_says_why_nothing_comes(ros_graph: RosGraph, stranger: Node, there: s
     parameters = {**FORCE, 'hardware.state_topic': topic}
     controller = ros_graph.add(ControllerNode, parameters=parameters)
     expected = {
-        'elsewhere': 'no joint_states yet: nobody publishes arm/states; sensor_msgs/msg/JointState '
-        'is published on /arm/joint_states (hardware.state_topic)',
+        'elsewhere': 'no joint_states yet: nobody publishes arm/states; '
+        'sensor_msgs/msg/JointState is published on /arm/joint_states (hardware.state_topic)',
         'another type': 'no joint_states yet: arm/states is published as std_msgs/msg/String, and '
         'read as sensor_msgs/msg/JointState (hardware.state_topic, hardware.state_type)',
         'other joints': "joint_states has no position of the joint 'slide'; it has those of 'a', "
