@@ -4,6 +4,7 @@ Control of a flexible needle: laws, references, observer, stability, safety, and
 Units are SI throughout; signs and frames are those of docs/architecture.md.
 """
 
+from needle_controller.admittance import Admittance
 from needle_controller.answer import Answer
 from needle_controller.controller import (
     Command,
@@ -13,6 +14,7 @@ from needle_controller.controller import (
     LAWS,
     Measurement,
 )
+from needle_controller.hardware import HardwareSettings, Robot
 from needle_controller.in_loop.continuous import run_continuous
 from needle_controller.in_loop.run import LoopRun
 from needle_controller.in_loop.sampled import Commander, LoopBatch, run_batch, run_controller
@@ -64,6 +66,7 @@ __all__ = [
     'REFERENCES',
     'Adaptive',
     'AdaptiveGains',
+    'Admittance',
     'Answer',
     'Axis',
     'Command',
@@ -76,6 +79,7 @@ __all__ = [
     'ControllerSettings',
     'Guard',
     'Guidance',
+    'HardwareSettings',
     'InverseDynamics',
     'InverseDynamicsGains',
     'Law',
@@ -93,6 +97,7 @@ __all__ = [
     'PidGains',
     'Reference',
     'ReferenceLimits',
+    'Robot',
     'Safety',
     'SafetyLimits',
     'SampledLoop',

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import fields
 import sys
+from time import sleep
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -17,6 +18,8 @@ from needle_controller.controller import (
     Gains,
     LAWS,
 )
+from needle_controller.hardware import HardwareSettings
+from needle_controller.hardware_node import CONTRACT, Driver
 from needle_controller.journal import Severity
 from needle_controller.observer.settings import ObserverSettings
 from needle_controller.reference.guide import REFERENCES
@@ -27,7 +30,7 @@ from needle_controller.uncertainty import Uncertainty
 from needle_dynamics.compiled.cache import announce_compilation
 from needle_dynamics.model_node import ModelNode
 from needle_ros import contract
-from needle_ros.errors import ParameterError
+from needle_ros.errors import NeedleError, ParameterError
 from needle_ros.publishers_node import offer_lease, Publishers
 from needle_ros.run_node import run
 from needle_ros.timing import nanoseconds, seconds
@@ -44,6 +47,13 @@ _RETRACT = 'retract_depth'
 
 #: Where to retract to by default [m], or as near to it as the range of depths has.
 _RETRACT_DEPTH = 0.01
+
+#: How often the last command is sent again when the node lets go of a robot whose driver may have
+#: no timeout, and how long after another [s].
+_AGAIN, _PAUSE = 5, 0.02
+
+#: Looks for joint states that do not come until there is a word about it.
+_PATIENCE = 20
 
 #: Joints that no axis law moves.
 _GUIDE = {joint.name for joint in contract.STEERING_JOINTS}
@@ -118,6 +128,7 @@ class ControllerNode(ModelNode):
         self.declare_settings('safety.', SafetyLimits())
         self.declare_settings('uncertainty.', Uncertainty())
         self.declare_settings('observer.', ObserverSettings())
+        self.declare_settings('hardware.', HardwareSettings())
         for law, axes in DEFAULT_GAINS.items():
             for axis, gains in axes.items():
                 self.declare_settings(f'{law}.{axis}.', gains)
@@ -125,27 +136,16 @@ class ControllerNode(ModelNode):
 
         self._supervisor = supervisor = Supervisor()
         self._truths: Subscription | None = None
-        offer_lease(self, contract.COMMANDER)
-        commanders = Publishers(self, contract.COMMANDER, self._look)
-        measurers = Publishers(self, contract.MEASURER, self._look)
-        #: Who counts the nodes that publish what may have one source only.
-        self._sources = {
-            contract.WRENCH_COMMAND: commanders,
-            contract.JOINT_STATES: measurers,
-            contract.BASE_WRENCH: measurers,
-            contract.TIP_DEFLECTION: measurers,
-        }
-        self._wrench_command = self.publisher(contract.WRENCH_COMMAND)
+        #: What reads and commands a robot that does not know the contract; why there is none.
+        self._driver: Driver | None = None
+        self._no_driver: NeedleError | None = None
+        self._hardware = HardwareSettings()
+        self._looks, self._missing = 0, ''
+        self._connect()
         self._reference = self.publisher(contract.REFERENCE)
         self._tracking_error = self.publisher(contract.TRACKING_ERROR)
         self._write_wrench = contract.WRENCH_COMMAND.template().serialize
         self._write_aim = contract.REFERENCE.template().serialize
-        for topic, take in (
-            (contract.JOINT_STATES, supervisor.encoders),
-            (contract.BASE_WRENCH, supervisor.wrench),
-            (contract.TIP_DEFLECTION, supervisor.tip),
-        ):
-            self.listen(topic, self._passing(take), self._look)
         self.subscribe(contract.TARGET, self._on_target)
         self.subscribe(contract.JOINT_TRAJECTORY, self._on_trajectory)
         self._serve(Trigger, 'emergency_stop', lambda _: supervisor.emergency_stop(self.now()))
@@ -155,10 +155,46 @@ class ControllerNode(ModelNode):
         #: A clock that stands still or jumps does not stop the watchdog.
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
 
+    def _connect(self) -> None:
+        """Offer the commands and subscribe to what is measured; `configure` says what is wrong."""
+        try:
+            self._hardware = self.settings('hardware.', HardwareSettings)
+            if self._hardware != HardwareSettings():
+                self._driver = Driver(self, self._hardware)
+        except NeedleError as error:
+            self._no_driver = error
+        self._topics = topics = self._driver.topics if self._driver is not None else CONTRACT
+        offer_lease(self, topics.commander)
+        commanders = Publishers(self, topics.commander, self._look)
+        measurers = Publishers(self, topics.measurer, self._look)
+        #: Who counts the nodes that publish what may have one source only, by its contract's name.
+        self._sources = {
+            contract.WRENCH_COMMAND.name: (topics.command, commanders),
+            contract.JOINT_STATES.name: (topics.state, measurers),
+            contract.BASE_WRENCH.name: (topics.wrench, measurers),
+            contract.TIP_DEFLECTION.name: (contract.TIP_DEFLECTION, measurers),
+        }
+        self._command = self.publisher(topics.command)
+        take_state = self._passing(self._supervisor.encoders)
+        take_wrench = self._passing(self._supervisor.wrench)
+        if self._driver is not None:
+            self._driver.listen(take_state, take_wrench, self._look)
+        else:
+            self.listen(topics.state, take_state, self._look)
+            self.listen(topics.wrench, take_wrench, self._look)
+        self.listen(contract.TIP_DEFLECTION, self._passing(self._supervisor.tip), self._look)
+
     # Transitions.
 
     def configure(self) -> None:
         """Make the controller from the parameters; reject unstable gains."""
+        if self.settings('hardware.', HardwareSettings) != self._hardware:
+            raise ParameterError(
+                'hardware.* is read when the node starts: give it on its command line or in its '
+                'parameter file'
+            )
+        if self._no_driver is not None:
+            raise self._no_driver
         feedback = self.text('deflection_feedback', FEEDBACKS)
         controller = Controller(
             self.model_parameters(),
@@ -173,7 +209,11 @@ class ControllerNode(ModelNode):
         limits, observed = self.settings('safety.', SafetyLimits), None
         if feedback == 'observer':
             observed = self.settings('observer.', ObserverSettings)
-        self._supervisor.configure(controller, limits, observed)
+        robot = None
+        if self._driver is not None:
+            self._driver.configure(controller)
+            robot = self._driver.robot
+        self._supervisor.configure(controller, limits, observed, robot)
         if feedback == 'ground_truth':
             take = self._passing(self._supervisor.truth)
             self._truths = self.listen(contract.GROUND_TRUTH, take)
@@ -209,6 +249,8 @@ class ControllerNode(ModelNode):
             self._tell()
             raise
         self._supervisor.retract_depth = depth
+        if self._driver is not None:
+            self._driver.robot.believe(parameters)
 
     def cleanup(self) -> None:
         """Forget the controller, the bending and who tells of it."""
@@ -220,6 +262,7 @@ class ControllerNode(ModelNode):
     def activate(self) -> None:
         """Begin to answer measurements and to watch for their absence."""
         self._supervisor.activate(self.now(), self._who_publishes())
+        self._looks, self._missing = 0, ''
         self._watchdog = self.create_timer(
             self._supervisor.watch_period, self._look, clock=self._steady
         )
@@ -228,15 +271,22 @@ class ControllerNode(ModelNode):
         """Name law, constants, rate and topics."""
         values = self.values()
         target = '' if values['steered'] else f'{contract.TARGET.name}, '
+        hardware = ''
+        if self._driver is not None:
+            hardware = f' ({self._hardware.command} of {", ".join(self._hardware.joints)})'
         return (
             f'law {values["law"]}, preset {values["model.preset"]}, {values["rate"]:g} Hz, delay '
             f'{values["delay"]:g}; takes {target}{contract.JOINT_TRAJECTORY.name} and '
-            f'{contract.JOINT_STATES.name}, publishes {contract.WRENCH_COMMAND.name}'
+            f'{self._topics.state.name}, publishes {self._topics.command.name}{hardware}'
         )
 
     def deactivate(self) -> None:
         """Let go: zero force, and no memory of the motion nor of its target."""
-        self._act(self._supervisor.deactivate(self.now()))
+        answer = self._supervisor.deactivate(self.now())
+        self._act(answer)
+        for _ in range(_AGAIN if self._driver is not None else 0):
+            sleep(_PAUSE)
+            self._act(answer)
         self.destroy_timer(self._watchdog)
 
     # What comes in.
@@ -289,12 +339,23 @@ class ControllerNode(ModelNode):
 
     def _who_publishes(self) -> dict[str, int]:
         """Count who publishes what may have one source only; active or not."""
-        return {topic.name: sources.count(topic) for topic, sources in self._sources.items()}
+        return {name: sources.count(topic) for name, (topic, sources) in self._sources.items()}
 
     def _look(self, _came: int = 0) -> None:
         """Look for what does not come, and who has come, from time to time and when one comes."""
         if self.is_active:
             self._act(self._supervisor.watch(self.now(), self._who_publishes()))
+            if self._driver is not None and self._supervisor.waits:
+                self._look_for(self._driver)
+
+    def _look_for(self, driver: Driver) -> None:
+        """Say why no joint states come, once each reason, and not before the graph is known."""
+        self._looks += 1
+        missing = driver.missing() if self._looks > _PATIENCE else ''
+        if missing != self._missing:
+            self._missing = missing
+            self._supervisor.journal.say(Severity.WARNING, missing)
+            self._tell()
 
     # What goes out.
 
@@ -302,8 +363,14 @@ class ControllerNode(ModelNode):
         """Publish a command, and what there is to say."""
         if answer is not None:
             stamp, force, torque, reference, error = answer
-            message = self._write_wrench(stamp, 0.0, force, 0.0, torque, 0.0, 0.0)
-            self._wrench_command.publish(message)
+            driver, supervisor = self._driver, self._supervisor
+            if driver is None:
+                message = self._write_wrench(stamp, 0.0, force, 0.0, torque, 0.0, 0.0)
+            else:
+                stopped = supervisor.safety.stop is not None
+                message = driver.message(answer, supervisor.bending.load, stopped=stopped)
+            if message is not None:
+                self._command.publish(message)
             if reference:
                 self._reference.publish(self._write_aim(stamp, *reference))
                 self._tracking_error.publish(self._write_aim(stamp, *error))
@@ -325,6 +392,10 @@ class ControllerNode(ModelNode):
     def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
         """Say what it aims at and what holds it back."""
         severity, held, values = self._supervisor.diagnose(self.now())
+        if self._driver is not None:
+            values |= self._driver.describe()
+            if held is not None and self._supervisor.waits and self._missing:
+                held = f'{held}: {self._missing}'
         return _LEVELS[severity], held or super().diagnose()[1], values
 
 

@@ -9,6 +9,7 @@ from typing import Final
 from needle_controller.answer import Answer, Reply
 from needle_controller.bending import Bending
 from needle_controller.controller import Controller, ControllerSettings, Gains, Measurement
+from needle_controller.hardware import Robot, STAMPS
 from needle_controller.journal import Journal, Severity
 from needle_controller.observer.observer import Observer
 from needle_controller.observer.settings import ObserverSettings
@@ -16,9 +17,11 @@ from needle_controller.safety.encoders import read_encoders
 from needle_controller.safety.following import Following
 from needle_controller.safety.lateness import Lateness
 from needle_controller.safety.limits import SafetyLimits
+from needle_controller.safety.pace import Pace
 from needle_controller.safety.safety import Safety
 from needle_controller.safety.stream import REPEATED
 from needle_dynamics import euler_loads, NeedleModel, NeedleParameters
+from needle_ros.contract import BASE
 from needle_ros.errors import NeedleError, ParameterError
 from needle_ros.timing import NANOSECONDS
 from needle_ros.trajectories import joint_values, MOST_POINTS
@@ -67,6 +70,10 @@ class Supervisor:
         self.retract_depth = 0.0
         self.fault: str | None = None
         self._lateness = Lateness()
+        self._pace: Pace | None = None
+        self._off_pace = False
+        self._robot: Robot | None = None
+        self._read = read_encoders
         self._deflection_ignored = False
         self._last = Answer(0)
         self._following = Following()
@@ -80,6 +87,7 @@ class Supervisor:
         controller: Controller,
         limits: SafetyLimits,
         observed: ObserverSettings | None = None,
+        robot: Robot | None = None,
     ) -> None:
         """
         Take a controller; a stop that is latched stays.
@@ -92,6 +100,8 @@ class Supervisor:
             Limits of what is measured.
         observed : ObserverSettings, optional
             Noise and sensors, for the load of the bent needle from an observer.
+        robot : Robot, optional
+            Reads the joint states of a robot that does not know the contract.
 
         Raises
         ------
@@ -110,6 +120,8 @@ class Supervisor:
             noise['tip_deflection'] = (observed.tip_noise,)
         self.controller = controller
         self.bending = Bending(controller.parameters, observer, limits.axial_load)
+        self._robot = robot
+        self._read = robot.measurement if robot is not None else read_encoders
         stop = self.safety.stop
         self.safety = Safety(
             limits,
@@ -117,6 +129,7 @@ class Supervisor:
             controller.parameters,
             expected=_SENSORS if observer is not None else (),
             noise=noise,
+            wrench_frame=(robot.settings.wrench_frame if robot is not None else '') or BASE,
         )
         self.safety.stop = stop
 
@@ -158,6 +171,11 @@ class Supervisor:
         timeout = self.safety.streams['joint_states'].timeout / NANOSECONDS
         return min(0.1, 0.5 * timeout)
 
+    @property
+    def waits(self) -> bool:
+        """Whether no measurement has come yet."""
+        return self.fault == _WAITING
+
     def activate(self, now: int, publishers: Mapping[str, int]) -> None:
         """
         Begin to answer measurements; see `watch`.
@@ -171,6 +189,11 @@ class Supervisor:
         self.fault = _WAITING
         if self.controller is not None:
             self._lateness = Lateness(self.controller.delay, self.controller.period)
+            settings, robot = self.controller.settings, self._robot
+            # Times of arrival say nothing of single periods.
+            stamped = robot is None or robot.settings.stamps == STAMPS[0]
+            pace = Pace(settings.rate, settings.measurement_timeout)
+            self._pace = pace if stamped else None
         self._begin(now)
         self.safety.count_publishers(publishers)
         self._active = self.controller
@@ -199,6 +222,8 @@ class Supervisor:
         """Know nothing of what was measured."""
         self.safety.begin(now)
         self.bending.forget()
+        if self._robot is not None:
+            self._robot.begin()
 
     def _check_clock(self, now: int) -> Answer | None:
         """Let go and know nothing if the clock was set back."""
@@ -503,7 +528,7 @@ class Supervisor:
             return answer if refusal.harmless else self._let_go(refusal.line, now)
         self._lateness.add(now, (now - stamp) / NANOSECONDS)
         try:
-            measured = read_encoders(reading)
+            measured = self._read(reading)
         except ParameterError as error:
             return self._let_go(str(error), stamp)
         if measured.is_finite():
@@ -609,7 +634,19 @@ class Supervisor:
             self._warn(line.partition(' ')[0], f'{line}; the observer goes on without it')
         if safety.limits.sensors_required:
             answer = self._stop_for(safety.warning(now), now) or answer
+        self._watch_pace()
         return answer
+
+    def _watch_pace(self) -> None:
+        """Say when measurements begin to come at another rate than the laws are made for."""
+        if self._pace is None:
+            return
+        joints = self.safety.streams['joint_states']
+        self._pace.add(joints.last, joints.step)
+        line = self._pace.warning()
+        if line is not None and not self._off_pace:
+            self._warn('pace', line)
+        self._off_pace = line is not None
 
     # No force.
 
@@ -692,6 +729,7 @@ class Supervisor:
         if self.safety.stop is not None:
             return Severity.ERROR, f'{self.safety.stop}; ~/clear_stop releases', values
         late = self._lateness.warning(now)
-        held = self.fault or self.safety.warning(now) or self.bending.warning or late
+        pace = self._pace.warning() if self._pace is not None else None
+        held = self.fault or self.safety.warning(now) or self.bending.warning or late or pace
         held = held if self._active is not None else None
         return Severity.WARNING if held else Severity.INFO, held, values

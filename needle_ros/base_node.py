@@ -442,7 +442,10 @@ class BaseNode(LifecycleNode):
         values = {}
         for item in fields(kind):  # type: ignore[arg-type]
             name = f'{prefix}{item.name}'
-            values[item.name] = self._meant(name, (changes or {}).get(name, self._value(name)))
+            value = self._meant(name, (changes or {}).get(name, self._value(name)))
+            if isinstance(value, bool) and isinstance(item.default, str):
+                value = _READ_AS_BOOL[not value]
+            values[item.name] = value
         return from_values(kind, values, prefix)
 
     def _meant(self, name: str, value: Any) -> Any:

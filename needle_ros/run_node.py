@@ -42,6 +42,8 @@ def run(kind: Callable[[], BaseNode]) -> int:
     """
     Run one node until SIGINT, SIGTERM or SIGHUP, then deactivate it while it can still publish.
 
+    An error in a callback ends the process too: the node is deactivated, and the error raised.
+
     This is the whole life of a process: its signals are taken over for good.
 
     Parameters
@@ -101,10 +103,13 @@ def run(kind: Callable[[], BaseNode]) -> int:
         # A full collection takes 0.2 s: it shall not scan what was imported.
         gc.freeze()
         spinning = True
-        while not stopping and status == 0:
-            # Unlike spin_once it does not return to Python at each event.
-            executor.spin_until_future_complete(Future(), timeout_sec=0.1)
-        node.stop()
+        try:
+            while not stopping and status == 0:
+                # Unlike spin_once it does not return to Python at each event.
+                executor.spin_until_future_complete(Future(), timeout_sec=0.1)
+        finally:
+            # An error shall not leave a force applied either.
+            node.stop()
         # The last messages (a zero force, a latched result) are still to be sent.
         deadline = time.monotonic() + 0.1
         while time.monotonic() < deadline:

@@ -23,7 +23,11 @@ PRINTED = {
 }
 
 
-@pytest.mark.parametrize('name', sorted(path.stem for path in EXAMPLES.glob('*.py')))
+#: Run by `test_hardware.py`.
+WITH_ROS = {'robot_driver'}
+
+
+@pytest.mark.parametrize('name', sorted({path.stem for path in EXAMPLES.glob('*.py')} - WITH_ROS))
 def test_example_runs(
     name: str,
     tmp_path: Path,

@@ -10,6 +10,7 @@ from needle_controller.safety.guard import Guard
 from needle_controller.safety.limits import SafetyLimits
 from needle_controller.safety.stream import Stream
 from needle_dynamics import NeedleParameters
+from needle_ros.contract import BASE
 from needle_ros.timing import NANOSECONDS, RateCounter
 
 #: Topics without which, and with several sources of which, there is no force.
@@ -40,6 +41,8 @@ class Safety:
         Topics that should come all the time.
     noise : Mapping[str, Sequence[float]]
         Noise of what the sensors report, by topic.
+    wrench_frame : str
+        Frame of the force sensor.
 
     Attributes
     ----------
@@ -64,6 +67,7 @@ class Safety:
         *,
         expected: Sequence[str] = (),
         noise: Mapping[str, Sequence[float]] | None = None,
+        wrench_frame: str = BASE,
     ) -> None:
         self.limits = limits
         self.stop: str | None = None
@@ -81,7 +85,7 @@ class Safety:
                 Stream('joint_states', settings.measurement_timeout, ahead=ahead),
                 Stream('ground_truth', settings.measurement_timeout, ahead=ahead),
                 Stream(
-                    'base_wrench', timeout, frames=('needle_base',),
+                    'base_wrench', timeout, frames=(wrench_frame,),
                     jumps=(limits.lateral_jump, limits.moment_jump),
                     noise=noise.get('base_wrench', ()), ahead=ahead,
                 ),

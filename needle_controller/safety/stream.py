@@ -59,6 +59,8 @@ class Stream:
     ----------
     last : int
         Stamp of the newest message that was in time [ns], -1 before the first.
+    step : int
+        How much later that was than the one before it [ns].
     counted : int or None
         When the last message came that counts [ns].
     counts : Counter
@@ -97,6 +99,7 @@ class Stream:
     def forget(self) -> None:
         """Forget what came before, but for the counts: a first message is the next one."""
         self.last = -1
+        self.step = 0
         self.counted: int | None = None
         self._values: Sequence[float] | None = None
         self._lively, self._changed = 0, 0
@@ -158,7 +161,7 @@ class Stream:
             return Refusal(REPEATED, f'{self.name} came twice')
         if stamp < self.last:
             return Refusal(DROPPED, f'{self.name} came after a later one')
-        self.last = stamp
+        self.step, self.last = stamp - self.last, stamp
         return None
 
     def _judge_change(self, stamp: int, values: Sequence[float]) -> Refusal | None:

@@ -48,25 +48,33 @@ class Bench:
     """A plant and the node in this process, and a user."""
 
     def __init__(
-        self, graph: RosGraph, mode: str = 'robot', bevel: float = 0.1, **options: Any
+        self,
+        graph: RosGraph,
+        mode: str = 'robot',
+        bevel: float = 0.1,
+        prefix: str = '',
+        **options: Any,
     ) -> None:
         self.graph, self.user = graph, graph.node('user')
-        self.states = graph.latest(self.user, JointState, 'joint_states', SENSOR)
+        self.states = graph.latest(self.user, JointState, f'{prefix}joint_states', SENSOR)
         self.truth = graph.latest(self.user, JointState, 'ground_truth', SENSOR)
         self.expected = graph.listen(self.user, PoseWithCovarianceStamped, 'tip_expected', COMMAND)
-        self.moves = graph.listen(self.user, JointTrajectory, 'joint_trajectory', COMMAND)
+        self.moves = graph.listen(self.user, JointTrajectory, f'{prefix}joint_trajectory', COMMAND)
         self.target = self.user.create_publisher(PointStamped, 'target', COMMAND)
         self.stop = self.user.create_client(Trigger, 'steering/stop')
         # Where a controller moves the needle, each sample waits for its answer, however busy the
         # machine is.
         own = {'mode': mode, 'lockstep': mode == 'simulation', 'steering.bevel_load': [bevel]}
-        self.plant = graph.add(PlantNode, parameters={**PLANT, **own})
+        remaps = ['--ros-args']
+        for name in ('joint_states', 'joint_trajectory'):
+            remaps += ['-r', f'{name}:={prefix}{name}']
+        self.plant = graph.add(PlantNode, parameters={**PLANT, **own}, cli_args=remaps)
         given = {name.replace('__', '.'): value for name, value in options.items()}
-        self.steering = graph.add(SteeringNode, parameters={**STEERING, **given})
+        self.steering = graph.add(SteeringNode, parameters={**STEERING, **given}, cli_args=remaps)
         self.takers = 1
         self.until(
             lambda: (
-                self.steering.count_subscribers('joint_trajectory') >= 2
+                self.steering.count_subscribers(f'{prefix}joint_trajectory') >= 2
                 and self.stop.service_is_ready()
                 and self.states.message
             ),
@@ -139,6 +147,18 @@ def test_it_brings_the_tip_to_its_target(ros_graph: RosGraph) -> None:
     assert {tuple(move.joint_names) for move in bench.moves} == {
         ('insertion', 'guide_x', 'guide_z')
     }
+
+
+def test_a_robot_may_have_its_own_topics(ros_graph: RosGraph) -> None:
+    """They are remapped; each trajectory names all joints of the robot and ends at rest."""
+    bench = Bench(ros_graph, prefix='arm/')
+    bench.aim()
+    bench.until(lambda: bench.said.startswith(('done', 'stopped')), 'the end')
+    assert bench.said.startswith('done: the tip is at x = ')
+    assert bench.user.count_publishers('joint_trajectory') == 0
+    for move in bench.moves:
+        assert move.joint_names == ['insertion', 'guide_x', 'guide_z']
+        assert list(move.points[-1].velocities) == [0.0, 0.0, 0.0]
 
 
 def test_a_bevel_is_turned_by_roll_alone(ros_graph: RosGraph) -> None:

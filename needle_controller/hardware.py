@@ -1,0 +1,496 @@
+"""A robot whose driver does not know the contract: what it says, and what it is told."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields
+from math import isfinite, isnan, nan
+from typing import Any, Final
+
+from needle_controller.admittance import Admittance
+from needle_controller.answer import Answer
+from needle_controller.controller import Controller, Measurement
+from needle_controller.laws.axis import Axis
+from needle_dynamics import NeedleParameters
+from needle_ros.contract import INSERTION, ROTATION
+from needle_ros.errors import ParameterError
+from needle_ros.settings import check_constants, constant
+from needle_ros.timing import NANOSECONDS
+from needle_ros.wire import Reading
+
+#: What the robot is told.
+EFFORT: Final = 'effort'
+POSITION: Final = 'position'
+COMMANDS: Final = (EFFORT, POSITION)
+
+#: By which messages it is told, and what says where it is; the first is that of the contract.
+COMMAND_TYPES: Final = {
+    'wrench': 'geometry_msgs/msg/WrenchStamped',
+    'float64_multi_array': 'std_msgs/msg/Float64MultiArray',
+    'joint_trajectory': 'trajectory_msgs/msg/JointTrajectory',
+    'joint_state': 'sensor_msgs/msg/JointState',
+}
+STATE_TYPES: Final = {
+    'joint_state': 'sensor_msgs/msg/JointState',
+    'dynamic_joint_state': 'control_msgs/msg/DynamicJointState',
+}
+
+#: When a measurement was taken: as its header says, or when it came.
+STAMPS: Final = ('header', 'receive')
+
+_AXES: Final = 'xyz'
+
+#: Time constant of an estimated velocity, and from which gap on it begins anew [s].
+_FILTER: Final = 5e-3
+_GAP: Final = 0.1
+
+#: Interfaces of ros2_control, in the order of a JointState.
+_INTERFACES: Final = ('position', 'velocity', 'effort')
+
+
+def _text(default: str, description: str) -> Any:
+    return field(default=default, metadata={'description': description})
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class HardwareSettings:
+    """How the driver of a robot is read and commanded; the defaults are the contract."""
+
+    joint: str = _text(INSERTION, 'joint that inserts the needle')
+    sign: float = constant(
+        1.0, '1', '1 if the position of the robot grows into the tissue, else -1', low=-1.0,
+        high=1.0,
+    )  # fmt: skip
+    scale: float = constant(
+        1.0, 'm', 'inserted length per unit of the position of the robot: 1e-3 for mm',
+        open_low=True,
+    )  # fmt: skip
+    zero: float = constant(
+        0.0, 'unit of the robot', 'position of the robot at inserted length 0', low=-1e9, high=1e9
+    )
+    state_topic: str = _text('', 'topic of the joint states; empty: joint_states')
+    state_type: str = _text('joint_state', f'one of {", ".join(STATE_TYPES)}')
+    stamps: str = _text(
+        STAMPS[0],
+        f'one of {", ".join(STAMPS)}: time of a measurement is that of its header, or when it '
+        'came, for a driver that does not stamp',
+    )
+    wrench_topic: str = _text('', 'topic of the force sensor; empty: base_wrench')
+    wrench_frame: str = _text('', 'frame of the force sensor; empty: needle_base')
+    force_axis: str = _text(
+        'y', 'axis of the force sensor that points into the tissue; may be signed: -z'
+    )
+    lateral_axis: str = _text(
+        '', 'axis of the force sensor along which the tip deflects; may be signed; empty: the one '
+        'after force_axis',
+    )  # fmt: skip
+    reaction: bool = field(
+        default=False,
+        metadata={
+            'description': 'the sensor says what the needle exerts on it, not what it exerts on '
+            'the needle'
+        },
+    )
+    command: str = _text(EFFORT, f'one of {", ".join(COMMANDS)}: what the robot is told')
+    command_topic: str = _text('', 'topic of the commands; empty: wrench_command')
+    command_type: str = _text('wrench', f'one of {", ".join(COMMAND_TYPES)}')
+    command_joints: tuple[str, ...] = field(
+        default=(),
+        metadata={
+            'description': 'joints of a command, in their order; empty: the one that inserts. The '
+            'others get no effort, or hold the position that they have at activation'
+        },
+    )
+    speed: float = constant(
+        0.05, 'm/s', 'command position: largest speed of the commanded position', open_low=True
+    )
+    lead: float = constant(
+        2e-3, 'm', 'command position: farthest that the commanded position may be from the '
+        'measured one', open_low=True,
+    )  # fmt: skip
+
+    def __post_init__(self) -> None:
+        check_constants(self)
+        for item in fields(self):
+            value = getattr(self, item.name)
+            if isinstance(item.default, str) and not isinstance(value, str):
+                raise ParameterError(f'{item.name} must be text, got {value!r}')
+        for name, valid in (
+            ('state_type', tuple(STATE_TYPES)),
+            ('stamps', STAMPS),
+            ('command', COMMANDS),
+            ('command_type', tuple(COMMAND_TYPES)),
+        ):
+            if getattr(self, name) not in valid:
+                raise ParameterError(
+                    f'{name} must be one of {", ".join(valid)}, got {getattr(self, name)!r}'
+                )
+        if abs(self.sign) != 1.0:
+            raise ParameterError(f'sign must be 1 or -1, got {self.sign!r}')
+        if not self.joint:
+            raise ParameterError("joint must be the name of a joint, got ''")
+        if not isinstance(self.reaction, bool):
+            raise ParameterError(f'reaction must be true or false, got {self.reaction!r}')
+        self.axes()
+        joints = self.command_joints
+        if joints and (self.joint not in joints or len({*joints}) < len(joints)):
+            raise ParameterError(
+                f'command_joints must have the joint {self.joint!r}, and each joint once, got '
+                f'{list(joints)}'
+            )
+        if self.command == POSITION and self.command_type == 'wrench':
+            others = ', '.join([*COMMAND_TYPES][1:])
+            raise ParameterError(
+                f"command_type must be one of {others} for the command position, got 'wrench'"
+            )
+
+        if self.command_type != 'wrench' and not self.command_topic:
+            raise ParameterError(
+                f"command_topic must be that of the driver for {self.command_type}, got ''"
+            )
+
+    @property
+    def joints(self) -> tuple[str, ...]:
+        """Joints of a command, in their order."""
+        return self.command_joints or (self.joint,)
+
+    def axes(self) -> tuple[tuple[int, float], ...]:
+        """
+        Return where the sensor has each axis of `needle_base`, by a proper rotation.
+
+        Returns
+        -------
+        tuple of (int, float)
+            Number and sign of the axis of the sensor, for x, y and z of `needle_base`.
+
+        Raises
+        ------
+        ParameterError
+            If an axis is unknown, or both are the same.
+
+        """
+        along, sign = _signed_axis('force_axis', self.force_axis)
+        aside, other = (along + 1) % 3, 1.0
+        if self.lateral_axis:
+            aside, other = _signed_axis('lateral_axis', self.lateral_axis)
+        if along == aside:
+            raise ParameterError(
+                f'lateral_axis must be across force_axis {self.force_axis!r}, got '
+                f'{self.lateral_axis!r}'
+            )
+        # x is y cross z.
+        third = sign * other * (1.0 if (along + 1) % 3 == aside else -1.0)
+        return (3 - along - aside, third), (along, sign), (aside, other)
+
+
+def _signed_axis(name: str, text: str) -> tuple[int, float]:
+    """Return number and sign of an axis."""
+    axis = text.removeprefix('-')
+    if len(axis) != 1 or axis not in _AXES:
+        raise ParameterError(f'{name} must be x, y, z, -x, -y or -z, got {text!r}')
+    return _AXES.index(axis), -1.0 if axis != text else 1.0
+
+
+def dynamic_reading(
+    stamp: int,
+    frame: str,
+    joints: Sequence[str],
+    interfaces: Sequence[tuple[Sequence[str], Sequence[float]]],
+) -> Reading:
+    """
+    Read a DynamicJointState as a JointState.
+
+    Parameters
+    ----------
+    stamp : int
+        Time of the header [ns].
+    frame : str
+        Frame of the header.
+    joints : sequence of str
+        Names of the joints.
+    interfaces : sequence of tuple
+        Names and values of the interfaces of each joint.
+
+    Returns
+    -------
+    Reading
+        Positions, velocities and efforts, NaN where a joint does not have one.
+
+    """
+    columns = tuple(
+        tuple(
+            values[names.index(wanted)] if wanted in names else nan
+            for names, values in ((list(one), list(two)) for one, two in interfaces)
+        )
+        for wanted in _INTERFACES
+    )
+    return Reading(stamp, frame, tuple(joints), columns)
+
+
+class Robot:
+    r"""
+    A robot in the terms of the contract.
+
+    With the position p of its joint, the inserted length is :math:`s = g (p - p_0)` with
+    :math:`g` = sign * scale. Velocities go with g, and the effort of the joint is :math:`e = g f`,
+    so that power is the same on both sides: :math:`e \dot{p} = f \dot{s}`.
+
+    Where positions are commanded, a velocity that the driver does not report is estimated: by
+    differences of positions, through a filter of first order with 5 ms.
+
+    Parameters
+    ----------
+    settings : HardwareSettings
+        How it is read and commanded.
+
+    Attributes
+    ----------
+    settings : HardwareSettings
+        As given.
+    estimates : bool
+        Whether velocities are estimated.
+
+    """
+
+    def __init__(self, settings: HardwareSettings) -> None:
+        self.settings = settings
+        self._gain = settings.sign * settings.scale
+        self._axes = settings.axes()
+        self._base: Admittance | None = None
+        self.begin()
+
+    def begin(self) -> None:
+        """Forget what was measured and commanded."""
+        self.estimates = False
+        self._speed = _Speed()
+        #: Inserted length that was last read [m].
+        self._depth = nan
+        #: Where the other joints of a command stay, in the unit of the robot.
+        self._others: dict[str, float] = {}
+        if self._base is not None:
+            self._base.hold()
+            self._base.position = None
+
+    def configure(self, controller: Controller) -> None:
+        """
+        Take over what a controller believes of the needle, for commands of positions.
+
+        Parameters
+        ----------
+        controller : Controller
+            The controller.
+
+        """
+        self._base = Admittance(
+            Axis.insertion(controller.parameters),
+            period=controller.period,
+            speed=self.settings.speed,
+            lead=self.settings.lead,
+            depths=controller.settings.depths(controller.parameters),
+        )
+
+    def believe(self, parameters: NeedleParameters) -> None:
+        """
+        Go on with another friction.
+
+        Parameters
+        ----------
+        parameters : NeedleParameters
+            Needle and tissue.
+
+        """
+        if self._base is not None:
+            self._base.axis = Axis.insertion(parameters)
+
+    # From the robot.
+
+    def length(self, position: float) -> float:
+        """
+        Return the inserted length at a position of the robot.
+
+        Parameters
+        ----------
+        position : float
+            Position of the joint, in its unit.
+
+        Returns
+        -------
+        float
+            Inserted length [m].
+
+        """
+        return self._gain * (position - self.settings.zero)
+
+    def force(self, effort: float) -> float:
+        """
+        Return the force along the needle of an effort of the robot.
+
+        Parameters
+        ----------
+        effort : float
+            Effort of the joint, in its unit.
+
+        Returns
+        -------
+        float
+            Force on the needle [N], positive into the tissue.
+
+        """
+        return effort / self._gain
+
+    def measurement(self, reading: Reading) -> Measurement:
+        """
+        Read a joint state.
+
+        Parameters
+        ----------
+        reading : Reading
+            The joint state, with any joints in any order.
+
+        Returns
+        -------
+        Measurement
+            What it says of the needle; the force is NaN if it does not say it, or if positions
+            are commanded.
+
+        Raises
+        ------
+        ParameterError
+            If it lacks what is needed: a joint, a position, or a velocity for efforts.
+
+        """
+        settings, names = self.settings, reading.names
+        positions, velocities, efforts = reading.values
+        i = self._find(settings.joint, reading)
+        depth = self.length(positions[i])
+        velocity = self._gain * velocities[i] if i < len(velocities) else nan
+        time = reading.stamp / NANOSECONDS
+        angle = angular_velocity = 0.0
+        force = nan
+        if settings.command == POSITION:
+            if not self._others:
+                self._others = {
+                    joint: positions[self._find(joint, reading)] for joint in settings.joints
+                }
+            if isnan(velocity):
+                velocity, self.estimates = self._speed.update(time, depth), True
+        else:
+            if isnan(velocity):
+                raise ParameterError(
+                    f'joint_states has no velocity of {settings.joint!r}: efforts need it '
+                    '(ros2_control: a state interface for velocity), hardware.command position '
+                    'does not'
+                )
+            if i < len(efforts):
+                force = self.force(efforts[i])
+            if settings.command_type == 'wrench' and ROTATION in names:
+                j = names.index(ROTATION)
+                if j < min(len(positions), len(velocities)):
+                    angle, angular_velocity = positions[j], velocities[j]
+        if isfinite(depth):
+            self._depth = depth
+        return Measurement(
+            time=time, depth=depth, speed=velocity, angle=angle, angular_speed=angular_velocity,
+            force=force,
+        )  # fmt: skip
+
+    def _find(self, joint: str, reading: Reading) -> int:
+        """Return the number of a joint that has a position."""
+        names, positions = reading.names, reading.values[0]
+        i = names.index(joint) if joint in names else len(positions)
+        if i >= len(positions) or isnan(positions[i]):
+            there = [repr(name) for name, one in zip(names, positions, strict=False) if one == one]
+            found = ', '.join(there) or 'none'
+            raise ParameterError(
+                f'joint_states has no position of the joint {joint!r}; it has those of {found} '
+                '(hardware.joint, hardware.command_joints)'
+            )
+        return i
+
+    def wrench(self, reading: Reading) -> Reading:
+        """
+        Turn a reading of the force sensor into the axes and the sign of the contract.
+
+        Parameters
+        ----------
+        reading : Reading
+            What the sensor says, in its own frame.
+
+        Returns
+        -------
+        Reading
+            What the base exerts on the needle, along the axes of `needle_base`, with the frame as
+            it was. The moment is still about the origin of the sensor.
+
+        """
+        numbers = reading.values[0]
+        sign = -1.0 if self.settings.reaction else 1.0
+        turned = tuple(
+            sign * one * numbers[begin + axis] for begin in (0, 3) for axis, one in self._axes
+        )
+        return reading._replace(values=(turned,))
+
+    # To the robot.
+
+    def command(
+        self, answer: Answer, load: float = 0.0, *, stopped: bool = False
+    ) -> list[float] | None:
+        """
+        Return what the joints of a command are told because of an answer.
+
+        Parameters
+        ----------
+        answer : Answer
+            What the controller says.
+        load : float
+            Force against the motion that its force has to overcome [N].
+        stopped : bool
+            Whether a stop is latched: then the position is the one last measured.
+
+        Returns
+        -------
+        list of float or None
+            Efforts, or positions, in the units of the robot; None if there is no position yet.
+
+        """
+        settings = self.settings
+        if settings.command == EFFORT:
+            effort = self._gain * answer.force
+            return [effort if joint == settings.joint else 0.0 for joint in settings.joints]
+        base, length = self._base, None
+        if base is not None and isfinite(self._depth):
+            # Without a reference nothing is wanted, beside a message that came twice.
+            if stopped:
+                length = base.give_way()
+            elif answer.reference:
+                length = base.step(answer.force - load, self._depth, answer.stamp)
+            elif base.answered == answer.stamp:
+                length = base.position
+            else:
+                length = base.hold()
+        if length is None:
+            return None
+        own = length / self._gain + settings.zero
+        return [own if joint == settings.joint else self._others[joint]
+                for joint in settings.joints]  # fmt: skip
+
+
+class _Speed:
+    """Velocity from differences of positions, through a filter of first order."""
+
+    def __init__(self) -> None:
+        self._time = self._position = nan
+        self._value = 0.0
+
+    def update(self, time: float, position: float) -> float:
+        """Return the velocity [m/s] at a time [s]; zero at first, and after a gap."""
+        elapsed, moved = time - self._time, position - self._position
+        if elapsed == 0.0:
+            return self._value
+        self._time, self._position = time, position
+        # Written so that what is not a number begins anew.
+        if not (0.0 < elapsed < _GAP and isfinite(moved)):
+            self._value = 0.0
+        else:
+            self._value += elapsed / (_FILTER + elapsed) * (moved / elapsed - self._value)
+        return self._value

@@ -1,0 +1,285 @@
+"""The driver of a robot that does not know the contract: its topics and messages."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any, Final, NamedTuple
+
+from builtin_interfaces.msg import Duration
+from needle_controller.answer import Answer
+from needle_controller.controller import Controller
+from needle_controller.hardware import (
+    COMMAND_TYPES,
+    dynamic_reading,
+    EFFORT,
+    HardwareSettings,
+    Robot,
+    STAMPS,
+    STATE_TYPES,
+)
+from needle_ros import contract
+from needle_ros.base_node import BaseNode, message_class, SENSOR
+from needle_ros.contract import Topic
+from needle_ros.errors import MessageError, ParameterError
+from needle_ros.timing import NANOSECONDS, nanoseconds
+from needle_ros.wire import Reading
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.exceptions import InvalidTopicNameException
+from rclpy.validate_topic_name import validate_topic_name
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+
+
+def _named(topic: Topic, name: str, type_name: str) -> Topic:
+    """Return a topic of the contract as the driver has it."""
+    if name:
+        try:
+            validate_topic_name(name)
+        except InvalidTopicNameException as error:
+            reason = ' '.join(str(error).split())
+            raise ParameterError(f'hardware: the topic {name!r}: {reason}') from error
+    return replace(topic, name=name or topic.name, type_name=type_name)
+
+
+def _of(lease: Topic, topic: Topic) -> Topic:
+    """Return a lease of the contract under the name of another topic."""
+    return replace(lease, name=f'{topic.name}/{lease.name.rpartition("/")[2]}')
+
+
+class Topics(NamedTuple):
+    """
+    What a controller listens to and publishes.
+
+    Attributes
+    ----------
+    state, wrench, command : Topic
+        Joint states, force sensor, commands.
+    measurer, commander : Topic
+        Leases of who publishes the first and the last of them.
+
+    """
+
+    state: Topic
+    wrench: Topic
+    command: Topic
+    measurer: Topic
+    commander: Topic
+
+
+#: Those of the contract.
+CONTRACT: Final = Topics(
+    contract.JOINT_STATES,
+    contract.BASE_WRENCH,
+    contract.WRENCH_COMMAND,
+    contract.MEASURER,
+    contract.COMMANDER,
+)
+
+
+class Driver:
+    """
+    Topics and messages by which a controller reads and commands a robot.
+
+    Parameters
+    ----------
+    node : BaseNode
+        The controller.
+    settings : HardwareSettings
+        How the robot is read and commanded.
+
+    Attributes
+    ----------
+    robot : Robot
+        What the messages mean.
+    topics : Topics
+        Its topics.
+
+    Raises
+    ------
+    ParameterError
+        If a topic cannot have its name.
+    MessageError
+        If the type of the joint states is not installed.
+
+    """
+
+    def __init__(self, node: BaseNode, settings: HardwareSettings) -> None:
+        self.robot = Robot(settings)
+        self._node, self._settings = node, settings
+        state, wrench, command = (
+            _named(topic, name, type_name)
+            for topic, name, type_name in (
+                (contract.JOINT_STATES, settings.state_topic, STATE_TYPES[settings.state_type]),
+                (contract.BASE_WRENCH, settings.wrench_topic, contract.BASE_WRENCH.type_name),
+                (
+                    contract.WRENCH_COMMAND,
+                    settings.command_topic,
+                    COMMAND_TYPES[settings.command_type],
+                ),
+            )
+        )
+        self.topics = Topics(
+            state, wrench, command, _of(contract.MEASURER, state), _of(contract.COMMANDER, command)
+        )
+        self._dynamic: Any = None
+        if state.type_name != contract.JOINT_STATES.type_name:
+            try:
+                self._dynamic = message_class(state.type_name)
+            except MessageError as error:
+                raise MessageError(
+                    f'hardware.state_type {settings.state_type}: {error}'
+                ) from error
+        self._write_wrench = contract.WRENCH_COMMAND.template().serialize
+        self._period = Duration()
+
+    # From the robot.
+
+    def listen(
+        self,
+        take_state: Callable[[Reading], None],
+        take_wrench: Callable[[Reading], None],
+        matched: Callable[[int], None],
+    ) -> None:
+        """
+        Subscribe to what is measured.
+
+        Parameters
+        ----------
+        take_state, take_wrench : callable
+            Called with joint states as they are, and with forces as in the contract.
+        matched : callable
+            As for `BaseNode.listen`.
+
+        """
+        node, robot = self._node, self.robot
+
+        def stamped(take: Callable[[Reading], None]) -> Callable[[Reading], None]:
+            if self._settings.stamps == STAMPS[0]:
+                return take
+            return lambda reading: take(reading._replace(stamp=node.now()))
+
+        take_state = stamped(take_state)
+        if self._dynamic is None:
+            node.listen(self.topics.state, take_state, matched)
+        else:
+            self._listen_to_dynamic(take_state, matched)
+        take = stamped(take_wrench)
+        node.listen(self.topics.wrench, lambda reading: take(robot.wrench(reading)), matched)
+
+    def _listen_to_dynamic(
+        self, take: Callable[[Reading], None], matched: Callable[[int], None]
+    ) -> None:
+        def on_message(message: Any) -> None:
+            interfaces = [(one.interface_names, one.values) for one in message.interface_values]
+            header = message.header
+            take(
+                dynamic_reading(
+                    nanoseconds(header.stamp), header.frame_id, message.joint_names, interfaces
+                )
+            )
+
+        def on_match(event: Any) -> None:
+            matched(event.total_count_change)
+
+        self._node.create_subscription(
+            self._dynamic,
+            self.topics.state.name,
+            on_message,
+            SENSOR,
+            event_callbacks=SubscriptionEventCallbacks(matched=on_match),
+        )
+
+    def describe(self) -> dict[str, object]:
+        """Return what diagnostics say of it."""
+        joints = ', '.join(self._settings.joints)
+        return {
+            'robot': f'{self.topics.state.name}, {self._settings.command} of {joints} on '
+            f'{self.topics.command.name}',
+            'velocity of the robot': 'estimated' if self.robot.estimates else 'reported',
+        }
+
+    def missing(self) -> str:
+        """
+        Say why no joint states come, as far as the graph shows it.
+
+        Returns
+        -------
+        str
+            Who publishes what instead.
+
+        """
+        node, topic = self._node, self.topics.state
+        types = {one.topic_type for one in node.get_publishers_info_by_topic(topic.name)}
+        if types == {topic.type_name}:
+            return f'{topic.name} is published, but no message has come'
+        if types:
+            return (
+                f'{topic.name} is published as {", ".join(sorted(types))}, and read as '
+                f'{topic.type_name} (hardware.state_topic, hardware.state_type)'
+            )
+        own = node.get_name(), node.get_namespace()
+        others = [
+            name
+            for name, kinds in node.get_topic_names_and_types()
+            if topic.type_name in kinds
+            and any(
+                (one.node_name, one.node_namespace) != own
+                for one in node.get_publishers_info_by_topic(name)
+            )
+        ]
+        return (
+            f'nobody publishes {topic.name}; {topic.type_name} is published on '
+            f'{", ".join(sorted(others)) or "no topic"} (hardware.state_topic)'
+        )
+
+    # To the robot.
+
+    def configure(self, controller: Controller) -> None:
+        """
+        Take over what a controller believes of the needle, and its period.
+
+        Parameters
+        ----------
+        controller : Controller
+            The controller.
+
+        """
+        self.robot.configure(controller)
+        whole, part = divmod(round(controller.period * NANOSECONDS), NANOSECONDS)
+        self._period = Duration(sec=whole, nanosec=part)
+
+    def message(self, answer: Answer, load: float, *, stopped: bool) -> Any:
+        """
+        Return the command for an answer.
+
+        Parameters
+        ----------
+        answer, load, stopped
+            As for `Robot.command`.
+
+        Returns
+        -------
+        message or bytes or None
+            What to publish; None for nothing.
+
+        """
+        settings, stamp = self._settings, answer.stamp
+        kind, joints = settings.command_type, list(settings.joints)
+        if kind == 'wrench':
+            return self._write_wrench(stamp, 0.0, answer.force, 0.0, answer.torque, 0.0, 0.0)
+        values = self.robot.command(answer, load, stopped=stopped)
+        if values is None:
+            return None
+        if kind == 'float64_multi_array':
+            return Float64MultiArray(data=values)
+        pushes = settings.command == EFFORT
+        if kind == 'joint_trajectory':
+            # Without a stamp it begins at once; without velocities it ends wherever it is.
+            field = {'effort' if pushes else 'positions': values}
+            point = JointTrajectoryPoint(**field, time_from_start=self._period)
+            return JointTrajectory(joint_names=joints, points=[point])
+        message = JointState(name=joints, **{'effort' if pushes else 'position': values})
+        message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp, NANOSECONDS)
+        return message

@@ -1,0 +1,68 @@
+"""Whether another rate is found, and the true one never is."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+from needle_controller.safety.pace import Pace
+from needle_ros.timing import NANOSECONDS
+import numpy as np
+from numpy.random import Generator
+import pytest
+
+
+def judged(
+    rate: float, true: float, rng: Generator, *, jitter: float = 0.0, lost: float = 0.0
+) -> str | None:
+    """Return what is said of five seconds of samples, looked at every 50 ms."""
+    pace = Pace(rate, 0.1)
+    stamps = np.arange(int(5.0 * true)) / true
+    stamps += jitter / true * rng.uniform(-1.0, 1.0, stamps.shape)
+    stamps = np.sort(stamps)[rng.random(stamps.shape) >= lost]
+    times = np.rint(NANOSECONDS * (1.0 + stamps)).astype(int).tolist()
+    look, newest = 0, (0, 0)
+    for before, stamp in pairwise(times):
+        if stamp >= look:
+            # What came last before the look.
+            pace.add(*newest)
+            look = stamp + NANOSECONDS // 20
+        newest = stamp, stamp - before
+    return pace.warning()
+
+
+@pytest.mark.parametrize(('rate', 'true'), [(1000.0, 500.0), (500.0, 1000.0), (100.0, 125.0)])
+def test_another_rate_is_said(rate: float, true: float) -> None:
+    """With both numbers and what to set, with jitter too."""
+    rng = np.random.default_rng(1)
+    for jitter in (0.0, 0.02):
+        said = judged(rate, true, rng, jitter=jitter)
+        assert said is not None
+        found = float(said.partition(' comes at ')[2].partition(' Hz')[0])
+        assert found == pytest.approx(true, rel=0.03)
+        assert f'rate is {rate:g} Hz: set rate to {found:.3g}' in said
+
+
+@pytest.mark.parametrize('rate', [50.0, 200.0, 1000.0])
+def test_the_true_rate_never_is(rate: float) -> None:
+    """Whatever jitter, lost samples and small differences of clocks there are."""
+    rng = np.random.default_rng(2)
+    for jitter in (0.0, 0.1, 0.45):
+        for lost in (0.0, 0.2, 0.4):
+            for drift in (0.95, 1.0, 1.05):
+                said = judged(rate, drift * rate, rng, jitter=jitter, lost=lost)
+                assert said is None, (jitter, lost, drift, said)
+
+
+def test_it_takes_a_second_of_samples() -> None:
+    """A few steps say nothing, nor do gaps, nor the same sample seen again."""
+    pace = Pace(100.0, 0.1)
+    for k in range(19):
+        pace.add(k * 20_000_000, 20_000_000)
+        pace.add(k * 20_000_000, 20_000_000)
+    pace.add(10**10, 10**9)
+    pace.add(10**10 + 1, 0)
+    assert pace.warning() is None
+    pace.add(2 * 10**10, 20_000_000)
+    assert pace.warning() == (
+        'joint_states comes at 50 Hz, rate is 100 Hz: set rate to 50, or the robot to 100 Hz'
+    )

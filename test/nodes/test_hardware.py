@@ -1,0 +1,472 @@
+"""Robots whose drivers know nothing of the contract: driven with parameters only, no relay."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Callable, Iterator
+from importlib.util import find_spec
+import os
+from pathlib import Path
+import re
+import runpy
+import subprocess
+import sys
+import textwrap
+from typing import Any
+
+from geometry_msgs.msg import PointStamped, WrenchStamped
+from needle_controller.controller_node import ControllerNode
+from needle_ros.base_node import COMMAND, SENSOR
+import pytest
+from rclpy.context import Context
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray, String
+from std_srvs.srv import SetBool, Trigger
+from support.installed import ROOT
+from support.ros_graph import RosGraph
+from trajectory_msgs.msg import JointTrajectory
+import yaml
+
+DRIVERS = runpy.run_path(str(ROOT / 'examples/robot_driver.py'), run_name='drivers')
+
+COMMON: dict[str, Any] = {'rate': 200.0, 'deflection_feedback': 'none'}
+
+#: The parameters of docs/howto/own-robot.md.
+FORCE = {
+    **COMMON,
+    'hardware.joint': 'slide',
+    'hardware.sign': -1.0,
+    'hardware.zero': 0.2,
+    'hardware.wrench_topic': 'ft_sensor/wrench',
+    'hardware.wrench_frame': 'ft_frame',
+    'hardware.force_axis': '-z',
+    'hardware.reaction': True,
+    'hardware.command_topic': 'slide/commands',
+    'hardware.command_type': 'float64_multi_array',
+}
+POSITION = {
+    **COMMON,
+    'hardware.joint': 'stage',
+    'hardware.scale': 1e-3,
+    'hardware.zero': 100.0,
+    'hardware.command': 'position',
+    'hardware.command_topic': 'stage/joint_trajectory',
+    'hardware.command_type': 'joint_trajectory',
+}
+#: The robots, with the first and the last inserted length as they have it.
+ROBOTS = {'force': (FORCE, 'ForceRobot'), 'position': (POSITION, 'PositionRobot')}
+
+
+class Bench:
+    """A robot of examples/robot_driver.py, a controller, and a user."""
+
+    def __init__(self, graph: RosGraph, which: str = 'force', **parameters: Any) -> None:
+        own, name = ROBOTS[which]
+        self.graph, self.user = graph, graph.node('user')
+        self.goal: PointStamped | None = None
+        given = {key.replace('__', '.'): value for key, value in parameters.items()}
+        self.parameters = {**own, **given}
+        self.robot = graph.add(DRIVERS[name])
+        self.target = self.user.create_publisher(PointStamped, 'target', COMMAND)
+        kind = Float64MultiArray if which == 'force' else JointTrajectory
+        self.topic = str(self.parameters['hardware.command_topic'])
+        self.commands = graph.listen(self.user, kind, self.topic, 10)
+        self.controller = graph.add(ControllerNode, parameters=self.parameters)
+        self.until(
+            lambda: (
+                self.user.count_publishers(self.topic) == 1
+                and self.target.get_subscription_count()
+                and self.taken('joint_states')
+                and self.commands
+            ),
+            'discovery',
+        )
+
+    def until(self, condition: Callable[[], Any], what: str) -> None:
+        """Spin until a condition holds; a target that is cleared is sent again."""
+
+        def holds() -> Any:
+            # A machine that is held up may have let the needle move on during a fault.
+            if self.goal is not None and self.controller.diagnose()[2]['target [m]'] is None:
+                self.target.publish(self.goal)
+            return condition()
+
+        self.graph.spin_until(holds, what)
+
+    def taken(self, topic: str) -> int:
+        """Return how many messages of a topic counted."""
+        return int(self.controller._supervisor.safety.streams[topic].counts['taken'])
+
+    @property
+    def said(self) -> str:
+        """What the diagnostics of the controller say first."""
+        return str(self.controller.diagnose()[1])
+
+    @property
+    def stop(self) -> str | None:
+        """Why the controller has stopped."""
+        reason: str | None = self.controller._supervisor.safety.stop
+        return reason
+
+    def aim(self, depth: float) -> None:
+        """Send a target until it is taken."""
+        self.goal = PointStamped()
+        self.goal.point.y = depth
+        self.target.publish(self.goal)
+        self.until(lambda: self.controller.diagnose()[2]['target [m]'] == depth, 'the target')
+
+    def arrive(self, depth: float) -> None:
+        """Spin until the robot is at a depth [m]."""
+        self.until(lambda: abs(self.depth - depth) < 1e-4, f'{depth} m')
+
+    @property
+    def depth(self) -> float:
+        """Inserted length of the robot, by its own numbers [m]."""
+        if hasattr(self.robot, 'mass'):
+            return float(0.2 - self.robot.mass.position)
+        return float(1e-3 * (self.robot.position - 100.0))
+
+    def values(self) -> list[float]:
+        """Return all that was commanded."""
+        if isinstance(self.commands[0], Float64MultiArray):
+            return [one.data[0] for one in self.commands]
+        return [one.points[0].positions[0] for one in self.commands]
+
+
+def test_the_drivers_are_short() -> None:
+    """Of 20 lines at most, and they know nothing of the contract."""
+    page = ast.parse((ROOT / 'examples/robot_driver.py').read_text(encoding='utf-8'))
+    drivers = [
+        part
+        for part in page.body
+        if isinstance(part, ast.ClassDef) and part.name.endswith('Robot')
+    ]
+    assert [driver.name for driver in drivers] == ['ForceRobot', 'PositionRobot']
+    for driver in drivers:
+        for part in ast.walk(driver):
+            if isinstance(part, (ast.ClassDef, ast.FunctionDef)) and ast.get_docstring(part):
+                part.body = part.body[1:]
+        lines = [line for line in ast.unparse(driver).splitlines()[1:] if line]
+        assert len(lines) <= 20
+        assert not any(word in ast.unparse(driver) for word in ('needle', 'insertion'))
+
+
+def test_the_documentation_has_these_parameters() -> None:
+    """The command lines of the page are what is tried here."""
+    page = (ROOT / 'docs/howto/own-robot.md').read_text(encoding='utf-8')
+    lines = [
+        {name: yaml.safe_load(value) for name, value in re.findall(r'-p (\S+?):=(\S+)', block)}
+        for block in re.findall(r'^```bash\n(.*?)^```', page, flags=re.DOTALL | re.MULTILINE)
+    ]
+    assert lines == [FORCE, POSITION]
+
+
+@pytest.mark.parametrize('which', ROBOTS)
+def test_a_foreign_robot_is_driven_with_parameters_only(ros_graph: RosGraph, which: str) -> None:
+    """To 0.05 m and back to 0.03 m, by effort and by position."""
+    bench = Bench(ros_graph, which)
+    assert bench.depth == pytest.approx(0.02)
+    for target in (0.05, 0.03):
+        bench.aim(target)
+        bench.arrive(target)
+    assert bench.stop is None
+    if which == 'force':
+        assert bench.taken('base_wrench') > 100
+        # All of the joint state was read, the effort too: with it a robot is judged.
+        assert max(bench.values()) > 0.5 > -0.5 > min(bench.values())
+    else:
+        values = bench.controller.diagnose()[2]
+        assert values['velocity of the robot'] == 'estimated'
+        steps = [abs(b - a) for a, b in zip(bench.values(), bench.values()[1:], strict=False)]
+        # In mm: 0.05 m/s for two periods of 5 ms, and no farther from the robot than 2 mm.
+        assert max(steps) <= 2.0
+
+
+def test_the_force_sensor_stops_the_robot(ros_graph: RosGraph) -> None:
+    """Its axis is mapped: the axial force counts as such, and beyond its limit ends the motion."""
+    bench = Bench(ros_graph, safety__axial_load=0.3)
+    bench.aim(0.05)
+    bench.until(lambda: bench.stop, 'the stop')
+    assert bench.stop is not None
+    assert bench.stop.startswith('axial force 0.')
+    bench.until(lambda: bench.values()[-1] == 0.0 == bench.robot.mass.velocity, 'rest')
+
+
+def test_a_position_robot_gives_way_in_a_stop(ros_graph: RosGraph) -> None:
+    """A load beyond its limit ends the motion where the robot is."""
+    bench = Bench(ros_graph, 'position', hardware__wrench_topic='load')
+    loads = bench.user.create_publisher(WrenchStamped, 'load', SENSOR)
+    bench.aim(0.05)
+    bench.until(lambda: bench.depth > 0.025, 'motion')
+
+    def press() -> str | None:
+        message = WrenchStamped()
+        message.header.frame_id = 'needle_base'
+        message.header.stamp = bench.user.get_clock().now().to_msg()
+        message.wrench.force.y = 40.0
+        loads.publish(message)
+        return bench.stop
+
+    bench.until(press, 'the stop')
+    assert str(bench.stop).startswith('axial force 40 N is beyond the limit of 30 N')
+    count = len(bench.commands)
+    bench.until(lambda: len(bench.commands) > count + 20, 'commands after it')
+    (rest,) = {*bench.values()[-10:]}
+    # Back from the lead, to where it was measured.
+    assert rest < max(bench.values()[:count])
+    bench.until(lambda: abs(bench.robot.position - rest) < 1e-3, 'rest')
+    assert 0.025 < bench.depth < 0.05
+
+
+def test_a_wrong_frame_is_said(ros_graph: RosGraph) -> None:
+    """With the one that is expected."""
+    bench = Bench(ros_graph, hardware__wrench_frame='tool0')
+    bench.until(
+        lambda: ' frame' in str(bench.controller.diagnose()[2].get('input base_wrench')),
+        'the refusal',
+    )
+    assert bench.taken('base_wrench') == 0
+
+
+@pytest.mark.parametrize(
+    ('parameters', 'said'),
+    [
+        ({'hardware.scale': 0.0}, 'hardware.scale must be finite, > 0 m, got 0.0'),
+        (
+            {'hardware.force_axis': 'w'},
+            "hardware.force_axis must be x, y, z, -x, -y or -z, got 'w'",
+        ),
+        ({'hardware.state_topic': 'a b'}, "hardware: the topic 'a b': Invalid topic name"),
+        ({'hardware.command': 'position'}, 'hardware.command_type must be one of float64_multi_a'),
+        ({'hardware.joint': 3}, 'hardware.joint must be text, got 3'),
+    ],
+)
+def test_bad_parameters_are_one_line(
+    ros_graph: RosGraph, parameters: dict[str, Any], said: str
+) -> None:
+    """The node refuses to be configured, with what would be valid."""
+    controller = ros_graph.add(ControllerNode, start=False, parameters=parameters)
+    assert not controller.start()
+    assert str(controller.failure).startswith(said)
+    assert '\n' not in str(controller.failure)
+
+
+@pytest.mark.skipif(find_spec('control_msgs') is not None, reason='control_msgs is installed')
+def test_what_is_not_installed_is_said(ros_graph: RosGraph) -> None:
+    """The package of DynamicJointState is not among the wheels."""
+    controller = ros_graph.add(
+        ControllerNode, start=False, parameters={'hardware.state_type': 'dynamic_joint_state'}
+    )
+    assert not controller.start()
+    assert controller.failure == (
+        'hardware.state_type dynamic_joint_state: control_msgs/msg/DynamicJointState is not '
+        'installed'
+    )
+
+
+def test_the_topics_are_those_at_the_start(ros_graph: RosGraph) -> None:
+    """A later change is refused, and does not pass unnoticed."""
+    controller = ros_graph.add(ControllerNode, start=False)
+    controller.set_parameters([Parameter('hardware.joint', value='slide')])
+    assert not controller.start()
+    assert str(controller.failure).startswith('hardware.* is read when the node starts')
+
+
+def test_y_is_an_axis(ros_graph: RosGraph) -> None:
+    """A parameter file that says y means the axis, though YAML reads it as true."""
+    parameters = {**FORCE, 'hardware.force_axis': True, 'hardware.lateral_axis': '-x'}
+    controller = ros_graph.add(ControllerNode, parameters=parameters)
+    assert controller._driver.robot.settings.force_axis == 'y'
+
+
+@pytest.fixture
+def stranger(ros_graph: RosGraph) -> Iterator[Node]:
+    """Return a node of another participant: one cannot have two types on a topic."""
+    context = Context()
+    context.init(domain_id=int(ros_graph.environment['ROS_DOMAIN_ID']))
+    node = Node('stranger', context=context)
+    yield node
+    node.destroy_node()
+    context.try_shutdown()
+
+
+@pytest.mark.parametrize('there', ['elsewhere', 'another type', 'other joints'])
+def test_it_says_why_nothing_comes(ros_graph: RosGraph, stranger: Node, there: str) -> None:
+    """Which topics there are, of which type, and which joints."""
+    user = ros_graph.node('user')
+    states = user.create_publisher(JointState, 'arm/joint_states', SENSOR)
+    topic = 'arm/joint_states' if there == 'other joints' else 'arm/states'
+    if there == 'another type':
+        stranger.create_publisher(String, topic, 10)
+    parameters = {**FORCE, 'hardware.state_topic': topic}
+    controller = ros_graph.add(ControllerNode, parameters=parameters)
+    expected = {
+        'elsewhere': 'no joint_states yet: nobody publishes arm/states; '
+        'sensor_msgs/msg/JointState is published on /arm/joint_states (hardware.state_topic)',
+        'another type': 'no joint_states yet: arm/states is published as std_msgs/msg/String, and '
+        'read as sensor_msgs/msg/JointState (hardware.state_topic, hardware.state_type)',
+        'other joints': "joint_states has no position of the joint 'slide'; it has those of 'a', "
+        "'b' (hardware.joint, hardware.command_joints)",
+    }[there]
+
+    def said() -> bool:
+        message = JointState(name=['a', 'b'], position=[0.0, 1.0], velocity=[0.0, 0.0])
+        message.header.stamp = user.get_clock().now().to_msg()
+        states.publish(message)
+        return str(controller.diagnose()[1]) == expected
+
+    ros_graph.spin_until(said, expected)
+
+
+@pytest.mark.parametrize(
+    ('kind', 'topic', 'said'),
+    [
+        (Float64MultiArray, 'slide/commands', '2 nodes publish wrench_command'),
+        (JointState, 'joint_states', '2 nodes publish joint_states'),
+    ],
+)
+def test_there_may_be_one_source_and_one_commander(
+    ros_graph: RosGraph, kind: type, topic: str, said: str
+) -> None:
+    """Of the topics that the driver has: a second one of either ends all force."""
+    bench = Bench(ros_graph)
+    bench.aim(0.15)
+    bench.until(lambda: bench.depth > 0.021, 'motion')
+    stranger = bench.user.create_publisher(kind, topic, 10)
+    bench.until(lambda: bench.said == said, said)
+    bench.until(lambda: bench.values()[-1] == 0.0 == bench.robot.mass.velocity, 'rest')
+    bench.user.destroy_publisher(stranger)
+    bench.until(lambda: bench.robot.mass.velocity < -1e-3, 'motion again')
+
+
+def test_zero_is_sent_again_and_again_when_measurements_end(ros_graph: RosGraph) -> None:
+    """A driver without a timeout would keep the last effort: so no single message may be lost."""
+    bench = Bench(ros_graph)
+    bench.aim(0.15)
+    bench.until(lambda: bench.values()[-1] < -0.5, 'a force')
+    for timer in list(bench.robot.timers):
+        bench.robot.destroy_timer(timer)
+    bench.until(lambda: 'joint_states is stale' in bench.said, 'the watchdog')
+    count = len(bench.commands)
+    bench.until(lambda: len(bench.commands) > count + 15, 'more of them')
+    assert {*bench.values()[-10:]} == {0.0}
+
+
+@pytest.mark.parametrize('which', ROBOTS)
+def test_the_last_command_is_sent_again_and_again(ros_graph: RosGraph, which: str) -> None:
+    """When the node lets go: zero effort, or the position where it is."""
+    bench = Bench(ros_graph, which)
+    bench.aim(0.15)
+    bench.until(lambda: bench.depth > 0.022, 'motion')
+    last = bench.values()[-1]
+    bench.commands.clear()
+    bench.controller.trigger_deactivate()
+    bench.until(lambda: len(bench.commands) >= 6, 'the last ones')
+    (rest,) = {*bench.values()[-5:]}
+    assert rest == (0.0 if which == 'force' else pytest.approx(last, abs=1.0))
+    if which == 'force':
+        bench.until(lambda: bench.robot.mass.effort == 0.0, 'no effort')
+    else:
+        bench.until(lambda: abs(bench.robot.position - rest) < 1e-3, 'rest')
+
+
+@pytest.mark.parametrize('ending', ['interrupted', 'fails'])
+def test_a_process_that_ends_leaves_no_effort(
+    ros_graph: RosGraph, tmp_path: Path, ending: str
+) -> None:
+    """By Ctrl-C, and by an error of its own; not by kill -9, which nothing can answer."""
+    robot = ros_graph.add(DRIVERS['ForceRobot'])
+    user = ros_graph.node('user')
+    efforts = ros_graph.listen(user, Float64MultiArray, 'slide/commands', 100)
+    target = user.create_publisher(PointStamped, 'target', COMMAND)
+    words = [f'-p {name}:={str(value).lower() if isinstance(value, bool) else value}'
+             for name, value in FORCE.items()]  # fmt: skip
+    # What fails is the answer to a pause, while a force is applied.
+    script = textwrap.dedent(
+        """
+        import sys
+        from needle_controller.controller_node import ControllerNode
+        from needle_ros.run_node import run
+        class Faulty(ControllerNode):
+            def __init__(self):
+                super().__init__()
+                self._supervisor.pause = lambda hold: 1 / 0
+        sys.exit(run(Faulty))
+        """
+    )
+    log = tmp_path / 'log'
+    with log.open('w') as output:
+        process = subprocess.Popen(
+            [sys.executable, '-c', script, '--ros-args', *' '.join(words).split()],
+            env={**ros_graph.environment, 'PYTHONPATH': os.pathsep.join(sys.path)},
+            stderr=output,
+        )
+    try:
+        message = PointStamped()
+        message.point.y = 0.15
+
+        def pushed() -> bool:
+            target.publish(message)
+            assert process.poll() is None
+            return robot.mass.effort < -0.5
+
+        ros_graph.spin_until(pushed, 'a force', timeout=180.0)
+        if ending == 'interrupted':
+            process.terminate()
+        else:
+            client = user.create_client(SetBool, 'controller/pause')
+            ros_graph.spin_until(client.service_is_ready, 'the service')
+            client.call_async(SetBool.Request(data=True))
+        ros_graph.spin_until(lambda: process.poll() is not None, 'its end')
+        ros_graph.spin_until(lambda: robot.mass.effort == 0.0, 'no effort')
+        assert (process.returncode == 0) == (ending == 'interrupted')
+        assert [one.data[0] for one in efforts[-5:]] == [0.0] * 5
+        assert ('ZeroDivisionError' in log.read_text()) == (ending == 'fails')
+    finally:
+        process.kill()
+        process.wait()
+
+
+def test_another_rate_is_said(ros_graph: RosGraph) -> None:
+    """Both numbers and what to set; nothing at the true rate."""
+    bench = Bench(ros_graph, rate=1000.0)
+    bench.until(lambda: ' Hz, rate is 1000 Hz: set rate to ' in bench.said, 'the rate')
+    assert bench.said.startswith('joint_states comes at ')
+
+
+@pytest.mark.parametrize(
+    ('stamps', 'said'),
+    [
+        ('header', 'joint_states is stale: it is not stamped'),
+        ('receive', 'active'),
+    ],
+)
+def test_a_driver_that_does_not_stamp(ros_graph: RosGraph, stamps: str, said: str) -> None:
+    """Is refused, unless the time of arrival is to count."""
+    user = ros_graph.node('user')
+    states = user.create_publisher(JointState, 'joint_states', SENSOR)
+    message = JointState(name=['slide'], position=[0.18], velocity=[0.0])
+    controller = ros_graph.add(ControllerNode, parameters={**FORCE, 'hardware.stamps': stamps})
+
+    def says() -> bool:
+        states.publish(message)
+        return str(controller.diagnose()[1]) == said
+
+    ros_graph.spin_until(says, said)
+
+
+def test_an_emergency_stop_reaches_a_foreign_driver(ros_graph: RosGraph) -> None:
+    """As any other plant, until it is cleared."""
+    bench = Bench(ros_graph)
+    bench.aim(0.15)
+    bench.until(lambda: bench.values()[-1] < -0.5, 'a force')
+    client = bench.user.create_client(Trigger, 'controller/emergency_stop')
+    bench.until(client.service_is_ready, 'the service')
+    future = client.call_async(Trigger.Request())
+    bench.until(future.done, 'the answer')
+    bench.until(lambda: bench.robot.mass.effort == 0.0, 'no effort')
+    count = len(bench.commands)
+    bench.until(lambda: len(bench.commands) > count + 20, 'more answers')
+    assert {*bench.values()[-10:]} == {0.0}
