@@ -11,7 +11,16 @@ ROOT = Path(__file__).resolve().parent
 MANIFEST = ET.parse(ROOT / 'package.xml').getroot()  # noqa: S314
 NAME = MANIFEST.findtext('name')
 NODES = runpy.run_path(str(ROOT / 'needle_insertion/nodes.py'))['NODES']
-TEST = ['hypothesis>=6.100', 'lxml>=5.0', 'mpmath>=1.3', 'pytest>=8.0', 'sympy>=1.12']
+#: What the node `slicer` speaks OpenIGTLink with.
+SLICER = ['pyigtl>=0.3.4']
+TEST = [
+    'hypothesis>=6.100',
+    'lxml>=5.0',
+    'mpmath>=1.3',
+    'pytest>=8.0',
+    'sympy>=1.12',
+    *SLICER,
+]
 
 
 def files(folder: str, pattern: str) -> list[str]:
@@ -69,6 +78,7 @@ setup(
             'ros-jazzy-rclpy>=7.1.6',
             'ros-jazzy-rmw-fastrtps-cpp>=8.4',
         ],
+        'slicer': SLICER,
         # The name by which colcon test knows pytest.
         'test': TEST,
         'dev': [
