@@ -93,7 +93,7 @@ class Frames:
                 self._skip = whole
             elif size > LARGEST:
                 self._refuse(
-                    f'{kind} of {device!r} refused: {size} bytes, at most {LARGEST} are taken'
+                    f'target refused: a {kind} message of {size} bytes, {LARGEST} at most'
                 )
                 self._skip = whole
             elif len(stream) - at < whole:

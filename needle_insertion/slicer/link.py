@@ -2,10 +2,10 @@
 One TCP connection, as server or as client. It has no thread, and nothing in it waits.
 
 pyigtl has a server and a client, too. They are not used, because a node could not live with them:
-the server takes over SIGINT and SIGTERM, and listens on addresses that it chooses itself. Both take
-a whole core when a peer has closed its end, until something is sent; they read whatever size a
-header announces, do not compare checksums, send what has waited for a peer since long, and print
-tracebacks.
+the server takes over SIGINT and SIGTERM, and listens on addresses that it chooses itself. Both
+take a whole core when a peer has closed its end, until something is sent; they read whatever size
+a header announces, do not compare checksums, send what has waited for a peer since long, and
+print tracebacks.
 """
 
 from __future__ import annotations
@@ -274,7 +274,7 @@ class Link:
             except BlockingIOError:
                 break
             except MessageError as error:
-                self._journal.refuse(f'{self.peer} refused: {error}')
+                self._journal.refuse(f'peer {self.peer} refused: {error}')
                 self._lose('what it says cannot be understood')
             except OSError as error:
                 self._lose(_words(error))

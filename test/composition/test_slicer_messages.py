@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
+from itertools import pairwise
 import math
 import struct
 import subprocess
@@ -364,7 +366,7 @@ def test_a_stream_may_come_in_any_pieces(cuts: list[int]) -> None:
     """The same messages come out, and those that nobody wants do not."""
     frames = Frames(is_wanted, pytest.fail)
     ends = [0, *sorted(cuts), len(STREAM)]
-    found = [one for a, b in zip(ends, ends[1:], strict=False) for one in frames.take(STREAM[a:b])]
+    found = [one for a, b in pairwise(ends) for one in frames.take(STREAM[a:b])]
     assert [one.kind for one in found] == ['POINT', 'TRANSFORM', 'STRING']
     assert {one.device for one in found} == {TARGET}
     assert all(one.data in STREAM for one in found)
@@ -373,10 +375,8 @@ def test_a_stream_may_come_in_any_pieces(cuts: list[int]) -> None:
 @given(st.binary(min_size=HEADER.size, max_size=500))
 def test_what_is_not_openigtlink_is_refused_or_passed_over(data: bytes) -> None:
     """Random bytes end the connection, or are a message that nobody wants."""
-    try:
+    with suppress(MessageError):
         assert Frames(is_wanted, pytest.fail).take(data) == []
-    except MessageError as error:
-        assert 'not OpenIGTLink' in str(error)
 
 
 def test_what_is_too_large_is_never_stored() -> None:
@@ -385,9 +385,7 @@ def test_what_is_too_large_is_never_stored() -> None:
     frames = Frames(is_wanted, complaints.append)
     large = HEADER.pack(1, b'POINT', b'TARGET', 0, 0, 1 << 30, 0)
     assert frames.take(large) == []
-    assert complaints == [
-        f"POINT of 'TARGET' refused: {1 << 30} bytes, at most {LARGEST} are taken"
-    ]
+    assert complaints == [f'target refused: a POINT message of {1 << 30} bytes, {LARGEST} at most']
     block = bytes(1 << 22)
     for _ in range((1 << 30) // len(block)):
         assert frames.take(block) == []
@@ -398,15 +396,17 @@ def test_what_is_too_large_is_never_stored() -> None:
         frames.take(HEADER.pack(1, b'POINT', b'TARGET', 0, 0, 2**64 - 1, 0))
 
 
-@given(st.integers(0, 65535), st.binary(min_size=12, max_size=12))
+@given(
+    st.integers(0, 5) | st.integers(0, 65535),
+    st.binary(min_size=12, max_size=12) | st.sampled_from([b'POINT' + bytes(7), b'STATUS' * 2]),
+)
 def test_names_of_types_are_words(version: int, kind: bytes) -> None:
     """A header of another protocol is not followed."""
     header = struct.pack('>H12s', version, kind) + bytes(HEADER.size - 14)
-    known = version in (1, 2, 3) and kind.rstrip(b' \0').decode('latin1').isprintable()
-    if known and kind.isascii():
-        assert len(Frames(is_wanted, pytest.fail).take(header)) == (
-            kind.rstrip(b' \0') == b'POINT'
-        )
+    name = kind.rstrip(b' \0')
+    if version in (1, 2, 3) and name.isascii() and name.decode('latin1').isprintable():
+        found = Frames(is_wanted, pytest.fail).take(header)
+        assert [one.kind for one in found] == ['POINT'] * (name == b'POINT')
     else:
         with pytest.raises(MessageError):
             Frames(is_wanted, pytest.fail).take(header)
