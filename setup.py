@@ -91,7 +91,7 @@ setup(
         # `make docs`; locked apart from the rest, in requirements-docs.lock.
         'docs': ['furo>=2024.8', 'myst-parser>=4.0', 'numpydoc>=1.8', 'sphinx>=8.1,<9'],
         # What `needle bench` is measured beside.
-        'bench': ['mcap-ros2-support>=0.5.6', 'mujoco>=3.2', 'pyelastica>=0.3.3'],
+        'bench': ['mcap-ros2-support>=0.5.6', 'mujoco>=3.2', 'pyelastica>=0.3.3', *SLICER],
     },
     entry_points={
         'console_scripts': [

@@ -10,6 +10,7 @@ from threading import active_count
 from time import monotonic, sleep
 from typing import Any
 
+from benchmarks.igtl_peer import free_port
 from needle_controller.journal import Journal
 from needle_insertion.slicer.frames import HEADER
 from needle_insertion.slicer.link import Link
@@ -20,13 +21,6 @@ import pyigtl
 import pytest
 
 MESSAGE = pyigtl.TransformMessage(np.eye(4), device_name=TARGET).pack()
-
-
-def free_port() -> int:
-    """Return a port that nobody uses."""
-    with closing(socket.socket()) as one:
-        one.bind(('127.0.0.1', 0))
-        return int(one.getsockname()[1])
 
 
 class Desk:

@@ -11,6 +11,7 @@ import socket
 import sys
 from typing import Any
 
+from benchmarks.igtl_peer import free_port, Peer, Told
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import (
     PointStamped,
@@ -27,7 +28,6 @@ import numpy as np
 import pyigtl
 import pytest
 from sensor_msgs.msg import JointState
-from support.igtl_peer import free_port, Peer, Told
 from support.ros_graph import RosGraph
 
 #: A needle that bends, at rest 6 cm deep with its guide aside.
