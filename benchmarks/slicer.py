@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from tempfile import TemporaryDirectory
 import time
-from typing import Final
+from typing import Any, Final
 
 from benchmarks.endurance import GROWTH, resident_memory
 from benchmarks.igtl_peer import free_port, Peer, SENT, Told
@@ -75,12 +75,11 @@ def _watch(folder: Path, duration: float, tick: Tick) -> Answer:
     port = free_port()
     with Graph(folder / 'logs') as graph:
         watch = graph.node('watch')
-        watch.create_subscription(
-            PointStamped,
-            'target',
-            lambda message: arrived.append((1e3 * message.point.x, time.monotonic())),
-            COMMAND,
-        )
+
+        def on_target(message: Any) -> None:
+            arrived.append((1e3 * message.point.x, time.monotonic()))
+
+        watch.create_subscription(PointStamped, 'target', on_target, COMMAND)
         graph.start('plant', _PLANT)
         node = graph.start('slicer', {'port': port})
         peer = Peer(folder, port, _TARGET, _STEP)

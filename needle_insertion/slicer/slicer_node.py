@@ -104,6 +104,8 @@ class SlicerNode(BaseNode):
 
     def cleanup(self) -> None:
         """Forget the connection."""
+        if self._link is not None:
+            self._link.close()
         self._link = self._interpreter = None
 
     def activate(self) -> None:

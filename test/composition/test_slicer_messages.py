@@ -299,13 +299,13 @@ def test_any_words_of_the_nodes_are_told(lines: list[str], stamp: int) -> None:
 
 
 @given(vectors, st.tuples(st.floats(-0.01, 0.01), st.floats(-0.01, 0.01)))
-def test_without_a_shape_it_is_a_line_and_says_so(tip: Any, guide: Any) -> None:
+def test_without_a_shape_it_is_a_line_and_says_so(tip: Any, guide: tuple[float, float]) -> None:
     """From the guide to the tip, with y along it; what is old is not shown."""
     view = NeedleView()
     assert view.shape(0.0) is None
     view.take_tip(5, tip, 0.0)
     assert view.shape(0.0) is None
-    view.take_guide(*guide, 0.5)
+    view.take_guide(guide[0], guide[1], 0.5)
     shape = view.shape(0.9)
     assert (shape.stamp, shape.source) == (5, LINE)
     np.testing.assert_array_equal(shape.points, [(guide[0], 0.0, guide[1]), tip])
@@ -317,7 +317,7 @@ def test_without_a_shape_it_is_a_line_and_says_so(tip: Any, guide: Any) -> None:
     view.take_poses(6, [[0.0, 0.0, 0.0], [0.0, 0.1, 0.0]], [0.0, 0.0, 0.0, 1.0], 1.0)
     assert view.shape(1.1).source == MEASURED
     view.take_tip(7, tip, 3.0)
-    view.take_guide(*guide, 3.0)
+    view.take_guide(guide[0], guide[1], 3.0)
     assert view.shape(3.0).source == LINE
 
 
@@ -338,9 +338,11 @@ def test_what_is_no_needle_is_refused(points: Any, turn: Any, complaint: str) ->
     with pytest.raises(MessageError, match=complaint):
         view.take_poses(0, points, turn, 0.0)
     assert view.shape(0.0) is None
-    for take in (view.take_tip, view.take_expected):
-        with pytest.raises(MessageError):
-            take(0, [math.nan] * 3, [0.0, 0.0, 0.0, 1.0])
+    nowhere = [math.nan] * 3
+    with pytest.raises(MessageError):
+        view.take_tip(0, nowhere, 0.0)
+    with pytest.raises(MessageError):
+        view.take_expected(0, nowhere, [0.0, 0.0, 0.0, 1.0])
     with pytest.raises(MessageError):
         view.take_guide(math.inf, 0.0, 0.0)
     assert view.expected is None
