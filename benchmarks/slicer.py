@@ -94,6 +94,8 @@ def _watch(folder: Path, duration: float, tick: Tick) -> Answer:
             share = 100.0 * (cpu_seconds(node.process.pid) - spent) / (time.monotonic() - begin)
             shapes = [one for one in peer.told('NeedleShapeHeader') if one.arrived > begin]
             sent = [one for one in peer.told(SENT) if one.arrived > begin]
+            # The last ones may be on their way. A new peer begins anew.
+            delays = _delays(sent[:-2], arrived)
 
             tick('the node is killed')
             killed = time.monotonic()
@@ -109,8 +111,6 @@ def _watch(folder: Path, duration: float, tick: Tick) -> Answer:
         finally:
             peer.kill()
         node.interrupt()
-    # The last ones may be on their way.
-    delays = _delays(sent[:-2], arrived)
     return _answer(duration, shapes, delays, memory, share, (after_node, after_peer))
 
 
