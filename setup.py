@@ -11,6 +11,8 @@ ROOT = Path(__file__).resolve().parent
 MANIFEST = ET.parse(ROOT / 'package.xml').getroot()  # noqa: S314
 NAME = MANIFEST.findtext('name')
 NODES = runpy.run_path(str(ROOT / 'needle_insertion/nodes.py'))['NODES']
+#: What the node `slicer` speaks OpenIGTLink with.
+SLICER = ['pyigtl>=0.3.4']
 TEST = [
     'hypothesis>=6.100',
     'lxml>=5.0',
@@ -18,6 +20,7 @@ TEST = [
     'pytest>=8.0',
     'sympy>=1.12',
     'xacro>=2.1',
+    *SLICER,
 ]
 
 
@@ -78,6 +81,7 @@ setup(
             'ros-jazzy-rclpy>=7.1.6',
             'ros-jazzy-rmw-fastrtps-cpp>=8.4',
         ],
+        'slicer': SLICER,
         # The name by which colcon test knows pytest.
         'test': TEST,
         'dev': [
@@ -90,7 +94,7 @@ setup(
         # `make docs`; locked apart from the rest, in requirements-docs.lock.
         'docs': ['furo>=2024.8', 'myst-parser>=4.0', 'numpydoc>=1.8', 'sphinx>=8.1,<9'],
         # What `needle bench` is measured beside.
-        'bench': ['mcap-ros2-support>=0.5.6', 'mujoco>=3.2', 'pyelastica>=0.3.3'],
+        'bench': ['mcap-ros2-support>=0.5.6', 'mujoco>=3.2', 'pyelastica>=0.3.3', *SLICER],
     },
     entry_points={
         'console_scripts': [

@@ -147,8 +147,21 @@ def sample_numbers(path: Path) -> dict[str, Any]:
     return {topic: np.concatenate(found or [np.empty(0, int)]) for topic, found in numbers.items()}
 
 
-def _resident_memory(process: int) -> int:
-    """Return the memory of a process that is in RAM [bytes]."""
+def resident_memory(process: int) -> int:
+    """
+    Return the memory of a process that is in RAM.
+
+    Parameters
+    ----------
+    process : int
+        Process id.
+
+    Returns
+    -------
+    int
+        Memory [bytes].
+
+    """
     pages = int(Path(f'/proc/{process}/statm').read_text('ascii').split()[1])
     return pages * os.sysconf('SC_PAGE_SIZE')
 
@@ -191,7 +204,7 @@ def watch_memory(folder: Path, duration: float, tick: Tick) -> Answer:
                 aimed = now
                 tick(f'memory, {now:.0f} of {duration:.0f} s')
                 watch.aim()
-            rows.append((now, [_resident_memory(one.process.pid) for one in started]))
+            rows.append((now, [resident_memory(one.process.pid) for one in started]))
             watch.spin(0.1)
     warm = min(_WARM_UP, 0.1 * duration)
     memory = np.array([values for at, values in rows if at >= warm or at == rows[-1][0]]) / 1e6

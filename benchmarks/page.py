@@ -19,6 +19,7 @@ _TOOLS: Final = {
     'dynamics': ('mujoco', 'pyelastica'),
     'identification': ('mcap', 'rosbags', 'mcap-ros2-support'),
     'graph': ('rclpy',),
+    'slicer': ('rclpy', 'pyigtl'),
 }
 
 

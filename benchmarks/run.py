@@ -18,7 +18,7 @@ from tqdm import tqdm
 #: Measures something.
 Question: TypeAlias = Callable[[Tick], Answer]
 
-#: Modules of each benchmark, each with a function `compare`; `graph` and `safety` need ROS.
+#: Modules of each benchmark, each with a function `compare`; the last two and `safety` need ROS.
 MODULES = {
     'dynamics': ('step', 'solvers', 'rods', 'batches'),
     'identification': ('identification',),
@@ -31,6 +31,7 @@ MODULES = {
     'laws': ('laws',),
     'safety': ('safety',),
     'graph': ('graph',),
+    'slicer': ('slicer',),
 }
 
 
@@ -85,6 +86,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action='store_const',
         const='quick',
         help='a trial, too short for reliable figures',
+    )
+    slicer = add('slicer', help='the node `slicer` for 10 min, and killed')
+    slicer.add_argument(
+        '--quick', dest='plan', action='store_const', const='quick', help='a trial of 20 s'
     )
 
 

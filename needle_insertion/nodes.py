@@ -16,6 +16,7 @@ NODES: Final = {
     'identification': 'needle_identification.identification_node',
     'recorder': 'needle_identification.recorder_node',
     'player': 'needle_identification.player_node',
+    'slicer': 'needle_insertion.slicer.slicer_node',
 }
 
 

@@ -393,7 +393,7 @@ TRACKING_ERROR: Final = Topic(
 TARGET: Final = Topic(
     'target',
     POINT,
-    USER,
+    f'{USER}, slicer',
     '`point.y`: inserted length to reach [m]; to the node `steering`: where the tip shall be, '
     'x, y, z [m]',
     qos=COMMAND,
@@ -405,6 +405,17 @@ TIP_EXPECTED: Final = Topic(
     'geometry_msgs/msg/PoseWithCovarianceStamped',
     'steering',
     'where the tip will be at the target depth, with covariance, after each look',
+    qos=COMMAND,
+    frame=ENTRY,
+)
+
+TIP_POSE: Final = Topic(
+    'tip_pose',
+    POSE,
+    'slicer',
+    'where the tip is, y along the needle, 20 Hz; its direction is measured only where '
+    '`needle_poses` come',
+    # SlicerROS2 asks for it.
     qos=COMMAND,
     frame=ENTRY,
 )

@@ -31,6 +31,7 @@ SETTINGS: Mapping[str, list[dict[str, object]]] = {
     'identification': [{'live': True, 'use_sim_time': True}],
     'recorder': [{'path': 'bag', 'use_sim_time': True}],
     'player': [{'path': str(SHIPPED_BAGS / 'friction_01'), 'use_sim_time': True}],
+    'slicer': [{'use_sim_time': True}],
 }
 
 #: What these may record or play depends on the other nodes.

@@ -1,0 +1,199 @@
+"""The node `slicer` for minutes: targets in, shapes out, and either side killed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from tempfile import TemporaryDirectory
+import time
+from typing import Any, Final
+
+from benchmarks.endurance import GROWTH, resident_memory
+from benchmarks.igtl_peer import free_port, Peer, SENT, Told
+from benchmarks.measure import Bar, number
+from benchmarks.page import Answer, Section, Tick
+from benchmarks.pairs import cpu_seconds
+from geometry_msgs.msg import PointStamped
+from needle_insertion.experiment.ros_graph import Graph
+from needle_ros.base_node import COMMAND
+import numpy as np
+
+#: A needle that bends, at rest.
+_PLANT: Final = {
+    'model.preset': 'bending_35mm',
+    'steered': True,
+    'mode': 'robot',
+    'rate': 200.0,
+    'depth': 0.06,
+}
+
+#: The target and how much its x grows from one to the next [mm]: so each is known by its x.
+_TARGET: Final = (0.0, 80.0, 0.0)
+_STEP: Final = 1e-3
+
+#: Rate that is wanted, its least in a window [Hz], and the window [s].
+_RATE: Final = 20.0
+_LEAST_RATE: Final = 19.5
+_WINDOW: Final = 10.0
+
+#: Longest time from a kill to the next shape: the node starts within it [s].
+_AGAIN: Final = 15.0
+
+#: Shapes that must have come before somebody is killed.
+_SOME: Final = 20
+
+
+#: Duration of the watch [s].
+PLANS: Final = {'default': 600.0, 'quick': 20.0}
+
+
+def compare(tick: Tick, plan: str = 'default') -> Answer:
+    """
+    Let the node work for some minutes, then kill it, then its peer.
+
+    Parameters
+    ----------
+    tick : callable
+        Called with the name of each stage.
+    plan : str
+        Duration of the measurements: a key of `PLANS`.
+
+    Returns
+    -------
+    sections : list of Section
+        Rate and gaps of the shapes, way of the targets, memory.
+    bars : list of Bar
+        What must hold for a person who works with it.
+
+    """
+    with TemporaryDirectory() as name:
+        return _watch(Path(name), PLANS[plan], tick)
+
+
+def _watch(folder: Path, duration: float, tick: Tick) -> Answer:
+    arrived: list[tuple[float, float]] = []
+    memory: list[float] = []
+    port = free_port()
+    with Graph(folder / 'logs') as graph:
+        watch = graph.node('watch')
+
+        def on_target(message: Any) -> None:
+            arrived.append((1e3 * message.point.x, time.monotonic()))
+
+        watch.create_subscription(PointStamped, 'target', on_target, COMMAND)
+        graph.start('plant', _PLANT)
+        node = graph.start('slicer', {'port': port})
+        peer = Peer(folder, port, _TARGET, _STEP)
+        try:
+            graph.spin_until(lambda: peer.told('NeedleShapeHeader') and arrived, 'the peer')
+            begin, spent = time.monotonic(), cpu_seconds(node.process.pid)
+            while (now := time.monotonic()) < begin + duration:
+                tick(f'watch, {now - begin:.0f} of {duration:.0f} s')
+                memory.append(resident_memory(node.process.pid) / 1e6)
+                end = now + 1.0
+                graph.spin_until(lambda end=end: time.monotonic() > end, 'a second')  # type: ignore[misc]
+            share = 100.0 * (cpu_seconds(node.process.pid) - spent) / (time.monotonic() - begin)
+            shapes = [one for one in peer.told('NeedleShapeHeader') if one.arrived > begin]
+            sent = [one for one in peer.told(SENT) if one.arrived > begin]
+            # The last ones may be on their way. A new peer begins anew.
+            delays = _delays(sent[:-2], arrived)
+
+            tick('the node is killed')
+            killed = time.monotonic()
+            node.kill()
+            node = graph.start('slicer', {'port': port})
+            after_node = _again(graph, peer, killed)
+
+            tick('the peer is killed')
+            killed = time.monotonic()
+            peer.kill()
+            peer = Peer(folder, port, _TARGET, _STEP)
+            after_peer = _again(graph, peer, killed)
+        finally:
+            peer.kill()
+        node.interrupt()
+    return _answer(duration, shapes, delays, memory, share, (after_node, after_peer))
+
+
+def _again(graph: Graph, peer: Peer, since: float) -> float:
+    """Wait for some shapes; return when the first came [s]."""
+
+    def come() -> list[Told]:
+        return [one for one in peer.told('NeedleShapeHeader') if one.arrived > since]
+
+    def enough() -> bool:
+        found = come()
+        # Those from before the kill may still have been in the system's buffers.
+        return len(found) > _SOME and found[-1].arrived - found[0].arrived > 1.0
+
+    graph.spin_until(enough, 'shapes after a kill', 60.0)
+    times = [one.arrived for one in come()]
+    gaps = np.diff([since, *times])
+    # The longest gap is that of the kill.
+    return float(times[int(np.argmax(gaps))] - since)
+
+
+def _delays(sent: list[Told], arrived: list[tuple[float, float]]) -> list[float | None]:
+    """Return the time from a peer to the topic of each target [s]; None if it has not come."""
+    came = {round(x / _STEP): when for x, when in arrived}
+    found = ((came.get(round(one.content[0] / _STEP)), one.arrived) for one in sent)
+    return [None if there is None else there - when for there, when in found]
+
+
+def _answer(
+    duration: float,
+    shapes: list[Told],
+    delays: list[float | None],
+    memory: list[float],
+    share: float,
+    again: tuple[float, float],
+) -> Answer:
+    numbers = [int(one.content.split(';')[1]) for one in shapes]
+    missing = numbers[-1] - numbers[0] + 1 - len(numbers)
+    stamps = np.array([one.time for one in shapes])
+    gaps = np.diff([one.arrived for one in shapes])
+    width = round(_RATE * min(_WINDOW, 0.5 * duration))
+    windows = width / (stamps[width:] - stamps[:-width])
+    rate = (len(stamps) - 1) / (stamps[-1] - stamps[0])
+    there = np.array([one for one in delays if one is not None])
+    lost = len(delays) - len(there)
+    tenth = max(1, len(memory) // 10)
+    # The first tenth, at most a minute, is warm-up.
+    warm = memory[min(tenth, 60) :]
+    early, late = np.median(warm[:tenth]), np.median(warm[-tenth:])
+    rows = [
+        ('shapes', f'{len(shapes)}'),
+        ('shapes per second by their stamps [Hz]', f'{rate:.3f}'),
+        (f'the same, least in {width / _RATE:g} s [Hz]', f'{windows.min():.3f}'),
+        ('shapes lost', f'{missing}'),
+        (
+            'between two shapes, p50, p99, longest [ms]',
+            ', '.join(f'{1e3 * one:.0f}' for one in (*np.percentile(gaps, [50, 99]), gaps.max())),
+        ),
+        ('targets sent', f'{len(delays)}'),
+        ('targets lost', f'{lost}'),
+        (
+            'from peer to topic, p50, p99, longest [ms]',
+            ', '.join(
+                f'{1e3 * one:.0f}' for one in (*np.percentile(there, [50, 99]), there.max())
+            ),
+        ),
+        ('CPU of the node [%]', f'{share:.1f}'),
+        ('memory of the node, warm and at the end [MB]', f'{early:.2f}, {late:.2f}'),
+        ('first shape after the node was killed, and started again [s]', number(again[0])),
+        ('first shape after the peer was killed, and started again [s]', number(again[1])),
+    ]
+    section = Section(
+        'Node slicer with a peer',
+        ('figure', 'found'),
+        rows,
+        f'{duration:g} s with a plant and a client of pyigtl that sends 10 targets a second; '
+        'then node and peer are killed in turn.',
+    )
+    bars = [
+        Bar('shapes per second, worst window', float(windows.min()), _LEAST_RATE, 'Hz', True),
+        Bar('shapes lost', float(missing), 0.0),
+        Bar('targets lost', float(lost), 0.0),
+        Bar(f'growth of memory in {duration:g} s', float(late - early), GROWTH, 'MB'),
+        Bar('first shape after a kill', max(again), _AGAIN, 's'),
+    ]
+    return [section], bars

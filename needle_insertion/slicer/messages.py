@@ -1,0 +1,264 @@
+"""
+What OpenIGTLink messages say, in quantities of the contract, and the other way round.
+
+Lengths of the messages are in mm, in the frame of the images (RAS in 3D Slicer); ours are in m, in
+`needle_entry`. A `Registration` is in between. The names of the devices are those of SmartNeedle
+(trajcontrol, and its module of 3D Slicer), as far as it has some: docs/howto/slicer.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from datetime import datetime, timedelta, timezone
+import re
+import struct
+from typing import Any, Final
+
+from needle_dynamics.arrays import FloatArray
+from needle_insertion.slicer.frames import Frame, HEADER
+from needle_insertion.slicer.needle import Pose, Shape
+from needle_insertion.slicer.registration import MILLIMETERS, Registration
+from needle_ros.errors import MessageError
+from needle_ros.timing import NANOSECONDS
+import numpy as np
+from pyigtl.messages import CRC64, MessageBase, PointMessage, StringMessage, TransformMessage
+
+#: Name of the target: of a point in any POINT message, or of the device.
+TARGET: Final = 'TARGET'
+
+#: Devices that are sent.
+SHAPE: Final = 'NeedleShapeZ'
+SHAPE_HEADER: Final = 'NeedleShapeHeader'
+TIP: Final = 'NeedleTip'
+TIP_EXPECTED: Final = 'NeedleTipExpected'
+STATE: Final = 'NeedleState'
+
+#: Numbers of the messages have 32 bits, and people point at the skin [m].
+_ROUNDING: Final = 1e-4
+
+#: Longest state [characters]; the length of a STRING has 16 bits.
+_LONGEST_STATE: Final = 8000
+
+_EPOCH: Final = datetime(1970, 1, 1, tzinfo=timezone.utc)
+
+#: What may be between the numbers of a STRING.
+_BETWEEN: Final = re.compile(r'[\s,;]+')
+
+#: What pyigtl raises for bodies that do not fit their type.
+_NOT_UNDERSTOOD: Final = (struct.error, ValueError, TypeError, IndexError)
+
+
+def is_wanted(kind: str, device: str) -> bool:
+    """
+    Return whether a message may have a target.
+
+    Parameters
+    ----------
+    kind, device : str
+        Its type, and the name of its device.
+
+    Returns
+    -------
+    bool
+        Whether it may.
+
+    """
+    return kind == 'POINT' or (device == TARGET and kind in ('TRANSFORM', 'STRING'))
+
+
+class Interpreter:
+    """
+    Turns messages of the peer into targets, and the needle into messages for it.
+
+    Parameters
+    ----------
+    registration : Registration
+        Where the needle is in the images.
+    reach : float
+        Farthest target from the entry point [m].
+
+    """
+
+    def __init__(self, registration: Registration, reach: float) -> None:
+        self._registration, self._reach = registration, reach
+
+    def target(self, frame: Frame) -> FloatArray | None:
+        """
+        Read the target of a message.
+
+        Parameters
+        ----------
+        frame : Frame
+            The message, see `is_wanted`.
+
+        Returns
+        -------
+        ndarray, shape (3,), or None
+            Where the tip shall be in `needle_entry` [m]; None if these are points of something
+            else.
+
+        Raises
+        ------
+        MessageError
+            If the message is damaged, or its target makes no sense.
+
+        """
+        found = _said(_message(frame))
+        if found is None:
+            return None
+        at = np.array(found, dtype=np.float64)
+        if at.shape != (3,) or not np.isfinite(at).all():
+            raise MessageError(f'it must be three finite numbers, got {at.tolist()}')
+        point = self._registration.to_needle(at)
+        distance = float(np.linalg.norm(point))
+        if not distance <= self._reach:
+            raise MessageError(
+                f'{_millimeters(at)} is {MILLIMETERS * distance:.6g} mm from the entry point, '
+                f'reach is {MILLIMETERS * self._reach:g} mm; is the registration right?'
+            )
+        if point[1] < -_ROUNDING:
+            raise MessageError(
+                f'{_millimeters(at)} is {-MILLIMETERS * point[1]:.6g} mm outside of the tissue; '
+                'is the registration right?'
+            )
+        return point
+
+    def shape(self, shape: Shape, number: int) -> list[bytes]:
+        """
+        Tell the shape of the needle: its points, and a line about them.
+
+        Parameters
+        ----------
+        shape : Shape
+            The shape.
+        number : int
+            How many there were before.
+
+        Returns
+        -------
+        list of bytes
+            A POINT message from the guide to the tip, then a STRING message: time, number, number
+            of points, frame and source, with semicolons between.
+
+        """
+        time = _seconds(shape.stamp)
+        count = len(shape.points)
+        points = PointMessage(
+            self._registration.to_image(shape.points),
+            names=[f'{SHAPE}{k}' for k in range(count)],
+            timestamp=time,
+            device_name=SHAPE,
+        )
+        moment = (_EPOCH + timedelta(seconds=time)).strftime('%Y-%m-%d %H:%M:%S.%f')[:-3]
+        words = (moment, str(number), str(count), 'image', shape.source)
+        header = StringMessage(';'.join(words), timestamp=time, device_name=SHAPE_HEADER)
+        return [points.pack(), header.pack()]
+
+    def tip(self, shape: Shape) -> bytes:
+        """
+        Tell where the tip is.
+
+        Parameters
+        ----------
+        shape : Shape
+            The needle.
+
+        Returns
+        -------
+        bytes
+            A TRANSFORM message, with y along the needle.
+
+        """
+        return self._pose(TIP, Pose(shape.stamp, shape.points[-1], shape.turn))
+
+    def tip_expected(self, pose: Pose) -> bytes:
+        """
+        Tell where the tip is expected.
+
+        Parameters
+        ----------
+        pose : Pose
+            Where.
+
+        Returns
+        -------
+        bytes
+            A TRANSFORM message.
+
+        """
+        return self._pose(TIP_EXPECTED, pose)
+
+    def _pose(self, device: str, pose: Pose) -> bytes:
+        matrix = self._registration.pose_to_image(pose.position, pose.turn)
+        message = TransformMessage(matrix, timestamp=_seconds(pose.stamp), device_name=device)
+        return bytes(message.pack())
+
+    def state(self, stamp: int, lines: Iterable[str]) -> bytes:
+        """
+        Tell what the nodes say of themselves.
+
+        Parameters
+        ----------
+        stamp : int
+            Time [ns].
+        lines : iterable of str
+            One for each node.
+
+        Returns
+        -------
+        bytes
+            A STRING message.
+
+        """
+        # pyigtl cannot write other letters: it waits for the wrong error of the encoding.
+        text = '\n'.join(lines).encode('ascii', 'replace').decode()[:_LONGEST_STATE]
+        message = StringMessage(text, timestamp=_seconds(stamp), device_name=STATE)
+        return bytes(message.pack())
+
+
+def _millimeters(at: FloatArray) -> str:
+    return f'({", ".join(f"{one:.6g}" for one in at.tolist())}) mm'
+
+
+def _message(frame: Frame) -> Any:
+    """Return a message as pyigtl reads it."""
+    header, body = frame.data[: HEADER.size], frame.data[HEADER.size :]
+    # pyigtl does not compare the checksum.
+    if HEADER.unpack(header)[-1] != CRC64(body):
+        raise MessageError('the message is damaged: its checksum is wrong')
+    try:
+        fields = MessageBase.parse_header(header)
+        message = MessageBase.create_message(fields['message_type'])
+        message.unpack(fields, body)
+    except _NOT_UNDERSTOOD as error:
+        raise MessageError(f'the body of {frame.kind} cannot be read: {error}') from error
+    return message
+
+
+def _said(message: Any) -> Any:
+    """Return the target as a message has it, None if it has none."""
+    if isinstance(message, TransformMessage):
+        return message.matrix[:3, 3]
+    if isinstance(message, StringMessage):
+        words = _BETWEEN.split(message.string.strip())
+        try:
+            return [float(word) for word in words]
+        except ValueError as error:
+            raise MessageError(f'it must be three numbers, got {message.string!r}') from error
+    places = dict(enumerate(message.positions))
+    named = [k for k, name in enumerate(message.names) if name == TARGET]
+    if not named and message.device_name == TARGET:
+        # A list of this name with a point of any name.
+        named = list(places)
+    elif not named:
+        return None
+    if len(named) != 1:
+        raise MessageError(
+            f'one point must be named {TARGET}, or alone in the list {TARGET}; got {len(named)}'
+        )
+    return places[named[0]]
+
+
+def _seconds(stamp: int) -> float:
+    """Return a time as the header takes it, which has 32 bits for the seconds."""
+    return min(max(stamp, 0), (1 << 32) * NANOSECONDS - NANOSECONDS) / NANOSECONDS

@@ -1,0 +1,327 @@
+"""Node `slicer`: targets from 3D Slicer, and the needle to it, by OpenIGTLink."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+import sys
+from time import monotonic
+from typing import Any, Final, TYPE_CHECKING
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from geometry_msgs.msg import PointStamped, PoseArray, PoseStamped, PoseWithCovarianceStamped
+from needle_controller.journal import Journal, Severity
+from needle_insertion.slicer.link import Link
+from needle_insertion.slicer.needle import NeedleView, Shape
+from needle_insertion.slicer.registration import MILLIMETERS, Registration
+from needle_insertion.slicer.settings import LinkSettings, TargetSettings
+from needle_ros import contract
+from needle_ros.base_node import BaseNode
+from needle_ros.errors import JobError, MessageError, printable
+from needle_ros.run_node import run
+from needle_ros.timing import NANOSECONDS, nanoseconds, RateCounter
+from needle_ros.wire import Reading
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+
+if TYPE_CHECKING:
+    from needle_insertion.slicer.frames import Frame
+    from needle_insertion.slicer.messages import Interpreter
+
+#: Time between two shapes, which is also that between two looks at the connection [s].
+PERIOD: Final = 0.05
+
+#: Time between two states, unless something changes [s].
+_STATE_PERIOD: Final = 1.0
+
+#: Messages that are read of those that have come at once.
+_AT_ONCE: Final = 16
+
+#: Nodes whose state is told, and the time after which one is silent, or forgotten [s].
+_MOST_NODES: Final = 20
+_SILENT: Final = 5.0
+_FORGOTTEN: Final = 60.0
+
+_LEVELS: Final = {0: 'OK', 1: 'WARN', 2: 'ERROR', 3: 'STALE'}
+
+_PACKAGE: Final = 'pyigtl'
+
+
+class SlicerNode(BaseNode):
+    """
+    Passes targets of 3D Slicer on to ``target``, and tells it the needle, by OpenIGTLink.
+
+    In come POINT, TRANSFORM and STRING messages with a target, in mm in the frame of the images.
+    Out go, 20 times a second, the shape of the needle and the pose of its tip; also where the tip
+    is expected, and what all nodes say on ``/diagnostics``. ``registration.*`` says where the
+    frame `needle_entry` is in the images. The tip goes to ``tip_pose``, too.
+
+    The shape is that of ``needle_poses``. If these do not come it is the line from the guide
+    (``joint_states``) to the tip (``tip_deflection``), and is said to be no measurement.
+
+    The connection is looked after by a timer of the node: there is no thread, and nothing waits.
+    """
+
+    def __init__(self, **node_options: Any) -> None:
+        super().__init__('slicer', **node_options)
+        self.declare_settings('', LinkSettings())
+        self.declare_settings('', TargetSettings())
+        self.declare_settings('registration.', Registration())
+        self._link: Link | None = None
+        self._journal, self._view = Journal(), NeedleView()
+        self._interpreter: Interpreter | None = None
+        self._greeted = ''
+        self._shapes = self._targets = 0
+        self._source = ''
+        self._rate = RateCounter()
+        #: What each node said last: when, level and words.
+        self._said: dict[str, tuple[float, int, str]] = {}
+        self._state_told = self._state_changed = -_STATE_PERIOD
+
+        self._target = self.publisher(contract.TARGET)
+        self._tip_pose = self.publisher(contract.TIP_POSE)
+        self.subscribe(contract.NEEDLE_POSES, self._on_poses)
+        self.listen(contract.JOINT_STATES, self._on_joints)
+        self.listen(contract.TIP_DEFLECTION, self._on_tip)
+        self.subscribe(contract.TIP_EXPECTED, self._on_expected)
+        self.subscribe(contract.DIAGNOSTICS, self._on_diagnostics)
+        #: A clock that stands still does not stop the connection.
+        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
+
+    # Transitions.
+
+    def configure(self) -> None:
+        """Read where the peer is, and load what speaks with it."""
+        if find_spec(_PACKAGE) is None:
+            raise JobError(
+                f'the Python package {_PACKAGE} is not installed: '
+                f"python3 -m pip install '{_PACKAGE}>=0.3.4'"
+            )
+        from needle_insertion.slicer.messages import Interpreter, is_wanted
+
+        registration = self.settings('registration.', Registration)
+        self._interpreter = Interpreter(registration, self.settings('', TargetSettings).reach)
+        self._link = Link(self.settings('', LinkSettings), is_wanted, self._journal)
+
+    def cleanup(self) -> None:
+        """Forget the connection."""
+        if self._link is not None:
+            self._link.close()
+        self._link = self._interpreter = None
+
+    def activate(self) -> None:
+        """Open the connection, and look after it from now on."""
+        self._timer = self.create_timer(PERIOD, self._tick, clock=self._steady)
+
+    def deactivate(self) -> None:
+        """Close the connection."""
+        self.destroy_timer(self._timer)
+        if self._link is not None:
+            self._link.close()
+
+    def about(self) -> str:
+        """Name the connection and the topics."""
+        return (
+            f'{self._link.state if self._link is not None else ""}; publishes '
+            f'{contract.TARGET.name} and {contract.TIP_POSE.name}, takes '
+            f'{contract.NEEDLE_POSES.name}, or {contract.JOINT_STATES.name} and '
+            f'{contract.TIP_DEFLECTION.name}'
+        )
+
+    # What comes from the nodes.
+
+    def _on_poses(self, message: PoseArray) -> None:
+        points = [(p.position.x, p.position.y, p.position.z) for p in message.poses]
+        turn = _quaternion(message.poses[-1].orientation) if message.poses else []
+        stamp, frame = nanoseconds(message.header.stamp), message.header.frame_id
+        try:
+            _check_frame(frame)
+            self._view.take_poses(stamp, points, turn, monotonic())
+        except MessageError as error:
+            self._journal.refuse(f'{contract.NEEDLE_POSES.name} refused: {error}')
+
+    def _on_joints(self, reading: Reading) -> None:
+        found = dict(zip(reading.names, reading.values[0], strict=False))
+        if contract.INSERTION not in found:
+            return
+        # A guide that does not move is where the needle enters.
+        x, z = found.get(contract.GUIDE_X, 0.0), found.get(contract.GUIDE_Z, 0.0)
+        try:
+            self._view.take_guide(x, z, monotonic())
+        except MessageError as error:
+            self._journal.refuse(f'{contract.JOINT_STATES.name} refused: {error}')
+
+    def _on_tip(self, reading: Reading) -> None:
+        try:
+            _check_frame(reading.frame)
+            self._view.take_tip(reading.stamp, reading.values[0], monotonic())
+        except MessageError as error:
+            self._journal.refuse(f'{contract.TIP_DEFLECTION.name} refused: {error}')
+
+    def _on_expected(self, message: PoseWithCovarianceStamped) -> None:
+        pose = message.pose.pose
+        at = [pose.position.x, pose.position.y, pose.position.z]
+        stamp, frame = nanoseconds(message.header.stamp), message.header.frame_id
+        try:
+            _check_frame(frame)
+            self._view.take_expected(stamp, at, _quaternion(pose.orientation))
+        except MessageError as error:
+            self._journal.refuse(f'{contract.TIP_EXPECTED.name} refused: {error}')
+            return
+        self._state_changed = monotonic()
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        now = monotonic()
+        for status in message.status:
+            name, words = status.name.lstrip('/'), printable(status.message)
+            level = int.from_bytes(status.level, 'little')
+            if name not in self._said and len(self._said) >= _MOST_NODES:
+                continue
+            if self._said.get(name, (0.0, -1, ''))[1:] != (level, words):
+                self._state_changed = now
+            self._said[name] = now, level, words
+
+    # What comes from the peer, and goes to it.
+
+    def _tick(self) -> None:
+        """Take what has come, and tell what is known."""
+        link, interpreter = self._link, self._interpreter
+        if link is None or interpreter is None:
+            return
+        self._take(interpreter, link.poll())
+        now = monotonic()
+        shape = self._view.shape(now)
+        self._source = '' if shape is None else shape.source
+        if shape is not None:
+            self._publish_tip(shape)
+        if link.peer:
+            if shape is not None:
+                self._tell_shape(link, interpreter, shape)
+            since = self._state_told
+            changed = link.peer != self._greeted or self._state_changed > since
+            if changed or now - since >= _STATE_PERIOD:
+                self._state_told = now
+                self._tell_state(link, interpreter, now)
+        self._greeted = link.peer
+        self._report()
+
+    def _take(self, interpreter: Interpreter, frames: list[Frame]) -> None:
+        """Pass the newest target on."""
+        newest = None
+        for frame in frames[-_AT_ONCE:]:
+            try:
+                found = interpreter.target(frame)
+            except MessageError as error:
+                self._journal.refuse(f'target refused: {error}')
+                continue
+            newest = newest if found is None else (frame, found.tolist())
+        if len(frames) > 2:
+            self._journal.say(
+                Severity.WARNING,
+                f'{len(frames)} messages within {PERIOD:g} s: only the newest target counts',
+                'flood',
+            )
+        if newest is None:
+            return
+        frame, (x, y, z) = newest
+        message = PointStamped()
+        message.header.frame_id = contract.ENTRY
+        # The clock of the peer may be any.
+        message.header.stamp = self.get_clock().now().to_msg()
+        message.point.x, message.point.y, message.point.z = x, y, z
+        self._target.publish(message)
+        self._targets += 1
+        heard = self._target.get_subscription_count()
+        words = ', '.join(f'{MILLIMETERS * one:.2f}' for one in (x, y, z))
+        self._journal.say(
+            Severity.INFO if heard else Severity.WARNING,
+            f'target ({words}) mm in {contract.ENTRY}, by {frame.kind} of {frame.device}'
+            + ('' if heard else f': no node takes {contract.TARGET.name}'),
+            'target',
+        )
+
+    def _publish_tip(self, shape: Shape) -> None:
+        message = PoseStamped()
+        message.header.frame_id = contract.ENTRY
+        message.header.stamp.sec, message.header.stamp.nanosec = divmod(shape.stamp, NANOSECONDS)
+        position, turn = message.pose.position, message.pose.orientation
+        position.x, position.y, position.z = shape.points[-1].tolist()
+        turn.x, turn.y, turn.z, turn.w = shape.turn.tolist()
+        self._tip_pose.publish(message)
+
+    def _tell_shape(self, link: Link, interpreter: Interpreter, shape: Shape) -> None:
+        points, header = interpreter.shape(shape, self._shapes)
+        if link.send(points) and link.send(header):
+            self._shapes += 1
+            self._rate.add(self._steady_ns())
+        link.send(interpreter.tip(shape))
+
+    def _tell_state(self, link: Link, interpreter: Interpreter, now: float) -> None:
+        self._said = {
+            name: said for name, said in self._said.items() if now - said[0] < _FORGOTTEN
+        }
+        lines = []
+        for name, (when, level, words) in sorted(self._said.items()):
+            age = now - when
+            word = _LEVELS.get(level, str(level))
+            silent = f', silent for {age:.0f} s' if age > _SILENT else ''
+            lines.append(f'{name} [{word}{silent}]: {words}')
+        link.send(interpreter.state(self.now(), lines))
+        if self._view.expected is not None:
+            link.send(interpreter.tip_expected(self._view.expected))
+
+    # What it says of itself.
+
+    def _steady_ns(self) -> int:
+        return int(monotonic() * NANOSECONDS)
+
+    def _report(self) -> None:
+        log, journal = self.get_logger(), self._journal
+        if not journal.changed:
+            return
+        for severity, line in journal.take():
+            # rclpy refuses another severity from the same place.
+            if severity is Severity.ERROR:
+                log.error(line)
+            elif severity is Severity.WARNING:
+                log.warning(line)
+            else:
+                log.info(line)
+        self.publish_diagnostics()
+
+    def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
+        """Say whether there is a peer, what it is told and what it said."""
+        link = self._link
+        if link is None or not self.is_active:
+            return super().diagnose()
+        source = self._source or (
+            f'none, neither {contract.NEEDLE_POSES.name} nor {contract.JOINT_STATES.name} with '
+            f'{contract.TIP_DEFLECTION.name} come'
+        )
+        values: dict[str, object] = {
+            'shapes sent': self._shapes,
+            'shapes per second [Hz]': f'{self._rate.rate(self._steady_ns()):.1f}',
+            'messages left out for a slow peer': link.left_out,
+            'targets passed on': self._targets,
+            'refused': self._journal.refused,
+            'refused last': self._journal.complaint,
+        }
+        level = DiagnosticStatus.ERROR if link.complaint else DiagnosticStatus.OK
+        return level, f'{link.state}; shape: {source}', values
+
+
+def _quaternion(orientation: Any) -> list[float]:
+    return [orientation.x, orientation.y, orientation.z, orientation.w]
+
+
+def _check_frame(frame: str) -> None:
+    if frame not in ('', contract.ENTRY):
+        raise MessageError(f'its frame must be {contract.ENTRY} or none, got {frame!r}')
+
+
+def main() -> int:
+    """Run the node; return its exit status."""
+    return run(SlicerNode)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

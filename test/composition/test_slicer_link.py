@@ -1,0 +1,257 @@
+"""The connection: whoever comes, leaves, is silent or talks nonsense, it goes on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import closing, ExitStack
+import socket
+import struct
+from threading import active_count
+from time import monotonic, sleep
+from typing import Any
+
+from benchmarks.igtl_peer import free_port
+from needle_controller.journal import Journal
+from needle_insertion.slicer.frames import HEADER
+from needle_insertion.slicer.link import Link
+from needle_insertion.slicer.messages import is_wanted, TARGET
+from needle_insertion.slicer.settings import LinkSettings
+import numpy as np
+import pyigtl
+import pytest
+
+MESSAGE = pyigtl.TransformMessage(np.eye(4), device_name=TARGET).pack()
+
+
+class Desk:
+    """A link, what it said and what came, and a clock that can be put forward."""
+
+    def __init__(self, role: str = 'server', port: int | None = None) -> None:
+        self.port = free_port() if port is None else port
+        self.journal, self.ahead = Journal(self.clock), 0.0
+        settings = LinkSettings(role=role, port=self.port)
+        self.link = Link(settings, is_wanted, self.journal, self.clock)
+        self.lines: list[str] = []
+        self.frames: list[Any] = []
+
+    def clock(self) -> float:
+        return monotonic() + self.ahead
+
+    def poll(self) -> None:
+        """Call it as the node does."""
+        begin = monotonic()
+        self.frames += self.link.poll()
+        # Nothing waits in it; a machine that is busy may.
+        assert monotonic() - begin < 5.0
+        self.lines += [line for _, line in self.journal.take()]
+
+    def until(self, condition: Callable[[], Any], what: str = 'it') -> None:
+        deadline = monotonic() + 60.0
+        while not condition():
+            assert monotonic() < deadline, f'{what} did not come: {self.lines}'
+            self.poll()
+            sleep(0.005)
+
+    def said(self, words: str) -> bool:
+        return any(words in line for line in self.lines)
+
+
+@pytest.fixture
+def stack() -> Iterator[ExitStack]:
+    with ExitStack() as opened:
+        yield opened
+
+
+@pytest.fixture
+def desk(stack: ExitStack) -> Desk:
+    """Return a link that listens."""
+    made = Desk()
+    stack.callback(made.link.close)
+    made.until(lambda: made.said('listens on'))
+    return made
+
+
+def visitor(desk: Desk, stack: ExitStack) -> socket.socket:
+    """Connect, and wait until the link has noticed."""
+    before = desk.link.peer
+    one = stack.enter_context(closing(socket.create_connection(('127.0.0.1', desk.port))))
+    desk.until(lambda: desk.link.peer not in ('', before), 'the peer')
+    return one
+
+
+def test_messages_go_both_ways(desk: Desk, stack: ExitStack) -> None:
+    """With the client of pyigtl; and the link has no thread."""
+    threads = active_count()
+    client = pyigtl.OpenIGTLinkClient(port=desk.port)
+    stack.callback(client.stop)
+    desk.until(lambda: desk.link.peer, 'the client')
+    assert active_count() == threads + 1
+    client.send_message(pyigtl.StringMessage('1 2 3', device_name=TARGET), wait=False)
+    client.send_message(pyigtl.StringMessage('1 2 3', device_name='Other'), wait=False)
+    assert desk.link.send(MESSAGE)
+    desk.until(lambda: desk.frames and client.incoming_messages, 'the messages')
+    assert [(one.kind, one.device) for one in desk.frames] == [('STRING', TARGET)]
+    assert list(client.incoming_messages) == [TARGET]
+
+
+@pytest.mark.parametrize('words', [b'', MESSAGE[:30], MESSAGE[:70]])
+def test_a_peer_that_leaves_makes_room_for_the_next(
+    desk: Desk, stack: ExitStack, words: bytes
+) -> None:
+    """Also within a header or a body, after which pyigtl's own server would turn for ever."""
+    for _ in range(3):
+        one = visitor(desk, stack)
+        one.sendall(words)
+        one.close()
+        desk.until(lambda: not desk.link.peer, 'the end')
+    assert desk.said('is gone: it closed the connection')
+    one = visitor(desk, stack)
+    one.sendall(MESSAGE)
+    desk.until(lambda: desk.frames, 'the message')
+
+
+def test_a_peer_that_is_killed_makes_room_for_the_next(desk: Desk, stack: ExitStack) -> None:
+    """Its system resets the connection, while something is on its way."""
+    one = visitor(desk, stack)
+    one.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack('ii', 1, 0))
+    desk.link.send(MESSAGE)
+    one.close()
+    desk.until(lambda: not desk.link.peer, 'the end')
+    assert not desk.link.send(MESSAGE)
+    visitor(desk, stack)
+
+
+def test_what_was_said_before_the_end_counts(desk: Desk, stack: ExitStack) -> None:
+    """A script may connect, send a target and leave."""
+    with closing(socket.create_connection(('127.0.0.1', desk.port))) as one:
+        one.sendall(MESSAGE)
+    desk.until(lambda: desk.frames, 'the message')
+    desk.until(lambda: not desk.link.peer, 'the end')
+
+
+@pytest.mark.parametrize(
+    ('words', 'line'),
+    [
+        (
+            b'GET / HTTP/1.1\r\n' + b'Accept: */*\r\n' * 5,
+            'refused: not OpenIGTLink',
+        ),
+        (HEADER.pack(1, b'IMAGE', b'', 0, 0, 2**63, 0), 'of 9223372036854775808 bytes'),
+    ],
+)
+def test_another_protocol_ends_the_connection(
+    desk: Desk, stack: ExitStack, words: bytes, line: str
+) -> None:
+    """With one line a second, however often it comes."""
+    for _ in range(5):
+        visitor(desk, stack).sendall(words)
+        desk.until(lambda: not desk.link.peer, 'the end')
+    assert sum(line in said for said in desk.lines) == 1
+    assert desk.journal.refused == 5
+    assert '\n' not in ''.join(desk.lines)
+
+
+def test_a_second_peer_is_turned_away(desk: Desk, stack: ExitStack) -> None:
+    """One commands; the first stays."""
+    first = visitor(desk, stack)
+    peer = desk.link.peer
+    second = stack.enter_context(closing(socket.create_connection(('127.0.0.1', desk.port))))
+    desk.until(lambda: desk.said(f'turned away: {peer} is connected'), 'the line')
+    second.settimeout(60.0)
+    assert second.recv(1) == b''
+    assert desk.link.peer == peer
+    first.sendall(MESSAGE)
+    desk.until(lambda: desk.frames, 'the message')
+
+
+def test_it_listens_on_its_address_only(desk: Desk) -> None:
+    """Other addresses, of this machine here, find nobody."""
+    with pytest.raises(ConnectionRefusedError):
+        socket.create_connection(('127.0.0.2', desk.port))
+
+
+def test_a_peer_that_does_not_read_loses_messages_and_then_the_connection(
+    desk: Desk, stack: ExitStack
+) -> None:
+    """What waits is bounded, and nothing waits for it."""
+    visitor(desk, stack)
+    sent = 0
+    while desk.link.send(bytes(50_000)):
+        sent += 1
+        assert sent < 1000
+    desk.poll()
+    assert desk.said('reads too slowly: messages are left out')
+    assert desk.link.left_out == 1
+    desk.ahead += 6.0
+    desk.until(lambda: not desk.link.peer, 'the end')
+    assert desk.said('it has read nothing for 5 s')
+    visitor(desk, stack)
+
+
+def test_a_message_arrives_whole_or_not_at_all(desk: Desk, stack: ExitStack) -> None:
+    """A peer that reads in bursts can follow the stream from message to message."""
+    one = visitor(desk, stack)
+    one.settimeout(60.0)
+    body = bytes(range(256)) * 100
+    message = HEADER.pack(1, b'POINT', b'a', 0, 0, len(body), 0) + body
+    sent = 0
+    while desk.link.send(message):
+        sent += 1
+        assert sent < 1000
+    data = bytearray()
+    while len(data) < sent * len(message):
+        desk.poll()
+        data += one.recv(1 << 20)
+    assert data == sent * message
+
+
+def test_a_port_that_is_in_use_is_said_and_tried_again(stack: ExitStack) -> None:
+    """As soon as it is free the link listens."""
+    other = stack.enter_context(closing(socket.create_server(('127.0.0.1', 0))))
+    desk = Desk(port=other.getsockname()[1])
+    stack.callback(desk.link.close)
+    for _ in range(3):
+        desk.poll()
+        desk.ahead += 1.5
+    assert [line for line in desk.lines if 'the port is in use' in line] == [
+        f'cannot listen on 127.0.0.1:{desk.port}: the port is in use; tries again every 1 s'
+    ]
+    assert desk.link.complaint == desk.link.state
+    other.close()
+    desk.ahead += 1.5
+    desk.until(lambda: desk.said('listens on'), 'the port')
+    assert desk.link.complaint == ''
+    visitor(desk, stack)
+
+
+def test_as_client_it_connects_whenever_there_is_a_server(stack: ExitStack) -> None:
+    """Before, after, and again when it has been away."""
+    desk = Desk(role='client')
+    stack.callback(desk.link.close)
+    desk.until(lambda: desk.said('cannot connect to'), 'the line')
+    for _ in range(2):
+        with ExitStack() as while_it_is_there:
+            server = socket.create_server(('127.0.0.1', desk.port))
+            while_it_is_there.callback(server.close)
+            desk.until(lambda: desk.link.peer, 'the server')
+            came, _address = server.accept()
+            while_it_is_there.callback(came.close)
+            came.settimeout(60.0)
+            came.sendall(MESSAGE)
+            assert desk.link.send(MESSAGE)
+            desk.until(lambda: desk.frames, 'the message')
+            assert came.recv(1 << 16) == MESSAGE
+            desk.frames.clear()
+        desk.until(lambda: not desk.link.peer, 'the end')
+
+
+def test_after_the_end_it_can_be_opened_again(desk: Desk, stack: ExitStack) -> None:
+    """As a node that is deactivated and activated."""
+    one = visitor(desk, stack)
+    desk.link.close()
+    one.settimeout(60.0)
+    assert one.recv(1) == b''
+    with pytest.raises(ConnectionRefusedError):
+        socket.create_connection(('127.0.0.1', desk.port))
+    desk.poll()
+    visitor(desk, stack)
