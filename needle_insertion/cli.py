@@ -22,6 +22,7 @@ from needle_ros.errors import JobError, NeedleError
 #: Subcommands, each a module of `needle_insertion.commands`, and what the help says of them.
 COMMANDS: Final[Mapping[str, str]] = {
     'demo': 'insertion, recording, identification and a report',
+    'run': 'bring the nodes up, and tell them where to go',
     'inspect': 'what recordings hold, and how to identify from them',
     'identify': 'fit parameters to recordings',
     'experiment': 'record an experiment on the simulated robot',

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import MutableMapping
+from collections.abc import Mapping, MutableMapping
 from pathlib import Path
 from typing import Final
+
+from needle_ros.errors import ParameterError
 
 #: Environment variable of ROS 2: how far a node looks for others.
 RANGE: Final = 'ROS_AUTOMATIC_DISCOVERY_RANGE'
@@ -20,6 +22,12 @@ LOCAL: Final = {
     RANGE: 'SUBNET',
     **dict.fromkeys(PROFILES, str(Path(__file__).with_name('loopback.xml'))),
 }
+
+#: Environment variable of ROS 2: nodes of another domain do not see each other.
+DOMAIN: Final = 'ROS_DOMAIN_ID'
+
+#: The largest domain whose ports exist, with those of some processes.
+_LARGEST_DOMAIN: Final = 232
 
 #: Ranges that let other machines in.
 OPEN: Final = ('SUBNET', 'SYSTEM_DEFAULT')
@@ -43,3 +51,31 @@ def stay_local(environment: MutableMapping[str, str]) -> None:
         environment.update(LOCAL)
     else:
         environment.setdefault(RANGE, 'LOCALHOST')
+
+
+def domain_of(environment: Mapping[str, str]) -> int:
+    """
+    Return the domain that an environment chooses.
+
+    Parameters
+    ----------
+    environment : Mapping[str, str]
+        Environment.
+
+    Returns
+    -------
+    int
+        The domain; 0 if none is chosen.
+
+    Raises
+    ------
+    ParameterError
+        If it is not a number of a domain.
+
+    """
+    text = environment.get(DOMAIN) or '0'
+    if not text.isascii() or not text.isdecimal() or int(text) > _LARGEST_DOMAIN:
+        raise ParameterError(
+            f'{DOMAIN} must be a whole number from 0 to {_LARGEST_DOMAIN}, got {text!r}'
+        )
+    return int(text)

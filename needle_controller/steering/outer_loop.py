@@ -760,6 +760,7 @@ class OuterLoop:
                     f'readings of the tip scatter: a look is good to {1e3 * seen.error:.2f} mm, '
                     f'believed are {1e3 * noise:.2f} mm (belief.noise)'
                 )
+        values['phase'] = self.phase.value
         values['inputs refused'] = self.journal.refused
         values['last complaint'] = self.journal.complaint
         for stream in (self._joint_stream, self._tip_stream):

@@ -32,6 +32,8 @@ class NodeProcess:
         Environment with the domain.
     log : file
         Receives what the node prints.
+    file : Path, optional
+        ROS parameter file; what `parameters` says counts more.
 
     """
 
@@ -41,11 +43,12 @@ class NodeProcess:
         parameters: Mapping[str, object],
         environment: Mapping[str, str],
         log: IO[str],
+        file: Path | None = None,
     ) -> None:
         self.name = name
         self.killed = False
         self._log = log
-        settings = []
+        settings = [] if file is None else ['--params-file', str(file)]
         for key, value in parameters.items():
             # One line of YAML, without the end-of-document mark of a bare scalar.
             text = yaml.safe_dump(value, default_flow_style=True, width=10_000).splitlines()[0]

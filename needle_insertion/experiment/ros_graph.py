@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from contextlib import suppress
+from contextlib import AbstractContextManager, nullcontext, suppress
 from functools import partial
 import gc
 import os
@@ -17,7 +17,7 @@ from domain_coordinator import domain_id
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from needle_insertion.experiment.node_process import GraphError, NodeProcess
-from needle_ros.network import LOCAL
+from needle_ros.network import domain_of, LOCAL, stay_local
 from needle_ros.run_node import END_WITH_PARENT
 from rclpy.client import Client
 from rclpy.context import Context
@@ -50,30 +50,43 @@ class Graph:
     executor : type of executor
         Runs the nodes of this process in the thread of the caller: an error in a callback is an
         error of the caller.
+    shared : bool
+        Whether it is the domain of the user instead, with whoever else is on it, and open to
+        other machines if the environment says so.
 
     """
 
-    def __init__(self, logs: Path, executor: Callable[..., Executor] = EventsExecutor) -> None:
+    def __init__(
+        self,
+        logs: Path,
+        executor: Callable[..., Executor] = EventsExecutor,
+        *,
+        shared: bool = False,
+    ) -> None:
         self._logs = logs
         self._executor_kind = executor
+        self._shared = shared
         self._processes: list[NodeProcess] = []
         self._files: list[IO[str]] = []
         self._nodes: list[Node] = []
         self._life_cycles: dict[str, Client] = {}
 
     def __enter__(self) -> Graph:
-        self._domain = domain_id()
-        domain = self._domain.__enter__()
+        # The context of this process reads the environment too.
+        if self._shared:
+            stay_local(os.environ)
+            self._domain: AbstractContextManager[int] = nullcontext(domain_of(os.environ))
+        else:
+            os.environ.update(LOCAL)
+            self._domain = domain_id()
+        self.domain = self._domain.__enter__()
         self.environment = {
             **os.environ,
-            'ROS_DOMAIN_ID': str(domain),
-            **LOCAL,
+            'ROS_DOMAIN_ID': str(self.domain),
             END_WITH_PARENT: '1',
         }
-        # The context of this process reads the environment too.
-        os.environ.update(LOCAL)
         self.context = Context()
-        self.context.init(domain_id=domain)
+        self.context.init(domain_id=self.domain)
         self.executor = self._executor_kind(context=self.context)
         return self
 
@@ -174,7 +187,12 @@ class Graph:
         node.create_subscription(kind, topic, partial(setattr, latest, 'message'), qos)
         return latest
 
-    def start(self, name: str, parameters: Mapping[str, object] | None = None) -> NodeProcess:
+    def start(
+        self,
+        name: str,
+        parameters: Mapping[str, object] | None = None,
+        file: Path | None = None,
+    ) -> NodeProcess:
         """
         Start a node of the suite as a process.
 
@@ -184,6 +202,8 @@ class Graph:
             A key of `NODES`.
         parameters : Mapping[str, object], optional
             Parameters by name.
+        file : Path, optional
+            ROS parameter file; what `parameters` says counts more.
 
         Returns
         -------
@@ -195,7 +215,7 @@ class Graph:
         # The process writes to it until the graph closes it.
         log = (self._logs / f'{name}.log').open('a', encoding='utf-8')
         self._files.append(log)
-        process = NodeProcess(name, parameters or {}, self.environment, log)
+        process = NodeProcess(name, parameters or {}, self.environment, log, file)
         self._processes.append(process)
         return process
 

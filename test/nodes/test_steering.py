@@ -295,3 +295,45 @@ def test_the_shipped_parameters_are_those_of_the_three_nodes(ros_graph: RosGraph
     target.publish(message)
     ros_graph.spin_until(lambda: moves, 'the first step')
     assert 'target' not in steering.diagnose()[2]['last complaint']
+
+
+def test_when_it_is_killed_needle_and_guide_rest_within_the_step(ros_graph: RosGraph) -> None:
+    """A robot ends the motion that it was sent last; no other follows."""
+    ros_graph.add(PlantNode, parameters={**PLANT, 'mode': 'robot', 'steering.bevel_load': [0.1]})
+    user = ros_graph.node('user')
+    states = ros_graph.latest(user, JointState, 'joint_states', SENSOR)
+    moves = ros_graph.listen(user, JointTrajectory, 'joint_trajectory', COMMAND)
+    target = user.create_publisher(PointStamped, 'target', COMMAND)
+    steering = ros_graph.start('steering', {**STEERING, 'speed': 0.01})
+    message = PointStamped()
+    message.header.frame_id = 'needle_entry'
+    message.point.x, message.point.y, message.point.z = TARGET
+    sent = 0
+
+    def at(name: str) -> float:
+        return float(states.message.position[states.message.name.index(name)])
+
+    def goes_in() -> bool:
+        nonlocal sent
+        if states.message is None or target.get_subscription_count() == 0:
+            return False
+        stamp = states.message.header.stamp
+        if not moves and stamp.sec > sent:
+            # What comes before the sensors is refused: again a second later.
+            sent = stamp.sec
+            target.publish(message)
+        return 0.012 < at('insertion') < 0.019
+
+    ros_graph.spin_until(goes_in, 'the second step', 180.0)
+    steering.kill()
+    seen: list[tuple[float, ...]] = []
+
+    def rests() -> bool:
+        now = (at('insertion'), at('guide_x'), at('guide_z'))
+        seen.append(now)
+        return len(seen) > 40 and bool((np.ptp(seen[-40:], axis=0) < 1e-6).all())
+
+    ros_graph.spin_until(rests, 'rest')
+    # The step ends at 21 mm.
+    assert seen[-1][0] < 0.0215
+    assert moves[-1].points[-1].positions[0] == pytest.approx(seen[-1][0], abs=1e-3)

@@ -1,0 +1,104 @@
+"""`needle run`: the nodes of an insertion, and a person who tells them where to go."""
+
+from __future__ import annotations
+
+import argparse
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from needle_insertion.commands.common import check_folder, Command
+from needle_ros.errors import ParameterError
+
+
+def _add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `needle run`."""
+    parser.add_argument(
+        '--hardware', action='store_true', help='no plant: a robot publishes joint_states'
+    )
+    parser.add_argument(
+        '--steering', action='store_true', help='a needle that bends, and the node that aims it'
+    )
+    parser.add_argument('--preset', help='constants of the needle (default that of the file)')
+    parser.add_argument('--law', help='control law (default that of the file)')
+    parser.add_argument(
+        '--params-file',
+        type=Path,
+        metavar='FILE',
+        help='ROS parameter file (default insertion.yaml or steering.yaml of this package)',
+    )
+    parser.add_argument(
+        '-p',
+        action='append',
+        default=[],
+        dest='parameters',
+        metavar='NODE.NAME=VALUE',
+        help='any parameter, such as controller.force_limit=5; repeatable',
+    )
+    parser.add_argument(
+        '-o',
+        '--output',
+        type=Path,
+        help='folder for recording and logs (default needle_runs/ and the time)',
+    )
+    parser.add_argument('--no-recording', action='store_true', help='do not record')
+
+
+def _run(options: argparse.Namespace) -> int:
+    """Run the nodes until `quit`; return 0."""
+    # Imported here: rclpy takes a second.
+    from needle_insertion.live.session import config_file, run, Session
+
+    if options.output is None:
+        options.output = Path('needle_runs') / f'{datetime.now().astimezone():%Y-%m-%d_%H-%M-%S}'
+    if options.output.exists():
+        raise ParameterError(f'{options.output} exists; name another folder')
+    check_folder(options.output)
+    file = options.params_file or config_file(
+        'steering.yaml' if options.steering else 'insertion.yaml'
+    )
+    if not file.is_file():
+        raise ParameterError(f'--params-file {file} does not exist')
+    nodes: dict[str, dict[str, Any]] = {} if options.hardware else {'plant': {}}
+    nodes['controller'] = {}
+    if options.steering:
+        nodes['steering'] = {}
+        nodes['controller']['steered'] = True
+        if not options.hardware:
+            nodes['plant']['steered'] = True
+    if options.preset:
+        for values in nodes.values():
+            values['model.preset'] = options.preset
+    if options.law:
+        nodes['controller']['law'] = options.law
+    for word in options.parameters:
+        node, name, value = _parameter(word)
+        if node not in nodes:
+            raise ParameterError(f'-p {word}: the nodes are {", ".join(nodes)}, got {node!r}')
+        nodes[node][name] = value
+    return run(
+        Session(
+            nodes=nodes,
+            file=file,
+            folder=options.output,
+            records=not options.no_recording,
+        )
+    )
+
+
+def _parameter(word: str) -> tuple[str, str, Any]:
+    """Read NODE.NAME=VALUE."""
+    # Imported here: the help does not need it.
+    import yaml
+
+    name, sign, text = word.partition('=')
+    node, dot, name = name.partition('.')
+    if not (sign and dot and name and text):
+        raise ParameterError(f'-p takes NODE.NAME=VALUE, got {word!r}')
+    try:
+        return node, name, yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise ParameterError(f'-p {word}: {text!r} is not a value in YAML') from error
+
+
+COMMAND = Command(_add_arguments, _run)

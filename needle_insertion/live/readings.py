@@ -1,0 +1,130 @@
+"""The newest measurements of a running graph, read when somebody looks."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Final
+
+from needle_ros import contract
+from needle_ros.base_node import message_class, profile
+from needle_ros.contract import Topic
+from needle_ros.errors import MessageError
+from needle_ros.wire import Reader, Reading
+from rclpy.node import Node
+
+#: A reference that is this near to its target has reached it [m]; one slower than this rests
+#: [m/s].
+_SAME: Final = 1e-9
+
+_TOPICS: Final = (
+    contract.JOINT_STATES,
+    contract.BASE_WRENCH,
+    contract.TIP_DEFLECTION,
+    contract.REFERENCE,
+)
+
+
+class Readings:
+    """
+    Keeps the newest message of each sensor and of the reference.
+
+    They come a thousand times a second: only those that are looked at are read.
+
+    Parameters
+    ----------
+    node : Node
+        Node of this process that subscribes.
+
+    """
+
+    def __init__(self, node: Node) -> None:
+        self._newest: dict[str, bytes] = {}
+        self._readers = {topic.name: Reader(topic.type_name) for topic in _TOPICS}
+        for topic in _TOPICS:
+            node.create_subscription(
+                message_class(topic.type_name),
+                topic.name,
+                partial(self._newest.__setitem__, topic.name),
+                profile(topic.qos._replace(depth=1)),
+                raw=True,
+            )
+
+    def newest(self, topic: Topic) -> Reading | None:
+        """
+        Read the newest message of a topic.
+
+        Parameters
+        ----------
+        topic : Topic
+            `JOINT_STATES`, `BASE_WRENCH`, `TIP_DEFLECTION` or `REFERENCE` of the contract.
+
+        Returns
+        -------
+        Reading or None
+            What it holds; None before the first, and if it is none.
+
+        """
+        data = self._newest.get(topic.name)
+        try:
+            return None if data is None else self._readers[topic.name].read(data)
+        except MessageError:
+            # Controller and recorder say so; here the needle is just not seen.
+            return None
+
+    def insertion(self, topic: Topic = contract.JOINT_STATES) -> tuple[float, float] | None:
+        """
+        Return inserted length and velocity.
+
+        Parameters
+        ----------
+        topic : Topic
+            `JOINT_STATES` for what is measured, `REFERENCE` for what is wanted.
+
+        Returns
+        -------
+        tuple of float or None
+            Inserted length [m] and velocity [m/s]; None if they are not known.
+
+        """
+        reading = self.newest(topic)
+        if reading is None or contract.INSERTION not in reading.names:
+            return None
+        at = reading.names.index(contract.INSERTION)
+        positions, velocities, *_ = reading.values
+        if len(positions) <= at or len(velocities) <= at:
+            return None
+        return positions[at], velocities[at]
+
+    def reference_rests_at(self, target: tuple[float, ...]) -> bool:
+        """
+        Tell whether the reference has arrived.
+
+        Parameters
+        ----------
+        target : tuple of float
+            Inserted length to reach [m]; empty if there is none.
+
+        Returns
+        -------
+        bool
+            Whether it rests there.
+
+        """
+        reference = self.insertion(contract.REFERENCE)
+        if reference is None or not target:
+            return False
+        depth, velocity = reference
+        return abs(depth - target[0]) < _SAME and abs(velocity) < _SAME
+
+    def line(self) -> str:
+        """Return where the needle is, what it takes, and where its tip is, for people."""
+        words = []
+        if (insertion := self.insertion()) is not None:
+            words.append(f'depth {1e3 * insertion[0]:.2f} mm')
+            words.append(f'{1e3 * insertion[1]:+.1f} mm/s')
+        if (wrench := self.newest(contract.BASE_WRENCH)) is not None:
+            words.append(f'force {wrench.values[0][1]:+.2f} N')
+        if (tip := self.newest(contract.TIP_DEFLECTION)) is not None:
+            x, _, z = tip.values[0]
+            words.append(f'tip x {1e3 * x:+.2f} mm, z {1e3 * z:+.2f} mm')
+        return ', '.join(words) or 'nothing is measured'

@@ -1,0 +1,155 @@
+"""Lines that a person types or a script gives, and lines for the person."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from queue import SimpleQueue
+import readline
+import sys
+import termios
+from threading import Semaphore, Thread
+from typing import Final
+
+from needle_ros.errors import ParameterError
+
+_PROMPT: Final = 'needle> '
+
+#: Goes to the begin of a line and clears it.
+_CLEAR: Final = '\r\033[K'
+
+
+class Screen:
+    """
+    The terminal, or a script on the standard input.
+
+    Attributes
+    ----------
+    typed : bool
+        Whether a person types the lines.
+
+    """
+
+    def __init__(self) -> None:
+        self.typed = bool(sys.stdin and sys.stdin.isatty() and sys.stdout.isatty())
+        self._lines: SimpleQueue[str | Exception | None] = SimpleQueue()
+        self._wanted = Semaphore(0)
+        self._asked = self._shown = False
+
+    @contextmanager
+    def reading(self) -> Iterator[None]:
+        """Read lines, in a thread of its own: nodes go on while a person types."""
+        before = termios.tcgetattr(sys.stdin) if self.typed else None
+        Thread(target=self._read, daemon=True).start()
+        try:
+            yield
+        finally:
+            if before is not None:
+                # The thread may still be waiting for a line, with a terminal set up for that.
+                termios.tcsetattr(sys.stdin, termios.TCSADRAIN, before)
+                if self._asked:
+                    sys.stdout.write('\n')
+
+    def complete(self, words: Sequence[str]) -> None:
+        """
+        Complete words with the tab key.
+
+        Parameters
+        ----------
+        words : sequence of str
+            The words.
+
+        """
+
+        def complete(begin: str, number: int) -> str | None:
+            found = [word for word in words if word.startswith(begin)]
+            return found[number] if number < len(found) else None
+
+        readline.set_completer(complete)
+        readline.parse_and_bind('tab: complete')
+
+    def _read(self) -> None:
+        while self._wanted.acquire():
+            self._lines.put(self._line())
+
+    def _line(self) -> str | Exception | None:
+        try:
+            return input(_PROMPT if self.typed else '')
+        except EOFError:
+            return None
+        except (OSError, ValueError, RuntimeError) as error:
+            # It cannot be read, is no text, or there is none at all.
+            return error
+
+    def ask(self) -> None:
+        """Let the next line come."""
+        self._clear()
+        self._asked = True
+        self._wanted.release()
+
+    @property
+    def answered(self) -> bool:
+        """Whether it has come."""
+        return not self._lines.empty()
+
+    def take(self) -> str | None:
+        """
+        Return the line.
+
+        Returns
+        -------
+        str or None
+            The line; None at the end of all lines.
+
+        Raises
+        ------
+        ParameterError
+            If it is not text.
+
+        """
+        line = self._lines.get()
+        if isinstance(line, Exception):
+            raise ParameterError(f'the standard input is not readable as text: {line}')
+        self._asked = False
+        if self.typed:
+            if line is None:
+                sys.stdout.write('\n')
+        elif line:
+            sys.stdout.write(f'{_PROMPT}{line}\n')
+        return line
+
+    def say(self, line: str) -> None:
+        """
+        Write a line for the person.
+
+        Parameters
+        ----------
+        line : str
+            One line, or several.
+
+        """
+        self._clear()
+        sys.stdout.write(f'{line}\n')
+        if self._asked and self.typed:
+            sys.stdout.write(f'{_PROMPT}{readline.get_line_buffer()}')
+        sys.stdout.flush()
+
+    def show(self, line: str) -> None:
+        """
+        Show a line that the next one replaces; nothing in a script.
+
+        Parameters
+        ----------
+        line : str
+            The line.
+
+        """
+        if self.typed:
+            sys.stdout.write(f'{_CLEAR}{line}')
+            sys.stdout.flush()
+            self._shown = True
+
+    def _clear(self) -> None:
+        if self.typed and (self._shown or self._asked):
+            sys.stdout.write(_CLEAR)
+        self._shown = False

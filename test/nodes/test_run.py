@@ -1,0 +1,270 @@
+"""`needle run`: nodes that a person, or a script, tells where to go."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+import os
+from pathlib import Path
+import pty
+import re
+import select
+import signal
+import subprocess
+import sys
+import time
+
+from needle_dynamics.plant_node import PlantNode
+from needle_identification import read_topic
+from needle_insertion.replay.rerun import verify
+import pytest
+from support.ros_graph import RosGraph
+
+#: Longest time for nodes to start and to do what a test wants, on a machine that is busy [s].
+_LONGEST = 300.0
+
+
+#: Lines that are not understood, or refused, and what is said of them.
+MISTAKES = [
+    ('targte 0.05', "unknown word 'targte'; did you mean target? Valid are target, wait"),
+    ('target', 'target takes DEPTH | X Y Z, got nothing'),
+    ('target deep', "'deep' is not a length, such as 0.05 or 50mm"),
+    ('target 1e400', "'1e400' is not a length"),
+    ('target 0.001 0.05 0', 'a target beside the axis needs the node steering: --steering'),
+    ('wait soon', 'wait takes [SECONDS], got soon'),
+    ('wait 1', 'there is no target to wait for'),
+    ('law bang', "law takes one of adaptive, inverse_dynamics, pid, got 'bang'"),
+    ('pause now', 'pause takes nothing, got now'),
+    ('set controller force_limit', 'set takes NODE NAME VALUE, got controller force_limit'),
+    ('set nobody x 1', 'nobody x = 1: no node nobody'),
+    ('set controller force_limit 3', 'force_limit: cannot change while configured'),
+    ("target '0.05", 'no closing quotation'),
+    ('set plant fault.kind [1, {', 'is not a value in YAML'),
+]
+
+
+def command(ros_graph: RosGraph, folder: Path, *words: str) -> tuple[list[str], dict[str, str]]:
+    """Return the command line, and the environment with the domain of the test."""
+    line = [sys.executable, '-m', 'needle_insertion.cli', 'run', '-o', str(folder), *words]
+    return line, {**ros_graph.environment}
+
+
+def told(
+    ros_graph: RosGraph, folder: Path, script: Sequence[str], *words: str
+) -> tuple[int, str, str]:
+    """Run a script; return the status, and what was said and complained of."""
+    line, environment = command(ros_graph, folder, *words)
+    process = subprocess.Popen(
+        line,
+        env=environment,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stdin is not None
+    process.stdin.write('\n'.join(script))
+    process.stdin.close()
+    process.stdin = None
+    begin = time.monotonic()
+    # Nodes of this process go on meanwhile.
+    while process.poll() is None and time.monotonic() - begin < _LONGEST:
+        ros_graph.executor.spin_once(timeout_sec=0.05)
+    if process.poll() is None:
+        process.send_signal(signal.SIGTERM)
+    said, complained = process.communicate(timeout=60.0)
+    return process.returncode, said, complained
+
+
+def test_a_script_inserts_changes_the_law_and_retracts(
+    ros_graph: RosGraph, tmp_path: Path
+) -> None:
+    """The recording has every sample, and can be computed again."""
+    status, said, complained = told(
+        ros_graph,
+        tmp_path / 'run',
+        [
+            '# a comment',
+            'set controller retract_depth 0.02',
+            'target 23mm',
+            'wait 60',
+            'pause',
+            'resume',
+            'law pid',
+            'target 0.025',
+            'wait 60',
+            'status',
+            'retract',
+            'wait 60',
+            'stop',
+            'clear',
+            'help',
+            'quit',
+            'target 0.1',
+        ],
+        '-p',
+        'controller.reference.speed=0.02',
+    )
+    assert (status, complained) == (0, ''), said
+    at = [float(found) for found in re.findall(r'^depth (\S+) mm', said, re.MULTILINE)]
+    # It settles within a second to a tenth of a millimeter or so, under both laws.
+    assert at == pytest.approx([23.0, 25.0, 25.0, 20.0], abs=0.3), said
+    assert 'controller  OK     active' in said
+    assert 'needle> quit\nrecorded to' in said
+    bag = tmp_path / 'run' / 'bag'
+    assert [message.point.y for _, message in read_topic(bag, '/target')] == [0.023, 0.025]
+    (run,) = verify(bag)
+    assert run.verdict == 'identical'
+    assert (tmp_path / 'run' / 'logs' / 'plant.log').is_file()
+
+
+def test_a_script_ends_with_what_cannot_be_done(ros_graph: RosGraph, tmp_path: Path) -> None:
+    """A refused target is an error of the script: what follows it is not done."""
+    script = ['target 5', 'target 0.03', 'wait']
+    status, said, complained = told(ros_graph, tmp_path / 'run', script, '--no-recording')
+    assert status == 1
+    assert re.fullmatch(r'error: target refused: .* 5 m.*\n|error: target .*\n', complained)
+    assert 'needle> target 0.03' not in said
+    assert not (tmp_path / 'run' / 'bag').exists()
+
+
+def test_a_robot_takes_the_place_of_the_plant(ros_graph: RosGraph, tmp_path: Path) -> None:
+    ros_graph.add(PlantNode, parameters={'rate': 500.0, 'depth': 0.02})
+    status, said, complained = told(
+        ros_graph,
+        tmp_path / 'run',
+        ['target 22mm', 'wait 100'],
+        '--hardware',
+        '-p',
+        'controller.rate=500',
+    )
+    assert (status, complained) == (0, ''), said
+    assert 'starting recorder, controller;' in said
+    assert 'depth 22.' in said or 'depth 21.9' in said
+
+
+def test_a_second_plant_is_refused(ros_graph: RosGraph, tmp_path: Path) -> None:
+    """Before anything moves."""
+    ros_graph.add(PlantNode, parameters={'rate': 200.0})
+    status, said, complained = told(ros_graph, tmp_path / 'run', ['target 0.05'])
+    assert status == 1
+    assert 'error: 2 nodes publish joint_states on domain' in complained
+    assert 'there is a plant already. End it, or choose another ROS_DOMAIN_ID' in complained
+    assert 'needle> target' not in said
+
+
+def test_the_tip_is_steered_to_a_point(ros_graph: RosGraph, tmp_path: Path) -> None:
+    status, said, complained = told(
+        ros_graph,
+        tmp_path / 'run',
+        ['target 1mm 31mm -0.5mm', 'wait', 'status', 'retract', 'wait'],
+        '--steering',
+        '-p', 'steering.look_time=0.3',
+        '-p', 'steering.patience=60',
+        '-p', 'steering.measurement_timeout=5',
+    )  # fmt: skip
+    assert (status, complained) == (0, ''), said
+    assert re.search(r'steering +OK +done: the tip is', said), said
+    *_, end = re.findall(r'^depth (\S+) mm', said, re.MULTILINE)
+    assert float(end) == pytest.approx(5.0, abs=0.3)
+
+
+class Typed:
+    """The command in a terminal."""
+
+    def __init__(self, ros_graph: RosGraph, folder: Path) -> None:
+        line, environment = command(ros_graph, folder)
+        master, slave = pty.openpty()
+        self.graph, self.master = ros_graph, master
+        self.process = subprocess.Popen(
+            line,
+            env={**environment, 'TERM': 'xterm'},
+            stdin=slave,
+            stdout=slave,
+            stderr=slave,
+            start_new_session=True,
+        )
+        os.close(slave)
+        self.seen = ''
+
+    def expect(self, pattern: str) -> None:
+        """Wait until it has written something, and forget what came up to there."""
+        begin = time.monotonic()
+        while (found := re.search(pattern, self.seen)) is None:
+            assert time.monotonic() - begin < _LONGEST, self.seen
+            ready, _, _ = select.select([self.master], [], [], 0.1)
+            if ready:
+                self.seen += os.read(self.master, 65536).decode(errors='replace')
+            assert ready or self.process.poll() is None, self.seen
+        self.seen = self.seen[found.end() :]
+
+    def type(self, text: str) -> None:
+        """Type."""
+        os.write(self.master, text.encode())
+
+
+def test_typed_words_are_completed_and_errors_do_not_end_it(
+    ros_graph: RosGraph, tmp_path: Path
+) -> None:
+    """Tab completes, a mistake is named, Ctrl-D ends it with a complete recording."""
+    typed = Typed(ros_graph, tmp_path / 'run')
+    typed.expect('needle> ')
+    typed.type('targ\t 5\n')
+    typed.expect('error: target')
+    typed.expect('needle> ')
+    typed.type('target 21mm\n')
+    typed.expect('controller: on its way')
+    typed.type('wait\n')
+    # A line that changes while it goes.
+    typed.expect(r'\r\x1b\[Kdepth')
+    typed.expect(r'depth 2[01]\.\d\d mm[^\n]*\r\n')
+    typed.expect('needle> ')
+    typed.type('\x04')
+    typed.expect('recorded to')
+    assert typed.process.wait(60.0) == 0
+    assert list(read_topic(tmp_path / 'run' / 'bag', '/target'))
+
+
+def test_ctrl_c_ends_all_and_the_recording_is_whole(ros_graph: RosGraph, tmp_path: Path) -> None:
+    """So does a terminal that is closed; the status is that of an interrupt."""
+    typed = Typed(ros_graph, tmp_path / 'run')
+    typed.expect('needle> ')
+    typed.type('target 100mm\n')
+    typed.expect('on its way')
+    typed.type('wait\n')
+    typed.expect(r'depth')
+    typed.type('\x03')
+    typed.expect('interrupted')
+    assert typed.process.wait(60.0) == 130
+    assert (tmp_path / 'run' / 'bag' / 'metadata.yaml').is_file()
+
+
+def children(pid: int) -> list[int]:
+    """Return the processes that a process has started."""
+    return [int(one) for one in Path(f'/proc/{pid}/task/{pid}/children').read_text().split()]
+
+
+def words_of(pid: int) -> str:
+    """Return the command line of a process."""
+    return Path(f'/proc/{pid}/cmdline').read_text()
+
+
+def test_a_node_that_dies_ends_the_session(ros_graph: RosGraph, tmp_path: Path) -> None:
+    """With status 1 and the node's name; also while nothing is typed."""
+    typed = Typed(ros_graph, tmp_path / 'run')
+    typed.expect('needle> ')
+    (pid,) = [one for one in children(typed.process.pid) if 'controller_node' in words_of(one)]
+    os.kill(pid, signal.SIGKILL)
+    typed.expect('error: controller ended early with status -9')
+    assert typed.process.wait(60.0) == 1
+
+
+def test_what_is_not_understood_is_named(ros_graph: RosGraph, tmp_path: Path) -> None:
+    """One line says what was given and what is valid; the session goes on."""
+    typed = Typed(ros_graph, tmp_path / 'run')
+    typed.expect('needle> ')
+    for line, complaint in MISTAKES:
+        typed.type(f'{line}\n')
+        typed.expect(f'error: [^\n]*{re.escape(complaint)}')
+        typed.expect('needle> ')
+    typed.type('quit\n')
+    assert typed.process.wait(60.0) == 0
