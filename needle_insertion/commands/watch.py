@@ -5,13 +5,20 @@ from __future__ import annotations
 import argparse
 import asyncio
 from contextlib import suppress
-import os
 from pathlib import Path
 import signal
 import sys
+from typing import TYPE_CHECKING
 
 from needle_insertion.commands.common import Command
 from needle_ros.errors import ParameterError, shown
+
+if TYPE_CHECKING:
+    # Takes long to import.
+    from needle_insertion.watch.server import Server
+
+#: What ends it.
+_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 #: Address and port by default; the port is that of `watch.server`, which takes long to import.
 HOST, PORT = '127.0.0.1', 8642
@@ -47,11 +54,9 @@ def _run(options: argparse.Namespace) -> int:
     """Serve the page until a signal comes."""
     if options.bag is not None and options.control:
         raise ParameterError('--control is for what is happening now: leave out it or the BAG')
-    try:
+    # One that comes before the page is served, or again at the end, ends it as well.
+    with suppress(KeyboardInterrupt):
         asyncio.run(_recorded(options) if options.bag is not None else _live(options))
-    except KeyboardInterrupt:
-        # It came before the page was served, or again at the end.
-        pass
     return 0
 
 
@@ -81,6 +86,24 @@ async def _live(options: argparse.Namespace) -> None:
             making.cancel()
             with suppress(asyncio.CancelledError):
                 await making
+
+
+async def _serve(server: Server, making: asyncio.Task[None] | None = None) -> None:
+    """Serve the page until a signal comes, or the frames end, which is an error."""
+    loop, ending = asyncio.get_running_loop(), asyncio.Event()
+    for one in _SIGNALS:
+        loop.add_signal_handler(one, ending.set)
+    await server.start()
+    try:
+        for line in server.words:
+            sys.stdout.write(f'{line}\n')
+        sys.stdout.flush()
+        ended = asyncio.create_task(ending.wait())
+        await asyncio.wait({ended, *filter(None, [making])}, return_when=asyncio.FIRST_COMPLETED)
+        if not ended.done() and making is not None:
+            making.result()
+    finally:
+        await server.end()
 
 
 COMMAND = Command(_add_arguments, _run)

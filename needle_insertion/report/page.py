@@ -67,6 +67,9 @@ def _contents(content: str) -> Markup:
     return Markup(f'<nav aria-label="Contents">\n{links}</nav>')  # noqa: S704
 
 
+#: Where the templates are, and what else pages are made of.
+TEMPLATE_FOLDER: Final = Path(__file__).with_name('templates')
+
 #: Templates of this folder.
 TEMPLATES: Final = Environment(
     loader=PackageLoader('needle_insertion.report'),

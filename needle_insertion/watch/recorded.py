@@ -18,7 +18,7 @@ from needle_insertion.watch.view import RATE, row, SPAN, View
 from needle_ros import contract
 from needle_ros.errors import MessageError, ParameterError
 from needle_ros.timing import NANOSECONDS
-from needle_ros.wire import Reader, Reading, read_line, read_string
+from needle_ros.wire import read_line, read_string, Reader, Reading
 
 #: Topics of which the page shows something; each also in a namespace.
 STREAMS: Final = (
@@ -34,7 +34,7 @@ _MOST: Final = 8192
 _HISTORY_RATE: Final = 10.0
 
 #: Speeds at which a recording may be shown, in multiples of that of its time.
-SLOWEST, FASTEST = 0.1, 50.0
+SLOWEST, FASTEST = 0.02, 50.0
 
 _Item = TypeVar('_Item')
 

@@ -107,6 +107,11 @@ class Control(Protocol):
         x, y, z : float
             Where it shall be [m].
 
+        Raises
+        ------
+        JobError
+            If nobody takes it.
+
         """
 
     async def ask(self, what: str) -> tuple[bool, str]:
@@ -122,6 +127,11 @@ class Control(Protocol):
         -------
         bool, str
             Whether it was done, and what is said of it.
+
+        Raises
+        ------
+        JobError
+            If there is no answer.
 
         """
 
@@ -182,9 +192,23 @@ class Server:
     @property
     def address(self) -> str:
         """URL of the page, with the token if there is one."""
-        host = f'[{self._host}]' if ':' in self._host else self._host
+        host = '127.0.0.1' if ip_address(self._host).is_unspecified else self._host
+        host = f'[{host}]' if ':' in host else host
         # What follows # stays in the browser.
         return f'http://{host}:{self._port}/' + (f'#token={self.token}' if self.token else '')
+
+    @property
+    def words(self) -> list[str]:
+        """What to say at the start, in lines."""
+        lines = [f'page: {self.address}']
+        if self.token:
+            lines.append('whoever has this address may move the needle: keep it to yourself')
+        elif not self._local:
+            lines.append(
+                f'other machines may look, by an address of this one and port {self._port}; '
+                'nobody may command here'
+            )
+        return [*lines, 'Ctrl-C ends it']
 
     async def start(self) -> None:
         """
@@ -293,8 +317,8 @@ class Server:
             content = _message(message)
             if 'ask' in content:
                 connection.begin(self._do(content), str(content['ask'])[:20])
-            elif content == {'seen': True}:
-                connection.seen()
+            elif content.keys() == {'seen'} and type(content['seen']) is int:
+                connection.seen(content['seen'])
             else:
                 connection.reader.take(content)
         except NeedleError as error:
@@ -319,10 +343,7 @@ class Server:
             return True, f'target {1e3 * x:g}, {1e3 * y:g}, {1e3 * z:g} mm sent'
         if what not in ASKED or message:
             raise ParameterError(f'ask must be one of target, {", ".join(ASKED)}, got {what!r}')
-        try:
-            return await self._control.ask(what)
-        except asyncio.TimeoutError:
-            raise JobError(f'no answer to {what}') from None
+        return await self._control.ask(what)
 
 
 class _Connection:
@@ -340,9 +361,9 @@ class _Connection:
         self._credit = asyncio.Semaphore(_AHEAD)
         self._ahead = 0
 
-    def seen(self) -> None:
-        """Note that a frame has been seen."""
-        if self._ahead:
+    def seen(self, number: int) -> None:
+        """Note that frames have been seen."""
+        for _ in range(min(number, self._ahead)):
             self._ahead -= 1
             self._credit.release()
 
@@ -385,9 +406,7 @@ class _Connection:
         return True
 
 
-def _file(
-    file: Path, kind: str
-) -> Callable[[web.Request], Awaitable[web.StreamResponse]]:
+def _file(file: Path, kind: str) -> Callable[[web.Request], Awaitable[web.StreamResponse]]:
     text = file.read_text(encoding='utf-8')
 
     async def answer(_request: web.Request) -> web.StreamResponse:

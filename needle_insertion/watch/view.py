@@ -323,9 +323,7 @@ class View:
                     'words': printable(status.message),
                     'age': round(age, 1),
                     'silent': age > _SILENT_NODE,
-                    'values': {
-                        key: printable(values[key]) for key in _SHOWN if values.get(key)
-                    },
+                    'values': {key: printable(values[key]) for key in _SHOWN if values.get(key)},
                 }
             )
         return sorted(nodes, key=lambda node: (-node['level'], node['name']))
