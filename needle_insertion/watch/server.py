@@ -329,7 +329,9 @@ class Server:
         if self._control is None:
             raise ParameterError('this page is for looking only: needle watch --control')
         token = message.pop('token', '')
-        if not isinstance(token, str) or not compare_digest(token.encode(), self.token.encode()):
+        # Text of JSON may have what cannot be encoded.
+        given = token.encode(errors='replace') if isinstance(token, str) else b''
+        if not compare_digest(given, self.token.encode()):
             raise ParameterError(
                 'the token is not that of this process: open the URL that needle watch has printed'
             )

@@ -160,12 +160,12 @@ class View:
         if not all(map(isfinite, (at.x, at.y, at.z, xx, xz, zz))):
             self.invalid += 1
             return
-        half = [_NORMAL * sqrt(max(0.0, one)) for one in (xx, zz)]
+        x, z = (sqrt(max(0.0, one)) for one in (xx, zz))
         self._expected = {
             'at': [number(one) for one in (at.x, at.y, at.z)],
-            'half': [number(one) for one in half],
+            'half': [number(_NORMAL * one) for one in (x, z)],
             # Of the ellipse: the correlation of x and z.
-            'correlation': number(xz / sqrt(xx * zz)) if xx > 0.0 and zz > 0.0 else 0.0,
+            'correlation': number(xz / (x * z)) if x * z > 0.0 else 0.0,
         }
 
     def configuration(self, node: str, parameters: dict[str, Any]) -> None:
