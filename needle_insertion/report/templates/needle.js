@@ -17,7 +17,7 @@ const needleDrawing = (() => {
   const FONT = '12px system-ui, sans-serif';
 
   /* Shown of the needle outside, at least across it, and beyond what is deepest [mm]. */
-  const OUTSIDE = 45, LEAST = 8, BEYOND = 12;
+  const OUTSIDE = 45, LEAST = 10, BEYOND = 12;
   const MARGIN = {left: 44, right: 10, top: 6, between: 12, bottom: 34};
 
   const mm = (value) => 1e3 * value;

@@ -238,6 +238,8 @@ function tellAim() {
     const {at, half} = frame.expected;
     parts.push(`Expected there: x ${fixed(mm(at[0]), 2)} ± ${fixed(mm(half[0]), 2)}, z ${fixed(mm(at[2]), 2)} ± ${fixed(mm(half[1]), 2)} mm (95 %).`);
   }
+  const chance = frame.nodes.map((node) => node.values['chance to come within 1 mm']).find(Boolean);
+  if (chance) parts.push(`Chance to come within 1 mm: ${chance}.`);
   put(find('reach'), parts.join(' '));
 }
 
@@ -310,6 +312,7 @@ function settle(given) {
   put(find('source'), setting.recording ? `recording ${setting.recording.name}` : 'live');
   if (!setting.recording) return;
   find('at').max = setting.recording.duration;
+  find('at').step = setting.recording.duration / 500;
   find('losses').hidden = !setting.recording.losses.length;
   put(find('losses'), setting.recording.losses.join('; '));
 }
@@ -325,7 +328,9 @@ function tellPlayback() {
 find('play').addEventListener('click', () => playback && send({play: !playback.playing}));
 find('speed').addEventListener('change', (event) => send({speed: Number(event.target.value)}));
 find('at').addEventListener('pointerdown', () => { dragging = true; });
-find('at').addEventListener('change', () => { dragging = false; });
+for (const kind of ['change', 'pointerup', 'pointercancel']) {
+  find('at').addEventListener(kind, () => { dragging = false; });
+}
 find('at').addEventListener('input', (event) => send({at: Number(event.target.value)}));
 
 /* Control. */
