@@ -213,14 +213,18 @@ const needleDrawing = (() => {
       const {axis, middle, half, across, up} = plane;
       const points = (line) => line[1].map((y, k) => [across(y), up(line[axis][k])]);
       const target = frame.target, expected = frame.expected;
-      if (frame.path) stroke(pen, COLORS.path, 1.4, [5, 4], points(frame.path));
       for (const earlier of frame.earlier || []) {
         stroke(pen, COLORS.earlier, 1.2, [], points(earlier));
       }
       if (frame.needle && frame.needle.length) {
         const line = points(frame.needle);
         stroke(pen, COLORS.paper, 5.5, [], line);
-        stroke(pen, COLORS.needle, 3, frame.shape === 'straight' ? [10, 5] : [], line);
+        stroke(pen, COLORS.needle, 3.5, frame.shape === 'straight' ? [10, 5] : [], line);
+      }
+      /* Over the needle, which hides most of it. */
+      if (frame.path) {
+        stroke(pen, COLORS.paper, 1.6, [], points(frame.path));
+        stroke(pen, COLORS.path, 1.6, [5, 4], points(frame.path));
       }
       if (target && target[axis] === null) {
         const x = across(target[1]);
@@ -230,7 +234,8 @@ const needleDrawing = (() => {
         cross(pen, across(target[1]), up(target[axis]), 5);
       }
       if (expected) {
-        const x = across(expected.at[1]), wide = expected.half[axis ? 1 : 0] || 0;
+        /* Beside the target, which would hide it. */
+        const x = across(expected.at[1]) + 12, wide = expected.half[axis ? 1 : 0] || 0;
         const low = up(expected.at[axis] - wide), high = up(expected.at[axis] + wide);
         for (const [color, width] of [[COLORS.paper, 4.5], [COLORS.expected, 2.2]]) {
           stroke(pen, color, width, [], [[x, low], [x, high]]);
