@@ -120,9 +120,24 @@ class LiveReader:
             parts += [f'"{key}":{_json(value)}' for key, value in live.beginning.items()]
         return '{' + ','.join(parts) + '}'
 
-    def take(self, _message: dict[str, Any]) -> None:
-        """Refuse: there is no other time than now."""
-        raise ParameterError('what is happening now takes no such message, only "seen" and "ask"')
+    def take(self, message: dict[str, Any]) -> None:
+        """
+        Refuse what is asked for: there is no other time than now.
+
+        Parameters
+        ----------
+        message : dict
+            From the page.
+
+        Raises
+        ------
+        ParameterError
+            Always.
+
+        """
+        raise ParameterError(
+            f'what is happening now takes "seen" and "ask" only, got {sorted(message)}'
+        )
 
 
 class RecordedReader:
