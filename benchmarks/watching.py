@@ -72,7 +72,7 @@ def page(graph: Graph, folder: str) -> Iterator[tuple[int, int]]:
         stdout=subprocess.PIPE,
         text=True,
     )
-    shown = None
+    running: list[subprocess.Popen[str]] = [watch]
     try:
         line = watch.stdout.readline() if watch.stdout else ''
         if not line.startswith('page: '):
@@ -80,14 +80,16 @@ def page(graph: Graph, folder: str) -> Iterator[tuple[int, int]]:
         options = ('--headless=new', '--no-sandbox', '--disable-gpu', '--disable-dev-shm-usage',
                    '--no-first-run', '--disable-background-networking',
                    '--remote-debugging-port=0', '--window-size=1400,1000')  # fmt: skip
-        shown = subprocess.Popen(
+        shown: subprocess.Popen[str] = subprocess.Popen(
             [browser, *options, f'--user-data-dir={folder}', line.removeprefix('page: ').strip()],
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
+            text=True,
         )
+        running.append(shown)
         yield watch.pid, shown.pid
     finally:
-        for process in filter(None, (shown, watch)):
+        for process in reversed(running):
             process.terminate()
             process.wait(30.0)
 

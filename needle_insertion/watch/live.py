@@ -185,7 +185,7 @@ class RecordedReader:
         self._asked.clear()
         at = playback.at
         view = self._recording.view(at)
-        content = {
+        content: dict[str, Any] = {
             'frame': view.frame(at),
             'playback': {'playing': playback.playing, 'speed': playback.speed},
         }

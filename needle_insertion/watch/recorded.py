@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from time import monotonic
 from typing import Any, Final, Generic, TypeVar
@@ -37,6 +38,10 @@ _HISTORY_RATE: Final = 10.0
 SLOWEST, FASTEST = 0.02, 50.0
 
 _Item = TypeVar('_Item')
+
+
+def _same(item: _Item) -> _Item:
+    return item
 
 
 class _Kept(Generic[_Item]):
@@ -123,7 +128,7 @@ class Recording:
         self.losses = tuple(bag.losses)
         if self._invalid:
             self.losses += (f'{self._invalid} messages are not of the type of their topic',)
-        shown = (*self._readings.values(), *self._lines.values())
+        shown: list[_Kept[Any]] = [*self._readings.values(), *self._lines.values()]
         if not any(kept.at(self.duration) for kept in shown):
             reasons = '; '.join((f'{path} has no readings to show', *self.losses))
             raise RecordingError(reasons)
@@ -144,7 +149,7 @@ class Recording:
             self._expected.add(time, lambda: deserialize(message.topic, data))
         elif name == contract.DIAGNOSTICS.name:
             for status in deserialize(message.topic, data).status:
-                self._nodes.setdefault(status.name, _Kept()).add(time, lambda one=status: one)
+                self._nodes.setdefault(status.name, _Kept()).add(time, partial(_same, status))
         else:
             parameters = parameters_of(read_string(data))
             self._configurations[name].add(time, lambda: parameters)

@@ -301,7 +301,7 @@ class Server:
         connection = _Connection(socket, self._readers())
         sending = asyncio.create_task(connection.send())
         # A reader that takes nothing would keep `close` waiting.
-        sending.add_done_callback(lambda _: request.transport and request.transport.abort())
+        sending.add_done_callback(lambda _: _break_off(request))
         try:
             async for message in socket:
                 await self._take(connection, message)
@@ -408,6 +408,12 @@ class _Connection:
         return True
 
 
+def _break_off(request: web.Request) -> None:
+    """End the connection of a request at once."""
+    if request.transport is not None:
+        request.transport.abort()
+
+
 def _file(file: Path, kind: str) -> Callable[[web.Request], Awaitable[web.StreamResponse]]:
     text = file.read_text(encoding='utf-8')
 
@@ -435,7 +441,7 @@ def _no_number(name: str) -> float:
 def _real(value: object) -> bool:
     number = isinstance(value, (int, float)) and not isinstance(value, bool)
     # Integers of JSON may have any number of digits.
-    return number and abs(value) < 1e9 and isfinite(value)  # type: ignore[arg-type, operator]
+    return number and abs(value) < 1e9 and isfinite(value)  # type: ignore[arg-type]
 
 
 def _reason(error: OSError) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import AsyncIterator, Callable, Coroutine
 from contextlib import asynccontextmanager
+from functools import partial
 import json
 from math import inf, nan
 import os
@@ -44,8 +45,6 @@ from support.watched import (
     TARGET,
     write_watched,
 )
-
-STATES = contract.steered_states()
 
 
 def joints(names: tuple[str, ...], *values: tuple[float, ...]) -> Reading:
@@ -101,7 +100,7 @@ def test_whatever_comes_a_frame_is_json(values: list[float], count: int, deviati
     view.reading('tip_deflection', numbers(*values), 0.0)
     view.reading('base_wrench', numbers(*values), 0.0)
     view.line('needle', np.array([values, [0.0, 0.1, 0.0]]), 0.0)
-    view.expected(expected(*values[:2], deviation=deviation))
+    view.expected(expected(values[0], values[1], deviation))
     said = json.loads(json.dumps(view.frame(0.0), allow_nan=False))
     for shown, value in zip(said['tip'], values, strict=True):
         assert shown is None if not abs(value) < inf else shown == round(value, 7)
@@ -112,7 +111,7 @@ def test_the_shape_is_that_of_the_plant_or_straight() -> None:
     view = View()
     assert view.frame(0.0)['shape'] is None
     told(view, 'plant')
-    state = joints(STATES.quantities[0].name and ('insertion', 'guide_x'), (0.05, 1e-3), (), ())
+    state = joints(('insertion', 'guide_x'), (0.05, 1e-3), (), ())
     view.reading('joint_states', state, 0.0)
     view.reading('tip_deflection', numbers(3e-3, 0.05, -1e-3), 0.0)
     straight = view.frame(0.0)
@@ -160,7 +159,7 @@ def test_the_worst_node_comes_first() -> None:
     view.status(status('/a', 'active'), 0.0)
     view.status(status('/b', 'no\njoint_states\x1b[2J', level=1), 0.0)
     view.status(status('/c', 'active'), 0.0)
-    view.status(status('/c', 'stopped', level=2, step='3 of 20'), 1.0)
+    view.status(status('/c', 'stopped', {'step': '3 of 20'}, level=2), 1.0)
     nodes = view.frame(1.0)['nodes']
     assert [(one['name'], one['level']) for one in nodes] == [('/c', 2), ('/b', 1), ('/a', 0)]
     assert nodes[0]['values'] == {'step': '3 of 20'}
@@ -172,16 +171,16 @@ def test_the_target_is_the_one_that_was_taken() -> None:
     view = View()
     view.reading('target', numbers(1e-3, 0.2, 0.0), 0.0)
     assert view.frame(0.0)['target'] == [1e-3, 0.2, 0.0]
-    view.status(status('/controller', 'active', **{'target [m]': 'None'}), 0.0)
+    view.status(status('/controller', 'active', {'target [m]': 'None'}), 0.0)
     assert view.frame(0.0)['target'] is None
-    view.status(status('/controller', 'active', **{'target [m]': '0.08'}), 0.0)
+    view.status(status('/controller', 'active', {'target [m]': '0.08'}), 0.0)
     assert view.frame(0.0)['target'] == [None, 0.08, None]
     told(view, 'steering')
     assert view.frame(0.0)['target'] is None
     aim = {'target x, y, z [m]': '0.004, 0.1, -0.002'}
-    view.status(status('/steering', 'inserts', **aim), 0.0)
+    view.status(status('/steering', 'inserts', aim), 0.0)
     assert view.frame(0.0)['target'] == list(TARGET)
-    view.status(status('/steering', 'inserts', **{'target x, y, z [m]': 'none'}), 0.0)
+    view.status(status('/steering', 'inserts', {'target x, y, z [m]': 'none'}), 0.0)
     assert view.frame(0.0)['target'] is None
 
 
@@ -299,7 +298,7 @@ def test_a_long_recording_does_not_fill_the_memory(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(recorded, '_MOST', 100)
     kept = recorded._Kept[int](1.0 / 30.0)
     for k in range(100_000):
-        kept.add(k / 100.0, lambda k=k: k)
+        kept.add(k / 100.0, partial(int, k))
     assert 40 < len(kept._times) <= 100
     for time in (0.0, 1.0, 500.0, 999.0):
         found = kept.at(time)

@@ -304,8 +304,8 @@ def test_a_browser_plays_a_recording(tmp_path: Path, width: int) -> None:
             clock = "document.getElementById('clock').textContent"
             at = "document.getElementById('at')"
             await tab.wait(f"{clock}.startsWith('4.0 of')", 'the end of the recording')
-            await tab.run(f"{at}.value = 2.5, {at}.dispatchEvent(new Event('input'))")
-            await tab.wait(f"{clock}.startsWith('2.5 of')", 'the time')
+            await tab.run(f"{at}.value = 3.5, {at}.dispatchEvent(new Event('input'))")
+            await tab.wait(f"{clock}.startsWith('3.5 of')", 'the time')
             await tab.picture(tmp_path / 'middle.png')
             assert 'silent' in (await tab.run(LOOK))['text']
             assert tab.faults == []
@@ -314,7 +314,7 @@ def test_a_browser_plays_a_recording(tmp_path: Path, width: int) -> None:
             count = await tab.run('needleWatch.drawn')
             await tab.run("document.getElementById('play').click()")
             await tab.wait(f"{clock}.startsWith('4.0 of')", 'the end')
-            # Two a second of what has 1.5 s.
+            # Two a second of what has half a second.
             assert await tab.run('needleWatch.drawn') - count < 12
             running.send_signal(signal.SIGINT)
             state = "document.getElementById('state').textContent"

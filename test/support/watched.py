@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -84,10 +85,13 @@ def marker(name: str, points: Any, stamp: int = 0) -> Any:
     )  # fmt: skip
 
 
-def status(name: str, message: str, level: int = 0, **values: str) -> Any:
+def status(
+    name: str, message: str, values: Mapping[str, str] | None = None, level: int = 0
+) -> Any:
     """Make what a node says of its state."""
     pairs = [
-        made('diagnostic_msgs/msg/KeyValue', key=key, value=value) for key, value in values.items()
+        made('diagnostic_msgs/msg/KeyValue', key=key, value=value)
+        for key, value in (values or {}).items()
     ]
     return made(
         'diagnostic_msgs/msg/DiagnosticStatus', level=level, name=name, message=message,
@@ -152,14 +156,12 @@ def write_watched(path: Path, space: str = '') -> None:
                 bag.write(f'{space}/needle_shape', encode(marker(name, line, stamp)), stamp)
             if k % RATE:
                 continue
+            aim = ', '.join(f'{value:.6f}' for value in TARGET)
             said = [
                 status('/plant', 'active'),
-                status('/controller', 'active', **{'target [m]': 'None'}),
-                status(
-                    '/steering', 'inserts', level=1 if time > 2.5 else 0,
-                    **{'target x, y, z [m]': '{:.6f}, {:.6f}, {:.6f}'.format(*TARGET)},
-                ),
-            ]  # fmt: skip
+                status('/controller', 'active', {'target [m]': 'None'}),
+                status('/steering', 'inserts', {'target x, y, z [m]': aim}, int(time > 2.5)),
+            ]
             # The controller has ended before.
             array = made(
                 'diagnostic_msgs/msg/DiagnosticArray',

@@ -21,7 +21,7 @@ window.needleWatch = seen;
 
 let socket = null, scene = {limits: {}, tissue: null, steered: false}, setting = null;
 let frame = null, playback = null, history = [], waiting = false, worded = 0, drawnAt = 0;
-let dragging = false, unseen = 0;
+let dragging = false, unseen = 0, saying = 0;
 
 /* Words. */
 
@@ -139,7 +139,7 @@ function steps(low, high) {
 }
 
 function chart({canvas, factor, least, lines, limit}) {
-  const width = canvas.clientWidth || 300, height = 130;
+  const width = canvas.clientWidth || 300, height = 165;
   const pen = prepared(canvas, width, height);
   const left = 40, right = width - 6, top = 6, bottom = height - 20;
   let low = Infinity, high = -Infinity;
@@ -252,6 +252,18 @@ function tellShape() {
   put(find('shape'), words);
 }
 
+/* Words and numbers: not so often that nobody could read them. */
+function say() {
+  clearTimeout(saying);
+  saying = 0;
+  worded = performance.now();
+  QUANTITIES.forEach(show);
+  tellNodes();
+  tellAim();
+  tellShape();
+  if (playback) tellPlayback();
+}
+
 /* Frames. */
 
 function draw(now) {
@@ -260,14 +272,9 @@ function draw(now) {
   drawnAt = now;
   drawing.draw(scene, frame);
   CHARTS.forEach(chart);
-  if (now - worded > WORDS) {
-    worded = now;
-    QUANTITIES.forEach(show);
-    tellNodes();
-    tellAim();
-    tellShape();
-    if (playback) tellPlayback();
-  }
+  if (now - worded > WORDS) say();
+  /* The last of several frames is told, too. */
+  else if (!saying) saying = setTimeout(say, WORDS);
   seen.drawn += 1;
   if (unseen) send({seen: unseen});
   unseen = 0;
