@@ -169,7 +169,8 @@ class Buttons:
             If nobody takes it.
 
         """
-        if not self._node.count_subscribers(contract.TARGET.name):
+        # One of them is the `WatchNode` of this process.
+        if self._node.count_subscribers(contract.TARGET.name) < 2:
             raise JobError('no node takes targets: start a controller or the node steering')
         self._operator.target(x, y, z)
 

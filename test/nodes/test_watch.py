@@ -89,6 +89,10 @@ class Reader:
         found = [one for one in self.frame['nodes'] if one['name'] == node]
         return found[0]['level'] if found and not found[0]['silent'] else None
 
+    def fine(self, node: str) -> bool:
+        """Tell whether a node works; on a machine that is busy it may warn of delays."""
+        return self.level(node) in (0, 1)
+
 
 @asynccontextmanager
 async def reading(url: str) -> AsyncIterator[Reader]:
@@ -110,8 +114,8 @@ async def ready(reader: Reader) -> None:
         lambda frame: (
             frame['shape'] == 'simulated'
             and frame['path'] is not None
-            and reader.level('/plant') == 0
-            and reader.level('/controller') == 0
+            and reader.fine('/plant')
+            and reader.fine('/controller')
             and reader.scene['limits']
             and reader.scene['tissue']
         ),
@@ -142,7 +146,7 @@ def test_buttons_move_the_needle_and_stop_it(ros_graph: RosGraph) -> None:
             assert said['success']
             await reader.until(lambda _: reader.level('/controller') == 2, 'the stop')
             assert (await reader.ask('clear'))['success']
-            await reader.until(lambda _: reader.level('/controller') == 0, 'the release')
+            await reader.until(lambda _: reader.fine('/controller'), 'the release')
             assert (await reader.ask('retract'))['success']
             await reader.until(lambda frame: frame['depth'] < 0.025, 'the retreat')
 
@@ -171,8 +175,8 @@ def test_without_control_it_only_listens(ros_graph: RosGraph) -> None:
             await reader.until(lambda frame: frame['shape'] == 'straight', 'no shape')
             ros_graph.start('plant', PLANT)
             await reader.until(lambda frame: frame['shape'] == 'simulated', 'the next plant')
-            assert reader.frame['silent'] == {}
-            assert reader.level('/plant') == 0
+            await reader.until(lambda frame: frame['silent'] == {}, 'its readings')
+            await reader.until(lambda _: reader.fine('/plant'), 'its state')
 
     with watching(ros_graph.environment) as (running, url):
         assert '#' not in url
@@ -187,7 +191,8 @@ def test_who_only_looks_has_nothing_to_command_with(ros_graph: RosGraph) -> None
     try:
         assert {one.topic_name for one in node.publishers} <= {'/parameter_events'}
         assert not [*node.clients]
-        assert not [*node.services]
+        # Of rclpy, for tools.
+        assert {one.srv_name for one in node.services} <= {'watch/get_type_description'}
     finally:
         node.destroy_node()
 
