@@ -31,7 +31,7 @@ from sensor_msgs.msg import JointState
 LARGEST: Final = 1.1
 
 #: Rounds, time that is measured in each half of one, and time before it [s].
-ROUNDS, TURN, SETTLE = 7, 8.0, 5.0
+ROUNDS, TURN, SETTLE = 5, 6.0, 4.0
 
 #: A needle that bends, half way in.
 _NEEDLE: Final[dict[str, object]] = {'model.preset': 'bending_35mm'}

@@ -142,7 +142,7 @@ const needleDrawing = (() => {
       pen.clip();
       this.tissue(pen, plane, scene, right);
       /* A grid in steps that leave room for their numbers. */
-      const step = scale * 5 > 22 ? 5 : 10;
+      const step = scale * 5 > 14 ? 5 : 10;
       pen.strokeStyle = COLORS.grid;
       pen.lineWidth = 1;
       stroke(pen, COLORS.grid, 1, [], [[left, middle], [right, middle]]);
