@@ -134,7 +134,8 @@ class _Tags(HTMLParser):
             if value.startswith('data:image/png;base64,'):
                 image = b64decode(value.partition(',')[2])
                 self.images.append((given.get('alt') or '', int.from_bytes(image[16:20], 'big')))
-            elif value:
+            elif value and not value.startswith('#'):
+                # A place in the page itself is no request.
                 self.requests.append(value)
 
     def handle_endtag(self, tag: str) -> None:
