@@ -45,6 +45,7 @@ setup(
         'needle_ros': ['*.xml'],
         'needle_insertion.report': ['templates/*'],
         'needle_insertion.paper.claims': ['*.yaml'],
+        'needle_insertion.watch': ['page/*'],
     },
     data_files=[
         ('share/ament_index/resource_index/packages', ['resource/needle_insertion']),
@@ -58,6 +59,7 @@ setup(
         (f'lib/{NAME}', [f'scripts/{node}' for node in NODES]),
     ],
     install_requires=[
+        'aiohttp>=3.9',
         'argcomplete>=2.0',
         'jinja2>=3.1',
         'lz4>=4.0',

@@ -544,33 +544,33 @@ class PlantNode(ModelNode):
 
     def _draw(self, plant_run: PlantRun, stamp: int) -> None:
         """Show the shape of the needle from its base to its tip, and the path that it cut."""
-        if not (
-            self._needle_shape.get_subscription_count()
-            or self._needle_poses.get_subscription_count()
-            or self._tf is not None
-        ):
-            return
-        seen = plant_run.plant.outline()
+        lines = self._needle_shape.get_subscription_count()
+        poses = self._needle_poses.get_subscription_count()
+        wanted = lines or poses or self._tf is not None
+        seen = plant_run.plant.outline() if wanted else None
         if seen is None:
             return
         if self._tf is not None:
             kind: Any = self._tf.msg_type
             self._tf.publish(kind(transforms=[_transform(seen, stamp)]))
-        lines = [(self._shape, [seen.base.tolist(), *seen.points.tolist()])]
-        if len(seen.path):
-            lines.append((self._path, seen.path.tolist()))
-        for line, points in lines:
-            line.header.stamp = _message(stamp)
-            line.points = [Point(x=x, y=y, z=z) for x, y, z in points]
-            self._needle_shape.publish(line)
-        self._poses.header.stamp = _message(stamp)
-        self._poses.poses = [
-            Pose(position=Point(x=x, y=y, z=z), orientation=Quaternion(x=i, y=j, z=k, w=w))
-            for (x, y, z), (i, j, k, w) in zip(
-                seen.points.tolist(), seen.turns.tolist(), strict=True
-            )
-        ]
-        self._needle_poses.publish(self._poses)
+        if lines:
+            self._draw_line(self._shape, [seen.base.tolist(), *seen.points.tolist()], stamp)
+            if len(seen.path):
+                self._draw_line(self._path, seen.path.tolist(), stamp)
+        if poses:
+            self._poses.header.stamp = _message(stamp)
+            self._poses.poses = [
+                Pose(position=Point(x=x, y=y, z=z), orientation=Quaternion(x=i, y=j, z=k, w=w))
+                for (x, y, z), (i, j, k, w) in zip(
+                    seen.points.tolist(), seen.turns.tolist(), strict=True
+                )
+            ]
+            self._needle_poses.publish(self._poses)
+
+    def _draw_line(self, line: Marker, points: list[list[float]], stamp: int) -> None:
+        line.header.stamp = _message(stamp)
+        line.points = [Point(x=x, y=y, z=z) for x, y, z in points]
+        self._needle_shape.publish(line)
 
     def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
         """Say where the needle is, how time goes, and what went wrong."""

@@ -23,6 +23,7 @@ from needle_ros.errors import JobError, NeedleError
 COMMANDS: Final[Mapping[str, str]] = {
     'demo': 'insertion, recording, identification and a report',
     'run': 'bring the nodes up, and tell them where to go',
+    'watch': 'a page in a browser: live, or of a bag',
     'inspect': 'what recordings hold, and how to identify from them',
     'identify': 'fit parameters to recordings',
     'experiment': 'record an experiment on the simulated robot',

@@ -513,3 +513,38 @@ def read_string(message: bytes) -> str:
 
     """
     return _Cursor(message).string()
+
+
+def read_line(message: bytes) -> tuple[str, NDArray[np.float64]]:
+    """
+    Read a line of a visualization_msgs Marker.
+
+    Parameters
+    ----------
+    message : bytes
+        The serialized message.
+
+    Returns
+    -------
+    name : str
+        Its namespace, which names the line.
+    points : ndarray, shape (n, 3)
+        Its points x, y, z [m].
+
+    Raises
+    ------
+    MessageError
+        If the bytes end before the points do.
+
+    """
+    cursor = _Cursor(message)
+    cursor.take(4, 2)
+    cursor.string()
+    name = cursor.string()
+    # Number, kind and action; pose and scale; color and lifetime; whether it is locked.
+    for size, number in ((4, 3), (8, 10), (4, 6), (1, 1)):
+        cursor.take(size, number)
+    count = cursor.count()
+    begin = cursor.take(8, 3 * count)
+    points = np.frombuffer(message, f'{cursor.order}f8', 3 * count, begin)
+    return name, points.reshape(count, 3).astype(np.float64)

@@ -91,7 +91,7 @@ def functions_in(file: str) -> set[str]:
         node.name
         for path in (ROOT / 'test').rglob(f'{file}.py')
         for node in ast.walk(ast.parse(path.read_text(encoding='utf-8')))
-        if isinstance(node, ast.FunctionDef)
+        if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef))
     }
 
 

@@ -19,8 +19,10 @@ from needle_insertion.experiment.insertion import COUNTED, RATE
 from needle_insertion.experiment.node_process import GraphError, NodeProcess
 from needle_insertion.experiment.ros_graph import ACTIVATE, CONFIGURE, Graph
 from needle_insertion.replay.rerun import verify
+from needle_insertion.report.animation import Animation
 from needle_insertion.report.insertion import draw_needle
 from needle_insertion.report.text import Check
+from needle_insertion.watch.recorded import Recording
 from needle_ros.base_node import COMMAND, SENSOR
 from needle_ros.timing import seconds
 import numpy as np
@@ -77,8 +79,9 @@ LARGEST_MISS: Final = 1e-3
 #: chance one in a thousand is farther.
 _LARGEST: Final = 13.8
 
-#: Needles that are drawn.
+#: Needles that are drawn, and frames of the needle that moves.
 _DRAWN: Final = 5
+_FRAMES: Final = 80
 
 #: Longest time that the insertion may take, and time after which a target is sent again [s].
 _LONGEST, _AGAIN = 180.0, 2.0
@@ -316,4 +319,31 @@ def draw_aiming(bag: Path, other: Path) -> Figure:
     at = np.linspace(0, len(needles) - 1, _DRAWN).round().astype(int).tolist()
     return draw_needle(
         [needles[k] for k in at], path, np.array(TARGET), read_needles(other)[0][-1]
+    )
+
+
+def animate_aiming(bag: Path) -> Animation:
+    """
+    Return the steered needle on its way, to play on a page.
+
+    Parameters
+    ----------
+    bag : Path
+        Bag of the steered insertion.
+
+    Returns
+    -------
+    Animation
+        It has some 80 frames.
+
+    """
+    recording = Recording(bag)
+    times = np.linspace(0.0, recording.duration, _FRAMES).tolist()
+    frames = [recording.view(time).frame(time) for time in times]
+    return Animation(
+        'The steered needle on its way, to scale: it rests at each look at its tip (ring), then '
+        'the guide moves and the needle goes in. The bar at the target (cross) is where the tip '
+        'is expected there, with an interval of 95 %.',
+        recording.view(recording.duration).scene,
+        [frame for frame in frames if frame['needle']],
     )

@@ -22,6 +22,7 @@ from needle_identification import (
 )
 from needle_insertion.experiment.aiming import (
     aiming_checks,
+    animate_aiming,
     draw_aiming,
     read_aimed,
     record_aimed,
@@ -167,6 +168,7 @@ def run(output: Path, bags: Path) -> int:
         rows=rows,
         heads=CHECK_HEADS,
         pictures=_pictures(bent, (aimed, alone), insertions, friction[-1], stiffness[-1]),
+        animation=animate_aiming(aimed),
     )
     sys.stdout.write(f'{table(rows, CHECK_HEADS)}\n\nreport: {page}\n')
     return 0 if all(check.passed for check in checks) else 1

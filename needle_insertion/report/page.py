@@ -16,6 +16,7 @@ from typing import Any, Final
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 from markupsafe import Markup
 from needle_identification.result import write_whole
+from needle_insertion.report.animation import Animation
 from needle_insertion.report.content import Picture
 from needle_insertion.report.made import made
 from needle_insertion.report.symbols import symbols
@@ -67,6 +68,9 @@ def _contents(content: str) -> Markup:
     return Markup(f'<nav aria-label="Contents">\n{links}</nav>')  # noqa: S704
 
 
+#: Where the templates are, and what else pages are made of.
+TEMPLATE_FOLDER: Final = Path(__file__).with_name('templates')
+
 #: Templates of this folder.
 TEMPLATES: Final = Environment(
     loader=PackageLoader('needle_insertion.report'),
@@ -86,7 +90,11 @@ TEMPLATES.filters.update(
 
 
 def write_page(
-    path: Path, template: str | Template, pictures: Iterable[Picture] = (), **content: Any
+    path: Path,
+    template: str | Template,
+    pictures: Iterable[Picture] = (),
+    animation: Animation | None = None,
+    **content: Any,
 ) -> None:
     """
     Write one page, and each of its pictures as a PNG beside it.
@@ -99,6 +107,8 @@ def write_page(
         The template, or the name of its file.
     pictures : iterable of Picture
         Pictures of the page; the template gets them by name as ``pictures``.
+    animation : Animation, optional
+        A needle that moves; the only script that the browser then runs on the page is its own.
     **content : object
         What else the template shows; a ``title`` and an ``introduction`` at least.
 
@@ -109,7 +119,9 @@ def write_page(
 
     """
     shown = {one.name: one for one in pictures}
-    page = TEMPLATES.get_template(template).render(pictures=shown, made=made(), **content)
+    page = TEMPLATES.get_template(template).render(
+        pictures=shown, animation=animation, made=made(), **content
+    )
     for name, one in shown.items():
         write_whole(path.parent / f'{name}.png', one.image)
     write_whole(path, page.encode())

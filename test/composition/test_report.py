@@ -1,7 +1,11 @@
 """Tables that line up, and pages that are complete and self-contained."""
 
+import asyncio
+from base64 import b64encode
 from collections.abc import Sequence
+from hashlib import sha256
 from html.parser import HTMLParser
+import json
 from pathlib import Path
 import re
 from typing import Any
@@ -11,12 +15,15 @@ from hypothesis import strategies as st
 from markupsafe import Markup
 from matplotlib.figure import Figure
 from needle_dynamics import ParameterError
+from needle_insertion.experiment.aiming import animate_aiming
 from needle_insertion.report.content import Picture
 from needle_insertion.report.made import COMMAND
 from needle_insertion.report.page import TEMPLATES, write_page
 from needle_insertion.report.text import Check, CHECK_HEADS, table
 import pytest
-from support.pages import look_at
+from support.browser import browser
+from support.pages import BROWSER, look_at
+from support.watched import TARGET, write_watched
 
 #: The blocks of pages, by name.
 BLOCKS: Any = TEMPLATES.get_template('blocks.html').module
@@ -266,3 +273,69 @@ def test_a_page_that_cannot_be_written_is_named(tmp_path: Path) -> None:
     with pytest.raises(ParameterError, match=r'no/page.html cannot be written: No such file'):
         show(tmp_path / 'no' / 'page.html', [])
     assert not list(tmp_path.iterdir())
+
+
+def show_moving(folder: Path) -> Path:
+    """Write a page with a picture, and a needle that moves."""
+    write_watched(folder / 'bag')
+    path = folder / 'page.html'
+    write_page(
+        path, 'checks.html', [picture()], animate_aiming(folder / 'bag'), title='A page',
+        introduction='of a needle', cards=[], rows=[], heads=CHECK_HEADS,
+    )  # fmt: skip
+    return path
+
+
+def test_a_needle_moves_by_its_own_script_only(tmp_path: Path) -> None:
+    """The page says which script may run: its own. The picture stays, and it is not too large."""
+    path = show_moving(tmp_path)
+    text = path.read_text()
+    (script,) = re.findall('<script>(.*?)</script>', text, re.DOTALL)
+    digest = b64encode(sha256(script.encode()).digest()).decode()
+    (policy,) = re.findall('Content-Security-Policy" content="([^"]*)"', text)
+    assert policy.startswith("default-src 'none'; ")
+    assert f"script-src 'sha256-{digest}'" in policy.replace('&#39;', "'").replace('&#43;', '+')
+    (data,) = re.findall('<script type="application/json" id="frames">(.*?)</script>', text)
+    content = json.loads(data)
+    assert len(content['frames']) == 80
+    assert content['frames'][-1]['target'] == list(TARGET)
+    assert [len(column) for column in content['frames'][-1]['needle']] == [40, 40, 40]
+    assert content['path'][1][-1] == pytest.approx(0.08)
+    assert 'data:image/png;base64,' in text
+    show(tmp_path / 'other.html', [], [picture()])
+    without = (tmp_path / 'other.html').read_text()
+    assert 'script' not in without
+    assert len(text) - len(without) < 300_000
+
+
+@pytest.mark.skipif(BROWSER is None, reason='no Chromium on this machine')
+def test_a_needle_moves_in_a_browser(tmp_path: Path) -> None:
+    """It is drawn at its end, goes to a time, and plays to the end; in print it is left out."""
+    path = show_moving(tmp_path)
+
+    async def look() -> None:
+        async with browser() as tab:
+            await tab.size(400, 900)
+            await tab.open(path.as_uri())
+            clock = "document.querySelector('.animation output').textContent"
+            await tab.wait(f"{clock} === '4.0 of 4.0 s'", 'the end')
+            slider = "document.querySelector('.animation input')"
+            await tab.run(f"{slider}.value = 1, {slider}.dispatchEvent(new Event('input'))")
+            assert await tab.run(clock) == '1.0 of 4.0 s'
+            pixels = (
+                "(() => { const one = document.querySelector('.animation canvas'); return one"
+                ".getContext('2d').getImageData(0, 0, one.width, one.height).data.join() })()"
+            )
+            early = await tab.run(pixels)
+            await tab.run("document.querySelector('.animation button').click()")
+            await tab.wait(f"{clock} === '4.0 of 4.0 s'", 'the end')
+            assert await tab.run(pixels) != early
+            wide = 'document.documentElement.scrollWidth - document.documentElement.clientWidth'
+            assert await tab.run(wide) == 0
+            await tab.picture(tmp_path / 'page.png')
+            await tab.call('Emulation.setEmulatedMedia', media='print')
+            assert await tab.run("document.querySelector('.animation').clientHeight") == 0
+            assert await tab.run("document.querySelector('img').clientHeight") > 0
+            assert tab.faults == []
+
+    asyncio.run(look())

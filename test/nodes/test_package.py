@@ -30,6 +30,7 @@ MANIFEST = ET.parse(ROOT / 'package.xml').getroot()  # noqa: S314
 
 #: rosdep keys by imported module, where they are not the module itself.
 KEYS = {
+    'aiohttp': 'python3-aiohttp',
     'argcomplete': 'python3-argcomplete',
     # Come with mcap.
     'lz4': 'mcap-ros2-support',

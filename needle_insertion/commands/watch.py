@@ -1,0 +1,109 @@
+"""`needle watch`: one page in a browser, of what is happening or of a bag."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+from contextlib import suppress
+from pathlib import Path
+import signal
+import sys
+from typing import TYPE_CHECKING
+
+from needle_insertion.commands.common import Command
+from needle_ros.errors import ParameterError, shown
+
+if TYPE_CHECKING:
+    # Takes long to import.
+    from needle_insertion.watch.server import Server
+
+#: What ends it.
+_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
+#: Address and port by default; the port is that of `watch.server`, which takes long to import.
+HOST, PORT = '127.0.0.1', 8642
+
+
+def _add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `needle watch`."""
+    parser.description = (
+        'Show needle, forces, limits and what the nodes say on a page in a browser: live, or '
+        'from a bag.'
+    )
+    parser.add_argument(
+        'bag', type=Path, nargs='?', metavar='BAG', help='recording to show (default: live)'
+    )
+    parser.add_argument(
+        '--control',
+        action='store_true',
+        help='buttons: target, pause, retract, stop (default: looking only)',
+    )
+    parser.add_argument(
+        '--host',
+        default=HOST,
+        metavar='ADDRESS',
+        help=f'address to listen on; another than {HOST} lets other machines look, and is not '
+        'for --control',
+    )
+    parser.add_argument(
+        '--port', type=int, default=PORT, help=f'port, 0 for a free one (default {PORT})'
+    )
+
+
+def _run(options: argparse.Namespace) -> int:
+    """Serve the page until a signal comes."""
+    if options.bag is not None and options.control:
+        raise ParameterError('--control is for what is happening now: leave out it or the BAG')
+    # One that comes before the page is served, or again at the end, ends it as well.
+    with suppress(KeyboardInterrupt):
+        asyncio.run(_recorded(options) if options.bag is not None else _live(options))
+    return 0
+
+
+async def _recorded(options: argparse.Namespace) -> None:
+    from needle_insertion.watch.live import RecordedReader
+    from needle_insertion.watch.recorded import Recording
+    from needle_insertion.watch.server import Server
+
+    recording = Recording(options.bag)
+    for loss in recording.losses:
+        sys.stderr.write(shown(f'warning: {loss}') + '\n')
+    await _serve(Server(lambda: RecordedReader(recording), options.host, options.port))
+
+
+async def _live(options: argparse.Namespace) -> None:
+    from needle_insertion.watch.live import Live
+    from needle_insertion.watch.server import Server
+    from needle_insertion.watch.watch_node import watching
+
+    with watching(control=options.control) as (view, poll, control):
+        live = Live(view, poll, control=options.control)
+        server = Server(live.reader, options.host, options.port, control)
+        making = asyncio.create_task(live.run())
+        try:
+            await _serve(server, making)
+        finally:
+            making.cancel()
+            with suppress(asyncio.CancelledError):
+                await making
+
+
+async def _serve(server: Server, making: asyncio.Task[None] | None = None) -> None:
+    """Serve the page until a signal comes, or the frames end, which is an error."""
+    loop, ending = asyncio.get_running_loop(), asyncio.Event()
+    for one in _SIGNALS:
+        loop.add_signal_handler(one, ending.set)
+    await server.start()
+    try:
+        for line in server.words:
+            sys.stdout.write(f'{line}\n')
+        sys.stdout.flush()
+        ended = asyncio.create_task(ending.wait())
+        await asyncio.wait({ended, *filter(None, [making])}, return_when=asyncio.FIRST_COMPLETED)
+        if not ended.done() and making is not None:
+            making.result()
+    finally:
+        await server.end()
+
+
+COMMAND = Command(_add_arguments, _run)

@@ -1,0 +1,218 @@
+"""Frames of what is happening now, and of a recording, as the readers of the page get them."""
+
+from __future__ import annotations
+
+import asyncio
+from collections import deque
+from collections.abc import Callable, Sequence
+import json
+from time import monotonic
+from typing import Any, Final
+
+from needle_insertion.watch.recorded import Playback, Recording
+from needle_insertion.watch.view import RATE, row, SPAN, View
+from needle_ros.errors import ParameterError
+
+#: Time between two frames [s].
+PERIOD: Final = 1.0 / RATE
+
+
+def _json(content: object) -> str:
+    return json.dumps(content, separators=(',', ':'), allow_nan=False)
+
+
+class Live:
+    """
+    Makes a frame now and then, the same for all readers.
+
+    Parameters
+    ----------
+    view : View
+        What is seen.
+    poll : callable
+        Brings what has come to the view.
+    control : bool
+        Whether the page has buttons.
+
+    """
+
+    def __init__(self, view: View, poll: Callable[[float], None], *, control: bool) -> None:
+        self._view, self._poll = view, poll
+        self._setting = {'control': control, 'recording': None}
+        self._history: deque[list[float | None]] = deque(maxlen=round(SPAN * RATE))
+        self._changed = asyncio.Condition()
+        self.scene: dict[str, Any] = {}
+        self.number, self.frame = 0, ''
+
+    async def run(self) -> None:
+        """Make frames, until it is cancelled."""
+        due = monotonic()
+        while True:
+            now = monotonic()
+            self._poll(now)
+            frame = self._view.frame(now)
+            self._history.append(row(frame))
+            self.scene = self._view.scene
+            self.number, self.frame = self.number + 1, _json(frame)
+            async with self._changed:
+                self._changed.notify_all()
+            # A machine that was busy does not catch up.
+            due = max(due + PERIOD, now)
+            await asyncio.sleep(due - monotonic())
+
+    def reader(self) -> LiveReader:
+        """Return what a new reader sees."""
+        return LiveReader(self)
+
+    @property
+    def beginning(self) -> dict[str, Any]:
+        """What a reader needs before its first frame."""
+        return {'setting': self._setting, 'history': list(self._history)}
+
+    async def newer(self, number: int) -> None:
+        """
+        Wait for a newer frame.
+
+        Parameters
+        ----------
+        number : int
+            Number of the frame that is known.
+
+        """
+        async with self._changed:
+            await self._changed.wait_for(lambda: self.number > number)
+
+
+class LiveReader:
+    """
+    What one reader sees of what is happening.
+
+    Parameters
+    ----------
+    live : Live
+        What is happening.
+
+    """
+
+    def __init__(self, live: Live) -> None:
+        self._live = live
+        self._number = 0
+        self._scene: dict[str, Any] = {}
+
+    async def next(self) -> str:
+        """
+        Wait for a frame that is newer than the last one.
+
+        Returns
+        -------
+        str
+            The newest frame, with the scene if it has changed, as JSON.
+
+        """
+        live, first = self._live, self._number == 0
+        await live.newer(self._number)
+        self._number = live.number
+        parts = [f'"frame":{live.frame}']
+        if first or live.scene is not self._scene:
+            self._scene = live.scene
+            parts.append(f'"scene":{_json(self._scene)}')
+        if first:
+            parts += [f'"{key}":{_json(value)}' for key, value in live.beginning.items()]
+        return '{' + ','.join(parts) + '}'
+
+    def take(self, message: dict[str, Any]) -> None:
+        """
+        Refuse what is asked for: there is no other time than now.
+
+        Parameters
+        ----------
+        message : dict
+            From the page.
+
+        Raises
+        ------
+        ParameterError
+            Always.
+
+        """
+        raise ParameterError(
+            f'what is happening now takes "seen" and "ask" only, got {sorted(message)}'
+        )
+
+
+class RecordedReader:
+    """
+    What one reader sees of a recording.
+
+    Parameters
+    ----------
+    recording : Recording
+        The recording.
+    losses : sequence of str
+        What could not be read.
+
+    """
+
+    def __init__(self, recording: Recording, losses: Sequence[str] = ()) -> None:
+        self._recording = recording
+        self._playback = Playback(recording.duration)
+        self._setting = {
+            'control': False,
+            'recording': {
+                'name': recording.name, 'duration': recording.duration, 'losses': list(losses)
+            },
+        }  # fmt: skip
+        self._scene: dict[str, Any] | None = None
+        self._jumped = True
+        self._asked = asyncio.Event()
+        self._asked.set()
+
+    async def next(self) -> str:
+        """
+        Wait until there is another frame.
+
+        Returns
+        -------
+        str
+            The frame of the present time, with the history if that has jumped, as JSON.
+
+        """
+        playback = self._playback
+        if playback.playing:
+            await asyncio.sleep(PERIOD)
+        else:
+            await self._asked.wait()
+        self._asked.clear()
+        at = playback.at
+        view = self._recording.view(at)
+        content: dict[str, Any] = {
+            'frame': view.frame(at),
+            'playback': {'playing': playback.playing, 'speed': playback.speed},
+        }
+        if view.scene != self._scene:
+            content['scene'], first = view.scene, self._scene is None
+            self._scene = view.scene
+            if first:
+                content['setting'] = self._setting
+        if self._jumped:
+            self._jumped = False
+            content['history'] = self._recording.history(at)
+        return _json(content)
+
+    def take(self, message: dict[str, Any]) -> None:
+        """
+        Go to a time, play, pause, or change the speed.
+
+        Parameters
+        ----------
+        message : dict
+            As `Playback.take` takes it.
+
+        Raises
+        ------
+        ParameterError
+            If it is not valid.
+
+        """
+        self._jumped |= self._playback.take(message)
+        self._asked.set()

@@ -1,0 +1,391 @@
+'use strict';
+
+/* The page of `needle watch`: takes frames, draws the newest, and says when it has drawn it. */
+
+const find = (id) => document.getElementById(id);
+const mm = (value) => (value === null ? null : 1e3 * value);
+
+/* Of the strip charts [s]; between two changes of words and numbers [ms]. */
+const SPAN = 20, WORDS = 120;
+const LEVELS = ['fine', 'warning', 'error', 'silent'];
+const SIGNS = {fine: '●', warning: '▲', error: '■', silent: '○', none: '○'};
+const COLUMNS = {time: 0, depth: 1, reference: 2, force: 3, x: 4, z: 5};
+
+const token = new URLSearchParams(location.hash.slice(1)).get('token') || '';
+const calm = matchMedia('(prefers-reduced-motion: reduce)');
+const drawing = new needleDrawing.Drawing(find('needle'));
+
+/* What tests and the curious may look at. */
+const seen = {frames: 0, drawn: 0, connected: false};
+window.needleWatch = seen;
+
+let socket = null, scene = {limits: {}, tissue: null, steered: false}, setting = null;
+let frame = null, playback = null, history = [], waiting = false, worded = 0, drawnAt = 0;
+let dragging = false, unseen = 0, saying = 0;
+
+/* Words. */
+
+const fixed = (value, digits) =>
+  (value === null || value === undefined ? '–' : (value + 0).toFixed(digits).replace(/^-(0\.?0*)$/, '$1'));
+
+function put(node, text) {
+  if (node.textContent !== text) node.textContent = text;
+}
+
+function level(node, name) {
+  if (node.dataset.level !== name) node.dataset.level = name;
+}
+
+function make(tag, text = '', kind = '') {
+  const node = document.createElement(tag);
+  if (text) node.textContent = text;
+  if (kind) node.className = kind;
+  return node;
+}
+
+/* Numbers with their limits. */
+
+const QUANTITIES = [
+  {name: 'Inserted depth', unit: 'mm', digits: 2, of: (f) => mm(f.depth), stream: 'joint_states',
+    range: (l) => ('low' in l && 'high' in l ? [mm(l.low), mm(l.high)] : null)},
+  {name: 'Velocity', unit: 'mm/s', digits: 1, of: (f) => mm(f.velocity), stream: 'joint_states',
+    range: (l) => ('speed' in l ? [-mm(l.speed), mm(l.speed)] : null)},
+  {name: 'Force', unit: 'N', digits: 2, of: (f) => f.force, stream: 'base_wrench',
+    range: (l) => ('load' in l ? [-l.load, l.load] : null),
+    marks: (l) => ('force' in l ? [-l.force, l.force] : []),
+    more: (l) => ('force' in l ? `, commanded ±${fixed(l.force, 0)}` : '')},
+  {name: 'Tracking error', unit: 'mm', digits: 3, of: (f) => mm(f.error), stream: 'tracking_error',
+    range: (l) => ('error' in l ? [-mm(l.error), mm(l.error)] : null)},
+  {name: 'Tip x', unit: 'mm', digits: 2, of: (f) => (f.tip ? mm(f.tip[0]) : null), stream: 'tip_deflection',
+    range: (l) => ('deflection' in l ? [-mm(l.deflection), mm(l.deflection)] : null)},
+  {name: 'Tip z', unit: 'mm', digits: 2, of: (f) => (f.tip ? mm(f.tip[2]) : null), stream: 'tip_deflection',
+    range: (l) => ('deflection' in l ? [-mm(l.deflection), mm(l.deflection)] : null)},
+];
+
+for (const one of QUANTITIES) {
+  one.box = make('div');
+  one.value = make('span', '–');
+  one.limit = make('dd', '', 'limit');
+  one.meter = make('div', '', 'meter');
+  one.bar = make('i');
+  one.meter.append(one.bar);
+  one.meter.setAttribute('role', 'meter');
+  one.meter.setAttribute('aria-label', one.name);
+  const value = make('dd', '', 'value'), bar = make('dd');
+  value.append(one.value, make('small', ` ${one.unit}`));
+  bar.append(one.meter);
+  one.box.append(make('dt', one.name), value, bar, one.limit);
+  find('numbers').querySelector('dl').append(one.box);
+}
+
+function show(one) {
+  const value = one.of(frame), range = one.range(scene.limits), age = frame.silent[one.stream];
+  put(one.value, fixed(value, one.digits));
+  one.meter.hidden = range === null;
+  if (range === null) {
+    put(one.limit, age === undefined ? 'limit not known' : `silent for ${fixed(age, 0)} s`);
+    level(one.box, age === undefined ? 'fine' : 'silent');
+    return;
+  }
+  const [low, high] = range, share = (at) => 100 * Math.min(1, Math.max(0, (at - low) / (high - low)));
+  const zero = share(0), at = share(value === null ? 0 : value);
+  one.bar.style.left = `${Math.min(zero, at)}%`;
+  one.bar.style.width = `${Math.max(Math.abs(at - zero), value === null ? 0 : 0.7)}%`;
+  one.meter.setAttribute('aria-valuemin', low);
+  one.meter.setAttribute('aria-valuemax', high);
+  one.meter.setAttribute('aria-valuenow', fixed(value, one.digits));
+  const marks = one.marks ? one.marks(scene.limits) : [];
+  if (one.meter.children.length !== 1 + marks.length) {
+    one.meter.replaceChildren(one.bar, ...marks.map(() => make('b')));
+  }
+  marks.forEach((mark, k) => { one.meter.children[k + 1].style.left = `${share(mark)}%`; });
+  let words = low === -high ? `limit ±${fixed(high, 0)}` : `${fixed(low, 0)} to ${fixed(high, 0)}`;
+  words += one.more ? one.more(scene.limits) : '';
+  /* The range of depths may be used up; the others are limits that stop the needle. */
+  const used = value === null || low !== -high ? 0 : Math.abs(value) / high;
+  let state = 'fine';
+  if (value !== null && (value < low || value > high)) {
+    state = 'error';
+    words = `■ beyond ${words}`;
+  } else if (used > 0.8) {
+    state = 'warning';
+    words = `▲ near ${words}`;
+  }
+  if (age !== undefined) {
+    state = 'silent';
+    words = `○ silent for ${fixed(age, 0)} s`;
+  }
+  put(one.limit, words);
+  level(one.box, state);
+}
+
+/* Strip charts. */
+
+const {prepared, stroke, label, COLORS} = needleDrawing;
+
+const CHARTS = [
+  {canvas: find('chart-depth'), factor: 1e3, least: 2, lines: [['depth', COLORS.needle, []], ['reference', COLORS.target, [6, 4]]]},
+  {canvas: find('chart-force'), factor: 1, least: 1, lines: [['force', COLORS.needle, []]],
+    limit: () => scene.limits.load},
+  {canvas: find('chart-tip'), factor: 1e3, least: 1, lines: [['x', COLORS.needle, []], ['z', COLORS.target, [6, 4]]]},
+];
+
+function steps(low, high) {
+  const rough = (high - low) / 3, power = 10 ** Math.floor(Math.log10(rough));
+  const step = [1, 2, 5, 10].find((one) => one * power >= rough) * power;
+  const values = [];
+  for (let k = Math.ceil(low / step); k * step <= high; k += 1) values.push(k * step);
+  return {values, digits: Math.max(0, -Math.floor(Math.log10(step) + 1e-9))};
+}
+
+function chart({canvas, factor, least, lines, limit}) {
+  const width = canvas.clientWidth || 300, height = 165;
+  const pen = prepared(canvas, width, height);
+  const left = 40, right = width - 6, top = 6, bottom = height - 20;
+  let low = Infinity, high = -Infinity;
+  for (const row of history) {
+    for (const [name] of lines) {
+      const value = row[COLUMNS[name]];
+      if (value === null) continue;
+      low = Math.min(low, value * factor);
+      high = Math.max(high, value * factor);
+    }
+  }
+  if (low > high) [low, high] = [-least, least];
+  const pad = Math.max(0.08 * (high - low), (least - (high - low)) / 2);
+  [low, high] = [low - pad, high + pad];
+  const x = (time) => right + (time - frame.time) * (right - left) / SPAN;
+  const y = (value) => bottom - (value - low) * (bottom - top) / (high - low);
+  pen.fillStyle = COLORS.ink;
+  const {values, digits} = steps(low, high);
+  for (const value of values) {
+    stroke(pen, COLORS.grid, 1, [], [[left, y(value)], [right, y(value)]]);
+    pen.textAlign = 'right';
+    pen.fillText(fixed(value, digits), left - 5, y(value) + 4);
+  }
+  pen.textAlign = 'center';
+  for (let back = 0; back <= SPAN; back += 5) {
+    pen.textAlign = back === 0 ? 'right' : 'center';
+    pen.fillText(back ? `−${back}` : 'now', x(frame.time - back), bottom + 15);
+  }
+  const most = limit && limit();
+  for (const value of most ? [-most, most] : []) {
+    if (value > low && value < high) {
+      stroke(pen, COLORS.target, 1.5, [2, 4], [[left, y(value)], [right, y(value)]]);
+      label(pen, 'limit', left + 4, y(value) - 4, COLORS.target);
+    }
+  }
+  for (const [name, color, dash] of lines) {
+    let points = [];
+    for (const row of history) {
+      const value = row[COLUMNS[name]], at = x(row[0]);
+      if (value !== null && at >= left) {
+        points.push([at, y(value * factor)]);
+      } else {
+        stroke(pen, color, 1.8, dash, points);
+        points = [];
+      }
+    }
+    stroke(pen, color, 1.8, dash, points);
+  }
+}
+
+/* What the nodes say. */
+
+function tell(node) {
+  const name = node.silent ? 'silent' : LEVELS[node.level] || 'silent';
+  const item = make('li'), line = make('p');
+  const state = make('strong', `${SIGNS[name]} ${node.name.replace(/^\//, '')}`);
+  level(state, name);
+  const words = node.silent ? `silent for ${fixed(node.age, 0)} s; last: ` : name === 'fine' ? '' : `${name}: `;
+  line.append(state, words + node.words);
+  item.append(line);
+  for (const [key, value] of Object.entries(node.values)) {
+    item.append(make('p', `${key}: ${value}`, 'more'));
+  }
+  return item;
+}
+
+let told = '';
+function tellNodes() {
+  const text = JSON.stringify(frame.nodes.map((node) => [node, Math.round(node.silent ? node.age : 0)]),
+    (key, value) => (key === 'age' ? undefined : value));
+  if (text !== told && frame.nodes.length) {
+    told = text;
+    find('nodes').querySelector('ul').replaceChildren(...frame.nodes.map(tell));
+  }
+  const worst = frame.nodes.reduce((state, node) => {
+    const name = node.silent ? 'silent' : LEVELS[node.level];
+    const rank = ['fine', 'silent', 'warning', 'error'];
+    return rank.indexOf(name) > rank.indexOf(state.name) ? {name, node} : state;
+  }, {name: frame.nodes.length ? 'fine' : 'none', node: null});
+  const of = worst.node ? worst.node.name.replace(/^\//, '') : '';
+  const words = {
+    fine: 'nodes are fine', none: 'no node has said anything', silent: `${of} is silent`,
+    warning: `warning: ${of}`, error: `error: ${of}`,
+  }[worst.name];
+  level(find('state'), worst.name);
+  put(find('state'), `${SIGNS[worst.name]} ${words}`);
+}
+
+function tellAim() {
+  const target = frame.target && frame.target[0] !== null ? frame.target : null;
+  find('aimed').hidden = target === null;
+  if (!target) return;
+  needleDrawing.aim(find('aim'), frame);
+  const parts = [`Target x ${fixed(mm(target[0]), 2)}, y ${fixed(mm(target[1]), 1)}, z ${fixed(mm(target[2]), 2)} mm.`];
+  if (frame.expected) {
+    const {at, half} = frame.expected;
+    parts.push(`Expected there: x ${fixed(mm(at[0]), 2)} ± ${fixed(mm(half[0]), 2)}, z ${fixed(mm(at[2]), 2)} ± ${fixed(mm(half[1]), 2)} mm (95 %).`);
+  }
+  const chance = frame.nodes.map((node) => node.values['chance to come within 1 mm']).find(Boolean);
+  if (chance) parts.push(`Chance to come within 1 mm: ${chance}.`);
+  put(find('reach'), parts.join(' '));
+}
+
+function tellShape() {
+  const of = scene.tissue ? ` Tissue as the node ${scene.tissue.of} has it.` : ' No node has told of needle and tissue.';
+  const words = frame.shape === 'straight'
+    ? `The shape of the needle is not measured: the dashed line is straight from the guide to the tip.${of}`
+    : frame.shape === null ? 'The needle is not seen: no joint_states.' : '';
+  find('shape').hidden = words === '';
+  put(find('shape'), words);
+}
+
+/* Words and numbers: not so often that nobody could read them. */
+function say() {
+  clearTimeout(saying);
+  saying = 0;
+  worded = performance.now();
+  QUANTITIES.forEach(show);
+  tellNodes();
+  tellAim();
+  tellShape();
+  if (playback) tellPlayback();
+}
+
+/* Frames. */
+
+function draw(now) {
+  waiting = false;
+  if (!frame) return;
+  drawnAt = now;
+  drawing.draw(scene, frame);
+  CHARTS.forEach(chart);
+  if (now - worded > WORDS) say();
+  /* The last of several frames is told, too. */
+  else if (!saying) saying = setTimeout(say, WORDS);
+  seen.drawn += 1;
+  if (unseen) send({seen: unseen});
+  unseen = 0;
+}
+
+function later() {
+  if (waiting) return;
+  waiting = true;
+  /* Who wants less motion gets two pictures a second. */
+  const pause = calm.matches ? Math.max(0, 500 - (performance.now() - drawnAt)) : 0;
+  if (pause) setTimeout(() => requestAnimationFrame(draw), pause);
+  else requestAnimationFrame(draw);
+}
+
+const rowOf = (f) => [f.time, f.depth, f.reference, f.force, f.tip ? f.tip[0] : null, f.tip ? f.tip[2] : null];
+
+function take(message) {
+  if (message.answer) return answered(message.answer);
+  if (message.setting) settle(message.setting);
+  if (message.scene) scene = message.scene;
+  if (message.playback) playback = message.playback;
+  if (message.history) {
+    history = message.history;
+    worded = 0;
+  }
+  if (!message.frame) return undefined;
+  frame = message.frame;
+  seen.frames += 1;
+  unseen += 1;
+  if (!history.length || frame.time > history[history.length - 1][0]) history.push(rowOf(frame));
+  while (history.length && history[0][0] < frame.time - SPAN - 1) history.shift();
+  later();
+  return undefined;
+}
+
+function settle(given) {
+  setting = given;
+  drawing.reset();
+  find('playback').hidden = setting.recording === null;
+  find('control').hidden = !(setting.control && token);
+  find('looking').hidden = setting.recording !== null || (setting.control && token !== '');
+  put(find('source'), setting.recording ? `recording ${setting.recording.name}` : 'live');
+  if (!setting.recording) return;
+  find('at').max = setting.recording.duration;
+  find('at').step = setting.recording.duration / 500;
+  find('losses').hidden = !setting.recording.losses.length;
+  put(find('losses'), setting.recording.losses.join('; '));
+}
+
+/* Playing a recording. */
+
+function tellPlayback() {
+  put(find('play'), playback.playing ? 'Pause' : 'Play');
+  put(find('clock'), `${fixed(frame.time, 1)} of ${fixed(setting.recording.duration, 1)} s`);
+  if (!dragging) find('at').value = frame.time;
+}
+
+find('play').addEventListener('click', () => playback && send({play: !playback.playing}));
+find('speed').addEventListener('change', (event) => send({speed: Number(event.target.value)}));
+find('at').addEventListener('pointerdown', () => { dragging = true; });
+for (const kind of ['change', 'pointerup', 'pointercancel']) {
+  find('at').addEventListener(kind, () => { dragging = false; });
+}
+find('at').addEventListener('input', (event) => send({at: Number(event.target.value)}));
+
+/* Control. */
+
+function answered({asked, success, words}) {
+  const node = find('answer');
+  level(node, success ? 'fine' : 'error');
+  put(node, `${success ? '●' : '■ refused'} ${asked}${asked && words ? ': ' : ''}${words}`);
+}
+
+for (const button of document.querySelectorAll('[data-ask]')) {
+  button.addEventListener('click', () => {
+    if (!send({ask: button.dataset.ask, token})) {
+      answered({asked: button.dataset.ask, success: false, words: 'not connected'});
+    }
+  });
+}
+
+find('target').addEventListener('submit', (event) => {
+  event.preventDefault();
+  const {x, y, z} = event.target.elements;
+  send({ask: 'target', at: [x, y, z].map((input) => Number(input.value) / 1e3), token});
+});
+
+/* The connection. */
+
+function send(message) {
+  const open = socket !== null && socket.readyState === WebSocket.OPEN;
+  if (open) socket.send(JSON.stringify(message));
+  return open;
+}
+
+function connect() {
+  socket = new WebSocket(`ws://${location.host}/frames`);
+  socket.addEventListener('open', () => {
+    seen.connected = true;
+    unseen = 0;
+    document.body.classList.remove('lost');
+  });
+  socket.addEventListener('message', (event) => take(JSON.parse(event.data)));
+  socket.addEventListener('close', () => {
+    seen.connected = false;
+    document.body.classList.add('lost');
+    level(find('state'), 'error');
+    put(find('state'), '■ not connected: needle watch has ended or cannot be reached');
+    setTimeout(connect, 1000);
+  });
+}
+
+new ResizeObserver(() => frame && later()).observe(document.querySelector('main'));
+connect();

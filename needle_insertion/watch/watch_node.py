@@ -1,0 +1,252 @@
+"""Node `watch`: listens to what the page shows, and costs the others as little as it can."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from functools import partial
+import os
+from time import monotonic
+from typing import Any, Final
+
+from needle_insertion.live.operator import Operator
+from needle_insertion.watch.recorded import STREAMS
+from needle_insertion.watch.scene import CONFIGURED, parameters_of
+from needle_insertion.watch.view import View
+from needle_ros import contract
+from needle_ros.base_node import message_class, profile
+from needle_ros.contract import Qos, Topic
+from needle_ros.errors import JobError, MessageError
+from needle_ros.network import domain_of, stay_local
+from needle_ros.wire import read_line, read_string, Reader
+from rclpy.context import Context
+from rclpy.experimental.events_executor import EventsExecutor
+from rclpy.node import Node
+from rclpy.subscription import Subscription
+
+#: Only the newest reading counts.
+_NEWEST: Final = contract.SENSOR._replace(depth=1)
+
+#: Needle and path of a picture, and those of the one before.
+_LINES: Final = contract.SENSOR._replace(depth=4)
+
+#: Longest wait for the answer of a node, and time between two looks for it [s].
+_PATIENCE: Final = 5.0
+_LOOK: Final = 0.01
+
+#: Events that are worked off at a time: the rest waits.
+_EVENTS: Final = 50
+
+#: A burst at the start: every node says something.
+_SAID: Final = contract.SENSOR._replace(depth=50)
+
+
+class WatchNode(Node):
+    """
+    Brings the newest of every topic to a view, when it is asked to.
+
+    It is not spun: messages wait in the middleware, which keeps the newest ones only, and `poll`
+    takes these. So a topic of 1 kHz costs no more of Python than one of 30 Hz. It asks for best
+    effort, so that nobody waits for it or sends anything again, and it publishes nothing.
+
+    Parameters
+    ----------
+    view : View
+        Where the messages go.
+    context : Context
+        Context of the node.
+
+    """
+
+    def __init__(self, view: View, context: Context) -> None:
+        super().__init__(
+            'watch', context=context, enable_rosout=False, start_parameter_services=False
+        )
+        self._view = view
+        self._takers: list[tuple[Subscription, Callable[[Any, float], None]]] = []
+        for topic in STREAMS:
+            read = Reader(topic.type_name).read
+
+            def take(data: bytes, now: float, name: str = topic.name, read: Any = read) -> None:
+                view.reading(name, read(data), now)
+
+            self._listen(topic, _NEWEST, take)
+        self._listen(
+            contract.NEEDLE_SHAPE, _LINES, lambda data, now: view.line(*read_line(data), now)
+        )
+        for node in CONFIGURED:
+            topic = replace(contract.CONFIGURATION, name=f'{node}/configuration')
+            self._listen(topic, contract.LATCHED, partial(self._configured, node))
+        self._listen(
+            contract.TIP_EXPECTED, _NEWEST, lambda said, _: view.expected(said), raw=False
+        )
+        self._listen(contract.DIAGNOSTICS, _SAID, self._told, raw=False)
+
+    def _listen(
+        self,
+        topic: Topic,
+        qos: Qos,
+        take: Callable[[Any, float], None],
+        *,
+        raw: bool = True,
+    ) -> None:
+        """Keep what comes on a topic until it is taken."""
+        made = self.create_subscription(
+            message_class(topic.type_name), topic.name, lambda _: None, profile(qos), raw=raw
+        )
+        self._takers.append((made, take))
+
+    def _configured(self, node: str, data: bytes, _now: float) -> None:
+        self._view.configuration(node, parameters_of(read_string(data)))
+
+    def _told(self, array: Any, now: float) -> None:
+        for status in array.status:
+            self._view.status(status, now)
+
+    def poll(self, now: float) -> None:
+        """
+        Take what has come.
+
+        Parameters
+        ----------
+        now : float
+            Time of a steady clock [s].
+
+        """
+        for subscription, take in self._takers:
+            # At most what may wait: what comes meanwhile is for the next time.
+            for _ in range(subscription.qos_profile.depth):
+                with subscription.handle:
+                    taken = subscription.handle.take_message(
+                        subscription.msg_type, subscription.raw
+                    )
+                if taken is None:
+                    break
+                try:
+                    take(taken[0], now)
+                except MessageError:
+                    self._view.invalid += 1
+
+
+class Buttons:
+    """
+    What the buttons of the page do, through an `Operator`.
+
+    Parameters
+    ----------
+    context : Context
+        Context of its node.
+
+    """
+
+    def __init__(self, context: Context) -> None:
+        self._node = Node(
+            'watch_control', context=context, enable_rosout=False, start_parameter_services=False
+        )
+        self._operator = Operator(self._node)
+        self._executor = EventsExecutor(context=context)
+        self._executor.add_node(self._node)
+
+    def spin(self) -> None:
+        """Take what nodes have answered."""
+        for _ in range(_EVENTS):
+            self._executor.spin_once(timeout_sec=0.0)
+
+    def target(self, x: float, y: float, z: float) -> None:
+        """
+        Aim the tip.
+
+        Parameters
+        ----------
+        x, y, z : float
+            Where it shall be [m].
+
+        Raises
+        ------
+        JobError
+            If nobody takes it.
+
+        """
+        # One of them is the `WatchNode` of this process.
+        if self._node.count_subscribers(contract.TARGET.name) < 2:
+            raise JobError('no node takes targets: start a controller or the node steering')
+        self._operator.target(x, y, z)
+
+    async def ask(self, what: str) -> tuple[bool, str]:
+        """
+        Ask the nodes for something.
+
+        Parameters
+        ----------
+        what : str
+            A key of `needle_insertion.live.operator.REQUESTS`.
+
+        Returns
+        -------
+        bool, str
+            Whether it was done, and what they said.
+
+        Raises
+        ------
+        JobError
+            If there is no answer.
+
+        """
+        answer = self._operator.ask(what)
+        end = monotonic() + _PATIENCE
+        while not answer.done():
+            if monotonic() > end:
+                raise JobError(f'no answer to {what} within {_PATIENCE:g} s')
+            await asyncio.sleep(_LOOK)
+            self.spin()
+        success, words = answer.result()
+        return bool(success), str(words)
+
+    def end(self) -> None:
+        """Leave the graph."""
+        self._executor.remove_node(self._node)
+        self._executor.shutdown()
+        self._node.destroy_node()
+
+
+@contextmanager
+def watching(*, control: bool) -> Iterator[tuple[View, Callable[[float], None], Buttons | None]]:
+    """
+    Join the graph of the user, to watch it.
+
+    Parameters
+    ----------
+    control : bool
+        Whether there are buttons.
+
+    Yields
+    ------
+    View
+        What is seen.
+    callable
+        Brings what has come to the view.
+    Buttons or None
+        What the buttons do.
+
+    """
+    stay_local(os.environ)
+    context = Context()
+    context.init(domain_id=domain_of(os.environ))
+    try:
+        view = View()
+        node = WatchNode(view, context)
+        buttons = Buttons(context) if control else None
+
+        def poll(now: float) -> None:
+            node.poll(now)
+            if buttons is not None:
+                buttons.spin()
+
+        yield view, poll, buttons
+        if buttons is not None:
+            buttons.end()
+        node.destroy_node()
+    finally:
+        context.try_shutdown()

@@ -1,0 +1,823 @@
+"""The page of `needle watch`: what is seen, of a bag too, and who is let in."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator, Callable, Coroutine
+from contextlib import asynccontextmanager
+from functools import partial
+import json
+from math import inf, nan
+import os
+from pathlib import Path
+import re
+import signal
+import socket
+import subprocess
+import sys
+from typing import Any
+
+from aiohttp import ClientSession, ClientWebSocketResponse, WSMsgType, WSServerHandshakeError
+from hypothesis import given
+from hypothesis import strategies as st
+from needle_identification import encode, RecordingError
+from needle_insertion import cli
+from needle_insertion.watch import recorded
+from needle_insertion.watch.live import Live, RecordedReader
+from needle_insertion.watch.recorded import Playback, Recording
+from needle_insertion.watch.scene import parameters_of, scene
+from needle_insertion.watch.server import LONGEST, MOST_READERS, Server
+from needle_insertion.watch.view import row, View
+from needle_ros import contract
+from needle_ros.errors import JobError, MessageError, ParameterError
+from needle_ros.wire import read_line, Reading
+import numpy as np
+import pytest
+from support.installed import ROOT
+from support.samples import simulated, write_bag
+from support.watched import (
+    CONFIGURATIONS,
+    DURATION,
+    expected,
+    marker,
+    shape,
+    status,
+    TARGET,
+    write_watched,
+)
+
+
+def joints(names: tuple[str, ...], *values: tuple[float, ...]) -> Reading:
+    """Return a reading of joints."""
+    return Reading(0, '', names, values)
+
+
+def numbers(*values: float) -> Reading:
+    """Return a reading of a type without joints."""
+    return Reading(0, '', (), (values,))
+
+
+def told(view: View, *names: str) -> None:
+    """Let a view have the configurations of nodes."""
+    for name in names:
+        view.configuration(name, parameters_of(CONFIGURATIONS[name]))
+
+
+# What is seen.
+
+
+def test_a_frame_has_what_has_come() -> None:
+    """Depth, velocity, force of the sensor, reference, error, tip and guide, in SI units."""
+    view = View()
+    view.reading(
+        'joint_states',
+        joints(('insertion', 'guide_x', 'guide_z'), (0.05, 1e-3, 2e-3), (0.01, 0, 0), (3.0, 0, 0)),
+        1.0,
+    )
+    assert view.frame(1.0)['force'] == 3.0
+    assert view.frame(1.0)['sensed'] is False
+    view.reading('base_wrench', numbers(0.1, 2.5, 0.2, 0.0, 0.0, 0.0), 1.0)
+    view.reading('tip_deflection', numbers(3e-3, 0.05, -1e-3), 1.0)
+    view.reading('reference', joints(('insertion',), (0.051,), (0.01,), ()), 1.0)
+    view.reading('tracking_error', joints(('insertion',), (0.001,), (0.0,), ()), 1.0)
+    seen = view.frame(1.25)
+    assert {
+        'time': 1.25, 'depth': 0.05, 'velocity': 0.01, 'force': 2.5, 'sensed': True,
+        'reference': 0.051, 'error': 0.001, 'tip': [3e-3, 0.05, -1e-3], 'guide': [1e-3, 2e-3],
+        'roll': None, 'target': None, 'expected': None, 'silent': {}, 'nodes': [],
+    }.items() <= seen.items()  # fmt: skip
+    assert row(seen) == [1.25, 0.05, 0.051, 2.5, 3e-3, -1e-3]
+
+
+any_number = st.floats(allow_nan=True, allow_infinity=True)
+
+
+@given(st.lists(any_number, min_size=3, max_size=3), st.integers(0, 3), st.floats(0.0, 1e150))
+def test_whatever_comes_a_frame_is_json(values: list[float], count: int, deviation: float) -> None:
+    """Numbers that are not finite, and joints without numbers, are None: JSON has no other."""
+    view = View()
+    view.reading('joint_states', joints(('insertion',) * count, tuple(values), (), ()), 0.0)
+    view.reading('tip_deflection', numbers(*values), 0.0)
+    view.reading('base_wrench', numbers(*values), 0.0)
+    view.line('needle', np.array([values, [0.0, 0.1, 0.0]]), 0.0)
+    view.expected(expected(values[0], values[1], deviation))
+    said = json.loads(json.dumps(view.frame(0.0), allow_nan=False))
+    for shown, value in zip(said['tip'], values, strict=True):
+        assert shown is None if not abs(value) < inf else shown == round(value, 7)
+
+
+def test_the_shape_is_that_of_the_plant_or_straight() -> None:
+    """Without a shape, or with one that is old, a straight needle is drawn, and is called so."""
+    view = View()
+    assert view.frame(0.0)['shape'] is None
+    told(view, 'plant')
+    state = joints(('insertion', 'guide_x'), (0.05, 1e-3), (), ())
+    view.reading('joint_states', state, 0.0)
+    view.reading('tip_deflection', numbers(3e-3, 0.05, -1e-3), 0.0)
+    straight = view.frame(0.0)
+    assert straight['shape'] == 'straight'
+    # From the base over the guide, 4 cm before the skin, to the tip.
+    assert straight['needle'] == [[1e-3, 1e-3, 3e-3], [-0.15, -0.04, 0.05], [0.0, 0.0, -1e-3]]
+    view.line('needle', shape(0.05), 0.5)
+    view.line('path', shape(0.05)[20:], 0.5)
+    bent = view.frame(0.6)
+    assert bent['shape'] == 'simulated'
+    np.testing.assert_allclose(np.transpose(bent['needle']), shape(0.05), atol=1e-6)
+    later = view.frame(2.0)
+    assert later['shape'] == 'straight'
+    # What was cut stays.
+    assert later['path'] == bent['path']
+
+
+def test_a_long_line_keeps_its_ends() -> None:
+    """A line has 120 points at most, the first and the last among them."""
+    view = View()
+    points = np.linspace([0.0, -0.04, 0.0], [1e-3, 0.1, 2e-3], 5000)
+    view.line('path', points, 0.0)
+    seen = np.transpose(view.frame(0.0)['path'])
+    assert len(seen) == 120
+    np.testing.assert_allclose(seen[[0, -1]], points[[0, -1]], atol=1e-6)
+
+
+def test_who_is_silent_is_named() -> None:
+    """A stream after a second, a node after three; a target comes once and is no stream."""
+    view = View()
+    view.reading('joint_states', joints(('insertion',), (0.05,), (), ()), 0.0)
+    view.reading('target', numbers(0.0, 0.1, 0.0), 0.0)
+    view.status(status('/plant', 'active'), 0.0)
+    assert view.frame(0.9)['silent'] == {}
+    seen = view.frame(2.5)
+    assert seen['silent'] == {'joint_states': 2.5}
+    assert not seen['nodes'][0]['silent']
+    (plant,) = view.frame(4.0)['nodes']
+    assert (plant['silent'], plant['age'], plant['words']) == (True, 4.0, 'active')
+
+
+def test_the_worst_node_comes_first() -> None:
+    """Each node once, with the newest that it has said; control characters are not shown."""
+    view = View()
+    view.status(status('/a', 'active'), 0.0)
+    view.status(status('/b', 'no\njoint_states\x1b[2J', level=1), 0.0)
+    view.status(status('/c', 'active'), 0.0)
+    view.status(status('/c', 'stopped', {'step': '3 of 20'}, level=2), 1.0)
+    nodes = view.frame(1.0)['nodes']
+    assert [(one['name'], one['level']) for one in nodes] == [('/c', 2), ('/b', 1), ('/a', 0)]
+    assert nodes[0]['values'] == {'step': '3 of 20'}
+    assert nodes[1]['words'] == 'no joint_states?[2J'
+
+
+def test_the_target_is_the_one_that_was_taken() -> None:
+    """As the nodes say; one on the topic counts only where no node of ours says anything."""
+    view = View()
+    view.reading('target', numbers(1e-3, 0.2, 0.0), 0.0)
+    assert view.frame(0.0)['target'] == [1e-3, 0.2, 0.0]
+    view.status(status('/controller', 'active', {'target [m]': 'None'}), 0.0)
+    assert view.frame(0.0)['target'] is None
+    view.status(status('/controller', 'active', {'target [m]': '0.08'}), 0.0)
+    assert view.frame(0.0)['target'] == [None, 0.08, None]
+    told(view, 'steering')
+    assert view.frame(0.0)['target'] is None
+    aim = {'target x, y, z [m]': '0.004, 0.1, -0.002'}
+    view.status(status('/steering', 'inserts', aim), 0.0)
+    assert view.frame(0.0)['target'] == list(TARGET)
+    view.status(status('/steering', 'inserts', {'target x, y, z [m]': 'none'}), 0.0)
+    assert view.frame(0.0)['target'] is None
+
+
+def test_what_is_expected_has_an_interval_of_95_percent() -> None:
+    """1.96 standard deviations on each side; without finite numbers there is none."""
+    view = View()
+    view.expected(expected(1e-3, 2e-3, deviation=1e-3))
+    assert view.frame(0.0)['expected'] == {
+        'at': [1e-3, 0.1, 2e-3], 'half': [1.96e-3, 1.96e-3], 'correlation': 0.0,
+    }  # fmt: skip
+    view = View()
+    view.expected(expected(nan, 2e-3, deviation=1e-3))
+    assert view.frame(0.0)['expected'] is None
+    assert view.frame(0.0)['invalid'] == 1
+
+
+def test_tissue_and_limits_are_those_of_the_configurations() -> None:
+    """Layers, membranes and free length of the plant; limits and depths of the controller."""
+    found = scene({name: parameters_of(text) for name, text in CONFIGURATIONS.items()})
+    assert found == {
+        'tissue': {
+            'of': 'plant', 'length': 0.2, 'free': 0.04,
+            'layers': [[0.0, 520.0], [0.04, 20000.0]], 'membranes': [[0.03, 1.2]],
+        },
+        'limits': {
+            'force': 15.0, 'load': 30.0, 'speed': 0.1, 'error': 0.01, 'deflection': 0.05,
+            'low': 0.001, 'high': 0.2,
+        },
+        'steered': True,
+    }  # fmt: skip
+    assert scene({}) == {'tissue': None, 'limits': {}, 'steered': False}
+
+
+@pytest.mark.parametrize(
+    'text', ['', '- 1', 'a: b', 'a: {ros__parameters: 3}', '{', 'a: &x [*x]', 'a: {}\nb: {}']
+)
+def test_a_configuration_that_is_none_is_left_out(text: str) -> None:
+    """It counts as a message that could not be read."""
+    view = View()
+    view.configuration('plant', parameters_of(text))
+    assert view.scene['tissue'] is None
+    assert view.frame(0.0)['invalid'] == 1
+
+
+@given(
+    st.dictionaries(
+        st.sampled_from(['model.length', 'model.layer_depths', 'force_limit', 'highest_depth']),
+        st.one_of(st.none(), st.text(), st.booleans(), any_number, st.lists(any_number)),
+    )
+)
+def test_whatever_a_configuration_says_a_scene_is_json(parameters: dict[str, Any]) -> None:
+    """What is no finite number is left out."""
+    json.dumps(scene({'plant': parameters, 'controller': parameters}), allow_nan=False)
+
+
+def test_a_line_is_read_from_its_bytes() -> None:
+    """Name and points of a marker; bytes that end before that are refused."""
+    data = encode(marker('path', shape(0.05)))
+    name, points = read_line(data)
+    assert name == 'path'
+    np.testing.assert_array_equal(points, shape(0.05))
+    for end in (0, 3, 40, len(data) // 2):
+        with pytest.raises(MessageError):
+            read_line(data[:end])
+
+
+# Of a bag.
+
+
+@pytest.fixture(scope='module')
+def watched(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a bag with everything that is shown."""
+    path = tmp_path_factory.mktemp('watched') / 'bag'
+    write_watched(path)
+    return path
+
+
+@pytest.mark.parametrize('space', ['', '/robot'])
+def test_a_bag_shows_what_was_at_each_time(tmp_path: Path, space: str) -> None:
+    """Also one of a graph in a namespace."""
+    write_watched(tmp_path / 'bag', space)
+    bag = Recording(tmp_path / 'bag')
+    assert bag.duration == DURATION
+    assert bag.losses == ()
+    for time in (1.0, 3.0, 1.0):
+        seen = bag.view(time).frame(time)
+        assert seen['depth'] == pytest.approx(0.02 * time, abs=1e-3)
+        assert seen['force'] == pytest.approx(2.0 + time, abs=0.05)
+        assert seen['shape'] == 'simulated'
+        assert seen['needle'][1][-1] == pytest.approx(0.02 * time, abs=1e-3)
+        assert seen['target'] == list(TARGET)
+        assert seen['expected']['half'][0] == pytest.approx(1.96e-3 / (1.0 + int(time)))
+        levels = {one['name']: (one['level'], one['silent']) for one in seen['nodes']}
+        assert levels['/steering'] == (time > 2.5, False)
+    assert {one['name']: one['silent'] for one in bag.view(3.9).frame(3.9)['nodes']} == {
+        '/steering': False, '/plant': False, '/controller': True,
+    }  # fmt: skip
+    assert bag.view(0.0).scene['tissue']['of'] == 'plant'
+    history = np.array(bag.history(3.0))
+    assert history.shape == (30, 6)
+    np.testing.assert_allclose(history[1:, 1], 0.02 * history[1:, 0], atol=1e-3)
+
+
+def test_a_bag_of_a_robot_has_no_shape(tmp_path: Path) -> None:
+    """Depth and force are shown, and the needle is straight."""
+    write_bag(tmp_path / 'bag', simulated())
+    bag = Recording(tmp_path / 'bag')
+    seen = bag.view(2.0).frame(2.0)
+    assert seen['shape'] == 'straight'
+    assert seen['depth'] > 0.02
+
+
+def test_a_long_recording_does_not_fill_the_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of more messages than are kept every other one goes, from its beginning to its end."""
+    monkeypatch.setattr(recorded, '_MOST', 100)
+    kept = recorded._Kept[int](1.0 / 30.0)
+    for k in range(100_000):
+        kept.add(k / 100.0, partial(int, k))
+    assert 40 < len(kept._times) <= 100
+    for time in (0.0, 1.0, 500.0, 999.0):
+        found = kept.at(time)
+        assert found is not None
+        assert found[1] == found[0] * 100.0
+        assert time - found[0] <= kept.interval + 0.02
+    assert kept.at(-1.0) is None
+
+
+def file_of(bag: Path) -> Path:
+    """Return the file in the folder of a bag."""
+    (file,) = bag.glob('*.mcap')
+    return file
+
+
+def test_of_a_damaged_bag_the_rest_is_shown(watched: Path, tmp_path: Path) -> None:
+    """What was lost is said."""
+    file = tmp_path / 'cut.mcap'
+    data = file_of(watched).read_bytes()
+    file.write_bytes(data[: 2 * len(data) // 3])
+    bag = Recording(file)
+    assert 0.5 < bag.duration < DURATION
+    assert bag.losses
+    assert bag.view(0.5).frame(0.5)['depth'] == pytest.approx(0.01, abs=1e-3)
+
+
+def unusable(folder: Path, what: str) -> Path:
+    """Make a bag that has nothing to show."""
+    path = folder / 'bag'
+    if what == 'damaged':
+        (folder / 'bag.mcap').write_bytes(bytes(range(256)) * 40)
+        return folder / 'bag.mcap'
+    if what == 'empty':
+        recorded_bag = folder / 'other'
+        write_watched(recorded_bag)
+        data = file_of(recorded_bag).read_bytes()
+        (folder / 'bag.mcap').write_bytes(data[:60])
+        return folder / 'bag.mcap'
+    if what == 'of others':
+        from needle_identification import BagWriter
+
+        with BagWriter(path) as bag:
+            bag.add_topic('/chatter', 'std_msgs/msg/String')
+            data = CONFIGURATIONS['plant'].encode()
+            bag.write('/chatter', b'\0\1\0\0' + len(data).to_bytes(4, 'little') + data, 0)
+    if what == 'invalid':
+        from needle_identification import BagWriter
+
+        with BagWriter(path) as bag:
+            bag.add_topic('/joint_states', contract.JOINT_STATES.type_name)
+            bag.write('/joint_states', b'\0\1\0\0no', 0)
+    return path
+
+
+@pytest.mark.parametrize('what', ['damaged', 'empty', 'of others', 'invalid', 'missing'])
+def test_a_bag_with_nothing_to_show_is_refused(
+    tmp_path: Path, what: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """One line that names it, and status 2."""
+    path = unusable(tmp_path, what)
+    with pytest.raises(RecordingError):
+        Recording(path)
+    assert cli.main(['watch', str(path), '--port', '0']) == 2
+    said = capsys.readouterr()
+    assert said.out == ''
+    (line,) = said.err.splitlines()
+    assert line.startswith('error: ')
+    assert path.name in line
+
+
+def test_a_recording_is_played() -> None:
+    """Its time goes on by its speed, up to the end; a jump is told."""
+    now = 100.0
+    play = Playback(10.0, lambda: now)
+    assert play.playing
+    now += 2.0
+    assert play.at == 2.0
+    assert not play.take({'speed': 2.0})
+    now += 1.0
+    assert play.at == 4.0
+    assert not play.take({'play': False})
+    now += 5.0
+    assert play.at == 4.0
+    assert play.take({'at': 9})
+    assert play.at == 9.0
+    assert not play.take({'play': True})
+    now += 5.0
+    assert (play.at, play.playing) == (10.0, False)
+    # From the end it begins anew.
+    assert play.take({'play': True})
+    assert play.at == 0.0
+    assert play.take({'at': 1e9})
+    assert play.at == 10.0
+
+
+@pytest.mark.parametrize(
+    'message',
+    [{}, {'at': '1'}, {'at': True}, {'play': 1}, {'speed': 0}, {'speed': 1e3}, {'at': 1, 'b': 2}],
+)
+def test_what_a_recording_does_not_know_is_refused(message: dict[str, Any]) -> None:
+    """With what it takes."""
+    with pytest.raises(ParameterError, match='a recording takes'):
+        Playback(10.0).take(message)
+
+
+# The server.
+
+
+class Counting:
+    """Frames that are numbers: a new one whenever a reader asks."""
+
+    def __init__(self) -> None:
+        self.number = 0
+        self.taken: list[dict[str, Any]] = []
+
+    async def next(self) -> str:
+        self.number += 1
+        await asyncio.sleep(0.001)
+        return json.dumps({'frame': self.number})
+
+    def take(self, message: dict[str, Any]) -> None:
+        if 'at' not in message:
+            raise ParameterError('takes at')
+        self.taken.append(message)
+
+
+class Buttons:
+    """What the buttons do: notes it. A retreat ends when it is let."""
+
+    def __init__(self) -> None:
+        self.done: list[Any] = []
+        self.free = asyncio.Event()
+
+    def target(self, x: float, y: float, z: float) -> None:
+        if y > 1.0:
+            raise JobError('no node takes targets')
+        self.done.append((x, y, z))
+
+    async def ask(self, what: str) -> tuple[bool, str]:
+        self.done.append(what)
+        if what == 'retract':
+            await self.free.wait()
+        return what != 'clear', f'{what} it is'
+
+
+class Page:
+    """A served page, and a browser at it."""
+
+    def __init__(self, server: Server, session: ClientSession, made: list[Counting]) -> None:
+        self.server, self.session, self.made = server, session, made
+        self.url = server.address.partition('#')[0]
+        self.port = self.url.rstrip('/').rpartition(':')[2]
+
+    async def open(self, **headers: str) -> ClientWebSocketResponse:
+        """Open the stream of frames."""
+        return await self.session.ws_connect(f'{self.url}frames', headers=headers)
+
+    async def tell(self, stream: ClientWebSocketResponse, message: object) -> dict[str, Any]:
+        """Send a message, and return its answer."""
+        await stream.send_str(message if isinstance(message, str) else json.dumps(message))
+        return await answer(stream)
+
+
+async def answer(stream: ClientWebSocketResponse) -> dict[str, Any]:
+    """Return the next answer; frames in between are seen."""
+    while True:
+        said = await asyncio.wait_for(stream.receive_json(), 60.0)
+        if 'answer' in said:
+            return said['answer']
+        await stream.send_json({'seen': 1})
+
+
+@asynccontextmanager
+async def served(control: Buttons | None = None, **options: Any) -> AsyncIterator[Page]:
+    """Serve numbers."""
+    made: list[Counting] = []
+
+    def reader() -> Counting:
+        made.append(Counting())
+        return made[-1]
+
+    server = Server(reader, **{'port': 0, 'control': control, **options})
+    await server.start()
+    try:
+        async with ClientSession() as session:
+            yield Page(server, session, made)
+    finally:
+        await server.end()
+
+
+def in_loop(test: Callable[[], Coroutine[Any, Any, None]]) -> Callable[[], None]:
+    """Run a test in a loop of its own."""
+
+    def run() -> None:
+        asyncio.run(asyncio.wait_for(test(), 300.0))
+
+    run.__doc__, run.__name__ = test.__doc__, test.__name__
+    return run
+
+
+@in_loop
+async def test_the_page_needs_nothing_from_elsewhere() -> None:
+    """No file of it names another server, and the browser is told to ask none."""
+    async with served() as page:
+        for name in ('', 'watch.css', 'watch.js', 'needle.js'):
+            async with page.session.get(page.url + name) as reply:
+                assert reply.status == 200
+                text = await reply.text()
+                assert not re.search(r'https?:|//\w+\.\w|@import|url\(', text), name
+                policy = reply.headers['Content-Security-Policy']
+                assert policy.startswith("default-src 'none'; script-src 'self'; ")
+                assert 'http' not in policy
+                assert reply.headers['X-Frame-Options'] == 'DENY'
+        for name in ('nothing', '..%2fserver.py', 'watch.html'):
+            async with page.session.get(page.url + name) as reply:
+                assert reply.status == 404
+
+
+@in_loop
+async def test_a_name_that_leads_here_is_refused() -> None:
+    """DNS rebinding: a page of somebody else whose name leads to 127.0.0.1 gets nothing."""
+    async with served() as page:
+        for host in (
+            f'evil.example:{page.port}', 'evil.example', '127.0.0.1', '127.0.0.1:1', '',
+            f'127.0.0.1.evil.example:{page.port}', f'8.8.8.8:{page.port}', '[::1',
+            f'@:{page.port}',
+        ):  # fmt: skip
+            async with page.session.get(page.url, headers={'Host': host}) as reply:
+                assert reply.status in (400, 403), host
+                assert 'needle' not in (await reply.text()).partition('header Host')[0]
+            with pytest.raises(WSServerHandshakeError):
+                await page.open(Host=host)
+        for host in (f'localhost:{page.port}', f'127.0.0.1:{page.port}'):
+            async with page.session.get(page.url, headers={'Host': host}) as reply:
+                assert reply.status == 200
+
+
+@in_loop
+async def test_a_page_of_somebody_else_is_refused() -> None:
+    """Cross-site requests: a WebSocket that another page opens gets nothing."""
+    async with served(Buttons()) as page:
+        for origin in ('http://evil.example', 'null', 'https://127.0.0.1', 'http://127.0.0.1:1'):
+            with pytest.raises(WSServerHandshakeError, match='403'):
+                await page.open(Origin=origin)
+        stream = await page.open(Origin=page.url.rstrip('/'))
+        assert (await stream.receive_json())['frame'] == 1
+
+
+@in_loop
+async def test_commands_need_the_token_of_the_process() -> None:
+    """Without it, or with another, nothing is done, and the answer says where it is."""
+    buttons = Buttons()
+    async with served(buttons) as page:
+        token = page.server.token
+        assert len(token) >= 32
+        assert page.server.address.endswith(f'#token={token}')
+        stream = await page.open()
+        for wrong in (None, '', 'x', token[:-1], token + 'x', 3, [token], 'ü', '\ud800'):
+            message = {'ask': 'stop'} if wrong is None else {'ask': 'stop', 'token': wrong}
+            said = await page.tell(stream, message)
+            assert said['success'] is False
+            assert 'open the URL that needle watch has printed' in said['words']
+        assert buttons.done == []
+        said = await page.tell(stream, {'ask': 'stop', 'token': token})
+        assert said == {'asked': 'stop', 'success': True, 'words': 'stop it is'}
+        said = await page.tell(stream, {'ask': 'clear', 'token': token})
+        assert said['success'] is False
+        said = await page.tell(stream, {'ask': 'target', 'at': [1e-3, 0.1, 0], 'token': token})
+        assert said['words'] == 'target 1, 100, 0 mm sent'
+        assert buttons.done == ['stop', 'clear', (1e-3, 0.1, 0.0)]
+    async with served(Buttons()) as page:
+        assert page.server.token != token
+
+
+@in_loop
+async def test_without_control_nothing_can_be_commanded() -> None:
+    """There is no token, and none helps."""
+    async with served() as page:
+        assert page.server.token == ''
+        assert '#' not in page.server.address
+        stream = await page.open()
+        for token in ('', 'x'):
+            said = await page.tell(stream, {'ask': 'stop', 'token': token})
+            assert said['success'] is False
+            assert said['words'] == 'this page is for looking only: needle watch --control'
+
+
+@in_loop
+async def test_a_command_that_is_none_is_refused() -> None:
+    """With what would be valid; nothing is done."""
+    buttons = Buttons()
+    async with served(buttons) as page:
+        stream, token = await page.open(), page.server.token
+        for message, words in (
+            ({'ask': 'fly'}, 'ask must be one of target, pause, resume, retract, stop, clear, '),
+            ({'ask': ['stop']}, 'ask must be one of'),
+            ({'ask': 'stop', 'more': 1}, 'ask must be one of'),
+            ({'ask': 'target'}, 'a target is {"at": [x, y, z]} with numbers in m'),
+            ({'ask': 'target', 'at': [0, 0.1]}, 'a target is'),
+            ({'ask': 'target', 'at': [0, '0.1', 0]}, 'a target is'),
+            ({'ask': 'target', 'at': [0, True, 0]}, 'a target is'),
+            ({'ask': 'target', 'at': [0, 10**400, 0]}, 'a target is'),
+            ({'ask': 'target', 'at': [0, 2.0, 0]}, 'no node takes targets'),
+        ):  # fmt: skip
+            said = await page.tell(stream, {**message, 'token': token})
+            assert said['success'] is False
+            assert words in said['words']
+        for text in (f'{{"ask": "target", "at": [0, {bad}, 0], "token": "{token}"}}'
+                     for bad in ('NaN', 'Infinity', '-Infinity', '1e999')):  # fmt: skip
+            assert (await page.tell(stream, text))['success'] is False
+        assert buttons.done == []
+
+
+@in_loop
+async def test_a_stop_does_not_wait_for_what_was_asked_before() -> None:
+    """While a retreat is under way, a stop is done and answered."""
+    buttons = Buttons()
+    async with served(buttons) as page:
+        stream, token = await page.open(), page.server.token
+        await stream.send_json({'ask': 'retract', 'token': token})
+        said = await page.tell(stream, {'ask': 'stop', 'token': token})
+        assert said['asked'] == 'stop'
+        for _ in range(20):
+            await stream.send_json({'ask': 'retract', 'token': token})
+        said = await answer(stream)
+        assert said['words'] == '8 commands are under way already'
+        buttons.free.set()
+
+
+@in_loop
+async def test_messages_that_are_none_do_no_harm() -> None:
+    """Each gets an answer, and the frames go on; too long a message ends its connection only."""
+    async with served() as page:
+        stream = await page.open()
+        for text in ('', '{', '[]', '3', 'null', '"x"', '[' * 4000, '{"seen": "all"}', '{"b": 1}'):
+            said = await page.tell(stream, text)
+            assert said['success'] is False
+        await stream.send_bytes(b'\0\xff')
+        assert 'must be text' in (await answer(stream))['words']
+        for number in (-5, 10**300):
+            await stream.send_json({'seen': number})
+        await stream.send_json({'at': 3})
+        await page.tell(stream, '{')
+        assert page.made[0].taken == [{'at': 3}]
+
+        await stream.send_str('x' * (LONGEST + 1))
+        kinds = []
+        while not stream.closed:
+            kinds.append((await stream.receive(60.0)).type)
+        assert kinds[-1] in (WSMsgType.CLOSE, WSMsgType.CLOSED)
+        assert stream.close_code == 1009
+        other = await page.open()
+        assert (await other.receive_json())['frame'] == 1
+
+
+@in_loop
+async def test_a_slow_reader_misses_frames_and_gets_no_old_ones() -> None:
+    """It gets two; the next only after it has seen one, and nothing is kept for it meanwhile."""
+    async with served() as page:
+        slow, quick = await page.open(), await page.open()
+        assert [(await slow.receive_json())['frame'] for _ in range(2)] == [1, 2]
+        for _ in range(100):
+            await quick.receive_json()
+            await quick.send_json({'seen': 1})
+        # The third is being made when the second has left; it has not been asked for.
+        assert page.made[0].number == 2
+        with pytest.raises(asyncio.TimeoutError):
+            await slow.receive(0.05)
+
+
+@in_loop
+async def test_what_is_live_is_the_newest() -> None:
+    """A reader that was slow gets the frame of now, and a new one what was before."""
+    view = View()
+    live = Live(view, lambda _: None, control=False)
+    running = asyncio.create_task(live.run())
+    try:
+        reader = live.reader()
+        first = json.loads(await reader.next())
+        assert {'frame', 'scene', 'setting', 'history'} == set(first)
+        while live.number < 10:
+            await live.newer(live.number)
+        view.reading('joint_states', joints(('insertion',), (0.05,), (), ()), 0.0)
+        told(view, 'controller')
+        number = live.number
+        await live.newer(number + 1)
+        later = json.loads(await reader.next())
+        assert later['frame']['depth'] == 0.05
+        assert later['scene']['limits']['force'] == 15.0
+        assert set(json.loads(await reader.next())) == {'frame'}
+        assert len(json.loads(await live.reader().next())['history']) > 10
+        with pytest.raises(ParameterError):
+            reader.take({'at': 1.0})
+    finally:
+        running.cancel()
+
+
+def test_what_is_recorded_is_shown_as_its_reader_asks(watched: Path) -> None:
+    """Frames of the time that was asked for, with what was before; two readers are apart."""
+    bag = Recording(watched)
+
+    async def look() -> None:
+        one, other = RecordedReader(bag), RecordedReader(bag)
+        first = json.loads(await one.next())
+        assert first['setting']['recording'] == {
+            'name': watched.name, 'duration': DURATION, 'losses': [],
+        }  # fmt: skip
+        assert first['scene']['tissue']['of'] == 'plant'
+        for reader, at in ((one, 3.0), (other, 1.0)):
+            reader.take({'play': False})
+            reader.take({'at': at})
+            seen = json.loads(await reader.next())
+            assert seen['frame']['time'] == at
+            assert len(seen['history']) == round(10 * at)
+        # One that is paused has nothing new.
+        waiting = asyncio.ensure_future(one.next())
+        await asyncio.sleep(0.2)
+        assert not waiting.done()
+        one.take({'play': True})
+        assert json.loads(await waiting)['frame']['time'] >= 3.0
+
+    asyncio.run(asyncio.wait_for(look(), 60.0))
+
+
+@in_loop
+async def test_readers_come_and_go() -> None:
+    """One that breaks off leaves nothing behind; more than may be at a time are refused."""
+    async with served() as page:
+        for _ in range(2 * MOST_READERS):
+            stream = await page.open()
+            await stream.receive_json()
+            # Without a word, as a browser that crashes.
+            assert stream._response.connection is not None
+            stream._response.connection.transport.abort()
+        for _ in range(600):
+            if not page.server._open:
+                break
+            await asyncio.sleep(0.1)
+        streams = [await page.open() for _ in range(MOST_READERS)]
+        with pytest.raises(WSServerHandshakeError, match='503'):
+            await page.open()
+        await streams[0].close()
+        assert len(asyncio.all_tasks()) < 10 * MOST_READERS
+
+
+@in_loop
+async def test_a_port_in_use_is_named() -> None:
+    """With what would be valid."""
+    with socket.socket() as taken:
+        taken.bind(('127.0.0.1', 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        with pytest.raises(ParameterError) as error:
+            await Server(Counting, port=port).start()
+    assert str(error.value) == (
+        f'cannot listen on 127.0.0.1, port {port}: the port is in use; valid: another --port, '
+        f'such as {port + 1}, or 0 for a free one'
+    )
+
+
+def test_it_is_open_for_looking_only() -> None:
+    """Control and other machines exclude each other; an address must be one."""
+    with pytest.raises(ParameterError, match='--control works on this machine only'):
+        Server(Counting, '0.0.0.0', control=Buttons())  # noqa: S104
+    with pytest.raises(ParameterError, match='--host must be an address'):
+        Server(Counting, 'lab.example')
+    with pytest.raises(ParameterError, match='--port must be 0 to 65535'):
+        Server(Counting, port=70_000)
+
+
+@in_loop
+async def test_an_open_page_is_found_by_address_only() -> None:
+    """And its first lines say that others may look."""
+    async with served(host='0.0.0.0') as page:  # noqa: S104
+        said = page.server.words
+        assert 'other machines may look' in said[1]
+        for host, code in ((f'192.0.2.1:{page.port}', 200), (f'evil.example:{page.port}', 403)):
+            async with page.session.get(page.url, headers={'Host': host}) as reply:
+                assert reply.status == code
+        stream = await page.open()
+        refused = await page.tell(stream, {'ask': 'stop', 'token': ''})
+        assert refused['success'] is False
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_it_with_status_0(watched: Path, number: signal.Signals) -> None:
+    """Also while somebody looks."""
+    running = subprocess.Popen(
+        [sys.executable, '-m', 'needle_insertion.cli', 'watch', str(watched), '--port', '0'],
+        env={**os.environ, 'PYTHONPATH': str(ROOT)},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        assert running.stdout is not None
+        line = running.stdout.readline()
+        url = line.removeprefix('page: ').strip()
+
+        async def look() -> None:
+            async with ClientSession() as session, session.ws_connect(f'{url}frames') as stream:
+                assert 'frame' in await stream.receive_json()
+                running.send_signal(number)
+                while not stream.closed:
+                    await stream.receive(60.0)
+                assert stream.close_code == 1001
+
+        asyncio.run(look())
+        assert running.wait(60.0) == 0
+        assert running.stderr is not None
+        assert running.stderr.read() == ''
+    finally:
+        running.kill()
+        running.communicate()
+
+
+def test_options_that_exclude_each_other_are_refused(
+    watched: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A recording cannot be commanded."""
+    assert cli.main(['watch', str(watched), '--control']) == 2
+    assert 'error: --control is for what is happening now' in capsys.readouterr().err

@@ -1,0 +1,329 @@
+"""`needle watch` on real nodes: frames arrive, buttons work or are refused, a browser shows it."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator, Callable, Iterator
+from contextlib import asynccontextmanager, contextmanager
+import os
+from pathlib import Path
+import signal
+import subprocess
+import sys
+from typing import Any
+
+from aiohttp import ClientSession, ClientWebSocketResponse
+from needle_insertion.watch.view import View
+from needle_insertion.watch.watch_node import WatchNode
+import pytest
+from support.browser import browser, Tab
+from support.installed import ROOT
+from support.pages import BROWSER
+from support.ros_graph import RosGraph
+from support.watched import write_watched
+
+#: A needle that a controller moves; slow enough for a machine that is busy.
+PLANT = {'model.preset': 'bending_35mm', 'steered': True, 'rate': 100.0, 'depth': 0.02}
+CONTROLLER = {
+    'model.preset': 'bending_35mm', 'rate': 100.0, 'deflection_feedback': 'none',
+    'measurement_timeout': 5.0,
+}  # fmt: skip
+
+needs_browser = pytest.mark.skipif(BROWSER is None, reason='no Chromium on this machine')
+
+
+@contextmanager
+def watching(environment: dict[str, str], *words: str) -> Iterator[tuple[Any, str]]:
+    """Start `needle watch`; give its process and the URL of its page."""
+    running = subprocess.Popen(
+        [sys.executable, '-m', 'needle_insertion.cli', 'watch', '--port', '0', *words],
+        env={**environment, 'PYTHONPATH': str(ROOT)},
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        assert running.stdout is not None
+        line = running.stdout.readline()
+        assert line.startswith('page: http://127.0.0.1:'), line
+        yield running, line.removeprefix('page: ').strip()
+    finally:
+        running.kill()
+        running.communicate()
+
+
+class Reader:
+    """Reads the frames of a page, and presses its buttons."""
+
+    def __init__(self, stream: ClientWebSocketResponse, token: str) -> None:
+        self._stream, self._token = stream, token
+        self.frame: dict[str, Any] = {}
+        self.scene: dict[str, Any] = {}
+        self.frames = 0
+
+    async def _next(self) -> dict[str, Any]:
+        message: dict[str, Any] = await asyncio.wait_for(self._stream.receive_json(), 60.0)
+        self.scene = message.get('scene', self.scene)
+        if 'frame' in message:
+            self.frame = message['frame']
+            self.frames += 1
+            await self._stream.send_json({'seen': 1})
+        return message
+
+    async def until(self, condition: Callable[[dict[str, Any]], Any], what: str) -> None:
+        """Read frames until one is as it should be."""
+        end = asyncio.get_running_loop().time() + 120.0
+        while not (self.frame and condition(self.frame)):
+            assert asyncio.get_running_loop().time() < end, (what, self.frame)
+            await self._next()
+
+    async def ask(self, what: str, **more: Any) -> dict[str, Any]:
+        """Press a button, and return the answer."""
+        await self._stream.send_json({'ask': what, 'token': self._token, **more})
+        while True:
+            message = await self._next()
+            if 'answer' in message:
+                return message['answer']
+
+    def level(self, node: str) -> int | None:
+        """Return the level of a node; None if it has not said anything, or is silent."""
+        found = [one for one in self.frame['nodes'] if one['name'] == node]
+        return found[0]['level'] if found and not found[0]['silent'] else None
+
+    def fine(self, node: str) -> bool:
+        """Tell whether a node works; on a machine that is busy it may warn of delays."""
+        return self.level(node) in (0, 1)
+
+
+@asynccontextmanager
+async def reading(url: str) -> AsyncIterator[Reader]:
+    """Read the frames of a page."""
+    page, _, token = url.partition('#token=')
+    async with ClientSession() as session, session.ws_connect(f'{page}frames') as stream:
+        yield Reader(stream, token)
+
+
+def begin(graph: RosGraph) -> None:
+    """Start a plant and a controller."""
+    graph.start('plant', PLANT)
+    graph.start('controller', CONTROLLER)
+
+
+async def ready(reader: Reader) -> None:
+    """Wait until both nodes and the shape are seen, and the controller has its measurements."""
+    await reader.until(
+        lambda frame: (
+            frame['shape'] == 'simulated'
+            and frame['path'] is not None
+            and reader.fine('/plant')
+            and reader.fine('/controller')
+            and reader.scene['limits']
+            and reader.scene['tissue']
+        ),
+        'the nodes',
+    )
+
+
+def test_buttons_move_the_needle_and_stop_it(ros_graph: RosGraph) -> None:
+    """A target by the page moves the needle; stop, clear, pause and retract do what they say."""
+    begin(ros_graph)
+
+    async def look(url: str) -> None:
+        async with reading(url) as reader:
+            await ready(reader)
+            assert reader.scene['tissue']['of'] == 'plant'
+            assert reader.scene['limits']['force'] == 15.0
+            assert reader.frame['depth'] == pytest.approx(0.02, abs=1e-3)
+            assert (await reader.ask('target', at=[0.0, 0.03, 0.0]))['success']
+            await reader.until(lambda frame: frame['target'] == [None, 0.03, None], 'the target')
+            await reader.until(lambda frame: frame['depth'] > 0.022, 'motion')
+            assert (await reader.ask('pause'))['success']
+            assert (await reader.ask('resume'))['success']
+            await reader.until(lambda frame: frame['depth'] > 0.0295, 'the end')
+            assert reader.frame['error'] == pytest.approx(0.0, abs=1e-3)
+            # What was cut is as long as what was inserted.
+            assert reader.frame['path'][1][-1] == pytest.approx(reader.frame['depth'], abs=1e-3)
+            said = await reader.ask('stop')
+            assert said['success']
+            await reader.until(lambda _: reader.level('/controller') == 2, 'the stop')
+            assert (await reader.ask('clear'))['success']
+            await reader.until(lambda _: reader.fine('/controller'), 'the release')
+            assert (await reader.ask('retract'))['success']
+            await reader.until(lambda frame: frame['depth'] < 0.025, 'the retreat')
+
+    with watching(ros_graph.environment, '--control') as (running, url):
+        assert running.stdout.readline().startswith('whoever has this address may move')
+        asyncio.run(look(url))
+        running.send_signal(signal.SIGINT)
+        assert running.wait(60.0) == 0
+
+
+def test_without_control_it_only_listens(ros_graph: RosGraph) -> None:
+    """Buttons are refused; what ends is shown as silent, and what comes back as there."""
+    ros_graph.start('controller', CONTROLLER)
+    plant = ros_graph.start('plant', PLANT)
+
+    async def look(url: str) -> None:
+        async with reading(url) as reader:
+            await ready(reader)
+            for what in ('target', 'stop'):
+                said = await reader.ask(what, at=[0.0, 0.03, 0.0])
+                assert said['success'] is False
+                assert 'for looking only' in said['words']
+            plant.kill()
+            await reader.until(lambda frame: 'joint_states' in frame['silent'], 'silence')
+            await reader.until(lambda _: reader.level('/plant') is None, 'silence of the node')
+            await reader.until(lambda frame: frame['shape'] == 'straight', 'no shape')
+            ros_graph.start('plant', PLANT)
+            await reader.until(lambda frame: frame['shape'] == 'simulated', 'the next plant')
+            await reader.until(lambda frame: frame['silent'] == {}, 'its readings')
+            await reader.until(lambda _: reader.fine('/plant'), 'its state')
+
+    with watching(ros_graph.environment) as (running, url):
+        assert '#' not in url
+        asyncio.run(look(url))
+        running.send_signal(signal.SIGTERM)
+        assert running.wait(60.0) == 0
+
+
+def test_who_only_looks_has_nothing_to_command_with(ros_graph: RosGraph) -> None:
+    """Its node publishes nothing of the contract, and asks for no service."""
+    node = WatchNode(View(), ros_graph.context)
+    try:
+        assert {one.topic_name for one in node.publishers} <= {'/parameter_events'}
+        assert not [*node.clients]
+        # Of rclpy, for tools.
+        assert {one.srv_name for one in node.services} <= {'watch/get_type_description'}
+    finally:
+        node.destroy_node()
+
+
+def test_a_button_without_nodes_says_so(ros_graph: RosGraph) -> None:
+    """Nobody takes a target, nobody can be stopped."""
+
+    async def look(url: str) -> None:
+        async with reading(url) as reader:
+            await reader.until(lambda frame: frame['shape'] is None, 'a frame')
+            said = await reader.ask('target', at=[0.0, 0.1, 0.0])
+            assert said['words'].startswith('no node takes targets')
+            said = await reader.ask('stop')
+            assert said == {
+                'asked': 'stop', 'success': False,
+                'words': 'no node offers steering/stop or controller/emergency_stop',
+            }  # fmt: skip
+
+    with watching(ros_graph.environment, '--control') as (_, url):
+        asyncio.run(look(url))
+
+
+def test_a_domain_that_is_none_is_refused(ros_graph: RosGraph) -> None:
+    """One line, and status 2."""
+    done = subprocess.run(
+        [sys.executable, '-m', 'needle_insertion.cli', 'watch', '--port', '0'],
+        env={**ros_graph.environment, 'PYTHONPATH': str(ROOT), 'ROS_DOMAIN_ID': 'lab'},
+        capture_output=True,
+        text=True,
+        timeout=60.0,
+        check=False,
+    )
+    assert done.returncode == 2
+    assert done.stderr == "error: ROS_DOMAIN_ID must be a whole number from 0 to 232, got 'lab'\n"
+
+
+# In a browser.
+
+
+#: What the page shows, and whether it sticks out [pixels].
+LOOK = """({
+  overflow: document.documentElement.scrollWidth - document.documentElement.clientWidth,
+  text: document.body.innerText,
+  blank: [...document.querySelectorAll('canvas')].filter((one) => one.clientWidth > 0)
+    .filter((one) => !one.getContext('2d').getImageData(0, 0, one.width, one.height)
+      .data.some((value) => value > 0)).map((one) => one.id),
+})"""
+
+
+async def shown(tab: Tab, url: str, width: int, picture: Path) -> dict[str, Any]:
+    """Open a page with a width, and return what is to be seen of it."""
+    await tab.size(width, 1000)
+    await tab.open(url)
+    await tab.wait('window.needleWatch && needleWatch.drawn > 20', 'the page')
+    # Words follow the frames.
+    await tab.wait("document.getElementById('state').dataset.level !== 'none'", 'the state')
+    await tab.picture(picture)
+    seen: dict[str, Any] = await tab.run(LOOK)
+    return seen
+
+
+@needs_browser
+@pytest.mark.parametrize('width', [1400, 400])
+def test_a_browser_shows_what_is_live(ros_graph: RosGraph, tmp_path: Path, width: int) -> None:
+    """It draws, fits, asks nobody else for anything, and can be used by keyboard."""
+    begin(ros_graph)
+
+    async def look(url: str) -> None:
+        async with reading(url) as reader:
+            await ready(reader)
+        async with browser() as tab:
+            seen = await shown(tab, url, width, tmp_path / 'page.png')
+            assert seen['overflow'] == 0
+            assert seen['blank'] == []
+            for words in ('Inserted depth', 'limit ±100', 'commanded ±15', 'Stop', 'plant'):
+                assert words in seen['text']
+            count = await tab.run('needleWatch.drawn')
+            begun = asyncio.get_running_loop().time()
+            await tab.wait(f'needleWatch.drawn >= {count + 60}', 'frames')
+            spent = asyncio.get_running_loop().time() - begun
+            # For whoever reads the output: it depends on the machine.
+            sys.stdout.write(f'{60.0 / spent:.1f} frames a second at {width} pixels\n')
+            # The first that the keyboard leads to is what stops the needle.
+            await tab.press('Tab')
+            assert await tab.run('document.activeElement.id') == 'stop'
+            await tab.press('Enter')
+            words = "document.getElementById('answer').textContent"
+            await tab.wait(f"{words}.startsWith('● stop')", 'the answer')
+            await tab.wait("document.getElementById('state').dataset.level === 'error'", 'it')
+            origin = url.partition('#')[0]
+            others = [
+                one for one in tab.requests
+                if not one.startswith((origin, origin.replace('http', 'ws'), 'data:'))
+            ]  # fmt: skip
+            assert others == []
+            assert tab.faults == []
+
+    with watching(ros_graph.environment, '--control') as (_, url):
+        asyncio.run(look(url))
+
+
+@needs_browser
+@pytest.mark.parametrize('width', [1400, 400])
+def test_a_browser_plays_a_recording(tmp_path: Path, width: int) -> None:
+    """The slider leads to a time; who wants less motion gets less; the end of it is told."""
+    write_watched(tmp_path / 'bag')
+
+    async def look(running: Any, url: str) -> None:
+        async with browser() as tab:
+            seen = await shown(tab, url, width, tmp_path / 'page.png')
+            assert seen['overflow'] == 0
+            assert 'recording bag' in seen['text']
+            assert 'At the target' in seen['text']
+            clock = "document.getElementById('clock').textContent"
+            at = "document.getElementById('at')"
+            await tab.wait(f"{clock}.startsWith('4.0 of')", 'the end of the recording')
+            await tab.run(f"{at}.value = 3.5, {at}.dispatchEvent(new Event('input'))")
+            await tab.wait(f"{clock}.startsWith('3.5 of')", 'the time')
+            await tab.picture(tmp_path / 'middle.png')
+            assert 'silent' in (await tab.run(LOOK))['text']
+            assert tab.faults == []
+            calm = {'name': 'prefers-reduced-motion', 'value': 'reduce'}
+            await tab.call('Emulation.setEmulatedMedia', features=[calm])
+            count = await tab.run('needleWatch.drawn')
+            await tab.run("document.getElementById('play').click()")
+            await tab.wait(f"{clock}.startsWith('4.0 of')", 'the end')
+            # Two a second of what has half a second.
+            assert await tab.run('needleWatch.drawn') - count < 12
+            running.send_signal(signal.SIGINT)
+            state = "document.getElementById('state').textContent"
+            await tab.wait(f"{state}.includes('not connected')", 'the end of the page')
+
+    with watching(dict(os.environ), str(tmp_path / 'bag')) as (running, url):
+        asyncio.run(look(running, url))
