@@ -92,8 +92,8 @@ def write(results: Results, path: Path) -> None:
             Section(
                 title='What matters',
                 paragraphs=(
-                    f'Part of the variance of {main} that each quantity explains alone. What is '
-                    'missing to 100 % is noise, and quantities that act together.',
+                    f'Part of the variance of {main} that each quantity explains alone.',
+                    'What is missing to 100 % is noise, and quantities that act together.',
                 ),
                 tables=(
                     Grid(
@@ -114,8 +114,7 @@ def write(results: Results, path: Path) -> None:
     sections.append(
         Section(
             title='The worst',
-            paragraphs=(f'`needle study --replay NUMBER {results.folder}` computes one again, '
-                        'into a bag.',),
+            paragraphs=('`needle study STUDY --replay NUMBER` computes one again, into a bag.',),
             tables=(
                 Grid(
                     caption=f'Samples with the largest {main}',

@@ -58,29 +58,26 @@ def replay(results: Results, number: int, bag: Path) -> bool:
             recorded = column(results.table, name)[number]
             if not np.array_equal(values, [recorded], equal_nan=True):
                 raise JobError(
-                    f'sample {number} differs from {results.table}: {name} was {recorded!r} and is '
-                    f'{values[0]!r}'
+                    f'sample {number} differs from {results.table}: {name} was {recorded!r}, '
+                    f'and is {values[0]!r}'
                 )
     joints = [contract.INSERTION, *(joint.name for joint in contract.STEERING_JOINTS)]
     states = Template(JOINT_STATE, names=joints, counts=(len(joints), len(joints), 0))
     tips, targets = contract.TIP_DEFLECTION.template(), contract.TARGET.template()
     drawn = {name: float(row[name][0]) for name in study.population}
+    tilt = [drawn.get(name, 0.0) for name in ('tilt_x', 'tilt_z')]
+    frame = np.array([drawn.get(name, 0.0) for name in ('frame_x', 'frame_z')])
     with BagWriter(bag) as writer:
         for topic in (contract.JOINT_STATES, contract.TIP_DEFLECTION, contract.TARGET):
             writer.add_topic(f'/{topic.name}', topic.type_name)
 
         def watch(one: SteeredNeedle) -> None:
             stamp = round(one.depth / _SPEED * NANOSECONDS)
-            (x, z), tilt = one.guide, one.tilt
-            at = (one.depth, x, z, *tilt, one.roll)
+            at = (one.depth, *one.guide, *tilt, one.roll)
             rest = np.zeros(len(joints)).tolist()
             writer.write('/joint_states', states.serialize(stamp, *at, *rest), stamp)
-            seen = one.tip[[0, 2]] + [
-                drawn.get('frame_x', 0.0) * one.depth,
-                drawn.get('frame_z', 0.0) * one.depth,
-            ]
-            tip = float(seen[0]), one.depth, float(seen[1])
-            writer.write('/tip_deflection', tips.serialize(stamp, *tip), stamp)
+            x, z = (one.tip[[0, 2]] + frame * one.depth).tolist()
+            writer.write('/tip_deflection', tips.serialize(stamp, x, one.depth, z), stamp)
 
         target = study.protocol.replay(drawn, study.rng(number, 1), watch)
         writer.write('/target', targets.serialize(0, *target.tolist()), 0)

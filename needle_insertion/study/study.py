@@ -86,7 +86,11 @@ class Study:
         """
         parts = self._parts(int(numbers[0]), len(numbers))
         if not np.array_equal(self.factor, np.eye(len(self.factor))):
-            parts = ndtr(ndtri(parts) @ self.factor.T)
+            scores = ndtri(parts)
+            # Not as a product of matrices: its bits may depend on the number of rows.
+            parts = np.array(
+                [ndtr(sum(f * one for f, one in zip(row, scores.T))) for row in self.factor]
+            ).T
         parts = np.clip(parts, _INSIDE, 1.0 - 2.0 * _INSIDE)
         return {
             name: one.quantiles(part)
