@@ -89,7 +89,10 @@ class Study:
             scores = ndtri(parts)
             # Not as a product of matrices: its bits may depend on the number of rows.
             parts = np.array(
-                [ndtr(sum(f * one for f, one in zip(row, scores.T))) for row in self.factor]
+                [
+                    ndtr(sum(f * one for f, one in zip(row, scores.T, strict=True)))
+                    for row in self.factor
+                ]
             ).T
         parts = np.clip(parts, _INSIDE, 1.0 - 2.0 * _INSIDE)
         return {
