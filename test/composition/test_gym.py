@@ -63,10 +63,10 @@ def test_a_guide_that_is_moved_reaches_what_one_at_rest_does_not() -> None:
     environment = SteeringEnv()
 
     def missed(seed: int) -> float:
-        seen, _ = environment.reset(seed=seed)
+        environment.reset(seed=seed)
         over, info = False, {}
         while not over:
-            seen, _, over, _, info = environment.step(np.zeros(2))
+            _, _, over, _, info = environment.step(np.zeros(2))
         return float(info['miss'])
 
     assert np.mean([missed(seed) for seed in range(10)]) > 1e-3
