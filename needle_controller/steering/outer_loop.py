@@ -764,7 +764,7 @@ class OuterLoop:
         values['inputs refused'] = self.journal.refused
         values['last complaint'] = self.journal.complaint
         for stream in (self._joint_stream, self._tip_stream):
-            values[stream.name] = stream.describe(now)
+            values[f'input {stream.name}'] = stream.describe(now)
         if self.phase is Phase.STOPPED:
             return Severity.ERROR, f'stopped: {self.fault}', values
         if warning:

@@ -17,6 +17,7 @@ from needle_insertion.live.operator import CONTROLLER, Operator, Outcome, State,
 from needle_insertion.live.readings import Readings
 from needle_insertion.live.screen import Screen
 from needle_insertion.report.text import table
+from needle_ros.contract import JOINT_STATES, TIP_DEFLECTION
 from needle_ros.errors import JobError, ParameterError
 import numpy as np
 from rclpy.task import Future
@@ -36,6 +37,13 @@ _SETTLING: Final = 1.0
 
 #: Nodes say something every second: one that was silent for this long is told of [s].
 _SILENT: Final = 5.0
+
+#: Sensors without which a node refuses all targets.
+_NEEDED: Final = (
+    (CONTROLLER, JOINT_STATES.name),
+    (STEERING, JOINT_STATES.name),
+    (STEERING, TIP_DEFLECTION.name),
+)
 
 #: Meters in a unit.
 _UNITS: Final = {'m': 1.0, 'cm': 1e-2, 'mm': 1e-3}
@@ -95,14 +103,16 @@ class Terminal:
         self._graph, self._operator, self._readings = graph, operator, readings
         self._screen, self._say = screen, screen.say
         screen.complete([*WORDS, *LAWS])
-        #: Level and message last told of each node.
+        #: Level and message last told of each node, without its numbers.
         self._told: dict[str, tuple[int, str]] = {}
         #: Whether the tip was sent to a target last, which the node `steering` brings there.
         self._steers = False
 
     def begin(self, nodes: Sequence[str]) -> None:
         """
-        Wait until nodes have said what state they are in.
+        Wait until nodes have said what state they are in, and those that move the needle see it.
+
+        What is asked of them before is refused.
 
         Parameters
         ----------
@@ -117,6 +127,13 @@ class Terminal:
         """
         for name in nodes:
             self._state(name)
+        for name, topic in _NEEDED:
+            if name in nodes:
+                self._spin_until(
+                    lambda name=name, topic=topic: _sees(self._state(name), topic),
+                    f'{topic}, which {name} needs,',
+                    _ANSWER,
+                )
 
     def next_line(self) -> str | None:
         """
@@ -202,10 +219,12 @@ class Terminal:
             level, message = state.level, state.message
             if state.age > _SILENT:
                 level, message = _ERROR, 'says nothing any more'
-            before, _ = self._told.get(name, (0, ''))
-            if (level or before) and (level, message) != self._told.get(name):
+            # Counts that grow say nothing new.
+            kind = level, re.sub(r'\d+', '', message)
+            before = self._told.get(name, (0, ''))
+            if (level or before[0]) and kind != before:
                 self._say(f'{name}: {_LEVELS[min(level, 3)]} {message}')
-            self._told[name] = (level, message)
+            self._told[name] = kind
 
     # Words.
 
@@ -317,6 +336,11 @@ def _length(word: str) -> float:
     if not isfinite(value):
         raise ParameterError(f'{word!r} is not a length, such as 0.05 or 50mm')
     return value
+
+
+def _sees(state: State, topic: str) -> bool:
+    """Tell whether a node has taken a message of a sensor."""
+    return ' 0 taken' not in state.values.get(f'input {topic}', ' 0 taken')
 
 
 def _refused(state: State) -> int:

@@ -20,7 +20,7 @@ import pytest
 from support.ros_graph import RosGraph
 
 #: Longest time for nodes to start and to do what a test wants, on a machine that is busy [s].
-_LONGEST = 300.0
+_LONGEST = 120.0
 
 
 #: Lines that are not understood, or refused, and what is said of them.
@@ -38,13 +38,17 @@ MISTAKES = [
     ('set nobody x 1', 'nobody x = 1: no node nobody'),
     ('set controller force_limit 3', 'force_limit: cannot change while configured'),
     ("target '0.05", 'no closing quotation'),
-    ('set plant fault.kind [1, {', 'is not a value in YAML'),
+    ('set plant fault.kind "[1, {"', 'is not a value in YAML'),
 ]
 
 
 def command(ros_graph: RosGraph, folder: Path, *words: str) -> tuple[list[str], dict[str, str]]:
     """Return the command line, and the environment with the domain of the test."""
     line = [sys.executable, '-m', 'needle_insertion.cli', 'run', '-o', str(folder), *words]
+    # Slower than by default: tests run beside others.
+    nodes = ('controller',) if '--hardware' in words else ('plant', 'controller')
+    for node in nodes:
+        line += ['-p', f'{node}.rate=200']
     return line, {**ros_graph.environment}
 
 
@@ -108,7 +112,7 @@ def test_a_script_inserts_changes_the_law_and_retracts(
     at = [float(found) for found in re.findall(r'^depth (\S+) mm', said, re.MULTILINE)]
     # It settles within a second to a tenth of a millimeter or so, under both laws.
     assert at == pytest.approx([23.0, 25.0, 25.0, 20.0], abs=0.3), said
-    assert 'controller  OK     active' in said
+    assert re.search(r'^controller +(OK|WARN) ', said, re.MULTILINE)
     assert 'needle> quit\nrecorded to' in said
     bag = tmp_path / 'run' / 'bag'
     assert [message.point.y for _, message in read_topic(bag, '/target')] == [0.023, 0.025]
@@ -128,14 +132,12 @@ def test_a_script_ends_with_what_cannot_be_done(ros_graph: RosGraph, tmp_path: P
 
 
 def test_a_robot_takes_the_place_of_the_plant(ros_graph: RosGraph, tmp_path: Path) -> None:
-    ros_graph.add(PlantNode, parameters={'rate': 500.0, 'depth': 0.02})
+    ros_graph.add(PlantNode, parameters={'rate': 200.0, 'depth': 0.02})
     status, said, complained = told(
         ros_graph,
         tmp_path / 'run',
         ['target 22mm', 'wait 100'],
         '--hardware',
-        '-p',
-        'controller.rate=500',
     )
     assert (status, complained) == (0, ''), said
     assert 'starting recorder, controller;' in said
@@ -175,16 +177,25 @@ class Typed:
         line, environment = command(ros_graph, folder)
         master, slave = pty.openpty()
         self.graph, self.master = ros_graph, master
+        # Its own terminal: Ctrl-C there is a signal.
         self.process = subprocess.Popen(
-            line,
+            ['/usr/bin/setsid', '--ctty', *line],
             env={**environment, 'TERM': 'xterm'},
             stdin=slave,
             stdout=slave,
             stderr=slave,
-            start_new_session=True,
         )
         os.close(slave)
         self.seen = ''
+
+    def __enter__(self) -> Typed:
+        return self
+
+    def __exit__(self, *raised: object) -> None:
+        # Its nodes end with it.
+        self.process.kill()
+        self.process.wait()
+        os.close(self.master)
 
     def expect(self, pattern: str) -> None:
         """Wait until it has written something, and forget what came up to there."""
@@ -206,36 +217,36 @@ def test_typed_words_are_completed_and_errors_do_not_end_it(
     ros_graph: RosGraph, tmp_path: Path
 ) -> None:
     """Tab completes, a mistake is named, Ctrl-D ends it with a complete recording."""
-    typed = Typed(ros_graph, tmp_path / 'run')
-    typed.expect('needle> ')
-    typed.type('targ\t 5\n')
-    typed.expect('error: target')
-    typed.expect('needle> ')
-    typed.type('target 21mm\n')
-    typed.expect('controller: on its way')
-    typed.type('wait\n')
-    # A line that changes while it goes.
-    typed.expect(r'\r\x1b\[Kdepth')
-    typed.expect(r'depth 2[01]\.\d\d mm[^\n]*\r\n')
-    typed.expect('needle> ')
-    typed.type('\x04')
-    typed.expect('recorded to')
-    assert typed.process.wait(60.0) == 0
-    assert list(read_topic(tmp_path / 'run' / 'bag', '/target'))
+    with Typed(ros_graph, tmp_path / 'run') as typed:
+        typed.expect('needle> ')
+        typed.type('targ\t 5\n')
+        typed.expect('error: target')
+        typed.expect('needle> ')
+        typed.type('target 21mm\n')
+        typed.expect('controller: on its way')
+        typed.type('wait\n')
+        # A line that changes while it goes.
+        typed.expect(r'\r\x1b\[Kdepth')
+        typed.expect(r'depth 2[01]\.\d\d mm[^\n]*\r\n')
+        typed.expect('needle> ')
+        typed.type('\x04')
+        typed.expect('recorded to')
+        assert typed.process.wait(60.0) == 0
+        assert list(read_topic(tmp_path / 'run' / 'bag', '/target'))
 
 
 def test_ctrl_c_ends_all_and_the_recording_is_whole(ros_graph: RosGraph, tmp_path: Path) -> None:
     """So does a terminal that is closed; the status is that of an interrupt."""
-    typed = Typed(ros_graph, tmp_path / 'run')
-    typed.expect('needle> ')
-    typed.type('target 100mm\n')
-    typed.expect('on its way')
-    typed.type('wait\n')
-    typed.expect(r'depth')
-    typed.type('\x03')
-    typed.expect('interrupted')
-    assert typed.process.wait(60.0) == 130
-    assert (tmp_path / 'run' / 'bag' / 'metadata.yaml').is_file()
+    with Typed(ros_graph, tmp_path / 'run') as typed:
+        typed.expect('needle> ')
+        typed.type('target 100mm\n')
+        typed.expect('on its way')
+        typed.type('wait\n')
+        typed.expect(r'depth')
+        typed.type('\x03')
+        typed.expect('interrupted')
+        assert typed.process.wait(60.0) == 130
+        assert (tmp_path / 'run' / 'bag' / 'metadata.yaml').is_file()
 
 
 def children(pid: int) -> list[int]:
@@ -250,21 +261,21 @@ def words_of(pid: int) -> str:
 
 def test_a_node_that_dies_ends_the_session(ros_graph: RosGraph, tmp_path: Path) -> None:
     """With status 1 and the node's name; also while nothing is typed."""
-    typed = Typed(ros_graph, tmp_path / 'run')
-    typed.expect('needle> ')
-    (pid,) = [one for one in children(typed.process.pid) if 'controller_node' in words_of(one)]
-    os.kill(pid, signal.SIGKILL)
-    typed.expect('error: controller ended early with status -9')
-    assert typed.process.wait(60.0) == 1
+    with Typed(ros_graph, tmp_path / 'run') as typed:
+        typed.expect('needle> ')
+        (pid,) = [one for one in children(typed.process.pid) if 'controller_node' in words_of(one)]
+        os.kill(pid, signal.SIGKILL)
+        typed.expect('error: controller ended early with status -9')
+        assert typed.process.wait(60.0) == 1
 
 
 def test_what_is_not_understood_is_named(ros_graph: RosGraph, tmp_path: Path) -> None:
     """One line says what was given and what is valid; the session goes on."""
-    typed = Typed(ros_graph, tmp_path / 'run')
-    typed.expect('needle> ')
-    for line, complaint in MISTAKES:
-        typed.type(f'{line}\n')
-        typed.expect(f'error: [^\n]*{re.escape(complaint)}')
+    with Typed(ros_graph, tmp_path / 'run') as typed:
         typed.expect('needle> ')
-    typed.type('quit\n')
-    assert typed.process.wait(60.0) == 0
+        for line, complaint in MISTAKES:
+            typed.type(f'{line}\n')
+            typed.expect(f'error: [^\n]*{re.escape(complaint)}')
+            typed.expect('needle> ')
+        typed.type('quit\n')
+        assert typed.process.wait(60.0) == 0

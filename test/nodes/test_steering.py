@@ -90,7 +90,7 @@ class Bench:
         self.until(lambda: self.target.get_subscription_count() >= self.takers, 'who takes it')
         self.until(
             lambda: all(
-                ' 0 taken' not in str(self.steering.diagnose()[2][topic])
+                ' 0 taken' not in str(self.steering.diagnose()[2][f'input {topic}'])
                 for topic in ('joint_states', 'tip_deflection')
             ),
             'the sensors',
@@ -292,7 +292,7 @@ def test_the_shipped_parameters_are_those_of_the_three_nodes(ros_graph: RosGraph
     ros_graph.spin_until(
         lambda: (
             target.get_subscription_count() == 2
-            and ' 0 taken' not in str(steering.diagnose()[2]['tip_deflection'])
+            and ' 0 taken' not in str(steering.diagnose()[2]['input tip_deflection'])
         ),
         'the sensors',
     )
