@@ -107,9 +107,10 @@ class Results:
                 raise ParameterError(f'{folder} exists and is not of a study; name another folder')
             if file.read_text(encoding='utf-8') != study.text:
                 raise ParameterError(f'{folder} is of another study; name another folder')
-        self._parts.mkdir(parents=True, exist_ok=True)
-        if not (folder / STUDY).exists():
-            write_whole(folder / STUDY, study.text.encode())
+        folder.mkdir(parents=True, exist_ok=True)
+        write_whole(folder / STUDY, study.text.encode())
+        if not self.table.exists():
+            self._parts.mkdir(exist_ok=True)
 
     @property
     def table(self) -> Path:
@@ -119,6 +120,8 @@ class Results:
     def missing(self) -> list[tuple[int, int]]:
         """Return the samples that are still to be computed, as ranges of first and last + 1."""
         begin, gaps = 0, list[tuple[int, int]]()
+        if self.table.exists():
+            return gaps
         for first, end in self._done():
             if first > begin:
                 gaps.append((begin, first))

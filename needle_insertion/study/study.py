@@ -107,7 +107,8 @@ class Study:
             sequence = qmc.Sobol(dimensions, rng=np.random.default_rng(self.seed))
             if first:
                 sequence.fast_forward(first)
-            return np.asarray(sequence.random(count))
+            # One by itself at the begin: scipy warns of a first draw that is no power of 2.
+            return np.concatenate([sequence.random(1), sequence.random(count - 1)])
         return np.array(
             [self.rng(number, 0).random(dimensions) for number in range(first, first + count)]
         ).reshape(count, dimensions)

@@ -140,7 +140,7 @@ def test_the_table_is_the_same_for_any_workers_and_chunks(tmp_path: Path) -> Non
         seen: list[int] = []
         compute(results, executor, workers, seen.append)
         assert sum(seen) == study.samples
-        assert results.missing() == [(0, study.samples)] or results.table.exists()
+        assert results.missing() == []
         sums.add(checksum(results.table))
     assert len(sums) == 1
     assert np.array_equal(column(results.table, 'sample'), np.arange(study.samples))
@@ -282,7 +282,7 @@ def test_shares_are_those_of_a_sum() -> None:
         ({'population': {'tilt_x': {'normal': [0, -1]}}}, 'must have standard deviation > 0'),
         ({'population': {'tilt_x': {'uniform': [1, 0]}}}, 'uniform must have low < high'),
         ({'population': {'tilt_x': {'normal': [0, float('nan')]}}}, 'takes finite numbers'),
-        ({'population': {'tilt_x': {'normal': [0, 0.02]}}}, 'cut it off with within: [-0.5, 0.5]'),
+        ({'population': {'tilt_x': {'normal': [0, 0.2]}}}, 'cut it off with within: [-0.5, 0.5]'),
         ({'population': {'skin': {'uniform': [-1, 1]}}}, 'skin must be in [0, 1000] 1'),
         ({'population': {'skin': {'normal': [1, 0.1], 'within': [90, 91]}}}, 'with values of the'),
         ({'correlations': [['skin', 'tilt', 0.5]]}, 'correlations takes [[name, name, value'),
@@ -332,7 +332,7 @@ def test_a_full_disk_ends_it_in_one_line(tmp_path: Path, monkeypatch: pytest.Mon
     study = made(SMALL)
     results = Results(tmp_path / 'results', study)
     room = resource_limit(2000)
-    with room, pytest.raises(JobError, match='cannot be written: File too large'):
+    with room, pytest.raises(JobError, match='cannot be written: .*File too large'):
         compute(results, here, 1, lambda _: None)
     assert not list((tmp_path / 'results').rglob('*.tmp'))
     compute(results, here, 1, lambda _: None)
