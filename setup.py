@@ -95,10 +95,16 @@ setup(
         ],
         # `make docs`; locked apart from the rest, in requirements-docs.lock.
         'docs': ['furo>=2024.8', 'myst-parser>=4.0', 'numpydoc>=1.8', 'sphinx>=8.1,<9'],
+        # `needle study`, and its `--scheduler`.
+        'study': ['pyarrow>=15'],
+        'dask': ['distributed>=2024.5', 'pyarrow>=15'],
+        # Environments for reinforcement learning.
+        'gym': ['gymnasium>=1.0'],
         # What `needle bench` is measured beside.
         'bench': ['mcap-ros2-support>=0.5.6', 'mujoco>=3.2', 'pyelastica>=0.3.3', *SLICER],
     },
     entry_points={
+        'gymnasium.envs': ['__root__ = needle_insertion.gym:register'],
         'console_scripts': [
             'needle = needle_insertion.cli:main',
             *(f'needle-{node} = needle_insertion.nodes:main' for node in NODES),

@@ -30,6 +30,7 @@ COMMANDS: Final[Mapping[str, str]] = {
     'reproduce': "compute the paper's results and compare them with the paper",
     'simulate': 'simulate the needle in open loop, without ROS',
     'steer': 'bring the tip of a simulated needle to a target, without ROS',
+    'study': 'how often it hits: a population of insertions',
     'analyze': 'controllability and observability',
     'verify': 'compute recorded runs again and compare',
     'bench': 'measure speed and accuracy (from a clone)',

@@ -1,0 +1,102 @@
+"""`needle study`: a population of insertions, on all cores or on a cluster."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Iterator
+from concurrent.futures import Executor
+from contextlib import AbstractContextManager, contextmanager
+from functools import partial
+import os
+from pathlib import Path
+import sys
+from typing import Any
+
+from needle_insertion.commands.common import check_folder, Command
+from needle_ros.errors import JobError, ParameterError
+
+
+def _add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `needle study`."""
+    parser.add_argument('study', type=Path, metavar='STUDY.yaml', help='the study')
+    parser.add_argument(
+        '-o', '--output', type=Path, metavar='DIR',
+        help='folder of the results (default: named as the study); what is in it is not computed '
+        'again',
+    )  # fmt: skip
+    parser.add_argument(
+        '--workers', type=int, help='processes of this machine (default: one per core)'
+    )
+    parser.add_argument(
+        '--scheduler', metavar='ADDRESS', help='Dask scheduler, such as tcp://host:8786'
+    )
+    parser.add_argument(
+        '--replay', type=int, metavar='NUMBER', help='compute one sample again, into a bag'
+    )
+
+
+def _run(options: argparse.Namespace) -> int:
+    """Compute what is missing, and write table and page."""
+    try:
+        from needle_insertion.study import engine, page
+        from needle_insertion.study.replay import replay
+    except ModuleNotFoundError as error:
+        raise ParameterError(
+            f"needle study needs {error.name}: pip install 'needle_insertion[study]'"
+        ) from error
+    from needle_insertion.study.study import read_study
+    from tqdm import tqdm
+
+    study = read_study(options.study)
+    folder = options.output or Path(f'{options.study.stem}_study')
+    check_folder(folder)
+    workers = options.workers if options.workers is not None else os.cpu_count() or 1
+    if workers < 1:
+        raise ParameterError(f'--workers must be >= 1, got {workers}')
+    results = engine.Results(folder, study)
+    if options.replay is not None:
+        bag = folder / f'sample_{options.replay}'
+        compared = replay(results, options.replay, bag)
+        same = 'the same numbers as in the table' if compared else 'there is no table yet'
+        sys.stdout.write(f'sample {options.replay}: {bag}; {same}\n')
+        return 0
+    if not results.table.exists():
+        missing = sum(end - first for first, end in results.missing())
+        with (
+            tqdm(
+                total=study.samples, initial=study.samples - missing, disable=None, unit=' samples'
+            ) as bar,
+            _executor(options.scheduler, workers) as (executor, count),
+        ):
+            engine.compute(results, executor, count, bar.update)
+    file = folder / 'study.html'
+    page.write(results, file)
+    sys.stdout.write(f'{study.samples} samples: {results.table}\npage: {file}\n')
+    return 0
+
+
+@contextmanager
+def _executor(
+    scheduler: str | None, workers: int
+) -> Iterator[tuple[Callable[[], AbstractContextManager[Executor]], int]]:
+    from needle_insertion.study import engine
+
+    if scheduler is None:
+        yield partial(engine.processes, workers), workers
+        return
+    try:
+        from distributed import Client
+    except ModuleNotFoundError as error:
+        raise ParameterError(
+            "--scheduler needs Dask: pip install 'needle_insertion[dask]'"
+        ) from error
+    try:
+        client: Any = Client(scheduler, timeout=10)
+    except (OSError, ValueError, TimeoutError) as error:
+        raise JobError(f'no Dask scheduler at {scheduler}: {error}') from error
+    with client:
+        count = sum(client.nthreads().values()) or 1
+        yield partial(engine.dask, client), count
+
+
+COMMAND = Command(_add_arguments, _run)

@@ -1,0 +1,1 @@
+"""Populations: many insertions that differ, and how often they do what they should."""

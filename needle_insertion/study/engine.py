@@ -1,0 +1,324 @@
+"""
+A study, computed on any executor: nothing twice, and nothing lost when it is broken off.
+
+Chunks of samples are written as they come, each whole or not at all, in a folder of parts. What is
+there is not computed again. When all are there they become one table, in the order of the samples,
+whose bytes depend neither on the chunks nor on who computed them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import (
+    BrokenExecutor,
+    Executor,
+    FIRST_COMPLETED,
+    Future,
+    ProcessPoolExecutor,
+    wait,
+)
+from contextlib import AbstractContextManager, contextmanager, ExitStack, suppress
+from functools import lru_cache
+import json
+from multiprocessing import get_context
+from pathlib import Path
+import re
+import signal
+from time import monotonic
+from typing import Any, Final
+
+from needle_dynamics import FloatArray
+from needle_identification.result import write_whole
+from needle_insertion.study.study import made, Study
+from needle_ros.errors import JobError, ParameterError
+import pyarrow as pa
+from pyarrow import parquet
+
+#: Samples of the first chunk, by whose time the others are sized, and that time [s].
+_FIRST, _WANTED = 16, 1.0
+_LARGEST: Final = 2**14
+
+#: Rows of the table that are written at once: its bytes depend on it.
+_GROUP: Final = 2**16
+
+#: How often workers may be lost without a chunk in between.
+_TRIES: Final = 5
+
+_PART: Final = re.compile(r'(\d{10})-(\d{10})\.parquet')
+
+TABLE: Final = 'samples.parquet'
+STUDY: Final = 'study.json'
+
+
+@lru_cache(maxsize=1)
+def _study(text: str) -> Study:
+    return made(json.loads(text))
+
+
+def chunk(text: str, first: int, count: int) -> tuple[float, dict[str, FloatArray]]:
+    """
+    Compute a chunk, in whatever process.
+
+    Parameters
+    ----------
+    text : str
+        `Study.text`.
+    first, count : int
+        As in `Study.rows`.
+
+    Returns
+    -------
+    taken : float
+        Time that it took [s].
+    columns : dict of str to ndarray
+        The columns.
+
+    """
+    study = _study(text)
+    begin = monotonic()
+    columns = study.rows(first, count)
+    return monotonic() - begin, columns
+
+
+class Results:
+    """
+    The folder of a study.
+
+    Parameters
+    ----------
+    folder : Path
+        May exist with the same study, which then goes on.
+    study : Study
+        The study.
+
+    Raises
+    ------
+    ParameterError
+        If there is another study in it, or anything else.
+
+    """
+
+    def __init__(self, folder: Path, study: Study) -> None:
+        self.folder, self.study = folder, study
+        self._parts = folder / 'parts'
+        if folder.exists():
+            file = folder / STUDY
+            if not file.is_file():
+                raise ParameterError(f'{folder} exists and is not of a study; name another folder')
+            if file.read_text(encoding='utf-8') != study.text:
+                raise ParameterError(f'{folder} is of another study; name another folder')
+        folder.mkdir(parents=True, exist_ok=True)
+        write_whole(folder / STUDY, study.text.encode())
+        if not self.table.exists():
+            self._parts.mkdir(exist_ok=True)
+
+    @property
+    def table(self) -> Path:
+        """The table of all samples."""
+        return self.folder / TABLE
+
+    def missing(self) -> list[tuple[int, int]]:
+        """Return the samples that are still to be computed, as ranges of first and last + 1."""
+        begin, gaps = 0, list[tuple[int, int]]()
+        if self.table.exists():
+            return gaps
+        for first, end in self._done():
+            if first > begin:
+                gaps.append((begin, first))
+            begin = max(begin, end)
+        if begin < self.study.samples:
+            gaps.append((begin, self.study.samples))
+        return gaps
+
+    def _done(self) -> list[tuple[int, int]]:
+        found = (_PART.fullmatch(path.name) for path in self._parts.iterdir())
+        return sorted((int(one[1]), int(one[2])) for one in found if one)
+
+    def add(self, first: int, columns: Mapping[str, FloatArray]) -> int:
+        """
+        Write a chunk.
+
+        Parameters
+        ----------
+        first : int
+            Number of its first sample.
+        columns : dict of str to ndarray
+            The columns.
+
+        Returns
+        -------
+        int
+            Number of its samples.
+
+        """
+        count = len(columns['sample'])
+        self._write(self._part(first, first + count), [pa.table(dict(columns))])
+        return count
+
+    def complete(self) -> None:
+        """Make one table of all parts, and remove them."""
+        self._write(self.table, self._groups())
+        for first, end in self._done():
+            self._part(first, end).unlink()
+        self._parts.rmdir()
+
+    def _groups(self) -> Iterator[Any]:
+        """Yield all samples in tables of the same number of rows."""
+        waiting: list[Any] = []
+        for first, end in self._done():
+            waiting.append(parquet.read_table(self._part(first, end)))
+            while sum(map(len, waiting)) >= _GROUP:
+                whole = pa.concat_tables(waiting)
+                yield whole.slice(0, _GROUP)
+                waiting = [whole.slice(_GROUP)]
+        if sum(map(len, waiting)):
+            yield pa.concat_tables(waiting)
+
+    def _part(self, first: int, end: int) -> Path:
+        return self._parts / f'{first:010d}-{end:010d}.parquet'
+
+    @staticmethod
+    def _write(path: Path, tables: Iterable[Any]) -> None:
+        """Write a file that is there whole or not at all."""
+        draft = path.with_suffix('.tmp')
+        try:
+            with ExitStack() as stack:
+                writer = None
+                for one in tables:
+                    if writer is None:
+                        writer = stack.enter_context(
+                            parquet.ParquetWriter(draft, one.schema, compression='zstd')
+                        )
+                    writer.write_table(one.combine_chunks(), row_group_size=_GROUP)
+            draft.replace(path)
+        except OSError as error:
+            with suppress(OSError):
+                draft.unlink()
+            raise JobError(f'{path} cannot be written: {error.strerror or error}') from error
+
+
+def compute(
+    results: Results,
+    executor: Callable[[], AbstractContextManager[Executor]],
+    workers: int,
+    progress: Callable[[int], object],
+) -> None:
+    """
+    Compute what is missing.
+
+    Parameters
+    ----------
+    results : Results
+        Where it goes.
+    executor : callable
+        Makes what runs it; called again if its workers are lost.
+    workers : int
+        How many they are.
+    progress : callable
+        Called with the number of samples of each chunk that is written.
+
+    Raises
+    ------
+    JobError
+        If it cannot be computed or written.
+
+    """
+    todo, losses = results.missing(), 0
+    while todo:
+        done = 0
+
+        def written(count: int) -> None:
+            nonlocal done
+            done += count
+            progress(count)
+
+        try:
+            with executor() as running:
+                _compute(results, running, workers, todo, written)
+        except BrokenExecutor as error:
+            losses = 0 if done else losses + 1
+            if losses == _TRIES:
+                raise JobError(f'workers end without a result: {error}') from error
+        todo = results.missing()
+    results.complete()
+
+
+def _compute(
+    results: Results,
+    executor: Executor,
+    workers: int,
+    todo: list[tuple[int, int]],
+    written: Callable[[int], object],
+) -> None:
+    text, size = results.study.text, _FIRST
+    running: dict[Future[tuple[float, dict[str, FloatArray]]], int] = {}
+    try:
+        while todo or running:
+            while todo and len(running) < 2 * workers:
+                first, end = todo.pop(0)
+                count = min(size, end - first)
+                running[executor.submit(chunk, text, first, count)] = first
+                if first + count < end:
+                    todo.insert(0, (first + count, end))
+            for future in wait(running, return_when=FIRST_COMPLETED).done:
+                first = running.pop(future)
+                taken, columns = future.result()
+                count = results.add(first, columns)
+                written(count)
+                # The first one compiles, or loads what was compiled.
+                size = min(max(1, round(count * _WANTED / max(taken, 1e-6))), 4 * size, _LARGEST)
+    finally:
+        for future in running:
+            future.cancel()
+
+
+def _ignore_interrupts() -> None:
+    # The process that has started the workers ends them.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+@contextmanager
+def processes(workers: int) -> Iterator[Executor]:
+    """
+    Make processes of this machine that compute.
+
+    Parameters
+    ----------
+    workers : int
+        How many.
+
+    Yields
+    ------
+    Executor
+        They end with the context.
+
+    """
+    pool = ProcessPoolExecutor(workers, get_context('spawn'), _ignore_interrupts)
+    try:
+        yield pool
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+@contextmanager
+def dask(client: Any) -> Iterator[Executor]:
+    """
+    Make an executor of a Dask cluster.
+
+    Parameters
+    ----------
+    client : distributed.Client
+        Its client.
+
+    Yields
+    ------
+    Executor
+        The cluster remains when the context ends.
+
+    """
+    # A sample is a pure function of its number, but the same chunk is not wanted twice.
+    pool = client.get_executor(pure=False, retries=_TRIES)
+    try:
+        yield pool
+    finally:
+        pool.shutdown(wait=False)

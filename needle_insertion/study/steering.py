@@ -1,0 +1,298 @@
+"""Insertions to a target: steered by a controller, or in open loop."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
+from math import nan
+from typing import Any, Final
+
+from needle_controller import (
+    OutOfReachError,
+    SteeringBelief,
+    SteeringController,
+    SteeringModel,
+)
+from needle_controller.steering.baselines import Broyden, OpenLoop, RollTowards, Springs
+from needle_controller.steering.controller import Guidance, SteeringFaultError
+from needle_controller.steering.trial import insert, Truth
+from needle_dynamics import (
+    FloatArray,
+    insert_batch,
+    NeedleParameters,
+    SteeredNeedle,
+    STEERING_PRESETS,
+    SteeringParameters,
+)
+from needle_dynamics.steering.parameters import with_lengths
+from needle_insertion.study.protocol import Figure, Quantity
+from needle_ros.errors import ParameterError
+from needle_ros.settings import check_constants, constant, from_values, unknown_name
+import numpy as np
+
+OURS: Final = 'ours'
+OPEN_LOOP: Final = 'open loop'
+
+#: Who moves the guide.
+CONTROLLERS: Final = (OURS, 'springs', 'Broyden', 'roll towards the target', OPEN_LOOP)
+
+#: A tip that is no farther from its target has hit it [m].
+HIT: Final = 1e-3
+
+#: Squared distance within which 95 of 100 draws of two normal numbers are.
+_ELLIPSE: Final = 5.991
+
+#: Seeds of paths are below.
+_SEEDS: Final = 2**63
+
+#: Parts of the settings that are mappings, or words.
+_PARTS: Final = ('needle', 'constants', 'belief', 'controller')
+
+FIGURES: Final[Mapping[str, Figure]] = {
+    'miss': Figure('m', 'distance of the tip from the target at the end'),
+    'hit': Figure('', f'the tip ends within {1e3 * HIT:g} mm of the target'),
+    'tip_x': Figure('m', 'where the tip ends, in the frame of the sensor'),
+    'tip_z': Figure('m', 'where the tip ends, in the frame of the sensor'),
+    'way': Figure('m', 'way of the guide'),
+    'turns': Figure('1', 'how often the needle was turned'),
+    'load': Figure('N', 'largest lateral force on the guide after a motion of it'),
+    'refused': Figure('', 'the target was refused as out of reach'),
+    'stopped': Figure('', 'the controller stopped short of the target'),
+    'warned': Figure('', 'it said on the way that the target is out of reach'),
+    'said_x': Figure('m', 'where the controller says that the tip ends'),
+    'said_z': Figure('m', 'where the controller says that the tip ends'),
+    'held': Figure('', 'the tip is in the ellipse of 95 % that the controller gives'),
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SteeringStudy:
+    """
+    Numbers of the protocol that are the same for all samples.
+
+    Raises
+    ------
+    ParameterError
+        If a value is not a number or is outside its range.
+
+    """
+
+    depth: float = constant(0.1, 'm', 'depth of the target', open_low=True)
+    step: float = constant(5e-3, 'm', 'way between two looks', open_low=True)
+    guide_limit: float = constant(6e-3, 'm', 'farthest position of the guide')
+    guide_step: float = constant(1.0, 'm', 'farthest way of the guide in a step', open_low=True)
+    load_limit: float = constant(
+        1e3, 'N', 'largest lateral force of the guide that is planned', open_low=True
+    )
+    turns: float = constant(0.0, '1', 'how often the needle may be turned')
+
+    def __post_init__(self) -> None:
+        check_constants(self)
+
+
+class SteeringProtocol:
+    """
+    Inserts needles that differ from what is believed of them.
+
+    Parameters
+    ----------
+    settings : dict
+        ``needle``, a preset; ``constants`` of it as they are believed; ``belief``, how far they
+        may be wrong; ``controller``, one of `CONTROLLERS`; and the numbers of `SteeringStudy`.
+
+    Raises
+    ------
+    ParameterError
+        If a setting is not valid.
+
+    """
+
+    figures = FIGURES
+
+    def __init__(self, settings: Mapping[str, Any]) -> None:
+        numbers = {name: value for name, value in settings.items() if name not in _PARTS}
+        known = [*_PARTS, *SteeringStudy.__dataclass_fields__]
+        for name in numbers:
+            if name not in known:
+                raise ParameterError(f'settings: {unknown_name(str(name), known)}')
+        self._numbers = from_values(SteeringStudy, numbers, 'settings.')
+        preset = settings.get('needle', 'bending_35mm')
+        if preset not in STEERING_PRESETS:
+            raise ParameterError(
+                f'settings: needle must be one of {", ".join(STEERING_PRESETS)}, got {preset!r}'
+            )
+        self._controller = settings.get('controller', OURS)
+        if self._controller not in CONTROLLERS:
+            raise ParameterError(
+                f'settings: controller must be one of {", ".join(CONTROLLERS)}, got '
+                f'{self._controller!r}'
+            )
+        needle, steering, _ = STEERING_PRESETS[preset]
+        given = dict(settings.get('constants') or {})
+        of_needle = {name: given.pop(name) for name in asdict(needle) if name in given}
+        self._needle = from_values(NeedleParameters, {**asdict(needle), **of_needle})
+        self._steering = from_values(SteeringParameters, {**asdict(steering), **given})
+        self._belief = from_values(
+            SteeringBelief, settings.get('belief') or {}, 'settings.belief.'
+        )
+        steps = max(1, round(self._numbers.depth / self._numbers.step))
+        self._depths = np.linspace(0.0, self._numbers.depth, steps + 1)
+        bevel = max(self._steering.bevel_load)
+        noise = self._belief.path_noise
+        self.quantities: Mapping[str, Quantity] = {
+            'target_x': Quantity(0.0, 'm', 'target, beside the axis'),
+            'target_z': Quantity(0.0, 'm', 'target, beside the axis'),
+            'bending_length': Quantity(1.0, '1', 'bending length over the believed one', 0.1, 10),
+            'skin': Quantity(1.0, '1', 'skin over tissue, over the believed one', 0.0, 1e3),
+            'tilt_x': Quantity(0.0, 'rad', 'tilt of the guide', -0.5, 0.5),
+            'tilt_z': Quantity(0.0, 'rad', 'tilt of the guide', -0.5, 0.5),
+            'bevel_x': Quantity(0.0, 'N', 'load of the bevel', -1e3, 1e3),
+            'bevel_z': Quantity(bevel, 'N', 'load of the bevel', -1e3, 1e3),
+            'frame_x': Quantity(0.0, 'rad', 'turn of the frame of the sensor', -0.5, 0.5),
+            'frame_z': Quantity(0.0, 'rad', 'turn of the frame of the sensor', -0.5, 0.5),
+            'path_noise': Quantity(noise, 'rad^2/m', 'variance of the direction of the path', 0.0),
+            'look_noise': Quantity(self._belief.noise, 'm', 'standard deviation of a look', 0.0),
+            'lost': Quantity(0.0, '1', 'part of the looks that are lost', 0.0, 1.0),
+        }
+
+    @cached_property
+    def _model(self) -> SteeringModel:
+        """What may be true: it is the same for all samples."""
+        return SteeringModel(self._needle, self._steering, self._depths, self._belief)
+
+    def run(
+        self, drawn: Mapping[str, FloatArray], streams: Sequence[np.random.Generator]
+    ) -> dict[str, FloatArray]:
+        """Insert some needles."""
+        count = len(streams)
+        each = {
+            name: drawn.get(name, np.full(count, one.default))
+            for name, one in self.quantities.items()
+        }
+        rows = [{name: float(values[k]) for name, values in each.items()} for k in range(count)]
+        truths = [self._truth(row, rng) for row, rng in zip(rows, streams, strict=True)]
+        targets = np.array([[row['target_x'], row['target_z']] for row in rows]).reshape(-1, 2)
+        found = {name: np.full(count, nan) for name in FIGURES}
+        if self._controller == OPEN_LOOP:
+            self._open(truths, found)
+        else:
+            for k, (truth, row, rng) in enumerate(zip(truths, rows, streams, strict=True)):
+                for name, value in self._steered(truth, row, rng).items():
+                    found[name][k] = value
+        tips = np.stack([found['tip_x'], found['tip_z']], axis=1)
+        found['miss'] = np.hypot(*(tips - targets).T)
+        found['hit'] = (found['miss'] <= HIT).astype(float)
+        return found
+
+    def _truth(self, row: Mapping[str, float], rng: np.random.Generator) -> Truth:
+        needle, steering = with_lengths(
+            self._needle, self._steering, row['bending_length'], row['skin']
+        )
+        bevel = np.array([row['bevel_x'], row['bevel_z']])
+        steering = replace(
+            steering,
+            bevel_load=(float(np.hypot(*bevel)),),
+            path_noise=row['path_noise'],
+            path_noise_length=self._belief.path_noise_length,
+        )
+        return Truth(
+            needle=needle,
+            steering=steering,
+            tilt=(row['tilt_x'], row['tilt_z']),
+            bevel=bevel,
+            frame=np.array([row['frame_x'], row['frame_z']]),
+            seed=int(rng.integers(_SEEDS)),
+        )
+
+    def _open(self, truths: Sequence[Truth], found: dict[str, FloatArray]) -> None:
+        """Insert needles whose guide rests, all at once."""
+        depth = self._depths[-1]
+        tilts = np.array([truth.tilt for truth in truths])[:, np.newaxis, :]
+        rolls = np.array([np.arctan2(*truth.bevel) for truth in truths])[:, np.newaxis]
+        tips = insert_batch(
+            [truth.needle for truth in truths],
+            [truth.steering for truth in truths],
+            self._depths,
+            tilts=np.broadcast_to(tilts, (len(truths), len(self._depths), 2)),
+            rolls=np.broadcast_to(rolls, (len(truths), len(self._depths))),
+            seeds=[truth.seed for truth in truths],
+            workers=1,
+        )
+        frames = np.array([truth.frame for truth in truths])
+        found['tip_x'], found['tip_z'] = (tips[:, -1, [0, 2]] + frames * depth).T
+        for name in ('way', 'turns'):
+            found[name][:] = 0.0
+
+    def replay(
+        self,
+        drawn: Mapping[str, float],
+        rng: np.random.Generator,
+        watch: Callable[[SteeredNeedle], object],
+    ) -> FloatArray:
+        """Insert one needle again, seen after each step; return its target, shape (3,) [m]."""
+        row = {name: drawn.get(name, one.default) for name, one in self.quantities.items()}
+        self._steered(self._truth(row, rng), row, rng, watch)
+        return np.array([row['target_x'], self._depths[-1], row['target_z']])
+
+    def _steered(
+        self,
+        truth: Truth,
+        row: Mapping[str, float],
+        rng: np.random.Generator,
+        watch: Callable[[SteeredNeedle], object] | None = None,
+    ) -> dict[str, float]:
+        """Insert one needle under a controller."""
+        target, said = (row['target_x'], row['target_z']), list[str]()
+        try:
+            controller = self._made(target)
+        except OutOfReachError:
+            return {'refused': 1.0}
+
+        def look(tip: FloatArray) -> FloatArray | None:
+            noise, lost = rng.standard_normal(2), rng.uniform() < row['lost']
+            return None if lost else np.asarray(tip + row['look_noise'] * noise)
+
+        def follow(tip: FloatArray | None) -> Guidance:
+            to = controller.next(tip)
+            if isinstance(controller, SteeringController) and controller.step < len(self._depths):
+                said.append(controller.warning)
+            return to
+
+        figures = {'refused': 0.0, 'stopped': 0.0}
+        try:
+            done = insert(truth, self._depths, look, follow, watch)
+        except SteeringFaultError:
+            return {**figures, 'stopped': 1.0}
+        tip = truth.tip(done.needle)
+        figures |= {
+            'tip_x': float(tip[0]), 'tip_z': float(tip[1]), 'way': done.way,
+            'turns': float(done.turns), 'load': done.load,
+        }  # fmt: skip
+        if isinstance(controller, SteeringController):
+            there = controller.expected()
+            off = tip - there.mean
+            figures |= {
+                'said_x': float(there.mean[0]),
+                'said_z': float(there.mean[1]),
+                'held': float(off @ np.linalg.solve(there.covariance, off) <= _ELLIPSE),
+                'warned': float(any(said)),
+            }
+        return figures
+
+    def _made(self, target: tuple[float, float]) -> SteeringController | OpenLoop:
+        """Return the controller of a target."""
+        numbers, believed = self._numbers, (self._needle, self._steering, self._depths)
+        match self._controller:
+            case 'springs':
+                return Springs(*believed, target, numbers.guide_limit)
+            case 'Broyden':
+                return Broyden(*believed, target, numbers.guide_limit)
+            case 'roll towards the target':
+                return RollTowards(self._depths, target, numbers.guide_limit)
+            case 'open loop':
+                return OpenLoop(self._depths, target)
+        return SteeringController(
+            self._model, target, numbers.guide_limit, int(numbers.turns), numbers.load_limit,
+            step_limit=numbers.guide_step,
+        )  # fmt: skip

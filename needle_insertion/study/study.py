@@ -1,0 +1,283 @@
+"""A study: a population, a protocol, and the numbers of each sample."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+import json
+from pathlib import Path
+from typing import Any, Final
+
+from needle_dynamics import FloatArray
+from needle_insertion.study.distribution import Distribution, distribution
+from needle_insertion.study.protocol import Protocol, PROTOCOLS
+from needle_ros.documents import DocumentError, read_document
+from needle_ros.errors import ParameterError
+from needle_ros.settings import unknown_name
+import numpy as np
+from scipy.special import ndtr, ndtri
+from scipy.stats import qmc
+
+#: What a study file may have.
+_KEYS: Final = ('protocol', 'samples', 'seed', 'design', 'settings', 'population', 'correlations')
+
+#: How samples are spread over the population.
+DESIGNS: Final = ('sobol', 'random')
+
+#: Largest study, and largest number of dimensions of the Sobol sequence.
+_MOST: Final = 2**31
+_DIMENSIONS: Final = 21201
+
+#: Parts of a distribution are this far from its ends.
+_INSIDE: Final = 2.0**-54
+
+
+@dataclass(frozen=True, eq=False)
+class Study:
+    """
+    A study.
+
+    Attributes
+    ----------
+    protocol : Protocol
+        What is done with a sample.
+    samples : int
+        Number of samples.
+    seed : int
+        The same seed gives the same samples.
+    design : str
+        One of `DESIGNS`.
+    population : dict of str to Distribution
+        What differs from sample to sample, by name; the rest is as the protocol has it.
+    factor : ndarray, shape (d, d)
+        Root of the correlations of the population's normal scores.
+    document : dict
+        All of it, as it was given.
+
+    """
+
+    protocol: Protocol
+    samples: int
+    seed: int
+    design: str
+    population: Mapping[str, Distribution]
+    factor: FloatArray
+    document: Mapping[str, Any]
+
+    @property
+    def text(self) -> str:
+        """The study in one line that tells it from any other."""
+        return json.dumps(self.document, sort_keys=True, default=str)
+
+    def draw(self, numbers: FloatArray | Sequence[int]) -> dict[str, FloatArray]:
+        """
+        Return what differs in some samples.
+
+        Parameters
+        ----------
+        numbers : sequence of int
+            Numbers of consecutive samples.
+
+        Returns
+        -------
+        dict of str to ndarray
+            Values by name.
+
+        """
+        parts = self._parts(int(numbers[0]), len(numbers))
+        if not np.array_equal(self.factor, np.eye(len(self.factor))):
+            scores = ndtri(parts)
+            # Not as a product of matrices: its bits may depend on the number of rows.
+            parts = np.array(
+                [
+                    ndtr(sum(f * one for f, one in zip(row, scores.T, strict=True)))
+                    for row in self.factor
+                ]
+            ).T
+        parts = np.clip(parts, _INSIDE, 1.0 - 2.0 * _INSIDE)
+        return {
+            name: one.quantiles(part)
+            for (name, one), part in zip(self.population.items(), parts.T, strict=True)
+        }
+
+    def _parts(self, first: int, count: int) -> FloatArray:
+        """Return numbers that are even in (0, 1), shape (count, d)."""
+        dimensions = len(self.population)
+        if self.design == 'sobol' and dimensions:
+            sequence = qmc.Sobol(dimensions, rng=np.random.default_rng(self.seed))
+            if first:
+                sequence.fast_forward(first)
+            # One by itself at the begin: scipy warns of a first draw that is no power of 2.
+            return np.concatenate([sequence.random(1), sequence.random(count - 1)])
+        return np.array(
+            [self.rng(number, 0).random(dimensions) for number in range(first, first + count)]
+        ).reshape(count, dimensions)
+
+    def rng(self, number: int, stream: int) -> np.random.Generator:
+        """
+        Return the source of chance of a sample, whoever computes it.
+
+        Parameters
+        ----------
+        number : int
+            Number of the sample.
+        stream : int
+            0 for what differs, 1 for noise.
+
+        Returns
+        -------
+        Generator
+            The source.
+
+        """
+        return np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=(number, stream)))
+
+    def rows(self, first: int, count: int) -> dict[str, FloatArray]:
+        """
+        Compute consecutive samples.
+
+        Parameters
+        ----------
+        first : int
+            Number of the first.
+        count : int
+            How many.
+
+        Returns
+        -------
+        dict of str to ndarray, shape (count,)
+            The columns of the table: number, what differs, and figures of merit.
+
+        """
+        numbers = range(first, first + count)
+        drawn = self.draw(numbers)
+        streams = [self.rng(number, 1) for number in numbers]
+        return {
+            'sample': np.arange(first, first + count, dtype=np.float64),
+            **drawn,
+            **self.protocol.run(drawn, streams),
+        }
+
+
+def read_study(path: Path) -> Study:
+    """
+    Read a study file.
+
+    Parameters
+    ----------
+    path : Path
+        YAML file.
+
+    Returns
+    -------
+    Study
+        The study.
+
+    Raises
+    ------
+    ParameterError
+        If it is not valid; the message names the file and what is wrong.
+
+    """
+    try:
+        return made(read_document(path.read_text(encoding='utf-8')))
+    except (DocumentError, ParameterError) as error:
+        raise ParameterError(f'{path}: {error}') from error
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else 'it is not text'
+        raise ParameterError(f'{path}: {reason}') from error
+
+
+def made(document: Any) -> Study:
+    """
+    Make a study of what a file says.
+
+    Parameters
+    ----------
+    document : object
+        Its content.
+
+    Returns
+    -------
+    Study
+        The study.
+
+    Raises
+    ------
+    ParameterError
+        If it is not valid.
+
+    """
+    if not isinstance(document, Mapping):
+        raise ParameterError(f'a study has {", ".join(_KEYS)}, got {document!r}')
+    for key in document:
+        if key not in _KEYS:
+            raise ParameterError(unknown_name(str(key), _KEYS))
+    kind = document.get('protocol')
+    if kind not in PROTOCOLS:
+        raise ParameterError(f'protocol must be one of {", ".join(PROTOCOLS)}, got {kind!r}')
+    samples, seed = (_whole(document, key, low) for key, low in (('samples', 1), ('seed', 0)))
+    design = document.get('design', DESIGNS[0])
+    if design not in DESIGNS:
+        raise ParameterError(f'design must be one of {", ".join(DESIGNS)}, got {design!r}')
+    settings, given = (_mapping(document, key) for key in ('settings', 'population'))
+    protocol = PROTOCOLS[kind](settings)
+    known = protocol.quantities
+    for name in given:
+        if name not in known:
+            raise ParameterError(f'population: {unknown_name(str(name), known)}')
+    population = {name: distribution(f'population: {name}', one) for name, one in given.items()}
+    for name, one in population.items():
+        ends = one.quantiles(np.array([_INSIDE, 1.0 - 2.0 * _INSIDE]))
+        low, high, unit = known[name].low, known[name].high, known[name].unit
+        if not low <= ends.min() <= ends.max() <= high:
+            raise ParameterError(
+                f'population: {name} must be in [{low:g}, {high:g}] {unit}, and would be from '
+                f'{ends.min():g} to {ends.max():g}; cut it off with within: [{low:g}, {high:g}]'
+            )
+    return Study(
+        protocol=protocol,
+        samples=samples,
+        seed=seed,
+        design=design,
+        population=population,
+        factor=_factor(document.get('correlations', []), list(population)),
+        document=dict(document),
+    )
+
+
+def _whole(document: Mapping[str, Any], key: str, low: int) -> int:
+    value = document.get(key, 1)
+    if not isinstance(value, int) or isinstance(value, bool) or not low <= value <= _MOST:
+        raise ParameterError(f'{key} must be a whole number from {low} to {_MOST}, got {value!r}')
+    return value
+
+
+def _mapping(document: Mapping[str, Any], key: str) -> Mapping[str, Any]:
+    value = document.get(key) or {}
+    if not isinstance(value, Mapping):
+        raise ParameterError(f'{key} must be names with values, got {value!r}')
+    return value
+
+
+def _factor(given: Any, names: Sequence[str]) -> FloatArray:
+    """Return a root of the matrix of correlations, given as ``[[name, name, value], ...]``."""
+    matrix = np.eye(len(names))
+    form = 'correlations takes [[name, name, value from -1 to 1], ...] of the population'
+    if not isinstance(given, Sequence) or isinstance(given, str):
+        raise ParameterError(f'{form}, got {given!r}')
+    for one in given:
+        valid = isinstance(one, Sequence) and not isinstance(one, str) and len(one) == 3
+        if not valid or one[0] not in names or one[1] not in names or one[0] == one[1]:
+            raise ParameterError(f'{form}, got {one!r}')
+        value = one[2]
+        if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) <= 1.0:
+            raise ParameterError(f'{form}, got {one!r}')
+        i, k = names.index(one[0]), names.index(one[1])
+        matrix[i, k] = matrix[k, i] = value
+    try:
+        return np.linalg.cholesky(matrix)
+    except np.linalg.LinAlgError as error:
+        raise ParameterError(
+            'correlations contradict each other: no numbers have all of them'
+        ) from error

@@ -1,0 +1,354 @@
+"""`needle study`: equal tables whoever computes them, and nothing lost."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import Executor, Future
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+import hashlib
+from math import sqrt
+import os
+from pathlib import Path
+import random
+import signal
+import subprocess
+import sys
+import time
+from typing import Any
+
+from hypothesis import given
+from hypothesis import strategies as st
+from needle_identification import read_topic
+from needle_insertion.cli import main
+from needle_insertion.study.distribution import distribution
+from needle_insertion.study.engine import compute, processes, Results
+from needle_insertion.study.study import made
+from needle_insertion.study.summary import column, probability, quantile, share, worst
+from needle_ros.errors import JobError
+import numpy as np
+import pytest
+from support.pages import look_at
+import yaml
+
+#: Few needles that go in by few steps.
+SMALL: dict[str, Any] = {
+    'protocol': 'steering',
+    'samples': 40,
+    'seed': 3,
+    'settings': {'depth': 0.05, 'step': 0.01, 'controller': 'springs'},
+    'population': {
+        'target_x': {'uniform': [-0.002, 0.002]},
+        'bending_length': {'lognormal': [1.0, 0.1], 'within': [0.6, 1.6]},
+        'tilt_z': {'normal': [0.0, 0.01], 'within': [-0.05, 0.05]},
+        'skin': {'gamma': [1.0, 0.2], 'within': [0.0, 3.0]},
+        'lost': {'choice': [0.0, 0.1]},
+    },
+    'correlations': [['bending_length', 'skin', -0.7]],
+}
+
+
+class Here(Executor):
+    """Computes at once in this process."""
+
+    def submit(self, function: Callable[..., Any], /, *words: Any, **options: Any) -> Future[Any]:
+        """Return what is done."""
+        future: Future[Any] = Future()
+        future.set_result(function(*words, **options))
+        return future
+
+
+def here() -> AbstractContextManager[Executor]:
+    """Make such an executor."""
+    return nullcontext(Here())
+
+
+def checksum(path: Path) -> str:
+    """Return the SHA-256 of a file."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+@pytest.mark.parametrize('design', ['sobol', 'random'])
+def test_a_sample_does_not_depend_on_its_chunk(design: str) -> None:
+    """To the bit, with correlations too."""
+    study = made({**SMALL, 'design': design})
+    whole = study.rows(0, 13)
+    for first, count in ((0, 1), (1, 5), (6, 7)):
+        part = study.rows(first, count)
+        assert list(part) == list(whole)
+        for name, values in part.items():
+            assert np.array_equal(values, whole[name][first : first + count], equal_nan=True)
+
+
+@pytest.mark.parametrize('design', ['sobol', 'random'])
+def test_samples_have_the_distributions_and_correlations_of_the_file(design: str) -> None:
+    study = made({**SMALL, 'design': design, 'population': {
+        'tilt_x': {'normal': [0.01, 0.002], 'within': [-0.1, 0.1]},
+        'tilt_z': {'uniform': [-0.02, 0.04]},
+        'skin': {'gamma': [2.0, 0.5], 'within': [0.0, 10.0]},
+        'bending_length': {'lognormal': [1.2, 0.1], 'within': [0.2, 5.0]},
+    }, 'correlations': [['tilt_x', 'tilt_z', 0.8]]})  # fmt: skip
+    drawn = study.draw(range(4096))
+    # Five standard errors of 4096 independent draws; Sobol is nearer.
+    near = 5.0 / sqrt(4096.0)
+    assert drawn['tilt_x'].mean() == pytest.approx(0.01, abs=0.002 * near)
+    assert drawn['tilt_x'].std() == pytest.approx(0.002, rel=near)
+    assert drawn['tilt_z'].min() > -0.02
+    assert drawn['tilt_z'].mean() == pytest.approx(0.01, abs=0.06 / sqrt(12.0) * near)
+    assert drawn['skin'].mean() == pytest.approx(2.0, abs=0.5 * near)
+    assert drawn['skin'].std() == pytest.approx(0.5, rel=2.0 * near)
+    assert np.median(drawn['bending_length']) == pytest.approx(1.2, rel=0.2 * near)
+    # Of ranks, for a normal copula: 6 / pi asin(rho / 2).
+    ranks = [np.argsort(np.argsort(drawn[name])) for name in ('tilt_x', 'tilt_z')]
+    assert np.corrcoef(*ranks)[0, 1] == pytest.approx(6 / np.pi * np.arcsin(0.4), abs=near)
+    assert np.corrcoef(drawn['skin'], drawn['tilt_x'])[0, 1] == pytest.approx(0.0, abs=near)
+
+
+@given(
+    kind=st.sampled_from(['uniform', 'normal', 'lognormal', 'gamma']),
+    first=st.floats(0.1, 10.0),
+    second=st.floats(0.01, 5.0),
+    parts=st.lists(st.floats(1e-6, 1.0 - 1e-6), min_size=2, max_size=20),
+    cut=st.tuples(st.floats(0.1, 0.45), st.floats(0.55, 0.9)),
+)
+def test_quantiles_grow_and_stay_within(
+    kind: str, first: float, second: float, parts: list[float], cut: tuple[float, float]
+) -> None:
+    """Of any distribution, also one that is cut off."""
+    numbers = [first, first + second] if kind == 'uniform' else [first, second]
+    free = distribution('x', {kind: numbers})
+    values = free.quantiles(np.sort(parts))
+    assert (np.diff(values) >= 0.0).all()
+    low, high = free.quantiles(np.array(cut)).tolist()
+    if not low < high:
+        return
+    within = distribution('x', {kind: numbers, 'within': [low, high]})
+    some = within.quantiles(np.array(parts))
+    assert ((some >= low) & (some <= high)).all()
+    # The middle of what is left is where the free one has it.
+    (middle,) = within.quantiles(np.array([0.5]))
+    assert middle == pytest.approx(free.quantiles(np.array([sum(cut) / 2]))[0], rel=1e-6)
+
+
+def test_the_table_is_the_same_for_any_workers_and_chunks(tmp_path: Path) -> None:
+    """Its bytes are; so it is after a part was lost, and when all was computed at once."""
+    study = made(SMALL)
+    sums = set()
+    for name, executor, workers in (
+        ('here', here, 1), ('two', lambda: processes(2), 2), ('one', lambda: processes(1), 1),
+    ):  # fmt: skip
+        results = Results(tmp_path / name, study)
+        seen: list[int] = []
+        compute(results, executor, workers, seen.append)
+        assert sum(seen) == study.samples
+        assert results.missing() == []
+        sums.add(checksum(results.table))
+    assert len(sums) == 1
+    assert np.array_equal(column(results.table, 'sample'), np.arange(study.samples))
+
+
+class Killer:
+    """Kills a worker when the first chunk has come, once."""
+
+    def __init__(self) -> None:
+        self.pools = 0
+
+    @contextmanager
+    def __call__(self) -> Any:
+        """Make a pool."""
+        self.pools += 1
+        with processes(2) as pool:
+            if self.pools == 1:
+                pool.submit(int).result()
+                os.kill(next(iter(pool._processes)), signal.SIGKILL)  # type: ignore[attr-defined]
+            yield pool
+
+
+def test_a_killed_worker_changes_nothing(tmp_path: Path) -> None:
+    study = made(SMALL)
+    whole, broken = Results(tmp_path / 'whole', study), Results(tmp_path / 'broken', study)
+    compute(whole, here, 1, lambda _: None)
+    killer = Killer()
+    compute(broken, killer, 2, lambda _: None)
+    assert killer.pools == 2
+    assert checksum(whole.table) == checksum(broken.table)
+
+
+def test_killed_at_any_moment_it_goes_on(tmp_path: Path) -> None:
+    """Ten times, by kill -9; nothing is computed twice, and the table is the same."""
+    document = {**SMALL, 'samples': 1500, 'settings': {**SMALL['settings'], 'step': 0.005}}
+    file = tmp_path / 'study.yaml'
+    file.write_text(yaml.safe_dump(document))
+    words = [sys.executable, '-m', 'needle_insertion.cli', 'study', str(file), '--workers', '1']
+    folder, rng = tmp_path / 'killed', random.Random(1)
+    whole = Results(tmp_path / 'whole', made(document))
+    compute(whole, here, 1, lambda _: None)
+    killed = 0
+    for _ in range(10):
+        process = subprocess.Popen([*words, '-o', str(folder)], stdout=subprocess.DEVNULL)
+        parts, patience = folder / 'parts', time.monotonic() + 120.0
+        before = len(list(parts.iterdir())) if parts.exists() else 0
+        # Until it has done something more, and then at a random moment.
+        while process.poll() is None and time.monotonic() < patience:
+            if parts.exists() and len(list(parts.iterdir())) > before:
+                break
+            time.sleep(0.01)
+        time.sleep(rng.uniform(0.0, 0.3))
+        killed += process.poll() is None
+        process.kill()
+        process.wait()
+        if (folder / 'study.html').exists():
+            break
+    assert killed >= 2
+    assert main(['study', str(file), '-o', str(folder), '--workers', '1']) == 0
+    assert checksum(folder / 'samples.parquet') == checksum(whole.table)
+    assert not (folder / 'parts').exists()
+
+
+def test_the_page_and_a_sample_again(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """What is shown is what the table holds; a bag of one sample ends at its tip."""
+    file, folder = tmp_path / 'study.yaml', tmp_path / 'results'
+    file.write_text(yaml.safe_dump(SMALL))
+    words = ['study', str(file), '-o', str(folder), '--workers', '1']
+    assert main(words) == 0
+    assert '40 samples' in capsys.readouterr().out
+    seen = look_at(folder / 'study.html')
+    assert seen.requests == []
+    table = folder / 'samples.parquet'
+    chance = probability(column(table, 'hit'))
+    for expected in (f'{chance.value:.1%}', 'bending_length', 'Median miss', 'seed 3, sobol'):
+        assert expected in seen.text
+    assert [width > 300 for _, width in seen.images] == [True, True]
+    assert main([*words, '--replay', '7']) == 0
+    assert 'the same numbers as in the table' in capsys.readouterr().out
+    *_, (_, last) = read_topic(folder / 'sample_7', '/tip_deflection')
+    assert last.point.x == column(table, 'tip_x')[7]
+    assert last.point.z == column(table, 'tip_z')[7]
+    # Again is at once, and changes nothing.
+    before = checksum(table)
+    assert main(words) == 0
+    assert checksum(table) == before
+    assert main([*words, '--replay', '40']) == 2
+    assert '--replay must be from 0 to 39' in capsys.readouterr().err
+
+
+def test_open_loop_is_that_of_a_guide_at_rest(tmp_path: Path) -> None:
+    """The batch says what single needles do."""
+    free = {**SMALL, 'settings': {**SMALL['settings'], 'controller': 'open loop'}}
+    rows = made(free).rows(0, 20)
+    still = {**SMALL, 'settings': {**SMALL['settings'], 'guide_limit': 0.0}}
+    same = made(still).rows(0, 20)
+    # A position of the guide and none differ by rounding.
+    np.testing.assert_allclose(rows['tip_x'], same['tip_x'], rtol=0.0, atol=1e-9)
+    np.testing.assert_allclose(rows['tip_z'], same['tip_z'], rtol=0.0, atol=1e-9)
+
+
+def test_intervals_hold_as_often_as_they_say() -> None:
+    """Of probabilities near 0 and in the middle, and of quantiles, over draws with known truth."""
+    rng = np.random.default_rng(5)
+    for truth in (0.01, 0.3, 0.95):
+        found = [probability((rng.random(300) < truth).astype(float)) for _ in range(1000)]
+        held = np.mean([one.low <= truth <= one.high for one in found])
+        # Wilson's interval is within some percent of 95 for any probability.
+        assert 0.925 < held < 0.99
+    median = [quantile(rng.standard_normal(200), 0.9) for _ in range(1000)]
+    exact = 1.2815515655446004
+    assert 0.93 < np.mean([one.low <= exact <= one.high for one in median]) < 0.985
+
+
+def test_shares_are_those_of_a_sum() -> None:
+    """Of y = 2 a + b with equal variances: 0.8 and 0.2; a bystander has none."""
+    rng = np.random.default_rng(2)
+    a, b, other = rng.standard_normal((3, 20_000))
+    y = 2.0 * a + b
+    y[::100] = np.nan
+    assert share(y, a) == pytest.approx(0.8, abs=0.01)
+    assert share(y, b) == pytest.approx(0.2, abs=0.01)
+    assert share(y, other) == pytest.approx(0.0, abs=0.005)
+    assert worst(y, 2) == list(np.argsort(np.where(np.isnan(y), np.inf, -y))[:2])
+
+
+@pytest.mark.parametrize(
+    ('change', 'complaint'),
+    [
+        ({'protocol': 'fishing'}, "protocol must be one of steering, got 'fishing'"),
+        ({'sample': 3}, "unknown parameter 'sample'"),
+        ({'samples': 0}, 'samples must be a whole number from 1 to'),
+        ({'seed': True}, 'seed must be a whole number from 0'),
+        ({'design': 'grid'}, "design must be one of sobol, random, got 'grid'"),
+        ({'population': {'tilt': 1}}, "population: unknown parameter 'tilt'; "),
+        ({'population': {'tilt_x': 'big'}}, 'population: tilt_x must be a number or one of'),
+        ({'population': {'tilt_x': {'cauchy': [0, 1]}}}, 'tilt_x must be one of {uniform:'),
+        ({'population': {'tilt_x': {'normal': [0]}}}, 'normal takes [mean, standard deviation]'),
+        ({'population': {'tilt_x': {'normal': [0, -1]}}}, 'must have standard deviation > 0'),
+        ({'population': {'tilt_x': {'uniform': [1, 0]}}}, 'uniform must have low < high'),
+        ({'population': {'tilt_x': {'normal': [0, float('nan')]}}}, 'takes finite numbers'),
+        ({'population': {'tilt_x': {'normal': [0, 0.2]}}}, 'cut it off with within: [-0.5, 0.5]'),
+        ({'population': {'skin': {'uniform': [-1, 1]}}}, 'skin must be in [0, 1000] 1'),
+        ({'population': {'skin': {'normal': [1, 0.1], 'within': [90, 91]}}}, 'with values of the'),
+        ({'correlations': [['skin', 'tilt', 0.5]]}, 'correlations takes [[name, name, value'),
+        ({'correlations': [['skin', 'tilt_z', 2]]}, 'correlations takes [[name, name, value'),
+        ({'correlations': [['skin', 'tilt_z', 0.9], ['tilt_z', 'target_x', 0.9],
+                           ['skin', 'target_x', -0.9]]}, 'correlations contradict each other'),
+        ({'settings': {'deep': 1}}, "settings: unknown parameter 'deep'; did you mean 'depth'?"),
+        ({'settings': {'depth': -1}}, 'settings.depth must be finite, > 0 m, got -1'),
+        ({'settings': {'needle': 'bone'}}, 'settings: needle must be one of'),
+        ({'settings': {'controller': 'me'}}, 'settings: controller must be one of ours'),
+        ({'settings': {'belief': {'nose': 1}}}, "unknown parameter 'settings.belief.nose'"),
+    ],
+)  # fmt: skip
+def test_what_a_study_cannot_have_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], change: Any, complaint: str
+) -> None:
+    """In one line, with the file, and nothing is written."""
+    file = tmp_path / 'study.yaml'
+    file.write_text(yaml.safe_dump({**SMALL, **change}))
+    assert main(['study', str(file), '-o', str(tmp_path / 'new')]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith(f'error: {file}: ')
+    assert complaint in said
+    assert said.count('\n') == 1
+    assert not (tmp_path / 'new').exists()
+
+
+def test_folders_and_files_that_cannot_be_used_are_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / 'study.yaml'
+    file.write_text(yaml.safe_dump(SMALL))
+    assert main(['study', str(tmp_path / 'none.yaml')]) == 2
+    assert 'none.yaml: No such file' in capsys.readouterr().err
+    (tmp_path / 'other').mkdir()
+    assert main(['study', str(file), '-o', str(tmp_path / 'other')]) == 2
+    assert 'exists and is not of a study; name another folder' in capsys.readouterr().err
+    Results(tmp_path / 'third', made({**SMALL, 'seed': 4}))
+    assert main(['study', str(file), '-o', str(tmp_path / 'third')]) == 2
+    assert 'is of another study; name another folder' in capsys.readouterr().err
+    assert main(['study', str(file), '-o', str(tmp_path / 'x'), '--workers', '0']) == 2
+    assert '--workers must be >= 1' in capsys.readouterr().err
+
+
+def test_a_full_disk_ends_it_in_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What was written before is whole, and the study goes on when there is room."""
+    study = made(SMALL)
+    results = Results(tmp_path / 'results', study)
+    room = resource_limit(2000)
+    with room, pytest.raises(JobError, match='cannot be written: .*File too large'):
+        compute(results, here, 1, lambda _: None)
+    assert not list((tmp_path / 'results').rglob('*.tmp'))
+    compute(results, here, 1, lambda _: None)
+    assert len(column(results.table, 'miss')) == study.samples
+
+
+@contextmanager
+def resource_limit(size: int) -> Any:
+    """Let no file of this process grow beyond a size [bytes]."""
+    import resource
+
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        signal.signal(signal.SIGXFSZ, handler)
