@@ -13,6 +13,10 @@ NAME = MANIFEST.findtext('name')
 NODES = runpy.run_path(str(ROOT / 'needle_insertion/nodes.py'))['NODES']
 #: What the node `slicer` speaks OpenIGTLink with.
 SLICER = ['pyigtl>=0.3.4']
+#: What `needle study` writes, what its `--scheduler` is, and environments for learning.
+STUDY = ['pyarrow>=15']
+DASK = [*STUDY, 'distributed>=2024.5']
+GYM = ['gymnasium>=1.0']
 TEST = [
     'hypothesis>=6.100',
     'lxml>=5.0',
@@ -21,6 +25,8 @@ TEST = [
     'sympy>=1.12',
     'xacro>=2.1',
     *SLICER,
+    *DASK,
+    *GYM,
 ]
 
 
@@ -95,11 +101,9 @@ setup(
         ],
         # `make docs`; locked apart from the rest, in requirements-docs.lock.
         'docs': ['furo>=2024.8', 'myst-parser>=4.0', 'numpydoc>=1.8', 'sphinx>=8.1,<9'],
-        # `needle study`, and its `--scheduler`.
-        'study': ['pyarrow>=15'],
-        'dask': ['distributed>=2024.5', 'pyarrow>=15'],
-        # Environments for reinforcement learning.
-        'gym': ['gymnasium>=1.0'],
+        'study': STUDY,
+        'dask': DASK,
+        'gym': GYM,
         # What `needle bench` is measured beside.
         'bench': ['mcap-ros2-support>=0.5.6', 'mujoco>=3.2', 'pyelastica>=0.3.3', *SLICER],
     },

@@ -332,7 +332,7 @@ def test_a_full_disk_ends_it_in_one_line(tmp_path: Path, monkeypatch: pytest.Mon
     study = made(SMALL)
     results = Results(tmp_path / 'results', study)
     room = resource_limit(2000)
-    with room, pytest.raises(JobError, match='cannot be written: .*File too large'):
+    with room, pytest.raises(JobError, match=r'cannot be written: .*File too large'):
         compute(results, here, 1, lambda _: None)
     assert not list((tmp_path / 'results').rglob('*.tmp'))
     compute(results, here, 1, lambda _: None)
