@@ -40,7 +40,7 @@ class _Needle:
 
     def __init__(self, preset: NeedleParameters, rng: np.random.Generator) -> None:
         factors = 1.0 + SPREAD * rng.uniform(-1.0, 1.0, len(DRAWN))
-        changed = {
+        changed: dict[str, Any] = {
             name: float(factor * getattr(preset, name))
             for name, factor in zip(DRAWN, factors, strict=True)
         }

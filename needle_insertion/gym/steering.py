@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Final
+from typing import Any, ClassVar, Final
 
 import gymnasium
 from gymnasium import spaces
@@ -49,7 +49,7 @@ class SteeringEnv(gymnasium.Env[FloatArray, FloatArray]):
 
     """
 
-    metadata = {'render_modes': []}  # noqa: RUF012
+    metadata: ClassVar[dict[str, Any]] = {'render_modes': []}
 
     def __init__(
         self,

@@ -129,11 +129,13 @@ class Terminal:
             self._state(name)
         for name, topic in _NEEDED:
             if name in nodes:
-                self._spin_until(
-                    lambda name=name, topic=topic: _sees(self._state(name), topic),
-                    f'{topic}, which {name} needs,',
-                    _ANSWER,
-                )
+                self._wait_for(name, topic)
+
+    def _wait_for(self, name: str, topic: str) -> None:
+        def sees() -> bool:
+            return _sees(self._state(name), topic)
+
+        self._spin_until(sees, f'{topic}, which {name} needs,', _ANSWER)
 
     def next_line(self) -> str | None:
         """

@@ -61,16 +61,17 @@ class Distribution:
         """
         if self.kind == _CHOICE:
             number = len(self.numbers)
-            return np.array(self.numbers)[np.minimum((parts * number).astype(int), number - 1)]
+            at = np.minimum((parts * number).astype(int), number - 1)
+            return np.array(self.numbers)[at]
         low, high = (self._below(end) for end in self.within)
         values = self._at(low + parts * (high - low))
-        return np.clip(values, *self.within)
+        return np.asarray(np.clip(values, *self.within))
 
     def _at(self, parts: FloatArray) -> FloatArray:
         first, second = self.numbers
         match self.kind:
             case 'uniform':
-                return first + parts * (second - first)
+                return np.asarray(first + parts * (second - first))
             case 'normal':
                 return np.asarray(first + second * ndtri(parts))
             case 'lognormal':

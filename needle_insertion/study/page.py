@@ -179,7 +179,10 @@ def _map(
     x, y, z = x[seen], y[seen], values[seen]
     drawing = Drawing(figsize=(8.0, 4.5), layout='constrained')
     axes = drawing.subplots()
-    edges = [np.linspace(*np.quantile(one, (0.005, 0.995)), _CELLS + 1) for one in (x, y)]
+    edges = [
+        np.linspace(float(np.quantile(one, 0.005)), float(np.quantile(one, 0.995)), _CELLS + 1)
+        for one in (x, y)
+    ]
     shown = np.full((_CELLS, _CELLS), np.nan)
     places = [np.digitize(one, edge) - 1 for one, edge in zip((x, y), edges, strict=True)]
     cell = places[0] * _CELLS + places[1]

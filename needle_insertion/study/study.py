@@ -214,7 +214,7 @@ def made(document: Any) -> Study:
         if key not in _KEYS:
             raise ParameterError(unknown_name(str(key), _KEYS))
     kind = document.get('protocol')
-    if kind not in PROTOCOLS:
+    if not isinstance(kind, str) or kind not in PROTOCOLS:
         raise ParameterError(f'protocol must be one of {", ".join(PROTOCOLS)}, got {kind!r}')
     samples, seed = (_whole(document, key, low) for key, low in (('samples', 1), ('seed', 0)))
     design = document.get('design', DESIGNS[0])
@@ -276,7 +276,7 @@ def _factor(given: Any, names: Sequence[str]) -> FloatArray:
         i, k = names.index(one[0]), names.index(one[1])
         matrix[i, k] = matrix[k, i] = value
     try:
-        return np.linalg.cholesky(matrix)
+        return np.asarray(np.linalg.cholesky(matrix))
     except np.linalg.LinAlgError as error:
         raise ParameterError(
             'correlations contradict each other: no numbers have all of them'

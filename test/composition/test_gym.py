@@ -28,7 +28,7 @@ def test_a_vector_is_single_environments_with_seeds_of_their_own() -> None:
         assert np.array_equal(one.reset(seed=5 + k)[0], observations[k])
     rng, begins = np.random.default_rng(1), np.zeros(3, dtype=bool)
     for _ in range(30):
-        actions = rng.uniform(-1.0, 1.0, (3, 1)).astype(np.float32)
+        actions = rng.uniform(-1.0, 1.0, (3, 1))
         observations, rewards, ended, broken, _ = many.step(actions)
         for k, one in enumerate(single):
             if begins[k]:
@@ -64,7 +64,7 @@ def test_a_guide_that_is_moved_reaches_what_one_at_rest_does_not() -> None:
 
     def missed(seed: int) -> float:
         environment.reset(seed=seed)
-        over, info = False, {}
+        over, info = False, dict[str, float]()
         while not over:
             _, _, over, _, info = environment.step(np.zeros(2))
         return float(info['miss'])

@@ -99,7 +99,8 @@ def test_samples_have_the_distributions_and_correlations_of_the_file(design: str
     assert np.median(drawn['bending_length']) == pytest.approx(1.2, rel=0.2 * near)
     # Of ranks, for a normal copula: 6 / pi asin(rho / 2).
     ranks = [np.argsort(np.argsort(drawn[name])) for name in ('tilt_x', 'tilt_z')]
-    assert np.corrcoef(*ranks)[0, 1] == pytest.approx(6 / np.pi * np.arcsin(0.4), abs=near)
+    found = np.asarray(np.corrcoef(np.array(ranks)))
+    assert found[0, 1] == pytest.approx(6 / np.pi * np.arcsin(0.4), abs=near)
     assert np.corrcoef(drawn['skin'], drawn['tilt_x'])[0, 1] == pytest.approx(0.0, abs=near)
 
 

@@ -183,7 +183,7 @@ def test_a_bevel_is_turned_by_roll_alone(ros_graph: RosGraph) -> None:
 @pytest.mark.parametrize('continuous', [False, True])
 def test_an_axis_law_moves_the_needle(ros_graph: RosGraph, continuous: bool) -> None:
     """A controller that is steered follows the node, with or without rests, and no targets."""
-    time = {'use_sim_time': True}
+    time: dict[str, Any] = {'use_sim_time': True}
     bench = Bench(ros_graph, mode='simulation', continuous=continuous, rate=50.0, **time)
     controller = ros_graph.add(
         ControllerNode,
