@@ -62,8 +62,8 @@ class Distribution:
         if self.kind == _CHOICE:
             number = len(self.numbers)
             at = np.minimum((parts * number).astype(int), number - 1)
-            return np.array(self.numbers)[at]
-        low, high = (self._below(end) for end in self.within)
+            return np.asarray(np.array(self.numbers)[at])
+        low, high = map(self._below, self.within)
         values = self._at(low + parts * (high - low))
         return np.asarray(np.clip(values, *self.within))
 

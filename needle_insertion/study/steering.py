@@ -164,7 +164,20 @@ class SteeringProtocol:
     def run(
         self, drawn: Mapping[str, FloatArray], streams: Sequence[np.random.Generator]
     ) -> dict[str, FloatArray]:
-        """Insert some needles."""
+        """
+        Insert some needles.
+
+        Parameters
+        ----------
+        drawn, streams
+            As in `Protocol.run`.
+
+        Returns
+        -------
+        dict of str to ndarray, shape (n,)
+            `FIGURES`.
+
+        """
         count = len(streams)
         each = {
             name: drawn.get(name, np.full(count, one.default))
@@ -230,7 +243,20 @@ class SteeringProtocol:
         rng: np.random.Generator,
         watch: Callable[[SteeredNeedle], object],
     ) -> FloatArray:
-        """Insert one needle again, seen after each step; return its target, shape (3,) [m]."""
+        """
+        Insert one needle again.
+
+        Parameters
+        ----------
+        drawn, rng, watch
+            As in `Protocol.replay`.
+
+        Returns
+        -------
+        ndarray, shape (3,)
+            Its target [m].
+
+        """
         row = {name: drawn.get(name, one.default) for name, one in self.quantities.items()}
         self._steered(self._truth(row, rng), row, rng, watch)
         return np.array([row['target_x'], self._depths[-1], row['target_z']])
