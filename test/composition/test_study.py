@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from concurrent.futures import Executor, Future
 from contextlib import AbstractContextManager, contextmanager, nullcontext
+from functools import partial
 import hashlib
 from math import sqrt
 import os
@@ -21,7 +22,7 @@ from hypothesis import strategies as st
 from needle_identification import read_topic
 from needle_insertion.cli import main
 from needle_insertion.study.distribution import distribution
-from needle_insertion.study.engine import compute, processes, Results
+from needle_insertion.study.engine import compute, dask, processes, Results
 from needle_insertion.study.study import made
 from needle_insertion.study.summary import column, probability, quantile, share, worst
 from needle_ros.errors import JobError
@@ -353,3 +354,42 @@ def resource_limit(size: int) -> Any:
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
         signal.signal(signal.SIGXFSZ, handler)
+
+
+def test_a_dask_cluster_computes_the_same_though_a_worker_is_killed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """On this machine, with two processes; a scheduler that is not there is named."""
+    from distributed import Client, LocalCluster
+
+    study = made({**SMALL, 'samples': 200})
+    whole = Results(tmp_path / 'whole', study)
+    compute(whole, here, 1, lambda _: None)
+    with (
+        LocalCluster(
+            n_workers=2, threads_per_worker=1, host='127.0.0.1', dashboard_address=None
+        ) as cluster,
+        Client(cluster) as client,
+    ):
+        results, pids = Results(tmp_path / 'dask', study), client.run(os.getpid)
+        came: list[int] = []
+
+        def kill(count: int) -> None:
+            if not came:
+                os.kill(next(iter(pids.values())), signal.SIGKILL)
+            came.append(count)
+
+        compute(results, partial(dask, client), 2, kill)
+        address = cluster.scheduler_address
+        file = tmp_path / 'study.yaml'
+        file.write_text(yaml.safe_dump({**SMALL, 'samples': 200}))
+        words = ['study', str(file), '--scheduler', address, '-o', str(tmp_path / 'command')]
+        assert main(words) == 0
+    assert sum(came) == 200
+    sums = {checksum(tmp_path / name / 'samples.parquet') for name in ('whole', 'dask', 'command')}
+    assert len(sums) == 1
+    capsys.readouterr()
+    gone = ['study', str(file), '--scheduler', address, '-o', str(tmp_path / 'gone')]
+    assert main(gone) == 1
+    said = capsys.readouterr().err
+    assert f'error: no Dask scheduler at {address}' in said
