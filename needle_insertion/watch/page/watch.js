@@ -131,7 +131,7 @@ const CHARTS = [
 ];
 
 function steps(low, high) {
-  const rough = (high - low) / 3, power = 10 ** Math.floor(Math.log10(rough));
+  const rough = (high - low) / 4, power = 10 ** Math.floor(Math.log10(rough));
   const step = [1, 2, 5, 10].find((one) => one * power >= rough) * power;
   const values = [];
   for (let k = Math.ceil(low / step); k * step <= high; k += 1) values.push(k * step);
