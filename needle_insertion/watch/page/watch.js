@@ -139,7 +139,7 @@ function steps(low, high) {
 }
 
 function chart({canvas, factor, least, lines, limit}) {
-  const width = canvas.clientWidth || 300, height = 165;
+  const width = canvas.clientWidth || 300, height = 200;
   const pen = prepared(canvas, width, height);
   const left = 40, right = width - 6, top = 6, bottom = height - 20;
   let low = Infinity, high = -Infinity;
