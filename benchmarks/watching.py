@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 import shutil
 import subprocess
@@ -154,7 +155,7 @@ def measure() -> dict[str, list[float]]:
         for k in range(ROUNDS):
             take('alone', {})
             with page(graph, f'{name}/browser_{k}') as (watch, port):
-                graph.spin_until(lambda port=port: connected(port), 'the page')
+                graph.spin_until(partial(connected, port), 'the page')
                 take('with a page', {'needle watch': watch})
             sys.stderr.write(f'round {k + 1} of {ROUNDS}\n')
     return found
