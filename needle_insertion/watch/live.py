@@ -164,6 +164,7 @@ class RecordedReader:
         }  # fmt: skip
         self._scene: dict[str, Any] | None = None
         self._jumped = True
+        self._due = monotonic()
         self._asked = asyncio.Event()
         self._asked.set()
 
@@ -179,9 +180,11 @@ class RecordedReader:
         """
         playback = self._playback
         if playback.playing:
-            await asyncio.sleep(PERIOD)
+            await asyncio.sleep(self._due - monotonic())
         else:
             await self._asked.wait()
+        # One that was slow does not catch up.
+        self._due = max(self._due, monotonic() - PERIOD) + PERIOD
         self._asked.clear()
         at = playback.at
         view = self._recording.view(at)

@@ -131,7 +131,7 @@ const CHARTS = [
 ];
 
 function steps(low, high) {
-  const rough = (high - low) / 3, power = 10 ** Math.floor(Math.log10(rough));
+  const rough = (high - low) / 4, power = 10 ** Math.floor(Math.log10(rough));
   const step = [1, 2, 5, 10].find((one) => one * power >= rough) * power;
   const values = [];
   for (let k = Math.ceil(low / step); k * step <= high; k += 1) values.push(k * step);
@@ -139,7 +139,7 @@ function steps(low, high) {
 }
 
 function chart({canvas, factor, least, lines, limit}) {
-  const width = canvas.clientWidth || 300, height = 165;
+  const width = canvas.clientWidth || 300, height = 200;
   const pen = prepared(canvas, width, height);
   const left = 40, right = width - 6, top = 6, bottom = height - 20;
   let low = Infinity, high = -Infinity;
