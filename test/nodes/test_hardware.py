@@ -163,6 +163,55 @@ def test_the_documentation_has_these_parameters() -> None:
     assert lines == [FORCE, POSITION]
 
 
+@pytest.mark.parametrize('command', ['effort', 'position'])
+@pytest.mark.parametrize('kind', ['float64_multi_array', 'joint_trajectory', 'joint_state'])
+def test_each_type_says_the_same(ros_graph: RosGraph, kind: str, command: str) -> None:
+    """Over DDS: the joints in their order, and of what is commanded nothing else."""
+    user = ros_graph.node('user')
+    states = user.create_publisher(JointState, 'joint_states', SENSOR)
+    types = {
+        'float64_multi_array': Float64MultiArray,
+        'joint_trajectory': JointTrajectory,
+        'joint_state': JointState,
+    }
+    told = ros_graph.listen(user, types[kind], 'told', COMMAND)
+    parameters = {
+        **COMMON,
+        'hardware.joint': 'slide',
+        'hardware.command': command,
+        'hardware.command_type': kind,
+        'hardware.command_topic': 'told',
+        'hardware.command_joints': ['door', 'slide'],
+    }
+    ros_graph.add(ControllerNode, parameters=parameters)
+
+    def answered() -> bool:
+        message = JointState(name=['slide', 'door'], position=[0.02, 1.0], velocity=[0.0, 0.0])
+        message.header.stamp = user.get_clock().now().to_msg()
+        states.publish(message)
+        return bool(told)
+
+    ros_graph.spin_until(answered, 'a command')
+    values, message = [0.0, 0.0] if command == 'effort' else [1.0, 0.02], told[0]
+    if kind == 'float64_multi_array':
+        assert list(message.data) == values
+        return
+    if kind == 'joint_trajectory':
+        assert message.joint_names == ['door', 'slide']
+        (point,) = message.points
+        # At once, and there within a period.
+        assert (message.header.stamp.sec, message.header.stamp.nanosec) == (0, 0)
+        assert (point.time_from_start.sec, point.time_from_start.nanosec) == (0, 5_000_000)
+        positions, velocities, efforts = point.positions, point.velocities, point.effort
+    else:
+        assert message.name == ['door', 'slide']
+        assert message.header.stamp.sec > 0
+        positions, velocities, efforts = message.position, message.velocity, message.effort
+    assert list(positions) == (values if command == 'position' else [])
+    assert list(efforts) == (values if command == 'effort' else [])
+    assert list(velocities) == []
+
+
 @pytest.mark.parametrize('which', ROBOTS)
 def test_a_foreign_robot_is_driven_with_parameters_only(ros_graph: RosGraph, which: str) -> None:
     """To 0.05 m and back to 0.03 m, by effort and by position."""
