@@ -544,18 +544,18 @@ class PlantNode(ModelNode):
 
     def _draw(self, plant_run: PlantRun, stamp: int) -> None:
         """Show the shape of the needle from its base to its tip, and the path that it cut."""
-        if not (
+        watched = (
             self._needle_shape.get_subscription_count()
             or self._needle_poses.get_subscription_count()
-            or self._tf is not None
-        ):
-            return
-        seen = plant_run.plant.outline()
+        )
+        seen = plant_run.plant.outline() if watched or self._tf is not None else None
         if seen is None:
             return
         if self._tf is not None:
             kind: Any = self._tf.msg_type
             self._tf.publish(kind(transforms=[_transform(seen, stamp)]))
+        if not watched:
+            return
         lines = [(self._shape, [seen.base.tolist(), *seen.points.tolist()])]
         if len(seen.path):
             lines.append((self._path, seen.path.tolist()))
