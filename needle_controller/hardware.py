@@ -23,6 +23,9 @@ EFFORT: Final = 'effort'
 POSITION: Final = 'position'
 COMMANDS: Final = (EFFORT, POSITION)
 
+#: Stands for the name of the topic, if there is one of its type.
+BY_TYPE: Final = 'auto'
+
 #: By which messages it is told, and what says where it is; the first is that of the contract.
 COMMAND_TYPES: Final = {
     'wrench': 'geometry_msgs/msg/WrenchStamped',
@@ -68,14 +71,18 @@ class HardwareSettings:
     zero: float = constant(
         0.0, 'unit of the robot', 'position of the robot at inserted length 0', low=-1e9, high=1e9
     )
-    state_topic: str = _text('', 'topic of the joint states; empty: joint_states')
+    state_topic: str = _text(
+        '', f'topic of the joint states; empty: joint_states; {BY_TYPE}: the only one of its type'
+    )
     state_type: str = _text('joint_state', f'one of {", ".join(STATE_TYPES)}')
     stamps: str = _text(
         STAMPS[0],
         f'one of {", ".join(STAMPS)}: time of a measurement is that of its header, or when it '
         'came, for a driver that does not stamp',
     )
-    wrench_topic: str = _text('', 'topic of the force sensor; empty: base_wrench')
+    wrench_topic: str = _text(
+        '', f'topic of the force sensor; empty: base_wrench; {BY_TYPE}: the only one of its type'
+    )
     wrench_frame: str = _text('', 'frame of the force sensor; empty: needle_base')
     force_axis: str = _text(
         'y', 'axis of the force sensor that points into the tissue; may be signed: -z'

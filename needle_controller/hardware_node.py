@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from time import monotonic, sleep
 from typing import Any, Final, NamedTuple
 
 from builtin_interfaces.msg import Duration
 from needle_controller.answer import Answer
 from needle_controller.controller import Controller
 from needle_controller.hardware import (
+    BY_TYPE,
     COMMAND_TYPES,
     dynamic_reading,
     EFFORT,
@@ -30,6 +32,10 @@ from rclpy.validate_topic_name import validate_topic_name
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+
+#: Longest time to find a topic by its type, and time between two looks [s].
+_DISCOVERY: Final = 10.0
+_LOOK: Final = 0.1
 
 
 def _named(topic: Topic, name: str, type_name: str) -> Topic:
@@ -99,7 +105,7 @@ class Driver:
     Raises
     ------
     ParameterError
-        If a topic cannot have its name.
+        If a topic cannot have its name, or there is not one of its type.
     MessageError
         If the type of the joint states is not installed.
 
@@ -109,7 +115,7 @@ class Driver:
         self.robot = Robot(settings)
         self._node, self._settings = node, settings
         state, wrench, command = (
-            _named(topic, name, type_name)
+            _named(topic, self._found(topic, name, type_name), type_name)
             for topic, name, type_name in (
                 (contract.JOINT_STATES, settings.state_topic, STATE_TYPES[settings.state_type]),
                 (contract.BASE_WRENCH, settings.wrench_topic, contract.BASE_WRENCH.type_name),
@@ -133,6 +139,36 @@ class Driver:
                 ) from error
         self._write_wrench = contract.WRENCH_COMMAND.template().serialize
         self._period = Duration()
+
+    def _found(self, topic: Topic, name: str, type_name: str) -> str:
+        """Return the name of a topic: for `BY_TYPE` that of the only one of its type."""
+        if name != BY_TYPE or topic is contract.WRENCH_COMMAND:
+            return name
+        deadline = monotonic() + _DISCOVERY
+        while True:
+            found = self._published(type_name)
+            if len(found) == 1:
+                return found[0]
+            if found or monotonic() > deadline:
+                raise ParameterError(
+                    f'hardware: {BY_TYPE} for {topic.name} needs one topic of {type_name} that '
+                    f'others publish, found {", ".join(found) or "none"}'
+                )
+            sleep(_LOOK)
+
+    def _published(self, type_name: str) -> list[str]:
+        """Return the topics of a type that other nodes publish."""
+        node = self._node
+        own = node.get_name(), node.get_namespace()
+        return sorted(
+            name
+            for name, kinds in node.get_topic_names_and_types()
+            if type_name in kinds
+            and any(
+                (one.node_name, one.node_namespace) != own
+                for one in node.get_publishers_info_by_topic(name)
+            )
+        )
 
     # From the robot.
 
@@ -219,19 +255,10 @@ class Driver:
                 f'{topic.name} is published as {", ".join(sorted(types))}, and read as '
                 f'{topic.type_name} (hardware.state_topic, hardware.state_type)'
             )
-        own = node.get_name(), node.get_namespace()
-        others = [
-            name
-            for name, kinds in node.get_topic_names_and_types()
-            if topic.type_name in kinds
-            and any(
-                (one.node_name, one.node_namespace) != own
-                for one in node.get_publishers_info_by_topic(name)
-            )
-        ]
+        others = self._published(topic.type_name)
         return (
             f'nobody publishes {topic.name}; {topic.type_name} is published on '
-            f'{", ".join(sorted(others)) or "no topic"} (hardware.state_topic)'
+            f'{", ".join(others) or "no topic"} (hardware.state_topic)'
         )
 
     # To the robot.
