@@ -310,8 +310,8 @@ NEEDLE_POSES: Final = Topic(
     'geometry_msgs/msg/PoseArray',
     'plant',
     'poses along the needle, y along it, 30 Hz while there is a subscriber',
-    # SlicerROS2 asks for it.
-    qos=COMMAND,
+    # SlicerROS2 asks for what is reliable. A burst is not lost.
+    qos=COMMAND._replace(depth=SENSOR.depth),
     frame=ENTRY,
 )
 
@@ -400,7 +400,7 @@ TIP_POSE: Final = Topic(
     'slicer',
     'where the tip is, y along the needle, 20 Hz; its direction is measured only where '
     '`needle_poses` come',
-    # SlicerROS2 asks for it.
+    # SlicerROS2 asks for what is reliable.
     qos=COMMAND,
     frame=ENTRY,
 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from importlib.util import find_spec
 import sys
 from time import monotonic
@@ -79,7 +80,8 @@ class SlicerNode(BaseNode):
 
         self._target = self.publisher(contract.TARGET)
         self._tip_pose = self.publisher(contract.TIP_POSE)
-        self.subscribe(contract.NEEDLE_POSES, self._on_poses)
+        # The driver of a sensor may offer its shapes as other sensors theirs.
+        self.subscribe(replace(contract.NEEDLE_POSES, qos=contract.SENSOR), self._on_poses)
         self.listen(contract.JOINT_STATES, self._on_joints)
         self.listen(contract.TIP_DEFLECTION, self._on_tip)
         self.subscribe(contract.TIP_EXPECTED, self._on_expected)
