@@ -28,8 +28,9 @@ if TYPE_CHECKING:
     from needle_insertion.slicer.frames import Frame
     from needle_insertion.slicer.messages import Interpreter
 
-#: Time between two shapes, which is also that between two looks at the connection [s].
-PERIOD: Final = 0.05
+#: Time between two looks at the connection, and between two shapes [s].
+_LOOK: Final = 0.02
+_PERIOD: Final = 0.05
 
 #: Time between two states, unless something changes [s].
 _STATE_PERIOD: Final = 1.0
@@ -112,7 +113,8 @@ class SlicerNode(BaseNode):
 
     def activate(self) -> None:
         """Open the connection, and look after it from now on."""
-        self._timer = self.create_timer(PERIOD, self._tick, clock=self._steady)
+        self._due = monotonic()
+        self._timer = self.create_timer(_LOOK, self._tick, clock=self._steady)
 
     def deactivate(self) -> None:
         """Close the connection."""
@@ -193,11 +195,13 @@ class SlicerNode(BaseNode):
         now = monotonic()
         shape = self._view.shape(now)
         self._source = '' if shape is None else shape.source
-        if shape is not None:
-            self._publish_tip(shape)
-        if link.peer:
+        if now >= self._due:
+            # What is late by less than a period does not make the next one late.
+            self._due = max(self._due + _PERIOD, now - _PERIOD)
             if shape is not None:
+                self._publish_tip(shape)
                 self._tell_shape(link, interpreter, shape)
+        if link.peer:
             since = self._state_told
             changed = link.peer != self._greeted or self._state_changed > since
             if changed or now - since >= _STATE_PERIOD:
@@ -219,7 +223,7 @@ class SlicerNode(BaseNode):
         if len(frames) > 2:
             self._journal.say(
                 Severity.WARNING,
-                f'{len(frames)} messages within {PERIOD:g} s: only the newest target counts',
+                f'{len(frames)} messages within {_LOOK:g} s: only the newest target counts',
                 'flood',
             )
         if newest is None:
@@ -251,6 +255,8 @@ class SlicerNode(BaseNode):
         self._tip_pose.publish(message)
 
     def _tell_shape(self, link: Link, interpreter: Interpreter, shape: Shape) -> None:
+        if not link.peer:
+            return
         points, header = interpreter.shape(shape, self._shapes)
         if link.send(points) and link.send(header):
             self._shapes += 1
