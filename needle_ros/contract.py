@@ -415,7 +415,7 @@ TIP_POSE: Final = Topic(
     'slicer',
     'where the tip is, y along the needle, 20 Hz; its direction is measured only where '
     '`needle_poses` come',
-    # SlicerROS2 asks for it.
+    # SlicerROS2 asks for what is reliable.
     qos=COMMAND,
     frame=ENTRY,
 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from importlib.util import find_spec
 import sys
 from time import monotonic
@@ -27,8 +28,9 @@ if TYPE_CHECKING:
     from needle_insertion.slicer.frames import Frame
     from needle_insertion.slicer.messages import Interpreter
 
-#: Time between two shapes, which is also that between two looks at the connection [s].
-PERIOD: Final = 0.05
+#: Time between two looks at the connection, and between two shapes [s].
+_LOOK: Final = 0.02
+_PERIOD: Final = 0.05
 
 #: Time between two states, unless something changes [s].
 _STATE_PERIOD: Final = 1.0
@@ -79,7 +81,8 @@ class SlicerNode(BaseNode):
 
         self._target = self.publisher(contract.TARGET)
         self._tip_pose = self.publisher(contract.TIP_POSE)
-        self.subscribe(contract.NEEDLE_POSES, self._on_poses)
+        # The driver of a sensor may offer its shapes as other sensors theirs.
+        self.subscribe(replace(contract.NEEDLE_POSES, qos=contract.SENSOR), self._on_poses)
         self.listen(contract.JOINT_STATES, self._on_joints)
         self.listen(contract.TIP_DEFLECTION, self._on_tip)
         self.subscribe(contract.TIP_EXPECTED, self._on_expected)
@@ -110,7 +113,8 @@ class SlicerNode(BaseNode):
 
     def activate(self) -> None:
         """Open the connection, and look after it from now on."""
-        self._timer = self.create_timer(PERIOD, self._tick, clock=self._steady)
+        self._due = monotonic()
+        self._timer = self.create_timer(_LOOK, self._tick, clock=self._steady)
 
     def deactivate(self) -> None:
         """Close the connection."""
@@ -191,11 +195,13 @@ class SlicerNode(BaseNode):
         now = monotonic()
         shape = self._view.shape(now)
         self._source = '' if shape is None else shape.source
-        if shape is not None:
-            self._publish_tip(shape)
-        if link.peer:
+        if now >= self._due:
+            # What is late by less than a period does not make the next one late.
+            self._due = max(self._due + _PERIOD, now - _PERIOD)
             if shape is not None:
+                self._publish_tip(shape)
                 self._tell_shape(link, interpreter, shape)
+        if link.peer:
             since = self._state_told
             changed = link.peer != self._greeted or self._state_changed > since
             if changed or now - since >= _STATE_PERIOD:
@@ -217,7 +223,7 @@ class SlicerNode(BaseNode):
         if len(frames) > 2:
             self._journal.say(
                 Severity.WARNING,
-                f'{len(frames)} messages within {PERIOD:g} s: only the newest target counts',
+                f'{len(frames)} messages within {_LOOK:g} s: only the newest target counts',
                 'flood',
             )
         if newest is None:
@@ -249,6 +255,8 @@ class SlicerNode(BaseNode):
         self._tip_pose.publish(message)
 
     def _tell_shape(self, link: Link, interpreter: Interpreter, shape: Shape) -> None:
+        if not link.peer:
+            return
         points, header = interpreter.shape(shape, self._shapes)
         if link.send(points) and link.send(header):
             self._shapes += 1
