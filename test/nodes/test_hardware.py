@@ -369,6 +369,23 @@ def test_it_says_why_nothing_comes(ros_graph: RosGraph, stranger: Node, there: s
     ros_graph.spin_until(said, expected)
 
 
+def test_topics_are_found_by_type(ros_graph: RosGraph) -> None:
+    """Where there is one; where there are two, both are named."""
+    auto = {'hardware__state_topic': 'auto', 'hardware__wrench_topic': 'auto'}
+    bench = Bench(ros_graph, **auto)
+    bench.until(lambda: bench.taken('base_wrench') > 0, 'the force sensor')
+    said = bench.controller.diagnose()[2]['robot']
+    assert said == '/joint_states, effort of slide on slide/commands'
+    bench.user.create_publisher(JointState, 'arm/joint_states', 10)
+    late = ros_graph.add(ControllerNode, start=False, parameters=bench.parameters)
+    assert not late.start()
+    assert late.failure is not None
+    assert late.failure.startswith(
+        'hardware: auto for joint_states needs one topic of sensor_msgs/msg/JointState that '
+        'others publish, found /arm/joint_states, /joint_states'
+    )
+
+
 @pytest.mark.parametrize(
     ('kind', 'topic', 'said'),
     [
