@@ -96,8 +96,8 @@ def _watch(folder: Path, duration: float, tick: Tick) -> Answer:
                 graph.spin_until(lambda end=end: time.monotonic() > end, 'a second')  # type: ignore[misc]
             share = 100.0 * (cpu_seconds(node.process.pid) - spent) / (time.monotonic() - begin)
             shapes = [one for one in peer.told('NeedleShapeHeader') if one.arrived > begin]
-            # The last ones were on their way when nobody listened any more. A new peer begins anew.
-            sent = [one for one in peer.told(SENT) if begin < one.arrived < now]
+            # The last ones may be on their way still. A new peer begins anew.
+            sent = [one for one in peer.told(SENT) if begin < one.arrived < now - 1.0]
             delays = _delays(sent, arrived)
 
             tick('the node is killed')
