@@ -96,9 +96,9 @@ def _watch(folder: Path, duration: float, tick: Tick) -> Answer:
                 graph.spin_until(lambda end=end: time.monotonic() > end, 'a second')  # type: ignore[misc]
             share = 100.0 * (cpu_seconds(node.process.pid) - spent) / (time.monotonic() - begin)
             shapes = [one for one in peer.told('NeedleShapeHeader') if one.arrived > begin]
-            sent = [one for one in peer.told(SENT) if one.arrived > begin]
-            # The last ones may be on their way. A new peer begins anew.
-            delays = _delays(sent[:-2], arrived)
+            # The last ones may be on their way still. A new peer begins anew.
+            sent = [one for one in peer.told(SENT) if begin < one.arrived < now - 1.0]
+            delays = _delays(sent, arrived)
 
             tick('the node is killed')
             killed = time.monotonic()
