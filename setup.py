@@ -108,7 +108,6 @@ setup(
         'bench': ['mcap-ros2-support>=0.5.6', 'mujoco>=3.2', 'pyelastica>=0.3.3', *SLICER],
     },
     entry_points={
-        'gymnasium.envs': ['__root__ = needle_insertion.gym:register'],
         'console_scripts': [
             'needle = needle_insertion.cli:main',
             *(f'needle-{node} = needle_insertion.nodes:main' for node in NODES),

@@ -1,25 +1,17 @@
 """
 Environments for reinforcement learning: `NeedleInsertion-v0` and `NeedleSteering-v0`.
 
-They are registered with Gymnasium where this package is installed (extra ``gym``).
+Gymnasium finds them by ``needle_insertion.gym:NeedleSteering-v0`` (extra ``gym``).
 """
 
 from __future__ import annotations
 
+import gymnasium
 
-def register() -> None:
-    """Tell Gymnasium of the environments; it calls this itself."""
-    import gymnasium
-
-    for name, steps in (('NeedleInsertion', 500), ('NeedleSteering', 100)):
-        environment = name.removeprefix('Needle')
-        gymnasium.register(
-            f'{name}-v0',
-            f'needle_insertion.gym.{environment.lower()}:{environment}Env',
-            vector_entry_point=(
-                'needle_insertion.gym.insertion:InsertionVectorEnv'
-                if environment == 'Insertion'
-                else None
-            ),
-            max_episode_steps=steps,
-        )
+gymnasium.register(
+    'NeedleInsertion-v0',
+    'needle_insertion.gym.insertion:InsertionEnv',
+    vector_entry_point='needle_insertion.gym.insertion:InsertionVectorEnv',
+    max_episode_steps=500,
+)
+gymnasium.register('NeedleSteering-v0', 'needle_insertion.gym.steering:SteeringEnv')

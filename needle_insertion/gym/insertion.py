@@ -31,6 +31,9 @@ _NEAR, _SLOW = 2e-4, 1e-3
 #: Units of an observation: error [m], velocity [m/s], depth [m], deflection [m].
 _UNITS: Final = np.array([0.1, 0.1, 0.1, 1e-3])
 
+#: Observations are cut here, which nothing sane comes near.
+BOUND: Final = 1e3
+
 #: Price of force in the reward [1/N^2].
 _PRICE: Final = 1e-5
 
@@ -65,7 +68,7 @@ class _Needle:
         one = self._integrator
         tip = float(one.model.tip_deflections(one.state))
         seen = np.array([self.target - one.depth, one.velocity, one.depth, tip])
-        return np.asarray((seen / _UNITS).astype(np.float32))
+        return np.clip(seen / _UNITS, -BOUND, BOUND).astype(np.float32)
 
 
 class InsertionEnv(gymnasium.Env[FloatArray, FloatArray]):
@@ -89,7 +92,7 @@ class InsertionEnv(gymnasium.Env[FloatArray, FloatArray]):
     def __init__(self, preset: str = 'phantom') -> None:
         self._preset = NeedleParameters.preset(preset)
         self.action_space = spaces.Box(-1.0, 1.0, (1,))
-        self.observation_space = spaces.Box(-np.inf, np.inf, (len(_UNITS),))
+        self.observation_space = spaces.Box(-BOUND, BOUND, (len(_UNITS),))
         self._needle: _Needle | None = None
 
     def reset(

@@ -9,6 +9,7 @@ from gymnasium import spaces
 from needle_controller import SteeringBelief
 from needle_controller.steering.trial import drawn, Truth
 from needle_dynamics import FloatArray, SteeredNeedle, STEERING_PRESETS
+from needle_insertion.gym.insertion import BOUND
 from needle_ros.errors import ParameterError
 import numpy as np
 
@@ -74,7 +75,7 @@ class SteeringEnv(gymnasium.Env[FloatArray, FloatArray]):
         self._depths = np.linspace(0.0, depth, max(1, round(depth / step)) + 1)
         self._limit, self._aside, self._belief = guide_limit, aside, belief
         self.action_space = spaces.Box(-1.0, 1.0, (2,))
-        self.observation_space = spaces.Box(-np.inf, np.inf, (7,))
+        self.observation_space = spaces.Box(-BOUND, BOUND, (7,))
         self._truth: Truth | None = None
 
     def reset(
@@ -147,4 +148,4 @@ class SteeringEnv(gymnasium.Env[FloatArray, FloatArray]):
         seen = truth.tip(one) + self._belief.noise * self.np_random.standard_normal(2)
         depth = one.depth / self._depths[-1]
         lengths = np.concatenate([seen, self._target, one.guide]) / self._limit
-        return np.concatenate([[depth], lengths]).astype(np.float32)
+        return np.clip(np.concatenate([[depth], lengths]), -BOUND, BOUND).astype(np.float32)

@@ -14,8 +14,8 @@ import pytest
 @pytest.mark.filterwarnings('error')
 @pytest.mark.parametrize('name', ['NeedleInsertion-v0', 'NeedleSteering-v0'])
 def test_gymnasium_has_nothing_to_complain_of(name: str) -> None:
-    """It finds them by name once the package is installed; seeds give the same episodes."""
-    with gymnasium.make(name) as environment:
+    """It finds them by module and name; the same seed gives the same episode."""
+    with gymnasium.make(f'needle_insertion.gym:{name}') as environment:
         check_env(environment.unwrapped, skip_render_check=True)
 
 
