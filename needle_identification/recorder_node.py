@@ -1,4 +1,4 @@
-"""Node that records topics into an MCAP bag, each with the QoS that its publishers offer."""
+"""Node that records topics into an MCAP bag, with the QoS that their publishers offer."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from needle_identification.bags.topics import OfferedQos
 from needle_identification.bags.writer import BagWriter, COMPRESSIONS, described
 from needle_identification.errors import RecordingError
 from needle_ros.base_node import BaseNode, message_class
+from needle_ros.contract import TOPICS
 from needle_ros.errors import MessageError
 from needle_ros.run_node import run
 from rclpy.clock import Clock
@@ -32,6 +33,10 @@ _TAKE_PERIOD: Final = 0.005
 _DEPTH: Final = 5000
 _AT_ONCE: Final = 1000
 
+#: Last parts of the names of topics whose late messages are worth no second try: asking for one
+#: would cost the plant a third more of its CPU.
+_LOSSY: Final = {topic.name.rpartition('/')[2] for topic in TOPICS if topic.qos.lossy}
+
 #: Topics of the middleware that * does not include.
 _NOT_FOR_ALL: Final = ('/rosout', '/parameter_events')
 
@@ -50,8 +55,9 @@ class RecorderNode(BaseNode):
     """
     Records while active, each topic with the quality of service that its publishers offer.
 
-    Messages are stored byte for byte, with the receive time. A second recording of the same node
-    (``~/stop``, ``~/start``) goes to ``path`` with ``_2`` appended.
+    Measurements it hears best effort, as all nodes of the suite do. Messages are stored byte for
+    byte, with the receive time. A second recording of the same node (``~/stop``, ``~/start``)
+    goes to ``path`` with ``_2`` appended.
     """
 
     def __init__(self, **node_options: Any) -> None:
@@ -233,7 +239,9 @@ class RecorderNode(BaseNode):
     ) -> None:
         """Subscribe, or subscribe again if a new publisher offers less than was requested."""
         profiles = [publisher.qos_profile for publisher in publishers]
-        best_effort = any(q.reliability == ReliabilityPolicy.BEST_EFFORT for q in profiles)
+        best_effort = topic.rpartition('/')[2] in _LOSSY or any(
+            q.reliability == ReliabilityPolicy.BEST_EFFORT for q in profiles
+        )
         latched = all(q.durability == DurabilityPolicy.TRANSIENT_LOCAL for q in profiles)
         before = self._recorded.get(topic)
         offered = {} if before is None else dict(before.offered)

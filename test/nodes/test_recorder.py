@@ -103,6 +103,33 @@ def test_records_each_topic_with_its_offered_qos(
     assert offered['/latched']['durability'] == 'transient_local'
 
 
+def test_measurements_are_recorded_best_effort(
+    ros_graph: RosGraph, record: Callable[..., Any], tmp_path: Path
+) -> None:
+    """As our nodes hear them, whatever is offered; the bag has what was offered."""
+    probe = ros_graph.node('probe')
+    topics = ('/lab/joint_states', '/lab/other')
+    for topic in topics:
+        probe.create_publisher(JointState, topic, COMMAND)
+    node = record(tmp_path / 'bag', topics=list(topics))
+    ros_graph.spin_until(
+        lambda: all(map(probe.get_subscriptions_info_by_topic, topics)), 'the recorder'
+    )
+    requested = [
+        [one.qos_profile.reliability.name for one in probe.get_subscriptions_info_by_topic(topic)]
+        for topic in topics
+    ]
+    assert requested == [['BEST_EFFORT'], ['RELIABLE']]
+    node.stop()
+    information = yaml.safe_load((tmp_path / 'bag' / 'metadata.yaml').read_text())
+    offered = {
+        topic['topic_metadata']['offered_qos_profiles'][0]['reliability']
+        for topic in information['rosbag2_bagfile_information']['topics_with_message_count']
+        if topic['topic_metadata']['name'] in topics
+    }
+    assert offered == {'reliable'}
+
+
 def test_stores_messages_byte_for_byte(
     ros_graph: RosGraph,
     record: Callable[..., Any],
