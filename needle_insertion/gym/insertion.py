@@ -68,7 +68,7 @@ class _Needle:
         one = self._integrator
         tip = float(one.model.tip_deflections(one.state))
         seen = np.array([self.target - one.depth, one.velocity, one.depth, tip])
-        return np.clip(seen / _UNITS, -BOUND, BOUND).astype(np.float32)
+        return np.asarray(np.clip(seen / _UNITS, -BOUND, BOUND), dtype=np.float32)
 
 
 class InsertionEnv(gymnasium.Env[FloatArray, FloatArray]):

@@ -148,4 +148,5 @@ class SteeringEnv(gymnasium.Env[FloatArray, FloatArray]):
         seen = truth.tip(one) + self._belief.noise * self.np_random.standard_normal(2)
         depth = one.depth / self._depths[-1]
         lengths = np.concatenate([seen, self._target, one.guide]) / self._limit
-        return np.clip(np.concatenate([[depth], lengths]), -BOUND, BOUND).astype(np.float32)
+        numbers = np.clip(np.concatenate([[depth], lengths]), -BOUND, BOUND)
+        return np.asarray(numbers, dtype=np.float32)
