@@ -48,8 +48,8 @@ KEYS = {
     'yaml': 'python3-yaml',
 }
 
-#: Imported by one node, which says how to install it: an extra of setup.py, without a key.
-EXTRAS = {'pyigtl'}
+#: Extras of setup.py, without a key: what needs one says how to install it.
+EXTRAS = {'distributed', 'gymnasium', 'pyarrow', 'pyigtl'}
 
 OWN = {path.parent.name for path in ROOT.glob('needle_*/__init__.py')}
 
