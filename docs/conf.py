@@ -40,8 +40,8 @@ suppress_warnings = ['config.cache']
 viewcode_follow_imported_members = False
 autodoc_member_order = 'bysource'
 autodoc_typehints = 'none'
-# It comes with the node `slicer` only.
-autodoc_mock_imports = ['pyigtl']
+# Extras: the pages are made without them.
+autodoc_mock_imports = ['distributed', 'gymnasium', 'pyarrow', 'pyigtl']
 # numpydoc loads it; our own pages are those of docs/_ext/api.py.
 autosummary_generate = False
 numpydoc_class_members_toctree = False

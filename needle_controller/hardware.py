@@ -163,12 +163,12 @@ class HardwareSettings:
 
     def axes(self) -> tuple[tuple[int, float], ...]:
         """
-        Return where the sensor has each axis of `needle_base`, by a proper rotation.
+        Return where the sensor has each axis of ``needle_base``, by a proper rotation.
 
         Returns
         -------
         tuple of (int, float)
-            Number and sign of the axis of the sensor, for x, y and z of `needle_base`.
+            Number and sign of the axis of the sensor, for x, y and z of ``needle_base``.
 
         Raises
         ------
@@ -426,8 +426,8 @@ class Robot:
         Returns
         -------
         Reading
-            What the base exerts on the needle, along the axes of `needle_base`, with the frame as
-            it was. The moment is still about the origin of the sensor.
+            What the base exerts on the needle, along the axes of ``needle_base``, with the frame
+            as it was. The moment is still about the origin of the sensor.
 
         """
         numbers = reading.values[0]

@@ -150,7 +150,7 @@ class Operator:
         Parameters
         ----------
         x, y, z : float
-            Where the tip shall be, in `needle_entry` [m]; without the node `steering` only the
+            Where the tip shall be, in ``needle_entry`` [m]; without the node `steering` only the
             depth y counts.
 
         """

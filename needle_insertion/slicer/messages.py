@@ -2,7 +2,7 @@
 What OpenIGTLink messages say, in quantities of the contract, and the other way round.
 
 Lengths of the messages are in mm, in the frame of the images (RAS in 3D Slicer); ours are in m, in
-`needle_entry`. A `Registration` is in between. The names of the devices are those of SmartNeedle
+``needle_entry``. A `Registration` is in between. The names of the devices are those of SmartNeedle
 (trajcontrol, and its module of 3D Slicer), as far as it has some: docs/howto/slicer.md.
 """
 
@@ -94,7 +94,7 @@ class Interpreter:
         Returns
         -------
         ndarray, shape (3,), or None
-            Where the tip shall be in `needle_entry` [m]; None if these are points of something
+            Where the tip shall be in ``needle_entry`` [m]; None if these are points of something
             else.
 
         Raises

@@ -26,7 +26,7 @@ LINE: Final = 'line from guide to tip, not measured'
 
 class Shape(NamedTuple):
     """
-    The needle in `needle_entry`.
+    The needle in ``needle_entry``.
 
     Attributes
     ----------
@@ -49,7 +49,7 @@ class Shape(NamedTuple):
 
 class Pose(NamedTuple):
     """
-    A pose in `needle_entry`.
+    A pose in ``needle_entry``.
 
     Attributes
     ----------

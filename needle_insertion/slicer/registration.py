@@ -58,7 +58,7 @@ def rotation_matrix(quaternion: ArrayLike) -> FloatArray:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Registration:
     r"""
-    Where the frame `needle_entry` is in the images.
+    Where the frame ``needle_entry`` is in the images.
 
     .. math:: p_{image} = R p_{needle} + t
 
@@ -100,7 +100,7 @@ class Registration:
         Parameters
         ----------
         points : array_like, shape (..., 3)
-            In `needle_entry` [m].
+            In ``needle_entry`` [m].
 
         Returns
         -------
@@ -123,7 +123,7 @@ class Registration:
         Returns
         -------
         ndarray, shape (..., 3)
-            In `needle_entry` [m].
+            In ``needle_entry`` [m].
 
         """
         lengths = np.asarray(points, dtype=np.float64) / MILLIMETERS
@@ -136,9 +136,9 @@ class Registration:
         Parameters
         ----------
         position : array_like, shape (3,)
-            In `needle_entry` [m].
+            In ``needle_entry`` [m].
         quaternion : array_like, shape (4,)
-            Orientation in `needle_entry`: x, y, z, w.
+            Orientation in ``needle_entry``: x, y, z, w.
 
         Returns
         -------

@@ -55,7 +55,7 @@ class SlicerNode(BaseNode):
     In come POINT, TRANSFORM and STRING messages with a target, in mm in the frame of the images.
     Out go, 20 times a second, the shape of the needle and the pose of its tip; also where the tip
     is expected, and what all nodes say on ``/diagnostics``. ``registration.*`` says where the
-    frame `needle_entry` is in the images. The tip goes to ``tip_pose``, too.
+    frame ``needle_entry`` is in the images. The tip goes to ``tip_pose``, too.
 
     The shape is that of ``needle_poses``. If these do not come it is the line from the guide
     (``joint_states``) to the tip (``tip_deflection``), and is said to be no measurement.

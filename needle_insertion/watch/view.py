@@ -131,7 +131,7 @@ class View:
 
     def line(self, name: str, points: FloatArray, now: float) -> None:
         """
-        Take a line of `needle_shape`.
+        Take a line of ``needle_shape``.
 
         Parameters
         ----------
