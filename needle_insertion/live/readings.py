@@ -45,7 +45,7 @@ class Readings:
                 message_class(topic.type_name),
                 topic.name,
                 partial(self._newest.__setitem__, topic.name),
-                profile(topic.qos._replace(depth=1)),
+                profile(topic.qos._replace(depth=1), request=True),
                 raw=True,
             )
 

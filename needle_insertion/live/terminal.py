@@ -45,6 +45,9 @@ _NEEDED: Final = (
     (STEERING, TIP_DEFLECTION.name),
 )
 
+#: A warning that comes and goes is told of once in this time [s].
+_AGAIN: Final = 30.0
+
 #: Meters in a unit.
 _UNITS: Final = {'m': 1.0, 'cm': 1e-2, 'mm': 1e-3}
 
@@ -103,8 +106,9 @@ class Terminal:
         self._graph, self._operator, self._readings = graph, operator, readings
         self._screen, self._say = screen, screen.say
         screen.complete([*WORDS, *LAWS])
-        #: Level and message last told of each node, without its numbers.
-        self._told: dict[str, tuple[int, str]] = {}
+        #: What each node said last, without its numbers, and when that was told of.
+        self._last: dict[str, str] = {}
+        self._told: dict[tuple[str, str], float] = {}
         #: Whether the tip was sent to a target last, which the node `steering` brings there.
         self._steers = False
 
@@ -216,17 +220,18 @@ class Terminal:
         self._graph.spin_until(holds, what, timeout)
 
     def _look(self) -> None:
-        """Tell of nodes that have something new to complain about, or are fine again."""
+        """Tell of nodes that have something new to complain about."""
         for name, state in self._operator.states.items():
-            level, message = state.level, state.message
+            level, message, now = state.level, state.message, monotonic()
             if state.age > _SILENT:
                 level, message = _ERROR, 'says nothing any more'
             # Counts that grow say nothing new.
-            kind = level, re.sub(r'\d+', '', message)
-            before = self._told.get(name, (0, ''))
-            if (level or before[0]) and kind != before:
+            kind = re.sub(r'\d+', '', message)
+            again = level >= _ERROR or now - self._told.get((name, kind), -inf) > _AGAIN
+            if level and kind != self._last.get(name) and again:
                 self._say(f'{name}: {_LEVELS[min(level, 3)]} {message}')
-            self._told[name] = kind
+                self._told[name, kind] = now
+            self._last[name] = kind
 
     # Words.
 

@@ -94,7 +94,11 @@ class WatchNode(Node):
     ) -> None:
         """Keep what comes on a topic until it is taken."""
         made = self.create_subscription(
-            message_class(topic.type_name), topic.name, lambda _: None, profile(qos), raw=raw
+            message_class(topic.type_name),
+            topic.name,
+            lambda _: None,
+            profile(qos, request=True),
+            raw=raw,
         )
         self._takers.append((made, take))
 
