@@ -23,6 +23,7 @@ import json
 from multiprocessing import get_context
 from pathlib import Path
 import re
+import shutil
 import signal
 from time import monotonic
 from typing import Any, Final
@@ -101,15 +102,18 @@ class Results:
     def __init__(self, folder: Path, study: Study) -> None:
         self.folder, self.study = folder, study
         self._parts = folder / 'parts'
-        if folder.exists():
-            file = folder / STUDY
-            if not file.is_file():
-                raise ParameterError(f'{folder} exists and is not of a study; name another folder')
+        file = folder / STUDY
+        if file.is_file():
             if file.read_text(encoding='utf-8') != study.text:
                 raise ParameterError(f'{folder} is of another study; name another folder')
+        # One that was killed at the begin leaves a draft, or nothing.
+        elif folder.exists() and any(path.suffix != '.tmp' for path in folder.iterdir()):
+            raise ParameterError(f'{folder} exists and is not of a study; name another folder')
         folder.mkdir(parents=True, exist_ok=True)
         write_whole(folder / STUDY, study.text.encode())
-        if not self.table.exists():
+        if self.table.exists():
+            self._clear()
+        else:
             self._parts.mkdir(exist_ok=True)
 
     @property
@@ -158,9 +162,13 @@ class Results:
     def complete(self) -> None:
         """Make one table of all parts, and remove them."""
         self._write(self.table, self._groups())
-        for first, end in self._done():
-            self._part(first, end).unlink()
-        self._parts.rmdir()
+        self._clear()
+
+    def _clear(self) -> None:
+        """Remove the parts, and what was broken off: all of it is in the table."""
+        shutil.rmtree(self._parts, ignore_errors=True)
+        for draft in self.folder.glob('*.tmp'):
+            draft.unlink()
 
     def _groups(self) -> Iterator[Any]:
         """Yield all samples in tables of the same number of rows."""

@@ -319,7 +319,7 @@ def test_folders_and_files_that_cannot_be_used_are_named(
     file.write_text(yaml.safe_dump(SMALL))
     assert main(['study', str(tmp_path / 'none.yaml')]) == 2
     assert 'none.yaml: No such file' in capsys.readouterr().err
-    (tmp_path / 'other').mkdir()
+    (tmp_path / 'other' / 'results').mkdir(parents=True)
     assert main(['study', str(file), '-o', str(tmp_path / 'other')]) == 2
     assert 'exists and is not of a study; name another folder' in capsys.readouterr().err
     Results(tmp_path / 'third', made({**SMALL, 'seed': 4}))

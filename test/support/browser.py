@@ -61,6 +61,8 @@ class Tab:
 
     async def wait(self, script: str, what: str) -> Any:
         """Wait until the value of a script is true, and return it."""
+        # While a page loads, what is looked for may not be there.
+        script = f'(() => {{ try {{ return {script} }} catch {{ return null }} }})()'
         for _ in range(round(_PATIENCE / 0.1)):
             if value := await self.run(script):
                 return value
