@@ -48,8 +48,8 @@ _RETRACT = 'retract_depth'
 #: Where to retract to by default [m], or as near to it as the range of depths has.
 _RETRACT_DEPTH = 0.01
 
-#: How often the last command is sent again when the node lets go of a robot whose driver may have
-#: no timeout, and how long after another [s].
+#: Number of times that the last command is repeated at deactivation, because the driver may have
+#: no timeout, and time between them [s].
 _AGAIN, _PAUSE = 5, 0.02
 
 #: Looks for joint states that do not come until there is a word about it.

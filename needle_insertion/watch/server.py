@@ -43,7 +43,7 @@ LONGEST: Final = 4096
 _AHEAD: Final = 2
 _MOST_ASKED: Final = 8
 
-#: A reader that takes nothing for so long is let go [s].
+#: A reader that accepts no data for this time is disconnected [s].
 _PATIENCE: Final = 10.0
 
 #: Time between two looks whether a reader is still there [s].

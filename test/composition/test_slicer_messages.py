@@ -272,6 +272,7 @@ def test_the_needle_is_told(
     about = f'1970-01-01 00:00:12.345;7;{len(points)};image;{shape.source}'
     assert header.string == about
     (tip,) = received(interpreter.tip(shape))
+    # A time is in parts of 2^-32 s, 2.3e-10 s, and pyigtl has it as a float.
     assert (tip.device_name, tip.timestamp) == (TIP, pytest.approx(12.345678901, abs=1e-8))
     np.testing.assert_allclose(tip.matrix[:3, 3], seen[-1], atol=2e-4)
     # y of the tip is along the needle: a step along it in the needle's frame.

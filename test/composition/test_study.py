@@ -96,8 +96,10 @@ def test_samples_have_the_distributions_and_correlations_of_the_file(design: str
     assert drawn['tilt_z'].min() > -0.02
     assert drawn['tilt_z'].mean() == pytest.approx(0.01, abs=0.06 / sqrt(12.0) * near)
     assert drawn['skin'].mean() == pytest.approx(2.0, abs=0.5 * near)
-    assert drawn['skin'].std() == pytest.approx(0.5, rel=2.0 * near)
-    assert np.median(drawn['bending_length']) == pytest.approx(1.2, rel=0.2 * near)
+    # Relative errors of a deviation of this gamma, and of a median: 0.77 and 1.25 x 0.1 over
+    # the root of the number.
+    assert drawn['skin'].std() == pytest.approx(0.5, rel=0.77 * near)
+    assert np.median(drawn['bending_length']) == pytest.approx(1.2, rel=0.125 * near)
     # Of ranks, for a normal copula: 6 / pi asin(rho / 2).
     ranks = [np.argsort(np.argsort(drawn[name])) for name in ('tilt_x', 'tilt_z')]
     found = np.asarray(np.corrcoef(np.array(ranks)))
@@ -126,7 +128,7 @@ def test_quantiles_grow_and_stay_within(
     within = distribution('x', {kind: numbers, 'within': [low, high]})
     some = within.quantiles(np.array(parts))
     assert ((some >= low) & (some <= high)).all()
-    # The middle of what is left is where the free one has it.
+    # The middle of what is left is where the free one has it, but for rounding far out in a tail.
     (middle,) = within.quantiles(np.array([0.5]))
     assert middle == pytest.approx(free.quantiles(np.array([sum(cut) / 2]))[0], rel=1e-6)
 
@@ -194,6 +196,7 @@ def test_killed_at_any_moment_it_goes_on(tmp_path: Path) -> None:
             if parts.exists() and len(list(parts.iterdir())) > before:
                 break
             time.sleep(0.01)
+        # The moment is random: no condition is waited for.
         time.sleep(rng.uniform(0.0, 0.3))
         killed += process.poll() is None
         process.kill()

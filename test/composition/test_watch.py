@@ -267,6 +267,7 @@ def test_a_bag_shows_what_was_at_each_time(tmp_path: Path, space: str) -> None:
     assert bag.losses == ()
     for time in (1.0, 3.0, 1.0):
         seen = bag.view(time).frame(time)
+        # At 20 mm/s the newest reading, less than 50 ms old, is within 1 mm.
         assert seen['depth'] == pytest.approx(0.02 * time, abs=1e-3)
         assert seen['force'] == pytest.approx(2.0 + time, abs=0.05)
         assert seen['shape'] == 'simulated'
@@ -671,7 +672,7 @@ async def test_a_slow_reader_misses_frames_and_gets_no_old_ones() -> None:
 
 @in_loop
 async def test_what_is_live_is_the_newest() -> None:
-    """A reader that was slow gets the frame of now, and a new one what was before."""
+    """A slow reader gets the newest frame; a new reader gets the history."""
     view = View()
     live = Live(view, lambda _: None, control=False)
     running = asyncio.create_task(live.run())

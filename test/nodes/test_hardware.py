@@ -422,7 +422,7 @@ def test_zero_is_sent_again_and_again_when_measurements_end(ros_graph: RosGraph)
 
 @pytest.mark.parametrize('which', ROBOTS)
 def test_the_last_command_is_sent_again_and_again(ros_graph: RosGraph, which: str) -> None:
-    """When the node lets go: zero effort, or the position where it is."""
+    """At deactivation: zero effort, or the position where it is."""
     bench = Bench(ros_graph, which)
     bench.aim(0.15)
     bench.until(lambda: bench.depth > 0.022, 'motion')
