@@ -8,7 +8,6 @@ import sys
 from time import sleep
 from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PointStamped
 from needle_controller.answer import Answer, Reply
 from needle_controller.controller import (
@@ -20,7 +19,6 @@ from needle_controller.controller import (
 )
 from needle_controller.hardware import HardwareSettings
 from needle_controller.hardware_node import CONTRACT, Driver
-from needle_controller.journal import Severity
 from needle_controller.observer.settings import ObserverSettings
 from needle_controller.reference.guide import REFERENCES
 from needle_controller.reference.setpoint import ReferenceLimits
@@ -31,6 +29,7 @@ from needle_dynamics.compiled.cache import announce_compilation
 from needle_dynamics.model_node import ModelNode
 from needle_ros import contract
 from needle_ros.errors import NeedleError, ParameterError
+from needle_ros.journal import Severity
 from needle_ros.publishers_node import offer_lease, Publishers
 from needle_ros.run_node import run
 from needle_ros.timing import nanoseconds, seconds
@@ -60,12 +59,6 @@ _GUIDE = {joint.name for joint in contract.STEERING_JOINTS}
 
 #: Sources of what is known of the bending.
 FEEDBACKS = ('observer', 'ground_truth', 'none')
-
-_LEVELS = {
-    Severity.INFO: DiagnosticStatus.OK,
-    Severity.WARNING: DiagnosticStatus.WARN,
-    Severity.ERROR: DiagnosticStatus.ERROR,
-}
 
 
 class ControllerNode(ModelNode):
@@ -246,7 +239,7 @@ class ControllerNode(ModelNode):
             self._supervisor.change(parameters, law, self._gains(changes))
         except ParameterError as error:
             self._supervisor.journal.refuse(f'parameters: {error}')
-            self._tell()
+            self.tell(self._supervisor.journal)
             raise
         self._supervisor.retract_depth = depth
         if self._driver is not None:
@@ -355,7 +348,7 @@ class ControllerNode(ModelNode):
         if missing != self._missing:
             self._missing = missing
             self._supervisor.journal.say(Severity.WARNING, missing)
-            self._tell()
+            self.tell(self._supervisor.journal)
 
     # What goes out.
 
@@ -374,20 +367,7 @@ class ControllerNode(ModelNode):
             if reference:
                 self._reference.publish(self._write_aim(stamp, *reference))
                 self._tracking_error.publish(self._write_aim(stamp, *error))
-        if self._supervisor.journal.changed:
-            self._tell()
-
-    def _tell(self) -> None:
-        log = self.get_logger()
-        for severity, line in self._supervisor.journal.take():
-            # rclpy refuses another severity from the same place.
-            if severity is Severity.ERROR:
-                log.error(line)
-            elif severity is Severity.WARNING:
-                log.warning(line)
-            else:
-                log.info(line)
-        self.publish_diagnostics()
+        self.tell(self._supervisor.journal)
 
     def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
         """Say what it aims at and what holds it back."""
@@ -396,7 +376,7 @@ class ControllerNode(ModelNode):
             values |= self._driver.describe()
             if held is not None and self._supervisor.waits and self._missing:
                 held = f'{held}: {self._missing}'
-        return _LEVELS[severity], held or super().diagnose()[1], values
+        return severity.level, held or super().diagnose()[1], values
 
 
 def main() -> int:

@@ -8,9 +8,7 @@ import sys
 from typing import Any
 
 from builtin_interfaces.msg import Duration
-from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PointStamped, PoseWithCovarianceStamped
-from needle_controller.journal import Severity
 from needle_controller.steering.belief import SteeringBelief
 from needle_controller.steering.controller import TipEstimate
 from needle_controller.steering.motion import Move
@@ -40,12 +38,6 @@ _PRESET = 'bending_35mm'
 
 #: Time between two looks for what does not come [s].
 _WATCH = 0.05
-
-_LEVELS = {
-    Severity.INFO: DiagnosticStatus.OK,
-    Severity.WARNING: DiagnosticStatus.WARN,
-    Severity.ERROR: DiagnosticStatus.ERROR,
-}
 
 
 class SteeringNode(BaseNode):
@@ -193,8 +185,7 @@ class SteeringNode(BaseNode):
             self._told = loop.expected
             if loop.expected is not None:
                 self._tell_tip(loop.expected, loop.depth)
-        if loop.journal.changed:
-            self._tell()
+        self.tell(loop.journal)
 
     def _message(self, move: Move) -> JointTrajectory:
         message = JointTrajectory(joint_names=list(move.joints))
@@ -223,26 +214,12 @@ class SteeringNode(BaseNode):
         message.pose.covariance = covariance.ravel()
         self._tip_expected.publish(message)
 
-    def _tell(self) -> None:
-        log, loop = self.get_logger(), self._loop
-        if loop is None:
-            return
-        for severity, line in loop.journal.take():
-            # rclpy refuses another severity from the same place.
-            if severity is Severity.ERROR:
-                log.error(line)
-            elif severity is Severity.WARNING:
-                log.warning(line)
-            else:
-                log.info(line)
-        self.publish_diagnostics()
-
     def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
         """Say what it does, what it expects and what is wrong."""
         if self._loop is None or not self.is_active:
             return super().diagnose()
         severity, state, values = self._loop.diagnose(self.now())
-        return _LEVELS[severity], state, values
+        return severity.level, state, values
 
 
 def main() -> int:

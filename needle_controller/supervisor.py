@@ -10,7 +10,6 @@ from needle_controller.answer import Answer, Reply
 from needle_controller.bending import Bending
 from needle_controller.controller import Controller, ControllerSettings, Gains, Measurement
 from needle_controller.hardware import Robot, STAMPS
-from needle_controller.journal import Journal, Severity
 from needle_controller.observer.observer import Observer
 from needle_controller.observer.settings import ObserverSettings
 from needle_controller.safety.encoders import read_encoders
@@ -23,6 +22,7 @@ from needle_controller.safety.stream import REPEATED
 from needle_dynamics import euler_loads, NeedleModel, NeedleParameters
 from needle_ros.contract import BASE
 from needle_ros.errors import NeedleError, ParameterError
+from needle_ros.journal import Journal, Severity
 from needle_ros.timing import NANOSECONDS
 from needle_ros.trajectories import joint_values, MOST_POINTS
 from needle_ros.wire import Reading

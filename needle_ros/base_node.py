@@ -21,6 +21,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from needle_ros import contract
 from needle_ros.contract import Qos, Topic
 from needle_ros.errors import MessageError, NeedleError, ParameterError, printable
+from needle_ros.journal import Journal, Severity
 from needle_ros.settings import from_values, unknown_name
 from needle_ros.wire import Reader, Reading
 from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor, SetParametersResult
@@ -683,6 +684,29 @@ class BaseNode(LifecycleNode):
         array = DiagnosticArray(status=[status])
         array.header.stamp = self.get_clock().now().to_msg()
         self._diagnostics.publish(array)
+
+    def tell(self, journal: Journal) -> None:
+        """
+        Write what there is to say to the log, and publish diagnostics, if anything is new.
+
+        Parameters
+        ----------
+        journal : Journal
+            What there is to say.
+
+        """
+        if not journal.changed:
+            return
+        log = self.get_logger()
+        for severity, line in journal.take():
+            # rclpy refuses another severity from the same place.
+            if severity is Severity.ERROR:
+                log.error(line)
+            elif severity is Severity.WARNING:
+                log.warning(line)
+            else:
+                log.info(line)
+        self.publish_diagnostics()
 
     def report_change(self) -> None:
         """Publish diagnostics now if the level has changed."""

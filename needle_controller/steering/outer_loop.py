@@ -15,7 +15,6 @@ from math import ceil, sqrt
 from time import monotonic
 from typing import Final
 
-from needle_controller.journal import Journal, Severity
 from needle_controller.safety.stream import Stream
 from needle_controller.steering.belief import SteeringBelief
 from needle_controller.steering.controller import (
@@ -33,6 +32,7 @@ from needle_dynamics.parameters import NeedleParameters
 from needle_dynamics.steering.parameters import SteeringParameters
 from needle_ros.contract import ENTRY, JOINT_STATES, ROLL, TIP_DEFLECTION
 from needle_ros.errors import JobError, NeedleError, ParameterError
+from needle_ros.journal import Journal, Severity
 from needle_ros.timing import NANOSECONDS
 from needle_ros.wire import Reading
 import numpy as np

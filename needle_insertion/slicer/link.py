@@ -19,10 +19,10 @@ import socket
 from time import monotonic
 from typing import Final
 
-from needle_controller.journal import Journal, Severity
 from needle_insertion.slicer.frames import Frame, Frames
 from needle_insertion.slicer.settings import LinkSettings
 from needle_ros.errors import MessageError
+from needle_ros.journal import Journal, Severity
 
 #: Time between attempts to listen or to connect [s].
 _RETRY: Final = 1.0

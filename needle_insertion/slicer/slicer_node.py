@@ -10,7 +10,6 @@ from typing import Any, Final, TYPE_CHECKING
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PointStamped, PoseArray, PoseStamped, PoseWithCovarianceStamped
-from needle_controller.journal import Journal, Severity
 from needle_insertion.slicer.link import Link
 from needle_insertion.slicer.needle import NeedleView, Shape
 from needle_insertion.slicer.registration import MILLIMETERS, Registration
@@ -18,6 +17,7 @@ from needle_insertion.slicer.settings import LinkSettings, TargetSettings
 from needle_ros import contract
 from needle_ros.base_node import BaseNode
 from needle_ros.errors import JobError, MessageError, printable
+from needle_ros.journal import Journal, Severity
 from needle_ros.run_node import run
 from needle_ros.timing import NANOSECONDS, nanoseconds, RateCounter
 from needle_ros.wire import Reading
@@ -208,7 +208,7 @@ class SlicerNode(BaseNode):
                 self._state_told = now
                 self._tell_state(link, interpreter, now)
         self._greeted = link.peer
-        self._report()
+        self.tell(self._journal)
 
     def _take(self, interpreter: Interpreter, frames: list[Frame]) -> None:
         """Pass the newest target on."""
@@ -281,20 +281,6 @@ class SlicerNode(BaseNode):
 
     def _steady_ns(self) -> int:
         return int(monotonic() * NANOSECONDS)
-
-    def _report(self) -> None:
-        log, journal = self.get_logger(), self._journal
-        if not journal.changed:
-            return
-        for severity, line in journal.take():
-            # rclpy refuses another severity from the same place.
-            if severity is Severity.ERROR:
-                log.error(line)
-            elif severity is Severity.WARNING:
-                log.warning(line)
-            else:
-                log.info(line)
-        self.publish_diagnostics()
 
     def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
         """Say whether there is a peer, what it is told and what it said."""

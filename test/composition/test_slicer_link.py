@@ -11,11 +11,11 @@ from time import monotonic, sleep
 from typing import Any
 
 from benchmarks.igtl_peer import free_port
-from needle_controller.journal import Journal
 from needle_insertion.slicer.frames import HEADER
 from needle_insertion.slicer.link import Link
 from needle_insertion.slicer.messages import is_wanted, TARGET
 from needle_insertion.slicer.settings import LinkSettings
+from needle_ros.journal import Journal
 import numpy as np
 import pyigtl
 import pytest

@@ -15,8 +15,8 @@ from needle_controller import (
     SafetyLimits,
     Supervisor,
 )
-from needle_controller.journal import Journal, Severity
 from needle_dynamics import NeedleModel, NeedleParameters
+from needle_ros.journal import Journal, Severity
 from needle_ros.trajectories import MOST_POINTS
 from needle_ros.wire import Reading
 import pytest

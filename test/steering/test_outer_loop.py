@@ -9,12 +9,12 @@ from typing import Any
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from needle_controller import OuterLoop, OuterLoopSettings, ReferenceLimits, SteeringBelief
-from needle_controller.journal import Severity
 from needle_controller.reference.path import Path
 from needle_controller.steering.look import Look
 from needle_controller.steering.motion import duration_of, Move, smooth
 from needle_controller.steering.outer_loop import Phase
 from needle_dynamics import ParameterError, SteeredNeedle, STEERING_PRESETS
+from needle_ros.journal import Severity
 from needle_ros.wire import Reading
 import numpy as np
 from numpy.testing import assert_allclose

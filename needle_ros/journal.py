@@ -1,4 +1,4 @@
-"""What a controller has to say: lines for the log, and when /diagnostics have changed."""
+"""What a node has to say: lines for the log, and when /diagnostics have changed."""
 
 from __future__ import annotations
 
@@ -21,6 +21,11 @@ class Severity(IntEnum):
     INFO = 0
     WARNING = 1
     ERROR = 2
+
+    @property
+    def level(self) -> bytes:
+        """The level, as DiagnosticStatus has it."""
+        return bytes([self])
 
 
 class Journal:
