@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from functools import partial
 from typing import Final
 
+from needle_insertion.live.waiting import waiting
 from needle_ros import contract
-from needle_ros.base_node import message_class, profile
 from needle_ros.contract import Topic
 from needle_ros.errors import MessageError
 from needle_ros.wire import Reader, Reading
@@ -28,26 +27,23 @@ class Readings:
     """
     Keeps the newest message of each sensor and of the reference.
 
-    They come a thousand times a second: only those that are looked at are read.
+    They come a thousand times a second: only those that are looked at are taken.
 
     Parameters
     ----------
     node : Node
-        Node of this process that subscribes.
+        Node of this process that subscribes, and that nobody spins.
 
     """
 
     def __init__(self, node: Node) -> None:
+        #: It must live as long as its subscriptions.
+        self._node = node
         self._newest: dict[str, bytes] = {}
         self._readers = {topic.name: Reader(topic.type_name) for topic in _TOPICS}
-        for topic in _TOPICS:
-            node.create_subscription(
-                message_class(topic.type_name),
-                topic.name,
-                partial(self._newest.__setitem__, topic.name),
-                profile(topic.qos._replace(depth=1), request=True),
-                raw=True,
-            )
+        self._come = {
+            topic.name: waiting(node, topic, topic.qos._replace(depth=1)) for topic in _TOPICS
+        }
 
     def newest(self, topic: Topic) -> Reading | None:
         """
@@ -64,6 +60,8 @@ class Readings:
             What it holds; None before the first, and if it is none.
 
         """
+        for message in self._come[topic.name]():
+            self._newest[topic.name] = message
         data = self._newest.get(topic.name)
         try:
             return None if data is None else self._readers[topic.name].read(data)

@@ -123,7 +123,8 @@ def run(session: Session) -> int:
     screen = Screen()
     with Graph(session.folder / 'logs', shared=True) as graph:
         node = graph.node('operator')
-        operator, readings = Operator(node), Readings(node)
+        operator = Operator(node)
+        readings = Readings(Node('readings', context=graph.context))
         screen.say(f'starting {", ".join(session.names)}; the very first start takes a minute')
         processes = _bring_up(session, graph, node)
         terminal = Terminal(graph, operator, readings, screen)

@@ -12,11 +12,11 @@ from time import monotonic
 from typing import Any, Final
 
 from needle_insertion.live.operator import Operator
+from needle_insertion.live.waiting import waiting
 from needle_insertion.watch.recorded import STREAMS
 from needle_insertion.watch.scene import CONFIGURED, parameters_of
 from needle_insertion.watch.view import View
 from needle_ros import contract
-from needle_ros.base_node import message_class, profile
 from needle_ros.contract import Qos, Topic
 from needle_ros.errors import JobError, MessageError
 from needle_ros.network import domain_of, stay_local
@@ -24,7 +24,6 @@ from needle_ros.wire import read_line, read_string, Reader
 from rclpy.context import Context
 from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.node import Node
-from rclpy.subscription import Subscription
 
 #: Only the newest reading counts.
 _NEWEST: Final = contract.SENSOR._replace(depth=1)
@@ -48,8 +47,8 @@ class WatchNode(Node):
     Brings the newest of every topic to a view, when it is asked to.
 
     It is not spun: messages wait in the middleware, which keeps the newest ones only, and `poll`
-    takes these. So a topic of 1 kHz costs no more of Python than one of 30 Hz. It asks for best
-    effort, so that nobody waits for it or sends anything again, and it publishes nothing.
+    takes these. It asks for best effort, so that nobody waits for it or sends anything again, and
+    it publishes nothing.
 
     Parameters
     ----------
@@ -65,7 +64,7 @@ class WatchNode(Node):
             'watch', context=context, enable_rosout=False, start_parameter_services=False
         )
         self._view = view
-        self._takers: list[tuple[Subscription, Callable[[Any, float], None]]] = []
+        self._takers: list[tuple[Callable[[], Iterator[Any]], Callable[[Any, float], None]]] = []
         for topic in STREAMS:
             read = Reader(topic.type_name).read
 
@@ -93,14 +92,7 @@ class WatchNode(Node):
         raw: bool = True,
     ) -> None:
         """Keep what comes on a topic until it is taken."""
-        made = self.create_subscription(
-            message_class(topic.type_name),
-            topic.name,
-            lambda _: None,
-            profile(qos, request=True),
-            raw=raw,
-        )
-        self._takers.append((made, take))
+        self._takers.append((waiting(self, topic, qos, raw=raw), take))
 
     def _configured(self, node: str, data: bytes, _now: float) -> None:
         self._view.configuration(node, parameters_of(read_string(data)))
@@ -119,18 +111,11 @@ class WatchNode(Node):
             Time of a steady clock [s].
 
         """
-        for subscription, take in self._takers:
-            # At most what may wait: what comes meanwhile is for the next time.
-            for _ in range(subscription.qos_profile.depth):
-                with subscription.handle:
-                    taken = subscription.handle.take_message(
-                        subscription.msg_type, subscription.raw
-                    )
-                if taken is None:
-                    break
+        for come, take in self._takers:
+            for message in come():
                 try:
-                    take(taken[0], now)
-                except MessageError:
+                    take(message, now)
+                except MessageError:  # noqa: PERF203
                     self._view.invalid += 1
 
 
