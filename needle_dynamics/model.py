@@ -78,8 +78,7 @@ class NeedleModel:
     def modes(self) -> ModeShapes:
         """Shape modes of the needle."""
         p = self.parameters
-        # Without the stop the needle may overshoot the hub by as much as its length.
-        return mode_shapes(p.length, p.modes, 1.0 if p.hub_stop else 2.0)
+        return mode_shapes(p.length, p.modes, p.reach)
 
     @cached_property
     def tissue(self) -> Tissue:

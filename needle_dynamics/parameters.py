@@ -194,6 +194,12 @@ class NeedleParameters:
         """Mass that moves along the insertion axis, rho A l plus the carriage [kg]."""
         return self.linear_density * self.length + self.carriage_mass
 
+    @property
+    def reach(self) -> float:
+        """Largest inserted length over l."""
+        # Without the stop the needle may overshoot the hub by as much as its length.
+        return 1.0 if self.hub_stop else 2.0
+
     @classmethod
     def preset(cls, name: str, **changes: Any) -> NeedleParameters:
         """

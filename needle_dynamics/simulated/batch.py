@@ -5,17 +5,25 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import cache, partial
+from math import inf
 import os
+from typing import Final
 
-from needle_dynamics.arrays import FloatArray
-from needle_dynamics.compiled.step import run
-from needle_dynamics.model import NeedleModel
+from needle_dynamics.arrays import FloatArray, IntArray
+from needle_dynamics.compiled import lanes
+from needle_dynamics.compiled.step import Needle, run
+from needle_dynamics.model import NeedleModel, ROUNDING
+from needle_dynamics.modes import mode_shapes
 from needle_dynamics.parameters import NeedleParameters
 from needle_dynamics.simulated.integrator import checked_step, DEFAULT_STEP
 from needle_dynamics.simulated.trajectory import count_of, floats
 from needle_ros.errors import ParameterError, ShapeError
 import numpy as np
 from numpy.typing import ArrayLike
+
+#: Most runs that a thread takes at once: enough to keep all lanes busy.
+_CHUNK: Final = 256
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -145,8 +153,10 @@ def simulate_batch(
     )
     count = count_of(duration, interval)
     sizes = {len(each), len(starts), len(pushes), len(turns)} - {1}
-    shaped = starts.ndim == 2 and all(
-        values.ndim == 2 and values.shape[1] in (1, count) for values in (pushes, turns)
+    shaped = (
+        starts.ndim == 2
+        and starts.size > 0
+        and all(values.ndim == 2 and values.shape[1] in (1, count) for values in (pushes, turns))
     )
     if len(sizes) > 1 or 0 in sizes or not shaped:
         raise ShapeError(
@@ -160,33 +170,121 @@ def simulate_batch(
     if workers is not None and (not isinstance(workers, int) or workers < 1):
         raise ParameterError(f'workers must be an integer >= 1, got {workers!r}')
     runs = sizes.pop() if sizes else 1
-    models = [NeedleModel(p) for p in each]
-    needles = [model.compiled for model in models]
-    starts = np.array(
-        [models[i % len(models)].checked_state(starts[i % len(starts)]) for i in range(runs)]
-    )
-    result = np.full((runs, count + 1 if keep else 1, starts.shape[1]), np.nan)
-    completed = np.empty(runs)
-
-    def take(share: range) -> None:
-        for i in share:
-            push, turn = (
-                np.ascontiguousarray(np.broadcast_to(values[i % len(values)], (count,)))
-                for values in (pushes, turns)
-            )
-            done = run(
-                needles[i % len(needles)], starts[i], push, turn, float(interval), step, graded,
-                result[i],
-            )  # fmt: skip
-            completed[i] = done * interval
-            if not keep and done == count:
-                result[i, 0] = starts[i]
-            if progress is not None:
-                progress()
-
-    workers = min(workers or os.cpu_count() or 1, runs)
-    with ThreadPoolExecutor(workers) as pool:
-        # A thread takes its share at once: one task per run would cost more than short runs do.
-        list(pool.map(take, [range(k, runs, workers) for k in range(workers)]))
+    _check(each, starts)
+    course = lanes.Course(pushes, turns, count, float(interval), step, graded)
+    kept, completed = _take(
+        each, np.array(np.broadcast_to(starts, (runs, starts.shape[1]))), course, keep=keep,
+        workers=min(workers or os.cpu_count() or 1, runs), progress=progress or (lambda: None),
+    )  # fmt: skip
     time = np.arange(count + 1, dtype=np.float64) * interval
-    return Batch(tuple(each), time if keep else time[-1:], result, completed)
+    return Batch(tuple(each), time if keep else time[-1:], kept, completed * interval)
+
+
+def _take(
+    each: Sequence[NeedleParameters],
+    states: FloatArray,
+    course: lanes.Course,
+    *,
+    keep: bool,
+    workers: int,
+    progress: Callable[[], object],
+) -> tuple[FloatArray, FloatArray]:
+    """Return states of all runs, and how many intervals each completed; overwrite ``states``."""
+    runs, width = states.shape
+    kept = np.full((runs, course.intervals + 1 if keep else 1, width), np.nan)
+    completed = np.zeros(runs)
+
+    @cache
+    def needle(k: int) -> Needle:
+        return NeedleModel(each[k]).compiled
+
+    def alone(some: IntArray) -> None:
+        for i in some:
+            push, turn = (
+                np.ascontiguousarray(np.broadcast_to(values[i % len(values)], (course.intervals,)))
+                for values in (course.forces, course.torques)
+            )
+            completed[i] = run(
+                needle(i % len(each)), states[i], push, turn, course.interval, course.longest,
+                course.graded, kept[i],
+            )  # fmt: skip
+            progress()
+
+    def together(needles: FloatArray, table: FloatArray, some: IntArray) -> None:
+        lanes.run(needles, table, course, some, states, kept, completed)
+        for _ in some:
+            progress()
+
+    # A thread takes many runs at once: one task for each would cost more than short runs do.
+    size = min(_CHUNK, -(-runs // workers))
+    jobs = list[Callable[[], None]]()
+    for reach, some in _groups(each, runs).items():
+        job = alone
+        if reach is not None:
+            job = partial(together, _constants(each), _table(reach))
+        jobs += [partial(job, some[k : k + size]) for k in range(0, len(some), size)]
+    with ThreadPoolExecutor(workers) as pool:
+        for done in [pool.submit(job) for job in jobs]:
+            done.result()
+    if not keep:
+        whole = completed == course.intervals
+        kept[whole, 0] = states[whole]
+    return kept, completed
+
+
+def _check(each: Sequence[NeedleParameters], starts: FloatArray) -> None:
+    """Refuse initial states as `NeedleModel.checked_state` does, only faster."""
+    length, least, columns = np.array(
+        [(p.length, p.minimum_depth, 4 + 2 * p.modes) for p in each]
+    ).T
+    depth = length - starts[:, 0]
+    high = np.array([p.reach for p in each]) * length
+    valid = (least - ROUNDING * length <= depth) & (depth <= high)
+    valid &= (columns == starts.shape[1]) & np.isfinite(starts).all(axis=1)
+    for i in np.flatnonzero(~valid).tolist():
+        NeedleModel(each[i % len(each)]).checked_state(starts[i % len(starts)])
+
+
+def _groups(each: Sequence[NeedleParameters], runs: int) -> dict[float | None, IntArray]:
+    """Return the runs that share a table of modes, by its reach; None for those that have none."""
+    reaches = [p.reach if _fits(p) else None for p in each]
+    if len(each) == 1:
+        return {reaches[0]: np.arange(runs)}
+    return {
+        one: np.array([i for i, reach in enumerate(reaches) if reach == one])
+        for one in dict.fromkeys(reaches)
+    }
+
+
+def _fits(p: NeedleParameters) -> bool:
+    """Return whether a needle may share a vector register with others."""
+    return (
+        p.modes == 2
+        and p.formulation == 'complete'
+        and p.friction_law == 'coulomb'
+        and p.swelling == 0.0
+        and not p.layer_depths
+    )
+
+
+def _constants(each: Sequence[NeedleParameters]) -> FloatArray:
+    """Return what `lanes.run` takes of each needle."""
+    return np.array(
+        [
+            (
+                p.length, p.linear_density, p.bending_stiffness, p.tissue_stiffness,
+                p.tissue_damping, p.moving_mass, p.coulomb_friction, p.viscous_friction,
+                p.withdrawal_friction, p.minimum_depth - ROUNDING * p.length, p.reach * p.length,
+                p.length if p.hub_stop else inf, p.rotary_inertia,
+            )
+            for p in each
+        ]
+    )  # fmt: skip
+
+
+@cache
+def _table(reach: float) -> FloatArray:
+    """Return the series of two modes of length 1 for `lanes.run`: 1 + 4 m terms."""
+    series = mode_shapes(1.0, 2, reach).tables.series[:, : lanes.COLUMNS]
+    more = -(len(series) - 1) % 4
+    return np.concatenate([series, np.zeros((more, lanes.COLUMNS))])

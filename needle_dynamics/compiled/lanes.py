@@ -1,0 +1,528 @@
+r"""
+Many needles at once, in the lanes of the processor's vector registers.
+
+The step is that of `needle_dynamics.compiled.step`, for two modes in homogeneous tissue under
+Coulomb friction. Every loop over lanes is without calls and branches, so that the compiler takes
+several lanes with one instruction; what seldom happens (the motion stops, an interval ends) is
+done lane by lane. No lane knows of another: which needles share a register, and how many they
+are, changes no bit.
+
+Modes scale with the length of the needle: with those of a needle of length 1,
+
+.. math:: G(s) = G_1(\xi), \quad H(s) = H_1(\xi) / l^4, \quad \phi(s) = \phi_1(\xi) / \sqrt l,
+   \quad \phi''(s) = \phi_1''(\xi) / l^{5/2}, \quad \xi = s / l,
+
+so that one table serves all.
+"""
+
+from __future__ import annotations
+
+from math import factorial, inf, isfinite, pi, sqrt
+from typing import Final, NamedTuple
+
+from needle_dynamics.arrays import FloatArray, IntArray
+from needle_dynamics.compiled.cache import compiled, inlined
+from needle_dynamics.compiled.friction import slide
+from needle_dynamics.compiled.step import GRADED_FROM
+import numpy as np
+
+#: Lanes that are taken through a step together: their rows stay in the fastest cache.
+LANES: Final = 32
+
+#: Columns of `ModeTables.series` for G, H, phi and phi'' of two modes.
+COLUMNS: Final = 26
+
+#: Constants of a needle, in this order: columns of the table that `run` takes.
+CONSTANTS: Final = (
+    'length', 'linear_density', 'bending_stiffness', 'tissue_stiffness', 'tissue_damping',
+    'moving_mass', 'coulomb_friction', 'viscous_friction', 'withdrawal_friction',
+    'lowest', 'highest', 'stop', 'rotary_inertia',
+)  # fmt: skip
+
+# Where each row of the lanes begins. First the constants.
+(
+    _LENGTH, _DENSITY, _BENDING, _STIFFNESS, _DAMPING, _MASS, _COULOMB, _VISCOUS, _WITHDRAWAL,
+    _LOW, _HIGH, _STOP, _INERTIA,
+    # Motion, modes, and what is left of the interval.
+    _S, _U, _A, _Q1, _Q2, _Z1, _Z2, _FORCE, _LEFT,
+    # One step: its length, what is left then, depth in its middle (over the length, and that to
+    # the fourth), whether that is in range, and the impulse of the modes.
+    _H, _REST, _XI, _XI4, _INSIDE, _IMPULSE,
+    # What it leads to.
+    _NEW_Q1, _NEW_Q2, _NEW_Z1, _NEW_Z2, _NEW_U, _TRAVEL, _STOPS,
+    # The series of the modes.
+    _SERIES,
+) = range(0, 36 * LANES, LANES)  # fmt: skip
+
+#: Rows that go with a needle from lane to lane.
+_KEPT: Final = _H // LANES
+_ROWS: Final = _SERIES // LANES + COLUMNS
+
+#: Added and subtracted, it rounds to a whole number.
+_ROUND: Final = 1.5 * 2.0**52
+
+#: Half of pi in three parts; whole multiples of the first two are exact.
+_HALF_PI: Final = (1.5707963267341256, 6.077100506303966e-11, 2.0222662487959506e-21)
+_TURN: Final = 2.0 / pi
+
+#: Coefficients of Taylor series, 1 / 2! to 1 / 19!.
+(
+    _F2, _F3, _F4, _F5, _F6, _F7, _F8, _F9, _F10, _F11, _F12, _F13, _F14, _F15, _F16, _F17, _F18,
+    _F19,
+) = (1.0 / factorial(k) for k in range(2, 20))  # fmt: skip
+
+#: exp(-x) is nothing beside 1 from here on.
+_DECAYED: Final = 40.0
+
+
+class Course(NamedTuple):
+    """
+    What happens to the needles of a batch.
+
+    Attributes
+    ----------
+    forces, torques : ndarray, shape (runs or 1, k or 1)
+        Insertion force [N] and torque [N m] in each interval.
+    intervals : int
+        Number of intervals.
+    interval, longest : float
+        Length of an interval and of the longest step [s].
+    graded : bool
+        As in `needle_dynamics.compiled.step.advance`.
+
+    """
+
+    forces: FloatArray
+    torques: FloatArray
+    intervals: int
+    interval: float
+    longest: float
+    graded: bool
+
+
+@inlined
+def _sine_cosine(x: float) -> tuple[float, float]:
+    """Return sine and cosine."""
+    turns = (x * _TURN + _ROUND) - _ROUND
+    r = ((x - turns * _HALF_PI[0]) - turns * _HALF_PI[1]) - turns * _HALF_PI[2]
+    y = r * r
+    sine = r - r * y * (
+        _F3 - y * (_F5 - y * (_F7 - y * (_F9 - y * (_F11 - y * (_F13 - y * _F15)))))
+    )
+    cosine = 1.0 - y * (
+        _F2 - y * (_F4 - y * (_F6 - y * (_F8 - y * (_F10 - y * (_F12 - y * (_F14 - y * _F16))))))
+    )
+    quarter = turns - 4.0 * ((0.25 * turns + _ROUND) - _ROUND)
+    odd = abs(quarter) == 1.0
+    one = cosine if odd else sine
+    two = sine if odd else cosine
+    # Quarters are -2 to 2.
+    first = -one if quarter == -1.0 or abs(quarter) == 2.0 else one
+    second = -two if quarter == 1.0 or abs(quarter) == 2.0 else two
+    return first, second
+
+
+@inlined
+def _decay_means(x: float) -> tuple[float, float]:
+    """Return what `oscillator.decay_means` does: for a part of x, doubled five times."""
+    z = -min(x, _DECAYED) / 32.0
+    ramp = _F2 + z * (
+        _F3
+        + z
+        * (
+            _F4
+            + z
+            * (
+                _F5
+                + z
+                * (
+                    _F6
+                    + z
+                    * (
+                        _F7
+                        + z
+                        * (
+                            _F8
+                            + z
+                            * (
+                                _F9
+                                + z
+                                * (
+                                    _F10
+                                    + z
+                                    * (
+                                        _F11
+                                        + z
+                                        * (
+                                            _F12
+                                            + z
+                                            * (
+                                                _F13
+                                                + z
+                                                * (
+                                                    _F14
+                                                    + z
+                                                    * (
+                                                        _F15
+                                                        + z
+                                                        * (
+                                                            _F16
+                                                            + z * (_F17 + z * (_F18 + z * _F19))
+                                                        )
+                                                    )
+                                                )
+                                            )
+                                        )
+                                    )
+                                )
+                            )
+                        )
+                    )
+                )
+            )
+        )
+    )
+    mean = 1.0 + z * ramp
+    for _ in range(5):
+        ramp = 0.25 * (mean * mean + 2.0 * ramp)
+        mean *= 1.0 + 0.5 * z * mean
+        z *= 2.0
+    far = 1.0 / max(x, _DECAYED)
+    return (far, (1.0 - far) * far) if x > _DECAYED else (mean, ramp)
+
+
+@compiled
+def _begin(w: FloatArray, n: int, longest: float, grade: float) -> None:
+    """Choose the step of each lane, and find the depth in its middle."""
+    sixth = grade / 6.0
+    for i in range(n):
+        s, u, left, length = w[_S + i], w[_U + i], w[_LEFT + i], w[_LENGTH + i]
+        whole = longest * max(1.0, grade * s / (GRADED_FROM * length))
+        count = left / whole * (1.0 - 1e-9)
+        near = (count + _ROUND) - _ROUND
+        steps = max(near + 1.0 if near < count else near, 1.0)
+        h = left / steps
+        middle = min(s + 0.5 * h * u + sixth * h * h * w[_A + i], w[_STOP + i])
+        inside = w[_LOW + i] <= middle <= w[_HIGH + i]
+        xi = middle / length if inside else 1.0
+        square = xi * xi
+        w[_H + i] = h
+        w[_REST + i] = left - h if steps > 1.0 else 0.0
+        w[_XI + i] = xi
+        w[_XI4 + i] = square * square
+        w[_INSIDE + i] = 1.0 if inside else 0.0
+
+
+@compiled
+def _modes(w: FloatArray, n: int, table: FloatArray) -> None:
+    """Sum the series of the modes: a first term, and four more at a time."""
+    last = table.shape[0] - 1
+    for j in range(COLUMNS):
+        row, top = _SERIES + j * LANES, table[last, j]
+        for i in range(n):
+            w[row + i] = top
+        for m in range(last - 4, -1, -4):
+            a, b, c, d = table[m, j], table[m + 1, j], table[m + 2, j], table[m + 3, j]
+            for i in range(n):
+                z = w[_XI4 + i]
+                w[row + i] = (((w[row + i] * z + d) * z + c) * z + b) * z + a
+
+
+@inlined
+def _powers(w: FloatArray, column: int, i: int, xi: float) -> float:
+    """Return a sum of three columns in powers of xi."""
+    at = _SERIES + column * LANES + i
+    return float(w[at] + xi * w[at + LANES] + xi * xi * w[at + 2 * LANES])
+
+
+@inlined
+def _line(w: FloatArray, column: int, i: int, xi: float) -> float:
+    """Return a sum of two columns in powers of xi."""
+    at = _SERIES + column * LANES + i
+    return float(w[at] + xi * w[at + LANES])
+
+
+@compiled
+def _rotate(w: FloatArray, n: int) -> None:
+    """Take the deflections through the step, as `modal_flow.rotate_two` does."""
+    for i in range(n):
+        h, xi, rho = w[_H + i], w[_XI + i], w[_DENSITY + i]
+        ka, length = w[_STIFFNESS + i], w[_LENGTH + i]
+        ei = w[_BENDING + i] / (length * length * length * length)
+        fifth = w[_XI4 + i] * xi
+        g11 = fifth * _powers(w, 0, i, xi)
+        g12 = fifth * _powers(w, 3, i, xi)
+        g22 = fifth * _powers(w, 6, i, xi)
+        k11 = ei * (xi * _powers(w, 9, i, xi)) + ka * g11
+        k12 = ei * (xi * _powers(w, 12, i, xi)) + ka * g12
+        k22 = ei * (xi * _powers(w, 15, i, xi)) + ka * g22
+        l11 = sqrt(rho * g11)
+        i11 = 1.0 / l11
+        l21 = rho * g12 * i11
+        l22 = sqrt(rho * g22 - l21 * l21)
+        i22 = 1.0 / l22
+        ratio = l21 * i11
+        b11 = k11 * i11 * i11
+        b12 = (k12 - ratio * k11) * i11 * i22
+        b22 = (k22 - 2.0 * ratio * k12 + ratio * ratio * k11) * i22 * i22
+        tau = (b22 - b11) / (2.0 * b12)
+        tangent = (1.0 if tau >= 0.0 else -1.0) / (abs(tau) + sqrt(1.0 + tau * tau))
+        cj = 1.0 / sqrt(1.0 + tangent * tangent)
+        sj = tangent * cj
+        square1 = b11 - tangent * b12
+        square2 = b22 + tangent * b12
+        omega1 = sqrt(square1)
+        omega2 = sqrt(square2)
+
+        q2, z1 = w[_Q2 + i], w[_Z1 + i]
+        y1 = l11 * w[_Q1 + i] + l21 * q2
+        y2 = l22 * q2
+        v1 = z1 * i11
+        v2 = (w[_Z2 + i] - l21 * v1) * i22
+        # The damping of half a step before and after.
+        x = 0.5 * h * w[_DAMPING + i] / rho
+        decay = 1.0 - x * _decay_means(x)[0]
+        a1 = cj * y1 - sj * y2
+        a2 = sj * y1 + cj * y2
+        b1 = (cj * v1 - sj * v2) * decay
+        b2 = (sj * v1 + cj * v2) * decay
+
+        sin1, cos1 = _sine_cosine(omega1 * h)
+        sin2, cos2 = _sine_cosine(omega2 * h)
+        e1 = a1 * cos1 + b1 * sin1 / omega1
+        f1 = b1 * cos1 - a1 * omega1 * sin1
+        e2 = a2 * cos2 + b2 * sin2 / omega2
+        f2 = b2 * cos2 - a2 * omega2 * sin2
+
+        twice1 = (b1 * b1 + square1 * a1 * a1) * h
+        twice2 = (b2 * b2 + square2 * a2 * a2) * h
+        change1 = e1 * f1 - a1 * b1
+        change2 = e2 * f2 - a2 * b2
+        aa1 = 0.5 * (twice1 - change1) / square1
+        bb1 = 0.5 * (twice1 + change1)
+        aa2 = 0.5 * (twice2 - change2) / square2
+        bb2 = 0.5 * (twice2 + change2)
+        change12 = e1 * f2 - a1 * b2
+        change21 = e2 * f1 - a2 * b1
+        gap = 1.0 / (square1 - square2)
+        aa12 = (change12 - change21) * gap
+        bb12 = (square1 * change12 - square2 * change21) * gap
+
+        w1 = xi * xi * _line(w, 18, i, xi) * i11
+        w2 = (xi * xi * _line(w, 20, i, xi) - l21 * w1) * i22
+        n1 = cj * w1 - sj * w2
+        n2 = sj * w1 + cj * w2
+        w1 = _line(w, 22, i, xi) * i11
+        w2 = (_line(w, 24, i, xi) - l21 * w1) * i22
+        m1 = cj * w1 - sj * w2
+        m2 = sj * w1 + cj * w2
+        elastic = (
+            (ei * m1 * m1 + ka * n1 * n1) * aa1
+            + (ei * m2 * m2 + ka * n2 * n2) * aa2
+            + 2.0 * (ei * m1 * m2 + ka * n1 * n2) * aa12
+        )
+        inertial = rho * (n1 * n1 * bb1 + n2 * n2 * bb2 + 2.0 * n1 * n2 * bb12)
+        w[_IMPULSE + i] = 0.5 * (elastic - inertial) / length
+
+        y1 = cj * e1 + sj * e2
+        y2 = cj * e2 - sj * e1
+        v1 = (cj * f1 + sj * f2) * decay
+        v2 = (cj * f2 - sj * f1) * decay
+        new_q2 = y2 * i22
+        w[_NEW_Q1 + i] = (y1 - l21 * new_q2) * i11
+        w[_NEW_Q2 + i] = new_q2
+        w[_NEW_Z1 + i] = l11 * v1
+        w[_NEW_Z2 + i] = l21 * v1 + l22 * v2
+
+
+@compiled
+def _move(w: FloatArray, n: int) -> None:
+    """Move the insertion axis, as `friction.slide` does where the motion does not stop."""
+    for i in range(n):
+        h, u, mass = w[_H + i], w[_U + i], w[_MASS + i]
+        sign, factor = (1.0, 1.0) if u > 0.0 else (-1.0, w[_WITHDRAWAL + i])
+        drive = w[_FORCE + i] - w[_IMPULSE + i] / h
+        a = (drive - sign * factor * w[_COULOMB + i]) / mass
+        x = factor * w[_VISCOUS + i] / mass * h
+        mean, ramp = _decay_means(x)
+        new_u = u * (1.0 - x * mean) + a * h * mean
+        w[_NEW_U + i] = new_u
+        w[_TRAVEL + i] = h * (u * mean + a * h * ramp)
+        w[_STOPS + i] = 1.0 if new_u * u <= 0.0 else 0.0
+    for i in range(n):
+        if w[_STOPS + i] != 0.0:
+            h = w[_H + i]
+            w[_NEW_U + i], w[_TRAVEL + i] = slide(
+                w[_U + i], w[_FORCE + i] - w[_IMPULSE + i] / h, w[_MASS + i], w[_COULOMB + i],
+                w[_VISCOUS + i], h, w[_WITHDRAWAL + i],
+            )  # fmt: skip
+
+
+@compiled
+def _end(w: FloatArray, n: int) -> None:
+    """End the step of each lane, or leave the lane where it was if it leaves its range."""
+    for i in range(n):
+        depth, speed = w[_S + i] + w[_TRAVEL + i], w[_NEW_U + i]
+        stopped = depth >= w[_STOP + i]
+        high = inf if stopped else w[_HIGH + i]
+        inside = w[_INSIDE + i] != 0.0 and w[_LOW + i] <= depth <= high
+        gain = (speed - w[_U + i]) / w[_H + i]
+        w[_INSIDE + i] = 1.0 if inside else 0.0
+        w[_S + i] = (w[_STOP + i] if stopped else depth) if inside else w[_S + i]
+        w[_U + i] = (0.0 if stopped else speed) if inside else w[_U + i]
+        w[_A + i] = gain
+        w[_Q1 + i] = w[_NEW_Q1 + i] if inside else w[_Q1 + i]
+        w[_Q2 + i] = w[_NEW_Q2 + i] if inside else w[_Q2 + i]
+        w[_Z1 + i] = w[_NEW_Z1 + i] if inside else w[_Z1 + i]
+        w[_Z2 + i] = w[_NEW_Z2 + i] if inside else w[_Z2 + i]
+        w[_LEFT + i] = w[_REST + i]
+
+
+@inlined
+def _gram(table: FloatArray, xi: float) -> tuple[float, float, float]:
+    """Return G of two modes at a relative depth."""
+    z = xi * xi * xi * xi
+    g11, g12, g22 = 0.0, 0.0, 0.0
+    for m in range(table.shape[0] - 1, -1, -1):
+        g11 = g11 * z + (table[m, 0] + xi * (table[m, 1] + xi * table[m, 2]))
+        g12 = g12 * z + (table[m, 3] + xi * (table[m, 4] + xi * table[m, 5]))
+        g22 = g22 * z + (table[m, 6] + xi * (table[m, 7] + xi * table[m, 8]))
+    fifth = z * xi
+    return fifth * g11, fifth * g12, fifth * g22
+
+
+@compiled
+def _load(
+    w: FloatArray, i: int, constants: FloatArray, state: FloatArray, table: FloatArray
+) -> None:
+    """Put a needle into a lane."""
+    for k in range(len(constants)):
+        w[k * LANES + i] = constants[k]
+    length, rho = constants[0], constants[1]
+    depth = length - state[0]
+    g11, g12, g22 = _gram(table, depth / length)
+    w[_S + i], w[_U + i] = depth, -state[4]
+    w[_Q1 + i], w[_Q2 + i] = state[2], state[3]
+    w[_Z1 + i] = rho * (g11 * state[6] + g12 * state[7])
+    w[_Z2 + i] = rho * (g12 * state[6] + g22 * state[7])
+
+
+@compiled
+def _save(w: FloatArray, i: int, table: FloatArray, state: FloatArray) -> None:
+    """Write the state of a lane, but for the angle and its rate."""
+    length, rho = w[_LENGTH + i], w[_DENSITY + i]
+    g11, g12, g22 = _gram(table, w[_S + i] / length)
+    z1, z2 = w[_Z1 + i], w[_Z2 + i]
+    # By Cholesky, as `advance` has it: G is nearly singular in shallow depths.
+    l11 = sqrt(rho * g11)
+    l21 = rho * g12 / l11
+    l22 = sqrt(rho * g22 - l21 * l21)
+    v1 = z1 / l11
+    rate2 = (z2 - l21 * v1) / (l22 * l22)
+    state[0], state[2], state[3] = length - w[_S + i], w[_Q1 + i], w[_Q2 + i]
+    state[4], state[6], state[7] = -w[_U + i], (v1 - l21 * rate2) / l11, rate2
+
+
+@compiled
+def run(
+    needles: FloatArray,
+    table: FloatArray,
+    course: Course,
+    runs: IntArray,
+    states: FloatArray,
+    kept: FloatArray,
+    completed: FloatArray,
+) -> None:
+    """
+    Take needles through intervals of constant inputs.
+
+    Parameters
+    ----------
+    needles : ndarray, shape (all or 1, 13)
+        `CONSTANTS`; ``lowest`` and ``highest`` are the range of the depth, ``stop`` the depth at
+        which the hub stops, or infinity.
+    table : ndarray, shape (1 + 4 m, 26)
+        First columns of the series of two modes of length 1.
+    course : Course
+        Inputs and steps.
+    runs : ndarray of int
+        Which of all runs to take.
+    states : ndarray, shape (all, 8)
+        Initial states; overwritten with those at the end of the last interval of each.
+    kept : ndarray, shape (all, count + 1, 8) or (all, 1, 8)
+        Filled with the states at the ends of the intervals; with one row it is left alone.
+    completed : ndarray, shape (all,)
+        Overwritten with the number of intervals that each has completed.
+
+    """
+    w = np.zeros(_ROWS * LANES)
+    # Run and interval of each lane.
+    which, at = np.zeros(LANES, dtype=np.int64), np.zeros(LANES, dtype=np.int64)
+    waiting, n = 0, 0
+    while True:
+        while n < LANES and waiting < len(runs):
+            i = runs[waiting]
+            waiting += 1
+            _load(w, n, needles[i if len(needles) > 1 else 0], states[i], table)
+            if kept.shape[1] > 1:
+                kept[i, 0] = states[i]
+            which[n], at[n] = i, 0
+            w[_FORCE + n] = _input(course.forces, i, 0)
+            w[_LEFT + n], w[_INSIDE + n] = course.interval, 1.0
+            n += 1
+        if n == 0:
+            return
+        _begin(w, n, course.longest, 1.0 if course.graded else 0.0)
+        _modes(w, n, table)
+        _rotate(w, n)
+        _move(w, n)
+        _end(w, n)
+        # Backwards: a lane that ends is filled with the last one, which has been looked at.
+        for i in range(n - 1, -1, -1):
+            goes_on = w[_INSIDE + i] != 0.0
+            if goes_on and w[_LEFT + i] == 0.0:
+                goes_on = _next(w, i, which[i], at, course, table, states, kept)
+                completed[which[i]] = at[i]
+            if not goes_on:
+                n -= 1
+                which[i], at[i] = which[n], at[n]
+                for k in range(_KEPT):
+                    w[k * LANES + i] = w[k * LANES + n]
+
+
+@inlined
+def _next(
+    w: FloatArray,
+    i: int,
+    which: int,
+    at: IntArray,
+    course: Course,
+    table: FloatArray,
+    states: FloatArray,
+    kept: FloatArray,
+) -> bool:
+    """End the interval of a lane, and return whether it goes on with the next one."""
+    state, time = states[which], course.interval
+    turn = 2.0 / w[_INERTIA + i] * _input(course.torques, which, at[i])
+    angle, rate = state[1], state[5]
+    _save(w, i, table, state)
+    state[1] = angle + (rate + 0.5 * turn * time) * time
+    state[5] = rate + turn * time
+    size = 0.0
+    for value in state:
+        size += abs(value)
+    if not isfinite(size):
+        return False
+    at[i] += 1
+    if kept.shape[1] > 1:
+        kept[which, at[i]] = state
+    w[_FORCE + i] = _input(course.forces, which, min(at[i], course.intervals - 1))
+    w[_LEFT + i], w[_A + i] = time, 0.0
+    return bool(at[i] < course.intervals)
+
+
+@inlined
+def _input(values: FloatArray, which: int, k: int) -> float:
+    """Return an input of a run in an interval, where one value may stand for all."""
+    first, second = values.shape
+    return float(values[which if first > 1 else 0, k if second > 1 else 0])

@@ -1,0 +1,158 @@
+"""Needles in the lanes of vector registers: each as if it were alone."""
+
+from __future__ import annotations
+
+from math import cos, exp, pi, sin
+from typing import Any
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from needle_dynamics import (
+    Batch,
+    FloatArray,
+    NeedleModel,
+    NeedleParameters,
+    simulate,
+    simulate_batch,
+)
+from needle_dynamics.compiled.lanes import _decay_means, _sine_cosine, LANES
+from needle_dynamics.compiled.oscillator import decay_means
+import numpy as np
+from numpy.testing import assert_allclose
+import pytest
+
+preset = NeedleParameters.preset
+COUNT, INTERVAL = 6, 2e-3
+
+
+def population(runs: int, seed: int = 3) -> tuple[list[NeedleParameters], FloatArray, FloatArray]:
+    """Return needles, states in motion and forces that push, hold and pull."""
+    rng = np.random.default_rng(seed)
+    needles = [
+        preset(
+            ('paper_si', 'phantom')[i % 2],
+            length=rng.uniform(0.15, 0.25),
+            tissue_stiffness=rng.uniform(0.0, 3000.0),
+            tissue_damping=rng.choice([0.0, rng.uniform(0.0, 5.0)]),
+            coulomb_friction=rng.uniform(0.0, 0.8),
+            withdrawal_friction=rng.uniform(0.5, 1.5),
+            carriage_mass=rng.choice([0.0, 0.1]),
+            hub_stop=bool(i % 3),
+        )
+        for i in range(runs)
+    ]
+    states = np.array(
+        [NeedleModel(p).state_at(rng.uniform(0.03, 0.14), rng.uniform(-1e-3, 1e-3))
+         for p in needles]
+    )  # fmt: skip
+    states[:, 4] = rng.uniform(-0.5, 0.5, runs)
+    states[:, 5] = rng.uniform(-1.0, 1.0, runs)
+    states[:, 6:] = rng.uniform(-1e-4, 1e-4, (runs, 2))
+    return needles, states, rng.uniform(-2.0, 4.0, (runs, COUNT))
+
+
+def batch(*arguments: Any, **options: Any) -> Batch:
+    options = {'duration': COUNT * INTERVAL, 'interval': INTERVAL, **options}
+    return simulate_batch(*arguments, **options)
+
+
+@pytest.mark.parametrize('graded', [False, True])
+def test_a_lane_is_a_simulation_alone(graded: bool) -> None:
+    """Pushed, held and pulled, with and without hub and damping: as `simulate` has it."""
+    needles, states, forces = population(60)
+    found = batch(needles, states, forces, graded=graded)
+    stuck = moved = 0
+    for i, (p, start) in enumerate(zip(needles, states, strict=True)):
+        whole = round(found.completed[i] / INTERVAL)
+        assert whole > 0
+
+        def force(time: float, course: FloatArray = forces[i]) -> float:
+            return float(course[round(time / INTERVAL)])
+
+        alone = simulate(
+            p, start, force, duration=whole * INTERVAL, interval=INTERVAL, graded=graded
+        )
+        scale = np.abs(alone.states).max(axis=0)
+        # Rounding, enlarged by cond(G) of 1e5 at 3 cm, in the phases of a thousand steps.
+        assert_allclose(found.states[i, : whole + 1] / scale, alone.states / scale, atol=1e-7)
+        stuck += bool((alone.velocity == 0.0).any())
+        moved += bool((alone.velocity[1:] != 0.0).all())
+    # Both happen, or nothing of it is shown.
+    assert stuck > 5
+    assert moved > 5
+
+
+def test_company_changes_no_bit() -> None:
+    """Whoever shares its register, and however many they are, a needle moves to the same bits."""
+    needles, states, forces = population(3 * LANES + 5)
+    found = batch(needles, states, forces, workers=1)
+    some = np.random.default_rng(5).permutation(len(needles))[: LANES + 3]
+    other = batch([needles[i] for i in some], states[some], forces[some], workers=2)
+    assert np.array_equal(other.states, found.states[some], equal_nan=True)
+    for i in (0, 1, 2):
+        alone = batch(needles[i], states[i], forces[i : i + 1])
+        assert np.array_equal(alone.states[0], found.states[i], equal_nan=True)
+
+
+def test_the_hub_stops_a_lane_and_a_force_takes_it_off_again() -> None:
+    """A needle pushed in to the hub rests there exactly, and is pulled out again."""
+    p = preset('paper_si')
+    start = NeedleModel(p).state_at(0.19, 1e-4)
+    forces = np.array([[3.0] * 10 + [-3.0] * 4])
+    found = batch(p, start, forces, duration=0.028, interval=2e-3)
+    assert found.depth[0, 10] == p.length
+    assert found.velocity[0, 10] == 0.0
+    assert found.depth[0, -1] < p.length - 1e-3
+    assert np.isfinite(found.states).all()
+
+
+def test_steps_of_second_order() -> None:
+    """Half the step, a quarter of the error."""
+    p = preset('paper_si', tissue_damping=1.0)
+    start = NeedleModel(p).state_at(0.08, 5e-4)
+
+    def end(step: float) -> FloatArray:
+        return batch(p, start, 3.0, duration=0.02, interval=0.02, step=step).states[0, -1]
+
+    exact = end(1e-7)
+    errors = [abs(end(step) - exact)[[0, 2]] for step in (1e-5, 5e-6)]
+    assert_allclose(errors[0] / errors[1], 4.0, rtol=0.2)
+
+
+def test_a_torque_turns_a_lane() -> None:
+    """The angle is that of a constant torque on the inertia, interval by interval."""
+    p = preset('phantom')
+    start = NeedleModel(p).state_at(0.05)
+    torques = np.array([[1e-6, -2e-6]])
+    found = batch(p, start, 0.0, torques, duration=0.02, interval=0.01).states[0]
+    gains = 2.0 * torques[0] / p.rotary_inertia * 0.01
+    assert_allclose(found[:, 5], [0.0, gains[0], gains.sum()], rtol=1e-14)
+    angles = 0.005 * np.array([0.0, gains[0], 3.0 * gains[0] + gains[1]])
+    assert_allclose(found[:, 1], angles, rtol=1e-14)
+
+
+@given(st.floats(-1e6, 1e6))
+def test_sine_and_cosine(x: float) -> None:
+    """Those of the library, but for the last digits: of the argument, too."""
+    found = _sine_cosine(x)
+    assert_allclose(found, (sin(x), cos(x)), rtol=0, atol=4e-16 + abs(x) * 1e-22)
+
+
+@given(st.floats(0.0, 200.0) | st.floats(0.0, 1e-3) | st.floats(1e2, 1e300))
+@settings(max_examples=300)
+def test_means_of_a_decay(x: float) -> None:
+    """Those that `oscillator` has; where it loses digits, their series."""
+    mean, ramp = _decay_means(x)
+    exact, other = decay_means(x)
+    assert_allclose(mean, exact, rtol=1e-13)
+    # The other one is a difference over x, or a series that ends at 1e-13.
+    assert_allclose(ramp, other, rtol=2e-13 + 3e-16 / max(x, 1e-4))
+    assert_allclose(1.0 - x * mean, exp(-x), rtol=0, atol=1e-15)
+
+
+def test_quarters_of_a_turn() -> None:
+    """At every multiple of a quarter turn, and beside it, the right sign."""
+    for k in range(-9, 10):
+        for off in (-1e-3, 0.0, 1e-3):
+            x = 0.25 * pi * k + off
+            assert_allclose(_sine_cosine(x), (sin(x), cos(x)), rtol=0, atol=4e-16)
