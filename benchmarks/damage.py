@@ -10,13 +10,12 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Mapping
 from pathlib import Path
-import resource
 import struct
 from tempfile import TemporaryDirectory
 import time
 from typing import Any, Final
 
-from benchmarks.measure import Bar
+from benchmarks.measure import Bar, peak_memory
 from benchmarks.page import Answer, Section, Tick
 from needle_dynamics import FloatArray
 from needle_identification import (
@@ -231,7 +230,7 @@ def compare(tick: Tick, files: int = 10_000, seed: int = 2014) -> Answer:
             counts[form, damage][what] += 1
             if what not in ('refused', 'the same', 'shorter', 'warned'):
                 silent.append(f'{number}: {form}, {damage}: {what}')
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1000.0
+    peak = 1e-6 * peak_memory()
     fates = ('refused', 'the same', 'shorter', 'warned', 'another, silently', 'traceback')
     total = Counter[str]()
     for count in counts.values():

@@ -12,7 +12,6 @@ from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 import json
 from pathlib import Path
-import resource
 import struct
 import subprocess
 import sys
@@ -20,7 +19,7 @@ from tempfile import TemporaryDirectory
 import time
 from typing import Any, Final
 
-from benchmarks.measure import Bar, NOT_INSTALLED, number, optional
+from benchmarks.measure import Bar, NOT_INSTALLED, number, optional, peak_memory
 from benchmarks.page import Answer, Section, Tick
 from needle_identification import (
     BagWriter,
@@ -204,25 +203,6 @@ READERS: Final[Mapping[str, Callable[[Path], object]]] = {
     'rosbags AnyReader': any_reader,
     'mcap-ros2-support': mcap_ros2,
 }
-
-
-def peak_memory() -> float:
-    """
-    Return the peak memory of this process.
-
-    Returns
-    -------
-    float
-        Memory [bytes].
-
-    """
-    status = Path('/proc/self/status')
-    if status.exists():
-        for line in status.read_text('ascii').splitlines():
-            if line.startswith('VmHWM'):
-                return 1024.0 * float(line.split()[1])
-    # Other systems. On Linux this would include the process before exec.
-    return float(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
 
 
 def measure(reader: str, warm: Path, path: Path, repeats: int) -> dict[str, float]:

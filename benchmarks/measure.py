@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib import import_module
+from pathlib import Path
+import resource
 import time
 from types import ModuleType
 from typing import Final
@@ -191,3 +193,22 @@ def optional(name: str) -> ModuleType | None:
         return import_module(name)
     except ModuleNotFoundError:
         return None
+
+
+def peak_memory() -> float:
+    """
+    Return the peak memory of this process.
+
+    Returns
+    -------
+    float
+        Memory [bytes].
+
+    """
+    status = Path('/proc/self/status')
+    if status.exists():
+        for line in status.read_text('ascii').splitlines():
+            if line.startswith('VmHWM'):
+                return 1024.0 * float(line.split()[1])
+    # Other systems. On Linux this would include the process before exec.
+    return float(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)

@@ -133,6 +133,7 @@ class OuterLoop:
     ) -> None:
         self._needle, self._steering, self._belief = needle, steering, belief
         self.settings = settings
+        self._steady = steady
         self.journal = Journal(steady)
         timeout = settings.measurement_timeout
         frames = ('', ENTRY)
@@ -271,7 +272,7 @@ class OuterLoop:
                 'may be: make step_length larger'
             )
         depths = np.linspace(depth, point[1], steps + 1)
-        asked = monotonic()
+        asked = self._steady()
         model = SteeringModel(
             self._needle,
             self._steering,
@@ -298,7 +299,7 @@ class OuterLoop:
         straight = self._goal.copy()
         straight[1:3] = 0.0
         # Time has gone on since.
-        return self._send(Phase.GUIDING, straight, now + round(1e9 * (monotonic() - asked)))
+        return self._send(Phase.GUIDING, straight, now + round(1e9 * (self._steady() - asked)))
 
     def stop(self, why: str, silence: float = 0.0) -> Move | None:
         """

@@ -8,6 +8,7 @@ from typing import Any, Final, NamedTuple
 
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PointStamped
+from needle_insertion.live.requests import CONTROLLER, Request, REQUESTS, STEERING
 from needle_ros import contract
 from needle_ros.base_node import profile
 from needle_ros.errors import printable
@@ -17,9 +18,6 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.task import Future
 from std_srvs.srv import SetBool, Trigger
-
-CONTROLLER: Final = 'controller'
-STEERING: Final = 'steering'
 
 #: Longest time to find a node that is asked for the first time [s].
 _PATIENCE: Final = 1.0
@@ -68,24 +66,6 @@ class Outcome(NamedTuple):
 
     success: bool
     message: str
-
-
-class _Request(NamedTuple):
-    """One service that a word stands for."""
-
-    node: str
-    service: str
-    data: bool | None = None
-
-
-#: What can be asked for. A node that is not there is left out, if another one answers.
-REQUESTS: Final[Mapping[str, tuple[_Request, ...]]] = {
-    'pause': (_Request(CONTROLLER, 'pause', data=True),),
-    'resume': (_Request(CONTROLLER, 'pause', data=False),),
-    'retract': (_Request(CONTROLLER, 'retract'),),
-    'stop': (_Request(STEERING, 'stop'), _Request(CONTROLLER, 'emergency_stop')),
-    'clear': (_Request(CONTROLLER, 'clear_stop'),),
-}
 
 
 class Operator:
@@ -227,7 +207,7 @@ class Operator:
         return _gathered({node: client.call_async(request)}, read)
 
 
-def _names(requests: tuple[_Request, ...]) -> str:
+def _names(requests: tuple[Request, ...]) -> str:
     return ' or '.join(f'{request.node}/{request.service}' for request in requests)
 
 

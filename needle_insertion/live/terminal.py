@@ -13,8 +13,9 @@ from typing import Final, NamedTuple
 from needle_controller import LAWS
 from needle_controller.steering.outer_loop import Phase
 from needle_insertion.experiment.ros_graph import Graph
-from needle_insertion.live.operator import CONTROLLER, Operator, Outcome, State, STEERING
+from needle_insertion.live.operator import Operator, Outcome, State
 from needle_insertion.live.readings import Readings
+from needle_insertion.live.requests import CONTROLLER, STEERING
 from needle_insertion.live.screen import Screen
 from needle_insertion.report.text import table
 from needle_ros.contract import JOINT_STATES, TIP_DEFLECTION

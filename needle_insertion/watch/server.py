@@ -25,14 +25,12 @@ from typing import Any, Final, Protocol
 from urllib.parse import urlsplit
 
 from aiohttp import web, WSCloseCode, WSMessage, WSMsgType
+from needle_insertion.live.requests import REQUESTS
 from needle_insertion.report.page import TEMPLATE_FOLDER
 from needle_ros.errors import JobError, NeedleError, ParameterError, printable
 
 #: Port by default.
 PORT: Final = 8642
-
-#: What the page may ask a control for.
-ASKED: Final = ('pause', 'resume', 'retract', 'stop', 'clear')
 
 #: Most readers at a time, and longest message of one [bytes].
 MOST_READERS: Final = 16
@@ -121,7 +119,7 @@ class Control(Protocol):
         Parameters
         ----------
         what : str
-            One of `ASKED`.
+            A key of `needle_insertion.live.requests.REQUESTS`.
 
         Returns
         -------
@@ -343,8 +341,8 @@ class Server:
             x, y, z = map(float, at)
             self._control.target(x, y, z)
             return True, f'target {1e3 * x:g}, {1e3 * y:g}, {1e3 * z:g} mm sent'
-        if what not in ASKED or message:
-            raise ParameterError(f'ask must be one of target, {", ".join(ASKED)}, got {what!r}')
+        if what not in REQUESTS or message:
+            raise ParameterError(f'ask must be one of target, {", ".join(REQUESTS)}, got {what!r}')
         return await self._control.ask(what)
 
 

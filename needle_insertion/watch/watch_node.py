@@ -170,7 +170,7 @@ class Buttons:
         Parameters
         ----------
         what : str
-            A key of `needle_insertion.live.operator.REQUESTS`.
+            A key of `needle_insertion.live.requests.REQUESTS`.
 
         Returns
         -------
