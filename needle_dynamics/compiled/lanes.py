@@ -401,7 +401,7 @@ def _load(
     length, rho = constants[0], constants[1]
     depth = length - state[0]
     g11, g12, g22 = _gram(table, depth / length)
-    w[_S + i], w[_U + i] = depth, -state[4]
+    w[_S + i], w[_U + i], w[_A + i] = depth, -state[4], 0.0
     w[_Q1 + i], w[_Q2 + i] = state[2], state[3]
     w[_Z1 + i] = rho * (g11 * state[6] + g12 * state[7])
     w[_Z2 + i] = rho * (g12 * state[6] + g22 * state[7])

@@ -82,15 +82,16 @@ def test_a_lane_is_a_simulation_alone(graded: bool) -> None:
     assert moved > 5
 
 
-def test_company_changes_no_bit() -> None:
+@pytest.mark.parametrize('graded', [False, True])
+def test_company_changes_no_bit(graded: bool) -> None:
     """Whoever shares its register, and however many they are, a needle moves to the same bits."""
     needles, states, forces = population(3 * LANES + 5)
-    found = batch(needles, states, forces, workers=1)
+    found = batch(needles, states, forces, workers=1, graded=graded)
     some = np.random.default_rng(5).permutation(len(needles))[: LANES + 3]
-    other = batch([needles[i] for i in some], states[some], forces[some], workers=2)
+    other = batch([needles[i] for i in some], states[some], forces[some], workers=2, graded=graded)
     assert np.array_equal(other.states, found.states[some], equal_nan=True)
     for i in (0, 1, 2):
-        alone = batch(needles[i], states[i], forces[i : i + 1])
+        alone = batch(needles[i], states[i], forces[i : i + 1], graded=graded)
         assert np.array_equal(alone.states[0], found.states[i], equal_nan=True)
 
 
