@@ -341,7 +341,7 @@ class Server:
             x, y, z = map(float, at)
             self._control.target(x, y, z)
             return True, f'target {1e3 * x:g}, {1e3 * y:g}, {1e3 * z:g} mm sent'
-        if what not in REQUESTS or message:
+        if not isinstance(what, str) or what not in REQUESTS or message:
             raise ParameterError(f'ask must be one of target, {", ".join(REQUESTS)}, got {what!r}')
         return await self._control.ask(what)
 
