@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from contextlib import suppress
 from dataclasses import fields
 from math import isfinite
-import os
 from pathlib import Path
 from typing import Final
 
@@ -15,7 +13,7 @@ from needle_identification.estimation.estimate import Statistic
 from needle_identification.estimation.formatting import UNKNOWN
 from needle_identification.friction.summary import FrictionSummary
 from needle_identification.stiffness.summary import StiffnessSummary
-from needle_ros.errors import ParameterError
+from needle_ros.files import write_whole
 import yaml
 
 #: Nodes that use the result.
@@ -145,33 +143,3 @@ def write_result(
 
     """
     write_whole(path, result_yaml(friction, stiffness).encode())
-
-
-def write_whole(path: Path | str, content: bytes) -> None:
-    """
-    Write a file so that a reader sees the old content or the new, never a part.
-
-    Parameters
-    ----------
-    path : Path or str
-        File to write.
-    content : bytes
-        All of its content.
-
-    Raises
-    ------
-    ParameterError
-        If the file cannot be written.
-
-    """
-    path = Path(path)
-    if not path.name or path.is_dir():
-        raise ParameterError(f'{path} cannot be written: it is not the name of a file')
-    draft = path.with_name(f'{path.name}.{os.getpid()}.tmp')
-    try:
-        draft.write_bytes(content)
-        draft.replace(path)
-    except OSError as error:
-        with suppress(OSError):
-            draft.unlink()
-        raise ParameterError(f'{path} cannot be written: {error.strerror}') from error

@@ -36,12 +36,9 @@ from numpy.typing import ArrayLike
 #: Default step [s]. The tip deflection of the source's open-loop run is then good to 2e-4.
 DEFAULT_STEP: Final = 1e-5
 
-#: Tolerance of `needle simulate`: a coast over the whole needle then keeps its energy to 1e-8.
-DEFAULT_TOLERANCE: Final = 1e-8
-
 #: Step at which a tolerance is given up, and shortest step taken [s]: rounding has taken over
 #: long before.
-_SHORTEST_STEP: Final = 1e-9
+SHORTEST_STEP: Final = 1e-9
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -317,19 +314,10 @@ class Integrator:
         left, sums = advance(
             self._needle, self._state, self.time, inputs, longest, self.graded, duration, felt
         )
-        if isnan(left):
-            raise NeedleError(
-                'the motion is not finite: constants, state or inputs are out of proportion'
-            )
-        if left > 0.0:
-            self.time += duration - left
-            p, far = self.model.parameters, self._needle.maximum_depth
-            limit = (
-                f'minimum_depth = {p.minimum_depth:g} m while withdrawing'
-                if self.depth - p.minimum_depth < far - self.depth
-                else f'the largest inserted length, {far:g} m'
-            )
-            raise InsertedLengthError(f'inserted length {self.depth:.6g} m reached {limit}')
+        if left != 0.0:
+            if left > 0.0:
+                self.time += duration - left
+            raise not_completed(self.model, self._state, left)
         return sums
 
     def _refine(self, duration: float, inputs: Inputs, felt: FloatArray, tolerance: float) -> Sums:
@@ -348,7 +336,7 @@ class Integrator:
         while True:
             coarse, before = self._state.copy(), outcome
             longest *= 0.5
-            if longest < _SHORTEST_STEP:
+            if longest < SHORTEST_STEP:
                 self._state[:], self.time = start, clock
                 raise ToleranceError(f'tolerance {tolerance:g} cannot be met at any step')
             outcome = attempt(longest)
@@ -382,6 +370,39 @@ class Integrator:
         return max(part, float(abs(two[0] - one[0])) / model.parameters.length)
 
 
+def not_completed(model: NeedleModel, state: FloatArray, left: float) -> NeedleError:
+    """
+    Say why a motion was not completed.
+
+    Parameters
+    ----------
+    model : NeedleModel
+        The needle.
+    state : ndarray, shape (2 (2 + n),)
+        Its last valid state.
+    left : float
+        Time left undone [s], or NaN, as from `needle_dynamics.compiled.step.advance`.
+
+    Returns
+    -------
+    NeedleError
+        An `InsertedLengthError` if the needle would leave its range.
+
+    """
+    if isnan(left):
+        return NeedleError(
+            'the motion is not finite: constants, state or inputs are out of proportion'
+        )
+    p, far = model.parameters, model.compiled.maximum_depth
+    depth = p.length - float(state[0])
+    limit = (
+        f'minimum_depth = {p.minimum_depth:g} m while withdrawing'
+        if depth - p.minimum_depth < far - depth
+        else f'the largest inserted length, {far:g} m'
+    )
+    return InsertedLengthError(f'inserted length {depth:.6g} m reached {limit}')
+
+
 def checked_step(step: float) -> float:
     """
     Return a longest step as a float, or say what is wrong with it.
@@ -404,6 +425,6 @@ def checked_step(step: float) -> float:
     """
     if isinstance(step, bool) or not isinstance(step, (int, float)):
         raise ParameterError(f'step must be a number, got {step!r}')
-    if not _SHORTEST_STEP <= step < inf:
-        raise ParameterError(f'step must be finite and >= {_SHORTEST_STEP:g} s, got {step!r} s')
+    if not SHORTEST_STEP <= step < inf:
+        raise ParameterError(f'step must be finite and >= {SHORTEST_STEP:g} s, got {step!r} s')
     return float(step)

@@ -4,19 +4,39 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from math import inf
+from math import inf, nan
 from typing import Final
 
 from needle_dynamics.arrays import FloatArray
+from needle_dynamics.compiled.refined import run_refined
+from needle_dynamics.compiled.step import run
+from needle_dynamics.errors import ToleranceError
 from needle_dynamics.model import NeedleModel
 from needle_dynamics.parameters import NeedleParameters
-from needle_dynamics.simulated.integrator import DEFAULT_STEP, Integrator
+from needle_dynamics.simulated.integrator import (
+    checked_step,
+    Integrator,
+    not_completed,
+    SHORTEST_STEP,
+)
 from needle_ros.errors import ParameterError, ShapeError
 import numpy as np
 from numpy.typing import ArrayLike
 
+#: Error of a run that nobody asked to be better, as in `Trajectory.error`.
+DEFAULT_TOLERANCE: Final = 1e-3
+
+#: Samples of a run of which nobody said how many.
+DEFAULT_SAMPLES: Final = 2000
+
 #: Most intervals of a run: more would not fit into memory.
 _MOST_INTERVALS: Final = 100_000_000
+
+#: A way counts as no shorter than this part of the needle.
+_SHORTEST_WAY: Final = 1e-4
+
+#: Halvings of the steps without a smaller error, after which rounding is all that is left.
+_TRIES: Final = 3
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -34,12 +54,14 @@ class Trajectory:
         States.
     forces : ndarray, shape (k,)
         Force over each interval [N].
-    step : float
-        Longest step of the integrator [s].
-    tolerance : float or None
-        As in `Integrator`.
+    steps : ndarray, shape (k,)
+        Longest step of the integrator in each interval, or the shortest, if they are not even [s].
     graded : bool
         As in `Integrator`.
+    error : float
+        By how much the samples differ from those of a run whose steps are twice as long: in the
+        deflection of the tip, as a part of its largest, or in the inserted length, as a part of
+        the way, whichever is more. NaN if the step was given: nothing was compared then.
 
     """
 
@@ -47,9 +69,9 @@ class Trajectory:
     time: FloatArray
     states: FloatArray
     forces: FloatArray
-    step: float
-    tolerance: float | None = None
+    steps: FloatArray
     graded: bool = False
+    error: float = nan
 
     def __repr__(self) -> str:
         depth = self.depth
@@ -100,7 +122,7 @@ class Trajectory:
         if rest <= 0.0:
             return np.array(self.states[k])
         integrator = Integrator(
-            self.parameters, self.states[k], self.step, self.tolerance, graded=self.graded
+            self.parameters, self.states[k], float(self.steps[k]), graded=self.graded
         )
         integrator.time = float(self.time[k])
         integrator.advance(rest, self.forces[k])
@@ -113,13 +135,18 @@ def simulate(
     force: float | Callable[[float], float],
     *,
     duration: float,
-    interval: float,
-    step: float = DEFAULT_STEP,
+    interval: float | None = None,
     tolerance: float | None = None,
+    step: float | None = None,
     graded: bool = False,
 ) -> Trajectory:
     """
     Simulate the needle under a force that is constant over each interval.
+
+    Steps are short where the needle vibrates fast and much. They are halved until the samples no
+    longer depend on them: the deflection of the tip changes by no more than ``tolerance`` of its
+    largest, and the inserted length by no more than ``tolerance`` of the way. The better of the
+    last two runs is returned; at second order its error is a third of that change.
 
     Parameters
     ----------
@@ -131,14 +158,16 @@ def simulate(
         Insertion force [N], or a function of time [s] read at the start of each interval.
     duration : float
         Time to simulate [s].
-    interval : float
-        Time between samples [s].
-    step : float
-        Longest step of the integrator [s].
+    interval : float, optional
+        Time between samples [s]; by default there are 2000 of them. A force that is a function
+        of time needs it.
     tolerance : float, optional
-        As in `Integrator`.
+        Largest `Trajectory.error`, by default 1e-3.
+    step : float, optional
+        Longest step of the integrator [s], in the place of a tolerance: with it one run is made,
+        as `Integrator` and `simulate_batch` make it.
     graded : bool
-        As in `Integrator`.
+        As in `Integrator`, with ``step``.
 
     Returns
     -------
@@ -151,6 +180,8 @@ def simulate(
         If an argument is not valid.
     InsertedLengthError
         If the needle leaves its range.
+    ToleranceError
+        If the tolerance cannot be met.
 
     Examples
     --------
@@ -162,24 +193,81 @@ def simulate(
     Trajectory(51 samples up to 0.5 s, depth 0.05 to 0.05407 m)
     >>> print(f'{run.velocity[-1]:.4f} m/s')
     0.0081 m/s
+    >>> run.error < 1e-3
+    True
 
     """
-    integrator = Integrator(parameters, state, step, tolerance, graded=graded)
+    if tolerance is not None and step is not None:
+        raise ParameterError('tolerance and step exclude each other')
+    if graded and step is None:
+        raise ParameterError('graded is for a given step')
+    tolerance = DEFAULT_TOLERANCE if tolerance is None else tolerance
+    if not 0.0 < tolerance < inf:
+        raise ParameterError(f'tolerance must be positive and finite, got {tolerance!r}')
+    if interval is None:
+        if callable(force):
+            raise ParameterError('interval must be given with a force that is a function of time')
+        interval = duration / DEFAULT_SAMPLES
     count = count_of(duration, interval)
     time = np.arange(count + 1, dtype=np.float64) * interval
-    forces = floats('force', [force(t) if callable(force) else force for t in time[:-1]])
+    pushes = [force(t) for t in time[:-1]] if callable(force) else np.full(count, force)
+    forces = floats('force', pushes)
     if forces.shape != (count,) or not np.isfinite(forces).all():
         raise ShapeError(
             f'force must be one finite number at each of {count} times, got {force!r}'
         )
-    states = np.empty((count + 1, integrator.state.size))
-    states[0] = integrator.state
-    for i in range(count):
-        # Not the sum of the intervals, whose rounding would grow.
-        integrator.time = float(time[i])
-        integrator.advance(interval, forces[i])
-        states[i + 1] = integrator.state
-    return Trajectory(parameters, time, states, forces, step, tolerance, graded)
+    model = NeedleModel(parameters)
+    start = model.checked_state(state)
+    if step is None:
+        return _refined(model, start, time, forces, float(interval), tolerance)
+    step, states = checked_step(step), np.empty((count + 1, start.size))
+    done = run(
+        model.compiled, start, forces, np.zeros(count), float(interval), step, graded, states
+    )
+    if done < count:
+        raise not_completed(model, start, interval if np.isfinite(start).all() else nan)
+    return Trajectory(parameters, time, states, forces, np.full(count, step), graded)
+
+
+def _refined(
+    model: NeedleModel,
+    start: FloatArray,
+    time: FloatArray,
+    forces: FloatArray,
+    interval: float,
+    tolerance: float,
+) -> Trajectory:
+    """Halve the steps until the samples no longer depend on them."""
+    states, steps = np.empty((len(time), start.size)), np.empty(len(forces))
+    before: tuple[int, FloatArray] | None = None
+    finer, best, tries, error = 1, inf, 0, inf
+    while True:
+        state = start.copy()
+        done, left = run_refined(model.compiled, state, forces, interval, finer, states, steps)
+        if before is not None:
+            error = _difference(model, before[1], states[: done + 1]) if before[0] == done else inf
+            if error <= tolerance:
+                break
+            tries = tries + 1 if error >= best else 0
+            best = min(best, error)
+            if tries == _TRIES or steps[:done].min(initial=interval) < 2.0 * SHORTEST_STEP:
+                raise ToleranceError(
+                    f'tolerance {tolerance:g} cannot be met at any step; the best is {best:.1g}'
+                )
+        before = done, states[: done + 1].copy()
+        finer *= 2
+    if done < len(forces):
+        raise not_completed(model, state, left)
+    return Trajectory(model.parameters, time, states, forces, steps, error=error)
+
+
+def _difference(model: NeedleModel, one: FloatArray, two: FloatArray) -> float:
+    """Return how far the samples of two runs differ, see `Trajectory.error`."""
+    tips, others = model.tip_deflections(two), model.tip_deflections(one)
+    ways, peak = np.abs(two[:, 0] - two[0, 0]), float(np.abs(tips).max())
+    way = max(float(ways.max()), _SHORTEST_WAY * model.parameters.length)
+    apart = float(np.abs(tips - others).max())
+    return max(float(np.abs(two[:, 0] - one[:, 0]).max()) / way, apart / peak if peak else apart)
 
 
 def floats(name: str, values: object) -> FloatArray:

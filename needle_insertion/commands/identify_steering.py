@@ -16,7 +16,6 @@ from needle_identification.estimation.estimate import ParameterEstimate
 from needle_identification.estimation.formatting import between, measured
 from needle_identification.recordings import TIMES
 from needle_identification.recordings.tables import column_roles
-from needle_identification.result import write_whole
 from needle_identification.steering.estimate import SteeringEstimate
 from needle_identification.steering.reading import read_steering_recording
 from needle_identification.steering.recording import SteeringRecording
@@ -25,6 +24,7 @@ from needle_identification.steering.tables import STEERING_ROLES
 from needle_insertion.commands.common import check_file
 from needle_insertion.report.text import table
 from needle_ros.errors import NeedleError, ParameterError, shown
+from needle_ros.files import write_whole
 from tqdm import tqdm
 
 #: What stands for a medium without a name.

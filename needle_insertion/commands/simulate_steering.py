@@ -17,10 +17,7 @@ from needle_dynamics import (
     SteeringParameters,
 )
 from needle_dynamics.steering.parameters import NEEDLE_CONSTANTS
-from needle_identification import RecordingError
-from needle_identification.recordings.tables import column_values, guessed, read_table
 from needle_insertion.commands.common import constants
-from needle_insertion.report import insertion as report
 from needle_insertion.report.text import table
 from needle_ros.errors import ParameterError
 from needle_ros.settings import from_values, unknown_name
@@ -131,6 +128,10 @@ def read_way(path: Path) -> dict[str, FloatArray]:
         If it has no such columns, or its depth does not increase.
 
     """
+    # As the report below, not needed by the model of modes: together half a second.
+    from needle_identification import RecordingError
+    from needle_identification.recordings.tables import column_values, guessed, read_table
+
     read = read_table(path)
     names = {name: (name.replace('_', ''),) for name in ('depth', *COLUMNS)}
     found = guessed(read, names)
@@ -162,6 +163,8 @@ def run_steering(options: argparse.Namespace) -> int:
         Exit status.
 
     """
+    from needle_insertion.report import insertion as report
+
     for path in options.output:
         if path.suffix not in ('.csv', '.png'):
             raise ParameterError(f'{path}: output of --model steering must be .csv or .png')

@@ -28,13 +28,13 @@ from needle_dynamics import (
     STEERING_PRESETS,
     SteeringParameters,
 )
-from needle_identification.result import write_whole
 from needle_insertion.commands.common import check_file, Command, constants
 from needle_insertion.commands.simulate_steering import made
 from needle_insertion.report.content import png
 from needle_insertion.report.insertion import draw_needle, draw_reach
 from needle_insertion.report.text import table
 from needle_ros.errors import ParameterError
+from needle_ros.files import write_whole
 from needle_ros.settings import from_values, unknown_name
 import numpy as np
 

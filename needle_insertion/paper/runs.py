@@ -28,7 +28,7 @@ from needle_dynamics import (
     Integrator,
     NeedleModel,
     NeedleParameters,
-    simulate_batch,
+    simulate,
 )
 import numpy as np
 
@@ -157,18 +157,17 @@ def open_loop(reading: str, formulation: str, deflection: float = DEFLECTION) ->
     """
     model = needle(reading, formulation)
     duration = OPEN_LOOP[reading]
-    batch = simulate_batch(
+    run = simulate(
         model.parameters,
         model.state_at(DEPTH, deflection),
         FORCE,
         duration=duration,
         interval=1e-5 if duration < 1.0 else 1e-4,
         step=1e-5,
-        workers=1,
     )
-    forces = np.zeros((len(batch.time), model.coordinates))
+    forces = np.zeros((len(run.time), model.coordinates))
     forces[:, 0] = FORCE
-    return LoopRun(model, batch.time, batch.states[0], forces)
+    return LoopRun(model, run.time, run.states, forces)
 
 
 def paper_law(

@@ -18,8 +18,8 @@ from needle_dynamics import (
     operating_point,
 )
 from needle_dynamics.analysis import controllability_map, ControllabilityMap, Structure
-from needle_identification.result import write_whole
 from needle_insertion.report.content import png
+from needle_ros.files import write_whole
 import numpy as np
 from tqdm import tqdm
 

@@ -8,15 +8,15 @@ from io import StringIO
 from pathlib import Path
 from typing import Final, TYPE_CHECKING
 
-from needle_controller.steering.controller import Reach
 from needle_dynamics import FloatArray, Insertion, NeedlePath, NeedleShape
-from needle_identification.result import write_whole
 from needle_insertion.report.content import png
+from needle_ros.files import write_whole
 import numpy as np
 
 if TYPE_CHECKING:
-    # Takes half a second to import; only the picture needs it.
+    # Take half a second each to import; only the picture needs one of them.
     from matplotlib.figure import Figure
+    from needle_controller.steering.controller import Reach
 
 #: Columns of the CSV, as identification of friction and steering finds them.
 COLUMNS: Final = (

@@ -15,11 +15,11 @@ from typing import Any, Final
 
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 from markupsafe import Markup
-from needle_identification.result import write_whole
 from needle_insertion.report.animation import Animation
 from needle_insertion.report.content import Picture
 from needle_insertion.report.made import made
 from needle_insertion.report.symbols import symbols
+from needle_ros.files import write_whole
 
 #: A text that starts with a number and is longer, such as a checksum, is not a number.
 _LONGEST_NUMBER: Final = 40

@@ -9,16 +9,16 @@ from pathlib import Path
 from typing import Final, TYPE_CHECKING
 
 from needle_dynamics import linearize, NeedleModel, Trajectory
-from needle_identification import BagWriter
-from needle_identification.result import write_whole
 from needle_insertion.report.content import png
 from needle_ros.contract import ground_truth, JOINT_STATES, TIP_DEFLECTION
+from needle_ros.files import write_whole
 from needle_ros.timing import NANOSECONDS
 import numpy as np
 
 if TYPE_CHECKING:
     # Takes half a second to import; only the picture needs it.
     from matplotlib.figure import Figure
+    from needle_identification import BagWriter
 
 #: Deflection up to which a linear beam is valid, as a part of the inserted length.
 _LINEAR: Final = 0.1
@@ -46,6 +46,7 @@ def summary(trajectory: Trajectory) -> dict[str, float]:
     model = NeedleModel(trajectory.parameters)
     states, tips = trajectory.states, trajectory.tip_deflection
     at_hub = trajectory.time[trajectory.depth >= trajectory.parameters.length]
+    compared = np.isfinite(trajectory.error)
     return {
         'duration [s]': float(trajectory.time[-1]),
         **({'hub at the skin after [s]': float(at_hub[0])} if at_hub.size else {}),
@@ -55,6 +56,7 @@ def summary(trajectory: Trajectory) -> dict[str, float]:
         'tip deflection at the end [m]': float(tips[-1]),
         'energy at the start [J]': model.energy(states[0]),
         'energy at the end [J]': model.energy(states[-1], float(trajectory.time[-1])),
+        **({'change by twice the step [1]': trajectory.error} if compared else {}),
     }
 
 
@@ -122,7 +124,11 @@ def write(path: Path, trajectory: Trajectory) -> None:
     elif path.suffix == '.png':
         write_whole(path, png(_figure(trajectory)))
     else:
-        _write_bag(path, trajectory)
+        # Takes a tenth of a second to import.
+        from needle_identification import BagWriter
+
+        with BagWriter(path) as bag:
+            _write_bag(bag, trajectory)
 
 
 def _csv(trajectory: Trajectory) -> str:
@@ -160,7 +166,7 @@ def _figure(trajectory: Trajectory) -> Figure:
     return result
 
 
-def _write_bag(path: Path, trajectory: Trajectory) -> None:
+def _write_bag(bag: BagWriter, trajectory: Trajectory) -> None:
     """Write the topics of the plant, stamped with the simulated time."""
     states, depths, tips = trajectory.states, trajectory.depth, trajectory.tip_deflection
     m = states.shape[1] // 2
@@ -173,12 +179,11 @@ def _write_bag(path: Path, trajectory: Trajectory) -> None:
         truth: states,
         TIP_DEFLECTION: np.column_stack([0.0 * depths, depths, tips]),
     }
-    with BagWriter(path) as bag:
-        for topic in rows:
-            bag.add_topic(f'/{topic.name}', topic.type_name)
-        templates = {topic: topic.template() for topic in rows}
-        for k, time in enumerate(trajectory.time):
-            stamp = round(time * NANOSECONDS)
-            for topic, values in rows.items():
-                data = templates[topic].serialize(stamp, *values[k].tolist())
-                bag.write(f'/{topic.name}', data, stamp)
+    for topic in rows:
+        bag.add_topic(f'/{topic.name}', topic.type_name)
+    templates = {topic: topic.template() for topic in rows}
+    for k, time in enumerate(trajectory.time):
+        stamp = round(time * NANOSECONDS)
+        for topic, values in rows.items():
+            data = templates[topic].serialize(stamp, *values[k].tolist())
+            bag.write(f'/{topic.name}', data, stamp)

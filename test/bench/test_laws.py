@@ -17,7 +17,10 @@ def batch(depths: list[float], completed: int = 1000) -> LoopBatch:
         rms=np.sqrt(np.mean(path**2, axis=1)),
         states=np.empty((1, 8)),
         completed=np.array([completed]),
+        goal=np.zeros(len(depths)),
         depths=path,
+        courses=np.empty((1, 0, 8)),
+        commands=np.empty((1, 0)),
     )
 
 

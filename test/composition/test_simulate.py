@@ -3,6 +3,7 @@
 import csv
 import json
 from pathlib import Path
+import re
 
 from needle_dynamics import NeedleModel, NeedleParameters, simulate
 from needle_identification import message_counts, read_topic
@@ -21,7 +22,7 @@ def test_csv_and_bag_hold_the_run(tmp_path: Path) -> None:
     assert main([*SHORT, *words]) == 0
     p = NeedleParameters.preset('paper_si')
     start = NeedleModel(p).state_at(0.02, 5e-4)
-    run = simulate(p, start, 3.0, duration=0.005, interval=1e-4, tolerance=1e-8)
+    run = simulate(p, start, 3.0, duration=0.005, interval=1e-4)
     with (tmp_path / 'run.csv').open() as file:
         rows = list(csv.reader(file))
     assert rows[0][:5] == ['time', 'd', 'theta', 'q1', 'q2']
@@ -84,6 +85,23 @@ def test_the_run_is_named_and_so_are_its_files(
     assert out.endswith(f'wrote {file}\n')
 
 
+def test_it_says_how_fast_and_how_exact_it_was(capsys: pytest.CaptureFixture[str]) -> None:
+    """On a line of its own, and in the table and JSON; a smaller tolerance is met."""
+    assert main(SHORT) == 0
+    *_, last = capsys.readouterr().out.splitlines()
+    pace = re.fullmatch(
+        r'0\.005 s simulated in (\S+) s, (\S+) times (faster|slower) than real time', last
+    )
+    assert pace is not None
+    taken, times = float(pace[1]), float(pace[2])
+    ratio = 0.005 / taken if pace[3] == 'faster' else taken / 0.005
+    # Both are said to two digits.
+    assert times == pytest.approx(ratio, rel=0.1)
+    for words, most in (([], 1e-3), (['--tolerance', '1e-6'], 1e-6)):
+        assert main([*SHORT, '--json', *words]) == 0
+        assert 0.0 < json.loads(capsys.readouterr().out)['change by twice the step [1]'] <= most
+
+
 def test_what_the_samples_cannot_show_is_said(capsys: pytest.CaptureFixture[str]) -> None:
     """A mode beyond half the sampling rate, and a deflection beyond a linear beam."""
     few = ['simulate', '--preset', 'paper_si', '--duration', '0.002', '--depth', '0.05']
@@ -102,7 +120,7 @@ def test_the_contact_of_the_hub_is_named(capsys: pytest.CaptureFixture[str]) -> 
     for preset, time in (('paper_si', 0.0287), ('phantom', 22.13)):
         assert main(['simulate', '--json', '--preset', preset]) == 0
         said = capsys.readouterr()
-        # A run takes 5000 samples by default; the modes that they cannot show have faded.
+        # A run takes 2000 samples by default; the modes that they cannot show have faded.
         assert abs(json.loads(said.out)[name] - time) < 3e-3 * time
         assert said.err == ''
     assert main([*SHORT, '--json']) == 0

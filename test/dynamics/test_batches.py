@@ -17,6 +17,7 @@ from needle_dynamics import (
     simulate,
     simulate_batch,
 )
+from needle_dynamics.simulated.integrator import DEFAULT_STEP
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest
@@ -91,6 +92,7 @@ def test_a_batch_is_its_runs_one_by_one(n: int) -> None:
             force,
             duration=COUNT * INTERVAL,
             interval=INTERVAL,
+            step=DEFAULT_STEP,
         )
         assert np.array_equal(found.states[i], alone.states)
         assert np.array_equal(found.time, alone.time)
@@ -145,12 +147,16 @@ def test_a_run_that_leaves_its_range_is_no_number_from_there_and_harms_no_other(
     forces = np.array([3.0, -1.0, 2.0])
     found = batch(p, states, forces, workers=workers)
     with pytest.raises(InsertedLengthError):
-        simulate(p, states[1], -1.0, duration=COUNT * INTERVAL, interval=INTERVAL)
+        simulate(
+            p, states[1], -1.0, duration=COUNT * INTERVAL, interval=INTERVAL, step=DEFAULT_STEP
+        )
     valid = round(found.completed[1] / INTERVAL)
     assert 0 < valid < COUNT
     assert np.isfinite(found.states[1, : valid + 1]).all()
     assert np.isnan(found.states[1, valid + 1 :]).all()
-    alone = simulate(p, states[1], -1.0, duration=valid * INTERVAL, interval=INTERVAL)
+    alone = simulate(
+        p, states[1], -1.0, duration=valid * INTERVAL, interval=INTERVAL, step=DEFAULT_STEP
+    )
     # At 4 mm cond(G) is 1e9: what is left of the digits is in depth and velocity.
     assert_allclose(found.depth[1, : valid + 1], alone.depth, rtol=1e-6)
     for i in (0, 2):

@@ -12,7 +12,6 @@ from needle_dynamics import (
     NeedleParameters,
     ParameterError,
 )
-from needle_dynamics.simulated.integrator import DEFAULT_TOLERANCE
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest
@@ -177,7 +176,7 @@ def test_energy_of_a_full_insertion(capsys: pytest.CaptureFixture[str]) -> None:
         model = conservative(name)
         start = model.state_at(0.02, 5e-4)
         start[4] = -1.0
-        it = Integrator(model.parameters, start, tolerance=DEFAULT_TOLERANCE)
+        it = Integrator(model.parameters, start, tolerance=1e-8)
         before, seen = model.energy(start), []
         while it.depth < 0.199:
             it.advance(2e-4)

@@ -70,7 +70,7 @@ def test_a_lane_is_a_simulation_alone(graded: bool) -> None:
             return float(course[round(time / INTERVAL)])
 
         alone = simulate(
-            p, start, force, duration=whole * INTERVAL, interval=INTERVAL, graded=graded
+            p, start, force, duration=whole * INTERVAL, interval=INTERVAL, step=1e-5, graded=graded
         )
         scale = np.abs(alone.states).max(axis=0)
         # Rounding, enlarged by cond(G) of 1e5 at 3 cm, in the phases of a thousand steps.

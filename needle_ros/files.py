@@ -1,0 +1,39 @@
+"""Files that are there whole or not at all."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+import os
+from pathlib import Path
+
+from needle_ros.errors import ParameterError
+
+
+def write_whole(path: Path | str, content: bytes) -> None:
+    """
+    Write a file so that a reader sees the old content or the new, never a part.
+
+    Parameters
+    ----------
+    path : Path or str
+        File to write.
+    content : bytes
+        All of its content.
+
+    Raises
+    ------
+    ParameterError
+        If the file cannot be written.
+
+    """
+    path = Path(path)
+    if not path.name or path.is_dir():
+        raise ParameterError(f'{path} cannot be written: it is not the name of a file')
+    draft = path.with_name(f'{path.name}.{os.getpid()}.tmp')
+    try:
+        draft.write_bytes(content)
+        draft.replace(path)
+    except OSError as error:
+        with suppress(OSError):
+            draft.unlink()
+        raise ParameterError(f'{path} cannot be written: {error.strerror}') from error
