@@ -172,12 +172,13 @@ class MeanPlan(SteeringController):
     """Ours, but for the plan: a quadratic program for the mean of what may be true."""
 
     def _choose(self) -> complex:
-        ends = self._ends(0, self.step + 2)
-        w, shifts, limit = self.weights, ends.shifts, self._limit
+        # Where a guide ends that may go anywhere is where the tip ends without it.
+        (means, _, w), limit = self.reach, self._now.limit
+        shifts = self._model.guide[:, -1, self.step :]
         rows = np.sqrt(w)[:, np.newaxis] * shifts
         rows = np.vstack([rows, 0.1 * np.eye(shifts.shape[1])])
         found = []
-        need = np.sqrt(w) * (self._goal - ends.means)
+        need = np.sqrt(w) * (complex(*self.target) - means)
         for plane in (need.real, need.imag):
             wanted = np.concatenate([plane, np.zeros(shifts.shape[1])])
             found.append(float(lsq_linear(rows, wanted, (-limit, limit), method='bvls').x[0]))

@@ -8,5 +8,6 @@ Compiled functions of laws, closed loops and observer, one concept a file.
 `bending`             the bending at a frozen depth as the observer's state has it
 `kalman`              the steps of the Kalman filter
 `filter`              the observer's filter and its past
+`steering`            one look and one plan of the controller that steers the tip
 ====================  ============================================================================
 """

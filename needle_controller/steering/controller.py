@@ -22,58 +22,35 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import inf, isfinite, sqrt, tau
-from typing import Final, NamedTuple
+from math import cos, inf, isfinite, nan, sin
+from typing import NamedTuple
 
+from needle_controller.compiled.steering import (
+    BEVEL,
+    chance,
+    choose,
+    expect,
+    FINE,
+    FROZEN,
+    LOST,
+    MISSING,
+    reach,
+    SAME,
+    see,
+    Steering,
+    STEP,
+    TURNS,
+    weights,
+)
 from needle_controller.steering.responses import SteeringModel
 from needle_dynamics.arrays import ComplexArray, FloatArray
 from needle_ros.errors import JobError, ParameterError, ShapeError
 import numpy as np
 from numpy.typing import ArrayLike
 
-#: Part of the later positions that is counted on.
-_COUNTED: Final = 0.8
-
-#: Positions of the guide that are compared.
-_TRIED: Final = 121
-
-#: Directions in which the bevel may push, and positions of the guide with each that are compared.
-_ROLLS, _COARSE = 16, 13
-
-#: Mean square of what is out of reach that a turn must be worth [m^2].
-_TURN: Final = 1e-4**2
-
-#: Cost of a load on the guide beyond its limit [m^2/N^2]: more than any distance.
-_OVERLOAD: Final = 1.0
-
-#: Standard deviation of the part of the bevel's load that a robot at rest takes away.
-_LET_GO: Final = 0.03
-
-#: Place of the load of the bevel among the causes.
-_BEVEL: Final = 3
-
-#: Abscissas and weights of a normal distribution.
-_ABSCISSAS: Final = np.array([-(3.0**0.5), 0.0, 3.0**0.5])
-_WEIGHTS: Final = np.array([1.0, 4.0, 1.0]) / 6.0
-
-#: Cost of being away from the plan for the mean, and of motion in that plan [shift of the tip per
-#: shift of the guide, squared].
-_AWAY, _MOTION = 1e-5, 1e-2
-
-#: A look at this squared distance from what is expected, in standard deviations, is no look at
-#: this needle: by chance one in 3 million has it. So many of them are a fault.
-_IMPOSSIBLE, _MOST_IMPOSSIBLE = 30.0, 2
-
-#: Looks without a change while the needle goes on, from which on the sensor has frozen.
-_FROZEN: Final = 2
-
-#: Looks that may be missing in a row.
-_MOST_MISSING: Final = 6
-
 #: A target that is reached in less of what may be true is refused at the start, and warned of on
-#: the way; reached is what is no farther from it than this [m].
+#: the way.
 _REFUSED, _WARNED = 0.05, 0.5
-_REACHED: Final = 1e-3
 
 
 class Reach(NamedTuple):
@@ -152,56 +129,6 @@ class Guidance(NamedTuple):
     x: float
     z: float
     roll: float = 0.0
-
-
-class _Predicted(NamedTuple):
-    """
-    Where the tip is by each hypothesis.
-
-    Attributes
-    ----------
-    means : ndarray of complex, shape (h,)
-        Mean, x + i z [m].
-    variances : ndarray, shape (h,)
-        Variance along each axis [m^2].
-    shared : ndarray of complex, shape (h, constants)
-        Covariance with each of the unknown constants.
-
-    """
-
-    means: ComplexArray
-    variances: FloatArray
-    shared: ComplexArray
-
-
-class _Ends(NamedTuple):
-    """
-    Where the tip ends by each hypothesis without further positions of the guide.
-
-    Attributes
-    ----------
-    means : ndarray of complex, shape (h,)
-        Mean, x + i z [m].
-    errors : ndarray, shape (h,)
-        Standard deviation along each axis [m].
-    shifts : ndarray, shape (h, positions)
-        What each further position of the guide does.
-    turned : ndarray, shape (h,)
-        How far later turns can push it along each axis [m].
-
-    """
-
-    means: ComplexArray
-    errors: FloatArray
-    shifts: FloatArray
-    turned: FloatArray
-
-
-class _Choice(NamedTuple):
-    """A position of the guide, x + i z [m], and what it leaves out of reach [m^2]."""
-
-    cost: float
-    guide: complex
 
 
 class SteeringController:
@@ -291,26 +218,30 @@ class SteeringController:
             raise ParameterError(f'roll must be finite, got {roll!r} rad')
         if position_limit == 0.0 and turns == 0:
             raise ParameterError('position_limit and turns cannot both be 0: nothing would move')
-        self._model, self._limit, self._load_limit = model, position_limit, load_limit
-        #: Farthest that the guide may have gone after so many steps, from 1 [m].
-        self._ways = np.minimum(
-            step_limit * np.arange(1.0, model.steps + 1.0), 2.0 * position_limit
-        )
-        self.step, self.turns = 0, turns
+        from needle_dynamics.compiled.held import Held
+
         count, size = len(model.lengths), len(model.prior)
-        #: Position of the guide, x + i z, and direction of the bevel over that at zero roll, in
-        #: each step; the latter on the skin, too.
-        self._guide = np.zeros(model.steps, dtype=np.complex128)
-        self._turned = np.full(model.steps + 1, np.exp(-1j * roll))
-        self._roll = roll
-        self._mean = np.zeros((count, size), dtype=np.complex128)
-        self._mean[:, _BEVEL] = 1j * model.push
-        self._covariance = np.empty((count, size, size), dtype=np.complex128)
-        self._covariance[:] = model.prior
-        self._logs = np.zeros(count)
-        self._last: FloatArray | None = None
-        self._same = self._impossible = self._missing = 0
-        self.target = np.zeros(2)
+        mean = np.zeros((count, size), dtype=np.complex128)
+        mean[:, BEVEL] = 1j * model.push
+        covariance = np.empty((count, size, size), dtype=np.complex128)
+        covariance[:] = model.prior
+        self._model = model
+        self._now = Steering(
+            responses=model.responses,
+            limit=float(position_limit),
+            load_limit=float(load_limit),
+            ways=np.minimum(step_limit * np.arange(1.0, model.steps + 1.0), 2.0 * position_limit),
+            target=np.zeros(2),
+            mean=mean,
+            covariance=covariance,
+            logs=np.zeros(count),
+            guide=np.zeros(model.steps, dtype=np.complex128),
+            turned=np.full(model.steps + 1, complex(cos(roll), -sin(roll))),
+            roll=np.array([roll], dtype=np.float64),
+            last=np.full(2, nan),
+            counts=np.array([0, turns, 0, 0, 0]),
+        )
+        self._held = Held(self._now)
         self.aim(target)
 
     def aim(self, target: ArrayLike) -> None:
@@ -335,19 +266,34 @@ class SteeringController:
             raise ShapeError(f'target must be x and z, got shape {new.shape}')
         if not np.isfinite(new).all():
             raise ParameterError(f'target must be finite, got {new.tolist()} m')
-        before, self.target = self.target, new
+        before = self.target
+        self._now.target[:] = new
         if self.chance < _REFUSED:
             error = OutOfReachError(self._unreachable(), self.reach)
-            self.target = before
+            self._now.target[:] = before
             raise error
 
     # What is known.
 
     @property
+    def target(self) -> FloatArray:
+        """The target [m], shape (2,)."""
+        return self._now.target.copy()
+
+    @property
+    def step(self) -> int:
+        """Number of looks so far."""
+        return int(self._now.counts[STEP])
+
+    @property
+    def turns(self) -> int:
+        """Turns that are left."""
+        return int(self._now.counts[TURNS])
+
+    @property
     def weights(self) -> FloatArray:
         """Probability of each hypothesis, shape (h,)."""
-        found = np.exp(self._logs - self._logs.max())
-        return np.asarray(found / found.sum())
+        return weights(self._now.logs)
 
     @property
     def bending(self) -> float:
@@ -370,87 +316,24 @@ class SteeringController:
             Mean and covariance over all hypotheses.
 
         """
-        return self._over_all(self._tip(at, self._held()))
-
-    def _over_all(self, predicted: _Predicted) -> TipEstimate:
-        w = self.weights
-        mean = complex(w @ predicted.means)
-        apart = predicted.means - mean
-        planes = np.array([apart.real, apart.imag])
-        spread = (w * planes) @ planes.T
-        return TipEstimate(_planes(mean), spread + w @ predicted.variances * np.eye(2))
-
-    def _held(self) -> ComplexArray:
-        """Return where the guide was, and is if it rests from now on, shape (n,)."""
-        guide, done = self._guide.copy(), min(self.step, self._model.steps)
-        guide[done:] = guide[done - 1] if done else 0.0
-        return guide
-
-    def _tip(self, at: int, guide: ComplexArray) -> _Predicted:
-        """Return where the tip is at a depth by each hypothesis."""
-        model = self._model
-        rows = np.empty_like(self._mean)
-        rows[:, :-2] = model.causes[:, at]
-        rows[:, _BEVEL] = model.bevel[:, at] @ self._turned
-        rows[:, -2:] = (model.between[:, :, at] @ guide).T
-        means = model.guide[:, at] @ guide + (self._mean * rows).sum(axis=1)
-        shared = np.matmul(self._covariance, rows.conj()[..., np.newaxis])[..., 0]
-        let_go = _LET_GO * model.elastic[:, at] * np.abs(self._mean[:, _BEVEL])
-        return _Predicted(means, (shared * rows).sum(axis=1).real + let_go**2, shared)
+        x, z, xx, xz, zz = expect(self._held, range(self._model.steps + 1)[at])
+        return TipEstimate(np.array([x, z]), np.array([[xx, xz], [xz, zz]]))
 
     @property
     def chance(self) -> float:
         """How probable it is that the tip can still come within a millimeter of the target."""
-        chance, errors = 1.0, self._ends(self.turns, self.step + 1).errors[:, np.newaxis]
-        middles, sizes, w = self.reach
-        need = self._goal - middles
-        for plane, size in ((need.real, sizes.real), (need.imag, sizes.imag)):
-            off = np.abs(plane[:, np.newaxis] + errors * _ABSCISSAS)
-            chance *= float(w @ ((off <= _REACHED + size[:, np.newaxis]) @ _WEIGHTS))
-        return chance
+        return chance(self._held)
 
     @property
     def reach(self) -> Reach:
         """Where the tip can be brought from here."""
-        ends, k = self._ends(self.turns, self.step + 1), self.step
-        middles = ends.means.copy()
-        sizes = np.array(ends.turned * (1.0 + 1.0j), dtype=np.complex128)
-        there = self._guide[k - 1] if 0 < k <= self._model.steps else 0j
-        for unit, at in ((1.0, there.real), (1.0j, there.imag)):
-            center, half = self._room(np.array([at]), ends.shifts.shape[1])
-            middles += unit * (ends.shifts @ center[0])
-            sizes += unit * (np.abs(ends.shifts) @ half[0])
+        middles, sizes, _ = reach(self._held)
         return Reach(middles, sizes, self.weights)
-
-    def _room(self, begin: FloatArray, count: int) -> tuple[FloatArray, FloatArray]:
-        """Return middle and half width of where the guide can go from positions, (m, count)."""
-        ways, limit = self._ways[:count], self._limit
-        low = np.maximum(begin[:, np.newaxis] - ways, -limit)
-        high = np.minimum(begin[:, np.newaxis] + ways, limit)
-        return 0.5 * (low + high), 0.5 * (high - low)
-
-    @property
-    def _goal(self) -> complex:
-        return complex(*self.target)
 
     @property
     def warning(self) -> str:
         """What is to be said of the target now, '' for nothing."""
         return '' if self.chance >= _WARNED else self._unreachable()
-
-    def _ends(self, turns: int, first: int) -> _Ends:
-        """Return where the tip ends with so many turns from a step on, counted from 1."""
-        k, model = self.step, self._model
-        guide = self._guide.copy()
-        guide[k:] = 0.0
-        end = self._tip(-1, guide)
-        means, turned = end.means, np.zeros(len(end.means))
-        if turns:
-            later = model.bevel[:, -1, first:]
-            load = self._mean[:, _BEVEL]
-            means = means - load * (later @ self._turned[first:])
-            turned = _COUNTED * sqrt(0.5) * np.abs(load) * np.abs(later).sum(axis=1)
-        return _Ends(means, np.sqrt(end.variances), model.guide[:, -1, k:], turned)
 
     def _unreachable(self) -> str:
         middles, sizes, w = self.reach
@@ -517,11 +400,24 @@ class SteeringController:
             raise JobError(f'all {self._model.steps} steps are done')
         if not 0 <= at <= self.step:
             raise ParameterError(f'at must be in [0, {self.step}], got {at!r}')
-        predicted, variance = self._tip(at, self._held()), self._model.belief.noise**2
-        variance = max(variance, noise**2)
-        seen = self._checked(tip, self._over_all(predicted), variance)
-        if seen is not None:
-            self._learn(complex(*seen), predicted, variance)
+        seen = np.full(2, nan) if tip is None else np.array(tip, dtype=np.float64)
+        if seen.shape != (2,):
+            raise ShapeError(f'a look must be x and z, got shape {seen.shape}')
+        x, z = seen.tolist()
+        variance = max(self._model.belief.noise, noise) ** 2
+        kind, off_x, off_z = see(self._held, at, x, z, variance)
+        if kind == FINE:
+            return
+        if kind == LOST:
+            missing = self._now.counts[MISSING]
+            raise SteeringFaultError(f'the tip was not seen in {missing} looks')
+        if kind == FROZEN:
+            same = self._now.counts[SAME] + 1
+            raise SteeringFaultError(f'the sensor of the tip is frozen: {same} looks are the same')
+        raise SteeringFaultError(
+            f'the tip is {1e3 * off_x:+.2f} mm in x and {1e3 * off_z:+.2f} mm in z from where any '
+            f'needle of the belief can be'
+        )
 
     def plan(self) -> Guidance:
         """
@@ -533,147 +429,13 @@ class SteeringController:
             As from `next`.
 
         """
-        k = self.step
-        if k < self._model.steps:
-            self._guide[k] = self._choose()
-        self.step += 1
-        there = self._guide[min(k, self._model.steps - 1)]
-        return Guidance(float(there.real), float(there.imag), self._roll)
-
-    def _checked(
-        self, tip: Sequence[float] | FloatArray | None, there: TipEstimate, variance: float
-    ) -> FloatArray | None:
-        """Return a look that counts; None if there is none."""
-        if tip is None or not all(map(isfinite, np.ravel(tip))):
-            self._missing += 1
-            if self._missing > _MOST_MISSING:
-                raise SteeringFaultError(f'the tip was not seen in {self._missing} looks')
-            return None
-        seen = np.array(tip, dtype=np.float64)
-        if seen.shape != (2,):
-            raise ShapeError(f'a look must be x and z, got shape {seen.shape}')
-        self._missing = 0
-        same = self._last is not None and bool((seen == self._last).all())
-        self._same = self._same + 1 if same else 0
-        self._last = seen
-        if self._same >= _FROZEN:
-            raise SteeringFaultError(
-                f'the sensor of the tip is frozen: {self._same + 1} looks are the same'
-            )
-        if same:
-            return None
-        off = seen - there.mean
-        # What is absurd is infinitely far.
-        with np.errstate(over='ignore', invalid='ignore'):
-            distance = float(off @ np.linalg.solve(there.covariance + variance * np.eye(2), off))
-        if distance <= _IMPOSSIBLE:
-            self._impossible = 0
-            return seen
-        self._impossible += 1
-        if self._impossible >= _MOST_IMPOSSIBLE:
-            x, z = 1e3 * off
-            raise SteeringFaultError(
-                f'the tip is {x:+.2f} mm in x and {z:+.2f} mm in z from where any needle of the '
-                f'belief can be'
-            )
-        return None
-
-    def _learn(self, seen: complex, predicted: _Predicted, variance: float) -> None:
-        """Update each hypothesis, and their probabilities."""
-        whole = predicted.variances + variance
-        off = seen - predicted.means
-        gain = predicted.shared / whole[:, np.newaxis]
-        self._mean += off[:, np.newaxis] * gain
-        self._covariance -= gain[..., np.newaxis] * predicted.shared.conj()[:, np.newaxis]
-        self._logs -= 0.5 * np.abs(off) ** 2 / whole + np.log(whole)
+        now, k, last = self._now, self.step, self._model.steps - 1
+        if k <= last:
+            now.guide[k] = self._choose()
+        now.counts[STEP] = k + 1
+        there = complex(now.guide[min(k, last)])
+        return Guidance(there.real, there.imag, float(now.roll[0]))
 
     def _choose(self) -> complex:
-        """Return the next position of the guide, and turn the needle if that is worth it."""
-        ends = self._ends(self.turns, self.step + 2)
-        tried = self._tried(_TRIED)
-        best = self._best(ends, tried)
-        if self.turns == 0 or best.cost < _TURN:
-            return best.guide
-        # As it is, but for a turn now.
-        left = self.turns - 1
-        base = self._ends(left, self.step + 2)
-        columns = slice(self.step + 1, self.step + 2 if left else None)
-        load = self._mean[:, _BEVEL] * self._model.bevel[:, -1, columns].sum(axis=1)
-        rolls = self._roll + tau * np.arange(1 - _ROLLS // 2, _ROLLS // 2 + 1) / _ROLLS
-        ways = np.exp(-1j * rolls)
-        others = [base._replace(means=base.means + load * (way - self._way)) for way in ways]
-        few = self._tried(_COARSE)
-        costs = [sum(float(cost.min()) for cost in self._costs(one, few)) for one in others]
-        k = int(np.argmin(costs))
-        if costs[k] + _TURN > best.cost:
-            return best.guide
-        self._roll, self.turns = float(rolls[k]), left
-        self._turned[self.step + 1 :] = ways[k]
-        return self._best(others[k], tried).guide
-
-    def _tried(self, count: int) -> tuple[FloatArray, FloatArray]:
-        """Return positions that the guide may have next, in x and in z [m]."""
-        there = complex(self._guide[self.step - 1]) if self.step else 0j
-        found = []
-        for at in (there.real, there.imag):
-            (middle,), (half,) = (one[0] for one in self._room(np.array([at]), 1))
-            found.append(middle + half * np.linspace(-1.0, 1.0, count if half else 1))
-        return found[0], found[1]
-
-    @property
-    def _way(self) -> complex:
-        """Direction of the bevel now over that at zero roll."""
-        return complex(np.exp(-1j * self._roll))
-
-    def _costs(
-        self, ends: _Ends, tried: tuple[FloatArray, FloatArray]
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return the mean square of what positions leave out of reach, in x and in z [m^2]."""
-        w, now, after = self.weights, ends.shifts[:, :1], ends.shifts[:, 1:]
-        sizes, need = np.abs(after), self._goal - ends.means
-        spread = ends.errors[:, np.newaxis, np.newaxis] * _ABSCISSAS
-        felt, stiffness = self._felt()
-        found = []
-        for plane, force, to in (
-            (need.real, felt.real, tried[0]), (need.imag, felt.imag, tried[1]),
-        ):  # fmt: skip
-            center, half = self._room(to, after.shape[1])
-            left = plane[:, np.newaxis] - now * to - after @ center.T
-            later = _COUNTED * (sizes @ half.T) + ends.turned[:, np.newaxis]
-            off = np.abs(left[..., np.newaxis] + spread)
-            short = np.maximum(0.0, off - later[..., np.newaxis])
-            over = np.maximum(0.0, np.abs(force + stiffness * to) - self._load_limit)
-            found.append(w @ (short**2 @ _WEIGHTS) + _OVERLOAD * over**2)
-        return found[0], found[1]
-
-    def _felt(self) -> tuple[complex, float]:
-        """Return the load on a guide that goes to zero [N], and what a shift adds [N/m]."""
-        if self._load_limit == inf:
-            return 0j, 0.0
-        k, w, model = self.step, self.weights, self._model
-        guide = self._guide.copy()
-        guide[k:] = 0.0
-        loads = model.causes_load[:, k] * self._mean[:, :-2]
-        loads[:, _BEVEL] = (model.bevel_load[:, k] @ self._turned) * self._mean[:, _BEVEL]
-        force = w @ (model.guide_load[:, k] @ guide + loads.sum(axis=1))
-        return complex(force), float(w @ model.guide_load[:, k, k])
-
-    def _best(self, ends: _Ends, tried: tuple[FloatArray, FloatArray]) -> _Choice:
-        """Return the best of positions along each axis."""
-        w, shifts, limit = self.weights, ends.shifts, self._limit
-        # The plan for the mean: least squares, with a price of motion.
-        weighted = w[:, np.newaxis] * shifts
-        normal = weighted.T @ shifts + _MOTION * np.eye(shifts.shape[1])
-        plan = np.linalg.solve(normal, weighted.T @ (self._goal - ends.means))[0]
-        whole, found = 0.0, list[float]()
-        wants = plan.real, plan.imag
-        for cost, to, wanted in zip(self._costs(ends, tried), tried, wants, strict=True):
-            away = _AWAY * (to - np.clip(wanted, -limit, limit)) ** 2
-            at = int(np.argmin(cost + away))
-            whole += float(cost[at])
-            found.append(float(to[at]))
-        return _Choice(whole, complex(*found))
-
-
-def _planes(value: complex) -> FloatArray:
-    return np.array([value.real, value.imag])
+        """Return the next position of the guide, x + i z [m]."""
+        return choose(self._held)

@@ -22,6 +22,7 @@ from dataclasses import replace
 from math import ceil, pi
 from typing import Final
 
+from needle_controller.compiled.steering import Responses
 from needle_controller.steering.belief import SteeringBelief
 from needle_dynamics.arrays import FloatArray
 from needle_dynamics.compiled.cut import insert
@@ -97,6 +98,8 @@ class SteeringModel:
     prior : ndarray, shape (7 + n, 7 + n)
         Covariance of the causes, before anything is seen, and of the places between two
         hypotheses.
+    responses : Responses
+        All responses, as compiled functions take them.
 
     Raises
     ------
@@ -157,6 +160,12 @@ class SteeringModel:
         )
         apart = np.abs(at[:, np.newaxis] - at) / b.path_noise_length
         self.prior[4:-2, 4:-2] = b.path_noise / (2.0 * b.path_noise_length) * np.exp(-apart)
+        self.responses = Responses(
+            self.guide, self.causes, self.bevel, self.elastic,
+            self.guide_load, self.causes_load, self.bevel_load, self.between,
+            _sums_from(self.guide[:, -1], self.steps + 1),
+            _sums_from(self.bevel[:, -1], self.steps + 3),
+        )  # fmt: skip
 
     @property
     def steps(self) -> int:
@@ -232,3 +241,10 @@ class SteeringModel:
             np.append(elastic, elastic[-1]),
             *sorted_by_cause(felt[:, 2 if self._together else 1 :: 2], none, none),
         )
+
+
+def _sums_from(values: FloatArray, count: int) -> FloatArray:
+    """Return the sums of absolute values from each column on, shape (h, count): 0 beyond."""
+    found = np.zeros((len(values), count))
+    found[:, : values.shape[1]] = np.abs(values)[:, ::-1].cumsum(axis=1)[:, ::-1]
+    return found

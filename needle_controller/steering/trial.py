@@ -179,7 +179,7 @@ def insert(
     for k, depth in enumerate(depths.tolist()):
         if k:
             one.move(guide=to[:2], roll=begun + to.roll)
-            load = max(load, float(np.hypot(*one.guide_load[0])))
+            load = max(load, hypot(*one.guide_load[0].tolist()))
             one.move(depth=depth)
             if watch is not None:
                 watch(one)

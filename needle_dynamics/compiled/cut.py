@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from math import ceil, cos, inf, sin
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, TYPE_CHECKING
 
 from needle_dynamics.arrays import FloatArray, IntArray
 from needle_dynamics.compiled.beam import (
@@ -18,6 +18,9 @@ from needle_dynamics.compiled.beam import (
 )
 from needle_dynamics.compiled.cache import compiled, inlined
 import numpy as np
+
+if TYPE_CHECKING:
+    from needle_dynamics.compiled.held import Held
 
 #: Places in `Cut.pose`.
 DEPTH: Final = 0
@@ -122,6 +125,23 @@ class Cut(NamedTuple):
     tip: FloatArray
     load: FloatArray
     counts: IntArray
+
+
+class Needle(NamedTuple):
+    """
+    A needle that cuts its path.
+
+    Attributes
+    ----------
+    constants : Steered
+        Its constants.
+    state : Cut
+        Its state.
+
+    """
+
+    constants: Steered
+    state: Cut
 
 
 class Pose(NamedTuple):
@@ -480,6 +500,72 @@ def respond(n: Steered, c: Cut, found: FloatArray) -> None:
         found[1, k] = e.t10 * w + e.t11 * turn
 
 
+@inlined
+def _bend(n: Steered, c: Cut, found: FloatArray, felt: FloatArray) -> int:
+    """Find the needle at its nodes, and what the guide feels; return the last node."""
+    depth = c.pose[DEPTH]
+    last = node_before(c.springs, c.counts[LAST], depth)
+    shape(c.springs, last, depth, n.ei, c.pose[FREE], c.guide, c.load, found, felt)
+    return last
+
+
+@compiled
+def bring(held: Held[Needle], to: Pose) -> None:
+    """
+    Do what `move` does with a needle that is held.
+
+    Parameters
+    ----------
+    held : Held of Needle
+        The needle, overwritten.
+    to : Pose
+        As for `move`.
+
+    """
+    move(held.value.constants, held.value.state, to)
+
+
+@compiled
+def bend(held: Held[Needle], found: FloatArray, felt: FloatArray) -> int:
+    """
+    Find the needle from the guide to the node before the tip, and what the guide feels.
+
+    Parameters
+    ----------
+    held : Held of Needle
+        The needle.
+    found : ndarray, shape (2, rows, 2)
+        For deflections [m] and slopes, by plane and node.
+    felt : ndarray, shape (2, 2)
+        For force [N] and moment [N m] of the needle on the guide, by plane.
+
+    Returns
+    -------
+    int
+        Row of the node before the tip.
+
+    """
+    return _bend(held.value.constants, held.value.state, found, felt)
+
+
+@compiled
+def remember(draws: FloatArray, part: float) -> None:
+    """
+    Add to each draw a part of the one before it.
+
+    Parameters
+    ----------
+    draws : ndarray, shape (k, 2)
+        Independent draws; overwritten.
+    part : float
+        The part.
+
+    """
+    for i in range(1, len(draws)):
+        for plane in range(2):
+            draws[i, plane] += part * draws[i - 1, plane]
+
+
 @compiled
 def set_free(n: Steered, c: Cut, free: float) -> None:
     """
@@ -560,7 +646,5 @@ def insert(
             move(n, c, to)
             tips[run, i, 0], tips[run, i, 1] = c.tip[0, 0], c.tip[1, 0]
             if len(felt) > 0:
-                depth, free = c.pose[DEPTH], c.pose[FREE]
-                last = node_before(c.springs, c.counts[LAST], depth)
-                shape(c.springs, last, depth, n.ei, free, c.guide, c.load, nodes, of_guide)
+                _bend(n, c, nodes, of_guide)
                 felt[run, i, 0], felt[run, i, 1] = of_guide[0, 0], of_guide[1, 0]

@@ -44,10 +44,17 @@ class Held(structref.StructRefProxy, Generic[_Value]):  # type: ignore[misc]
     """
 
     value: _Value
+    _kept: _Value
 
     def __new__(cls, value: _Value) -> Held[_Value]:
         """Convert the value."""
-        return _hold(value)
+        held = _hold(value)
+        held._kept = value
+        return held
+
+    def __reduce__(self) -> tuple[type[Held[_Value]], tuple[_Value]]:
+        """Let a copy, or one from a pickle, hold a copy of the value."""
+        return Held, (self._kept,)
 
 
 structref.define_proxy(Held, _HeldType, ['value'])

@@ -3,22 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import accumulate
 from math import ceil, exp, isfinite, sqrt
 from typing import Any, Final, NamedTuple
 
 from needle_dynamics.arrays import FloatArray
-from needle_dynamics.compiled.beam import shape, Springs
+from needle_dynamics.compiled.beam import Springs
 from needle_dynamics.compiled.cut import (
+    bend,
+    bring,
     Cut,
     DEEPEST,
     DEPTH,
     FREE,
     LAST,
-    move,
-    node_before,
+    Needle,
     place,
     Pose,
+    remember,
     respond,
     ROLL,
     set_free,
@@ -165,13 +166,14 @@ def wandering(needle: NeedleParameters, steering: SteeringParameters, seed: int)
     cell = noise_cell(steering)
     depths = np.arange(ceil(needle.length / cell) + 2) * cell
     keep = exp(-cell / steering.path_noise_length)
-    draws = np.random.default_rng(seed).standard_normal((len(depths), 2))
-    draws[1:] *= sqrt(1.0 - keep * keep)
-    turns = np.array(list(accumulate(draws, lambda last, draw: keep * last + draw)))
+    turns = np.random.default_rng(seed).standard_normal((len(depths), 2))
+    turns[1:] *= sqrt(1.0 - keep * keep)
+    remember(turns, keep)
     ei, tissue = needle.bending_stiffness, needle.tissue
-    loads = np.array([turning_load(ei, k) for k in map(tissue.stiffness, depths)])
+    loads = np.array([turning_load(ei, k) for k in tissue.stiffnesses])
+    layers = np.searchsorted(tissue.starts, depths, side='right') - 1
     size = sqrt(steering.path_noise / (2.0 * steering.path_noise_length))
-    return np.asarray(size * turns * loads[:, np.newaxis])
+    return np.asarray(size * turns * loads[layers, np.newaxis])
 
 
 def empty_cut(length: float, element: float, layers: int) -> Cut:
@@ -267,10 +269,13 @@ class SteeredNeedle:
         roll: float = 0.0,
         seed: int = 0,
     ) -> None:
+        from needle_dynamics.compiled.held import Held
+
         self.needle = needle
         self.steering = steering or SteeringParameters()
         self._constants = steered(needle, self.steering, wandering(needle, self.steering, seed))
         self._cut = empty_cut(needle.length, self._constants.element, len(self._constants.starts))
+        self._held = Held(Needle(self._constants, self._cut))
         self._shift = np.zeros(3)
         self._guide, self._tilt = _pair('guide', guide), _pair('tilt', tilt)
         self._roll = _finite('roll', roll)
@@ -354,9 +359,9 @@ class SteeredNeedle:
             free = self.steering.free_length + float(shift[1])
             if free != self._cut.pose[FREE]:
                 set_free(self._constants, self._cut, free)
-            move(self._constants, self._cut, self._pose(here))
+            bring(self._held, self._pose(here))
         self._guide, self._tilt, self._roll = given
-        move(self._constants, self._cut, self._pose(depth))
+        bring(self._held, self._pose(depth))
 
     def checked(
         self,
@@ -463,12 +468,9 @@ class SteeredNeedle:
         return NeedlePath(depths + self._shift[1], values + self._shift[[0, 2]])
 
     def _solve(self) -> tuple[int, FloatArray, FloatArray]:
-        n, c = self._constants, self._cut
-        last = node_before(c.springs, c.counts[LAST], c.pose[DEPTH])
-        found, felt = np.empty((2, last + 1, 2)), np.empty((2, 2))
-        free, depth = c.pose[FREE], c.pose[DEPTH]
-        shape(c.springs, last, depth, n.ei, free, c.guide, c.load, found, felt)
-        return last, found, felt
+        found, felt = np.empty((2, len(self._cut.springs.depths), 2)), np.empty((2, 2))
+        last = bend(self._held, found, felt)
+        return last, found[:, : last + 1], felt
 
     @property
     def shape(self) -> NeedleShape:

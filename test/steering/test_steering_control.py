@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+import copy
 from dataclasses import replace
+import pickle
 from typing import Any
 
 from hypothesis import given, settings
@@ -28,7 +30,7 @@ from needle_dynamics import (
     SteeringParameters,
 )
 import numpy as np
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 import pytest
 
 NEEDLE, _STEERING, _ = STEERING_PRESETS['bending_35mm']
@@ -118,6 +120,28 @@ def test_it_hits_whatever_of_its_belief_is_true(
     assert np.abs(one.guide).max() <= 6e-3
     there = controller.expected()
     assert np.hypot(*(there.mean - tip)) < 1e-4
+
+
+@pytest.mark.parametrize('again', [copy.deepcopy, lambda one: pickle.loads(pickle.dumps(one))])  # noqa: S301
+def test_copies_go_their_own_way(again: Callable[[Any], Any]) -> None:
+    """Of needle and controller, half way in; they end where the first ones end."""
+    one, controller = SteeredNeedle(*other(0.9)), SteeringController(MODEL, (2e-3, 1e-3))
+    to, copies = Guidance(0.0, 0.0), list[tuple[SteeredNeedle, SteeringController, Guidance]]()
+    rng = np.random.default_rng(3)
+    for k, look in enumerate(1e-6 * rng.standard_normal((21, 2))):
+        pairs = [(one, controller, to), *copies]
+        for i, (needle, follows, there) in enumerate(pairs):
+            if k:
+                needle.move(guide=there[:2])
+                needle.move(depth=DEPTHS[k].item())
+            pairs[i] = needle, follows, follows.next(needle.tip[[0, 2]] + look)
+        (one, controller, to), *copies = pairs
+        if k == 10:
+            assert controller.step == 11
+            copies = [(again(one), again(controller), to)]
+    assert copies[0][0] is not one
+    assert_array_equal(copies[0][0].tip, one.tip)
+    assert one.depth == DEPTHS[-1]
 
 
 def test_planes_are_alike() -> None:

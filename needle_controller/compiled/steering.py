@@ -1,0 +1,656 @@
+r"""
+One look and one plan of the controller that steers the tip; `SteeringController` says what for.
+
+By hypothesis the tip at a depth is :math:`z = a \cdot b + x \cdot \theta` with the positions b of
+the guide, x + i z, and the unknown constants :math:`\theta`, of which mean and covariance P are
+known. So it has the mean :math:`a \cdot b + x \cdot \bar\theta`, and :math:`s = P \bar x` is its
+covariance with the constants: its variance is :math:`x \cdot s`, and a look at it is an update of
+rank one.
+"""
+
+from __future__ import annotations
+
+from math import cos, inf, isfinite, log, sin, sqrt, tau
+from typing import Final, NamedTuple, TYPE_CHECKING
+
+from needle_dynamics.arrays import ComplexArray, FloatArray, IntArray
+from needle_dynamics.compiled.cache import compiled, inlined
+from needle_dynamics.compiled.matrices import backward, cholesky, forward
+import numpy as np
+
+if TYPE_CHECKING:
+    from needle_dynamics.compiled.held import Held
+
+#: Part of the later positions that is counted on.
+_COUNTED: Final = 0.8
+
+#: Positions of the guide that are compared.
+_TRIED: Final = np.linspace(-1.0, 1.0, 121)
+
+#: Directions in which the bevel may push, and positions of the guide with each that are compared.
+_ROLLS: Final = 16
+_COARSE: Final = np.linspace(-1.0, 1.0, 13)
+
+#: Mean square of what is out of reach that a turn must be worth [m^2].
+_TURN: Final = 1e-4**2
+
+#: Cost of a load on the guide beyond its limit [m^2/N^2]: more than any distance.
+_OVERLOAD: Final = 1.0
+
+#: Standard deviation of the part of the bevel's load that a robot at rest takes away.
+_LET_GO: Final = 0.03
+
+#: Place of the load of the bevel among the constants.
+BEVEL: Final = 3
+
+#: Abscissas and weights of a normal distribution.
+_ABSCISSAS: Final = np.array([-(3.0**0.5), 0.0, 3.0**0.5])
+_WEIGHTS: Final = np.array([1.0, 4.0, 1.0]) / 6.0
+
+#: Cost of being away from the plan for the mean, and of motion in that plan [shift of the tip per
+#: shift of the guide, squared].
+_AWAY, _MOTION = 1e-5, 1e-2
+
+#: A look at this squared distance from what is expected, in standard deviations, is no look at
+#: this needle: by chance one in 3 million has it. So many of them are a fault.
+_IMPOSSIBLE, _MOST_IMPOSSIBLE = 30.0, 2
+
+#: Looks without a change while the needle goes on, from which on the sensor has frozen.
+_FROZEN: Final = 2
+
+#: Looks that may be missing in a row.
+_MOST_MISSING: Final = 6
+
+#: Reached is what is no farther from the target than this [m].
+_REACHED: Final = 1e-3
+
+#: Places in `Steering.counts`: looks so far, turns that are left, and looks in a row that were
+#: the same, impossible and missing.
+STEP: Final = 0
+TURNS: Final = 1
+SAME: Final = 2
+STRANGE: Final = 3
+MISSING: Final = 4
+
+#: What a look may be.
+FINE: Final = 0
+LOST: Final = 1
+FROZEN: Final = 2
+FOREIGN: Final = 3
+
+
+class Responses(NamedTuple):
+    """
+    What the tip does by each hypothesis: the arrays of `SteeringModel` of these names, and sums.
+
+    Attributes
+    ----------
+    guide, causes, bevel, elastic, guide_load, causes_load, bevel_load, between : ndarray
+        As there.
+    later_guide : ndarray, shape (h, n + 1)
+        Sums of the absolute values of `guide` at the last depth, from each step on.
+    later_bevel : ndarray, shape (h, n + 3)
+        The same of `bevel`, from the skin and from each step on.
+
+    """
+
+    guide: FloatArray
+    causes: FloatArray
+    bevel: FloatArray
+    elastic: FloatArray
+    guide_load: FloatArray
+    causes_load: FloatArray
+    bevel_load: FloatArray
+    between: FloatArray
+    later_guide: FloatArray
+    later_bevel: FloatArray
+
+
+class Steering(NamedTuple):
+    """
+    What a steering controller knows and may do, with h hypotheses, n steps and m constants.
+
+    Attributes
+    ----------
+    responses : Responses
+        What the tip does.
+    limit : float
+        Farthest position of the guide along each axis [m].
+    load_limit : float
+        Largest force of the guide that is planned [N].
+    ways : ndarray, shape (n,)
+        How far the guide may have gone after so many steps, from 1 [m].
+    target : ndarray, shape (2,)
+        Where the tip shall be, x and z [m].
+    mean : ndarray of complex, shape (h, m)
+        Mean of the constants.
+    covariance : ndarray of complex, shape (h, m, m)
+        Their covariance.
+    logs : ndarray, shape (h,)
+        Logarithm of the probability of each hypothesis, up to a constant.
+    guide : ndarray of complex, shape (n,)
+        Position of the guide in each step [m]; 0 in those that are still to come.
+    turned : ndarray of complex, shape (n + 1,)
+        Direction of the bevel over that at zero roll, on the skin and in each step.
+    roll : ndarray, shape (1,)
+        Roll of the needle [rad].
+    last : ndarray, shape (2,)
+        The last look [m].
+    counts : ndarray of int, shape (5,)
+        Looks so far, turns that are left, looks in a row that were the same, impossible, missing.
+
+    """
+
+    responses: Responses
+    limit: float
+    load_limit: float
+    ways: FloatArray
+    target: FloatArray
+    mean: ComplexArray
+    covariance: ComplexArray
+    logs: FloatArray
+    guide: ComplexArray
+    turned: ComplexArray
+    roll: FloatArray
+    last: FloatArray
+    counts: IntArray
+
+
+class Tip(NamedTuple):
+    """
+    Where the tip is by each hypothesis.
+
+    Attributes
+    ----------
+    means : ndarray of complex, shape (h,)
+        Mean, x + i z [m].
+    variances : ndarray, shape (h,)
+        Variance along each axis [m^2].
+    shared : ndarray of complex, shape (h, m)
+        Covariance with each of the constants.
+
+    """
+
+    means: ComplexArray
+    variances: FloatArray
+    shared: ComplexArray
+
+
+class Ends(NamedTuple):
+    """
+    Where the tip ends by each hypothesis without further positions of the guide.
+
+    Attributes
+    ----------
+    means : ndarray of complex, shape (h,)
+        Mean, x + i z [m].
+    errors : ndarray, shape (h,)
+        Standard deviation along each axis [m].
+    turned : ndarray, shape (h,)
+        How far later turns can push it along each axis [m].
+
+    """
+
+    means: ComplexArray
+    errors: FloatArray
+    turned: FloatArray
+
+
+class Whole(NamedTuple):
+    """
+    Where the tip is over all hypotheses.
+
+    Attributes
+    ----------
+    x, z : float
+        Mean [m].
+    xx, xz, zz : float
+        Covariance [m^2].
+
+    """
+
+    x: float
+    z: float
+    xx: float
+    xz: float
+    zz: float
+
+
+# What is known.
+
+
+@compiled
+def weights(logs: FloatArray) -> FloatArray:
+    """
+    Return probabilities.
+
+    Parameters
+    ----------
+    logs : ndarray, shape (h,)
+        Their logarithms, up to a constant.
+
+    Returns
+    -------
+    ndarray, shape (h,)
+        The probabilities.
+
+    """
+    found = np.exp(logs - logs.max())
+    return np.asarray(found / found.sum())
+
+
+@inlined
+def _held(c: Steering) -> ComplexArray:
+    """Return where the guide was, and is if it rests from now on, shape (n,)."""
+    guide, done = c.guide.copy(), min(c.counts[STEP], len(c.guide))
+    if done > 0:
+        guide[done:] = guide[done - 1]
+    return guide
+
+
+@compiled
+def _tip(c: Steering, at: int, guide: ComplexArray) -> Tip:
+    """Return where the tip is at a depth by each hypothesis."""
+    r = c.responses
+    h, m = c.mean.shape
+    means, variances = np.zeros(h, np.complex128), np.zeros(h)
+    shared, row = np.zeros((h, m), np.complex128), np.empty(m, np.complex128)
+    for i in range(h):
+        row[: m - 2] = r.causes[i, at]
+        row[BEVEL] = row[m - 2] = row[m - 1] = 0.0
+        for j in range(len(c.turned)):
+            row[BEVEL] += r.bevel[i, at, j] * c.turned[j]
+        for j in range(len(guide)):
+            means[i] += r.guide[i, at, j] * guide[j]
+            row[m - 2] += r.between[0, i, at, j] * guide[j]
+            row[m - 1] += r.between[1, i, at, j] * guide[j]
+        of = shared[i]
+        for j in range(m):
+            means[i] += c.mean[i, j] * row[j]
+            # P is Hermitian: its rows are its columns, conjugated.
+            for l in range(m):
+                of[l] += row[j] * c.covariance[i, j, l]
+        for j in range(m):
+            variances[i] += of[j].real * row[j].real + of[j].imag * row[j].imag
+            of[j] = of[j].conjugate()
+        variances[i] += (_LET_GO * r.elastic[i, at] * abs(c.mean[i, BEVEL])) ** 2
+    return Tip(means, variances, shared)
+
+
+@compiled
+def _whole(w: FloatArray, tip: Tip) -> Whole:
+    """Return where the tip is over all hypotheses."""
+    x = z = xx = xz = zz = 0.0
+    for i in range(len(w)):
+        x += w[i] * tip.means[i].real
+        z += w[i] * tip.means[i].imag
+    for i in range(len(w)):
+        dx, dz = tip.means[i].real - x, tip.means[i].imag - z
+        xx += w[i] * (dx * dx + tip.variances[i])
+        xz += w[i] * dx * dz
+        zz += w[i] * (dz * dz + tip.variances[i])
+    return Whole(x, z, xx, xz, zz)
+
+
+@compiled
+def expect(held: Held[Steering], at: int) -> Whole:
+    """
+    Return where the tip is expected; guide and roll stay as they were last sent.
+
+    Parameters
+    ----------
+    held : Held of Steering
+        What is known.
+    at : int
+        Number of the depth, from 0.
+
+    Returns
+    -------
+    Whole
+        Mean and covariance over all hypotheses.
+
+    """
+    c = held.value
+    return _whole(weights(c.logs), _tip(c, at, _held(c)))
+
+
+@compiled
+def see(
+    held: Held[Steering], at: int, x: float, z: float, variance: float
+) -> tuple[int, float, float]:
+    """
+    Take a look at the tip: each hypothesis learns from it, and becomes more probable, or less.
+
+    Parameters
+    ----------
+    held : Held of Steering
+        What is known; updated.
+    at : int
+        Number of the depth, from 0.
+    x, z : float
+        The look [m]; nan if the tip was not seen.
+    variance : float
+        Its variance along each axis [m^2].
+
+    Returns
+    -------
+    kind : int
+        `FINE`, or why the needle must stop.
+    off_x, off_z : float
+        How far the tip is from where it was expected [m].
+
+    """
+    c = held.value
+    tip, w = _tip(c, at, _held(c)), weights(c.logs)
+    there = _whole(w, tip)
+    off_x, off_z = x - there.x, z - there.z
+    kind, counts = _judge(c, x, z, off_x, off_z, there, variance)
+    if counts:
+        for i in range(len(w)):
+            _learn(c, i, complex(x, z) - tip.means[i], tip.variances[i] + variance, tip.shared[i])
+    return kind, off_x, off_z
+
+
+@inlined
+def _judge(
+    c: Steering, x: float, z: float, off_x: float, off_z: float, there: Whole, variance: float
+) -> tuple[int, bool]:
+    """Return what a look is, and whether it counts."""
+    counts = c.counts
+    if not (isfinite(x) and isfinite(z)):
+        counts[MISSING] += 1
+        return (LOST if counts[MISSING] > _MOST_MISSING else FINE), False
+    counts[MISSING] = 0
+    same = x == c.last[0] and z == c.last[1]
+    counts[SAME] = counts[SAME] + 1 if same else 0
+    c.last[0], c.last[1] = x, z
+    if same:
+        return (FROZEN if counts[SAME] >= _FROZEN else FINE), False
+    xx, xz, zz = there.xx + variance, there.xz, there.zz + variance
+    distance = zz * off_x**2 - 2.0 * xz * off_x * off_z + xx * off_z**2
+    # What is absurd is infinitely far, or nowhere.
+    if distance <= _IMPOSSIBLE * (xx * zz - xz**2):
+        counts[STRANGE] = 0
+        return FINE, True
+    counts[STRANGE] += 1
+    return (FOREIGN if counts[STRANGE] >= _MOST_IMPOSSIBLE else FINE), False
+
+
+@inlined
+def _learn(c: Steering, i: int, off: complex, variance: float, shared: ComplexArray) -> None:
+    """Update a hypothesis, and its probability, by a look that is off what it expected."""
+    for j in range(len(shared)):
+        gain = shared[j] / variance
+        c.mean[i, j] += gain * off
+        to = c.covariance[i, j]
+        for k in range(len(shared)):
+            to[k] -= gain * shared[k].conjugate()
+    c.logs[i] -= 0.5 * (off.real**2 + off.imag**2) / variance + log(variance)
+
+
+# Where the tip can be brought.
+
+
+@compiled
+def _ends(c: Steering, turns: int, first: int) -> Ends:
+    """Return where the tip ends with so many turns from a step on, counted from 1."""
+    r, last = c.responses, len(c.guide)
+    # What is still to come of the guide is 0.
+    tip = _tip(c, last, c.guide)
+    means, turned = tip.means, np.zeros(len(tip.means))
+    if turns > 0:
+        for i in range(len(means)):
+            load = c.mean[i, BEVEL]
+            for j in range(first, last + 1):
+                means[i] -= load * r.bevel[i, last, j] * c.turned[j]
+            turned[i] = _COUNTED * sqrt(0.5) * abs(load) * r.later_bevel[i, first]
+    return Ends(means, np.sqrt(tip.variances), turned)
+
+
+@inlined
+def _there(c: Steering) -> complex:
+    """Return where the guide is [m]."""
+    k = c.counts[STEP]
+    return c.guide[k - 1] if 0 < k <= len(c.guide) else 0j
+
+
+@inlined
+def _room(c: Steering, begin: float, step: int) -> tuple[float, float]:
+    """Return middle and half width of where the guide can go in some steps more than one [m]."""
+    low, high = max(begin - c.ways[step], -c.limit), min(begin + c.ways[step], c.limit)
+    return 0.5 * (low + high), 0.5 * (high - low)
+
+
+@compiled
+def _reach(c: Steering) -> tuple[ComplexArray, ComplexArray, FloatArray]:
+    k, last, there = c.counts[STEP], len(c.guide), _there(c)
+    ends = _ends(c, c.counts[TURNS], k + 1)
+    middles, sizes = ends.means, np.empty(len(ends.means), np.complex128)
+    for i in range(len(sizes)):
+        sizes[i] = complex(ends.turned[i], ends.turned[i])
+    for j in range(k, last):
+        (x, wide), (z, high) = _room(c, there.real, j - k), _room(c, there.imag, j - k)
+        for i in range(len(middles)):
+            shift = c.responses.guide[i, last, j]
+            middles[i] += shift * complex(x, z)
+            sizes[i] += abs(shift) * complex(wide, high)
+    return middles, sizes, ends.errors
+
+
+@compiled
+def reach(held: Held[Steering]) -> tuple[ComplexArray, ComplexArray, FloatArray]:
+    """
+    Return where the tip can be brought from here, by each hypothesis.
+
+    Parameters
+    ----------
+    held : Held of Steering
+        What is known.
+
+    Returns
+    -------
+    middles : ndarray of complex, shape (h,)
+        Where it goes without further motion, x + i z [m].
+    sizes : ndarray of complex, shape (h,)
+        How far it can be brought from there, along x + i along z [m].
+    errors : ndarray, shape (h,)
+        Standard deviation of the middles along each axis [m].
+
+    """
+    return _reach(held.value)
+
+
+@compiled
+def chance(held: Held[Steering]) -> float:
+    """
+    Return how probable it is that the tip can still come within a millimeter of the target.
+
+    Parameters
+    ----------
+    held : Held of Steering
+        What is known.
+
+    Returns
+    -------
+    float
+        The probability.
+
+    """
+    c = held.value
+    (middles, sizes, errors), w = _reach(c), weights(c.logs)
+    along_x = along_z = 0.0
+    for i in range(len(w)):
+        x, z = c.target[0] - middles[i].real, c.target[1] - middles[i].imag
+        for a in range(len(_WEIGHTS)):
+            off = errors[i] * _ABSCISSAS[a]
+            if abs(x + off) <= _REACHED + sizes[i].real:
+                along_x += w[i] * _WEIGHTS[a]
+            if abs(z + off) <= _REACHED + sizes[i].imag:
+                along_z += w[i] * _WEIGHTS[a]
+    return along_x * along_z
+
+
+# What is done.
+
+
+@compiled
+def choose(held: Held[Steering]) -> complex:
+    """
+    Return the next position of the guide, and turn the needle if that is worth it.
+
+    Parameters
+    ----------
+    held : Held of Steering
+        What is known; its roll and what follows from it are updated.
+
+    Returns
+    -------
+    complex
+        The position, x + i z [m].
+
+    """
+    c = held.value
+    k, last, w = c.counts[STEP], len(c.guide), weights(c.logs)
+    turns, tried = c.counts[TURNS], _tried(c, _TRIED)
+    ends = _ends(c, turns, k + 2)
+    cost, guide = _best(c, w, ends, tried)
+    if turns == 0 or cost < _TURN:
+        return guide
+    # As it is, but for a turn now.
+    base, few = _ends(c, turns - 1, k + 2), _tried(c, _COARSE)
+    best, roll, chosen = inf, 0.0, base
+    for turn in range(1 - _ROLLS // 2, _ROLLS // 2 + 1):
+        other = c.roll[0] + tau * turn / _ROLLS
+        means = base.means.copy()
+        for i in range(len(means)):
+            push = 0.0
+            for j in range(k + 1, k + 2 if turns > 1 else last + 1):
+                push += c.responses.bevel[i, last, j]
+            means[i] += c.mean[i, BEVEL] * push * (_direction(other) - c.turned[k + 1])
+        ends = Ends(means, base.errors, base.turned)
+        costs = _costs(c, w, ends, few)
+        found = costs[0].min() + costs[1].min()
+        if found < best:
+            best, roll, chosen = found, other, ends
+    if best + _TURN > cost:
+        return guide
+    c.roll[0], c.counts[TURNS] = roll, turns - 1
+    c.turned[k + 1 :] = _direction(roll)
+    return _best(c, w, chosen, tried)[1]
+
+
+@inlined
+def _direction(roll: float) -> complex:
+    """Return the direction of the bevel over that at zero roll."""
+    return complex(cos(roll), -sin(roll))
+
+
+@inlined
+def _tried(c: Steering, parts: FloatArray) -> FloatArray:
+    """Return positions that the guide may have next, in x and in z [m]; shape (2, positions)."""
+    if c.limit == 0.0:
+        return np.zeros((2, 1))
+    there, found = _there(c), np.empty((2, len(parts)))
+    for plane in range(2):
+        middle, half = _room(c, there.imag if plane else there.real, 0)
+        found[plane] = middle + half * parts
+    return found
+
+
+@compiled
+def _best(c: Steering, w: FloatArray, ends: Ends, tried: FloatArray) -> tuple[float, complex]:
+    """Return what the best of positions along each axis leaves out of reach [m^2], and it."""
+    costs, whole, found = _costs(c, w, ends, tried), 0.0, np.empty(2)
+    plan = _plan(c, w, ends)
+    for plane in range(2):
+        wanted, best = min(max(plan[plane], -c.limit), c.limit), inf
+        for t in range(tried.shape[1]):
+            cost = costs[plane, t] + _AWAY * (tried[plane, t] - wanted) ** 2
+            if cost < best:
+                best, at = cost, t
+        whole += costs[plane, at]
+        found[plane] = tried[plane, at]
+    return whole, complex(found[0], found[1])
+
+
+@compiled
+def _costs(c: Steering, w: FloatArray, ends: Ends, tried: FloatArray) -> FloatArray:
+    """Return the mean square of what positions leave out of reach, in x and in z [m^2]."""
+    r, k, last = c.responses, c.counts[STEP], len(c.guide)
+    # Later positions that depend on the next one; the others are anywhere within the limit.
+    near = 0
+    while near < last - k - 1 and c.ways[near] < 2.0 * c.limit:
+        near += 1
+    count = tried.shape[1]
+    middles, halves = np.empty((near, count)), np.empty((near, count))
+    left, later, found = np.empty(count), np.empty(count), np.zeros((2, count))
+    felt, stiffness = _felt(c, w)
+    for plane in range(2):
+        to = tried[plane]
+        for j in range(near):
+            for t in range(count):
+                middles[j, t], halves[j, t] = _room(c, to[t], j)
+        for i in range(len(w)):
+            mean = ends.means[i].imag if plane else ends.means[i].real
+            need = c.target[plane] - mean
+            shift, anywhere = r.guide[i, last, k], c.limit * r.later_guide[i, k + 1 + near]
+            for t in range(count):
+                left[t] = need - shift * to[t]
+                later[t] = _COUNTED * anywhere + ends.turned[i]
+            for j in range(near):
+                shift = r.guide[i, last, k + 1 + j]
+                for t in range(count):
+                    left[t] -= shift * middles[j, t]
+                    later[t] += _COUNTED * abs(shift) * halves[j, t]
+            for a in range(len(_WEIGHTS)):
+                off, weight = ends.errors[i] * _ABSCISSAS[a], w[i] * _WEIGHTS[a]
+                for t in range(count):
+                    short = max(0.0, abs(left[t] + off) - later[t])
+                    found[plane, t] += weight * short * short
+        force = felt.imag if plane else felt.real
+        for t in range(count):
+            over = max(0.0, abs(force + stiffness * to[t]) - c.load_limit)
+            found[plane, t] += _OVERLOAD * over**2
+    return found
+
+
+@compiled
+def _felt(c: Steering, w: FloatArray) -> tuple[complex, float]:
+    """Return the load on a guide that goes to zero [N], and what a shift adds [N/m]."""
+    r, k, force, stiffness = c.responses, c.counts[STEP], 0j, 0.0
+    if c.load_limit == inf:
+        return force, stiffness
+    for i in range(len(w)):
+        load = 0j
+        for j in range(k):
+            load += r.guide_load[i, k, j] * c.guide[j]
+        push = 0j
+        for j in range(len(c.turned)):
+            push += r.bevel_load[i, k, j] * c.turned[j]
+        for j in range(r.causes_load.shape[2]):
+            load += (push if j == BEVEL else r.causes_load[i, k, j]) * c.mean[i, j]
+        force += w[i] * load
+        stiffness += w[i] * r.guide_load[i, k, k]
+    return force, stiffness
+
+
+@compiled
+def _plan(c: Steering, w: FloatArray, ends: Ends) -> tuple[float, float]:
+    """Return the next position in a plan for the mean: least squares, with a price of motion."""
+    k, last = c.counts[STEP], len(c.guide)
+    count = last - k
+    normal, factor = _MOTION * np.eye(count), np.zeros((count, count))
+    x, z = np.zeros(count), np.zeros(count)
+    for i in range(len(w)):
+        shifts = c.responses.guide[i, last, k:]
+        for j in range(count):
+            weighted = w[i] * shifts[j]
+            x[j] += weighted * (c.target[0] - ends.means[i].real)
+            z[j] += weighted * (c.target[1] - ends.means[i].imag)
+            for m in range(j, count):
+                normal[j, m] += weighted * shifts[m]
+    cholesky(normal, factor)
+    for one in (x, z):
+        forward(factor, one)
+        backward(factor, one)
+    return x[0], z[0]

@@ -1,0 +1,233 @@
+"""The controller beside a plain statement of its formulas in NumPy, a hundred insertions long."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from math import inf, sqrt, tau
+from typing import Any
+
+from needle_controller import Guidance, SteeringBelief, SteeringController, SteeringModel
+from needle_controller.steering.trial import drawn, insert
+from needle_dynamics import FloatArray, STEERING_PRESETS
+from needle_dynamics.arrays import ComplexArray
+import numpy as np
+from numpy.testing import assert_allclose
+import pytest
+
+NEEDLE, _STEERING, _ = STEERING_PRESETS['bending_35mm']
+STEERING = replace(_STEERING, skin_stiffness=0.02 * NEEDLE.tissue_stiffness)
+DEPTHS = np.linspace(0.0, 0.1, 11)
+TRUE = SteeringBelief(tilt=0.02, frame=0.03, bevel=0.1)
+MODELS = {
+    bevel: SteeringModel(NEEDLE, replace(STEERING, bevel_load=(bevel,)), DEPTHS)
+    for bevel in (0.0, 0.8)
+}
+
+
+class Plain:
+    """What the controller does, array by array; it takes each look for one of this needle."""
+
+    def __init__(
+        self,
+        model: SteeringModel,
+        target: FloatArray,
+        limit: float,
+        turns: int,
+        load_limit: float,
+        step_limit: float,
+    ) -> None:
+        self.model, self.goal, self.limit = model, complex(*target), limit
+        self.turns, self.load_limit, self.roll, self.step = turns, load_limit, 0.0, 0
+        n, m = model.steps, len(model.prior)
+        self.ways = np.minimum(step_limit * np.arange(1, n + 1), 2.0 * limit)
+        self.guide, self.turned = np.zeros(n, complex), np.ones(n + 1, complex)
+        self.mean = np.zeros((len(model.lengths), m), complex)
+        self.mean[:, 3] = 1j * model.push
+        self.covariance = np.array([model.prior] * len(model.lengths), complex)
+        self.logs = np.zeros(len(model.lengths))
+
+    @property
+    def weights(self) -> FloatArray:
+        """Return the probability of each hypothesis."""
+        found = np.exp(self.logs - self.logs.max())
+        return np.asarray(found / found.sum())
+
+    def tip(self, at: int, guide: ComplexArray) -> tuple[ComplexArray, FloatArray, ComplexArray]:
+        """Return means, variances, and covariances with the constants."""
+        model = self.model
+        causes = model.causes[:, at].astype(complex)
+        causes[:, 3] = model.bevel[:, at] @ self.turned
+        rows = np.concatenate([causes, (model.between[:, :, at] @ guide).T], axis=1)
+        means = model.guide[:, at] @ guide + np.einsum('hm,hm->h', rows, self.mean)
+        shared = np.einsum('hml,hl->hm', self.covariance, rows.conj())
+        variances = np.einsum('hm,hm->h', rows, shared).real
+        return means, variances + (0.03 * model.elastic[:, at] * abs(self.mean[:, 3])) ** 2, shared
+
+    def held(self) -> ComplexArray:
+        """Return the guide as if it rests."""
+        guide, done = self.guide.copy(), min(self.step, len(self.guide))
+        guide[done:] = guide[done - 1] if done else 0.0
+        return guide
+
+    def expected(self) -> tuple[FloatArray, FloatArray]:
+        """Return mean and covariance of the tip at the end."""
+        (means, variances, _), w = self.tip(-1, self.held()), self.weights
+        mean = w @ means
+        off = np.array([(means - mean).real, (means - mean).imag])
+        return np.array([mean.real, mean.imag]), (w * off) @ off.T + w @ variances * np.eye(2)
+
+    def see(self, look: FloatArray) -> None:
+        """Learn."""
+        means, variances, shared = self.tip(self.step, self.held())
+        whole, off = variances + self.model.belief.noise**2, complex(*look) - means
+        self.mean += (off / whole)[:, None] * shared
+        self.covariance -= np.einsum('hm,hl->hml', shared / whole[:, None], shared.conj())
+        self.logs -= 0.5 * abs(off) ** 2 / whole + np.log(whole)
+
+    def ends(self, turns: int, first: int) -> tuple[ComplexArray, FloatArray, FloatArray]:
+        """Return means, standard deviations, and what later turns can do."""
+        means, variances, _ = self.tip(-1, self.guide)
+        later, turned = self.model.bevel[:, -1, first:], np.zeros(len(means))
+        if turns:
+            means = means - self.mean[:, 3] * (later @ self.turned[first:])
+            turned = 0.8 * sqrt(0.5) * abs(self.mean[:, 3]) * abs(later).sum(axis=1)
+        return means, np.sqrt(variances), turned
+
+    def room(self, begin: FloatArray, count: int) -> tuple[FloatArray, FloatArray]:
+        """Return middles and half widths of where the guide can go, (positions, count)."""
+        low = np.maximum(begin[:, None] - self.ways[:count], -self.limit)
+        high = np.minimum(begin[:, None] + self.ways[:count], self.limit)
+        return (low + high) / 2.0, (high - low) / 2.0
+
+    @property
+    def chance(self) -> float:
+        """Return how probable it is that the tip can still come near."""
+        means, errors, turned = self.ends(self.turns, self.step + 1)
+        shifts, chance = self.model.guide[:, -1, self.step :], 1.0
+        there = self.guide[self.step - 1] if 0 < self.step <= self.model.steps else 0j
+        for need, at in (
+            ((self.goal - means).real, there.real), ((self.goal - means).imag, there.imag),
+        ):  # fmt: skip
+            middle, half = (one[0] for one in self.room(np.array([at]), shifts.shape[1]))
+            size = 1e-3 + turned + abs(shifts) @ half
+            off = [
+                abs(need - shifts @ middle + a * errors) <= size for a in (-sqrt(3), 0, sqrt(3))
+            ]
+            chance *= self.weights @ np.transpose(off) @ [1 / 6, 4 / 6, 1 / 6]
+        return chance
+
+    def tried(self, count: int) -> FloatArray:
+        """Return positions that are compared, (2, count)."""
+        there = self.guide[self.step - 1] if self.step else 0j
+        middle, half = self.room(np.array([there.real, there.imag]), 1)
+        return np.asarray(middle + half * np.linspace(-1.0, 1.0, count))
+
+    def costs(self, ends: tuple[Any, ...], tried: FloatArray) -> FloatArray:
+        """Return what positions leave out of reach, (2, count)."""
+        (means, errors, turned), k, w, model = ends, self.step, self.weights, self.model
+        now, after = model.guide[:, -1, k], model.guide[:, -1, k + 1 :]
+        push = (model.bevel_load[:, k] @ self.turned) * self.mean[:, 3]
+        causes = model.causes_load[:, k] * self.mean[:, :-2]
+        causes[:, 3] = push
+        force = w @ (model.guide_load[:, k] @ self.guide + causes.sum(axis=1))
+        found, need = np.zeros(tried.shape), self.goal - means
+        for plane, (at, felt) in enumerate(((need.real, force.real), (need.imag, force.imag))):
+            to = tried[plane]
+            middle, half = self.room(to, after.shape[1])
+            left = at[:, None] - now[:, None] * to - after @ middle.T
+            later = 0.8 * (abs(after) @ half.T) + turned[:, None]
+            for a, weight in ((-sqrt(3), 1 / 6), (0.0, 4 / 6), (sqrt(3), 1 / 6)):
+                short = np.maximum(0.0, abs(left + a * errors[:, None]) - later)
+                found[plane] += weight * (w @ short**2)
+            load = abs(felt + w @ model.guide_load[:, k, k] * to)
+            found[plane] += np.maximum(0.0, load - self.load_limit) ** 2
+        return found
+
+    def best(self, ends: tuple[Any, ...], tried: FloatArray) -> tuple[float, complex]:
+        """Return what the best position leaves out of reach, and it."""
+        w, shifts = self.weights, self.model.guide[:, -1, self.step :]
+        normal = (w * shifts.T) @ shifts + 1e-2 * np.eye(shifts.shape[1])
+        plan = np.linalg.solve(normal, (w * shifts.T) @ (self.goal - ends[0]))[0]
+        costs = self.costs(ends, tried)
+        wanted = np.clip([[plan.real], [plan.imag]], -self.limit, self.limit)
+        at = np.argmin(costs + 1e-5 * (tried - wanted) ** 2, axis=1)
+        return costs[[0, 1], at].sum(), complex(*tried[[0, 1], at])
+
+    def choose(self) -> complex:
+        """Return the next position, and turn the needle if that is worth it."""
+        k, tried = self.step, self.tried(121)
+        ends = self.ends(self.turns, k + 2)
+        cost, guide = self.best(ends, tried)
+        if self.turns == 0 or cost < 1e-8:
+            return guide
+        means, errors, turned = self.ends(self.turns - 1, k + 2)
+        until = k + 2 if self.turns > 1 else None
+        load = self.mean[:, 3] * self.model.bevel[:, -1, k + 1 : until].sum(axis=1)
+        rolls = self.roll + tau * np.arange(-7, 9) / 16
+        ways, now = np.exp(-1j * rolls), np.exp(-1j * self.roll)
+        others = [(means + load * (way - now), errors, turned) for way in ways]
+        costs = [self.costs(one, self.tried(13)).min(axis=1).sum() for one in others]
+        one = int(np.argmin(costs))
+        if costs[one] + 1e-8 > cost:
+            return guide
+        self.roll, self.turns = rolls[one], self.turns - 1
+        self.turned[k + 1 :] = ways[one]
+        return self.best(others[one], tried)[1]
+
+    def plan(self) -> Guidance:
+        """Go on to the next step."""
+        k, last = self.step, self.model.steps - 1
+        if k <= last:
+            self.guide[k] = self.choose()
+        self.step += 1
+        at = self.guide[min(k, last)]
+        return Guidance(at.real, at.imag, self.roll)
+
+
+@pytest.mark.parametrize(
+    ('limit', 'turns', 'load_limit', 'step_limit'),
+    [
+        (6e-3, 0, inf, inf),
+        (6e-3, 0, inf, 2e-3),
+        (6e-3, 0, 2.0, inf),
+        (6e-3, 3, 1e3, 3e-3),
+        (0.0, 4, inf, inf),
+    ],
+)
+def test_a_hundred_insertions_are_those_of_the_plain_formulas(
+    limit: float, turns: int, load_limit: float, step_limit: float
+) -> None:
+    """The same motions, to a millionth of a micrometer, and the same is said; twenty each."""
+    model = MODELS[0.8 if turns else 0.0]
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        truth = drawn(NEEDLE, STEERING, TRUE, rng, seed)
+        load = model.push * (1.0 + 0.2 * rng.uniform(-1.0, 1.0))
+        bevel = truth.bevel + np.array([0.0, load])
+        steering = replace(truth.steering, bevel_load=(float(np.hypot(*bevel)),))
+        truth = replace(truth, bevel=bevel, steering=steering)
+        target = (4e-3 if turns == 0 else 2e-3) * rng.uniform(-1.0, 1.0, 2)
+        ours = SteeringController(model, target, limit, turns, load_limit, step_limit=step_limit)
+        plain = Plain(model, target, limit, turns, load_limit, step_limit)
+
+        def look(tip: FloatArray, rng: np.random.Generator = rng) -> FloatArray:
+            return np.asarray(tip + 4e-5 * rng.standard_normal(2))
+
+        def both(
+            tip: FloatArray | None, ours: SteeringController = ours, plain: Plain = plain
+        ) -> Guidance:
+            assert tip is not None
+            to = ours.next(tip)
+            plain.see(tip)
+            # Sums in another order.
+            assert_allclose(to, plain.plan(), rtol=0.0, atol=1e-12)
+            mean, covariance = plain.expected()
+            there = ours.expected()
+            assert_allclose(there.mean, mean, rtol=0.0, atol=1e-11)
+            assert_allclose(there.covariance, covariance, rtol=1e-6, atol=1e-16)
+            assert_allclose(ours.weights, plain.weights, rtol=1e-6, atol=1e-12)
+            assert ours.chance == pytest.approx(plain.chance, abs=1e-9)
+            return to
+
+        insert(truth, DEPTHS, look, both)
+        assert ours.turns == plain.turns
