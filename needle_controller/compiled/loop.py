@@ -17,7 +17,7 @@ import numpy as np
 
 
 @compiled
-def run_loop(
+def run_loop(  # noqa: C901
     c: Needle,
     state: FloatArray,
     law: tuple[float, ...],
@@ -25,9 +25,13 @@ def run_loop(
     setpoints: FloatArray,
     goal: FloatArray,
     pending: FloatArray,
+    known: int,
+    noise: FloatArray,
     added: FloatArray,
     longest: float,
     depths: FloatArray,
+    states: FloatArray,
+    commands: FloatArray,
     errors: FloatArray,
 ) -> int:
     """
@@ -49,6 +53,11 @@ def run_loop(
         Position of the reference at the times of the measurements [m].
     pending : ndarray, shape (delay,)
         Commands that have not yet taken effect [N]; overwritten.
+    known : int
+        Periods of delay that the law knows: it sees that many of the newest pending commands.
+    noise : ndarray, shape (k, 3) or (0, 3)
+        What the law measures too much, position [m] and speed [m/s], and what acts beyond its
+        commands [N].
     added : ndarray, shape (m, 3)
         Friction along the way: inserted length from which on [m] the needle has this much more
         Coulomb friction [N] and viscous friction [N s/m], until the next row.
@@ -57,6 +66,10 @@ def run_loop(
     depths : ndarray, shape (k + 1,) or (0,)
         Overwritten with the inserted lengths at the times of the measurements [m]; empty if they
         are not needed.
+    states : ndarray, shape (k + 1, 2 (2 + n)) or (0, 2 (2 + n))
+        Overwritten with the states then; empty if they are not needed.
+    commands : ndarray, shape (k,) or (0,)
+        Overwritten with the command that answers each measurement [N]; empty likewise.
     errors : ndarray, shape (3,)
         Overwritten with goal minus inserted length: last [m], largest in modulus [m] and mean
         square [m^2].
@@ -70,29 +83,39 @@ def run_loop(
     memory = np.zeros(MEMORY)
     period, delay, m = LawConstants(*law).period, pending.shape[0], state.shape[0] // 2
     count = setpoints.shape[0]
-    largest, squares, force = 0.0, 0.0, 0.0
+    largest, squares, acts = 0.0, 0.0, 0.0
     for k in range(count + 1):
         depth, speed = c.length - state[0], -state[m]
         if depths.shape[0] > 0:
             depths[k] = depth
+        if states.shape[0] > 0:
+            states[k] = state
         error = goal[k] - depth
         largest = max(largest, abs(error))
         squares += error * error
         errors[0], errors[1], errors[2] = error, largest, squares / (k + 1)
         if k == count:
             break
-        law_learn(law, memory, depth, speed, force)
-        for i in range(delay):
+        if noise.shape[0] > 0:
+            depth, speed = depth + noise[k, 0], speed + noise[k, 1]
+        law_learn(law, memory, depth, speed, acts)
+        for i in range(delay - known, delay):
             depth, speed = axis_step(law, depth, speed, pending[i])
         aim = setpoints[k]
         instant = (depth, speed, aim[0], aim[1], aim[2])
         command = law_step(law, memory, instant, 0.0, limit)
+        if commands.shape[0] > 0:
+            commands[k] = command
+        # What acts in this period, as the law knows it.
+        acts = pending[delay - known] if known > 0 else command
         force = command
         if delay > 0:
             force = pending[0]
             for i in range(1, delay):
                 pending[i - 1] = pending[i]
             pending[delay - 1] = command
+        if noise.shape[0] > 0:
+            force += noise[k, 2]
         inputs = Inputs(force, 0.0, 0.0, False)
         needle = c
         for row in added:

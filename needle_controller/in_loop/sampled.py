@@ -6,6 +6,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import chain
 from math import isfinite
 import os
 from typing import Protocol
@@ -158,8 +159,14 @@ class LoopBatch:
         States at the end.
     completed : ndarray, shape (runs,)
         Periods completed before the needle left its range.
+    goal : ndarray, shape (k + 1,)
+        Positions of the reference at the times of the measurements [m].
     depths : ndarray, shape (runs, k + 1) or (runs, 0)
-        Inserted lengths at the times of the measurements [m], if they were kept.
+        Inserted lengths then [m], if they were kept.
+    courses : ndarray, shape (runs, k + 1, 2 (2 + n)) or (runs, 0, 2 (2 + n))
+        States then, if they were recorded; NaN after a needle has left its range.
+    commands : ndarray, shape (runs, k) or (runs, 0)
+        Command that answers each measurement [N], likewise.
 
     """
 
@@ -168,7 +175,10 @@ class LoopBatch:
     rms: FloatArray
     states: FloatArray
     completed: FloatArray
+    goal: FloatArray
     depths: FloatArray
+    courses: FloatArray
+    commands: FloatArray
 
 
 def run_batch(
@@ -180,9 +190,12 @@ def run_batch(
     delay: int,
     limit: float,
     duration: float,
+    late: int = 0,
+    noise: ArrayLike = (),
     added: ArrayLike = (),
     step: float = DEFAULT_STEP,
     keep: bool = False,
+    record: bool = False,
     workers: int | None = None,
     progress: Callable[[], object] | None = None,
 ) -> LoopBatch:
@@ -208,6 +221,11 @@ def run_batch(
         Largest force [N].
     duration : float
         Time to simulate [s].
+    late : int
+        Periods of delay beyond those, of which the laws know nothing.
+    noise : array_like, shape (k, 3) or (0,)
+        In each period: what the laws measure too much, inserted length [m] and speed [m/s], and
+        what acts on the needles beyond the commands [N].
     added : array_like, shape (m, 3)
         Friction along the way, for membranes and layers: inserted length from which on [m] the
         needles have this much more Coulomb friction [N] and viscous friction [N s/m], until the
@@ -216,6 +234,8 @@ def run_batch(
         Longest step of the integrator [s].
     keep : bool
         Keep the inserted lengths of all periods.
+    record : bool
+        Keep the states and the commands of all periods.
     workers : int, optional
         Threads; one per core if not given.
     progress : callable, optional
@@ -247,15 +267,18 @@ def run_batch(
     if len(periods) > 1:
         raise ParameterError(f'laws must have the same period, got {sorted(periods)} s')
     period = periods.pop()
-    if not (isfinite(duration) and duration >= period and step > 0.0 and delay >= 0):
+    if not (isfinite(duration) and duration >= period and step > 0.0 and min(delay, late) >= 0):
         raise ParameterError(
-            f'duration must be finite and >= {period:g} s, step > 0 and delay >= 0, got '
-            f'{duration!r}, {step!r} and {delay!r}'
+            f'duration must be finite and >= {period:g} s, step > 0, delay and late >= 0, got '
+            f'{duration!r}, {step!r}, {delay!r} and {late!r}'
         )
     count, runs = round(duration / period), sizes.pop() if sizes else 1
     # What a command aims at: the reference when it takes effect.
-    setpoints = np.array([reference.at(k * period + delay * period) for k in range(count)])
-    goal = np.array([reference.at(k * period).position for k in range(count + 1)])
+    course = _setpoints(reference, period, count + delay + 1)
+    setpoints, goal = course[delay:-1], np.ascontiguousarray(course[: count + 1, 0])
+    blurred = np.array(noise, dtype=np.float64).reshape(-1, 3)
+    if len(blurred) not in (0, count) or not np.isfinite(blurred).all():
+        raise ShapeError(f'noise must be finite, of shape ({count}, 3), got {blurred.shape}')
     along = np.array(added, dtype=np.float64).reshape(-1, 3)
     if not np.isfinite(along).all() or (np.diff(along[:, 0]) <= 0.0).any():
         raise ParameterError(f'added must be finite, with increasing lengths, got {added!r}')
@@ -266,13 +289,16 @@ def run_batch(
     )
     errors, completed = np.empty((runs, 3)), np.empty(runs)
     depths = np.full((runs, count + 1 if keep else 0), np.nan)
+    courses = np.full((runs, count + 1 if record else 0, ends.shape[1]), np.nan)
+    commands = np.full((runs, count if record else 0), np.nan)
 
     def run(share: range) -> None:
         for i in share:
             law = each_law[i % len(each_law)]
             completed[i] = run_loop(
                 needles[i % len(needles)], ends[i], law.packed, float(limit), setpoints,
-                goal, np.zeros(delay), along, float(step), depths[i], errors[i],
+                goal, np.zeros(delay + late), delay, blurred, along, float(step), depths[i],
+                courses[i], commands[i], errors[i],
             )  # fmt: skip
             if progress is not None:
                 progress()
@@ -288,5 +314,21 @@ def run_batch(
         rms=np.sqrt(errors[:, 2]),
         states=ends,
         completed=completed,
+        goal=goal,
         depths=depths,
+        courses=courses,
+        commands=commands,
     )
+
+
+def _setpoints(reference: Reference, period: float, count: int) -> FloatArray:
+    """Return position, speed and acceleration of a reference at multiples of a period."""
+    times = np.arange(count, dtype=np.float64) * period
+    # Beyond its end it rests.
+    moving = int(np.searchsorted(times, reference.duration))
+    result = np.empty((count, 3))
+    result[moving:] = reference.at(reference.duration + 1.0)
+    # Row by row, or by way of a list, it would take longer than the setpoints themselves.
+    numbers = chain.from_iterable(map(reference.at, times[:moving].tolist()))
+    result[:moving] = np.fromiter(numbers, np.float64, 3 * moving).reshape(-1, 3)
+    return result

@@ -20,30 +20,35 @@ from concurrent.futures import (
 from contextlib import AbstractContextManager, contextmanager, ExitStack, suppress
 from functools import lru_cache
 import json
-from multiprocessing import get_context
+from multiprocessing import get_context, parent_process
+import os
 from pathlib import Path
 import re
 import shutil
 import signal
+from threading import Thread
 from time import monotonic
 from typing import Any, Final
 
 from needle_dynamics import FloatArray
-from needle_identification.result import write_whole
 from needle_insertion.study.study import made, Study
 from needle_ros.errors import JobError, ParameterError
+from needle_ros.files import write_whole
 import pyarrow as pa
 from pyarrow import parquet
 
 #: Samples of the first chunk, by whose time the others are sized, and that time [s].
 _FIRST, _WANTED = 16, 1.0
-_LARGEST: Final = 2**14
+_LARGEST: Final = 2**13
 
 #: Rows of the table that are written at once: its bytes depend on it.
-_GROUP: Final = 2**16
+_GROUP: Final = 2**13
 
 #: How often workers may be lost without a chunk in between.
 _TRIES: Final = 5
+
+# The other pools keep what they are given back.
+pa.set_memory_pool(pa.system_memory_pool())
 
 _PART: Final = re.compile(r'(\d{10})-(\d{10})\.parquet')
 
@@ -174,7 +179,7 @@ class Results:
         """Yield all samples in tables of the same number of rows."""
         waiting: list[Any] = []
         for first, end in self._done():
-            waiting.append(parquet.read_table(self._part(first, end)))
+            waiting.append(parquet.read_table(self._part(first, end), use_threads=False))
             while sum(map(len, waiting)) >= _GROUP:
                 whole = pa.concat_tables(waiting)
                 yield whole.slice(0, _GROUP)
@@ -195,7 +200,9 @@ class Results:
                 for one in tables:
                     if writer is None:
                         writer = stack.enter_context(
-                            parquet.ParquetWriter(draft, one.schema, compression='zstd')
+                            parquet.ParquetWriter(
+                                draft, one.schema, compression='zstd', use_dictionary=False
+                            )
                         )
                     writer.write_table(one.combine_chunks(), row_group_size=_GROUP)
             draft.replace(path)
@@ -280,9 +287,18 @@ def _compute(
             future.cancel()
 
 
-def _ignore_interrupts() -> None:
-    # The process that has started the workers ends them.
+def _serve() -> None:
+    # The process that has started the workers ends them ...
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # ... and if it is killed, they end with it: the pool alone would have them wait for ever.
+    Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    parent = parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
 
 
 @contextmanager
@@ -301,7 +317,7 @@ def processes(workers: int) -> Iterator[Executor]:
         They end with the context.
 
     """
-    pool = ProcessPoolExecutor(workers, get_context('spawn'), _ignore_interrupts)
+    pool = ProcessPoolExecutor(workers, get_context('spawn'), _serve)
     try:
         yield pool
     finally:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from math import ceil, floor, log10, nan, sqrt
 from pathlib import Path
 from typing import Final
 
@@ -11,14 +13,36 @@ from needle_insertion.report.content import Grid, Picture, Section
 from needle_insertion.report.page import write_page
 from needle_insertion.study.engine import Results
 from needle_insertion.study.protocol import Figure
-from needle_insertion.study.summary import column, Estimate, probability, quantile, share, worst
+from needle_insertion.study.study import Study
+from needle_insertion.study.summary import (
+    batches,
+    column,
+    Estimate,
+    picked,
+    probability,
+    quantile,
+    share,
+    worst,
+)
 import numpy as np
+import yaml
 
 #: Quantiles of each figure.
 _PARTS: Final = (0.5, 0.95, 0.99)
 
-#: Cells of a map along each axis, and samples that one needs at least.
-_CELLS, _FEWEST = 24, 5
+#: Most bars of a distribution.
+_BARS: Final = 80
+
+#: Most cells of a map along each axis, samples of one in the mean, and that it needs at least.
+_CELLS, _MEAN, _FEWEST = 24, 25, 5
+
+#: How numbers in SI units are shown: unit and factor.
+_SHOWN: Final[Mapping[str, tuple[str, float]]] = {
+    'm': ('mm', 1e3), 'rad': ('mrad', 1e3), '1': ('', 1.0), '%': ('%', 100.0),
+}  # fmt: skip
+
+#: Samples of which quantiles, shares and pictures are: the page needs no more memory for more.
+_MOST: Final = 2**17
 
 #: Worst samples that are listed.
 _WORST: Final = 10
@@ -39,17 +63,26 @@ def write(results: Results, path: Path) -> None:
     study, table = results.study, results.table
     figures, drawn = study.protocol.figures, list(study.population)
     main = next(iter(figures))
-    values = column(table, main)
-    chances = {
-        name: probability(column(table, name)) for name, one in figures.items() if not one.unit
-    }
-    shares = {
-        name: {other: share(column(table, name), column(table, other)) for other in drawn}
-        for name, one in figures.items()
-        if one.unit
-    }
-    order = sorted(drawn, key=lambda name: -shares[main][name])
-    bad = worst(values, _WORST)
+    values = column(table, main, _MOST)
+    chances, quantiles = dict[str, Estimate](), list[tuple[str, ...]]()
+    for name, one in figures.items():
+        if not one.unit:
+            chances[name] = probability(batches(table, name))
+            continue
+        seen = values if name == main else column(table, name, _MOST)
+        if np.isfinite(seen).any():
+            parts = (_rounded(quantile(seen, part), one.unit) for part in _PARTS)
+            words = (f'{value} ({ends})' for value, ends in parts)
+            quantiles.append((_head(name, one.unit), *words, one.meaning))
+    shares = {name: share(values, column(table, name, _MOST)) for name in drawn}
+    order = sorted(drawn, key=lambda name: -shares[name])
+    # The two that matter most are drawn.
+    most = {name: column(table, name, _MOST) for name in order[:2]}
+    bad, listed = worst(batches(table, main), _WORST), [main, *order[:4]]
+    of_bad = {name: picked(table, name, bad) for name in listed}
+    units = {name: study.protocol.quantities[name].unit for name in drawn}
+    units[main] = figures[main].unit
+    limited = (f'Of the first {_MOST} samples.',) if study.samples > _MOST else ()
     sections = [
         Section(
             title='How often',
@@ -59,8 +92,7 @@ def write(results: Results, path: Path) -> None:
                     caption='Probabilities',
                     heads=('figure', 'probability', '95 % interval', 'what it is'),
                     rows=tuple(
-                        (name, f'{one.value:.2%}', f'{one.low:.2%} to {one.high:.2%}',
-                         figures[name].meaning)
+                        (name, *_rounded(one, '%'), figures[name].meaning)
                         for name, one in chances.items()
                         if np.isfinite(one.value)
                     ),
@@ -70,18 +102,12 @@ def write(results: Results, path: Path) -> None:
         ),
         Section(
             title='How far',
-            paragraphs=('With intervals of 95 %, whatever the distribution.',),
+            paragraphs=('With intervals of 95 %, whatever the distribution.', *limited),
             tables=(
                 Grid(
                     caption='Quantiles',
                     heads=('figure', *(f'{part:.0%}' for part in _PARTS), 'what it is'),
-                    rows=tuple(
-                        (f'{name} [{one.unit}]',
-                         *(_words(quantile(column(table, name), part)) for part in _PARTS),
-                         one.meaning)
-                        for name, one in figures.items()
-                        if one.unit and np.isfinite(column(table, name)).any()
-                    ),
+                    rows=tuple(quantiles),
                 ),
             ),
             pictures=(_distribution(main, figures[main], values),),
@@ -94,35 +120,37 @@ def write(results: Results, path: Path) -> None:
                 paragraphs=(
                     f'Part of the variance of {main} that each quantity explains alone.',
                     'What is missing to 100 % is noise, and quantities that act together.',
+                    'Quantities that are correlated have a part of the share of each other.',
+                    *limited,
                 ),
                 tables=(
                     Grid(
                         caption='Shares of the variance',
                         heads=('quantity', main, 'what it is'),
                         rows=tuple(
-                            (name, f'{shares[main][name]:.1%}',
+                            (name, f'{shares[name]:.1%}',
                              study.protocol.quantities[name].meaning)
                             for name in order
                         ),
                     ),
                 ),
-                pictures=tuple(
-                    _map(main, figures[main], values, order[:2], results) for _ in order[1:2]
+                pictures=_map(
+                    main, figures[main], values, most, study
                 ),
             )
         )  # fmt: skip
     sections.append(
         Section(
             title='The worst',
-            paragraphs=('`needle study STUDY --replay NUMBER` computes one again, into a bag.',),
+            paragraphs=('One of them again, into a bag: needle study STUDY --replay NUMBER',),
             tables=(
                 Grid(
                     caption=f'Samples with the largest {main}',
-                    heads=('sample', f'{main} [{figures[main].unit}]', *order[:4]),
+                    heads=('sample', *(_head(name, units[name]) for name in listed)),
                     rows=tuple(
-                        (str(number), f'{values[number]:.4g}',
-                         *(f'{column(table, name)[number]:.4g}' for name in order[:4]))
-                        for number in bad
+                        (str(number),
+                         *(_number(of_bad[name][place], units[name]) for name in listed))
+                        for place, number in enumerate(bad)
                     ),
                 ),
             ),
@@ -133,8 +161,11 @@ def write(results: Results, path: Path) -> None:
     hit = chances.get('hit')
     cards = [('Samples', f'{study.samples}', f'seed {study.seed}, {study.design}')]
     if hit is not None:
-        cards.append(('Hit', f'{hit.value:.1%}', f'95 %: {hit.low:.1%} to {hit.high:.1%}'))
-    cards.append((f'Median {main}', _words(quantile(values, 0.5)), figures[main].unit))
+        value, ends = _rounded(hit, '%')
+        cards.append(('Hit', value, f'95 %: {ends}'))
+    value, ends = _rounded(quantile(values, 0.5), units[main])
+    unit, _ = _shown(units[main])
+    cards.append((f'Median {main}', f'{value} {unit}', f'95 %: {ends} {unit}'))
     write_page(
         path,
         'study.html',
@@ -143,25 +174,44 @@ def write(results: Results, path: Path) -> None:
         introduction='Simulated insertions of a population of needles that nobody knows exactly.',
         cards=cards,
         sections=sections,
-        study=study.text,
+        study=yaml.safe_dump(dict(study.document), default_flow_style=None, sort_keys=False),
     )
 
 
-def _words(one: Estimate) -> str:
-    return f'{one.value:.4g} ({one.low:.4g} to {one.high:.4g})'
+def _shown(unit: str) -> tuple[str, float]:
+    """Return the unit in which numbers of a unit are shown, and the factor to it."""
+    return _SHOWN.get(unit, (unit, 1.0))
+
+
+def _head(name: str, unit: str) -> str:
+    shown, _ = _shown(unit)
+    return f'{name} [{shown}]' if shown else name
+
+
+def _number(value: float, unit: str) -> str:
+    return f'{_shown(unit)[1] * value:.4g}'
+
+
+def _rounded(one: Estimate, unit: str) -> tuple[str, str]:
+    """Return a number and its interval, with the digits that the interval leaves to it."""
+    value, low, high = (_shown(unit)[1] * number for number in one)
+    form = f'.{min(9, max(1, 1 - floor(log10(high - low))))}f' if high > low else '.4g'
+    sign = unit if unit == '%' else ''
+    return f'{value:{form}}{sign}', f'{low:{form}}{sign} to {high:{form}}{sign}'
 
 
 def _distribution(name: str, figure: Figure, values: FloatArray) -> Picture:
     drawing = Drawing(figsize=(8.0, 3.2), layout='constrained')
     axes = drawing.subplots()
-    seen = np.sort(values[np.isfinite(values)])
+    seen = np.sort(_shown(figure.unit)[1] * values[np.isfinite(values)])
     if len(seen):
         # What is beyond the last thousandth would leave nothing to see of the rest.
         end = float(np.quantile(seen, 0.999))
-        axes.hist(seen[seen <= end], bins=80, color='tab:blue')
+        bars = min(_BARS, ceil(2.0 * len(seen) ** (1.0 / 3.0)))
+        axes.hist(seen[seen <= end], bins=bars, color='tab:blue')
         for part in _PARTS:
             axes.axvline(float(np.quantile(seen, part)), color='k', lw=0.8, ls='--')
-    axes.set(xlabel=f'{name} [{figure.unit}]', ylabel='samples')
+    axes.set(xlabel=_head(name, figure.unit), ylabel='samples')
     return Picture('distribution', f'Distribution of {name}; dashed: {_dashed()}.', drawing)
 
 
@@ -170,35 +220,34 @@ def _dashed() -> str:
 
 
 def _map(
-    name: str, figure: Figure, values: FloatArray, axes_of: list[str], results: Results
-) -> Picture:
-    """Draw the median of a figure over the two quantities that matter most."""
-    first, second = axes_of
-    x, y = (column(results.table, one) for one in axes_of)
-    seen = np.isfinite(values)
-    x, y, z = x[seen], y[seen], values[seen]
+    name: str, figure: Figure, values: FloatArray, over: dict[str, FloatArray], study: Study
+) -> tuple[Picture, ...]:
+    """Draw the median of a figure over two quantities, if there is anything to see."""
+    if len(over) < 2:
+        return ()
+    inside = np.isfinite(values)
+    count = max(1, min(_CELLS, floor(sqrt(inside.sum() / _MEAN))))
+    heads, edges, cells = list[str](), list[FloatArray](), np.zeros(len(values), dtype=np.int16)
+    for one, of in over.items():
+        low, high = np.quantile(of, [0.005, 0.995])
+        if low == high or not inside.any():
+            return ()
+        at = np.linspace(low, high, count + 1)
+        place = (np.digitize(of, at) - 1).astype(np.int16)
+        inside &= (place >= 0) & (place < count)
+        cells = count * cells + place
+        unit = study.protocol.quantities[one].unit
+        heads.append(_head(one, unit))
+        edges.append(_shown(unit)[1] * at)
+    cells[~inside] = last = count * count
+    ends = np.cumsum(np.bincount(cells, minlength=last))[:last]
+    groups = np.split(values[np.argsort(cells, kind='stable')], ends)[:last]
+    shown = np.array([np.median(one) if len(one) >= _FEWEST else nan for one in groups])
+    shown *= _shown(figure.unit)[1]
     drawing = Drawing(figsize=(8.0, 4.5), layout='constrained')
     axes = drawing.subplots()
-    edges = [
-        np.linspace(float(np.quantile(one, 0.005)), float(np.quantile(one, 0.995)), _CELLS + 1)
-        for one in (x, y)
-    ]
-    shown = np.full((_CELLS, _CELLS), np.nan)
-    places = [np.digitize(one, edge) - 1 for one, edge in zip((x, y), edges, strict=True)]
-    cell = places[0] * _CELLS + places[1]
-    inside = (places[0] >= 0) & (places[0] < _CELLS) & (places[1] >= 0) & (places[1] < _CELLS)
-    order = np.argsort(cell[inside], kind='stable')
-    cells, begins = np.unique(cell[inside][order], return_index=True)
-    for at, group in zip(cells, np.split(z[inside][order], begins[1:]), strict=True):
-        if len(group) >= _FEWEST:
-            shown[at // _CELLS, at % _CELLS] = np.median(group)
-    mesh = axes.pcolormesh(*edges, shown.T, cmap='viridis')
-    drawing.colorbar(mesh, label=f'median {name} [{figure.unit}]')
-    quantities = results.study.protocol.quantities
-    axes.set(
-        xlabel=f'{first} [{quantities[first].unit}]',
-        ylabel=f'{second} [{quantities[second].unit}]',
-    )
-    return Picture(
-        'map', f'Median {name} over the two quantities that matter most. White: too few.', drawing
-    )
+    mesh = axes.pcolormesh(*edges, shown.reshape(count, count).T, cmap='viridis')
+    drawing.colorbar(mesh, label=_head(f'median {name}', figure.unit))
+    axes.set(xlabel=heads[0], ylabel=heads[1])
+    words = f'Median {name} over the two quantities that matter most. White: too few.'
+    return (Picture('map', words, drawing),)

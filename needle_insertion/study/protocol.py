@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from math import inf
 from typing import Any, Final, NamedTuple
 from typing import Protocol as Interface
 
-from needle_dynamics import FloatArray, SteeredNeedle
+from needle_dynamics import FloatArray
+from needle_ros.contract import Topic
 import numpy as np
 
 
@@ -52,6 +53,26 @@ class Figure(NamedTuple):
     meaning: str
 
 
+class Seen(NamedTuple):
+    """
+    What a robot or a sensor would have said in a sample.
+
+    Attributes
+    ----------
+    topic : Topic
+        Where.
+    stamp : int
+        When [ns].
+    values : sequence of float
+        Its numbers, see `Topic.quantities`.
+
+    """
+
+    topic: Topic
+    stamp: int
+    values: Sequence[float]
+
+
 class Protocol(Interface):
     """
     What is done with a sample.
@@ -88,12 +109,7 @@ class Protocol(Interface):
 
         """
 
-    def replay(
-        self,
-        drawn: Mapping[str, float],
-        rng: np.random.Generator,
-        watch: Callable[[SteeredNeedle], object],
-    ) -> FloatArray:
+    def replay(self, drawn: Mapping[str, float], rng: np.random.Generator) -> Iterator[Seen]:
         """
         Do it with one sample again.
 
@@ -103,23 +119,32 @@ class Protocol(Interface):
             What differs.
         rng : Generator
             Its source of chance.
-        watch : callable
-            Called with the needle after each step.
 
-        Returns
-        -------
-        ndarray, shape (3,)
-            Its target [m].
+        Yields
+        ------
+        Seen
+            What was measured and commanded, in the order of time within each topic.
 
         """
 
 
-def _steering(settings: Mapping[str, Any]) -> Protocol:
-    # Imported here: a study needs one of them.
-    from needle_insertion.study.steering import SteeringProtocol
+# Imported when they are made: a study needs one of them.
 
-    return SteeringProtocol(settings)
+
+def _steering(settings: Mapping[str, Any]) -> Protocol:
+    from needle_insertion.study.steering_seen import SeenSteering
+
+    return SeenSteering(settings)
+
+
+def _insertion(settings: Mapping[str, Any]) -> Protocol:
+    from needle_insertion.study.insertion import InsertionProtocol
+
+    return InsertionProtocol(settings)
 
 
 #: Makes each protocol from the settings of a study.
-PROTOCOLS: Final[Mapping[str, Callable[[Mapping[str, Any]], Protocol]]] = {'steering': _steering}
+PROTOCOLS: Final[Mapping[str, Callable[[Mapping[str, Any]], Protocol]]] = {
+    'steering': _steering,
+    'insertion': _insertion,
+}

@@ -46,6 +46,9 @@ _ELLIPSE: Final = 5.991
 #: Seeds of paths are below.
 _SEEDS: Final = 2**63
 
+#: Needles that are held at once.
+_TOGETHER: Final = 256
+
 #: Parts of the settings that are mappings, or words.
 _PARTS: Final = ('needle', 'constants', 'belief', 'controller')
 
@@ -183,20 +186,38 @@ class SteeringProtocol:
             name: drawn.get(name, np.full(count, one.default))
             for name, one in self.quantities.items()
         }
-        rows = [{name: float(values[k]) for name, values in each.items()} for k in range(count)]
-        truths = [self._truth(row, rng) for row, rng in zip(rows, streams, strict=True)]
-        targets = np.array([[row['target_x'], row['target_z']] for row in rows]).reshape(-1, 2)
         found = {name: np.full(count, nan) for name in FIGURES}
-        if self._controller == OPEN_LOOP:
-            self._open(truths, found)
-        else:
-            for k, (truth, row, rng) in enumerate(zip(truths, rows, streams, strict=True)):
-                for name, value in self._steered(truth, row, rng).items():
-                    found[name][k] = value
+        for first in range(0, count, _TOGETHER):
+            some = slice(first, first + _TOGETHER)
+            self._insert(
+                {name: values[some] for name, values in each.items()},
+                streams[some],
+                {name: values[some] for name, values in found.items()},
+            )
+        targets = np.stack([each['target_x'], each['target_z']], axis=1)
         tips = np.stack([found['tip_x'], found['tip_z']], axis=1)
         found['miss'] = np.hypot(*(tips - targets).T)
         found['hit'] = (found['miss'] <= HIT).astype(float)
         return found
+
+    def _insert(
+        self,
+        each: Mapping[str, FloatArray],
+        streams: Sequence[np.random.Generator],
+        found: Mapping[str, FloatArray],
+    ) -> None:
+        """Insert needles; each quantity and each figure has a number for each of them."""
+        rows = [
+            dict(zip(each, values, strict=True))
+            for values in zip(*(values.tolist() for values in each.values()), strict=True)
+        ]
+        truths = [self._truth(row, rng) for row, rng in zip(rows, streams, strict=True)]
+        if self._controller == OPEN_LOOP:
+            self._open(truths, found)
+            return
+        for k, (truth, row, rng) in enumerate(zip(truths, rows, streams, strict=True)):
+            for name, value in self._steered(truth, row, rng).items():
+                found[name][k] = value
 
     def _truth(self, row: Mapping[str, float], rng: np.random.Generator) -> Truth:
         needle, steering = with_lengths(
@@ -218,7 +239,7 @@ class SteeringProtocol:
             seed=int(rng.integers(_SEEDS)),
         )
 
-    def _open(self, truths: Sequence[Truth], found: dict[str, FloatArray]) -> None:
+    def _open(self, truths: Sequence[Truth], found: Mapping[str, FloatArray]) -> None:
         """Insert needles whose guide rests, all at once."""
         depth = self._depths[-1]
         tilts = np.array([truth.tilt for truth in truths])[:, np.newaxis, :]
@@ -233,7 +254,7 @@ class SteeringProtocol:
             workers=1,
         )
         frames = np.array([truth.frame for truth in truths])
-        found['tip_x'], found['tip_z'] = (tips[:, -1, [0, 2]] + frames * depth).T
+        found['tip_x'][:], found['tip_z'][:] = (tips[:, -1, [0, 2]] + frames * depth).T
         for name in ('way', 'turns'):
             found[name][:] = 0.0
 

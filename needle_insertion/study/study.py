@@ -15,6 +15,7 @@ from needle_ros.documents import DocumentError, read_document
 from needle_ros.errors import ParameterError
 from needle_ros.settings import unknown_name
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 from scipy.stats import qmc
 
@@ -22,11 +23,14 @@ from scipy.stats import qmc
 _KEYS: Final = ('protocol', 'samples', 'seed', 'design', 'settings', 'population', 'correlations')
 
 #: How samples are spread over the population.
-DESIGNS: Final = ('sobol', 'random')
+DESIGNS: Final = ('sobol', 'random', 'latin')
 
 #: Largest study, and largest number of dimensions of the Sobol sequence.
 _MOST: Final = 2**31
 _DIMENSIONS: Final = 21201
+
+#: Rounds of a permutation.
+_ROUNDS: Final = 8
 
 #: Parts of a distribution are this far from its ends.
 _INSIDE: Final = 2.0**-54
@@ -109,9 +113,17 @@ class Study:
                 sequence.fast_forward(first)
             # One by itself at the begin: scipy warns of a first draw that is no power of 2.
             return np.concatenate([sequence.random(1), sequence.random(count - 1)])
-        return np.array(
+        chance = np.array(
             [self.rng(number, 0).random(dimensions) for number in range(first, first + count)]
         ).reshape(count, dimensions)
+        if self.design != 'latin':
+            return chance
+        numbers = np.arange(first, first + count, dtype=np.uint64)
+        strata = [
+            _permuted(numbers, self.samples, (self.seed, dimension))
+            for dimension in range(dimensions)
+        ]
+        return np.asarray((np.transpose(strata) + chance) / self.samples).reshape(chance.shape)
 
     def rng(self, number: int, stream: int) -> np.random.Generator:
         """
@@ -157,6 +169,33 @@ class Study:
             **drawn,
             **self.protocol.run(drawn, streams),
         }
+
+
+def _permuted(numbers: NDArray[np.uint64], count: int, key: tuple[int, int]) -> NDArray[np.uint64]:
+    """
+    Return where a permutation of ``range(count)`` takes some numbers, without making all of it.
+
+    It is a network of Feistel on the least even number of bits, whose values beyond the range are
+    taken through it again until they are inside.
+    """
+    half = np.uint64(max(1, ((count - 1).bit_length() + 1) // 2))
+    low = np.uint64((1 << int(half)) - 1)
+    # Streams of chance of samples have two numbers as their key, this one has three.
+    words = np.random.SeedSequence(key[0], spawn_key=(key[1], 0, 0)).generate_state(
+        _ROUNDS, np.uint64
+    )
+    found = numbers.copy()
+    outside = np.ones(len(found), dtype=bool)
+    while outside.any():
+        left, right = found[outside] >> half, found[outside] & low
+        for word in words:
+            # The finalizer of SplitMix64: each bit of a number changes half of the bits.
+            mixed = (right + word) * np.uint64(0xBF58476D1CE4E5B9)
+            mixed = (mixed ^ (mixed >> np.uint64(31))) * np.uint64(0x94D049BB133111EB)
+            left, right = right, left ^ ((mixed ^ (mixed >> np.uint64(29))) & low)
+        found[outside] = (left << half) | right
+        outside = found >= count
+    return found
 
 
 def read_study(path: Path) -> Study:
@@ -226,7 +265,8 @@ def made(document: Any) -> Study:
     for name in given:
         if name not in known:
             raise ParameterError(f'population: {unknown_name(str(name), known)}')
-    population = {name: distribution(f'population: {name}', one) for name, one in given.items()}
+    # Which dimension a name has shall not depend on the order in a file: `Study.text` sorts.
+    population = {name: distribution(f'population: {name}', given[name]) for name in sorted(given)}
     for name, one in population.items():
         ends = one.quantiles(np.array([_INSIDE, 1.0 - 2.0 * _INSIDE]))
         low, high, unit = known[name].low, known[name].high, known[name].unit

@@ -219,7 +219,7 @@ def test_a_batch_is_the_controller_of_the_node(name: str, delay: int) -> None:
     needles = plants(3)
     batch = run_batch(
         law, needles, START, REFERENCE, delay=delay, limit=2.0, duration=DURATION, step=1e-4,
-        keep=True,
+        keep=True, record=True,
     )  # fmt: skip
     for i, plant in enumerate(needles):
         controller = Controller(
@@ -234,6 +234,12 @@ def test_a_batch_is_the_controller_of_the_node(name: str, delay: int) -> None:
         # 1e-9: the same arithmetic, but for what the compiler may join.
         assert_allclose(batch.depths[i], run.depth, rtol=1e-9)
         assert_allclose(batch.states[i], run.states[-1], rtol=1e-9, atol=1e-12)
+        # Of what each coordinate reaches: rates swing by kilohertz.
+        reached = np.abs(run.states).max(axis=0) + 1e-12
+        assert_allclose(batch.courses[i] / reached, run.states / reached, atol=1e-9)
+        # A command takes effect after its delay.
+        acted = run.forces[delay:-1, 0]
+        assert_allclose(batch.commands[i, : len(acted)], acted, rtol=1e-9, atol=1e-9)
         wanted = np.array([REFERENCE.at(t).position for t in run.time])
         error = wanted - run.depth
         assert_allclose(batch.final[i], error[-1], atol=1e-12)
@@ -273,6 +279,46 @@ def test_an_own_law_runs_in_the_loop() -> None:
     model = NeedleModel(BELIEVED)
     expected = [-model.bias_forces(x)[0] for x in run.states[:-1]]
     assert_allclose(told.loads, expected, rtol=1e-12)
+
+
+class Blurred:
+    """A controller whose measurements have noise, and whose commands another force besides."""
+
+    def __init__(self, controller: Controller, noise: FloatArray) -> None:
+        self._controller, self._noise = controller, iter(noise)
+        self.period, self.delay = controller.period, controller.delay
+
+    def command(self, measured: Measurement, load: float = 0.0) -> Command:
+        depth, speed, _ = next(self._noise)
+        return self._controller.command(
+            replace(measured, depth=measured.depth + depth, speed=measured.speed + speed), load
+        )
+
+
+def test_noise_in_a_batch_is_that_of_the_encoders() -> None:
+    """It is added to what the law sees, and not to the needle; what acts besides moves it."""
+    law = Pid(axis=Axis.insertion(BELIEVED), gains=PidGains(), period=PERIOD)
+    count = round(DURATION / PERIOD)
+    noise = np.random.default_rng(3).standard_normal((count, 3)) * [2e-6, 2e-4, 0.0]
+    options: Any = {'delay': 1, 'limit': 15.0, 'duration': DURATION, 'step': 1e-4, 'record': True}
+    batch = run_batch(law, BELIEVED, START, REFERENCE, noise=noise, **options)
+    controller = Controller(
+        BELIEVED, 'pid', reference='minimum_jerk', settings=ControllerSettings(rotation=False)
+    )
+    # The reference of the batch begins where the needle is.
+    controller.set_target(0.024)
+    controller.guide.at(0.0, 0.02)
+    run = run_controller(Blurred(controller, noise), BELIEVED, START, duration=DURATION, step=1e-4)
+    reached = np.abs(run.states).max(axis=0) + 1e-12
+    assert_allclose(batch.courses[0] / reached, run.states / reached, atol=1e-9)
+    beside = np.array([0.0, 0.0, 0.1])
+    pushed = run_batch(law, BELIEVED, START, REFERENCE, noise=noise + beside, **options)
+    plain = run_batch(law, BELIEVED, START, REFERENCE, noise=noise, **options)
+    assert (pushed.commands < plain.commands).mean() > 0.9
+    with pytest.raises(ShapeError, match=r'noise must be finite, of shape \(\d+, 3\)'):
+        run_batch(law, BELIEVED, START, REFERENCE, noise=noise[1:], **options)
+    with pytest.raises(ParameterError, match='delay and late >= 0'):
+        run_batch(law, BELIEVED, START, REFERENCE, late=-1, **options)
 
 
 def test_a_batch_does_not_depend_on_threads_nor_on_its_step() -> None:

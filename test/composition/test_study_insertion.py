@@ -1,0 +1,326 @@
+"""`needle study` with the protocol `insertion`: a needle of eight states, pushed to a depth."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from needle_controller import (
+    Command,
+    Controller,
+    ControllerSettings,
+    Guard,
+    Measurement,
+    run_controller,
+    SafetyLimits,
+)
+from needle_dynamics import NeedleModel, NeedleParameters
+from needle_identification import message_counts, read_topic
+from needle_insertion.cli import main
+from needle_insertion.study.engine import compute, processes, Results
+from needle_insertion.study.insertion import CONTROLLERS, FIGURES
+from needle_insertion.study.study import made
+from needle_insertion.study.summary import column
+import numpy as np
+import pytest
+import yaml
+
+PHANTOM = NeedleParameters.preset('phantom')
+
+#: Short ways, from 2 cm.
+POPULATION: dict[str, Any] = {
+    'target': {'uniform': [0.025, 0.03]},
+    'depth': {'uniform': [0.018, 0.02]},
+    'tip': {'normal': [0.0, 2e-4], 'within': [-6e-4, 6e-4]},
+    'coulomb_friction': {'lognormal': [1.0, 0.2], 'within': [0.5, 2.0]},
+    'viscous_friction': {'lognormal': [1.0, 0.2], 'within': [0.5, 2.0]},
+    'carriage_mass': {'uniform': [0.0, 0.2]},
+    'tissue_stiffness': {'uniform': [0.5, 2.0]},
+    'tissue_damping': {'uniform': [0.5, 2.0]},
+    'depth_noise': {'choice': [0.0, 2e-6]},
+    'speed_noise': {'choice': [0.0, 2e-4]},
+    'force_noise': {'choice': [0.0, 0.05]},
+    'late': {'choice': [0, 2]},
+}
+SMALL: dict[str, Any] = {
+    'protocol': 'insertion',
+    'samples': 24,
+    'seed': 5,
+    'settings': {'wait': 0.5},
+    'population': POPULATION,
+}
+
+
+def one(settings: dict[str, Any] | None = None, **drawn: float) -> dict[str, float]:
+    """Return the figures of one sample with given values."""
+    protocol = made({**SMALL, 'settings': settings or {}, 'population': {}}).protocol
+    rows = {name: np.array([value]) for name, value in drawn.items()}
+    found = protocol.run(rows, [np.random.default_rng(1)])
+    assert list(found) == list(FIGURES)
+    return {name: float(values[0]) for name, values in found.items()}
+
+
+@pytest.mark.parametrize('controller', CONTROLLERS)
+@pytest.mark.parametrize('design', ['sobol', 'latin'])
+def test_a_sample_does_not_depend_on_its_chunk(controller: str, design: str) -> None:
+    """To the bit, whatever differs."""
+    settings = {'wait': 0.2, 'controller': controller}
+    study = made({**SMALL, 'settings': settings, 'design': design})
+    whole = study.rows(0, 20)
+    assert not np.isnan(whole['error']).any()
+    for first, count in ((0, 1), (1, 2), (3, 17)):
+        part = study.rows(first, count)
+        assert list(part) == list(whole)
+        for name, values in part.items():
+            assert np.array_equal(values, whole[name][first : first + count], equal_nan=True)
+
+
+def test_the_table_is_the_same_for_any_workers(tmp_path: Path) -> None:
+    """Its bytes are."""
+    study, tables = made({**SMALL, 'settings': {'wait': 0.2}}), []
+    for workers in (1, 2):
+        results = Results(tmp_path / str(workers), study)
+        compute(results, partial(processes, workers), workers, lambda _: None)
+        tables.append(results.table.read_bytes())
+    assert tables[0] == tables[1]
+
+
+class Late:
+    """A controller whose commands take effect later than it believes."""
+
+    def __init__(self, controller: Controller, late: int) -> None:
+        self._controller = controller
+        self.period, self.delay = controller.period, controller.delay + late
+
+    def command(self, measured: Measurement, load: float = 0.0) -> Command:
+        """Answer as the controller does."""
+        return self._controller.command(measured, load)
+
+
+@pytest.mark.parametrize('law', ['adaptive', 'inverse_dynamics', 'pid'])
+@pytest.mark.parametrize('late', [0, 3])
+def test_it_is_the_controller_of_the_node(law: str, late: int) -> None:
+    """The same figures as from the object that the node runs, on the same needle."""
+    settings = {'controller': law, 'step': 1e-5, 'reference': 'minimum_jerk', 'wait': 0.5}
+    drawn = {'target': 0.025, 'depth': 0.02, 'tip': 3e-4, 'coulomb_friction': 1.3,
+             'viscous_friction': 0.8, 'carriage_mass': 0.1, 'tissue_damping': 0.5}  # fmt: skip
+    found = one(settings, **drawn, late=float(late))
+    p = replace(
+        PHANTOM,
+        coulomb_friction=1.3 * PHANTOM.coulomb_friction,
+        viscous_friction=0.8 * PHANTOM.viscous_friction,
+        carriage_mass=0.1,
+        tissue_damping=0.5 * PHANTOM.tissue_damping,
+    )
+    controller = Controller(
+        PHANTOM, law, reference='minimum_jerk', settings=ControllerSettings(rotation=False)
+    )
+    controller.set_target(0.025)
+    # Rest of the run: the longer one of 15/8 D / v and of the acceleration, and the wait.
+    duration = round(1e3 * (1.875 * 0.005 / 0.01 + 0.5)) * 1e-3
+    run = run_controller(
+        Late(controller, late), p, NeedleModel(p).state_at(0.02, 3e-4), duration=duration
+    )
+    # Rounding of a closed loop with dry friction.
+    assert found['error'] == pytest.approx(abs(0.025 - run.depth[-1]), abs=1e-11)
+    assert found['overshoot'] == pytest.approx(max(0.0, run.depth.max() - 0.025), abs=1e-11)
+    assert found['force'] == pytest.approx(np.abs(run.forces[:, 0]).max(), rel=1e-6)
+    assert found['deflection'] == pytest.approx(np.abs(run.tip_deflection).max(), rel=1e-9)
+    assert found['stopped'] == found['left'] == 0.0
+
+
+def test_what_the_law_does_not_know_makes_it_worse() -> None:
+    """Exactly known it hits; with friction or delay that nobody told it, it follows less well."""
+    settings = {'controller': 'inverse_dynamics'}
+    known = one(settings, target=0.03)
+    assert known['hit'] == 1.0
+    assert known['following'] < 5e-6
+    assert np.isfinite(known['rest'])
+    for name, value in (('viscous_friction', 1.5), ('coulomb_friction', 1.5), ('late', 30.0)):
+        worse = one(settings, target=0.03, **{name: value})
+        assert worse['following'] > 2.0 * known['following']
+    # Noise of the encoders lets it come to rest later.
+    assert one(settings, target=0.03, depth_noise=2e-5)['rest'] > known['rest'] + 0.1
+
+
+def test_a_law_that_is_too_late_swings() -> None:
+    """Reversals at the end tell a limit cycle from a needle that comes to rest."""
+    settings = {'controller': 'pid', 'wait': 2.0}
+    calm = one(settings, target=0.03)
+    assert calm['reversals'] <= 2.0
+    assert np.isfinite(calm['rest'])
+    swings = one(settings, target=0.03, late=100.0)
+    assert swings['reversals'] > 5.0
+    assert np.isnan(swings['rest'])
+
+
+def test_open_loop_goes_where_friction_lets_it() -> None:
+    """A straight needle as believed is within a period of its target; others by closed form."""
+    settings, p = {'controller': 'open loop', 'wait': 0.1}, PHANTOM
+    speed = (3.0 - p.coulomb_friction) / p.viscous_friction
+    known = one(settings, target=0.03, depth=0.02)
+    # M / mu_v is 7 us: it is at its speed at once.
+    assert known['error'] < speed * 1e-3
+    assert np.isnan(known['following'])
+    assert np.isnan(known['stopped'])
+    assert known['force'] == 3.0
+    for name, factor in (('viscous_friction', 1.25), ('coulomb_friction', 2.0)):
+        mu_s = p.coulomb_friction * (factor if name == 'coulomb_friction' else 1.0)
+        mu_v = p.viscous_friction * (factor if name == 'viscous_friction' else 1.0)
+        way = 0.01 * (3.0 - mu_s) / mu_v / speed
+        found = one(settings, target=0.03, depth=0.02, **{name: factor})
+        assert found['error'] == pytest.approx(0.01 - way, abs=speed * 1e-3)
+    out = one(settings, target=0.02, depth=0.03)
+    assert out['error'] < speed * 1e-3
+
+
+def test_a_needle_that_leaves_its_range_is_said() -> None:
+    """Pulled out by a push for more friction than there is; before that, the guard stops a law."""
+    found = one({'controller': 'open loop'}, target=0.001, depth=0.02, viscous_friction=0.5)
+    assert found['left'] == 1.0
+    assert found['hit'] == 0.0
+    assert np.isnan(found['rest'])
+    wild = {'target': 0.03, 'late': 100.0, 'viscous_friction': 0.1}
+    stopped = one({'controller': 'pid'}, **wild)
+    assert (stopped['stopped'], stopped['left']) == (1.0, 0.0)
+    free = one({'controller': 'pid', 'speed_limit': 10.0, 'error_limit': 10.0}, **wild)
+    assert (free['stopped'], free['left']) == (0.0, 1.0)
+
+
+@pytest.mark.parametrize(
+    ('settings', 'limits'),
+    [
+        ({'speed_limit': 0.009}, {'speed': 0.009}),
+        ({'reference': 'step', 'error_limit': 0.005}, {'tracking_error': 0.005}),
+        ({'deflection_limit': 1e-4}, {'tip_deflection': 1e-4}),
+        ({}, {}),
+    ],
+)
+def test_the_guard_stops_as_that_of_the_node(
+    settings: dict[str, Any], limits: dict[str, Any]
+) -> None:
+    """Fed with what was measured, it finds a violation at the last sample and at none before."""
+    study = made({**SMALL, 'settings': settings, 'population': {}})
+    drawn = {'target': 0.03, 'depth': 0.02, 'tip': 3e-4, 'speed_noise': 2e-4}
+    rows = {name: np.array([value]) for name, value in drawn.items()}
+    found = study.protocol.run(rows, [study.rng(0, 1)])
+    guard = Guard(SafetyLimits(**limits), (PHANTOM.minimum_depth, PHANTOM.length))
+    said: list[bool] = []
+    for topic, _, values in study.protocol.replay(drawn, study.rng(0, 1)):
+        if topic.name == 'joint_states':
+            measured = Measurement(time=0.0, depth=values[0], speed=values[2])
+            beyond = [guard.encoders(measured)]
+            if settings.get('reference') == 'step':
+                beyond.append(guard.tracking(0.03 - values[0]))
+        elif topic.name == 'tip_deflection':
+            beyond.append(guard.tip(values[2]))
+            said.append(any(beyond))
+    assert not any(said[:-1])
+    assert said[-1] == bool(settings)
+    assert found['stopped'][0] == float(bool(settings))
+    assert found['hit'][0] == float(not settings)
+
+
+def test_a_bag_of_a_sample_has_what_the_table_has(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Depth, force, deflection and target, bit for bit; the encoders beside their noise."""
+    file, folder = tmp_path / 'insertion.yaml', tmp_path / 'results'
+    file.write_text(yaml.safe_dump(SMALL))
+    words = ['study', str(file), '-o', str(folder), '--workers', '1']
+    assert main(words) == 0
+    assert '24 samples' in capsys.readouterr().out
+    table = folder / 'samples.parquet'
+    # With noise of the encoders, and without noise of the force.
+    wanted = (column(table, 'depth_noise') > 0.0) & (column(table, 'force_noise') == 0.0)
+    number = int(np.flatnonzero(wanted)[0])
+    assert main([*words, '--replay', str(number)]) == 0
+    assert 'the same numbers as in the table' in capsys.readouterr().out
+    bag = folder / f'sample_{number}'
+    counts = message_counts(bag)
+    assert set(counts) == {'/joint_states', '/tip_deflection', '/wrench_command', '/target'}
+    assert counts['/joint_states'] == counts['/tip_deflection'] == counts['/wrench_command'] + 1
+    row = {name: column(table, name)[number] for name in (*FIGURES, 'target')}
+    ((_, target),) = read_topic(bag, '/target')
+    assert target.point.y == row['target']
+    tips = np.array([[m.point.y, m.point.z] for _, m in read_topic(bag, '/tip_deflection')])
+    assert abs(row['target'] - tips[-1, 0]) == row['error']
+    assert np.abs(tips[:, 1]).max() == row['deflection']
+    acted = [m.effort[0] for _, m in read_topic(bag, '/joint_states')]
+    assert np.abs(acted).max() == row['force']
+    commands = [m.wrench.force.y for _, m in read_topic(bag, '/wrench_command')]
+    late = int(column(table, 'late')[number])
+    # A command takes effect one period, and those that nobody knows, after its sample.
+    assert acted[2 + late :] == commands[: len(commands) - 1 - late]
+    off = np.array([m.position[0] for _, m in read_topic(bag, '/joint_states')]) - tips[:, 0]
+    # Five standard errors of a standard deviation; nothing answers the last sample.
+    assert off[:-1].std() == pytest.approx(2e-6, rel=5.0 / np.sqrt(2.0 * len(off)))
+
+
+def test_the_page_and_the_example(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The study that is shipped, with few samples: it goes through, and most needles hit."""
+    example = Path(__file__).parents[2] / 'examples' / 'studies' / 'insertion.yaml'
+    document = {**yaml.safe_load(example.read_text()), 'samples': 20}
+    file = tmp_path / 'few.yaml'
+    file.write_text(yaml.safe_dump(document, sort_keys=False))
+    assert main(['study', str(file), '-o', str(tmp_path / 'few'), '--workers', '1']) == 0
+    capsys.readouterr()
+    assert column(tmp_path / 'few' / 'samples.parquet', 'hit').mean() > 0.5
+    again = ['study', str(file), '-o', str(tmp_path / 'few'), '--replay', '17']
+    assert main(again) == 0
+    assert 'the same numbers as in the table' in capsys.readouterr().out
+    page = (tmp_path / 'few' / 'study.html').read_text()
+    for words in ('Median error', 'viscous_friction', 'how often it turns round'):
+        assert words in page
+
+
+def test_steps_of_the_simulation_do_not_matter_at_the_default() -> None:
+    """Figures are those of steps 20 times as short, to a thousandth of what they are for."""
+    drawn = {'target': 0.04, 'tip': 5e-4, 'coulomb_friction': 1.2, 'carriage_mass': 0.1}
+    found, fine = (one(settings, **drawn) for settings in ({}, {'step': 1e-5}))
+    for name in ('error', 'overshoot', 'following'):
+        assert found[name] == pytest.approx(fine[name], abs=1e-3 * 1e-4)
+    assert found['force'] == pytest.approx(fine['force'], rel=1e-3)
+    assert found['deflection'] == pytest.approx(fine['deflection'], rel=1e-3)
+    assert found['rest'] == pytest.approx(fine['rest'], abs=2e-3)
+
+
+@pytest.mark.parametrize(
+    ('change', 'complaint'),
+    [
+        ({'population': {'mu_s': 1}}, "population: unknown parameter 'mu_s'; "),
+        ({'population': {'target': 0.3}}, 'target must be in [0.001, 0.2] m, and would be from'),
+        ({'population': {'late': {'choice': [-1, 0]}}}, 'late must be in [0, 100] periods'),
+        ({'settings': {'deep': 1}}, "settings: unknown parameter 'deep'"),
+        ({'settings': {'needle': 'bone'}}, 'needle must be one of paper_si, paper_mm, phantom,'),
+        ({'settings': {'controller': 'me'}}, 'controller must be one of adaptive'),
+        ({'settings': {'reference': 'leap'}}, 'reference must be one of trapezoid'),
+        ({'settings': {'constants': {'leng': 1}}}, "'settings.constants.leng'; did you mean"),
+        ({'settings': {'constants': 1}}, 'settings: constants must be names with values'),
+        ({'settings': {'gains': {'kq': 1}}}, "unknown parameter 'settings.gains.kq'"),
+        ({'settings': {'controller': 'pid', 'gains': {'kp': 1e6}}}, 'pid gains are unstable at'),
+        ({'settings': {'delay': 0.5}}, 'delay must be a whole number of periods, got 0.5'),
+        ({'settings': {'wait': 0}}, 'settings.wait must be finite, > 0 s, got 0'),
+        ({'settings': {'uncertainty': {'coulomb': 2}}}, 'settings.uncertainty.coulomb must be'),
+        ({'settings': {'controller': 'open loop', 'push': 0.5}}, 'push must be > Coulomb frict'),
+        ({'settings': {'controller': 'open loop', 'gains': {'kp': 1}}}, 'gains are for adaptive,'),
+        (
+            {'settings': {'constants': {'formulation': 'as_printed'}}},
+            "formulation must be 'complete' for controller",
+        ),
+    ],
+)
+def test_what_is_wrong_is_named_before_anything_is_computed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], change: Any, complaint: str
+) -> None:
+    """In one line, with the file, and nothing is written."""
+    file = tmp_path / 'study.yaml'
+    file.write_text(yaml.safe_dump({**SMALL, **change}))
+    assert main(['study', str(file), '-o', str(tmp_path / 'new')]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith(f'error: {file}: ')
+    assert complaint in said
+    assert said.count('\n') == 1
+    assert not (tmp_path / 'new').exists()
