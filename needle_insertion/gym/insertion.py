@@ -10,12 +10,12 @@ import gymnasium
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
-from needle_dynamics import FloatArray, Integrator, NeedleModel, NeedleParameters
-from needle_dynamics.errors import InsertedLengthError
+from needle_dynamics import FloatArray, NeedleModel, NeedleParameters
+from needle_dynamics.compiled.held import Held
+from needle_dynamics.compiled.tissue import Layers
+from needle_insertion.gym.pushed import BOUND, observe, push, Pushed, UNITS
+from needle_ros.errors import ParameterError
 import numpy as np
-
-#: Time of a step [s], longest step of the integrator [s], and largest force [N].
-PERIOD, STEP, FORCE = 0.01, 1e-3, 15.0
 
 #: Depth at the start, and depths of targets [m].
 START: Final = 0.02
@@ -25,50 +25,50 @@ TARGETS: Final = (0.03, 0.12)
 SPREAD: Final = 0.3
 DRAWN: Final = ('coulomb_friction', 'viscous_friction', 'tissue_stiffness')
 
-#: A needle is there when it is nearer [m] and slower [m/s].
-_NEAR, _SLOW = 2e-4, 1e-3
-
-#: Units of an observation: error [m], velocity [m/s], depth [m], deflection [m].
-_UNITS: Final = np.array([0.1, 0.1, 0.1, 1e-3])
-
-#: Observations are cut here, which nothing sane comes near.
-BOUND: Final = 1e3
-
-#: Price of force in the reward [1/N^2].
-_PRICE: Final = 1e-5
+#: The needle of a single environment is pushed in each step.
+_ONE: Final = np.ones(1, dtype=bool)
 
 
-class _Needle:
-    """A needle of an episode, with its target."""
+class _Needles:
+    """The needles of some episodes, each with its target."""
 
-    def __init__(self, preset: NeedleParameters, rng: np.random.Generator) -> None:
+    def __init__(self, preset: str, number: int) -> None:
+        self._preset = NeedleParameters.preset(preset)
+        model = NeedleModel(self._preset)
+        self._start, common = model.state_at(START), model.compiled
+        self._needles = Pushed(
+            common,
+            np.zeros((number, 2)),
+            Layers(*(np.array([one] * number) for one in common.layers)),
+            np.zeros(number),
+            np.array([self._start] * number),
+            np.zeros(number),
+        )
+        self._held = Held(self._needles)
+
+    def begin(self, k: int, rng: np.random.Generator) -> None:
+        """Draw another needle."""
         factors = 1.0 + SPREAD * rng.uniform(-1.0, 1.0, len(DRAWN))
         changed: dict[str, Any] = {
-            name: float(factor * getattr(preset, name))
+            name: float(factor * getattr(self._preset, name))
             for name, factor in zip(DRAWN, factors, strict=True)
         }
-        parameters = replace(preset, **changed)
-        model = NeedleModel(parameters)
-        self._integrator = Integrator(parameters, model.state_at(START), STEP)
-        self.target = float(rng.uniform(*TARGETS))
+        drawn, all_of = NeedleModel(replace(self._preset, **changed)).compiled, self._needles
+        all_of.friction[k] = drawn.friction.coulomb, drawn.friction.viscous
+        for layers, one in zip(all_of.layers, drawn.layers, strict=True):
+            layers[k] = one
+        all_of.times[k], all_of.states[k] = 0.0, self._start
+        all_of.targets[k] = rng.uniform(*TARGETS)
 
-    def step(self, action: float) -> tuple[float, bool]:
-        """Push for a period; return the reward, and whether the episode has ended."""
-        one, force = self._integrator, FORCE * min(max(float(action), -1.0), 1.0)
-        try:
-            one.advance(PERIOD, force)
-        except InsertedLengthError:
-            return -1.0, True
-        error = abs(self.target - one.depth)
-        there = error < _NEAR and abs(one.velocity) < _SLOW
-        return -error - _PRICE * force * force, there
+    def step(self, actions: FloatArray, which: Any) -> tuple[FloatArray, Any]:
+        """Push some for a period; return rewards, and which episodes have ended."""
+        if not np.isfinite(actions).all():
+            raise ParameterError(f'an action must be finite, got {actions!r}')
+        return push(self._held, np.array(actions, dtype=np.float64), which)
 
     def observe(self) -> FloatArray:
-        """Return what is seen of it, shape (4,)."""
-        one = self._integrator
-        tip = float(one.model.tip_deflections(one.state))
-        seen = np.array([self.target - one.depth, one.velocity, one.depth, tip])
-        return np.asarray(np.clip(seen / _UNITS, -BOUND, BOUND), dtype=np.float32)
+        """Return what is seen of them, shape (n, 4)."""
+        return np.asarray(observe(self._held))
 
 
 class InsertionEnv(gymnasium.Env[FloatArray, FloatArray]):
@@ -90,10 +90,9 @@ class InsertionEnv(gymnasium.Env[FloatArray, FloatArray]):
     metadata: ClassVar[dict[str, Any]] = {'render_modes': []}
 
     def __init__(self, preset: str = 'phantom') -> None:
-        self._preset = NeedleParameters.preset(preset)
+        self._needles, self._begun = _Needles(preset, 1), False
         self.action_space = spaces.Box(-1.0, 1.0, (1,))
-        self.observation_space = spaces.Box(-BOUND, BOUND, (len(_UNITS),))
-        self._needle: _Needle | None = None
+        self.observation_space = spaces.Box(-BOUND, BOUND, (len(UNITS),))
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -117,8 +116,9 @@ class InsertionEnv(gymnasium.Env[FloatArray, FloatArray]):
 
         """
         super().reset(seed=seed, options=options)
-        self._needle = _Needle(self._preset, self.np_random)
-        return self._needle.observe(), {}
+        self._needles.begin(0, self.np_random)
+        self._begun = True
+        return self._needles.observe()[0], {}
 
     def step(self, action: FloatArray) -> tuple[FloatArray, float, bool, bool, dict[str, Any]]:
         """
@@ -143,10 +143,10 @@ class InsertionEnv(gymnasium.Env[FloatArray, FloatArray]):
             Empty.
 
         """
-        if self._needle is None:
+        if not self._begun:
             raise gymnasium.error.ResetNeeded('no episode has begun: call reset')
-        reward, over = self._needle.step(action[0])
-        return self._needle.observe(), reward, over, False, {}
+        [reward], [over] = self._needles.step(action, _ONE)
+        return self._needles.observe()[0], float(reward), bool(over), False, {}
 
 
 class InsertionVectorEnv(VectorEnv[FloatArray, FloatArray, FloatArray]):
@@ -177,9 +177,8 @@ class InsertionVectorEnv(VectorEnv[FloatArray, FloatArray, FloatArray]):
         self.single_observation_space = single.observation_space
         self.action_space = batch_space(single.action_space, num_envs)
         self.observation_space = batch_space(single.observation_space, num_envs)
-        self._preset, self._longest = NeedleParameters.preset(preset), max_episode_steps
+        self._needles, self._longest = _Needles(preset, num_envs), max_episode_steps
         self._rngs: list[np.random.Generator] = []
-        self._needles: list[_Needle] = []
 
     def reset(
         self,
@@ -213,10 +212,11 @@ class InsertionVectorEnv(VectorEnv[FloatArray, FloatArray, FloatArray]):
         )
         if any(one is not None for one in seeds) or not self._rngs:
             self._rngs = [gymnasium.utils.seeding.np_random(one)[0] for one in seeds]
-        self._needles = [_Needle(self._preset, rng) for rng in self._rngs]
+        for k, rng in enumerate(self._rngs):
+            self._needles.begin(k, rng)
         self._steps = np.zeros(self.num_envs, dtype=int)
         self._over = np.zeros(self.num_envs, dtype=bool)
-        return self._observe(), {}
+        return self._needles.observe(), {}
 
     def step(self, actions: FloatArray) -> tuple[FloatArray, FloatArray, Any, Any, dict[str, Any]]:
         """
@@ -239,19 +239,13 @@ class InsertionVectorEnv(VectorEnv[FloatArray, FloatArray, FloatArray]):
             Empty.
 
         """
-        if not self._needles:
+        if not self._rngs:
             raise gymnasium.error.ResetNeeded('no episode has begun: call reset')
-        rewards, ended = np.zeros(self.num_envs), np.zeros(self.num_envs, dtype=bool)
         again = self._over
-        for k, needle in enumerate(self._needles):
-            if again[k]:
-                self._needles[k] = _Needle(self._preset, self._rngs[k])
-            else:
-                rewards[k], ended[k] = needle.step(actions[k, 0])
+        rewards, ended = self._needles.step(actions[:, 0], ~again)
+        for k in np.flatnonzero(again).tolist():
+            self._needles.begin(k, self._rngs[k])
         self._steps = np.where(again, 0, self._steps + 1)
         broken = (self._steps >= self._longest) & ~ended
         self._over = ended | broken
-        return self._observe(), rewards, ended, broken, {}
-
-    def _observe(self) -> FloatArray:
-        return np.array([needle.observe() for needle in self._needles])
+        return self._needles.observe(), rewards, ended, broken, {}

@@ -9,7 +9,7 @@ from gymnasium import spaces
 from needle_controller import SteeringBelief
 from needle_controller.steering.trial import drawn, Truth
 from needle_dynamics import FloatArray, SteeredNeedle, STEERING_PRESETS
-from needle_insertion.gym.insertion import BOUND
+from needle_insertion.gym.pushed import BOUND
 from needle_ros.errors import ParameterError
 import numpy as np
 
@@ -86,10 +86,8 @@ class SteeringEnv(gymnasium.Env[FloatArray, FloatArray]):
 
         Parameters
         ----------
-        seed : int, optional
-            Seed of all that follows.
-        options : dict, optional
-            Not used.
+        seed, options
+            As in `InsertionEnv.reset`.
 
         Returns
         -------
@@ -138,11 +136,11 @@ class SteeringEnv(gymnasium.Env[FloatArray, FloatArray]):
         x, z = (self._limit * np.clip(action, -1.0, 1.0)).tolist()
         self._one.move(guide=(x, z))
         self._one.move(depth=float(self._depths[self._at]))
-        over = self._at == len(self._depths) - 1
+        seen = self._observe(truth, self._one)
+        if self._at < len(self._depths) - 1:
+            return seen, 0.0, False, False, {}
         miss = float(np.hypot(*(truth.tip(self._one) - self._target)))
-        info = {'miss': miss} if over else {}
-        reward = -1e3 * miss if over else 0.0
-        return self._observe(truth, self._one), reward, over, False, info
+        return seen, -1e3 * miss, True, False, {'miss': miss}
 
     def _observe(self, truth: Truth, one: SteeredNeedle) -> FloatArray:
         seen = truth.tip(one) + self._belief.noise * self.np_random.standard_normal(2)

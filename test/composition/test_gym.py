@@ -2,9 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import gymnasium
 from gymnasium.utils.env_checker import check_env
-from needle_insertion.gym.insertion import InsertionEnv, InsertionVectorEnv
+from needle_dynamics import Integrator, NeedleModel, NeedleParameters
+from needle_dynamics.errors import InsertedLengthError
+from needle_insertion.gym.insertion import (
+    DRAWN,
+    InsertionEnv,
+    InsertionVectorEnv,
+    SPREAD,
+    START,
+    TARGETS,
+)
+from needle_insertion.gym.pushed import FORCE, PERIOD, STEP
 from needle_insertion.gym.steering import SteeringEnv
 from needle_ros.errors import ParameterError
 import numpy as np
@@ -39,6 +51,44 @@ def test_a_vector_is_single_environments_with_seeds_of_their_own() -> None:
             assert (rewards[k], ended[k], broken[k]) == (reward, over, late)
         begins = ended | broken
     many.close()
+
+
+def test_a_needle_is_that_of_the_integrator() -> None:
+    """To the bit, until it leaves its range."""
+    environment = InsertionEnv('phantom')
+    seen, _ = environment.reset(seed=3)
+    rng, _ = gymnasium.utils.seeding.np_random(3)
+    preset = NeedleParameters.preset('phantom')
+    factors = 1.0 + SPREAD * rng.uniform(-1.0, 1.0, len(DRAWN))
+    parameters = replace(
+        preset, **{name: f * getattr(preset, name) for name, f in zip(DRAWN, factors, strict=True)}
+    )
+    target = rng.uniform(*TARGETS)
+    one = Integrator(parameters, NeedleModel(parameters).state_at(START), STEP)
+    # In for a while, then out, and beyond the range.
+    for force in [FORCE] * 20 + [-FORCE] * 200:
+        seen, reward, over, _, _ = environment.step(np.array([force / FORCE]))
+        try:
+            one.advance(PERIOD, force)
+        except InsertedLengthError:
+            assert over
+            assert reward == -1.0
+            break
+        assert not over
+        assert reward == -abs(target - one.depth) - 1e-5 * force * force
+        tip = one.model.tip_deflection(one.state)
+        expected = [10.0 * (target - one.depth), 10.0 * one.velocity, 10.0 * one.depth, 1e3 * tip]
+        # Observations have the precision of 32 bits.
+        np.testing.assert_allclose(seen, expected, rtol=1e-6, atol=1e-9)
+    else:
+        pytest.fail('the needle did not come out')
+
+
+def test_a_force_that_is_no_number_is_named() -> None:
+    environment = InsertionEnv()
+    environment.reset(seed=1)
+    with pytest.raises(ParameterError, match='an action must be finite'):
+        environment.step(np.array([np.nan]))
 
 
 def test_a_push_towards_the_target_earns_more_than_none() -> None:
