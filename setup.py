@@ -105,7 +105,15 @@ setup(
         'dask': DASK,
         'gym': GYM,
         # What `needle bench` is measured beside.
-        'bench': ['mcap-ros2-support>=0.5.6', 'mujoco>=3.2', 'pyelastica>=0.3.3', *SLICER],
+        'bench': [
+            'mcap-ros2-support>=0.5.6',
+            'mujoco>=3.2',
+            'psutil>=5.8',
+            'pyelastica>=0.3.3',
+            *SLICER,
+            *DASK,
+            *GYM,
+        ],
     },
     entry_points={
         'console_scripts': [

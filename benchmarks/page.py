@@ -20,6 +20,7 @@ _TOOLS: Final = {
     'identification': ('mcap', 'rosbags', 'mcap-ros2-support'),
     'graph': ('rclpy',),
     'slicer': ('rclpy', 'pyigtl'),
+    'study': ('pyarrow', 'distributed', 'gymnasium'),
 }
 
 

@@ -13,12 +13,13 @@ from typing import TypeAlias
 
 from benchmarks.measure import Bar
 from benchmarks.page import Answer, conclusion, header, Tick
+from needle_ros.errors import ParameterError
 from tqdm import tqdm
 
 #: Measures something.
 Question: TypeAlias = Callable[[Tick], Answer]
 
-#: Modules of each benchmark, each with a function `compare`; the last two and `safety` need ROS.
+#: Modules of each benchmark, each with a function `compare`; safety, graph and slicer need ROS.
 MODULES = {
     'dynamics': ('step', 'solvers', 'rods', 'batches'),
     'identification': ('identification',),
@@ -32,6 +33,7 @@ MODULES = {
     'safety': ('safety',),
     'graph': ('graph',),
     'slicer': ('slicer',),
+    'study': ('study', 'environments'),
 }
 
 
@@ -91,6 +93,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     slicer.add_argument(
         '--quick', dest='plan', action='store_const', const='quick', help='a trial of 20 s'
     )
+    study = add(
+        'study', help='populations of insertions: rates, memory, and workers that are killed'
+    )
+    study.add_argument(
+        '--quick',
+        dest='plan',
+        action='store_const',
+        const='quick',
+        help='a trial, too short for reliable figures',
+    )
 
 
 def run(options: argparse.Namespace) -> int:
@@ -110,15 +122,19 @@ def run(options: argparse.Namespace) -> int:
     Raises
     ------
     ParameterError
-        If a number is out of range.
+        If a number is out of range, or what it needs is not installed.
 
     """
     given = {key: value for key, value in vars(options).items() if value is not None}
     name, output = given.pop('name'), given.pop('output', None)
     words = [f'--{value}' if key == 'plan' else f'--{key} {value}' for key, value in given.items()]
-    questions = [
-        partial(import_module(f'benchmarks.{module}').compare, **given) for module in MODULES[name]
-    ]
+    try:
+        modules = [import_module(f'benchmarks.{module}') for module in MODULES[name]]
+    except ModuleNotFoundError as error:
+        raise ParameterError(
+            f"needle bench {name} needs {error.name}: pip install -e '.[bench,ros]'"
+        ) from error
+    questions = [partial(module.compare, **given) for module in modules]
     page, missed = ask(name, ' '.join(('needle bench', name, *words)), questions)
     if output is not None:
         output.write_text(page, encoding='utf-8')

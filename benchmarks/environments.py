@@ -1,0 +1,105 @@
+"""Environments of Gymnasium: steps per second, beside two that come with it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, Final
+
+from benchmarks.measure import least_times, number
+from benchmarks.page import Answer, Section, Tick
+import gymnasium
+
+#: Ours, and two of classic control.
+NAMES: Final = (
+    'needle_insertion.gym:NeedleInsertion-v0', 'needle_insertion.gym:NeedleSteering-v0',
+    'CartPole-v1', 'Pendulum-v1',
+)  # fmt: skip
+
+#: How many at once.
+MANY: Final = 64
+
+#: Steps of a turn, of one environment and of all at once: some episodes.
+STEPS: Final = {'single': 1000, 'vector': 100}
+
+_REPEATS: Final = {'default': 10, 'full': 10, 'quick': 1}
+
+
+def steps(environment: Any, actions: list[Any]) -> None:
+    """
+    Take steps; where an episode is over, the next one begins.
+
+    Parameters
+    ----------
+    environment : gymnasium.Env
+        Environment.
+    actions : list
+        Action of each step.
+
+    """
+    environment.reset()
+    for action in actions:
+        _, _, over, late, _ = environment.step(action)
+        if over or late:
+            environment.reset()
+
+
+def vector_steps(environments: Any, actions: list[Any]) -> None:
+    """
+    Take steps of many environments at once; the next episodes begin by themselves.
+
+    Parameters
+    ----------
+    environments : gymnasium.vector.VectorEnv
+        Environments.
+    actions : list
+        Actions of each step.
+
+    """
+    environments.reset()
+    for action in actions:
+        environments.step(action)
+
+
+def compare(tick: Tick, plan: str = 'default') -> Answer:
+    """
+    Take random actions in each environment, alone and many at once.
+
+    Parameters
+    ----------
+    tick : callable
+        Called with the name of each stage.
+    plan : str
+        How long: a key of the plans of `benchmarks.study`.
+
+    Returns
+    -------
+    sections, bars
+        A page; no bar.
+
+    """
+    tick('environments')
+    jobs: dict[str, Callable[[], object]] = {}
+    for name in NAMES:
+        one, many = gymnasium.make(name), gymnasium.make_vec(name, num_envs=MANY)
+        for kind, environment, take in (('single', one, steps), ('vector', many, vector_steps)):
+            environment.reset(seed=1)
+            environment.action_space.seed(1)
+            actions = [environment.action_space.sample() for _ in range(STEPS[kind])]
+            jobs[f'{name} {kind}'] = partial(take, environment, actions)
+    times = least_times(jobs, _REPEATS[plan])
+    rows = []
+    for name in NAMES:
+        single = STEPS['single'] / times[f'{name} single']
+        many_at_once = MANY * STEPS['vector'] / times[f'{name} vector']
+        rows.append((name.rpartition(':')[2], number(single), number(many_at_once)))
+    section = Section(
+        'Environments of Gymnasium: steps per second',
+        ('environment', 'one', f'{MANY} at once'),
+        rows,
+        'One core, random actions, with resets. `gymnasium.make` and `gymnasium.make_vec` make '
+        'them with their defaults: `NeedleInsertion-v0` and `CartPole-v1` have a vector form of '
+        'their own, the others are taken one by one. A step of `NeedleInsertion-v0` is 10 ms of a '
+        'needle with its modes, and one of `NeedleSteering-v0` is 5 mm of a beam in tissue.',
+    )
+    return [section], []

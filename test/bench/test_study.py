@@ -1,0 +1,83 @@
+"""The benchmark of studies computes what it says; times are not tested."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import ModuleType
+
+from benchmarks import environments, run
+from benchmarks import study as bench_study
+from benchmarks.kills import again, written
+from benchmarks.study import Plan
+from needle_insertion.cli import main
+import pytest
+import yaml
+
+#: Few short insertions, by a controller that takes no time.
+SMALL = {
+    'protocol': 'steering',
+    'samples': 1,
+    'seed': 3,
+    'settings': {'depth': 0.05, 'step': 0.01, 'controller': 'springs'},
+    'population': {'bending_length': {'uniform': [0.8, 1.2]}},
+}
+
+
+def test_every_figure_is_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Tables are equal, though workers and the study are killed."""
+    file = tmp_path / 'study.yaml'
+    file.write_text(yaml.safe_dump(SMALL))
+    monkeypatch.setattr(bench_study, 'STUDY', file)
+    monkeypatch.setitem(bench_study.PLANS, 'quick', Plan(400, 1, (10, 20, 40), 2, 3))
+    told: list[str] = []
+    [rates, memory, tables], bars = bench_study.compare(told.append, 'quick')
+    assert [row[1] for row in rates.rows] == ['1', '2', '2', '1', '2']
+    assert all(float(row[2]) > 0.0 for row in rates.rows)
+    assert [row[0] for row in memory.rows] == ['10', '20', '40']
+    # A process that has imported NumPy and Numba.
+    assert all(50.0 < float(peak) < 2000.0 for row in memory.rows for peak in row[2:])
+    assert len({row[1] for row in tables.rows}) == 1
+    assert 'a worker of Dask is killed half way' in [row[0] for row in tables.rows]
+    found = {bar.figure: bar for bar in bars}
+    assert found['tables that differ'].found == 0.0
+    assert found['insertions computed twice'].found == 0.0
+    assert found['closed loop, per second and core'].limit == 200.0
+    assert 'growth of the parent, 20 to 40 insertions' in found
+    assert 'the study is killed' in told
+
+
+def test_what_is_computed_twice_is_found(tmp_path: Path) -> None:
+    """In a part that is written anew, one that is gone, and one that has it, too."""
+    for name in ('0000000000-0000000004.parquet', '0000000004-0000000010.parquet', 'x.tmp'):
+        (tmp_path / name).write_text('')
+    before = written(tmp_path)
+    assert set(before) == {(0, 4), (4, 10)}
+    assert written(tmp_path / 'none') == {}
+    assert again(before, {**before, (10, 20): 0}) == 0
+    assert again(before, {**before, (4, 10): 1}) == 6
+    assert again(before, {(4, 10): before[4, 10]}) == 4
+    assert again(before, {**before, (8, 20): 0}) == 2
+
+
+def test_every_environment_is_measured(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(environments, 'STEPS', {'single': 30, 'vector': 3})
+    [section], bars = environments.compare(lambda _stage: None, 'quick')
+    assert bars == []
+    names = ['NeedleInsertion-v0', 'NeedleSteering-v0', 'CartPole-v1', 'Pendulum-v1']
+    assert [row[0] for row in section.rows] == names
+    assert all(float(rate) > 0.0 for row in section.rows for rate in row[1:])
+
+
+def test_what_is_not_installed_is_named(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """In one line, before anything is measured."""
+
+    def missing(_name: str) -> ModuleType:
+        raise ModuleNotFoundError("No module named 'pyarrow'", name='pyarrow')
+
+    monkeypatch.setattr(run, 'import_module', missing)
+    assert main(['bench', 'study', '--quick']) == 2
+    said = capsys.readouterr()
+    assert said.err == "error: needle bench study needs pyarrow: pip install -e '.[bench,ros]'\n"
+    assert said.out == ''
