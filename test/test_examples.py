@@ -14,6 +14,7 @@ EXAMPLES = Path(__file__).parents[1] / 'examples'
 PRINTED = {
     'aiming': r'steered: 0\.0\d mm from the target\nopen loop: 6\.\d\d mm',
     'batch': r'median \d+\.\d mm, 95 % of them between',
+    'inference': r'bending length: intervals of 95 % hold 9\d\.\d % of the true values',
     'fit_from_arrays': r'coulomb_friction: 0\.50\d* N',
     'observer': r'1\.00 s: estimate -?0\.0\d\d mm, true -?0\.000 mm',
     'own_controller': r'own law: 0\.280 mm short of the target',
@@ -22,6 +23,9 @@ PRINTED = {
     'simulate': r'depth at the end: 28\.1\d mm',
 }
 
+
+#: What a script needs that nothing else does: it is run where that is installed.
+NEEDS = {'inference': 'sbi'}
 
 #: Run by `test_hardware.py`.
 WITH_ROS = {'robot_driver'}
@@ -35,6 +39,8 @@ def test_example_runs(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     """The script runs by itself in an empty folder."""
+    if name in NEEDS:
+        pytest.importorskip(NEEDS[name])
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr('sys.argv', [name])
     runpy.run_path(str(EXAMPLES / f'{name}.py'), run_name='__main__')
