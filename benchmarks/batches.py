@@ -182,7 +182,8 @@ def compare(tick: Tick) -> Answer:
     ceiling = times['ceiling, 1'] / times['ceiling, 2']
     one, two = batches.run(1).states, batches.run(2).states
     alone = batches.one_by_one()
-    apart = float(np.abs((one[:, 0] - alone)[:, [0, 4]] / alone[:, [0, 4]]).max())
+    ends, others = one[:, 0, [0, 4]], alone[:, [0, 4]]
+    apart = float((np.abs(ends - others) / np.maximum(np.abs(others), 1e-9)).max())
     tick('memory of batches')
     runs = ((0.1, False), (1.0, False), (1.0, True))
     short, long, kept = (batches.peak_memory(part, keep=keep) for part, keep in runs)

@@ -24,7 +24,6 @@ from typing import Any, Final, NamedTuple, TypeAlias
 from benchmarks.kills import kill_again_and_again, Kills
 from benchmarks.measure import Bar, number, seconds
 from benchmarks.page import Answer, Section, Tick
-import dask
 from distributed import Client, LocalCluster
 from needle_dynamics import FloatArray
 from needle_insertion.study import engine
@@ -53,13 +52,6 @@ _CHUNK: Final = 200
 
 #: Workers of ten machines with 32 cores each.
 _WORKERS: Final = 320
-
-#: Without these a worker gives memory back that it wants again at once, and looks at what it does
-#: a hundred times a second. docs/howto/study.md says how they are set on a cluster.
-_DASK: Final = {
-    'distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_': 2**28,
-    'distributed.worker.profile.enabled': False,
-}
 
 #: Makes what computes, as `engine.compute` takes it.
 _Factory: TypeAlias = Callable[[], AbstractContextManager[Executor]]
@@ -247,7 +239,6 @@ def cluster(text: str, workers: int) -> Iterator[_Factory]:
 @contextmanager
 def _dask(workers: int) -> Iterator[Any]:
     with (
-        dask.config.set(_DASK),
         LocalCluster(
             n_workers=workers, threads_per_worker=1, host='127.0.0.1', dashboard_address=None
         ) as made_of,

@@ -211,4 +211,4 @@ def worst(parts: Iterable[FloatArray], number: int) -> list[int]:
         numbers = np.concatenate([numbers, np.arange(first, first + len(values))])
         best = np.argsort(-top, kind='stable')[:number]
         top, numbers, first = top[best], numbers[best], first + len(values)
-    return numbers[np.isfinite(top)].tolist()
+    return [int(number) for number in numbers[np.isfinite(top)]]

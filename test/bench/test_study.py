@@ -42,7 +42,7 @@ def test_every_figure_is_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     assert found['tables that differ'].found == 0.0
     assert found['insertions computed twice'].found == 0.0
     assert found['closed loop, per second and core'].limit == 200.0
-    assert 'growth of the parent, 20 to 40 insertions' in found
+    assert 'peak of parent, 40 over 20 insertions' in found
     assert 'the study is killed' in told
 
 
