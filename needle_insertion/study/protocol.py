@@ -132,9 +132,9 @@ class Protocol(Interface):
 
 
 def _steering(settings: Mapping[str, Any]) -> Protocol:
-    from needle_insertion.study.steering_seen import SeenSteering
+    from needle_insertion.study.steering import SteeringProtocol
 
-    return SeenSteering(settings)
+    return SteeringProtocol(settings)
 
 
 def _insertion(settings: Mapping[str, Any]) -> Protocol:

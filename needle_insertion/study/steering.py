@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from math import nan
@@ -26,9 +26,11 @@ from needle_dynamics import (
     SteeringParameters,
 )
 from needle_dynamics.steering.parameters import with_lengths
-from needle_insertion.study.protocol import Figure, Quantity
+from needle_insertion.study.protocol import Figure, Quantity, Seen
+from needle_ros import contract
 from needle_ros.errors import ParameterError
 from needle_ros.settings import check_constants, constant, from_values, unknown_name
+from needle_ros.timing import NANOSECONDS
 import numpy as np
 
 OURS: Final = 'ours'
@@ -42,6 +44,13 @@ HIT: Final = 1e-3
 
 #: Squared distance within which 95 of 100 draws of two normal numbers are.
 _ELLIPSE: Final = 5.991
+
+#: Velocity by which the depths of the looks of a replay become times [m/s].
+_SPEED: Final = 0.01
+
+#: The joints of a guide, without forces.
+_STATES: Final = contract.steered_states()
+_JOINTS: Final = replace(_STATES, joints=tuple(one._replace(effort='') for one in _STATES.joints))
 
 #: Seeds of paths are below.
 _SEEDS: Final = 2**63
@@ -258,29 +267,34 @@ class SteeringProtocol:
         for name in ('way', 'turns'):
             found[name][:] = 0.0
 
-    def replay(
-        self,
-        drawn: Mapping[str, float],
-        rng: np.random.Generator,
-        watch: Callable[[SteeredNeedle], object],
-    ) -> FloatArray:
+    def replay(self, drawn: Mapping[str, float], rng: np.random.Generator) -> Iterator[Seen]:
         """
-        Insert one needle again.
+        Insert one needle again, as if it had gone in at 1 cm/s.
 
         Parameters
         ----------
-        drawn, rng, watch
+        drawn, rng
             As in `Protocol.replay`.
 
-        Returns
-        -------
-        ndarray, shape (3,)
-            Its target [m].
+        Yields
+        ------
+        Seen
+            The target, and joints and tip after each step.
 
         """
         row = {name: drawn.get(name, one.default) for name, one in self.quantities.items()}
+        tilt, frame = ([row[f'{name}_x'], row[f'{name}_z']] for name in ('tilt', 'frame'))
+        still, seen = [0.0] * len(_JOINTS.joints), list[Seen]()
+
+        def watch(one: SteeredNeedle) -> None:
+            stamp = round(one.depth / _SPEED * NANOSECONDS)
+            seen.append(Seen(_JOINTS, stamp, (one.depth, *one.guide, *tilt, one.roll, *still)))
+            x, z = (one.tip[[0, 2]] + np.array(frame) * one.depth).tolist()
+            seen.append(Seen(contract.TIP_DEFLECTION, stamp, (x, one.depth, z)))
+
         self._steered(self._truth(row, rng), row, rng, watch)
-        return np.array([row['target_x'], self._depths[-1], row['target_z']])
+        yield Seen(contract.TARGET, 0, (row['target_x'], float(self._depths[-1]), row['target_z']))
+        yield from seen
 
     def _steered(
         self,
