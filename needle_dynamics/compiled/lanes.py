@@ -88,7 +88,7 @@ class Course(NamedTuple):
     interval, longest : float
         Length of an interval and of the longest step [s].
     graded : bool
-        As in `needle_dynamics.compiled.step.advance`.
+        Let steps grow with the inserted length, as `Integrator` does.
 
     """
 

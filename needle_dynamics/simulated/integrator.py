@@ -381,7 +381,7 @@ def not_completed(model: NeedleModel, state: FloatArray, left: float) -> NeedleE
     state : ndarray, shape (2 (2 + n),)
         Its last valid state.
     left : float
-        Time left undone [s], or NaN, as from `needle_dynamics.compiled.step.advance`.
+        Time left undone [s], or NaN, as from the compiled step.
 
     Returns
     -------
