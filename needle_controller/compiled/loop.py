@@ -12,7 +12,7 @@ from needle_controller.compiled.laws import (
 from needle_dynamics.arrays import FloatArray
 from needle_dynamics.compiled.cache import compiled
 from needle_dynamics.compiled.friction import friction_flow, FrictionConstants
-from needle_dynamics.compiled.step import advance, Inputs, Needle, with_friction
+from needle_dynamics.compiled.step import adapted, advance, Inputs, Needle
 import numpy as np
 
 
@@ -120,7 +120,9 @@ def run_loop(  # noqa: C901
         needle = c
         for row in added:
             if c.length - state[0] >= row[0]:
-                needle = with_friction(c, row[1], row[2])
+                needle = adapted(
+                    c, c.friction.coulomb + row[1], c.friction.viscous + row[2], c.layers
+                )
         left, _ = advance(needle, state, k * period, inputs, longest, False, period)
         if left != 0.0:
             return k

@@ -23,6 +23,7 @@ from typing import Final, NamedTuple
 from needle_dynamics.arrays import FloatArray, IntArray
 from needle_dynamics.compiled.cache import compiled, inlined
 from needle_dynamics.compiled.friction import slide
+from needle_dynamics.compiled.modal_flow import normal_pair, turn_pair
 from needle_dynamics.compiled.step import GRADED_FROM
 import numpy as np
 
@@ -31,13 +32,6 @@ LANES: Final = 32
 
 #: Columns of `ModeTables.series` for G, H, phi and phi'' of two modes.
 COLUMNS: Final = 26
-
-#: Constants of a needle, in this order: columns of the table that `run` takes.
-CONSTANTS: Final = (
-    'length', 'linear_density', 'bending_stiffness', 'tissue_stiffness', 'tissue_damping',
-    'moving_mass', 'coulomb_friction', 'viscous_friction', 'withdrawal_friction',
-    'lowest', 'highest', 'stop', 'rotary_inertia',
-)  # fmt: skip
 
 # Where each row of the lanes begins. First the constants.
 (
@@ -73,6 +67,36 @@ _TURN: Final = 2.0 / pi
 
 #: exp(-x) is nothing beside 1 from here on.
 _DECAYED: Final = 40.0
+
+
+class Constants(NamedTuple):
+    """
+    Constants of a needle, in the order of the first rows.
+
+    Attributes
+    ----------
+    lowest, highest : float
+        Range of the inserted length [m].
+    stop : float
+        Inserted length at which the hub stops, or infinity [m].
+
+    The others are those of `needle_dynamics.parameters.NeedleParameters`.
+
+    """
+
+    length: float
+    linear_density: float
+    bending_stiffness: float
+    tissue_stiffness: float
+    tissue_damping: float
+    moving_mass: float
+    coulomb_friction: float
+    viscous_friction: float
+    withdrawal_friction: float
+    lowest: float
+    highest: float
+    stop: float
+    rotary_inertia: float
 
 
 class Course(NamedTuple):
@@ -126,62 +150,9 @@ def _sine_cosine(x: float) -> tuple[float, float]:
 def _decay_means(x: float) -> tuple[float, float]:
     """Return what `oscillator.decay_means` does: for a part of x, doubled five times."""
     z = -min(x, _DECAYED) / 32.0
-    ramp = _F2 + z * (
-        _F3
-        + z
-        * (
-            _F4
-            + z
-            * (
-                _F5
-                + z
-                * (
-                    _F6
-                    + z
-                    * (
-                        _F7
-                        + z
-                        * (
-                            _F8
-                            + z
-                            * (
-                                _F9
-                                + z
-                                * (
-                                    _F10
-                                    + z
-                                    * (
-                                        _F11
-                                        + z
-                                        * (
-                                            _F12
-                                            + z
-                                            * (
-                                                _F13
-                                                + z
-                                                * (
-                                                    _F14
-                                                    + z
-                                                    * (
-                                                        _F15
-                                                        + z
-                                                        * (
-                                                            _F16
-                                                            + z * (_F17 + z * (_F18 + z * _F19))
-                                                        )
-                                                    )
-                                                )
-                                            )
-                                        )
-                                    )
-                                )
-                            )
-                        )
-                    )
-                )
-            )
-        )
-    )
+    ramp = _F14 + z * (_F15 + z * (_F16 + z * (_F17 + z * (_F18 + z * _F19))))
+    ramp = _F8 + z * (_F9 + z * (_F10 + z * (_F11 + z * (_F12 + z * (_F13 + z * ramp)))))
+    ramp = _F2 + z * (_F3 + z * (_F4 + z * (_F5 + z * (_F6 + z * (_F7 + z * ramp)))))
     mean = 1.0 + z * ramp
     for _ in range(5):
         ramp = 0.25 * (mean * mean + 2.0 * ramp)
@@ -253,86 +224,32 @@ def _rotate(w: FloatArray, n: int) -> None:
         g11 = fifth * _powers(w, 0, i, xi)
         g12 = fifth * _powers(w, 3, i, xi)
         g22 = fifth * _powers(w, 6, i, xi)
-        k11 = ei * (xi * _powers(w, 9, i, xi)) + ka * g11
-        k12 = ei * (xi * _powers(w, 12, i, xi)) + ka * g12
-        k22 = ei * (xi * _powers(w, 15, i, xi)) + ka * g22
-        l11 = sqrt(rho * g11)
-        i11 = 1.0 / l11
-        l21 = rho * g12 * i11
-        l22 = sqrt(rho * g22 - l21 * l21)
-        i22 = 1.0 / l22
-        ratio = l21 * i11
-        b11 = k11 * i11 * i11
-        b12 = (k12 - ratio * k11) * i11 * i22
-        b22 = (k22 - 2.0 * ratio * k12 + ratio * ratio * k11) * i22 * i22
-        tau = (b22 - b11) / (2.0 * b12)
-        tangent = (1.0 if tau >= 0.0 else -1.0) / (abs(tau) + sqrt(1.0 + tau * tau))
-        cj = 1.0 / sqrt(1.0 + tangent * tangent)
-        sj = tangent * cj
-        square1 = b11 - tangent * b12
-        square2 = b22 + tangent * b12
-        omega1 = sqrt(square1)
-        omega2 = sqrt(square2)
-
-        q2, z1 = w[_Q2 + i], w[_Z1 + i]
-        y1 = l11 * w[_Q1 + i] + l21 * q2
-        y2 = l22 * q2
-        v1 = z1 * i11
-        v2 = (w[_Z2 + i] - l21 * v1) * i22
-        # The damping of half a step before and after.
-        x = 0.5 * h * w[_DAMPING + i] / rho
-        decay = 1.0 - x * _decay_means(x)[0]
-        a1 = cj * y1 - sj * y2
-        a2 = sj * y1 + cj * y2
-        b1 = (cj * v1 - sj * v2) * decay
-        b2 = (sj * v1 + cj * v2) * decay
-
-        sin1, cos1 = _sine_cosine(omega1 * h)
-        sin2, cos2 = _sine_cosine(omega2 * h)
-        e1 = a1 * cos1 + b1 * sin1 / omega1
-        f1 = b1 * cos1 - a1 * omega1 * sin1
-        e2 = a2 * cos2 + b2 * sin2 / omega2
-        f2 = b2 * cos2 - a2 * omega2 * sin2
-
-        twice1 = (b1 * b1 + square1 * a1 * a1) * h
-        twice2 = (b2 * b2 + square2 * a2 * a2) * h
-        change1 = e1 * f1 - a1 * b1
-        change2 = e2 * f2 - a2 * b2
-        aa1 = 0.5 * (twice1 - change1) / square1
-        bb1 = 0.5 * (twice1 + change1)
-        aa2 = 0.5 * (twice2 - change2) / square2
-        bb2 = 0.5 * (twice2 + change2)
-        change12 = e1 * f2 - a1 * b2
-        change21 = e2 * f1 - a2 * b1
-        gap = 1.0 / (square1 - square2)
-        aa12 = (change12 - change21) * gap
-        bb12 = (square1 * change12 - square2 * change21) * gap
-
-        w1 = xi * xi * _line(w, 18, i, xi) * i11
-        w2 = (xi * xi * _line(w, 20, i, xi) - l21 * w1) * i22
-        n1 = cj * w1 - sj * w2
-        n2 = sj * w1 + cj * w2
-        w1 = _line(w, 22, i, xi) * i11
-        w2 = (_line(w, 24, i, xi) - l21 * w1) * i22
-        m1 = cj * w1 - sj * w2
-        m2 = sj * w1 + cj * w2
-        elastic = (
-            (ei * m1 * m1 + ka * n1 * n1) * aa1
-            + (ei * m2 * m2 + ka * n2 * n2) * aa2
-            + 2.0 * (ei * m1 * m2 + ka * n1 * n2) * aa12
+        m = normal_pair(
+            rho,
+            g11,
+            g12,
+            g22,
+            ei * (xi * _powers(w, 9, i, xi)) + ka * g11,
+            ei * (xi * _powers(w, 12, i, xi)) + ka * g12,
+            ei * (xi * _powers(w, 15, i, xi)) + ka * g22,
         )
-        inertial = rho * (n1 * n1 * bb1 + n2 * n2 * bb2 + 2.0 * n1 * n2 * bb12)
-        w[_IMPULSE + i] = 0.5 * (elastic - inertial) / length
-
-        y1 = cj * e1 + sj * e2
-        y2 = cj * e2 - sj * e1
-        v1 = (cj * f1 + sj * f2) * decay
-        v2 = (cj * f2 - sj * f1) * decay
-        new_q2 = y2 * i22
-        w[_NEW_Q1 + i] = (y1 - l21 * new_q2) * i11
+        v1 = w[_Z1 + i] * m.i11
+        v2 = (w[_Z2 + i] - m.l21 * v1) * m.i22
+        x = 0.5 * h * w[_DAMPING + i] / rho
+        turned = turn_pair(
+            m, rho, ei, ka,
+            (xi * xi * _line(w, 18, i, xi), xi * xi * _line(w, 20, i, xi)),
+            (_line(w, 22, i, xi), _line(w, 24, i, xi)),
+            (m.l11 * w[_Q1 + i] + m.l21 * w[_Q2 + i], m.l22 * w[_Q2 + i]), (v1, v2),
+            1.0 - x * _decay_means(x)[0],
+            _sine_cosine(m.omega1 * h), _sine_cosine(m.omega2 * h), h,
+        )  # fmt: skip
+        new_q2 = turned.y2 * m.i22
+        w[_NEW_Q1 + i] = (turned.y1 - m.l21 * new_q2) * m.i11
         w[_NEW_Q2 + i] = new_q2
-        w[_NEW_Z1 + i] = l11 * v1
-        w[_NEW_Z2 + i] = l21 * v1 + l22 * v2
+        w[_NEW_Z1 + i] = m.l11 * turned.v1
+        w[_NEW_Z2 + i] = m.l21 * turned.v1 + m.l22 * turned.v2
+        w[_IMPULSE + i] = turned.impulse / length
 
 
 @compiled
@@ -439,8 +356,7 @@ def run(
     Parameters
     ----------
     needles : ndarray, shape (all or 1, 13)
-        `CONSTANTS`; ``lowest`` and ``highest`` are the range of the depth, ``stop`` the depth at
-        which the hub stops, or infinity.
+        `Constants` of each run, or of all.
     table : ndarray, shape (1 + 4 m, 26)
         First columns of the series of two modes of length 1.
     course : Course

@@ -78,6 +78,210 @@ class Rotated(NamedTuple):
     lost: float
 
 
+class NormalPair(NamedTuple):
+    """
+    Normal modes of two shape modes, and the way to their coordinates and back.
+
+    Attributes
+    ----------
+    l11, l21, l22 : float
+        Cholesky factor L of the modal mass rho A G.
+    i11, i22 : float
+        One over its diagonal.
+    cosine, sine : float
+        Rotation that diagonalizes the stiffness in the coordinates y = L^T q.
+    square1, square2, omega1, omega2 : float
+        Squares of the frequencies [1/s^2], and frequencies [1/s].
+
+    """
+
+    l11: float
+    l21: float
+    l22: float
+    i11: float
+    i22: float
+    cosine: float
+    sine: float
+    square1: float
+    square2: float
+    omega1: float
+    omega2: float
+
+
+class Turn(NamedTuple):
+    """
+    What two normal modes do along a rotation.
+
+    Attributes
+    ----------
+    y1, y2, v1, v2 : float
+        Coordinates y = L^T q at its end, and their rates after another half step of damping.
+    b1, b2, f1, f2 : float
+        Rates of the normal modes at the begin and at the end, between the two of damping.
+    n1, n2 : float
+        Values of the normal modes at the tip.
+    impulse : float
+        Impulse of the modes on the insertion axis, against insertion [N s].
+    lost : float
+        Energy lost to tissue damping [J].
+
+    """
+
+    y1: float
+    y2: float
+    v1: float
+    v2: float
+    b1: float
+    b2: float
+    f1: float
+    f2: float
+    n1: float
+    n2: float
+    impulse: float
+    lost: float
+
+
+@inlined
+def normal_pair(
+    rho: float, g11: float, g12: float, g22: float, k11: float, k12: float, k22: float
+) -> NormalPair:
+    """
+    Find the normal modes of two shape modes: one Jacobi rotation is exact.
+
+    Parameters
+    ----------
+    rho : float
+        Mass per length rho A [kg/m].
+    g11, g12, g22 : float
+        G at the frozen depth [1].
+    k11, k12, k22 : float
+        Modal stiffness there [N/m].
+
+    Returns
+    -------
+    NormalPair
+        The normal modes.
+
+    """
+    l11 = sqrt(rho * g11)
+    l21 = rho * g12 / l11
+    l22 = sqrt(rho * g22 - l21 * l21)
+    i11 = 1.0 / l11
+    i22 = 1.0 / l22
+    ratio = l21 * i11
+    # Stiffness in the coordinates y, where the mass is the identity.
+    b11 = k11 * i11 * i11
+    b12 = (k12 - ratio * k11) * i11 * i22
+    b22 = (k22 - 2.0 * ratio * k12 + ratio * ratio * k11) * i22 * i22
+    tau = (b22 - b11) / (2.0 * b12)
+    tangent = (1.0 if tau >= 0.0 else -1.0) / (abs(tau) + sqrt(1.0 + tau * tau))
+    cj = 1.0 / sqrt(1.0 + tangent * tangent)
+    square1 = b11 - tangent * b12
+    square2 = b22 + tangent * b12
+    return NormalPair(
+        l11, l21, l22, i11, i22, cj, tangent * cj, square1, square2, sqrt(square1), sqrt(square2)
+    )
+
+
+@inlined
+def turn_pair(
+    m: NormalPair,
+    rho: float,
+    ei: float,
+    ka: float,
+    value: tuple[float, float],
+    curvature: tuple[float, float],
+    y: tuple[float, float],
+    v: tuple[float, float],
+    decay: float,
+    first: tuple[float, float],
+    second: tuple[float, float],
+    h: float,
+) -> Turn:
+    """
+    Take two normal modes through a step, between two half steps of damping.
+
+    Parameters
+    ----------
+    m : NormalPair
+        The normal modes.
+    rho, ei, ka : float
+        Mass per length [kg/m], bending stiffness [N m^2], and stiffness of the tissue at the tip
+        [N/m^2].
+    value, curvature : tuple of float
+        Values and curvatures of the shape modes at the tip.
+    y, v : tuple of float
+        Coordinates L^T q and their rates.
+    decay : float
+        Part of the rates that half a step of damping leaves.
+    first, second : tuple of float
+        Sine and cosine of the angle through which each normal mode turns.
+    h : float
+        Length of the step [s].
+
+    Returns
+    -------
+    Turn
+        Where they are then, and what they did.
+
+    """
+    cj, sj, square1, square2 = m.cosine, m.sine, m.square1, m.square2
+    a1 = cj * y[0] - sj * y[1]
+    a2 = sj * y[0] + cj * y[1]
+    b1 = cj * v[0] - sj * v[1]
+    b2 = sj * v[0] + cj * v[1]
+
+    lost = b1 * b1 + b2 * b2
+    b1 *= decay
+    b2 *= decay
+
+    # Their values at the end.
+    sin1, cos1 = first
+    sin2, cos2 = second
+    e1 = a1 * cos1 + b1 * sin1 / m.omega1
+    f1 = b1 * cos1 - a1 * m.omega1 * sin1
+    e2 = a2 * cos2 + b2 * sin2 / m.omega2
+    f2 = b2 * cos2 - a2 * m.omega2 * sin2
+
+    # Integrals over the rotation of a_i a_j and b_i b_j (b = a_dot), from the end values.
+    twice1 = (b1 * b1 + square1 * a1 * a1) * h
+    twice2 = (b2 * b2 + square2 * a2 * a2) * h
+    change1 = e1 * f1 - a1 * b1
+    change2 = e2 * f2 - a2 * b2
+    aa1 = 0.5 * (twice1 - change1) / square1
+    bb1 = 0.5 * (twice1 + change1)
+    aa2 = 0.5 * (twice2 - change2) / square2
+    bb2 = 0.5 * (twice2 + change2)
+    change12 = e1 * f2 - a1 * b2
+    change21 = e2 * f1 - a2 * b1
+    gap = 1.0 / (square1 - square2)
+    aa12 = (change12 - change21) * gap
+    bb12 = (square1 * change12 - square2 * change21) * gap
+
+    # Tip value n and tip curvature m of the two normal modes.
+    w1 = value[0] * m.i11
+    w2 = (value[1] - m.l21 * w1) * m.i22
+    n1 = cj * w1 - sj * w2
+    n2 = sj * w1 + cj * w2
+    w1 = curvature[0] * m.i11
+    w2 = (curvature[1] - m.l21 * w1) * m.i22
+    m1 = cj * w1 - sj * w2
+    m2 = sj * w1 + cj * w2
+    elastic = (
+        (ei * m1 * m1 + ka * n1 * n1) * aa1
+        + (ei * m2 * m2 + ka * n2 * n2) * aa2
+        + 2.0 * (ei * m1 * m2 + ka * n1 * n2) * aa12
+    )
+    inertial = rho * (n1 * n1 * bb1 + n2 * n2 * bb2 + 2.0 * n1 * n2 * bb12)
+
+    lost += f1 * f1 + f2 * f2
+    g1, g2 = f1 * decay, f2 * decay
+    return Turn(
+        cj * e1 + sj * e2, cj * e2 - sj * e1, cj * g1 + sj * g2, cj * g2 - sj * g1,
+        b1, b2, f1, f2, n1, n2, 0.5 * (elastic - inertial), 0.5 * lost * (1.0 - decay * decay),
+    )  # fmt: skip
+
+
 @inlined
 def rotate_two(
     e: Elasticity,
@@ -110,111 +314,39 @@ def rotate_two(
 
     """
     rho, ei, ka, layer = e.density, e.bending, e.stiffness, e.layer
-    growth, decay = e.growth, e.decay
+    growth = e.growth
     q1, q2, z1, z2 = q[0], q[1], z[0], z[1]
     gram, curved = at.gram, at.curvature_gram
-    k11 = ei * curved[0, 0] + ka * gram[0, 0] + growth * layers.gram[layer, 0, 0]
-    k12 = ei * curved[0, 1] + ka * gram[0, 1] + growth * layers.gram[layer, 0, 1]
-    k22 = ei * curved[1, 1] + ka * gram[1, 1] + growth * layers.gram[layer, 1, 1]
-    # Cholesky factor of the modal mass rho A G = L L^T.
-    l11 = sqrt(rho * gram[0, 0])
-    l21 = rho * gram[0, 1] / l11
-    l22 = sqrt(rho * gram[1, 1] - l21 * l21)
-    i11 = 1.0 / l11
-    i22 = 1.0 / l22
-    ratio = l21 * i11
-    # Stiffness in the coordinates y = L^T q, where the mass is the identity.
-    b11 = k11 * i11 * i11
-    b12 = (k12 - ratio * k11) * i11 * i22
-    b22 = (k22 - 2.0 * ratio * k12 + ratio * ratio * k11) * i22 * i22
-    # One Jacobi rotation diagonalizes it.
-    tau = (b22 - b11) / (2.0 * b12)
-    tangent = (1.0 if tau >= 0.0 else -1.0) / (abs(tau) + sqrt(1.0 + tau * tau))
-    cj = 1.0 / sqrt(1.0 + tangent * tangent)
-    sj = tangent * cj
-    square1 = b11 - tangent * b12
-    square2 = b22 + tangent * b12
-    omega1 = sqrt(square1)
-    omega2 = sqrt(square2)
-
-    # Normal coordinates a and their rates b.
-    y1 = l11 * q1 + l21 * q2
-    y2 = l22 * q2
-    if e.as_printed:
-        v1 = l11 * z1 + l21 * z2
-        v2 = l22 * z2
-    else:
-        v1 = z1 * i11
-        v2 = (z2 - l21 * v1) * i22
-    a1 = cj * y1 - sj * y2
-    a2 = sj * y1 + cj * y2
-    b1 = cj * v1 - sj * v2
-    b2 = sj * v1 + cj * v2
-
-    lost = b1 * b1 + b2 * b2
-    b1 *= decay
-    b2 *= decay
-
-    # Their values at the end.
-    cos1 = cos(omega1 * h)
-    sin1 = sin(omega1 * h)
-    cos2 = cos(omega2 * h)
-    sin2 = sin(omega2 * h)
-    e1 = a1 * cos1 + b1 * sin1 / omega1
-    f1 = b1 * cos1 - a1 * omega1 * sin1
-    e2 = a2 * cos2 + b2 * sin2 / omega2
-    f2 = b2 * cos2 - a2 * omega2 * sin2
-
-    # Integrals over the rotation of a_i a_j and b_i b_j (b = a_dot), from the end values.
-    twice1 = (b1 * b1 + square1 * a1 * a1) * h
-    twice2 = (b2 * b2 + square2 * a2 * a2) * h
-    change1 = e1 * f1 - a1 * b1
-    change2 = e2 * f2 - a2 * b2
-    aa1 = 0.5 * (twice1 - change1) / square1
-    bb1 = 0.5 * (twice1 + change1)
-    aa2 = 0.5 * (twice2 - change2) / square2
-    bb2 = 0.5 * (twice2 + change2)
-    change12 = e1 * f2 - a1 * b2
-    change21 = e2 * f1 - a2 * b1
-    gap = 1.0 / (square1 - square2)
-    aa12 = (change12 - change21) * gap
-    bb12 = (square1 * change12 - square2 * change21) * gap
-
-    # Tip value n and tip curvature m of the two normal modes.
-    w1 = at.value[0] * i11
-    w2 = (at.value[1] - l21 * w1) * i22
-    n1 = cj * w1 - sj * w2
-    n2 = sj * w1 + cj * w2
-    w1 = at.curvature[0] * i11
-    w2 = (at.curvature[1] - l21 * w1) * i22
-    m1 = cj * w1 - sj * w2
-    m2 = sj * w1 + cj * w2
-    elastic = (
-        (ei * m1 * m1 + ka * n1 * n1) * aa1
-        + (ei * m2 * m2 + ka * n2 * n2) * aa2
-        + 2.0 * (ei * m1 * m2 + ka * n1 * n2) * aa12
+    m = normal_pair(
+        rho,
+        gram[0, 0],
+        gram[0, 1],
+        gram[1, 1],
+        ei * curved[0, 0] + ka * gram[0, 0] + growth * layers.gram[layer, 0, 0],
+        ei * curved[0, 1] + ka * gram[0, 1] + growth * layers.gram[layer, 0, 1],
+        ei * curved[1, 1] + ka * gram[1, 1] + growth * layers.gram[layer, 1, 1],
     )
-    inertial = rho * (n1 * n1 * bb1 + n2 * n2 * bb2 + 2.0 * n1 * n2 * bb12)
+    if e.as_printed:
+        v1 = m.l11 * z1 + m.l21 * z2
+        v2 = m.l22 * z2
+    else:
+        v1 = z1 * m.i11
+        v2 = (z2 - m.l21 * v1) * m.i22
+    turned = turn_pair(
+        m, rho, ei, ka, (at.value[0], at.value[1]), (at.curvature[0], at.curvature[1]),
+        (m.l11 * q1 + m.l21 * q2, m.l22 * q2), (v1, v2), e.decay,
+        (sin(m.omega1 * h), cos(m.omega1 * h)), (sin(m.omega2 * h), cos(m.omega2 * h)), h,
+    )  # fmt: skip
 
     # Integral of q over the rotation.
-    s1 = (b1 - f1) / square1
-    s2 = (b2 - f2) / square2
-    tip = n1 * s1 + n2 * s2
-    y1 = cj * s1 + sj * s2
-    y2 = cj * s2 - sj * s1
-    mean2 = y2 * i22
-    mean1 = (y1 - l21 * mean2) * i11
+    s1 = (turned.b1 - turned.f1) / m.square1
+    s2 = (turned.b2 - turned.f2) / m.square2
+    tip = turned.n1 * s1 + turned.n2 * s2
+    mean2 = (m.cosine * s2 - m.sine * s1) * m.i22
+    mean1 = (m.cosine * s1 + m.sine * s2 - m.l21 * mean2) * m.i11
 
-    lost += f1 * f1 + f2 * f2
-    f1 *= decay
-    f2 *= decay
-
-    y1 = cj * e1 + sj * e2
-    y2 = cj * e2 - sj * e1
-    v1 = cj * f1 + sj * f2
-    v2 = cj * f2 - sj * f1
-    q[1] = y2 * i22
-    q[0] = (y1 - l21 * q[1]) * i11
+    q[1] = turned.y2 * m.i22
+    q[0] = (turned.y1 - m.l21 * q[1]) * m.i11
     moved1 = e.damping * (q[0] - q1)
     moved2 = e.damping * (q[1] - q2)
     # The tissue holds the needle by the integral of k w, and damps it by that of c_a w_dot.
@@ -230,13 +362,12 @@ def rotate_two(
         + at.moment[0] * moved1
         + at.moment[1] * moved2
     )
-    lost = 0.5 * lost * (1.0 - decay * decay)
     if e.as_printed:
-        z[1] = v2 * i22
-        z[0] = (v1 - l21 * z[1]) * i11
-        return Rotated(0.0, tip, reaction, moment, lost)
-    z[0], z[1] = l11 * v1, l21 * v1 + l22 * v2
-    return Rotated(0.5 * (elastic - inertial), tip, reaction, moment, lost)
+        z[1] = turned.v2 * m.i22
+        z[0] = (turned.v1 - m.l21 * z[1]) * m.i11
+        return Rotated(0.0, tip, reaction, moment, turned.lost)
+    z[0], z[1] = m.l11 * turned.v1, m.l21 * turned.v1 + m.l22 * turned.v2
+    return Rotated(turned.impulse, tip, reaction, moment, turned.lost)
 
 
 @compiled

@@ -24,9 +24,6 @@ SHARE: Final = 0.25
 #: Steps after which their length is chosen anew.
 _BLOCK: Final = 32
 
-#: Root of cos(x) cosh(x) = -1: the slowest mode of a beam clamped at one end.
-_ROOT: Final = 1.8751040687119611
-
 #: Most steps of an interval: nobody waits for them.
 _MOST: Final = 1e12
 
@@ -73,7 +70,7 @@ def run_refined(
     grids, rows = np.empty((2, n, n)), np.empty((4, n))
     at = ModeIntegrals(grids[0], grids[1], rows[0], rows[1], rows[2], rows[3])
     work = np.empty(c.modes.series.shape[1] + 4 * n)
-    tissue, largest = c.layers.stiffnesses.max(), 0.0
+    tissue, slowest, largest = c.layers.stiffnesses.max(), c.modes.modes[0, 0], 0.0
     states[0] = state
     for k in range(forces.shape[0]):
         inputs = Inputs(forces[k], 0.0, 0.0, False)
@@ -81,7 +78,7 @@ def run_refined(
         while rest > 0.0:
             depth = c.length - state[0]
             mode_integrals(c.modes, depth, work, at)
-            square = (c.bending_stiffness * (_ROOT / depth) ** 4 + tissue) / c.linear_density
+            square = (c.bending_stiffness * (slowest / depth) ** 4 + tissue) / c.linear_density
             # Energy of the modes, as if all were of this frequency.
             size = 0.0
             for i in range(n):

@@ -63,16 +63,18 @@ class Needle(NamedTuple):
 
 
 @compiled
-def with_friction(c: Needle, coulomb: float, viscous: float) -> Needle:
+def adapted(c: Needle, coulomb: float, viscous: float, layers: Layers) -> Needle:
     """
-    Return a needle with more friction.
+    Return a needle with other friction, in other tissue.
 
     Parameters
     ----------
     c : Needle
         The needle.
     coulomb, viscous : float
-        What is added to Coulomb friction [N] and to viscous friction [N s/m].
+        Coulomb friction [N] and viscous friction [N s/m].
+    layers : Layers
+        Layers of tissue.
 
     Returns
     -------
@@ -82,32 +84,13 @@ def with_friction(c: Needle, coulomb: float, viscous: float) -> Needle:
     """
     f = c.friction
     friction = FrictionConstants(
-        f.law,
-        f.coulomb + coulomb,
-        f.viscous + viscous,
-        f.withdrawal,
-        f.breakaway,
-        f.stribeck_speed,
-        f.smoothing_speed,
+        f.law, coulomb, viscous, f.withdrawal, f.breakaway, f.stribeck_speed, f.smoothing_speed
     )
     return Needle(
-        c.length,
-        c.linear_density,
-        c.bending_stiffness,
-        c.tissue_damping,
-        c.moving_mass,
-        c.carriage_mass,
-        c.rotary_inertia,
-        c.minimum_depth,
-        c.maximum_depth,
-        c.hub_stop,
-        c.as_printed,
-        c.swelling,
-        c.swelling_time,
-        friction,
-        c.modes,
-        c.layers,
-    )
+        c.length, c.linear_density, c.bending_stiffness, c.tissue_damping, c.moving_mass,
+        c.carriage_mass, c.rotary_inertia, c.minimum_depth, c.maximum_depth, c.hub_stop,
+        c.as_printed, c.swelling, c.swelling_time, friction, c.modes, layers,
+    )  # fmt: skip
 
 
 class Inputs(NamedTuple):

@@ -271,15 +271,24 @@ def _constants(each: Sequence[NeedleParameters]) -> FloatArray:
     """Return what `lanes.run` takes of each needle."""
     return np.array(
         [
-            (
-                p.length, p.linear_density, p.bending_stiffness, p.tissue_stiffness,
-                p.tissue_damping, p.moving_mass, p.coulomb_friction, p.viscous_friction,
-                p.withdrawal_friction, p.minimum_depth - ROUNDING * p.length, p.reach * p.length,
-                p.length if p.hub_stop else inf, p.rotary_inertia,
+            lanes.Constants(
+                length=p.length,
+                linear_density=p.linear_density,
+                bending_stiffness=p.bending_stiffness,
+                tissue_stiffness=p.tissue_stiffness,
+                tissue_damping=p.tissue_damping,
+                moving_mass=p.moving_mass,
+                coulomb_friction=p.coulomb_friction,
+                viscous_friction=p.viscous_friction,
+                withdrawal_friction=p.withdrawal_friction,
+                lowest=p.minimum_depth - ROUNDING * p.length,
+                highest=p.reach * p.length,
+                stop=p.length if p.hub_stop else inf,
+                rotary_inertia=p.rotary_inertia,
             )
             for p in each
         ]
-    )  # fmt: skip
+    )
 
 
 @cache

@@ -6,9 +6,8 @@ from typing import Any, Final, NamedTuple, TYPE_CHECKING
 
 from needle_dynamics import FloatArray
 from needle_dynamics.compiled.cache import compiled
-from needle_dynamics.compiled.friction import FrictionConstants
 from needle_dynamics.compiled.integrals import tip_deflections
-from needle_dynamics.compiled.step import advance, Inputs, Needle
+from needle_dynamics.compiled.step import adapted, advance, Inputs, Needle
 from needle_dynamics.compiled.tissue import Layers
 import numpy as np
 
@@ -83,24 +82,16 @@ def push(held: Held[Pushed], actions: FloatArray, which: Any) -> tuple[FloatArra
 
     """
     c, friction, layers, times, states, targets = held.value
-    f, n, u = c.friction, states.shape[0], states.shape[1] // 2
+    n, u = states.shape[0], states.shape[1] // 2
     rewards, over = np.zeros(n), np.zeros(n, dtype=np.bool_)
     for k in range(n):
         if not which[k]:
             continue
-        law = FrictionConstants(
-            f.law, friction[k, 0], friction[k, 1], f.withdrawal, f.breakaway, f.stribeck_speed,
-            f.smoothing_speed,
-        )  # fmt: skip
         tissue = Layers(
             layers.starts[k], layers.stiffnesses[k], layers.gram[k], layers.area[k],
             layers.moment[k],
         )  # fmt: skip
-        needle = Needle(
-            c.length, c.linear_density, c.bending_stiffness, c.tissue_damping, c.moving_mass,
-            c.carriage_mass, c.rotary_inertia, c.minimum_depth, c.maximum_depth, c.hub_stop,
-            c.as_printed, c.swelling, c.swelling_time, law, c.modes, tissue,
-        )  # fmt: skip
+        needle = adapted(c, friction[k, 0], friction[k, 1], tissue)
         force = FORCE * min(max(actions[k], -1.0), 1.0)
         inputs = Inputs(force, 0.0, 0.0, False)
         left, _ = advance(needle, states[k], times[k], inputs, STEP, False, PERIOD)
