@@ -136,6 +136,11 @@ class SteeredPlant:
         self._moving: set[str] = set()
         self._resolution = robot.encoder_resolution if base is not None else 0.0
         self._felt = np.zeros((sensor.samples, 6))
+        # Part of each sample that falls into each push, shape (pushes, samples).
+        begins = np.arange(sensor.samples) * (_PUSHES / sensor.samples)
+        pushes, longest = np.arange(_PUSHES)[:, np.newaxis], _PUSHES / sensor.samples
+        common = np.minimum(begins + longest, pushes + 1) - np.maximum(begins, pushes)
+        self._shares = np.maximum(common, 0.0) / longest
         self._tip = [*insertion.needle.tip.tolist(), insertion.needle.tip_roll]
         #: What the guide does to the needle, in the order of its joints.
         self._load = [0.0] * len(_JOINTS)
@@ -288,11 +293,12 @@ class SteeredPlant:
             insertion.carry(interval, speed, felt=forces, **across)
             self._felt[:, 1] = forces
             return
-        for k, rows in enumerate(np.array_split(self._felt, _PUSHES)):
+        self._felt[:, 1] = 0.0
+        for k, shares in enumerate(self._shares):
             if k:
                 later = base.push(self.time + k * part, self.depth, part)
                 push = push if later is None else later
-            rows[:, 1] = insertion.push(
+            self._felt[:, 1] += shares * insertion.push(
                 part, push, speed_limit=base.limits.speed_limit, **(across if k == 0 else {})
             )
 

@@ -185,6 +185,23 @@ def test_the_sensor_feels_what_carries_the_needle() -> None:
     assert_allclose(numbers['base_wrench'][1], expected, rtol=1e-5)
 
 
+@pytest.mark.parametrize('samples', [1, 2, 3, 4, 7])
+def test_readings_of_a_push_have_its_impulse(samples: int) -> None:
+    """Whatever the rate of the sensor, the mean of its samples is that of the force that rises."""
+    push = Event(
+        TRAJECTORY,
+        {'joints': ['insertion'], 'times': [0.02], 'positions': [[]], 'efforts': [[4.0]]},
+    )
+    plant, _ = run({**VALUES, 'sensor.rate': 500.0 * samples}, 5, push)
+    fine, _ = run({**VALUES, 'sensor.rate': 500.0 * 8}, 5, push)
+    felt, other = (one.plant._felt[:, 1] for one in (plant, fine))  # type: ignore[attr-defined]
+    assert len(felt) == samples
+    assert (np.diff(felt) > 0.0).all()
+    # Half of the way, but for steps of a quarter of a period; otherwise rounding.
+    assert felt.mean() == pytest.approx(1.8, abs=0.06)
+    assert felt.mean() == pytest.approx(other.mean(), rel=1e-12)
+
+
 def test_a_push_ramps_up_and_is_no_faster_than_the_robot() -> None:
     """The force of a push is the one that was asked for, until the speed is at its limit."""
     push = Event(
