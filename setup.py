@@ -16,7 +16,7 @@ SLICER = ['pyigtl>=0.3.4']
 #: What `needle study` writes, what its `--scheduler` is, and environments for learning.
 STUDY = ['pyarrow>=15']
 DASK = [*STUDY, 'distributed>=2024.5']
-GYM = ['gymnasium>=1.0']
+GYM = ['gymnasium>=1.1']
 TEST = [
     'hypothesis>=6.100',
     'lxml>=5.0',

@@ -78,7 +78,7 @@ class InsertionEnv(gymnasium.Env[FloatArray, FloatArray]):
     The action is the force over 10 ms, in parts of 15 N. The observation is the error of depth,
     velocity and depth in dm and dm/s, and the deflection of the tip in mm. The reward is the
     error with a minus [m], and a small price of force. The episode ends where the needle rests at
-    its target, or leaves its range.
+    its target, or leaves its range, which is a reward of -1.
 
     Parameters
     ----------
@@ -178,7 +178,14 @@ class InsertionVectorEnv(VectorEnv[FloatArray, FloatArray, FloatArray]):
         self.action_space = batch_space(single.action_space, num_envs)
         self.observation_space = batch_space(single.observation_space, num_envs)
         self._needles, self._longest = _Needles(preset, num_envs), max_episode_steps
-        self._rngs: list[np.random.Generator] = []
+        self._rngs = [gymnasium.utils.seeding.np_random()[0] for _ in range(num_envs)]
+        self._begun, self._over = np.zeros((2, num_envs), dtype=bool)
+        self._steps = np.zeros(num_envs, dtype=int)
+
+    def _begin(self, k: int) -> None:
+        """Begin an episode."""
+        self._needles.begin(k, self._rngs[k])
+        self._begun[k], self._over[k], self._steps[k] = True, False, 0
 
     def reset(
         self,
@@ -192,9 +199,10 @@ class InsertionVectorEnv(VectorEnv[FloatArray, FloatArray, FloatArray]):
         Parameters
         ----------
         seed : int or sequence of int, optional
-            Seed of the first, the next one of the second, and so on; or of each.
+            Seed of the first, the next one of the second, and so on; or of each, where None goes
+            on as it was.
         options : dict, optional
-            Not used.
+            ``reset_mask``, a bool for each: where it is False the episode goes on.
 
         Returns
         -------
@@ -205,17 +213,21 @@ class InsertionVectorEnv(VectorEnv[FloatArray, FloatArray, FloatArray]):
 
         """
         super().reset(options=options)
-        seeds: Sequence[int | None] = (
-            [None if seed is None else seed + k for k in range(self.num_envs)]
-            if seed is None or isinstance(seed, int)
-            else seed
-        )
-        if any(one is not None for one in seeds) or not self._rngs:
-            self._rngs = [gymnasium.utils.seeding.np_random(one)[0] for one in seeds]
-        for k, rng in enumerate(self._rngs):
-            self._needles.begin(k, rng)
-        self._steps = np.zeros(self.num_envs, dtype=int)
-        self._over = np.zeros(self.num_envs, dtype=bool)
+        seeds: list[int | None] = [None] * self.num_envs
+        if isinstance(seed, Sequence):
+            seeds = list(seed)
+        elif seed is not None:
+            seeds = [int(seed) + k for k in range(self.num_envs)]
+        which = np.array((options or {}).get('reset_mask', [True] * self.num_envs), dtype=bool)
+        if len(seeds) != self.num_envs or which.shape != (self.num_envs,):
+            raise ParameterError(
+                f'seed and reset_mask must be of {self.num_envs} environments, got {len(seeds)} '
+                f'and {which.shape}'
+            )
+        for k in np.flatnonzero(which).tolist():
+            if seeds[k] is not None:
+                self._rngs[k] = gymnasium.utils.seeding.np_random(seeds[k])[0]
+            self._begin(k)
         return self._needles.observe(), {}
 
     def step(self, actions: FloatArray) -> tuple[FloatArray, FloatArray, Any, Any, dict[str, Any]]:
@@ -239,13 +251,13 @@ class InsertionVectorEnv(VectorEnv[FloatArray, FloatArray, FloatArray]):
             Empty.
 
         """
-        if not self._rngs:
+        if not self._begun.all():
             raise gymnasium.error.ResetNeeded('no episode has begun: call reset')
         again = self._over
         rewards, ended = self._needles.step(actions[:, 0], ~again)
+        self._steps += 1
         for k in np.flatnonzero(again).tolist():
-            self._needles.begin(k, self._rngs[k])
-        self._steps = np.where(again, 0, self._steps + 1)
-        broken = (self._steps >= self._longest) & ~ended
+            self._begin(k)
+        broken = self._steps >= self._longest
         self._over = ended | broken
         return self._needles.observe(), rewards, ended, broken, {}

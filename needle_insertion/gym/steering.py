@@ -72,6 +72,9 @@ class SteeringEnv(gymnasium.Env[FloatArray, FloatArray]):
             if not 0.0 < value < np.inf:
                 raise ParameterError(f'{name} must be positive and finite, got {value!r} m')
         self._needle, self._steering, _ = STEERING_PRESETS[needle]
+        reach = self._needle.length - self._steering.free_length
+        if depth > reach:
+            raise ParameterError(f'depth must be <= {reach:g} m with this needle, got {depth!r} m')
         self._depths = np.linspace(0.0, depth, max(1, round(depth / step)) + 1)
         self._limit, self._aside, self._belief = guide_limit, aside, belief
         self.action_space = spaces.Box(-1.0, 1.0, (2,))
@@ -132,9 +135,9 @@ class SteeringEnv(gymnasium.Env[FloatArray, FloatArray]):
         truth = self._truth
         if truth is None or self._at == len(self._depths) - 1:
             raise gymnasium.error.ResetNeeded('the episode is over, or none has begun: call reset')
-        self._at += 1
         x, z = (self._limit * np.clip(action, -1.0, 1.0)).tolist()
         self._one.move(guide=(x, z))
+        self._at += 1
         self._one.move(depth=float(self._depths[self._at]))
         seen = self._observe(truth, self._one)
         if self._at < len(self._depths) - 1:

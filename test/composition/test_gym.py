@@ -53,6 +53,28 @@ def test_a_vector_is_single_environments_with_seeds_of_their_own() -> None:
     many.close()
 
 
+def test_seeds_and_masks_of_a_vector() -> None:
+    """None goes on, a mask leaves the others alone, and what does not fit is named."""
+    many, other = InsertionVectorEnv(3), InsertionVectorEnv(3)
+    with pytest.raises(gymnasium.error.ResetNeeded, match='call reset'):
+        many.step(np.zeros((3, 1)))
+    for one in (many, other):
+        one.reset(seed=np.int64(5))  # type: ignore[arg-type]
+        one.step(np.full((3, 1), 0.3))
+    first, _ = many.reset(seed=[8, None, 8])
+    second, _ = other.reset()
+    assert np.array_equal(first[0], first[2])
+    assert np.array_equal(first[1], second[1])
+    assert not np.array_equal(first[0], second[0])
+    before, *_ = many.step(np.full((3, 1), 0.3))
+    some, _ = many.reset(options={'reset_mask': np.array([True, False, False])})
+    assert np.array_equal(some[1:], before[1:])
+    assert some[0][1] == 0.0
+    for options in ({'seed': [1, 2]}, {'options': {'reset_mask': np.ones(2, dtype=bool)}}):
+        with pytest.raises(ParameterError, match='must be of 3 environments'):
+            many.reset(**options)
+
+
 def test_a_needle_is_that_of_the_integrator() -> None:
     """To the bit, until it leaves its range."""
     environment = InsertionEnv('phantom')
@@ -124,9 +146,24 @@ def test_a_guide_that_is_moved_reaches_what_one_at_rest_does_not() -> None:
         environment.step(np.zeros(2))
 
 
+def test_a_position_that_is_no_number_moves_nothing() -> None:
+    """The next one goes on from there."""
+    environment = SteeringEnv()
+    seen, _ = environment.reset(seed=1)
+    with pytest.raises(ParameterError):
+        environment.step(np.array([np.nan, 0.0]))
+    after, *_ = environment.step(np.zeros(2))
+    assert after[0] == pytest.approx(0.05)
+    assert seen[0] == 0.0
+
+
 @pytest.mark.parametrize(
     ('options', 'complaint'),
-    [({'needle': 'bone'}, 'needle must be one of'), ({'depth': 0.0}, 'depth must be positive')],
+    [
+        ({'needle': 'bone'}, 'needle must be one of'),
+        ({'depth': 0.0}, 'depth must be positive'),
+        ({'depth': 1.0}, 'depth must be <='),
+    ],
 )
 def test_what_cannot_be_is_named(options: dict[str, object], complaint: str) -> None:
     with pytest.raises(ParameterError, match=complaint):
