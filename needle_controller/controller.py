@@ -36,6 +36,13 @@ DEFAULT_GAINS: Final[Mapping[str, Mapping[str, Gains]]] = {
     'pid': {'insertion': PidGains(), 'rotation': PidGains(kp=2.1e-7, ki=0.0, kd=2.1e-8)},
 }
 
+#: The law that kinds of gains are for.
+LAW_OF: Final[Mapping[type[Gains], type[Law]]] = {
+    AdaptiveGains: Adaptive,
+    InverseDynamicsGains: InverseDynamics,
+    PidGains: Pid,
+}
+
 #: Control laws by name, the default first.
 LAWS: Final = tuple(DEFAULT_GAINS)
 
@@ -271,13 +278,7 @@ class Controller:
         limits: dict[str, Limit] = {}
         for axis, where in zip(axes, AXES, strict=True):
             chosen = gains[name][where]
-            law: Law
-            if isinstance(chosen, PidGains):
-                law = Pid(axis=axis, gains=chosen, period=self.period)
-            elif isinstance(chosen, AdaptiveGains):
-                law = Adaptive(axis=axis, gains=chosen, period=self.period)
-            else:
-                law = InverseDynamics(axis=axis, gains=chosen, period=self.period)
+            law = LAW_OF[type(chosen)](axis=axis, gains=chosen, period=self.period)
             laws.append(law)
             if where == 'insertion' or self.settings.rotation:
                 limits[where] = check_stability(

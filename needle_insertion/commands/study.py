@@ -10,10 +10,13 @@ from functools import partial
 import os
 from pathlib import Path
 import sys
-from typing import Any
+from typing import Any, Final
 
 from needle_insertion.commands.common import check_folder, Command
 from needle_ros.errors import JobError, ParameterError
+
+#: Time in which a scheduler must answer, and have a worker [s].
+_PATIENCE: Final = 10
 
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -91,11 +94,15 @@ def _executor(
             "--scheduler needs Dask: pip install 'needle_insertion[dask]'"
         ) from error
     try:
-        client: Any = Client(scheduler, timeout=10)
+        client: Any = Client(scheduler, timeout=_PATIENCE)
     except (OSError, ValueError, TimeoutError) as error:
         raise JobError(f'no Dask scheduler at {scheduler}: {error}') from error
     with client:
-        count = sum(client.nthreads().values()) or 1
+        try:
+            client.wait_for_workers(1, timeout=_PATIENCE)
+        except TimeoutError as error:
+            raise JobError(f'the scheduler at {scheduler} has no workers') from error
+        count = sum(client.nthreads().values())
         yield partial(engine.dask, client), count
 
 

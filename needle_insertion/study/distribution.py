@@ -20,6 +20,12 @@ KINDS: Final[Mapping[str, tuple[str, ...]]] = {
     'gamma': ('mean', 'standard deviation'),
 }
 
+#: Numbers beyond cannot be reckoned with.
+_LARGEST: Final = 1e100
+
+#: Least and largest mean of a gamma distribution over its standard deviation.
+_FLATTEST, _SHARPEST = 1e-3, 1e6
+
 _WITHIN: Final = 'within'
 _CHOICE: Final = 'choice'
 
@@ -66,6 +72,27 @@ class Distribution:
         low, high = map(self._below, self.within)
         values = self._at(low + parts * (high - low))
         return np.asarray(np.clip(values, *self.within))
+
+    def ends(self, least: float, most: float) -> tuple[float, float]:
+        """
+        Return between which values all are.
+
+        Parameters
+        ----------
+        least, most : float
+            Least and largest part that is asked for.
+
+        Returns
+        -------
+        low, high : float
+            The values; not finite if there are larger ones than a number can be.
+
+        """
+        if self.kind == _CHOICE:
+            return min(self.numbers), max(self.numbers)
+        with np.errstate(over='ignore', invalid='ignore'):
+            low, high = self.quantiles(np.array([least, most])).tolist()
+        return low, high
 
     def _at(self, parts: FloatArray) -> FloatArray:
         first, second = self.numbers
@@ -140,6 +167,11 @@ def distribution(name: str, given: Any) -> Distribution:
         valid = first < second
     else:
         valid = second > 0.0 and (kind == 'normal' or first > 0.0)
+    if valid and kind == 'gamma' and not _FLATTEST < first / second < _SHARPEST:
+        raise ParameterError(
+            f'{name}: gamma must have a mean over standard deviation from {_FLATTEST:g} to '
+            f'{_SHARPEST:g}, got {list(numbers)}'
+        )
     if not valid:
         rule = 'low < high' if kind == 'uniform' else f'{wanted[1]} > 0'
         rule += '' if kind in ('uniform', 'normal') else f' and {wanted[0]} > 0'
@@ -161,7 +193,8 @@ def _kinds() -> str:
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and isfinite(value)
+    number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    return number and abs(value) <= _LARGEST
 
 
 def _numbers(name: str, given: Any) -> tuple[float, ...]:
@@ -170,7 +203,9 @@ def _numbers(name: str, given: Any) -> tuple[float, ...]:
     # YAML 1.1 reads 1e-3 as text.
     read = [_read(one) for one in given]
     if not all(map(_is_number, read)):
-        raise ParameterError(f'{name} takes finite numbers, got {list(given)!r}')
+        raise ParameterError(
+            f'{name} takes finite numbers up to {_LARGEST:g}, got {list(given)!r}'
+        )
     return tuple(map(float, read))
 
 

@@ -3,7 +3,7 @@ A study, computed on any executor: nothing twice, and nothing lost when it is br
 
 Chunks of samples are written as they come, each whole or not at all, in a folder of parts. What is
 there is not computed again. When all are there they become one table, in the order of the samples,
-whose bytes depend neither on the chunks nor on who computed them.
+whose bytes depend neither on the chunks nor on the number of workers.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import (
     BrokenExecutor,
+    CancelledError,
     Executor,
     FIRST_COMPLETED,
     Future,
@@ -18,7 +19,9 @@ from concurrent.futures import (
     wait,
 )
 from contextlib import AbstractContextManager, contextmanager, ExitStack, suppress
+import fcntl
 from functools import lru_cache
+from importlib.metadata import version
 import json
 from multiprocessing import get_context, parent_process
 import os
@@ -52,13 +55,52 @@ pa.set_memory_pool(pa.system_memory_pool())
 
 _PART: Final = re.compile(r'(\d{10})-(\d{10})\.parquet')
 
+#: Packages on whose versions the bits of a sample depend.
+_PACKAGES: Final = ('needle_insertion', 'numba', 'numpy', 'scipy')
+
 TABLE: Final = 'samples.parquet'
 STUDY: Final = 'study.json'
 
 
+def order(study: Study) -> str:
+    """
+    Return what a worker must know.
+
+    Parameters
+    ----------
+    study : Study
+        The study.
+
+    Returns
+    -------
+    str
+        The study, and the versions by which it is computed.
+
+    """
+    return json.dumps(
+        {'study': study.document, 'versions': _versions()}, sort_keys=True, default=str
+    )
+
+
+def _versions() -> dict[str, str]:
+    return {name: version(name) for name in _PACKAGES}
+
+
+def _check_versions(wanted: Mapping[str, str], what: str) -> None:
+    here = _versions()
+    if here != wanted:
+        words = ' and '.join(
+            ', '.join(f'{name} {given[name]}' for name in _PACKAGES if here[name] != wanted[name])
+            for given in (here, wanted)
+        )
+        raise JobError(f'{what} has another version: {words}; the bits of a sample depend on it')
+
+
 @lru_cache(maxsize=1)
 def _study(text: str) -> Study:
-    return made(json.loads(text))
+    given = json.loads(text)
+    _check_versions(given['versions'], 'a worker')
+    return made(given['study'])
 
 
 def chunk(text: str, first: int, count: int) -> tuple[float, dict[str, FloatArray]]:
@@ -68,7 +110,7 @@ def chunk(text: str, first: int, count: int) -> tuple[float, dict[str, FloatArra
     Parameters
     ----------
     text : str
-        `Study.text`.
+        Of `order`.
     first, count : int
         As in `Study.rows`.
 
@@ -78,6 +120,11 @@ def chunk(text: str, first: int, count: int) -> tuple[float, dict[str, FloatArra
         Time that it took [s].
     columns : dict of str to ndarray
         The columns.
+
+    Raises
+    ------
+    JobError
+        If this process has other versions than the one that gives the order.
 
     """
     study = _study(text)
@@ -101,25 +148,64 @@ class Results:
     ------
     ParameterError
         If there is another study in it, or anything else.
+    JobError
+        If its table is damaged.
 
     """
 
     def __init__(self, folder: Path, study: Study) -> None:
         self.folder, self.study = folder, study
         self._parts = folder / 'parts'
-        file = folder / STUDY
-        if file.is_file():
-            if file.read_text(encoding='utf-8') != study.text:
+        self._file = folder / STUDY
+        if self._file.is_file():
+            if self._begun()['study'] != json.loads(order(study))['study']:
                 raise ParameterError(f'{folder} is of another study; name another folder')
         # One that was killed at the begin leaves a draft, or nothing.
         elif folder.exists() and any(path.suffix != '.tmp' for path in folder.iterdir()):
             raise ParameterError(f'{folder} exists and is not of a study; name another folder')
-        folder.mkdir(parents=True, exist_ok=True)
-        write_whole(folder / STUDY, study.text.encode())
+        else:
+            folder.mkdir(parents=True, exist_ok=True)
+            write_whole(self._file, order(study).encode())
         if self.table.exists():
+            if _rows(self.table) != study.samples:
+                raise JobError(f'{self.table} is damaged; remove it, and it is computed again')
             self._clear()
         else:
             self._parts.mkdir(exist_ok=True)
+
+    def _begun(self) -> dict[str, Any]:
+        """Return the study that was begun, and by which versions."""
+        try:
+            given = json.loads(self._file.read_bytes())
+            return {name: given[name] for name in ('study', 'versions')}
+        except (ValueError, TypeError, KeyError) as error:
+            raise ParameterError(f'{self._file} is not of a study; name another folder') from error
+
+    @contextmanager
+    def alone(self) -> Iterator[None]:
+        """
+        Keep other processes from computing here, and remove parts that are damaged.
+
+        Raises
+        ------
+        JobError
+            If another one does, or the study was begun by other versions.
+
+        """
+        _check_versions(self._begun()['versions'], f'the study in {self.folder}')
+        self._parts.mkdir(exist_ok=True)
+        with (self._parts / 'lock').open('w') as lock:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as error:
+                raise JobError(f'another process computes {self.folder}') from error
+            end = 0
+            for first, after in [] if self.table.exists() else self._done():
+                if first < end or _rows(self._part(first, after)) != after - first:
+                    self._part(first, after).unlink()
+                else:
+                    end = after
+            yield
 
     @property
     def table(self) -> Path:
@@ -166,14 +252,14 @@ class Results:
 
     def complete(self) -> None:
         """Make one table of all parts, and remove them."""
-        self._write(self.table, self._groups())
+        if not self.table.exists():
+            self._write(self.table, self._groups())
         self._clear()
 
     def _clear(self) -> None:
-        """Remove the parts, and what was broken off: all of it is in the table."""
+        """Remove the parts: all of it is in the table."""
         shutil.rmtree(self._parts, ignore_errors=True)
-        for draft in self.folder.glob('*.tmp'):
-            draft.unlink()
+        self.table.with_suffix('.tmp').unlink(missing_ok=True)
 
     def _groups(self) -> Iterator[Any]:
         """Yield all samples in tables of the same number of rows."""
@@ -205,6 +291,10 @@ class Results:
                             )
                         )
                     writer.write_table(one.combine_chunks(), row_group_size=_GROUP)
+            if path.name == TABLE:
+                # The parts are removed then. A part that is lost is computed again.
+                with draft.open('rb') as file:
+                    os.fsync(file.fileno())
             draft.replace(path)
         except OSError as error:
             with suppress(OSError):
@@ -238,24 +328,24 @@ def compute(
         If it cannot be computed or written.
 
     """
-    todo, losses = results.missing(), 0
-    while todo:
-        done = 0
+    losses = 0
+    with results.alone():
+        while todo := results.missing():
+            done = 0
 
-        def written(count: int) -> None:
-            nonlocal done
-            done += count
-            progress(count)
+            def written(count: int) -> None:
+                nonlocal done
+                done += count
+                progress(count)
 
-        try:
-            with executor() as running:
-                _compute(results, running, workers, todo, written)
-        except BrokenExecutor as error:
-            losses = 0 if done else losses + 1
-            if losses == _TRIES:
-                raise JobError(f'workers end without a result: {error}') from error
-        todo = results.missing()
-    results.complete()
+            try:
+                with executor() as running:
+                    _compute(results, running, workers, todo, written)
+            except BrokenExecutor as error:
+                losses = 0 if done else losses + 1
+                if losses == _TRIES:
+                    raise JobError(f'workers end without a result: {error}') from error
+        results.complete()
 
 
 def _compute(
@@ -265,13 +355,15 @@ def _compute(
     todo: list[tuple[int, int]],
     written: Callable[[int], object],
 ) -> None:
-    text, size = results.study.text, _FIRST
+    text, size = order(results.study), _FIRST
     running: dict[Future[tuple[float, dict[str, FloatArray]]], int] = {}
     try:
         while todo or running:
             while todo and len(running) < 2 * workers:
+                # Small ones at the end: no worker shall wait for another one's last.
+                left = sum(end - first for first, end in todo)
                 first, end = todo.pop(0)
-                count = min(size, end - first)
+                count = min(size, end - first, max(_FIRST, left // (2 * workers)))
                 running[executor.submit(chunk, text, first, count)] = first
                 if first + count < end:
                     todo.insert(0, (first + count, end))
@@ -339,10 +431,31 @@ def dask(client: Any) -> Iterator[Executor]:
     Executor
         The cluster remains when the context ends.
 
+    Raises
+    ------
+    JobError
+        If the cluster loses a chunk for good.
+
     """
     # A sample is a pure function of its number, but the same chunk is not wanted twice.
-    pool = client.get_executor(pure=False, retries=_TRIES)
+    pool = client.get_executor(pure=False)
     try:
         yield pool
+    except (CancelledError, ImportError) as error:
+        reason = str(error) or 'the scheduler is gone'
+        raise JobError(f'the cluster has lost a part of the study: {reason}') from error
+    except Exception as error:
+        if not type(error).__module__.startswith('distributed'):
+            raise
+        raise JobError(f'the cluster has lost a part of the study: {error}') from error
     finally:
-        pool.shutdown(wait=False)
+        if client.status == 'running':
+            pool.shutdown(wait=False)
+
+
+def _rows(path: Path) -> int:
+    """Return the number of rows of a table; -1 if it is damaged."""
+    try:
+        return int(parquet.read_metadata(path).num_rows)
+    except (OSError, pa.ArrowException):
+        return -1

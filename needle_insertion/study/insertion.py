@@ -8,15 +8,10 @@ from math import copysign, nan
 from typing import Any, Final, NamedTuple
 
 from needle_controller import (
-    Adaptive,
-    AdaptiveGains,
     Axis,
     check_stability,
-    InverseDynamics,
-    InverseDynamicsGains,
+    DEFAULT_GAINS,
     LAWS,
-    Pid,
-    PidGains,
     Reference,
     ReferenceLimits,
     REFERENCES,
@@ -24,6 +19,7 @@ from needle_controller import (
     SafetyLimits,
     Setpoint,
 )
+from needle_controller.controller import LAW_OF
 from needle_controller.laws.axis import require_complete
 from needle_controller.laws.law import Law
 from needle_controller.uncertainty import Uncertainty
@@ -36,9 +32,10 @@ from needle_dynamics import (
     simulate_batch,
 )
 from needle_insertion.study.protocol import Figure, Quantity, Seen
+from needle_insertion.study.reading import check_names, mapping, one_of
 from needle_ros import contract
 from needle_ros.errors import ParameterError
-from needle_ros.settings import check_constants, constant, from_values, unknown_name
+from needle_ros.settings import check_constants, constant, from_values
 from needle_ros.timing import NANOSECONDS
 import numpy as np
 from scipy.optimize import brentq
@@ -48,18 +45,14 @@ OPEN_LOOP: Final = 'open loop'
 #: What pushes the needle.
 CONTROLLERS: Final = (*LAWS, OPEN_LOOP)
 
-#: Class of each law and of its gains.
-_KINDS: Final[Mapping[str, tuple[type[Law], type]]] = {
-    'adaptive': (Adaptive, AdaptiveGains),
-    'inverse_dynamics': (InverseDynamics, InverseDynamicsGains),
-    'pid': (Pid, PidGains),
-}
-
 #: Slower than this a needle rests [m/s].
 _REST: Final = 1e-5
 
 #: Limits of the guard of the node.
 _LIMITS: Final = SafetyLimits()
+
+#: Most samples of an insertion.
+_MOST: Final = 1_000_000
 
 #: Insertions in open loop that are computed at once: all their samples are kept meanwhile.
 _AT_ONCE: Final = 16
@@ -193,36 +186,40 @@ class InsertionProtocol:
     figures = FIGURES
 
     def __init__(self, settings: Mapping[str, Any]) -> None:
+        check_names('settings: ', settings, [*_PARTS, *InsertionStudy.__dataclass_fields__])
         numbers = {name: value for name, value in settings.items() if name not in _PARTS}
-        known = [*_PARTS, *InsertionStudy.__dataclass_fields__]
-        for name in numbers:
-            if name not in known:
-                raise ParameterError(f'settings: {unknown_name(str(name), known)}')
         self._numbers = from_values(InsertionStudy, numbers, 'settings.')
         words = {
             'needle': (DEFAULT_PRESET, tuple(PRESETS)),
             'controller': (LAWS[0], CONTROLLERS),
             'reference': (next(iter(REFERENCES)), tuple(REFERENCES)),
         }
-        chosen = {name: settings.get(name, default) for name, (default, _) in words.items()}
-        for name, (_, valid) in words.items():
-            if chosen[name] not in valid:
-                raise ParameterError(
-                    f'settings: {name} must be one of {", ".join(valid)}, got {chosen[name]!r}'
-                )
+        chosen = {
+            name: one_of(f'settings: {name}', settings.get(name, default), valid)
+            for name, (default, valid) in words.items()
+        }
+        constants, gains, uncertainty = (
+            mapping(f'settings: {name}', settings.get(name))
+            for name in ('constants', 'gains', 'uncertainty')
+        )
         self._needle = from_values(
             NeedleParameters,
-            {**asdict(PRESETS[chosen['needle']]), **_mapping(settings, 'constants')},
+            {**asdict(PRESETS[chosen['needle']]), **constants},
             'settings.constants.',
         )
         self._kind = REFERENCES[chosen['reference']]
         self._period = 1.0 / self._numbers.rate
         self._law = self._made(
             chosen['controller'],
-            _mapping(settings, 'gains'),
-            from_values(Uncertainty, _mapping(settings, 'uncertainty'), 'settings.uncertainty.'),
+            gains,
+            from_values(Uncertainty, uncertainty, 'settings.uncertainty.'),
         )
-        p = self._needle
+        p, samples = self._needle, self._longest * self._numbers.rate
+        if samples > _MOST:
+            raise ParameterError(
+                f'settings: an insertion must have <= {_MOST} samples, and would have up to '
+                f'{samples:.3g}: see rate, wait, speed and push'
+            )
         deepest, most = p.length, NeedleModel(p).modes.reach * p.length
         self.quantities: Mapping[str, Quantity] = {
             'target': Quantity(0.5 * p.length, 'm', 'target depth', p.minimum_depth, deepest),
@@ -248,6 +245,17 @@ class InsertionProtocol:
             ),
         }  # fmt: skip
 
+    @property
+    def _longest(self) -> float:
+        """Time of the longest insertion [s]."""
+        p, numbers = self._needle, self._numbers
+        if self._law is None:
+            axis = Axis.insertion(p)
+            return _time(axis, numbers.push, p.length - p.minimum_depth) + numbers.wait
+        limits = ReferenceLimits(speed=numbers.speed, acceleration=numbers.acceleration)
+        reference: Reference = self._kind(Setpoint(p.minimum_depth), p.length, limits)
+        return reference.duration + numbers.wait
+
     def _made(
         self, controller: str, gains: Mapping[str, Any], uncertainty: Uncertainty
     ) -> Law | None:
@@ -264,9 +272,10 @@ class InsertionProtocol:
                 )
             return None
         require_complete(p)
-        kind, of_gains = _KINDS[controller]
-        axis, chosen = Axis.insertion(p), from_values(of_gains, gains, 'settings.gains.')
-        law = kind(axis=axis, gains=chosen, period=self._period)
+        usual = DEFAULT_GAINS[controller]['insertion']
+        chosen = from_values(type(usual), {**asdict(usual), **gains}, 'settings.gains.')
+        axis = Axis.insertion(p)
+        law = LAW_OF[type(usual)](axis=axis, gains=chosen, period=self._period)
         plants = uncertainty.axes(axis, carriage=True)
         check_stability(law, int(self._numbers.delay), f'{controller} gains', plants=plants)
         return law
@@ -470,13 +479,6 @@ class InsertionProtocol:
             'stopped': course.stopped,
             'left': course.left,
         }
-
-
-def _mapping(settings: Mapping[str, Any], name: str) -> Mapping[str, Any]:
-    value = settings.get(name) or {}
-    if not isinstance(value, Mapping):
-        raise ParameterError(f'settings: {name} must be names with values, got {value!r}')
-    return value
 
 
 def _said(noise: FloatArray) -> FloatArray:

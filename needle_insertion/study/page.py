@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from math import ceil, floor, log10, nan, sqrt
+from math import ceil, floor, isfinite, log10, nan, sqrt
 from pathlib import Path
 from typing import Final
 
@@ -30,8 +30,8 @@ import yaml
 #: Quantiles of each figure.
 _PARTS: Final = (0.5, 0.95, 0.99)
 
-#: Most bars of a distribution.
-_BARS: Final = 80
+#: Most bars of a distribution, and samples from which on its tail is cut off.
+_BARS, _TAILED = 80, 1000
 
 #: Most cells of a map along each axis, samples of one in the mean, and that it needs at least.
 _CELLS, _MEAN, _FEWEST = 24, 25, 5
@@ -43,6 +43,8 @@ _SHOWN: Final[Mapping[str, tuple[str, float]]] = {
 
 #: Samples of which quantiles, shares and pictures are: the page needs no more memory for more.
 _MOST: Final = 2**17
+
+_MISSING: Final = 'A sample in which a figure does not exist does not count for it.'
 
 #: Worst samples that are listed.
 _WORST: Final = 10
@@ -73,9 +75,10 @@ def write(results: Results, path: Path) -> None:
         if np.isfinite(seen).any():
             parts = (_rounded(quantile(seen, part), one.unit) for part in _PARTS)
             words = (f'{value} ({ends})' for value, ends in parts)
-            quantiles.append((_head(name, one.unit), *words, one.meaning))
+            there = str(np.isfinite(seen).sum())
+            quantiles.append((_head(name, one.unit), *words, there, one.meaning))
     shares = {name: share(values, column(table, name, _MOST)) for name in drawn}
-    order = sorted(drawn, key=lambda name: -shares[name])
+    order = sorted(drawn, key=lambda name: -np.nan_to_num(shares[name]))
     # The two that matter most are drawn.
     most = {name: column(table, name, _MOST) for name in order[:2]}
     bad, listed = worst(batches(table, main), _WORST), [main, *order[:4]]
@@ -86,13 +89,13 @@ def write(results: Results, path: Path) -> None:
     sections = [
         Section(
             title='How often',
-            paragraphs=('Intervals are of 95 %, of Wilson.',),
+            paragraphs=('Intervals are of 95 %, of Wilson.', _MISSING),
             tables=(
                 Grid(
                     caption='Probabilities',
-                    heads=('figure', 'probability', '95 % interval', 'what it is'),
+                    heads=('figure', 'probability', '95 % interval', 'samples', 'what it is'),
                     rows=tuple(
-                        (name, *_rounded(one, '%'), figures[name].meaning)
+                        (name, *_rounded(one, '%'), str(one.samples), figures[name].meaning)
                         for name, one in chances.items()
                         if np.isfinite(one.value)
                     ),
@@ -102,11 +105,11 @@ def write(results: Results, path: Path) -> None:
         ),
         Section(
             title='How far',
-            paragraphs=('With intervals of 95 %, whatever the distribution.', *limited),
+            paragraphs=('With intervals of 95 %, whatever the distribution.', _MISSING, *limited),
             tables=(
                 Grid(
                     caption='Quantiles',
-                    heads=('figure', *(f'{part:.0%}' for part in _PARTS), 'what it is'),
+                    heads=('figure', *(f'{part:.0%}' for part in _PARTS), 'samples', 'what it is'),
                     rows=tuple(quantiles),
                 ),
             ),
@@ -128,8 +131,7 @@ def write(results: Results, path: Path) -> None:
                         caption='Shares of the variance',
                         heads=('quantity', main, 'what it is'),
                         rows=tuple(
-                            (name, f'{shares[name]:.1%}',
-                             study.protocol.quantities[name].meaning)
+                            (name, _share(shares[name]), study.protocol.quantities[name].meaning)
                             for name in order
                         ),
                     ),
@@ -194,25 +196,42 @@ def _number(value: float, unit: str) -> str:
 
 def _rounded(one: Estimate, unit: str) -> tuple[str, str]:
     """Return a number and its interval, with the digits that the interval leaves to it."""
-    value, low, high = (_shown(unit)[1] * number for number in one)
-    form = f'.{min(9, max(1, 1 - floor(log10(high - low))))}f' if high > low else '.4g'
+    value, low, high = (_shown(unit)[1] * number for number in one[:3])
+    wide = sum(end for end in (value - low, high - value) if isfinite(end))
+    form = f'.{min(9, max(1, 1 - floor(log10(wide))))}f' if wide > 0.0 else '.4g'
     sign = unit if unit == '%' else ''
-    return f'{value:{form}}{sign}', f'{low:{form}}{sign} to {high:{form}}{sign}'
+    ends = [f'{end:{form}}{sign}' for end in (low, high) if isfinite(end)]
+    match isfinite(low), isfinite(high):
+        case True, True:
+            return f'{value:{form}}{sign}', ' to '.join(ends)
+        case True, False:
+            return f'{value:{form}}{sign}', f'at least {ends[0]}'
+        case False, True:
+            return f'{value:{form}}{sign}', f'at most {ends[0]}'
+    return f'{value:{form}}{sign}', 'too few samples'
+
+
+def _share(part: float) -> str:
+    return f'{part:.1%}' if isfinite(part) else 'too few samples'
 
 
 def _distribution(name: str, figure: Figure, values: FloatArray) -> Picture:
     drawing = Drawing(figsize=(8.0, 3.2), layout='constrained')
     axes = drawing.subplots()
     seen = np.sort(_shown(figure.unit)[1] * values[np.isfinite(values)])
+    words = f'Distribution of {name}; dashed: {_dashed()}.'
     if len(seen):
-        # What is beyond the last thousandth would leave nothing to see of the rest.
-        end = float(np.quantile(seen, 0.999))
+        end = float(seen[-1])
+        if len(seen) >= _TAILED:
+            # What is beyond would leave nothing to see of the rest.
+            end = float(np.quantile(seen, 0.999))
+            words += ' The largest thousandth is not shown.'
         bars = min(_BARS, ceil(2.0 * len(seen) ** (1.0 / 3.0)))
         axes.hist(seen[seen <= end], bins=bars, color='tab:blue')
         for part in _PARTS:
             axes.axvline(float(np.quantile(seen, part)), color='k', lw=0.8, ls='--')
     axes.set(xlabel=_head(name, figure.unit), ylabel='samples')
-    return Picture('distribution', f'Distribution of {name}; dashed: {_dashed()}.', drawing)
+    return Picture('distribution', words, drawing)
 
 
 def _dashed() -> str:
@@ -233,8 +252,9 @@ def _map(
         if low == high or not inside.any():
             return ()
         at = np.linspace(low, high, count + 1)
-        place = (np.digitize(of, at) - 1).astype(np.int16)
-        inside &= (place >= 0) & (place < count)
+        # The last edge is that of the last cell.
+        place = np.minimum(np.digitize(of, at) - 1, count - 1).astype(np.int16)
+        inside &= (of >= low) & (of <= high)
         cells = count * cells + place
         unit = study.protocol.quantities[one].unit
         heads.append(_head(one, unit))

@@ -27,17 +27,19 @@ from needle_dynamics import (
 )
 from needle_dynamics.steering.parameters import with_lengths
 from needle_insertion.study.protocol import Figure, Quantity, Seen
+from needle_insertion.study.reading import check_names, mapping, one_of
 from needle_ros import contract
 from needle_ros.errors import ParameterError
-from needle_ros.settings import check_constants, constant, from_values, unknown_name
+from needle_ros.settings import check_constants, constant, from_values
 from needle_ros.timing import NANOSECONDS
 import numpy as np
 
 OURS: Final = 'ours'
+BROYDEN: Final = 'Broyden'
 OPEN_LOOP: Final = 'open loop'
 
 #: Who moves the guide.
-CONTROLLERS: Final = (OURS, 'springs', 'Broyden', 'roll towards the target', OPEN_LOOP)
+CONTROLLERS: Final = (OURS, 'springs', BROYDEN, 'roll towards the target', OPEN_LOOP)
 
 #: A tip that is no farther from its target has hit it [m].
 HIT: Final = 1e-3
@@ -54,6 +56,9 @@ _JOINTS: Final = replace(_STATES, joints=tuple(one._replace(effort='') for one i
 
 #: Seeds of paths are below.
 _SEEDS: Final = 2**63
+
+#: Most steps of an insertion.
+_MOST: Final = 1000
 
 #: Needles that are held at once.
 _TOGETHER: Final = 256
@@ -101,6 +106,8 @@ class SteeringStudy:
 
     def __post_init__(self) -> None:
         check_constants(self)
+        if self.turns != int(self.turns):
+            raise ParameterError(f'turns must be a whole number, got {self.turns!r}')
 
 
 class SteeringProtocol:
@@ -123,33 +130,40 @@ class SteeringProtocol:
     figures = FIGURES
 
     def __init__(self, settings: Mapping[str, Any]) -> None:
-        numbers = {name: value for name, value in settings.items() if name not in _PARTS}
-        known = [*_PARTS, *SteeringStudy.__dataclass_fields__]
-        for name in numbers:
-            if name not in known:
-                raise ParameterError(f'settings: {unknown_name(str(name), known)}')
-        self._numbers = from_values(SteeringStudy, numbers, 'settings.')
+        check_names('settings: ', settings, [*_PARTS, *SteeringStudy.__dataclass_fields__])
+        given = {name: value for name, value in settings.items() if name not in _PARTS}
+        self._numbers = numbers = from_values(SteeringStudy, given, 'settings.')
         preset = settings.get('needle', 'bending_35mm')
-        if preset not in STEERING_PRESETS:
-            raise ParameterError(
-                f'settings: needle must be one of {", ".join(STEERING_PRESETS)}, got {preset!r}'
-            )
-        self._controller = settings.get('controller', OURS)
-        if self._controller not in CONTROLLERS:
-            raise ParameterError(
-                f'settings: controller must be one of {", ".join(CONTROLLERS)}, got '
-                f'{self._controller!r}'
-            )
-        needle, steering, _ = STEERING_PRESETS[preset]
-        given = dict(settings.get('constants') or {})
+        needle, steering, _ = STEERING_PRESETS[
+            one_of('settings: needle', preset, STEERING_PRESETS)
+        ]
+        self._controller = one_of(
+            'settings: controller', settings.get('controller', OURS), CONTROLLERS
+        )
+        given = dict(mapping('settings: constants', settings.get('constants')))
         of_needle = {name: given.pop(name) for name in asdict(needle) if name in given}
         self._needle = from_values(NeedleParameters, {**asdict(needle), **of_needle})
         self._steering = from_values(SteeringParameters, {**asdict(steering), **given})
-        self._belief = from_values(
-            SteeringBelief, settings.get('belief') or {}, 'settings.belief.'
-        )
-        steps = max(1, round(self._numbers.depth / self._numbers.step))
-        self._depths = np.linspace(0.0, self._numbers.depth, steps + 1)
+        belief = mapping('settings: belief', settings.get('belief'))
+        self._belief = from_values(SteeringBelief, belief, 'settings.belief.')
+        reach = self._needle.length - self._steering.free_length
+        if numbers.depth > reach:
+            raise ParameterError(
+                f'settings.depth must be <= {reach:g} m, the length of the needle without its '
+                f'free length, got {numbers.depth:g} m'
+            )
+        ways = numbers.depth / numbers.step
+        if ways > _MOST:
+            raise ParameterError(
+                f'settings: depth over step must be <= {_MOST} steps, got {ways:.3g}'
+            )
+        moves = {OURS: numbers.guide_limit or numbers.turns, BROYDEN: numbers.guide_limit}
+        if not moves.get(self._controller, True):
+            raise ParameterError(
+                f'settings: controller {self._controller} with guide_limit 0 would move nothing'
+            )
+        steps = max(1, round(ways))
+        self._depths = np.linspace(0.0, numbers.depth, steps + 1)
         bevel = max(self._steering.bevel_load)
         noise = self._belief.path_noise
         self.quantities: Mapping[str, Quantity] = {

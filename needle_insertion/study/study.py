@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-import json
+from math import isfinite
 from pathlib import Path
 from typing import Any, Final
 
 from needle_dynamics import FloatArray
 from needle_insertion.study.distribution import Distribution, distribution
 from needle_insertion.study.protocol import Protocol, PROTOCOLS
+from needle_insertion.study.reading import check_names, mapping, one_of
 from needle_ros.documents import DocumentError, read_document
 from needle_ros.errors import ParameterError
-from needle_ros.settings import unknown_name
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
@@ -25,15 +25,16 @@ _KEYS: Final = ('protocol', 'samples', 'seed', 'design', 'settings', 'population
 #: How samples are spread over the population.
 DESIGNS: Final = ('sobol', 'random', 'latin')
 
-#: Largest study, and largest number of dimensions of the Sobol sequence.
-_MOST: Final = 2**31
+#: Largest study, which is that of the Sobol sequence, and its largest number of dimensions.
+_MOST: Final = 2**30
 _DIMENSIONS: Final = 21201
 
 #: Rounds of a permutation.
 _ROUNDS: Final = 8
 
-#: Parts of a distribution are this far from its ends.
+#: Least and largest part of a distribution.
 _INSIDE: Final = 2.0**-54
+_BELOW: Final = 1.0 - 2.0**-53
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,11 +69,6 @@ class Study:
     factor: FloatArray
     document: Mapping[str, Any]
 
-    @property
-    def text(self) -> str:
-        """The study in one line that tells it from any other."""
-        return json.dumps(self.document, sort_keys=True, default=str)
-
     def draw(self, numbers: FloatArray | Sequence[int]) -> dict[str, FloatArray]:
         """
         Return what differs in some samples.
@@ -88,7 +84,7 @@ class Study:
             Values by name.
 
         """
-        parts = self._parts(int(numbers[0]), len(numbers))
+        parts = np.clip(self._parts(int(numbers[0]), len(numbers)), _INSIDE, _BELOW)
         if not np.array_equal(self.factor, np.eye(len(self.factor))):
             scores = ndtri(parts)
             # Not as a product of matrices: its bits may depend on the number of rows.
@@ -98,7 +94,7 @@ class Study:
                     for row in self.factor
                 ]
             ).T
-        parts = np.clip(parts, _INSIDE, 1.0 - 2.0 * _INSIDE)
+            parts = np.clip(parts, _INSIDE, _BELOW)
         return {
             name: one.quantiles(part)
             for (name, one), part in zip(self.population.items(), parts.T, strict=True)
@@ -108,7 +104,7 @@ class Study:
         """Return numbers that are even in (0, 1), shape (count, d)."""
         dimensions = len(self.population)
         if self.design == 'sobol' and dimensions:
-            sequence = qmc.Sobol(dimensions, rng=np.random.default_rng(self.seed))
+            sequence = qmc.Sobol(dimensions, seed=np.random.default_rng(self.seed))
             if first:
                 sequence.fast_forward(first)
             # One by itself at the begin: scipy warns of a first draw that is no power of 2.
@@ -249,31 +245,23 @@ def made(document: Any) -> Study:
     """
     if not isinstance(document, Mapping):
         raise ParameterError(f'a study has {", ".join(_KEYS)}, got {document!r}')
-    for key in document:
-        if key not in _KEYS:
-            raise ParameterError(unknown_name(str(key), _KEYS))
-    kind = document.get('protocol')
-    if not isinstance(kind, str) or kind not in PROTOCOLS:
-        raise ParameterError(f'protocol must be one of {", ".join(PROTOCOLS)}, got {kind!r}')
+    check_names('', document, _KEYS)
+    kind = one_of('protocol', document.get('protocol'), PROTOCOLS)
     samples, seed = (_whole(document, key, low) for key, low in (('samples', 1), ('seed', 0)))
-    design = document.get('design', DESIGNS[0])
-    if design not in DESIGNS:
-        raise ParameterError(f'design must be one of {", ".join(DESIGNS)}, got {design!r}')
-    settings, given = (_mapping(document, key) for key in ('settings', 'population'))
+    design = one_of('design', document.get('design', DESIGNS[0]), DESIGNS)
+    settings, given = (mapping(key, document.get(key)) for key in ('settings', 'population'))
     protocol = PROTOCOLS[kind](settings)
     known = protocol.quantities
-    for name in given:
-        if name not in known:
-            raise ParameterError(f'population: {unknown_name(str(name), known)}')
-    # Which dimension a name has shall not depend on the order in a file: `Study.text` sorts.
+    check_names('population: ', given, known)
+    # Which dimension a name has shall not depend on the order in a file: workers get it sorted.
     population = {name: distribution(f'population: {name}', given[name]) for name in sorted(given)}
     for name, one in population.items():
-        ends = one.quantiles(np.array([_INSIDE, 1.0 - 2.0 * _INSIDE]))
+        least, most = one.ends(_INSIDE, _BELOW)
         low, high, unit = known[name].low, known[name].high, known[name].unit
-        if not low <= ends.min() <= ends.max() <= high:
+        if not low <= least <= most <= high or not isfinite(least) or not isfinite(most):
             raise ParameterError(
-                f'population: {name} must be in [{low:g}, {high:g}] {unit}, and would be from '
-                f'{ends.min():g} to {ends.max():g}; cut it off with within: [{low:g}, {high:g}]'
+                f'population: {name} must be finite and in [{low:g}, {high:g}] {unit}, and would '
+                f'be from {least:g} to {most:g}; cut it off with within: [low, high]'
             )
     return Study(
         protocol=protocol,
@@ -293,17 +281,10 @@ def _whole(document: Mapping[str, Any], key: str, low: int) -> int:
     return value
 
 
-def _mapping(document: Mapping[str, Any], key: str) -> Mapping[str, Any]:
-    value = document.get(key) or {}
-    if not isinstance(value, Mapping):
-        raise ParameterError(f'{key} must be names with values, got {value!r}')
-    return value
-
-
 def _factor(given: Any, names: Sequence[str]) -> FloatArray:
     """Return a root of the matrix of correlations, given as ``[[name, name, value], ...]``."""
     matrix = np.eye(len(names))
-    form = 'correlations takes [[name, name, value from -1 to 1], ...] of the population'
+    form = 'correlations takes [[name, name, value between -1 and 1], ...] of the population'
     if not isinstance(given, Sequence) or isinstance(given, str):
         raise ParameterError(f'{form}, got {given!r}')
     for one in given:
@@ -311,9 +292,11 @@ def _factor(given: Any, names: Sequence[str]) -> FloatArray:
         if not valid or one[0] not in names or one[1] not in names or one[0] == one[1]:
             raise ParameterError(f'{form}, got {one!r}')
         value = one[2]
-        if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) <= 1.0:
+        if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < 1.0:
             raise ParameterError(f'{form}, got {one!r}')
         i, k = names.index(one[0]), names.index(one[1])
+        if matrix[i, k] != 0.0:
+            raise ParameterError(f'correlations has {one[0]} with {one[1]} twice')
         matrix[i, k] = matrix[k, i] = value
     try:
         return np.asarray(np.linalg.cholesky(matrix))

@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from math import ceil, floor, sqrt
+from math import sqrt
 from pathlib import Path
 from typing import Final, NamedTuple
 
 from needle_dynamics import FloatArray
 import numpy as np
 from pyarrow import parquet
+from scipy.stats import binom
 
 #: Half of an interval of 95 % over the standard deviation.
 _NORMAL: Final = 1.96
 
-#: Groups of samples by which a share of the variance is found.
-_GROUPS: Final = 32
+#: Part of all intervals that lie above the true value, and below it.
+_TAIL: Final = 0.025
+
+#: Groups of samples by which a share of the variance is found, and the fewest samples.
+_GROUPS, _FEWEST = 32, 200
 
 
 class Estimate(NamedTuple):
@@ -26,12 +30,15 @@ class Estimate(NamedTuple):
     ----------
     value, low, high : float
         The number, and the ends of the interval.
+    samples : int
+        Of how many samples it is.
 
     """
 
     value: float
     low: float
     high: float
+    samples: int
 
 
 def batches(table: Path, name: str) -> Iterator[FloatArray]:
@@ -127,11 +134,11 @@ def probability(parts: Iterable[FloatArray]) -> Estimate:
         seen = values[np.isfinite(values)]
         n, yes = n + len(seen), yes + float(seen.sum())
     if n == 0:
-        return Estimate(np.nan, 0.0, 1.0)
+        return Estimate(np.nan, 0.0, 1.0, 0)
     p, z = yes / n, _NORMAL
     middle = (p + z * z / (2 * n)) / (1.0 + z * z / n)
     half = z / (1.0 + z * z / n) * sqrt(p * (1.0 - p) / n + z * z / (4 * n * n))
-    return Estimate(p, max(0.0, middle - half), min(1.0, middle + half))
+    return Estimate(p, max(0.0, middle - half), min(1.0, middle + half), n)
 
 
 def quantile(values: FloatArray, part: float) -> Estimate:
@@ -148,16 +155,23 @@ def quantile(values: FloatArray, part: float) -> Estimate:
     Returns
     -------
     Estimate
-        With an interval between two of the values, whatever the distribution.
+        With an interval between two of the values, whatever the distribution; an end is infinite
+        where there are too few of them.
 
     """
     seen = np.sort(values[np.isfinite(values)])
     n = len(seen)
     if n == 0:
-        return Estimate(np.nan, np.nan, np.nan)
-    half = _NORMAL * sqrt(n * part * (1.0 - part))
-    low, high = max(0, floor(n * part - half) - 1), min(n - 1, ceil(n * part + half))
-    return Estimate(float(np.quantile(seen, part)), float(seen[low]), float(seen[high]))
+        return Estimate(np.nan, -np.inf, np.inf, 0)
+    # Ranks, from 1: the true value is below that of the first, and above that of the second, once
+    # in 40 studies each.
+    low, high = (int(binom.ppf(tail, n, part)) for tail in (_TAIL, 1.0 - _TAIL))
+    return Estimate(
+        float(np.quantile(seen, part)),
+        float(seen[low - 1]) if low >= 1 else -np.inf,
+        float(seen[high]) if high < n else np.inf,
+        n,
+    )
 
 
 def share(values: FloatArray, by: FloatArray) -> float:
@@ -174,17 +188,19 @@ def share(values: FloatArray, by: FloatArray) -> float:
     Returns
     -------
     float
-        First-order index of Sobol, from means of equal groups, less what chance would give.
+        First-order index of Sobol, from means of equal groups, less what chance would give; nan
+        of fewer than 200 samples, where chance is most of it.
 
     """
     seen = np.isfinite(values)
     y = values[seen][np.argsort(by[seen], kind='stable')]
-    groups = min(_GROUPS, len(y) // 2)
-    if groups < 2 or y.var() == 0.0 or np.ptp(by[seen]) == 0.0:
+    if len(y) < _FEWEST:
+        return float('nan')
+    if np.ptp(y) == 0.0 or np.ptp(by[seen]) == 0.0:
         return 0.0
-    means = [(len(one), one.mean()) for one in np.array_split(y, groups)]
+    means = [(len(one), one.mean()) for one in np.array_split(y, _GROUPS)]
     between = sum(n * (mean - y.mean()) ** 2 for n, mean in means) / (len(y) * y.var())
-    chance = (groups - 1) / (len(y) - 1)
+    chance = (_GROUPS - 1) / (len(y) - 1)
     return float(max(0.0, (between - chance) / (1.0 - chance)))
 
 

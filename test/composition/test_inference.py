@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from importlib.util import find_spec
 from pathlib import Path
 import runpy
+import sys
 
 from needle_dynamics import FloatArray, SteeredNeedle, STEERING_PRESETS
 import numpy as np
@@ -64,8 +64,8 @@ def test_what_is_inferred() -> None:
     assert np.array_equal(EXAMPLE['unknown'](needles), np.tile([0.0, -3.0], (4, 1)))
 
 
-@pytest.mark.skipif(find_spec('sbi') is not None, reason='sbi is installed')
-def test_without_sbi_it_says_how_to_install_it() -> None:
+def test_without_sbi_it_says_how_to_install_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, 'sbi', None)
     with pytest.raises(SystemExit, match='this example needs sbi: pip install sbi'):
         EXAMPLE['learn'](np.zeros((4, 2)), np.zeros((4, 24)))
 

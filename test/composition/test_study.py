@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, ExitStack, nullcontext
 from functools import partial
 import hashlib
 import json
@@ -12,6 +12,7 @@ from math import sqrt
 import os
 from pathlib import Path
 import signal
+import subprocess
 import sys
 from typing import Any
 
@@ -21,15 +22,17 @@ from hypothesis import strategies as st
 from needle_dynamics import FloatArray
 from needle_identification import read_topic
 from needle_insertion.cli import main
+from needle_insertion.commands import study as study_command
 from needle_insertion.study import page
 from needle_insertion.study.distribution import distribution
-from needle_insertion.study.engine import compute, dask, processes, Results
-from needle_insertion.study.study import DESIGNS, made
+from needle_insertion.study.engine import chunk, compute, dask, order, processes, Results
+from needle_insertion.study.study import DESIGNS, made, Study
 from needle_insertion.study.summary import column, probability, quantile, share, worst
 from needle_ros.errors import JobError
 import numpy as np
 import pytest
 from support.pages import look_at
+from support.studies import check_refused
 import yaml
 
 #: Few needles that go in by few steps.
@@ -81,19 +84,6 @@ def test_a_sample_does_not_depend_on_its_chunk(design: str) -> None:
             assert np.array_equal(values, whole[name][first : first + count], equal_nan=True)
 
 
-def test_samples_do_not_depend_on_the_order_in_the_file() -> None:
-    """Workers are sent the names in order, and a sample is computed again from the file."""
-    population, correlations = SMALL['population'], [['skin', 'tilt_z', 0.5]]
-    first = made({**SMALL, 'correlations': correlations}).draw(range(20))
-    names = list(population)[::-1]
-    assert names != sorted(names)
-    assert list(population) != sorted(names)
-    turned = {name: population[name] for name in names}
-    again = made({**SMALL, 'correlations': correlations, 'population': turned}).draw(range(20))
-    for name in names:
-        assert np.array_equal(first[name], again[name])
-
-
 @pytest.mark.parametrize(('controller', 'count'), [('ours', 5), ('open loop', 300)])
 def test_a_sample_does_not_depend_on_its_neighbors(controller: str, count: int) -> None:
     """To the bit; of those in open loop some hundreds are computed together."""
@@ -134,15 +124,18 @@ def test_samples_have_the_distributions_and_correlations_of_the_file(design: str
 
 @pytest.mark.parametrize('design', DESIGNS)
 def test_a_worker_draws_what_the_file_says_in_whatever_order(design: str) -> None:
-    """A worker gets the study as text, whose names are sorted; who replays reads the file."""
-    names = list(SMALL['population'])
-    turned = {name: SMALL['population'][name] for name in reversed(names)}
-    one, other = (made({**SMALL, 'design': design, 'population': p}) for p in (
-        SMALL['population'], turned,
-    ))  # fmt: skip
-    for study in (one, other, made(json.loads(one.text))):
-        drawn = study.draw(range(5))
-        for name, values in one.draw(range(5)).items():
+    """A worker gets the study with sorted names; who replays reads the file."""
+    given = SMALL['population']
+    turned = {name: given[name] for name in reversed(given)}
+    for names in (list(given), list(turned)):
+        assert names != sorted(names)
+    one, other = (
+        made({**SMALL, 'design': design, 'population': each}) for each in (given, turned)
+    )
+    whole = one.draw(range(20))
+    for study in (other, made(json.loads(order(one))['study'])):
+        drawn = study.draw(range(20))
+        for name, values in whole.items():
             assert np.array_equal(drawn[name], values)
 
 
@@ -321,9 +314,16 @@ def test_intervals_hold_as_often_as_they_say() -> None:
         held = np.mean([one.low <= truth <= one.high for one in found])
         # Wilson's interval is within some percent of 95 for any probability.
         assert 0.925 < held < 0.99
-    median = [quantile(rng.standard_normal(200), 0.9) for _ in range(1000)]
-    exact = 1.2815515655446004
-    assert 0.93 < np.mean([one.low <= exact <= one.high for one in median]) < 0.985
+    for part, exact in ((0.5, 0.0), (0.9, 1.2815515655446004), (0.99, 2.3263478740408408)):
+        for n in (1, 5, 20, 200):
+            near = [quantile(rng.standard_normal(n), part) for _ in range(1000)]
+            held = np.mean([one.low <= exact <= one.high for one in near])
+            # Four standard errors below 95 %; of few samples only wide intervals hold so often.
+            assert held > 0.95 - 4.0 * sqrt(0.95 * 0.05 / 1000)
+        assert held < 0.99
+    # Without an order statistic that is large enough often enough there is no end.
+    assert quantile(rng.standard_normal(367), 0.99).high == np.inf
+    assert np.isfinite(quantile(rng.standard_normal(368), 0.99).high)
 
 
 def test_shares_are_those_of_a_sum() -> None:
@@ -335,8 +335,105 @@ def test_shares_are_those_of_a_sum() -> None:
     assert share(y, a) == pytest.approx(0.8, abs=0.01)
     assert share(y, b) == pytest.approx(0.2, abs=0.01)
     assert share(y, other) == pytest.approx(0.0, abs=0.005)
+    # Rounding of a mean is no variance.
+    assert share(np.full(1000, 1.23e-5), a[:1000]) == 0.0
+    assert np.isnan(share(y[:199], a[:199]))
     found = list(np.argsort(np.where(np.isnan(y), np.inf, -y))[:2])
     assert worst([y], 2) == worst(np.array_split(y, 7), 2) == found
+
+
+def test_a_map_has_the_samples_at_its_edges() -> None:
+    """Of quantities with two values each, all are at an edge."""
+    study, rng = made(SMALL), np.random.default_rng(3)
+    over = {name: rng.integers(0, 2, 4000).astype(float) for name in ('tilt_z', 'skin')}
+    values = over['tilt_z'] + 2.0 * over['skin']
+    [picture] = page._map('miss', study.protocol.figures['miss'], values, over, study)
+    cells = picture.figure.axes[0].collections[0].get_array()
+    seen = np.ma.masked_invalid(cells).compressed()
+    assert sorted(seen) == pytest.approx([0.0, 1e3, 2e3, 3e3])
+
+
+def test_a_part_at_the_end_of_its_range_is_a_number(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A scrambled Sobol sequence may have an exact 0, whose normal score is infinite."""
+    study = made(SMALL)
+    for part in (0.0, 1.0):
+        monkeypatch.setattr(Study, '_parts', lambda *_, at=part: np.full((3, 5), at))
+        for name, values in study.draw(range(3)).items():
+            quantity = study.protocol.quantities[name]
+            assert ((values >= quantity.low) & (values <= quantity.high)).all()
+
+
+def test_only_one_process_computes_a_study(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file, folder = tmp_path / 'study.yaml', tmp_path / 'results'
+    file.write_text(yaml.safe_dump(SMALL))
+    results = Results(folder, made(SMALL))
+    words = ['study', str(file), '-o', str(folder), '--workers', '1']
+    with results.alone():
+        assert main(words) == 1
+    assert capsys.readouterr().err == f'error: another process computes {folder}\n'
+    assert main(words) == 0
+
+
+@pytest.mark.parametrize(
+    'damage',
+    [
+        lambda part: part.write_bytes(b''),
+        lambda part: part.write_bytes(part.read_bytes()[:-1]),
+        lambda part: part.rename(part.with_name('0000000000-0000000017.parquet')),
+        lambda part: part.with_name('0000000007-0000000016.parquet').write_bytes(
+            part.read_bytes()
+        ),
+    ],
+    ids=['empty', 'cut', 'other number', 'twice'],
+)
+def test_a_damaged_part_is_computed_again(
+    tmp_path: Path, damage: Callable[[Path], object]
+) -> None:
+    """Also one that has other samples than its name says, and one that is there twice."""
+    study = made(SMALL)
+    whole, broken = Results(tmp_path / 'whole', study), Results(tmp_path / 'broken', study)
+    compute(whole, here, 1, lambda _: None)
+    for first in (0, 16):
+        broken.add(first, study.rows(first, 16))
+    damage(tmp_path / 'broken' / 'parts' / '0000000000-0000000016.parquet')
+    compute(broken, here, 1, lambda _: None)
+    assert checksum(broken.table) == checksum(whole.table)
+
+
+def test_what_is_damaged_or_of_another_version_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file, folder = tmp_path / 'study.yaml', tmp_path / 'results'
+    file.write_text(yaml.safe_dump(SMALL))
+    words = ['study', str(file), '-o', str(folder), '--workers', '1']
+    assert main(words) == 0
+    table = folder / 'samples.parquet'
+    whole = table.read_bytes()
+    capsys.readouterr()
+    table.write_bytes(whole[:-100])
+    assert main(words) == 1
+    assert f'{table} is damaged; remove it, and it is computed' in capsys.readouterr().err
+    table.unlink()
+    assert main(words) == 0
+    assert table.read_bytes() == whole
+    # One that was begun by others must not go on: its samples would be of two kinds.
+    table.unlink()
+    begun = json.loads((folder / 'study.json').read_text())
+    begun['versions']['numpy'] = '1.26.4'
+    (folder / 'study.json').write_text(json.dumps(begun))
+    capsys.readouterr()
+    assert main(words) == 1
+    assert f'{folder} has another version: numpy {np.__version__} and numpy 1.26.4;' in (
+        capsys.readouterr().err
+    )
+    with pytest.raises(JobError, match='a worker has another version: numpy'):
+        chunk(json.dumps(begun), 0, 1)
+    for content in (b'\xff', b'{}', b'3', b'[1'):
+        (folder / 'study.json').write_bytes(content)
+        assert main(words) == 2
+        assert 'study.json is not of a study; name another folder' in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -354,9 +451,21 @@ def test_shares_are_those_of_a_sum() -> None:
         ({'population': {'tilt_x': {'normal': [0, -1]}}}, 'must have standard deviation > 0'),
         ({'population': {'tilt_x': {'uniform': [1, 0]}}}, 'uniform must have low < high'),
         ({'population': {'tilt_x': {'normal': [0, float('nan')]}}}, 'takes finite numbers'),
-        ({'population': {'tilt_x': {'normal': [0, 0.2]}}}, 'cut it off with within: [-0.5, 0.5]'),
-        ({'population': {'skin': {'uniform': [-1, 1]}}}, 'skin must be in [0, 1000] 1'),
+        ({'population': {'tilt_x': {'normal': [0, 0.2]}}}, 'in [-0.5, 0.5] rad, and would'),
+        ({'population': {'skin': {'uniform': [-1, 1]}}}, 'skin must be finite and in [0, 1000]'),
         ({'population': {'skin': {'normal': [1, 0.1], 'within': [90, 91]}}}, 'with values of the'),
+        ({'population': {'bending_length': {'choice': [1, 0, 1]}}}, 'finite and in [0.1, 10]'),
+        ({'population': {'skin': {'gamma': [1, 1.0e+90]}}}, 'gamma must have a mean over'),
+        ({'population': {'tilt_x': 10**400}}, 'tilt_x must be a number or one of'),
+        ({'population': {'tilt_x': {'normal': [0, 10**400]}}}, 'takes finite numbers up to 1e+1'),
+        ({'population': {'look_noise': {'lognormal': [1, 1000]}}}, 'look_noise must be finite'),
+        ({'correlations': [['skin', 'tilt_z', 1]]}, 'value between -1 and 1'),
+        ({'correlations': [['skin', 'tilt_z', 0.5], ['tilt_z', 'skin', 0.1]]}, 'skin twice'),
+        ({'settings': {'depth': 0.3}}, 'settings.depth must be <='),
+        ({'settings': {'step': 1e-9}}, 'depth over step must be <= 1000 steps, got 1e+08'),
+        ({'settings': {'turns': 0.7}}, 'settings.turns must be a whole number, got 0.7'),
+        ({'settings': {'guide_limit': 0}}, 'controller ours with guide_limit 0 would move noth'),
+        ({'settings': {'guide_limit': 0, 'controller': 'Broyden'}}, 'controller Broyden with'),
         ({'correlations': [['skin', 'tilt', 0.5]]}, 'correlations takes [[name, name, value'),
         ({'correlations': [['skin', 'tilt_z', 2]]}, 'correlations takes [[name, name, value'),
         ({'correlations': [['skin', 'tilt_z', 0.9], ['tilt_z', 'target_x', 0.9],
@@ -365,21 +474,23 @@ def test_shares_are_those_of_a_sum() -> None:
         ({'settings': {'depth': -1}}, 'settings.depth must be finite, > 0 m, got -1'),
         ({'settings': {'needle': 'bone'}}, 'settings: needle must be one of'),
         ({'settings': {'controller': 'me'}}, 'settings: controller must be one of ours'),
+        ({'settings': {'needle': [1]}}, 'settings: needle must be one of'),
+        ({'settings': {'controller': [1]}}, 'settings: controller must be one of ours'),
+        ({'settings': {'constants': 1}}, 'settings: constants must be names with values, got 1'),
+        ({'settings': {'constants': {1: 1}}}, "unknown parameter '1'"),
+        ({'settings': {'belief': 1}}, 'settings: belief must be names with values, got 1'),
         ({'settings': {'belief': {'nose': 1}}}, "unknown parameter 'settings.belief.nose'"),
+        ({'settings': 1}, 'settings must be names with values, got 1'),
+        ({'population': [1]}, 'population must be names with values, got [1]'),
+        ({'protocol': ['steering']}, 'protocol must be one of steering, insertion, got'),
+        ({'design': ['sobol']}, 'design must be one of sobol, random, latin, got'),
     ],
 )  # fmt: skip
 def test_what_a_study_cannot_have_is_named(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], change: Any, complaint: str
 ) -> None:
     """In one line, with the file, and nothing is written."""
-    file = tmp_path / 'study.yaml'
-    file.write_text(yaml.safe_dump({**SMALL, **change}))
-    assert main(['study', str(file), '-o', str(tmp_path / 'new')]) == 2
-    said = capsys.readouterr().err
-    assert said.startswith(f'error: {file}: ')
-    assert complaint in said
-    assert said.count('\n') == 1
-    assert not (tmp_path / 'new').exists()
+    check_refused({**SMALL, **change}, complaint, tmp_path, capsys)
 
 
 def test_folders_and_files_that_cannot_be_used_are_named(
@@ -426,8 +537,42 @@ def resource_limit(size: int) -> Any:
         signal.signal(signal.SIGXFSZ, handler)
 
 
+def test_a_scheduler_that_is_killed_ends_it_in_one_line(tmp_path: Path) -> None:
+    """In the middle; what was written is not lost."""
+    from distributed import Client
+
+    study, file = made({**SMALL, 'samples': 400}), tmp_path / 'scheduler.json'
+    whole, results = Results(tmp_path / 'whole', study), Results(tmp_path / 'dask', study)
+    compute(whole, here, 1, lambda _: None)
+    words = ['--host', '127.0.0.1', '--no-dashboard', '--scheduler-file', str(file)]
+    with ExitStack() as stack:
+        scheduler, _ = (
+            stack.enter_context(ended(subprocess.Popen([sys.executable, '-m', *command])))
+            for command in (
+                ['distributed.cli.dask_scheduler', *words, '--port', '0'],
+                ['distributed.cli.dask_worker', *words, '--nthreads', '1', '--no-nanny'],
+            )
+        )
+        client = stack.enter_context(Client(scheduler_file=str(file), timeout=60))
+        with pytest.raises(JobError, match='the cluster has lost a part of the study'):
+            compute(results, partial(dask, client), 1, lambda _: scheduler.kill())
+    assert results.missing() != [(0, 400)]
+    compute(results, here, 1, lambda _: None)
+    assert checksum(results.table) == checksum(whole.table)
+
+
+@contextmanager
+def ended(process: subprocess.Popen[bytes]) -> Iterator[subprocess.Popen[bytes]]:
+    """Kill a process at the end."""
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.wait()
+
+
 def test_a_dask_cluster_computes_the_same_though_a_worker_is_killed(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """On this machine, with two processes; a scheduler that is not there is named."""
     from distributed import Client, LocalCluster
@@ -459,6 +604,11 @@ def test_a_dask_cluster_computes_the_same_though_a_worker_is_killed(
     sums = {checksum(tmp_path / name / 'samples.parquet') for name in ('whole', 'dask', 'command')}
     assert len(sums) == 1
     capsys.readouterr()
+    empty = ['study', str(file), '-o', str(tmp_path / 'empty')]
+    monkeypatch.setattr(study_command, '_PATIENCE', 1)
+    with LocalCluster(n_workers=0, host='127.0.0.1', dashboard_address=None) as cluster:
+        assert main([*empty, '--scheduler', cluster.scheduler_address]) == 1
+    assert 'has no workers' in capsys.readouterr().err
     gone = ['study', str(file), '--scheduler', address, '-o', str(tmp_path / 'gone')]
     assert main(gone) == 1
     said = capsys.readouterr().err
