@@ -1,17 +1,18 @@
 """
 Studies of populations: insertions per second, memory, and the same tables whoever computes.
 
-The study is that of `examples/studies`. Its workers are started, and have loaded or compiled what
-they need, before a rate is measured; how long that takes is shown beside it.
+The study is that of `examples/studies`. Workers of every kind are started, and have loaded or
+compiled what they need, before a rate is measured; then they take turns.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, ExitStack, nullcontext
 from functools import partial
 import hashlib
+from itertools import count
 import os
 from pathlib import Path
 import signal
@@ -22,8 +23,9 @@ import time
 from typing import Any, Final, NamedTuple, TypeAlias
 
 from benchmarks.kills import kill_again_and_again, Kills
-from benchmarks.measure import Bar, number, seconds
+from benchmarks.measure import Bar, least_times, number, seconds
 from benchmarks.page import Answer, Section, Tick
+import dask
 from distributed import Client, LocalCluster
 from needle_dynamics import FloatArray
 from needle_insertion.study import engine
@@ -44,14 +46,18 @@ _FIRST: Final = 16
 #: Insertions in open loop whose time is a bar.
 _MILLION: Final = 1_000_000
 
-#: Chunks in which as many samples are computed without the engine.
-_CHUNKS: Final = 64
-
 #: Insertions of a chunk whose cost to the parent is measured: a worker takes a second for them.
 _CHUNK: Final = 200
 
 #: Workers of ten machines with 32 cores each.
 _WORKERS: Final = 320
+
+#: What docs/howto/study.md tells to set for workers. Otherwise each insertion gives its memory
+#: back and takes it anew, and a profiler looks at the worker a hundred times per second.
+_SETTINGS: Final = {
+    'distributed.nanny.pre-spawn-environ.MALLOC_TOP_PAD_': '16777216',
+    'distributed.worker.profile.enabled': False,
+}
 
 #: Makes what computes, as `engine.compute` takes it.
 _Factory: TypeAlias = Callable[[], AbstractContextManager[Executor]]
@@ -64,7 +70,9 @@ class Plan(NamedTuple):
     Attributes
     ----------
     closed : int
-        Insertions under our controller in a study.
+        Insertions under our controller in the studies whose tables are compared.
+    timed : int
+        Those in the studies that are timed.
     rounds : int
         How often each is timed.
     open : tuple of int
@@ -77,6 +85,7 @@ class Plan(NamedTuple):
     """
 
     closed: int
+    timed: int
     rounds: int
     open: tuple[int, int, int]
     kills: int
@@ -84,32 +93,9 @@ class Plan(NamedTuple):
 
 
 PLANS: Final = {
-    'default': Plan(100_000, 1, (1000, 10_000, _MILLION), 10, 2000),
-    'quick': Plan(800, 1, (100, 1000, 2000), 2, 100),
+    'default': Plan(100_000, 8000, 10, (1000, 10_000, _MILLION), 10, 2000),
+    'quick': Plan(800, 400, 2, (100, 1000, 2000), 2, 100),
 }
-
-
-class Timed(NamedTuple):
-    """
-    A study that was computed.
-
-    Attributes
-    ----------
-    start : float
-        Time until the workers were there and had computed something [s].
-    taken : float
-        Time of the study, from the first sample to the table [s].
-    table : str
-        SHA-256 of the table.
-    bare : float
-        Samples per second of the same workers without the engine; 0 if not measured.
-
-    """
-
-    start: float
-    taken: float
-    table: str
-    bare: float
 
 
 class Watched(NamedTuple):
@@ -154,26 +140,25 @@ def compare(tick: Tick, plan: str = 'default') -> Answer:
 
 def _compare(folder: Path, plan: Plan, tick: Tick) -> Answer:
     study = _study(plan.closed)
-    found: dict[str, list[Timed]] = {'one': [], 'two': [], 'dask': []}
-    for turn in range(plan.rounds):
-        for name, workers, begin in (('one', 1, pool), ('two', 2, pool), ('dask', 2, cluster)):
-            tick(f'closed loop, round {turn + 1} of {plan.rounds}: {name}')
-            place = folder / f'{name}_{turn}'
-            found[name].append(timed(place, study, begin, workers))
+    tick('closed loop, in turns')
+    least = times(folder / 'timed', _study(plan.timed), plan.rounds)
+    tables = {}
+    for name, (begin, workers) in WAYS.items():
+        tick(f'closed loop, {plan.closed} insertions: {name}')
+        with begin(engine.order(study), workers) as factory:
+            tables[name] = computed(folder / name, study, factory, workers)
     tick('Dask, a worker is killed')
-    tables = {name: runs[0].table for name, runs in found.items()}
     tables['a worker of Dask is killed half way'] = half_way(folder / 'half', study)
-    different = {one.table for runs in found.values() for one in runs} | set(tables.values())
     watched = {}
-    for count in plan.open:
-        tick(f'open loop, {count} insertions')
-        watched[count] = watch(folder / f'open_{count}', _study(count, _OPEN))
+    for size in plan.open:
+        tick(f'open loop, {size} insertions')
+        watched[size] = watch(folder / f'open_{size}', _study(size, _OPEN))
     tick('the parent alone')
     fed = 1.0 / parent_time(folder / 'parent', _study(plan.chunks * _CHUNK))
     tick('the study is killed')
     small = _study(max(plan.closed // 4, 1))
     kills, same = killed(folder / 'killed', small, plan.kills)
-    return _answer(plan, found, tables, len(different) - 1, watched, fed, kills, same)
+    return _answer(plan, least, tables, watched, fed, kills, same)
 
 
 def _study(samples: int, settings: dict[str, Any] | None = None) -> Study:
@@ -198,7 +183,7 @@ def pool(text: str, workers: int) -> Iterator[_Factory]:
     Parameters
     ----------
     text : str
-        `Study.text`.
+        Of `engine.order`.
     workers : int
         How many.
 
@@ -239,6 +224,7 @@ def cluster(text: str, workers: int) -> Iterator[_Factory]:
 @contextmanager
 def _dask(workers: int) -> Iterator[Any]:
     with (
+        dask.config.set(_SETTINGS),
         LocalCluster(
             n_workers=workers, threads_per_worker=1, host='127.0.0.1', dashboard_address=None
         ) as made_of,
@@ -247,12 +233,47 @@ def _dask(workers: int) -> Iterator[Any]:
         yield client
 
 
-def timed(
-    folder: Path,
-    study: Study,
-    begin: Callable[[str, int], AbstractContextManager[_Factory]],
-    workers: int,
-) -> Timed:
+#: Who computes, and how many they are.
+WAYS: Final = {
+    'process pool, 1 worker': (pool, 1),
+    'process pool, 2 workers': (pool, 2),
+    'Dask, LocalCluster, 2 workers': (cluster, 2),
+}
+
+
+def times(folder: Path, study: Study, rounds: int) -> dict[str, float]:
+    """
+    Measure how long each of `WAYS` takes for a study.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder of all results.
+    study : Study
+        The study.
+    rounds : int
+        How often each takes its turn.
+
+    Returns
+    -------
+    dict of str to float
+        The least time of each, from the first sample to the table [s].
+
+    """
+    numbers = count()
+
+    def once(factory: _Factory, workers: int) -> None:
+        computed(folder / str(next(numbers)), study, factory, workers)
+
+    with ExitStack() as stack:
+        jobs = {
+            name: partial(once, stack.enter_context(begin(engine.order(study), workers)), workers)
+            for name, (begin, workers) in WAYS.items()
+        }
+        return least_times(jobs, rounds)
+
+
+def computed(folder: Path, study: Study, factory: _Factory, workers: int) -> str:
     """
     Compute a study.
 
@@ -262,38 +283,23 @@ def timed(
         Folder of its results.
     study : Study
         The study.
-    begin : callable
-        `pool` or `cluster`.
+    factory : callable
+        Of `pool` or `cluster`.
     workers : int
-        Number of processes.
+        Number of workers.
 
     Returns
     -------
-    Timed
-        How long it took.
+    str
+        SHA-256 of the table.
 
     """
-    start = time.perf_counter()
-    with begin(study.text, workers) as factory:
-        start = time.perf_counter() - start
-        results = engine.Results(folder, study)
-        taken = seconds(partial(engine.compute, results, factory, workers, _ignore))
-        bare = 0.0
-        if begin is pool:
-            # As many samples for each worker, in chunks that are equal, and not written.
-            size = max(1, study.samples // _CHUNKS)
-            firsts = range(0, size * (_CHUNKS // 4), size)
-            with factory() as executor:
-                job = partial(executor.map, partial(_chunk, study.text, size), firsts)
-                bare = len(firsts) * size / seconds(lambda: list(job()))
-    return Timed(start, taken, _checksum(results.table), bare)
+    results = engine.Results(folder, study)
+    engine.compute(results, factory, workers, _ignore)
+    return _checksum(results.table)
 
 
-def _chunk(text: str, count: int, first: int) -> object:
-    return engine.chunk(text, first, count)
-
-
-def _ignore(count: int) -> None:
+def _ignore(_count: int) -> None:
     """Do nothing with the progress."""
 
 
@@ -304,7 +310,7 @@ def half_way(folder: Path, study: Study) -> str:
     Parameters
     ----------
     folder, study
-        As in `timed`.
+        As in `computed`.
 
     Returns
     -------
@@ -348,7 +354,7 @@ def parent_time(folder: Path, study: Study) -> float:
     Parameters
     ----------
     folder, study
-        As in `timed`.
+        As in `computed`.
 
     Returns
     -------
@@ -433,7 +439,7 @@ def killed(folder: Path, study: Study, times: int) -> tuple[Kills, bool]:
     Parameters
     ----------
     folder, study
-        As in `timed`.
+        As in `computed`.
     times : int
         How often.
 
@@ -448,8 +454,9 @@ def killed(folder: Path, study: Study, times: int) -> tuple[Kills, bool]:
     words = _words(folder, study, 2)
     kills = kill_again_and_again(words, folder, times, np.random.default_rng(1))
     subprocess.run(words, stdout=subprocess.DEVNULL, check=True)
-    whole = timed(folder.with_name('whole'), study, pool, 2)
-    return kills, _checksum(folder / engine.TABLE) == whole.table
+    with pool(engine.order(study), 2) as factory:
+        whole = computed(folder.with_name('whole'), study, factory, 2)
+    return kills, _checksum(folder / engine.TABLE) == whole
 
 
 def _checksum(path: Path) -> str:
@@ -458,25 +465,15 @@ def _checksum(path: Path) -> str:
 
 def _answer(
     plan: Plan,
-    found: dict[str, list[Timed]],
+    least: dict[str, float],
     tables: dict[str, str],
-    different: int,
     watched: dict[int, Watched],
     fed: float,
     kills: Kills,
     same: bool,
 ) -> Answer:
-    least = {name: min(one.taken for one in runs) for name, runs in found.items()}
-    labels = {
-        'one': ('process pool', 1), 'two': ('process pool', 2), 'dask': ('Dask, LocalCluster', 2),
-    }  # fmt: skip
-    rows = []
-    for name, (label, workers) in labels.items():
-        start = min(one.start for one in found[name])
-        rows.append(_row(label, workers, plan.closed / least[name], start))
-    for name in ('one', 'two'):
-        bare = max(one.bare for one in found[name])
-        rows.append(_row('no engine, nothing written', labels[name][1], bare))
+    rates = {name: plan.timed / taken for name, taken in least.items()}
+    one, two, dask = rates.values()
     small, large = plan.open[1:3]
     each = (watched[large].taken - watched[small].taken) / (large - small)
     start = watched[small].taken - small * each
@@ -484,20 +481,20 @@ def _answer(
     sections = [
         Section(
             'Insertions under our controller',
-            ('who computes', 'workers', 'per second', 'per second and worker', 'start [s]'),
-            rows,
-            f'{plan.closed} insertions of `examples/studies/steering.yaml`, the best of '
-            f'{plan.rounds} rounds in turns, from the first sample to the table. The start is not '
-            'in it: workers that begin, import, and load compiled code or compile. The parent '
-            f'takes {1e3 / fed:.2f} ms for a chunk and its part of the table, and a chunk is a '
-            'second of a worker.',
+            ('who computes', 'per second', 'per second and worker'),
+            [(name, number(rate), number(rate / WAYS[name][1])) for name, rate in rates.items()],
+            f'{plan.timed} insertions of `examples/studies/steering.yaml`, from the first sample '
+            f'to the table, the best of {plan.rounds} turns. All workers are there all the time; '
+            'those of Dask with the settings that the how-to names. '
+            f'The parent takes {1e3 / fed:.2f} ms for a chunk and its part of the table, and a '
+            'chunk is a second of a worker.',
         ),
         Section(
             'Open loop: the command, with two workers',
             ('insertions', 'time [s]', 'peak of the parent [MB]', 'peak of a worker [MB]'),
             [
-                (f'{count}', f'{one.taken:.1f}', f'{one.parent:.0f}', f'{one.worker:.0f}')
-                for count, one in watched.items()
+                (f'{size}', f'{run.taken:.1f}', f'{run.parent:.0f}', f'{run.worker:.0f}')
+                for size, run in watched.items()
             ],
             f'100 mm by steps of 1 mm, with start and page. An insertion takes '
             f'{1e6 * each:.0f} us of wall time, and start and page {start:.1f} s. A million takes '
@@ -507,11 +504,8 @@ def _answer(
         Section(
             'Equal tables',
             ('who computes', 'SHA-256 of the table'),
-            [
-                (' '.join(map(str, labels[name])) if name in labels else name, f'`{one[:16]}`')
-                for name, one in tables.items()
-            ],
-            f'{plan.closed} insertions, the table of each round. Another study was killed '
+            [(name, f'`{table[:16]}`') for name, table in tables.items()],
+            f'{plan.closed} insertions under our controller. Another study was killed '
             f'{kills.killed} times by `kill -9`, and went on each time: {kills.twice} insertions '
             f'were computed though they had been written, its table is '
             f'{"that" if same else "NOT that"} of one that was not killed, and {kills.left} '
@@ -519,24 +513,19 @@ def _answer(
         ),
     ]
     bars = [
-        Bar('closed loop, per second and core', plan.closed / least['one'], 200.0, at_least=True),
+        Bar('closed loop, per second and core', one, 200.0, at_least=True),
         Bar('a million in open loop, two workers', million, 600.0, 's'),
-        Bar('two workers over one', least['one'] / least['two'], 1.8, 'x', at_least=True),
+        Bar('two workers over one', two / one, 1.8, 'x', at_least=True),
         Bar('workers that one parent can feed', fed, float(_WORKERS), at_least=True),
-        Bar('time that Dask adds', 100.0 * (least['dask'] / least['two'] - 1.0), 10.0, '%'),
+        Bar('time that Dask adds', 100.0 * (two / dask - 1.0), 10.0, '%'),
     ]
     span = f'{large} over {small} insertions'
     for name in ('parent', 'worker'):
-        peaks = [getattr(watched[count], name) for count in (large, small)]
+        peaks = [getattr(watched[size], name) for size in (large, small)]
         bars.append(Bar(f'peak of {name}, {span}', peaks[0] / peaks[1], 1.2, 'x'))
     bars += [
-        Bar('tables that differ', float(different + (not same)), 0.0),
+        Bar('tables that differ', float(len(set(tables.values())) - 1 + (not same)), 0.0),
         Bar('insertions computed twice', float(kills.twice), 0.0),
         Bar('processes left behind', float(kills.left), 0.0),
     ]
     return sections, bars
-
-
-def _row(label: str, workers: int, rate: float, start: float | None = None) -> tuple[str, ...]:
-    begun = '' if start is None else f'{start:.1f}'
-    return label, f'{workers}', number(rate), number(rate / workers), begun
