@@ -93,7 +93,7 @@ class Plan(NamedTuple):
 
 
 PLANS: Final = {
-    'default': Plan(100_000, 8000, 10, (1000, 10_000, _MILLION), 10, 2000),
+    'default': Plan(100_000, 8000, 6, (1000, 10_000, _MILLION), 10, 2000),
     'quick': Plan(800, 400, 2, (100, 1000, 2000), 2, 100),
 }
 

@@ -205,9 +205,9 @@ def _rounded(one: Estimate, unit: str) -> tuple[str, str]:
         case True, True:
             return f'{value:{form}}{sign}', ' to '.join(ends)
         case True, False:
-            return f'{value:{form}}{sign}', f'at least {ends[0]}'
+            return f'{value:{form}}{sign}', f'≥ {ends[0]}'
         case False, True:
-            return f'{value:{form}}{sign}', f'at most {ends[0]}'
+            return f'{value:{form}}{sign}', f'≤ {ends[0]}'
     return f'{value:{form}}{sign}', 'too few samples'
 
 
