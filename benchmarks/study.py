@@ -141,7 +141,7 @@ def compare(tick: Tick, plan: str = 'default') -> Answer:
 def _compare(folder: Path, plan: Plan, tick: Tick) -> Answer:
     study = _study(plan.closed)
     tick('closed loop, in turns')
-    least = times(folder / 'timed', _study(plan.timed), plan.rounds)
+    least = take_turns(folder / 'timed', _study(plan.timed), plan.rounds)
     tables = {}
     for name, (begin, workers) in WAYS.items():
         tick(f'closed loop, {plan.closed} insertions: {name}')
@@ -241,7 +241,7 @@ WAYS: Final = {
 }
 
 
-def times(folder: Path, study: Study, rounds: int) -> dict[str, float]:
+def take_turns(folder: Path, study: Study, rounds: int) -> dict[str, float]:
     """
     Measure how long each of `WAYS` takes for a study.
 
@@ -473,7 +473,7 @@ def _answer(
     same: bool,
 ) -> Answer:
     rates = {name: plan.timed / taken for name, taken in least.items()}
-    one, two, dask = rates.values()
+    one, two, spread = rates.values()
     small, large = plan.open[1:3]
     each = (watched[large].taken - watched[small].taken) / (large - small)
     start = watched[small].taken - small * each
@@ -517,7 +517,7 @@ def _answer(
         Bar('a million in open loop, two workers', million, 600.0, 's'),
         Bar('two workers over one', two / one, 1.8, 'x', at_least=True),
         Bar('workers that one parent can feed', fed, float(_WORKERS), at_least=True),
-        Bar('time that Dask adds', 100.0 * (two / dask - 1.0), 10.0, '%'),
+        Bar('time that Dask adds', 100.0 * (two / spread - 1.0), 10.0, '%'),
     ]
     span = f'{large} over {small} insertions'
     for name in ('parent', 'worker'):

@@ -72,11 +72,10 @@ def write(results: Results, path: Path) -> None:
             chances[name] = probability(batches(table, name))
             continue
         seen = values if name == main else column(table, name, _MOST)
-        if np.isfinite(seen).any():
-            parts = (_rounded(quantile(seen, part), one.unit) for part in _PARTS)
-            words = (f'{value} ({ends})' for value, ends in parts)
-            there = str(np.isfinite(seen).sum())
-            quantiles.append((_head(name, one.unit), *words, there, one.meaning))
+        parts = [quantile(seen, part) for part in _PARTS]
+        if there := parts[0].samples:
+            words = (f'{value} ({ends})' for value, ends in (_rounded(p, one.unit) for p in parts))
+            quantiles.append((_head(name, one.unit), *words, str(there), one.meaning))
     shares = {name: share(values, column(table, name, _MOST)) for name in drawn}
     order = sorted(drawn, key=lambda name: -np.nan_to_num(shares[name]))
     # The two that matter most are drawn.
