@@ -4,12 +4,12 @@ VENV := .venv
 BIN := $(VENV)/bin
 SOURCES := needle_ros needle_dynamics needle_controller needle_identification needle_insertion benchmarks examples test description launch docs setup.py
 
-.PHONY: demo test check docs format setup lock bags results bench clean
+.PHONY: demo test check docs format setup compiled lock bags results bench clean
 
 demo: setup
 	$(BIN)/needle demo
 
-test: $(VENV)/.dev
+test: $(VENV)/.dev compiled
 	$(BIN)/python -m pytest -n auto
 
 check: $(VENV)/.dev
@@ -26,7 +26,11 @@ format: $(VENV)/.dev
 	$(BIN)/ruff check --fix $(SOURCES)
 	$(BIN)/ruff format $(SOURCES)
 
-setup: $(VENV)/.complete
+setup: compiled
+
+# Machine code for this processor: a second if it is there already.
+compiled: $(VENV)/.complete
+	$(BIN)/needle compile
 
 # The marker is written last: an interrupted set-up starts anew.
 $(VENV)/.complete: requirements.lock setup.py package.xml

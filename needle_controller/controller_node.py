@@ -25,7 +25,6 @@ from needle_controller.reference.setpoint import ReferenceLimits
 from needle_controller.safety.limits import SafetyLimits
 from needle_controller.supervisor import Supervisor
 from needle_controller.uncertainty import Uncertainty
-from needle_dynamics.compiled.cache import announce_compilation
 from needle_dynamics.model_node import ModelNode
 from needle_ros import contract
 from needle_ros.errors import NeedleError, ParameterError
@@ -95,6 +94,17 @@ class ControllerNode(ModelNode):
                 for item in fields(gains)
             ),
         }
+    )
+
+    KERNELS = (
+        'needle_controller.compiled.laws',
+        'needle_controller.compiled.filter',
+        'needle_controller.compiled.loop:ring',
+        'needle_controller.compiled.quintic',
+        'needle_dynamics.compiled.friction',
+        'needle_dynamics.compiled.integrals',
+        'needle_dynamics.compiled.normal_modes',
+        'needle_dynamics.compiled.oscillator',
     )
 
     def __init__(self, **node_options: Any) -> None:
@@ -381,7 +391,6 @@ class ControllerNode(ModelNode):
 
 def main() -> int:
     """Run the node; return its exit status."""
-    announce_compilation()
     return run(ControllerNode)
 
 

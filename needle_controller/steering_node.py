@@ -15,12 +15,11 @@ from needle_controller.steering.motion import Move
 from needle_controller.steering.outer_loop import OuterLoop
 from needle_controller.steering.responses import OF_NEEDLE, OF_STEERING, SteeringModel
 from needle_controller.steering.settings import OuterLoopSettings
-from needle_dynamics.compiled.cache import announce_compilation
+from needle_dynamics.compiled_node import CompiledNode
 from needle_dynamics.parameters import NeedleParameters
 from needle_dynamics.simulated.assembly import defaults_of
 from needle_dynamics.steering.parameters import NEEDLES, SteeringParameters
 from needle_ros import contract
-from needle_ros.base_node import BaseNode
 from needle_ros.publishers_node import Publishers
 from needle_ros.run_node import run
 from needle_ros.settings import from_values
@@ -40,7 +39,7 @@ _PRESET = 'bending_35mm'
 _WATCH = 0.05
 
 
-class SteeringNode(BaseNode):
+class SteeringNode(CompiledNode):
     """
     Brings the tip to a ``target`` (point x, y, z [m]; y is the depth) by guide and roll.
 
@@ -59,6 +58,8 @@ class SteeringNode(BaseNode):
 
     The node passes messages to an `OuterLoop`, which decides, and publishes what comes back.
     """
+
+    KERNELS = ('needle_controller.compiled.steering', 'needle_dynamics.compiled.cut:insert')
 
     def __init__(self, **node_options: Any) -> None:
         super().__init__('steering', **node_options)
@@ -224,7 +225,6 @@ class SteeringNode(BaseNode):
 
 def main() -> int:
     """Run the node; return its exit status."""
-    announce_compilation()
     return run(SteeringNode)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TypeAlias
+from typing import Annotated, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,3 +18,37 @@ BoolArray: TypeAlias = NDArray[np.bool_]
 
 #: NumPy array of integers.
 IntArray: TypeAlias = NDArray[np.int64]
+
+
+class Shaped(NamedTuple):
+    """
+    Layout of an array that a compiled function takes: contiguous, in C order.
+
+    Attributes
+    ----------
+    dtype : type
+        Type of its elements.
+    dimensions : int
+        Number of its dimensions.
+    writable : bool
+        Whether it may be written to.
+
+    """
+
+    dtype: type
+    dimensions: int
+    writable: bool = True
+
+
+#: Arrays with a known number of dimensions, as compiled functions take them.
+Vector: TypeAlias = Annotated[FloatArray, Shaped(np.float64, 1)]
+Matrix: TypeAlias = Annotated[FloatArray, Shaped(np.float64, 2)]
+Array3: TypeAlias = Annotated[FloatArray, Shaped(np.float64, 3)]
+Array4: TypeAlias = Annotated[FloatArray, Shaped(np.float64, 4)]
+FixedVector: TypeAlias = Annotated[FloatArray, Shaped(np.float64, 1, writable=False)]
+FixedMatrix: TypeAlias = Annotated[FloatArray, Shaped(np.float64, 2, writable=False)]
+ComplexVector: TypeAlias = Annotated[ComplexArray, Shaped(np.complex128, 1)]
+ComplexMatrix: TypeAlias = Annotated[ComplexArray, Shaped(np.complex128, 2)]
+ComplexArray3: TypeAlias = Annotated[ComplexArray, Shaped(np.complex128, 3)]
+IntVector: TypeAlias = Annotated[IntArray, Shaped(np.int64, 1)]
+BoolVector: TypeAlias = Annotated[BoolArray, Shaped(np.bool_, 1)]

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from needle_dynamics.compiled_node import CompiledNode
 from needle_dynamics.parameters import DEFAULT_PRESET, NeedleParameters
 from needle_dynamics.steering.parameters import NEEDLES
-from needle_ros.base_node import BaseNode
 from rcl_interfaces.msg import ParameterDescriptor
 
 
-class ModelNode(BaseNode):
+class ModelNode(CompiledNode):
     """A node whose parameters ``model.*`` are the constants of the needle and its tissue."""
 
     def declare_model(self) -> None:

@@ -15,7 +15,6 @@ from typing import Any
 from builtin_interfaces.msg import Time as TimeMessage
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import Point, Pose, PoseArray, Quaternion, TransformStamped, Vector3
-from needle_dynamics.compiled.cache import announce_compilation
 from needle_dynamics.model_node import ModelNode
 from needle_dynamics.simulated.assembly import defaults_of, LARGEST_SEED, MODES, SETTINGS
 from needle_dynamics.simulated.faults import Fault, FaultParameters, FAULTS, FAULTY
@@ -110,6 +109,16 @@ class PlantNode(ModelNode):
             'fault.topic',
             *(f'fault.{item.name}' for item in fields(FaultParameters)),
         }
+    )
+
+    KERNELS = (
+        'needle_dynamics.compiled.axis',
+        'needle_dynamics.compiled.cut',
+        'needle_dynamics.compiled.force_sensor',
+        'needle_dynamics.compiled.friction',
+        'needle_dynamics.compiled.integrals',
+        'needle_dynamics.compiled.normal_modes',
+        'needle_dynamics.compiled.step:advance',
     )
 
     def __init__(self, **node_options: Any) -> None:
@@ -617,7 +626,6 @@ class PlantNode(ModelNode):
 
 def main() -> int:
     """Run the node; return its exit status."""
-    announce_compilation()
     return run(PlantNode)
 
 

@@ -21,6 +21,7 @@ from needle_ros.errors import JobError, NeedleError
 
 #: Subcommands, each a module of `needle_insertion.commands`, and what the help says of them.
 COMMANDS: Final[Mapping[str, str]] = {
+    'compile': 'compile all functions for this machine, once',
     'demo': 'insertion, recording, identification and a report',
     'run': 'bring the nodes up, and tell them where to go',
     'watch': 'a page in a browser: live, or of a bag',

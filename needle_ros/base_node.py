@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from array import array
 from collections import Counter
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import fields
 from importlib import import_module
@@ -22,6 +22,8 @@ from needle_ros import contract
 from needle_ros.contract import Qos, Topic
 from needle_ros.errors import MessageError, NeedleError, ParameterError, printable
 from needle_ros.journal import Journal, Severity
+from needle_ros.life_cycle_node import LifeCycle
+from needle_ros.preparation import imports, Preparation, Progress
 from needle_ros.settings import from_values, unknown_name
 from needle_ros.wire import Reader, Reading
 from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor, SetParametersResult
@@ -120,6 +122,9 @@ _Dumper.add_representer(
 _Settings = TypeVar('_Settings')
 _SUCCESS = TransitionCallbackReturn.SUCCESS
 
+#: Time between two lines of the log about a preparation [s].
+_LONG = 2.0
+
 
 def _same(new: Any, old: Any) -> bool:
     """Return whether a parameter stays as it is."""
@@ -153,6 +158,8 @@ class BaseNode(LifecycleNode):
 
     #: Names of the parameters that may change while the node is configured.
     LIVE: ClassVar[frozenset[str]] = frozenset()
+    #: Modules that the node imports before it is configured, because their import takes long.
+    IMPORTS: ClassVar[tuple[str, ...]] = ()
 
     def __init__(self, name: str, **node_options: Any) -> None:
         super().__init__(name, **node_options)
@@ -163,6 +170,8 @@ class BaseNode(LifecycleNode):
         self._numbers: set[str] = set()
         self.shared: frozenset[str] = frozenset()
         self._configured = False
+        self._preparation = Preparation(self.preparation())
+        self._life_cycle = LifeCycle(self, self._preparation, self._is_valid)
         self.declare_text('autostart', True, 'configure and activate at start')
         self._configuration = self.publisher(contract.CONFIGURATION, always=True)
         self._diagnostics = self.publisher(contract.DIAGNOSTICS, always=True)
@@ -174,6 +183,20 @@ class BaseNode(LifecycleNode):
         self.add_post_set_parameters_callback(self._after_change)
 
     # What a subclass fills in.
+
+    def preparation(self) -> Iterable[Progress]:
+        """
+        Return the steps that take long: imports, and functions to load or to compile.
+
+        They are done in a thread, while services are answered, before the node is configured.
+
+        Returns
+        -------
+        iterable of Progress
+            Taking the next element does the next step.
+
+        """
+        return imports(self.IMPORTS)
 
     def cleanup(self) -> None:
         """Undo `configure`, also if it raised halfway."""
@@ -529,6 +552,14 @@ class BaseNode(LifecycleNode):
                 values[name] = self._meant(name, value)
         return values
 
+    def _is_valid(self) -> bool:
+        """Return whether the node has all parameters that were given."""
+        try:
+            self._check_overrides()
+        except ParameterError:
+            return False
+        return True
+
     def _check_overrides(self) -> None:
         known = sorted(self._parameters)
         others = sorted(self.shared - set(known))
@@ -579,9 +610,31 @@ class BaseNode(LifecycleNode):
         """Whether the node is active."""
         return bool(self._state_machine.current_state[1] == 'active')
 
+    def begin(self, refused: Callable[[], None]) -> None:
+        """
+        Prepare, configure and activate, while the executor spins.
+
+        Parameters
+        ----------
+        refused : callable
+            Called if a transition is not made.
+
+        """
+
+        def start() -> None:
+            if not self.start():
+                refused()
+
+        self._life_cycle.when_prepared(start)
+
+    @property
+    def is_preparing(self) -> bool:
+        """Whether the thread that prepares the node is at work."""
+        return self._preparation.is_running
+
     def start(self) -> bool:
         """
-        Configure and activate.
+        Configure and activate, at once.
 
         Returns
         -------
@@ -601,6 +654,7 @@ class BaseNode(LifecycleNode):
 
         def configure() -> None:
             self._check_overrides()
+            self._preparation.complete()
             try:
                 self.configure()
             except NeedleError:
@@ -670,6 +724,9 @@ class BaseNode(LifecycleNode):
     def publish_diagnostics(self) -> None:
         """Publish the state of the node, once a second and when it changes."""
         level, message, values = self.diagnose()
+        if self.is_preparing:
+            message = str(self._preparation.progress)
+            self.get_logger().info(message, throttle_duration_sec=_LONG, skip_first=True)
         if self.failure:
             level, message = DiagnosticStatus.ERROR, self.failure
         self._last_level = level

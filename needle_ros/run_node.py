@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Sequence
 import ctypes
-import gc
 import inspect
 import os
 from pathlib import Path
@@ -89,21 +88,21 @@ def run(kind: Callable[[], BaseNode]) -> int:
             # for a node that its security refuses.
             sys.stderr.write(f'error: {" ".join(str(error).split())}\n')
             return 2
-        found, name = sections(sys.argv), node.get_fully_qualified_name()
-        for line in strangers(found, name):
-            node.get_logger().warning(line)
-        node.shared = shared_names(found, name)
+        _read_files(node)
         executor: Executor = EventsExecutor()
         executor.add_node(node)
         status = 0
-        if node.get_parameter('autostart').value and not node.start():
+
+        def refuse() -> None:
+            nonlocal status
             # The reason, on /diagnostics.
             node.publish_diagnostics()
             status = 2
-        # A full collection takes 0.2 s: it shall not scan what was imported.
-        gc.freeze()
+
         spinning = True
         try:
+            if node.get_parameter('autostart').value:
+                node.begin(refuse)
             while not stopping and status == 0:
                 # Unlike spin_once it does not return to Python at each event.
                 executor.spin_until_future_complete(Future(), timeout_sec=0.1)
@@ -114,6 +113,10 @@ def run(kind: Callable[[], BaseNode]) -> int:
         deadline = time.monotonic() + 0.1
         while time.monotonic() < deadline:
             executor.spin_once(timeout_sec=0.02)
+        if node.is_preparing:
+            # Nothing has been commanded, and a compiler in a thread cannot be ended otherwise.
+            sys.stderr.flush()
+            os._exit(status)
         executor.shutdown()
         node.destroy_node()
         return status or int(node.failed)
@@ -122,6 +125,14 @@ def run(kind: Callable[[], BaseNode]) -> int:
         # A second Ctrl-C shall not change how the process ends.
         for one in _ENDINGS:
             signal.signal(one, signal.SIG_IGN)
+
+
+def _read_files(node: BaseNode) -> None:
+    """Name what parameter files give to other nodes, and warn of sections for none."""
+    found, name = sections(sys.argv), node.get_fully_qualified_name()
+    for line in strangers(found, name):
+        node.get_logger().warning(line)
+    node.shared = shared_names(found, name)
 
 
 def _check_words(kind: Callable[[], BaseNode], words: Sequence[str]) -> None:

@@ -8,7 +8,7 @@ so that a measurement that comes late is taken in where it belongs.
 from __future__ import annotations
 
 from math import exp, pi, sqrt
-from typing import Final, NamedTuple, TYPE_CHECKING
+from typing import Annotated, Final, NamedTuple, TYPE_CHECKING
 
 from needle_controller.compiled.bending import (
     base_impulse,
@@ -19,8 +19,8 @@ from needle_controller.compiled.bending import (
     turn,
 )
 from needle_controller.compiled.kalman import add_to_mean, clear_mean, measure, propagate
-from needle_dynamics.arrays import FloatArray
-from needle_dynamics.compiled.cache import compiled, inlined
+from needle_dynamics.arrays import Array3, FloatArray, Matrix, Shaped, Vector
+from needle_dynamics.compiled.cache import compiled, inlined, kernel
 from needle_dynamics.compiled.normal_modes import coupling, empty_normal_modes, NormalModes
 from needle_dynamics.compiled.step import Needle
 from needle_dynamics.compiled.tissue import growth_at
@@ -61,10 +61,10 @@ class LowPass(NamedTuple):
     """
 
     ticks: int
-    transition: FloatArray
-    noise: FloatArray
-    response: FloatArray
-    steady: FloatArray
+    transition: Matrix
+    noise: Array3
+    response: Matrix
+    steady: Vector
 
 
 #: Entries of the state after c and b of the modes: lateral force at the tip [N], and the offsets
@@ -134,16 +134,16 @@ class Filter(NamedTuple):
     needle: Needle
     noise: Noise
     low_pass: LowPass
-    samples: NDArray[np.void]
-    states: FloatArray
-    covariances: FloatArray
-    transitions: FloatArray
-    shapes: FloatArray
-    inverses: FloatArray
-    squares: FloatArray
-    tips: FloatArray
-    changes: FloatArray
-    exposures: FloatArray
+    samples: Annotated[NDArray[np.void], Shaped(SAMPLE, 1)]
+    states: Matrix
+    covariances: Array3
+    transitions: Array3
+    shapes: Array3
+    inverses: Array3
+    squares: Matrix
+    tips: Matrix
+    changes: Array3
+    exposures: Matrix
 
 
 @inlined
@@ -157,7 +157,7 @@ def _growth(needle: Needle, time: float) -> float:
     return growth_at(needle.swelling, needle.swelling_time, max(time, 0.0))
 
 
-@compiled
+@kernel
 def begin(held: Held[Filter], time: float, span: float, depth: float) -> None:
     """
     Write the state before any measurement into the first slot.
@@ -378,7 +378,7 @@ def _advance(f: Filter, count: int, old: int, new: int) -> None:  # noqa: C901
     sample['nis'], sample['degrees'] = nis, degrees
 
 
-@compiled
+@kernel
 def observe(
     held: Held[Filter],
     count: int,
@@ -432,7 +432,7 @@ def observe(
     _advance(f, count, old, new)
 
 
-@compiled
+@kernel
 def replay(held: Held[Filter], count: int, oldest: int, newest: int, since: float) -> None:
     """
     Fill the slots after the last one that is not later than a time once more.
@@ -459,14 +459,14 @@ def replay(held: Held[Filter], count: int, oldest: int, newest: int, since: floa
         slot = following
 
 
-@compiled
+@kernel
 def estimate(  # noqa: C901
     held: Held[Filter],
     slot: int,
     depth: float,
     span: float,
-    modal: FloatArray,
-    jacobian: FloatArray,
+    modal: Vector,
+    jacobian: Matrix,
 ) -> tuple[float, float, float]:
     """
     Return to the coordinates of the model at the present depth, half a sample after the mean one.

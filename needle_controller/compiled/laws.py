@@ -9,11 +9,11 @@ recognizes a plain tuple several times faster than a named one.
 from __future__ import annotations
 
 from math import inf
-from typing import Final, NamedTuple
+from typing import Annotated, Final, NamedTuple, TypeAlias
 
 from needle_controller.compiled.learning import BLOCK, bounds, correction, learn
-from needle_dynamics.arrays import FloatArray
-from needle_dynamics.compiled.cache import compiled
+from needle_dynamics.arrays import FloatArray, Vector
+from needle_dynamics.compiled.cache import compiled, kernel
 from needle_dynamics.compiled.friction import (
     dry_friction,
     friction_flow,
@@ -140,6 +140,11 @@ class Instant(NamedTuple):
     target_acceleration: float
 
 
+#: The same as plain tuples: they reach compiled code faster than named ones.
+LawTuple: TypeAlias = Annotated[tuple[float, ...], len(LawConstants._fields)]
+InstantTuple: TypeAlias = Annotated[tuple[float, ...], len(Instant._fields)]
+
+
 class _Implicit(NamedTuple):
     """
     Feedback as an equation for its own force: force = forward + push / divisor.
@@ -216,9 +221,9 @@ def _learned(c: LawConstants, memory: FloatArray, aim: Instant) -> float:
     return found * min(max(soon / c.breakaway_speed, -1.0), 1.0)
 
 
-@compiled
+@kernel
 def law_learn(
-    constants: tuple[float, ...], memory: FloatArray, position: float, speed: float, force: float
+    constants: LawTuple, memory: Vector, position: float, speed: float, force: float
 ) -> None:
     """
     Learn from the period that has passed, if the law learns and the axis was sliding.
@@ -323,10 +328,8 @@ def _step(c: LawConstants, memory: FloatArray, at: Instant, load: float, limit: 
     return force
 
 
-@compiled
-def law_force(
-    constants: tuple[float, ...], memory: FloatArray, instant: tuple[float, ...], load: float
-) -> float:
+@kernel
+def law_force(constants: LawTuple, memory: Vector, instant: InstantTuple, load: float) -> float:
     """
     Return the force for the next period, before any limit.
 
@@ -350,11 +353,11 @@ def law_force(
     return _step(LawConstants(*constants), memory.copy(), Instant(*instant), load, inf)
 
 
-@compiled
+@kernel
 def law_match(
-    constants: tuple[float, ...],
-    memory: FloatArray,
-    instant: tuple[float, ...],
+    constants: LawTuple,
+    memory: Vector,
+    instant: InstantTuple,
     load: float,
     force: float,
 ) -> None:
@@ -382,11 +385,11 @@ def law_match(
         memory[OFFSET] = missing
 
 
-@compiled
+@kernel
 def law_step(
-    constants: tuple[float, ...],
-    memory: FloatArray,
-    instant: tuple[float, ...],
+    constants: LawTuple,
+    memory: Vector,
+    instant: InstantTuple,
     load: float,
     limit: float,
 ) -> float:
@@ -409,9 +412,9 @@ def law_step(
     return _step(LawConstants(*constants), memory, Instant(*instant), load, limit)
 
 
-@compiled
+@kernel
 def axis_step(
-    constants: tuple[float, ...], position: float, speed: float, force: float
+    constants: LawTuple, position: float, speed: float, force: float
 ) -> tuple[float, float]:
     """
     Move the axis of a law through one period under a constant force.

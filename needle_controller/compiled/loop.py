@@ -7,32 +7,33 @@ from needle_controller.compiled.laws import (
     law_learn,
     law_step,
     LawConstants,
+    LawTuple,
     MEMORY,
 )
-from needle_dynamics.arrays import FloatArray
-from needle_dynamics.compiled.cache import compiled
+from needle_dynamics.arrays import Matrix, Vector
+from needle_dynamics.compiled.cache import kernel
 from needle_dynamics.compiled.friction import friction_flow, FrictionConstants
 from needle_dynamics.compiled.step import adapted, advance, Inputs, Needle
 import numpy as np
 
 
-@compiled
+@kernel
 def run_loop(  # noqa: C901
     c: Needle,
-    state: FloatArray,
-    law: tuple[float, ...],
+    state: Vector,
+    law: LawTuple,
     limit: float,
-    setpoints: FloatArray,
-    goal: FloatArray,
-    pending: FloatArray,
+    setpoints: Matrix,
+    goal: Vector,
+    pending: Vector,
     known: int,
-    noise: FloatArray,
-    added: FloatArray,
+    noise: Matrix,
+    added: Matrix,
     longest: float,
-    depths: FloatArray,
-    states: FloatArray,
-    commands: FloatArray,
-    errors: FloatArray,
+    depths: Vector,
+    states: Matrix,
+    commands: Vector,
+    errors: Vector,
 ) -> int:
     """
     Run a sampled law of insertion around the simulated needle.
@@ -129,13 +130,13 @@ def run_loop(  # noqa: C901
     return int(count)
 
 
-@compiled
+@kernel
 def ring(
-    law: tuple[float, ...],
+    law: LawTuple,
     friction: FrictionConstants,
     inertia: float,
     known: int,
-    pending: FloatArray,
+    pending: Vector,
     start: float,
     count: int,
 ) -> tuple[float, float, int]:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from needle_dynamics.arrays import FloatArray
-from needle_dynamics.compiled.cache import compiled
+from needle_dynamics.arrays import FloatArray, Vector
+from needle_dynamics.compiled.cache import compiled, kernel
 import numpy as np
 
 
@@ -16,8 +16,8 @@ def _value(c: FloatArray, x: float) -> float:
     return value
 
 
-@compiled
-def quintic_extremes(c: FloatArray) -> FloatArray:
+@kernel
+def quintic_extremes(c: Vector) -> FloatArray:
     """
     Return the extreme values of a quintic and of its first two derivatives on [0, 1].
 

@@ -13,8 +13,19 @@ from __future__ import annotations
 from math import cos, inf, isfinite, log, sin, sqrt, tau
 from typing import Final, NamedTuple, TYPE_CHECKING
 
-from needle_dynamics.arrays import ComplexArray, FloatArray, IntArray
-from needle_dynamics.compiled.cache import compiled, inlined
+from needle_dynamics.arrays import (
+    Array3,
+    Array4,
+    ComplexArray,
+    ComplexArray3,
+    ComplexMatrix,
+    ComplexVector,
+    FloatArray,
+    IntVector,
+    Matrix,
+    Vector,
+)
+from needle_dynamics.compiled.cache import compiled, inlined, kernel
 from needle_dynamics.compiled.matrices import backward, cholesky, forward
 import numpy as np
 
@@ -94,16 +105,16 @@ class Responses(NamedTuple):
 
     """
 
-    guide: FloatArray
-    causes: FloatArray
-    bevel: FloatArray
-    elastic: FloatArray
-    guide_load: FloatArray
-    causes_load: FloatArray
-    bevel_load: FloatArray
-    between: FloatArray
-    later_guide: FloatArray
-    later_bevel: FloatArray
+    guide: Array3
+    causes: Array3
+    bevel: Array3
+    elastic: Matrix
+    guide_load: Array3
+    causes_load: Array3
+    bevel_load: Array3
+    between: Array4
+    later_guide: Matrix
+    later_bevel: Matrix
 
 
 class Steering(NamedTuple):
@@ -144,16 +155,16 @@ class Steering(NamedTuple):
     responses: Responses
     limit: float
     load_limit: float
-    ways: FloatArray
-    target: FloatArray
-    mean: ComplexArray
-    covariance: ComplexArray
-    logs: FloatArray
-    guide: ComplexArray
-    turned: ComplexArray
-    roll: FloatArray
-    last: FloatArray
-    counts: IntArray
+    ways: Vector
+    target: Vector
+    mean: ComplexMatrix
+    covariance: ComplexArray3
+    logs: Vector
+    guide: ComplexVector
+    turned: ComplexVector
+    roll: Vector
+    last: Vector
+    counts: IntVector
 
 
 class Tip(NamedTuple):
@@ -171,9 +182,9 @@ class Tip(NamedTuple):
 
     """
 
-    means: ComplexArray
-    variances: FloatArray
-    shared: ComplexArray
+    means: ComplexVector
+    variances: Vector
+    shared: ComplexMatrix
 
 
 class Ends(NamedTuple):
@@ -191,9 +202,9 @@ class Ends(NamedTuple):
 
     """
 
-    means: ComplexArray
-    errors: FloatArray
-    turned: FloatArray
+    means: ComplexVector
+    errors: Vector
+    turned: Vector
 
 
 class Whole(NamedTuple):
@@ -219,8 +230,8 @@ class Whole(NamedTuple):
 # What is known.
 
 
-@compiled
-def weights(logs: FloatArray) -> FloatArray:
+@kernel
+def weights(logs: Vector) -> FloatArray:
     """
     Return probabilities.
 
@@ -292,7 +303,7 @@ def _whole(w: FloatArray, tip: Tip) -> Whole:
     return Whole(x, z, xx, xz, zz)
 
 
-@compiled
+@kernel
 def expect(held: Held[Steering], at: int) -> Whole:
     """
     Return where the tip is expected; guide and roll stay as they were last sent.
@@ -314,7 +325,7 @@ def expect(held: Held[Steering], at: int) -> Whole:
     return _whole(weights(c.logs), _tip(c, at, _held(c)))
 
 
-@compiled
+@kernel
 def see(
     held: Held[Steering], at: int, x: float, z: float, variance: float
 ) -> tuple[int, float, float]:
@@ -437,7 +448,7 @@ def _reach(c: Steering) -> tuple[ComplexArray, ComplexArray, FloatArray]:
     return middles, sizes, ends.errors
 
 
-@compiled
+@kernel
 def reach(held: Held[Steering]) -> tuple[ComplexArray, ComplexArray, FloatArray]:
     """
     Return where the tip can be brought from here, by each hypothesis.
@@ -460,7 +471,7 @@ def reach(held: Held[Steering]) -> tuple[ComplexArray, ComplexArray, FloatArray]
     return _reach(held.value)
 
 
-@compiled
+@kernel
 def chance(held: Held[Steering]) -> float:
     """
     Return how probable it is that the tip can still come within a millimeter of the target.
@@ -493,7 +504,7 @@ def chance(held: Held[Steering]) -> float:
 # What is done.
 
 
-@compiled
+@kernel
 def choose(held: Held[Steering]) -> complex:
     """
     Return the next position of the guide, and turn the needle if that is worth it.

@@ -5,8 +5,8 @@ from __future__ import annotations
 from math import copysign, inf, sqrt
 from typing import Final, NamedTuple
 
-from needle_dynamics.arrays import BoolArray, FloatArray
-from needle_dynamics.compiled.cache import compiled, inlined
+from needle_dynamics.arrays import BoolArray, BoolVector, FloatArray, Vector
+from needle_dynamics.compiled.cache import compiled, inlined, kernel
 from needle_dynamics.compiled.friction import slide
 
 #: Places in the state of the axis.
@@ -49,13 +49,13 @@ class Axis(NamedTuple):
     viscous: float
     withdrawal: float
     reach: float
-    starts: FloatArray
-    coulomb_per_length: FloatArray
-    viscous_per_length: FloatArray
-    cutting: FloatArray
-    membranes: FloatArray
-    strengths: FloatArray
-    stiffness: FloatArray
+    starts: Vector
+    coulomb_per_length: Vector
+    viscous_per_length: Vector
+    cutting: Vector
+    membranes: Vector
+    strengths: Vector
+    stiffness: Vector
 
 
 class Resistance(NamedTuple):
@@ -166,9 +166,9 @@ def _glide(a: Axis, r: Resistance, speed: float, force: float, t: float) -> tupl
     return slide(speed, drive, a.mass, r.dry + share, r.viscous, t, a.withdrawal)
 
 
-@compiled
+@kernel
 def push(
-    a: Axis, state: FloatArray, punctured: BoolArray, force: float, duration: float, step: float
+    a: Axis, state: Vector, punctured: BoolVector, force: float, duration: float, step: float
 ) -> float:
     """
     Advance under a constant force.
@@ -235,15 +235,15 @@ def push(
     return 0.0
 
 
-@compiled
+@kernel
 def carry_on(
     a: Axis,
-    state: FloatArray,
-    punctured: BoolArray,
+    state: Vector,
+    punctured: BoolVector,
     speed: float,
     duration: float,
     step: float,
-    felt: FloatArray,
+    felt: Vector,
 ) -> float:
     """
     Advance with the needle brought evenly to a velocity, whatever force that takes.

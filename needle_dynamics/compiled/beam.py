@@ -21,7 +21,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from needle_dynamics.arrays import FloatArray
+from needle_dynamics.arrays import Array3, FloatArray, Matrix, Vector
 from needle_dynamics.compiled.cache import compiled, inlined
 
 
@@ -47,12 +47,12 @@ class Springs(NamedTuple):
 
     """
 
-    depths: FloatArray
-    stiffness: FloatArray
-    compliance: FloatArray
-    response: FloatArray
-    rest: FloatArray
-    path: FloatArray
+    depths: Vector
+    stiffness: Vector
+    compliance: Matrix
+    response: Array3
+    rest: Array3
+    path: Array3
 
 
 class Element(NamedTuple):

@@ -1,27 +1,37 @@
 """
-The decorator of every compiled function, and its cache on disk.
+The decorators of compiled functions, and their preparation before they are called.
 
-Numba renews the machine code that it keeps on disk when the file of a function changes, but not
-when the file of a function that it calls does. Here the cache of a function is stamped with all
-sources that it may depend on: those of this folder and those of its own folder. A compiled
-function must therefore call, and take constants from, files of these two folders only.
+Three decorators: a `kernel` is called from Python, and is compiled for the types of its
+annotations; `compiled` is for functions that only compiled functions call, and `inlined` for
+parts of a hot loop. `prepare` loads or compiles kernels, so that nothing is compiled later.
 
-Numba is imported at the first call of a compiled function, not before.
+A compiled function must call, and take constants from, files of its own folder and of this one
+only: the machine code on disk is valid for their sources (`store`).
+
+Numba is imported when the first function is prepared or called, not before.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import cache, cached_property, update_wrapper
-from hashlib import sha256
-from pathlib import Path
-from pickle import UnpicklingError
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from functools import cached_property, partial, update_wrapper
+from importlib import import_module
 import sys
-from typing import Any, cast, TypeVar
+from typing import Any, cast, Final, overload, TypeVar
+
+from needle_dynamics.compiled.store import (
+    FOLDER_VARIABLE,
+    folders,
+    LISTENERS,
+    Store,
+    writable_folder,
+)
 
 _Function = TypeVar('_Function', bound=Callable[..., object])
 
-_FOLDER = Path(__file__).parent
+#: Kernels by the module that defines them, and by name.
+_KERNELS: Final[dict[str, dict[str, _Compiled]]] = {}
 
 
 class _Compiled:
@@ -43,15 +53,9 @@ class _Compiled:
         """Numba's dispatcher of the function."""
         import numba
 
-        _listen()
-        try:
-            kept = numba.njit(cache=True, **self._options)(self.py_func)
-            _set_stamp(kept, _stamp(Path(self.py_func.__code__.co_filename).parent))
-        except (AttributeError, ImportError, RuntimeError, TypeError):
-            # This Numba takes no stamp, or no folder is writable: compile each time rather than
-            # run old code.
-            return numba.njit(**self._options)(self.py_func)
-        return kept
+        made = numba.njit(**self._options)(self.py_func)
+        made._cache = Store(self.py_func, self._options)
+        return made
 
     @property
     def _numba_type_(self) -> Any:
@@ -60,16 +64,68 @@ class _Compiled:
 
         return types.Dispatcher(self.dispatcher)
 
+    @property
+    def is_kept(self) -> bool:
+        """Whether the machine code for the types of its annotations is on disk."""
+        from needle_dynamics.compiled.signatures import argument_types
+        from numba.core.registry import cpu_target
 
-def compiled(function: _Function) -> _Function:
+        target = cpu_target.target_context
+        return bool(self.dispatcher._cache.has(argument_types(self.py_func), target))
+
+    def prepare(self) -> None:
+        """Load or compile the function for the types of its annotations."""
+        from needle_dynamics.compiled.held import prepare_hold
+        from needle_dynamics.compiled.signatures import argument_types
+
+        found = argument_types(self.py_func)
+        for one in found:
+            prepare_hold(one)
+        self.dispatcher.compile(found)
+
+
+@overload
+def kernel(function: _Function) -> _Function: ...
+
+
+@overload
+def kernel(*, inline: bool) -> Callable[[_Function], _Function]: ...
+
+
+def kernel(function: _Function | None = None, *, inline: bool = False) -> Any:
     """
-    Compile a function to machine code at its first call and keep it on disk.
+    Compile a function that is called from Python.
 
     Parameters
     ----------
     function : callable
         Function in the subset of Python that Numba compiles. It may call compiled functions of
-        its own folder and of `needle_dynamics.compiled`.
+        its own folder and of `needle_dynamics.compiled`. Its annotations determine the types for
+        which `prepare` compiles it; for others it is compiled at the first call.
+    inline : bool
+        Whether compiled functions that call it inline it, see `inlined`.
+
+    Returns
+    -------
+    callable
+        The compiled function; its Python source is the attribute ``py_func``.
+
+    """
+    if function is None:
+        return partial(kernel, inline=inline)
+    made = _Compiled(function, **({'forceinline': True} if inline else {}))
+    _KERNELS.setdefault(function.__module__, {})[function.__name__] = made
+    return made
+
+
+def compiled(function: _Function) -> _Function:
+    """
+    Compile a function that compiled functions call.
+
+    Parameters
+    ----------
+    function : callable
+        As for `kernel`; any types.
 
     Returns
     -------
@@ -82,7 +138,7 @@ def compiled(function: _Function) -> _Function:
 
 def inlined(function: _Function) -> _Function:
     """
-    Do what `compiled` does for a part of a hot loop: its code becomes part of its callers'.
+    Do the same as `compiled` for a part of a hot loop: its code becomes part of its callers'.
 
     A call that is not inlined passes every number of its arguments, an array being seven.
 
@@ -100,70 +156,129 @@ def inlined(function: _Function) -> _Function:
     return cast(_Function, _Compiled(function, forceinline=True))
 
 
-def _set_stamp(dispatcher: Any, stamp: str) -> None:
-    """Have the cache of a dispatcher hold for sources with this digest only."""
-    from numba.core.caching import IndexDataCacheFile
-
-    class Index(IndexDataCacheFile):  # type: ignore[misc]
-        def _load_index(self) -> object:
-            try:
-                return super()._load_index()
-            except (AttributeError, EOFError, ImportError, TypeError, ValueError, UnpicklingError):
-                # It names a class that is there no more, or is damaged: all of it is old.
-                return {}
-
-    known = dispatcher._cache
-    if (
-        not isinstance(known._cache_file, IndexDataCacheFile)
-        or not known._cache_file._source_stamp
-    ):
-        raise AttributeError('Numba keeps its cache in another way')
-    known._cache_file = Index(known._cache_path, known._impl.filename_base, stamp)
+# Preparation.
 
 
-@cache
-def _stamp(folder: Path) -> str:
-    """Return a digest of all sources of this folder and of another one."""
-    digest = sha256()
-    for place in sorted({_FOLDER, folder}):
-        for path in sorted(place.glob('*.py')):
-            digest.update(path.name.encode() + path.read_bytes())
-    return digest.hexdigest()
+def kernels(names: Iterable[str]) -> list[str]:
+    """
+    List kernels.
+
+    Parameters
+    ----------
+    names : iterable of str
+        Modules, which are imported, for all of their kernels, or kernels as ``module:kernel``.
+
+    Returns
+    -------
+    list of str
+        Kernels as ``module:kernel``, each once.
+
+    """
+    found = []
+    for name in names:
+        module, _, own = name.partition(':')
+        import_module(module)
+        found += [f'{module}:{own}'] if own else [f'{module}:{one}' for one in _KERNELS[module]]
+    return list(dict.fromkeys(found))
 
 
-class _Notice:
-    """Tells once, on the terminal, that functions are being compiled."""
+def is_kept(name: str) -> bool:
+    """
+    Return whether the machine code of a kernel is on disk.
 
-    wanted = False
-    given = False
+    Parameters
+    ----------
+    name : str
+        One of `kernels`.
 
-    @classmethod
-    def give(cls) -> None:
-        if cls.wanted and not cls.given:
-            cls.given = True
-            sys.stderr.write('compiling for this machine (once, about a minute) ...\n')
+    Returns
+    -------
+    bool
+        Whether `prepare` would load it.
+
+    """
+    module, _, own = name.partition(':')
+    return _KERNELS[module][own].is_kept
+
+
+def prepare(names: Iterable[str]) -> Iterator[tuple[int, int, str]]:
+    """
+    Load or compile kernels, one at each step of the iterator.
+
+    Parameters
+    ----------
+    names : iterable of str
+        As for `kernels`.
+
+    Yields
+    ------
+    done, count : int
+        Kernels that are ready, and all of them.
+    name : str
+        Name of the next one; '' after the last.
+
+    """
+    found = kernels(names)
+    for done, name in enumerate(found):
+        module, _, own = name.partition(':')
+        yield done, len(found), own
+        _KERNELS[module][own].prepare()
+    yield len(found), len(found), ''
+
+
+def where_kept() -> str:
+    """
+    Return the folder of machine code, for people.
+
+    Returns
+    -------
+    str
+        The folder; if none is writable, a sentence with those that were tried.
+
+    """
+    folder = writable_folder()
+    if folder is not None:
+        return str(folder)
+    tried = ', '.join(map(str, folders()))
+    return (
+        f'no writable folder for machine code (tried {tried}): it is compiled at each start; set '
+        f'{FOLDER_VARIABLE}'
+    )
+
+
+# What the process does.
+
+
+@contextmanager
+def reports(listener: Callable[[str, bool], None]) -> Iterator[None]:
+    """
+    Report each function that this process compiles or loads.
+
+    Parameters
+    ----------
+    listener : callable
+        Called with the name of the function and whether it is loaded from disk; by the thread
+        that does it, before it is compiled or after it is loaded.
+
+    """
+    LISTENERS.append(listener)
+    try:
+        yield
+    finally:
+        LISTENERS.remove(listener)
 
 
 def announce_compilation() -> None:
     """
-    Write one line to standard error when this process first has to compile a function.
+    Write one line to standard error when this process first compiles a function.
 
-    Code that is loaded from disk is not announced. Commands and nodes call this at their start;
-    libraries and tests stay silent.
+    Commands call this at their start; libraries and tests stay silent.
     """
-    _Notice.wanted = True
 
+    def report(_name: str, loaded: bool) -> None:
+        if not loaded:
+            LISTENERS.remove(report)
+            often = 'once' if writable_folder() else where_kept()
+            sys.stderr.write(f'compiling for this machine ({often}) ...\n')
 
-@cache
-def _listen() -> None:
-    """Have Numba tell about each function that it compiles."""
-    from numba.core import event
-
-    class Listener(event.Listener):  # type: ignore[misc]
-        def on_start(self, _event: object) -> None:
-            _Notice.give()
-
-        def on_end(self, _event: object) -> None:
-            pass
-
-    event.register('numba:compile', Listener())
+    LISTENERS.append(report)

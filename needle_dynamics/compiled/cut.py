@@ -5,7 +5,7 @@ from __future__ import annotations
 from math import ceil, cos, inf, sin
 from typing import Final, NamedTuple, TYPE_CHECKING
 
-from needle_dynamics.arrays import FloatArray, IntArray
+from needle_dynamics.arrays import Array3, FloatArray, IntVector, Matrix, Vector
 from needle_dynamics.compiled.beam import (
     begin,
     carry,
@@ -16,7 +16,7 @@ from needle_dynamics.compiled.beam import (
     shape,
     Springs,
 )
-from needle_dynamics.compiled.cache import compiled, inlined
+from needle_dynamics.compiled.cache import compiled, inlined, kernel
 import numpy as np
 
 if TYPE_CHECKING:
@@ -88,11 +88,11 @@ class Steered(NamedTuple):
     twist: float
     turning: float
     length: float
-    starts: FloatArray
-    stiffness: FloatArray
-    bevel: FloatArray
+    starts: Vector
+    stiffness: Vector
+    bevel: Vector
     cell: float
-    wander: FloatArray
+    wander: Matrix
 
 
 class Cut(NamedTuple):
@@ -119,12 +119,12 @@ class Cut(NamedTuple):
     """
 
     springs: Springs
-    guide: FloatArray
-    pose: FloatArray
-    entry: FloatArray
-    tip: FloatArray
-    load: FloatArray
-    counts: IntArray
+    guide: Matrix
+    pose: Vector
+    entry: Vector
+    tip: Matrix
+    load: Vector
+    counts: IntVector
 
 
 class Needle(NamedTuple):
@@ -167,7 +167,7 @@ class Pose(NamedTuple):
     roll: float
 
 
-@compiled
+@kernel
 def start(n: Steered, c: Cut, to: Pose, free: float) -> None:
     """
     Set the tip on the skin.
@@ -443,7 +443,7 @@ def _over(n: Steered, s: Springs, i: int, h: float) -> Crossing:
     )
 
 
-@compiled
+@kernel
 def place(n: Steered, c: Cut) -> tuple[float, float, float]:
     """
     Find the tip: its load, its deflection and slope, and its compliance.
@@ -476,8 +476,8 @@ def place(n: Steered, c: Cut) -> tuple[float, float, float]:
     return e.c00, e.c01, e.c11
 
 
-@compiled
-def respond(n: Steered, c: Cut, found: FloatArray) -> None:
+@kernel
+def respond(n: Steered, c: Cut, found: Matrix) -> None:
     """
     Find what the tip does per change of the guide, at rest.
 
@@ -509,7 +509,7 @@ def _bend(n: Steered, c: Cut, found: FloatArray, felt: FloatArray) -> int:
     return last
 
 
-@compiled
+@kernel
 def bring(held: Held[Needle], to: Pose) -> None:
     """
     Do what `move` does with a needle that is held.
@@ -525,8 +525,8 @@ def bring(held: Held[Needle], to: Pose) -> None:
     move(held.value.constants, held.value.state, to)
 
 
-@compiled
-def bend(held: Held[Needle], found: FloatArray, felt: FloatArray) -> int:
+@kernel
+def bend(held: Held[Needle], found: Array3, felt: Matrix) -> int:
     """
     Find the needle from the guide to the node before the tip, and what the guide feels.
 
@@ -548,8 +548,8 @@ def bend(held: Held[Needle], found: FloatArray, felt: FloatArray) -> int:
     return _bend(held.value.constants, held.value.state, found, felt)
 
 
-@compiled
-def remember(draws: FloatArray, part: float) -> None:
+@kernel
+def remember(draws: Matrix, part: float) -> None:
     """
     Add to each draw a part of the one before it.
 
@@ -566,7 +566,7 @@ def remember(draws: FloatArray, part: float) -> None:
             draws[i, plane] += part * draws[i - 1, plane]
 
 
-@compiled
+@kernel
 def set_free(n: Steered, c: Cut, free: float) -> None:
     """
     Change the free length: the skin came towards the guide, or went away from it.
@@ -592,17 +592,17 @@ def set_free(n: Steered, c: Cut, free: float) -> None:
     place(n, c)
 
 
-@compiled
+@kernel
 def insert(
-    constants: FloatArray,
-    layers: FloatArray,
+    constants: Matrix,
+    layers: Array3,
     cell: float,
-    wander: FloatArray,
-    poses: FloatArray,
-    runs: IntArray,
+    wander: Array3,
+    poses: Array3,
+    runs: IntVector,
     c: Cut,
-    tips: FloatArray,
-    felt: FloatArray,
+    tips: Array3,
+    felt: Array3,
 ) -> None:
     """
     Bring needles from the skin through poses. Of arrays with one row that row is for all runs.

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from needle_dynamics.arrays import FloatArray
-from needle_dynamics.compiled.cache import compiled
+from needle_dynamics.arrays import Array3, Matrix, Vector
+from needle_dynamics.compiled.cache import kernel
 import numpy as np
 
 
-@compiled
-def straight(before: FloatArray, now: FloatArray, felt: FloatArray) -> None:
+@kernel
+def straight(before: Vector, now: Vector, felt: Matrix) -> None:
     """
     Fill ``felt``, shape (k, 6), with a straight line that ends with ``now``.
 
@@ -28,16 +28,16 @@ def straight(before: FloatArray, now: FloatArray, felt: FloatArray) -> None:
             felt[j, i] = now[i] + back * (before[i] - now[i])
 
 
-@compiled
+@kernel
 def sense(
-    felt: FloatArray,
-    drawn: FloatArray,
-    constants: FloatArray,
-    sections: FloatArray,
-    memory: FloatArray,
-    offset: FloatArray,
-    zero: FloatArray,
-    reading: FloatArray,
+    felt: Matrix,
+    drawn: Matrix,
+    constants: Matrix,
+    sections: Matrix,
+    memory: Array3,
+    offset: Vector,
+    zero: Vector,
+    reading: Vector,
 ) -> None:
     """
     Take the samples of a force sensor since its last reading; read the last of them.

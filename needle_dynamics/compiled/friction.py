@@ -11,7 +11,7 @@ from __future__ import annotations
 from math import exp, inf, log1p, sqrt, tanh
 from typing import Final, NamedTuple
 
-from needle_dynamics.compiled.cache import compiled, inlined
+from needle_dynamics.compiled.cache import compiled, kernel
 from needle_dynamics.compiled.oscillator import glide
 
 #: Laws by name; a law's number is its place here.
@@ -50,7 +50,7 @@ class FrictionConstants(NamedTuple):
     smoothing_speed: float
 
 
-@compiled
+@kernel
 def dry_friction(f: FrictionConstants, coulomb: float, speed: float) -> tuple[float, float]:
     """
     Return dry friction at a speed: the definition of every law.
@@ -85,7 +85,7 @@ def dry_friction(f: FrictionConstants, coulomb: float, speed: float) -> tuple[fl
     return coulomb, 0.0
 
 
-@compiled
+@kernel
 def friction_force(f: FrictionConstants, velocity: float, drive: float) -> float:
     """
     Return the friction force on the needle, equation (15) with the dry part of the law.
@@ -175,7 +175,7 @@ def slide(
     return velocity, distance + further
 
 
-@inlined
+@kernel(inline=True)
 def friction_flow(
     f: FrictionConstants, mass: float, u: float, drive: float, h: float
 ) -> tuple[float, float]:

@@ -60,6 +60,17 @@ class Held(structref.StructRefProxy, Generic[_Value]):  # type: ignore[misc]
 structref.define_proxy(Held, _HeldType, ['value'])
 
 
+def held_type(value: Any) -> Any:
+    """Return Numba's type of a `Held` value of a type."""
+    return _HeldType([('value', value)])
+
+
+def prepare_hold(kind: Any) -> None:
+    """Load or compile the conversion to a `Held` type; other types need none."""
+    if isinstance(kind, _HeldType):
+        _hold.dispatcher.compile((kind.field_dict['value'],))  # type: ignore[attr-defined]
+
+
 @compiled
 def _hold(value: _Value) -> Held[_Value]:
     return Held(value)

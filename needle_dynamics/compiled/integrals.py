@@ -11,8 +11,8 @@ from __future__ import annotations
 from math import cos, exp, isfinite, nan, sin
 from typing import Final, NamedTuple
 
-from needle_dynamics.arrays import FloatArray
-from needle_dynamics.compiled.cache import compiled, inlined
+from needle_dynamics.arrays import FixedMatrix, FixedVector, FloatArray, Matrix, Vector
+from needle_dynamics.compiled.cache import compiled, inlined, kernel
 import numpy as np
 
 #: Below this argument k_i s the series of a mode is used, above it the closed form.
@@ -43,9 +43,9 @@ class ModeTables(NamedTuple):
     """
 
     length: float
-    series: FloatArray
-    terms: FloatArray
-    modes: FloatArray
+    series: FixedMatrix
+    terms: FixedVector
+    modes: FixedMatrix
 
 
 class ModeIntegrals(NamedTuple):
@@ -65,12 +65,12 @@ class ModeIntegrals(NamedTuple):
 
     """
 
-    gram: FloatArray
-    curvature_gram: FloatArray
-    value: FloatArray
-    curvature: FloatArray
-    area: FloatArray
-    moment: FloatArray
+    gram: Matrix
+    curvature_gram: Matrix
+    value: Vector
+    curvature: Vector
+    area: Vector
+    moment: Vector
 
 
 @compiled
@@ -233,8 +233,8 @@ def many_modes(tables: ModeTables, depth: float, work: FloatArray, out: ModeInte
             pair += 1
 
 
-@inlined
-def mode_integrals(tables: ModeTables, depth: float, work: FloatArray, out: ModeIntegrals) -> None:
+@kernel(inline=True)
+def mode_integrals(tables: ModeTables, depth: float, work: Vector, out: ModeIntegrals) -> None:
     """
     Evaluate the modes and their integrals at an inserted length.
 
@@ -256,8 +256,8 @@ def mode_integrals(tables: ModeTables, depth: float, work: FloatArray, out: Mode
         many_modes(tables, depth, work, out)
 
 
-@compiled
-def tip_deflections(tables: ModeTables, states: FloatArray) -> FloatArray:
+@kernel
+def tip_deflections(tables: ModeTables, states: Matrix) -> FloatArray:
     """
     Return the deflection of the tip w(s) = phi(s) q for many states.
 

@@ -20,8 +20,8 @@ from __future__ import annotations
 from math import factorial, inf, isfinite, pi, sqrt
 from typing import Final, NamedTuple
 
-from needle_dynamics.arrays import FloatArray, IntArray
-from needle_dynamics.compiled.cache import compiled, inlined
+from needle_dynamics.arrays import Array3, FloatArray, IntArray, IntVector, Matrix, Vector
+from needle_dynamics.compiled.cache import compiled, inlined, kernel
 from needle_dynamics.compiled.friction import slide
 from needle_dynamics.compiled.modal_flow import normal_pair, turn_pair
 from needle_dynamics.compiled.step import GRADED_FROM
@@ -116,8 +116,8 @@ class Course(NamedTuple):
 
     """
 
-    forces: FloatArray
-    torques: FloatArray
+    forces: Matrix
+    torques: Matrix
     intervals: int
     interval: float
     longest: float
@@ -340,15 +340,15 @@ def _save(w: FloatArray, i: int, table: FloatArray, state: FloatArray) -> None:
     state[4], state[6], state[7] = -w[_U + i], (v1 - l21 * rate2) / l11, rate2
 
 
-@compiled
+@kernel
 def run(
-    needles: FloatArray,
-    table: FloatArray,
+    needles: Matrix,
+    table: Matrix,
     course: Course,
-    runs: IntArray,
-    states: FloatArray,
-    kept: FloatArray,
-    completed: FloatArray,
+    runs: IntVector,
+    states: Matrix,
+    kept: Array3,
+    completed: Vector,
 ) -> None:
     """
     Take needles through intervals of constant inputs.

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from needle_dynamics.arrays import FloatArray
-from needle_dynamics.compiled.cache import compiled
+from needle_dynamics.arrays import FloatArray, Matrix, Vector
+from needle_dynamics.compiled.cache import compiled, kernel
 from needle_dynamics.compiled.integrals import ModeIntegrals
 from needle_dynamics.compiled.matrices import backward, cholesky, diagonalize, forward
 from needle_dynamics.compiled.tissue import Layers
@@ -33,9 +33,9 @@ class NormalModes(NamedTuple):
 
     """
 
-    shapes: FloatArray
-    inverse: FloatArray
-    squares: FloatArray
+    shapes: Matrix
+    inverse: Matrix
+    squares: Vector
 
 
 @compiled
@@ -142,7 +142,7 @@ def normal_modes(
     modes.inverse[:] = stiffness
 
 
-@compiled
+@kernel
 def coupling(
     density: float, bending: float, stiffness: float, bend: float, tip: float, rate: float
 ) -> float:

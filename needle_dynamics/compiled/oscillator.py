@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from math import cos, exp, expm1, sin, sqrt
 
-from needle_dynamics.compiled.cache import compiled
+from needle_dynamics.compiled.cache import compiled, kernel
 
 
 @compiled
@@ -44,7 +44,7 @@ def swing(damping: float, square: float, t: float) -> tuple[float, float, float,
     return exp(slow * t) - slow * pv, pv, -square * pv, exp(slow * t) + fast * pv
 
 
-@compiled
+@kernel
 def decay_means(x: float) -> tuple[float, float]:
     """
     Return the means of an exponential decay, without cancellation at small x.

@@ -12,8 +12,8 @@ from __future__ import annotations
 from math import ceil, sqrt
 from typing import Final
 
-from needle_dynamics.arrays import FloatArray
-from needle_dynamics.compiled.cache import compiled
+from needle_dynamics.arrays import Matrix, Vector
+from needle_dynamics.compiled.cache import kernel
 from needle_dynamics.compiled.integrals import mode_integrals, ModeIntegrals
 from needle_dynamics.compiled.step import advance, Inputs, Needle
 import numpy as np
@@ -28,15 +28,15 @@ _BLOCK: Final = 32
 _MOST: Final = 1e12
 
 
-@compiled
+@kernel
 def run_refined(
     c: Needle,
-    state: FloatArray,
-    forces: FloatArray,
+    state: Vector,
+    forces: Vector,
     interval: float,
     finer: int,
-    states: FloatArray,
-    steps: FloatArray,
+    states: Matrix,
+    steps: Vector,
 ) -> tuple[int, float]:
     """
     Advance a state through intervals of constant force, in place.

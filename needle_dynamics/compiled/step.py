@@ -12,8 +12,8 @@ from __future__ import annotations
 from math import ceil, exp, inf, nan
 from typing import Final, NamedTuple
 
-from needle_dynamics.arrays import FloatArray
-from needle_dynamics.compiled.cache import compiled, inlined
+from needle_dynamics.arrays import FloatArray, Matrix, Vector
+from needle_dynamics.compiled.cache import compiled, inlined, kernel
 from needle_dynamics.compiled.friction import dry_friction, friction_flow, FrictionConstants
 from needle_dynamics.compiled.integrals import mode_integrals, ModeIntegrals, ModeTables
 from needle_dynamics.compiled.matrices import backward, cholesky, forward
@@ -371,16 +371,16 @@ def _steps(  # noqa: C901
     return _Motion(s, u, acceleration), sums, left
 
 
-@compiled
+@kernel
 def advance(
     c: Needle,
-    state: FloatArray,
+    state: Vector,
     time: float,
     inputs: Inputs,
     longest: float,
     graded: bool,
     duration: float,
-    felt: FloatArray | None = None,
+    felt: Matrix | None = None,
 ) -> tuple[float, Sums]:
     """
     Advance a state under constant inputs, in place.
@@ -476,16 +476,16 @@ def advance(
     return (left if size < inf else nan), sums
 
 
-@compiled
+@kernel
 def run(
     c: Needle,
-    state: FloatArray,
-    forces: FloatArray,
-    torques: FloatArray,
+    state: Vector,
+    forces: Vector,
+    torques: Vector,
     interval: float,
     longest: float,
     graded: bool,
-    states: FloatArray,
+    states: Matrix,
 ) -> int:
     """
     Advance a state through intervals of constant inputs, in place.

@@ -5,7 +5,7 @@ from __future__ import annotations
 from math import expm1, inf
 from typing import NamedTuple
 
-from needle_dynamics.arrays import FloatArray
+from needle_dynamics.arrays import Array3, FloatArray, Matrix, Vector
 from needle_dynamics.compiled.cache import compiled
 
 
@@ -31,11 +31,11 @@ class Layers(NamedTuple):
 
     """
 
-    starts: FloatArray
-    stiffnesses: FloatArray
-    gram: FloatArray
-    area: FloatArray
-    moment: FloatArray
+    starts: Vector
+    stiffnesses: Vector
+    gram: Array3
+    area: Matrix
+    moment: Matrix
 
 
 @compiled

@@ -12,8 +12,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from needle_dynamics import FloatArray, NeedleModel, NeedleParameters
 from needle_dynamics.compiled.held import Held
-from needle_dynamics.compiled.tissue import Layers
-from needle_insertion.gym.pushed import BOUND, observe, push, Pushed, UNITS
+from needle_insertion.gym.pushed import BOUND, observe, push, Pushed, Tissues, UNITS
 from needle_ros.errors import ParameterError
 import numpy as np
 
@@ -39,7 +38,7 @@ class _Needles:
         self._needles = Pushed(
             common,
             np.zeros((number, 2)),
-            Layers(*(np.array([one] * number) for one in common.layers)),
+            Tissues(*(np.array([one] * number) for one in common.layers)),
             np.zeros(number),
             np.array([self._start] * number),
             np.zeros(number),

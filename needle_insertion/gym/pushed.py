@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any, Final, NamedTuple, TYPE_CHECKING
 
-from needle_dynamics import FloatArray
-from needle_dynamics.compiled.cache import compiled
+from needle_dynamics.arrays import Array3, Array4, BoolVector, FloatArray, Matrix, Vector
+from needle_dynamics.compiled.cache import kernel
 from needle_dynamics.compiled.integrals import tip_deflections
 from needle_dynamics.compiled.step import adapted, advance, Inputs, Needle
 from needle_dynamics.compiled.tissue import Layers
@@ -30,6 +30,28 @@ UNITS: Final = (0.1, 0.1, 0.1, 1e-3)
 BOUND: Final = 1e3
 
 
+class Tissues(NamedTuple):
+    """
+    Layers of tissue of several needles: the fields of `Layers`.
+
+    Attributes
+    ----------
+    starts, stiffnesses : ndarray, shape (n, layers)
+        As in `Layers`, as are the others.
+    gram : ndarray, shape (n, layers, modes, modes)
+        Of each needle.
+    area, moment : ndarray, shape (n, layers, modes)
+        Of each needle.
+
+    """
+
+    starts: Matrix
+    stiffnesses: Matrix
+    gram: Array4
+    area: Array3
+    moment: Array3
+
+
 class Pushed(NamedTuple):
     """
     Some needles.
@@ -40,8 +62,8 @@ class Pushed(NamedTuple):
         What is the same for all.
     friction : ndarray, shape (n, 2)
         Coulomb friction [N] and viscous friction [N s/m] of each.
-    layers : Layers
-        Layers of tissue of each: arrays with one axis more, the first.
+    layers : Tissues
+        Layers of tissue of each.
     times : ndarray, shape (n,)
         Time of each [s].
     states : ndarray, shape (n, 2 (2 + modes))
@@ -52,15 +74,15 @@ class Pushed(NamedTuple):
     """
 
     common: Needle
-    friction: FloatArray
-    layers: Layers
-    times: FloatArray
-    states: FloatArray
-    targets: FloatArray
+    friction: Matrix
+    layers: Tissues
+    times: Vector
+    states: Matrix
+    targets: Vector
 
 
-@compiled
-def push(held: Held[Pushed], actions: FloatArray, which: Any) -> tuple[FloatArray, Any]:
+@kernel
+def push(held: Held[Pushed], actions: Vector, which: BoolVector) -> tuple[FloatArray, Any]:
     """
     Push some needles for a period.
 
@@ -105,7 +127,7 @@ def push(held: Held[Pushed], actions: FloatArray, which: Any) -> tuple[FloatArra
     return rewards, over
 
 
-@compiled
+@kernel
 def observe(held: Held[Pushed]) -> Any:
     """
     Return what is seen of needles.

@@ -10,6 +10,9 @@ from needle_ros.base_node import BaseNode
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
+#: What a node writes to its log when it compiles or loads a function while it is active.
+LATE = 'while the node is active'
+
 
 class RosGraph(Graph):
     """The graph of one test: nodes in its own thread, and processes."""
@@ -17,6 +20,13 @@ class RosGraph(Graph):
     def __enter__(self) -> RosGraph:
         super().__enter__()
         return self
+
+    def __exit__(self, *raised: Any) -> None:
+        late = [name for node in self._nodes for name in getattr(node, 'late', ())]
+        super().__exit__(*raised)
+        for log in self._logs.glob('*.log'):
+            late += [line for line in log.read_text().splitlines() if LATE in line]
+        assert not late, f'functions were compiled or loaded in an active node: {late}'
 
     def add(self, kind: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
         """

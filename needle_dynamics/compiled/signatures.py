@@ -1,0 +1,98 @@
+"""
+From the annotations of a function to the types for which it is compiled.
+
+This file imports Numba: import it where it is first needed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Annotated, Any, Final, get_args, get_origin, get_type_hints
+
+from needle_dynamics.arrays import Shaped
+from needle_dynamics.compiled.held import Held, held_type
+import numba
+from numba.core import types
+
+_SCALARS: Final = {
+    bool: types.boolean,
+    int: types.int64,
+    float: types.float64,
+    complex: types.complex128,
+}
+
+
+_tuple_type: Any = types.BaseTuple.from_types  # type: ignore[attr-defined]
+
+
+def argument_types(function: Callable[..., object]) -> tuple[Any, ...]:
+    """
+    Return Numba's types of the arguments of a function.
+
+    Parameters
+    ----------
+    function : callable
+        Its arguments are annotated by numbers, arrays of `needle_dynamics.arrays` with a known
+        number of dimensions, tuples, named tuples of these, and `Held` named tuples.
+
+    Returns
+    -------
+    tuple
+        One type for each argument.
+
+    Raises
+    ------
+    TypeError
+        If an annotation does not determine a type.
+
+    """
+    hints = get_type_hints(function, localns={'Held': Held}, include_extras=True)
+    names = function.__code__.co_varnames[: function.__code__.co_argcount]
+    try:
+        return tuple(numba_type(hints[name]) for name in names)
+    except (KeyError, TypeError) as error:
+        raise TypeError(f'{function.__module__}.{function.__qualname__}: {error}') from error
+
+
+def numba_type(hint: Any) -> Any:
+    """
+    Return Numba's type of an annotation.
+
+    Parameters
+    ----------
+    hint : type
+        The annotation.
+
+    Returns
+    -------
+    object
+        The type.
+
+    Raises
+    ------
+    TypeError
+        If the annotation does not determine a type.
+
+    """
+    if hint in _SCALARS:
+        return _SCALARS[hint]
+    origin, arguments = get_origin(hint), get_args(hint)
+    if type(None) in arguments:
+        # Python code gives it always.
+        return numba_type(next(one for one in arguments if one is not type(None)))
+    if origin is Annotated:
+        shaped = hint.__metadata__[0]
+        if isinstance(shaped, int):
+            return _tuple_type([numba_type(get_args(arguments[0])[0])] * shaped)
+        if isinstance(shaped, Shaped):
+            kind = numba.from_dtype(shaped.dtype)
+            return types.Array(kind, shaped.dimensions, 'C', readonly=not shaped.writable)
+    if origin is Held:
+        return held_type(numba_type(arguments[0]))
+    if origin is tuple and Ellipsis not in arguments:
+        return _tuple_type([numba_type(one) for one in arguments])
+    if isinstance(hint, type) and issubclass(hint, tuple) and hasattr(hint, '_fields'):
+        fields = get_type_hints(hint, include_extras=True)
+        inner = [numba_type(fields[name]) for name in hint._fields]
+        return _tuple_type(inner, hint)
+    raise TypeError(f'{hint} is not a number, an array with dimensions, or a tuple of these')

@@ -1,0 +1,247 @@
+"""
+Machine code on disk: one file for each function and signature.
+
+The name of a file has a digest of everything that its machine code depends on: sources, signature,
+processor, and versions of Python and Numba. So an entry is never wrong, only missing, and several
+processes, users and machines can share a folder. A file is written under another name and renamed;
+a damaged file counts as missing.
+
+Entries are read from the folder of this package, which may be read-only, and from the cache folder
+of the user. New entries go to the first of the two that is writable.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import errno
+import fcntl
+from functools import cache
+from hashlib import sha256
+import os
+from pathlib import Path
+import pickle
+import sys
+import tempfile
+from time import monotonic, sleep
+from typing import Any, Final
+import warnings
+
+_FOLDER: Final = Path(__file__).parent
+
+#: Environment variable with a folder that replaces both; it is also Numba's.
+FOLDER_VARIABLE: Final = 'NUMBA_CACHE_DIR'
+
+#: Suffix of an entry.
+SUFFIX: Final = '.nbc'
+
+#: Longest wait for another process that compiles the same function, and time between checks [s].
+_LONGEST, _CHECK = 120.0, 0.05
+
+_DIGEST: Final = 32
+
+#: Called with the name of each function that is loaded or compiled, and whether it is loaded.
+LISTENERS: Final[list[Callable[[str, bool], None]]] = []
+
+
+def folders() -> tuple[Path, ...]:
+    """
+    Return the folders of machine code.
+
+    Returns
+    -------
+    tuple of Path
+        In the order in which they are read.
+
+    """
+    given = os.environ.get(FOLDER_VARIABLE)
+    if given:
+        return (Path(given),)
+    found = [_FOLDER / '__pycache__']
+    try:
+        home = os.environ.get('XDG_CACHE_HOME') or Path.home() / '.cache'
+        found.append(Path(home) / 'needle_insertion')
+    except RuntimeError:
+        # This user has no home directory.
+        pass
+    return tuple(found)
+
+
+@cache
+def writable_folder() -> Path | None:
+    """
+    Return the folder that new entries are written to.
+
+    Returns
+    -------
+    Path or None
+        The first writable folder of `folders`; None if there is none.
+
+    """
+    for folder in folders():
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            tempfile.TemporaryFile(dir=folder).close()
+        except OSError:
+            continue
+        return folder
+    return None
+
+
+@cache
+def _stamp(folder: Path) -> str:
+    """Return a digest of all sources in this folder and in another one."""
+    digest = sha256()
+    for place in sorted({_FOLDER, folder}):
+        for path in sorted(place.glob('*.py')):
+            digest.update(path.name.encode() + path.read_bytes())
+    return digest.hexdigest()
+
+
+class Store:
+    """
+    The machine code of one function, in the interface of Numba's caches.
+
+    Parameters
+    ----------
+    function : callable
+        The Python source.
+    options : dict
+        Options of the compiler.
+
+    """
+
+    def __init__(self, function: Callable[..., object], options: dict[str, Any]) -> None:
+        code = function.__code__
+        source = Path(code.co_filename)
+        self._name = f'{source.stem}.{function.__qualname__}'
+        self._stamp = _stamp(source.parent)
+        self._fixed = [function.__module__, self._name, self._stamp, sorted(options.items())]
+
+    @property
+    def cache_path(self) -> str:
+        """The folder of new entries, for Numba's statistics."""
+        return str(writable_folder())
+
+    def enable(self) -> None:
+        """Do nothing: it is always enabled."""
+
+    def disable(self) -> None:
+        """Do nothing: it is always enabled."""
+
+    def flush(self) -> None:
+        """Do nothing: entries do not become invalid."""
+
+    def has(self, signature: Any, target_context: Any) -> bool:
+        """Return whether there is an entry for a signature."""
+        name = self._file_name(signature, target_context.codegen())
+        return any((folder / name).is_file() for folder in folders())
+
+    def load_overload(self, signature: Any, target_context: Any) -> Any:
+        """Return the machine code for a signature, or None; Numba calls this."""
+        target_context.refresh()
+        name = self._file_name(signature, target_context.codegen())
+        found, folder = self._read(name, signature, target_context), writable_folder()
+        if found is None and folder is not None:
+            # Another process may be compiling it: wait, rather than do the same work again.
+            deadline = monotonic() + _LONGEST
+            while not _lock(folder, name) and monotonic() < deadline:
+                sleep(_CHECK)
+            found = self._read(name, signature, target_context)
+            if found is not None:
+                _unlock(folder, name)
+        for listener in tuple(LISTENERS):
+            listener(self._name, found is not None)
+        return found
+
+    def save_overload(self, signature: Any, result: Any) -> None:
+        """Write machine code for a signature; Numba calls this after compiling it."""
+        folder = writable_folder()
+        if folder is None:
+            return
+        name = self._file_name(signature, result.codegen)
+        try:
+            if not any(one.can_cache for one in result.lifted) and (
+                not result.library.has_dynamic_globals
+            ):
+                from numba.core.serialize import dumps
+
+                self._write(folder, name, dumps(result._reduce()))
+        finally:
+            _unlock(folder, name)
+
+    def _file_name(self, signature: Any, codegen: Any) -> str:
+        """Return the name of the entry for a signature on this processor."""
+        from numba import __version__
+        from numba.core.sigutils import normalize_signature
+
+        arguments, _ = normalize_signature(signature)
+        parts = [*self._fixed, str(arguments), codegen.magic_tuple(), __version__, sys.version]
+        digest = sha256(repr(parts).encode()).hexdigest()
+        return f'{self._name}-{self._stamp[:8]}-{digest[:24]}{SUFFIX}'
+
+    @staticmethod
+    def _read(name: str, signature: Any, target_context: Any) -> Any:
+        from numba.core.compiler import CompileResult
+        from numba.core.sigutils import normalize_signature
+
+        for folder in folders():
+            try:
+                content = (folder / name).read_bytes()
+            except OSError:
+                continue
+            data = content[_DIGEST:]
+            if sha256(data).digest() != content[:_DIGEST]:
+                continue
+            result = CompileResult._rebuild(target_context, *pickle.loads(data))  # noqa: S301
+            if result.signature.args == normalize_signature(signature)[0]:
+                return result
+        return None
+
+    def _write(self, folder: Path, name: str, data: bytes) -> None:
+        """Write an entry; remove those of earlier sources in the folder of the package."""
+        try:
+            handle, draft = tempfile.mkstemp(dir=folder, prefix=name, suffix='.tmp')
+            try:
+                with os.fdopen(handle, 'wb') as file:
+                    file.write(sha256(data).digest() + data)
+                # mkstemp makes it private; an installation by root serves every user.
+                Path(draft).chmod(0o644)
+                Path(draft).replace(folder / name)
+            except BaseException:
+                Path(draft).unlink(missing_ok=True)
+                raise
+            if folder == _FOLDER / '__pycache__':
+                for old in folder.glob(f'{self._name}-*{SUFFIX}'):
+                    if self._stamp[:8] not in old.name:
+                        old.unlink(missing_ok=True)
+        except OSError as error:
+            warnings.warn(f'compiled code cannot be kept in {folder}: {error}', stacklevel=2)
+
+
+@cache
+def _lock_file(folder: Path) -> int:
+    """Open the file whose bytes are locks, for the life of the process."""
+    return os.open(folder / 'needle.lock', os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+
+
+def _lock(folder: Path, name: str) -> bool:
+    """Lock an entry; return False while another process has it."""
+    try:
+        fcntl.lockf(_lock_file(folder), fcntl.LOCK_EX | fcntl.LOCK_NB, 1, _byte(name))
+    except OSError as error:
+        # A file system without locks: both processes compile it.
+        return error.errno not in (errno.EACCES, errno.EAGAIN)
+    return True
+
+
+def _unlock(folder: Path, name: str) -> None:
+    try:
+        fcntl.lockf(_lock_file(folder), fcntl.LOCK_UN, 1, _byte(name))
+    except OSError:
+        # It ends with the process.
+        return
+
+
+def _byte(name: str) -> int:
+    """Return the byte of the lock file that stands for an entry."""
+    return int.from_bytes(sha256(name.encode()).digest()[:7], 'big')

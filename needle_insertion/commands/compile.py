@@ -1,0 +1,28 @@
+"""`needle compile`: compile all functions for this machine, once."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+
+from needle_insertion.commands.common import Command
+
+
+def _add_arguments(_parser: argparse.ArgumentParser) -> None:
+    """Add no options."""
+
+
+def _run(_options: argparse.Namespace) -> int:
+    """Compile; return 1 if no folder is writable."""
+    from needle_dynamics.compiled.cache import kernels, where_kept
+    from needle_dynamics.compiled.store import writable_folder
+    from needle_insertion.compilation import compile_all, MODULES
+
+    if compile_all() and writable_folder() is None:
+        sys.stderr.write(f'error: {where_kept()}\n')
+        return 1
+    sys.stdout.write(f'{len(kernels(MODULES))} compiled functions: {where_kept()}\n')
+    return 0
+
+
+COMMAND = Command(_add_arguments, _run)

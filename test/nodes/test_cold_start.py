@@ -1,0 +1,250 @@
+"""Everything that takes long is done before a node is configured, while its services respond."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+import re
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray
+from lifecycle_msgs.srv import GetState
+from needle_controller import LAWS
+from needle_controller.reference.guide import REFERENCES
+from needle_dynamics.compiled.store import SUFFIX
+from needle_insertion.live.operator import Operator
+from needle_ros.base_node import COMMAND, SENSOR
+import pytest
+from rclpy.node import Node
+from rclpy.task import Future
+from sensor_msgs.msg import JointState
+from std_srvs.srv import Trigger
+from support.ros_graph import RosGraph
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+
+#: A node is deaf meanwhile: an import that takes longer counts as large [us].
+LARGEST_IMPORT = 20_000
+
+#: The longest part of a line of ``-X importtime``: own and cumulative time [us], module.
+IMPORT = re.compile(r'import time:\s+\d+ \|\s+(\d+) \|\s*(\S+)')
+
+#: A node that is busy compiling has responded to at least so many requests, one after another.
+RESPONSES = 10
+
+STEERED = {'model.preset': 'bending_35mm', 'steered': True, 'depth': 0.001, 'rate': 200.0}
+STEERING = {
+    'step_length': 0.01,
+    'speed': 0.05,
+    'guide_speed': 0.05,
+    'acceleration': 0.4,
+    'look_time': 0.15,
+    'settle_time': 0.02,
+    'measurement_timeout': 5.0,
+}
+
+
+class Rig:
+    """Nodes as processes that log their imports, and a user."""
+
+    def __init__(self, graph: RosGraph, logs: Path, **nodes: dict[str, Any]) -> None:
+        self.graph, self.logs = graph, logs
+        graph.environment['PYTHONPROFILEIMPORTTIME'] = '1'
+        self.user = graph.node('user')
+        self.operator = Operator(self.user)
+        self.states = graph.latest(self.user, JointState, 'joint_states', SENSOR)
+        self.course = self.user.create_publisher(JointTrajectory, 'joint_trajectory', COMMAND)
+        for name, parameters in nodes.items():
+            graph.start(name, parameters)
+        self.until(lambda: all('active:' in self.log(name) for name in nodes), 'the nodes')
+        self.until(lambda: set(nodes) <= set(self.operator.states), '/diagnostics')
+
+    def until(self, condition: Callable[[], Any], event: str) -> None:
+        """Spin until a condition holds."""
+        self.graph.spin_until(condition, event, 300.0)
+
+    def log(self, name: str) -> str:
+        """Return the log of a node."""
+        return (self.logs / f'{name}.log').read_text()
+
+    def done(self, response: Future) -> None:
+        """Wait for the response to a request."""
+        self.until(response.done, 'the response')
+        assert response.result().success, response.result()
+
+    @property
+    def depth(self) -> float:
+        """Insertion depth [m]."""
+        message = self.states.message
+        return float(message.position[0]) if message else 0.0
+
+    def go(self, depth: float) -> None:
+        """Send a target depth until the needle is near it."""
+
+        def near() -> bool:
+            self.operator.target(0.0, depth, 0.0)
+            return abs(self.depth - depth) < 1e-4
+
+        self.until(near, f'a depth of {depth} m')
+
+    def move(self, depth: float, duration: float) -> None:
+        """Send a trajectory of the insertion until the needle is near its end."""
+        point = JointTrajectoryPoint(positions=[depth])
+        point.time_from_start.sec = 0
+        point.time_from_start.nanosec = round(1e9 * duration)
+        message = JointTrajectory(joint_names=['insertion'], points=[point])
+        self.until(self.course.get_subscription_count, 'who takes it')
+        begin = self.depth
+        self.course.publish(message)
+        self.until(lambda: abs(self.depth - begin) > 1e-4, 'a motion')
+
+    def imports(self) -> Iterator[str]:
+        """Yield large imports in nodes that were active."""
+        for path in self.logs.glob('*.log'):
+            active = False
+            for line in path.read_text().splitlines():
+                active |= 'active:' in line
+                found = IMPORT.search(line)
+                if active and found and int(found[1]) > LARGEST_IMPORT:
+                    yield f'{path.stem}: {found[2]} {int(found[1]) / 1e3:.0f} ms'
+
+
+@pytest.fixture
+def rig(ros_graph: RosGraph, tmp_path: Path) -> Iterator[Callable[..., Rig]]:
+    """Return what makes the rig; at the end nothing was imported late (nor compiled: RosGraph)."""
+    made: list[Rig] = []
+
+    def make(**nodes: dict[str, Any]) -> Rig:
+        made.append(Rig(ros_graph, tmp_path / 'logs', **nodes))
+        return made[-1]
+
+    yield make
+    for one in made:
+        assert not [*one.imports()]
+
+
+@pytest.mark.parametrize('feedback', ['observer', 'ground_truth', 'none'])
+def test_the_controller_has_everything_for_all_laws(
+    rig: Callable[..., Rig], feedback: str
+) -> None:
+    """Targets, trajectories, pauses, retraction, stops, and live changes of law and gains."""
+    one = rig(plant={}, controller={'deflection_feedback': feedback})
+    one.go(0.025)
+    for law in LAWS[::-1]:
+        one.done(one.operator.set('controller', 'law', law))
+        one.go(0.03 if one.depth < 0.028 else 0.025)
+    one.done(one.operator.set('controller', 'model.viscous_friction', 310.0))
+    one.done(one.operator.ask('pause'))
+    one.done(one.operator.ask('resume'))
+    one.move(one.depth + 2e-3, 0.5)
+    one.done(one.operator.ask('retract'))
+    one.done(one.operator.ask('stop'))
+    one.done(one.operator.ask('clear'))
+    one.go(0.022)
+
+
+@pytest.mark.parametrize('reference', [*REFERENCES])
+def test_the_controller_has_everything_for_all_references(
+    rig: Callable[..., Rig], reference: str
+) -> None:
+    """Each kind of reference reaches a target, also from a motion to another one."""
+    one = rig(plant={}, controller={'reference.kind': reference})
+    one.go(0.03)
+    one.operator.target(0.0, 0.05, 0.0)
+    one.go(0.025)
+
+
+@pytest.mark.parametrize(
+    'plant',
+    [
+        {'mode': 'robot'},
+        {'mode': 'robot', 'fault.kind': 'freeze'},
+        {'mode': 'robot', 'sensor.filter': 3},
+        {'mode': 'robot', **STEERED},
+    ],
+    ids=str,
+)
+def test_the_plant_has_everything_in_mode_robot(
+    rig: Callable[..., Rig], plant: dict[str, Any]
+) -> None:
+    """It follows positions, and pushes with a force."""
+    one = rig(plant=plant)
+    one.move(one.depth + 2e-3, 0.2)
+    one.done(one.operator.set('plant', 'model.coulomb_friction', 0.6))
+
+
+@pytest.mark.parametrize('options', [{}, {'continuous': True}, {'turns': 1}], ids=str)
+@pytest.mark.parametrize('mode', ['robot', 'simulation'])
+def test_steering_has_everything(
+    rig: Callable[..., Rig], options: dict[str, Any], mode: str
+) -> None:
+    """From the target to the end of the insertion."""
+    nodes = {'plant': {'mode': mode, **STEERED}, 'steering': {**STEERING, **options}}
+    if mode == 'simulation':
+        nodes['controller'] = {
+            'model.preset': 'bending_35mm', 'steered': True, 'rate': 200.0,
+            'deflection_feedback': 'none', 'reference.speed': 0.05,
+        }  # fmt: skip
+    one = rig(**nodes)
+
+    def ended() -> bool:
+        state = one.operator.states['steering']
+        if state.values.get('phase', '') == 'waits for a target':
+            one.operator.target(1e-3, 0.031, -1e-3)
+        return state.message.startswith(('done', 'stopped'))
+
+    one.until(ended, 'the end of the insertion')
+
+
+def test_nodes_respond_while_they_compile(ros_graph: RosGraph, tmp_path: Path) -> None:
+    """Three nodes share an empty folder: each function is compiled once, and none later."""
+    folder, logs = tmp_path / 'code', tmp_path / 'logs'
+    ros_graph.environment['NUMBA_CACHE_DIR'] = str(folder)
+    user = ros_graph.node('user')
+    names = ('plant', 'controller', 'steering')
+    reports: list[str] = []
+
+    def hear(array: DiagnosticArray) -> None:
+        reports.extend(status.message for status in array.status)
+
+    user.create_subscription(DiagnosticArray, '/diagnostics', hear, 10)
+    for name in names:
+        ros_graph.start(name)
+    for name in names:
+        ros_graph.wait_for(user, name)
+    stop = user.create_client(Trigger, 'steering/stop')
+    answered = {name: _answers(ros_graph, user, name) for name in names}
+    ros_graph.spin_until(stop.service_is_ready, 'the service')
+    response = stop.call_async(Trigger.Request())
+    ros_graph.spin_until(response.done, 'the response of a node that compiles')
+    ros_graph.spin_until(
+        lambda: all(states()[-1:] == ['active'] for states in answered.values()),
+        'the nodes',
+        600.0,
+    )
+    for states in answered.values():
+        assert states().count('unconfigured') >= RESPONSES
+    assert any(re.match(r'preparing \d+ of \d+ \(\w+\)', report) for report in reports)
+    compiled = [
+        int(number)
+        for path in logs.glob('*.log')
+        for number in re.findall(r'(\d+) functions compiled', path.read_text())
+    ]
+    assert sum(compiled) == len([*folder.glob(f'*{SUFFIX}')])
+
+
+def _answers(graph: RosGraph, user: Node, name: str) -> Callable[[], list[str]]:
+    """Ask a node for its state again and again; return its answers so far."""
+    client = user.create_client(GetState, f'{name}/get_state')
+    states: list[str] = []
+
+    def ask() -> None:
+        client.call_async(GetState.Request()).add_done_callback(take)
+
+    def take(response: Future) -> None:
+        states.append(response.result().current_state.label)
+        if states[-1] != 'active':
+            ask()
+
+    graph.spin_until(client.service_is_ready, f'the node {name}')
+    ask()
+    return lambda: states
