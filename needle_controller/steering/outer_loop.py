@@ -62,7 +62,7 @@ _STILL: Final = 1e-4
 #: The needle counts as outside tissue up to this depth: there the guide may move freely [m].
 _OUTSIDE: Final = 1e-3
 
-#: Depths that are the same [m].
+#: Positions that are the same [m, rad].
 _SAME: Final = 1e-6
 
 #: Most steps of a plan.
@@ -869,7 +869,8 @@ class OuterLoop:
     def _move(self, now: int, begin: FloatArray, *, again: bool = False) -> Move | None:
         duration = duration_of(self._goal - begin, self.settings)
         self._due = now + round(duration * NANOSECONDS)
-        if duration == 0.0:
+        if np.abs(self._goal - begin).max() < _SAME:
+            # Too short to be a motion: the times of its points would be the same.
             self._monitor.forget()
             return None
         # Again from the present positions: it never jumps.

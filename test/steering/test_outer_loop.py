@@ -536,3 +536,15 @@ def test_whatever_is_said_no_motion_leaves_the_limits(
         for name, column in zip(move.joints, move.positions.T, strict=True):
             low, high = (0.0, TARGET[1]) if name == 'insertion' else (-6e-3, 6e-3)
             assert low - 1e-12 <= column.min() <= column.max() <= high + 1e-12
+
+
+def test_a_motion_of_rounding_is_none() -> None:
+    """The times of its points would all be the same, which a controller rejects."""
+    robot = Robot()
+    robot.tick(5)
+    robot.aim()
+    loop = robot.loop
+    for way, sent in ((1e-15, False), (5e-7, False), (2e-6, True)):
+        move = loop._send(Phase.GUIDING, loop._goal + [0.0, way, 0.0], robot.now)
+        assert (move is not None) == sent
+        assert move is None or (np.diff(move.times) > 1e-5).all()
