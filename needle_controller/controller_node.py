@@ -154,7 +154,7 @@ class ControllerNode(ModelNode):
         self._serve(Trigger, 'emergency_stop', lambda _: supervisor.emergency_stop(self.now()))
         self._serve(Trigger, 'clear_stop', lambda _: supervisor.clear_stop(self.now()))
         self._serve(SetBool, 'pause', lambda request: supervisor.pause(request.data))
-        self._serve(Trigger, 'retract', lambda _: supervisor.retract())
+        self._serve(Trigger, 'retract', lambda _: supervisor.retract(self.now()))
         #: A clock that stands still or jumps does not stop the watchdog.
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
 
@@ -209,6 +209,7 @@ class ControllerNode(ModelNode):
             uncertainty=self.settings('uncertainty.', Uncertainty),
         )
         self._supervisor.retract_depth = self._retract_depth({})
+        self._supervisor.receive(targets=not self.get_parameter('steered').value)
         limits, observed = self.settings('safety.', SafetyLimits), None
         if feedback == 'observer':
             observed = self.settings('observer.', ObserverSettings)
@@ -378,6 +379,8 @@ class ControllerNode(ModelNode):
                 self._reference.publish(self._write_aim(stamp, *reference))
                 self._tracking_error.publish(self._write_aim(stamp, *error))
         self.tell(self._supervisor.journal)
+        if self._supervisor.requests.due():
+            self.publish_diagnostics()
 
     def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
         """Say what it aims at and what holds it back."""

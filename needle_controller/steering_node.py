@@ -1,4 +1,4 @@
-"""Node `steering`: brings the tip to a target by moving the guide, one step at a time."""
+"""Node `steering`: steers the tip to a target by motions of the guide."""
 
 from __future__ import annotations
 
@@ -8,11 +8,13 @@ import sys
 from typing import Any
 
 from builtin_interfaces.msg import Duration
+from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PointStamped, PoseWithCovarianceStamped
 from needle_controller.steering.belief import SteeringBelief
 from needle_controller.steering.controller import TipEstimate
 from needle_controller.steering.motion import Move
 from needle_controller.steering.outer_loop import OuterLoop
+from needle_controller.steering.planning import ThreadJob
 from needle_controller.steering.responses import OF_NEEDLE, OF_STEERING, SteeringModel
 from needle_controller.steering.settings import OuterLoopSettings
 from needle_dynamics.compiled_node import CompiledNode
@@ -20,9 +22,11 @@ from needle_dynamics.parameters import NeedleParameters
 from needle_dynamics.simulated.assembly import defaults_of
 from needle_dynamics.steering.parameters import NEEDLES, SteeringParameters
 from needle_ros import contract
+from needle_ros.errors import printable
 from needle_ros.publishers_node import Publishers
 from needle_ros.run_node import run
 from needle_ros.settings import from_values
+from needle_ros.status import RequestStatus, Verdict
 from needle_ros.timing import NANOSECONDS, nanoseconds
 from needle_ros.wire import Reading
 import numpy as np
@@ -32,31 +36,32 @@ from rclpy.clock_type import ClockType
 from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-#: Needle and tissue that are believed by default.
+#: Default of the nominal needle and tissue.
 _PRESET = 'bending_35mm'
 
-#: Time between two looks for what does not come [s].
+#: Time between two checks for missing inputs, and for a plan that is computed [s].
 _WATCH = 0.05
 
 
 class SteeringNode(CompiledNode):
     """
-    Brings the tip to a ``target`` (point x, y, z [m]; y is the depth) by guide and roll.
+    Steer the tip to a ``target`` (point x, y, z [m]; y is the depth) by guide and roll.
 
-    The needle goes in by steps. At the end of each it rests, and the readings of
-    ``tip_deflection`` that come then are a look at the tip. Then the guide moves, by a
+    The needle is inserted in steps. At the end of each it rests, and the readings of
+    ``tip_deflection`` are averaged to a measurement of the tip. Then the guide moves, by a
     ``joint_trajectory`` of `insertion`, `guide_x` and `guide_z`, with ``turns`` also `roll`; when
     it has arrived the next step begins. If it is ``continuous`` the needle does not rest, and the
-    guide follows its depth. A robot follows all of it; where a controller moves the needle, with
+    guide follows its depth. A robot follows all joints; where a controller moves the needle, with
     its parameter ``steered``, it follows the insertion. ``joint_states`` must have these joints.
 
-    What is believed of needle and tissue is ``model.*`` and ``steering.*``, how far it may be
-    wrong ``belief.*``. A target out of reach is refused, with what is within it. The needle stops
-    when the tip freezes, is lost, slips or cannot be that of this needle, when a joint does not
-    get to where it was sent, and by ``~/stop``. ``tip_expected`` says where the tip will be at
-    the target depth.
+    The nominal model of needle and tissue is ``model.*`` and ``steering.*``, its uncertainty
+    ``belief.*``. The plan is computed in a thread: messages and ``~/stop`` do not wait for it. A
+    target out of reach is rejected with the reachable range. Each motion is sent again until the
+    robot follows it. The needle stops when the tip freezes, is lost, slips or is implausible, when
+    a node rejects a motion, when a joint does not arrive, and by ``~/stop``. ``tip_expected`` is
+    the expected position of the tip at the target depth.
 
-    The node passes messages to an `OuterLoop`, which decides, and publishes what comes back.
+    The node passes messages to an `OuterLoop`, which decides, and publishes its motions.
     """
 
     KERNELS = ('needle_controller.compiled.steering', 'needle_dynamics.compiled.cut:insert')
@@ -76,7 +81,7 @@ class SteeringNode(CompiledNode):
             self.declare_settings(prefix, defaults_of(prefix, preset), names)
 
         self._loop: OuterLoop | None = None
-        #: What was last said of the tip.
+        #: The expected tip that was published last.
         self._told: TipEstimate | None = None
         self._measurers = Publishers(self, contract.MEASURER, self._watch)
         self._trajectory = self.publisher(contract.JOINT_TRAJECTORY)
@@ -87,14 +92,15 @@ class SteeringNode(CompiledNode):
         ):
             self.listen(topic, self._passing(take), self._watch)
         self.subscribe(contract.TARGET, self._on_target)
+        self.subscribe(contract.DIAGNOSTICS, self._on_diagnostics)
         self.create_service(Trigger, '~/stop', self._on_stop)
-        #: A clock that stands still or jumps does not stop the watch.
+        #: A clock that stands still or jumps does not stop the checks.
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
 
     # Transitions.
 
     def configure(self) -> None:
-        """Make the loop from the parameters."""
+        """Create the loop from the parameters."""
         preset, values = self.text('model.preset', tuple(NEEDLES)), self.values()
 
         def given(prefix: str, names: Collection[str]) -> dict[str, Any]:
@@ -106,20 +112,21 @@ class SteeringNode(CompiledNode):
         belief = self.settings('belief.', SteeringBelief)
         # Compile, or load what was compiled, before anything moves; and refuse what cannot be.
         SteeringModel(needle, steering, [0.0, 1e-3], belief)
-        self._loop = OuterLoop(needle, steering, belief, self.settings('', OuterLoopSettings))
+        settings = self.settings('', OuterLoopSettings)
+        self._loop = OuterLoop(needle, steering, belief, settings, start=ThreadJob)
 
     def cleanup(self) -> None:
-        """Forget the loop."""
+        """Discard the loop."""
         self._loop = self._told = None
 
     def activate(self) -> None:
-        """Begin to listen, and to watch for what does not come."""
+        """Begin to listen, and to check for missing inputs."""
         self._timer = self.create_timer(_WATCH, self._watch, clock=self._steady)
 
     def deactivate(self) -> None:
         """Bring needle and guide to rest."""
         if self._loop is not None:
-            self._act(self._loop.stop('the node was deactivated'))
+            self._act(self._loop.stop('the node was deactivated', self.now()))
         self.destroy_timer(self._timer)
 
     def about(self) -> str:
@@ -132,12 +139,12 @@ class SteeringNode(CompiledNode):
             f'{contract.TIP_EXPECTED.name}'
         )
 
-    # What comes in.
+    # Inputs.
 
     def _passing(
         self, take: Callable[[OuterLoop, Reading, int], Move | None]
     ) -> Callable[[Reading], None]:
-        """Return what passes a reading on, and does what comes of it."""
+        """Return a callback that passes a measurement on, and publishes the motion."""
 
         def on_reading(reading: Reading) -> None:
             if self._loop is not None and self.is_active:
@@ -146,37 +153,54 @@ class SteeringNode(CompiledNode):
         return on_reading
 
     def _on_target(self, message: PointStamped) -> None:
+        stamp = nanoseconds(message.header.stamp)
         if self._loop is None or not self.is_active:
-            self.get_logger().error(
-                'target refused: the node is not active', throttle_duration_sec=1.0
-            )
+            why = 'the node is not active'
+            self.get_logger().error(f'target rejected: {why}', throttle_duration_sec=1.0)
+            if self._loop is not None:
+                self._loop.requests.answer(contract.TARGET, stamp, Verdict.REJECTED, why)
+                self._act(None)
             return
         header, point = message.header, message.point
         at = (point.x, point.y, point.z)
-        stamp = nanoseconds(header.stamp)
         self._act(self._loop.target(stamp, header.frame_id, at, self.now()))
 
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        """Pass the answers of other nodes to the motions on."""
+        if self._loop is None or not self.is_active:
+            return
+        for status in message.status:
+            values = {one.key: one.value for one in status.values}
+            answers = RequestStatus.from_values(values)
+            if answers.takes:
+                node = printable(status.name.rpartition('/')[2])
+                self._act(self._loop.hear(node, answers, self.now()))
+
     def _on_stop(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        if self._loop is not None and self._loop.steers:
-            self._act(self._loop.stop('~/stop'))
+        loop = self._loop
+        if loop is not None and loop.steers:
             response.message = 'stopped; retract the needle before the next target'
+        elif loop is not None and loop.busy:
+            response.message = 'planning cancelled'
         else:
-            response.message = 'nothing was under way'
+            response.message = 'no insertion is under way'
+        if loop is not None:
+            self._act(loop.stop('~/stop', self.now()))
         response.success = True
         return response
 
     def _watch(self, _came: int = 0) -> None:
-        """Look for what does not come, and who publishes what there may be one source of."""
+        """Check for missing inputs, for duplicate publishers, and for a plan that is computed."""
         if self._loop is None or not self.is_active:
             return
         count = self._measurers.count
         self._loop.count_publishers(count(contract.JOINT_STATES), count(contract.TIP_DEFLECTION))
         self._act(self._loop.watch(self.now()))
 
-    # What goes out.
+    # Outputs.
 
     def _act(self, move: Move | None) -> None:
-        """Publish a motion, and what there is to say."""
+        """Publish a motion, the expected tip, lines for the log and answers to requests."""
         loop = self._loop
         if loop is None:
             return
@@ -187,10 +211,13 @@ class SteeringNode(CompiledNode):
             if loop.expected is not None:
                 self._tell_tip(loop.expected, loop.depth)
         self.tell(loop.journal)
+        if loop.requests.due():
+            self.publish_diagnostics()
 
     def _message(self, move: Move) -> JointTrajectory:
         message = JointTrajectory(joint_names=list(move.joints))
-        message.header.stamp = self.get_clock().now().to_msg()
+        stamp = message.header.stamp
+        stamp.sec, stamp.nanosec = divmod(move.stamp, NANOSECONDS)
         rows = zip(move.times.tolist(), move.positions, move.velocities, strict=True)
         for time, positions, velocities in rows:
             whole, part = divmod(round(time * NANOSECONDS), NANOSECONDS)
@@ -216,9 +243,12 @@ class SteeringNode(CompiledNode):
         self._tip_expected.publish(message)
 
     def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
-        """Say what it does, what it expects and what is wrong."""
-        if self._loop is None or not self.is_active:
+        """Report the state, the expected tip and faults."""
+        if self._loop is None:
             return super().diagnose()
+        if not self.is_active:
+            level, state, _ = super().diagnose()
+            return level, state, self._loop.requests.status().to_values()
         severity, state, values = self._loop.diagnose(self.now())
         return severity.level, state, values
 

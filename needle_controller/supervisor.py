@@ -20,9 +20,10 @@ from needle_controller.safety.pace import Pace
 from needle_controller.safety.safety import Safety
 from needle_controller.safety.stream import REPEATED
 from needle_dynamics import euler_loads, NeedleModel, NeedleParameters
-from needle_ros.contract import BASE
-from needle_ros.errors import NeedleError, ParameterError
+from needle_ros.contract import BASE, ENTRY, INSERTION, JOINT_TRAJECTORY, TARGET, Topic
+from needle_ros.errors import JobError, NeedleError, ParameterError
 from needle_ros.journal import Journal, Severity
+from needle_ros.status import RequestLog, Verdict
 from needle_ros.timing import NANOSECONDS
 from needle_ros.trajectories import joint_values, MOST_POINTS
 from needle_ros.wire import Reading
@@ -51,6 +52,8 @@ class Supervisor:
     ----------
     journal : Journal
         What there is to say.
+    requests : RequestLog
+        Targets and trajectories, and the answers to them.
     safety : Safety
         Inputs, limits and the stop.
     controller : Controller or None
@@ -65,7 +68,9 @@ class Supervisor:
     """
 
     def __init__(self, steady: Callable[[], float] = monotonic) -> None:
+        self._steady = steady
         self.journal = Journal(steady)
+        self.receive(targets=True)
         self.safety = Safety(SafetyLimits(), ControllerSettings(), NeedleParameters())
         self.retract_depth = 0.0
         self.fault: str | None = None
@@ -219,8 +224,9 @@ class Supervisor:
         return self._command(Answer(now))
 
     def _begin(self, now: int) -> None:
-        """Know nothing of what was measured."""
+        """Forget all measurements and requests."""
         self.safety.begin(now)
+        self.requests.forget()
         self.bending.forget()
         if self._robot is not None:
             self._robot.begin()
@@ -233,13 +239,27 @@ class Supervisor:
         self._begin(now)
         return self._let_go(f'clock went back by {back:.3f} s', now)
 
-    # Wishes of the user.
+    # Requests.
+
+    def receive(self, *, targets: bool) -> None:
+        """
+        Begin to take requests.
+
+        Parameters
+        ----------
+        targets : bool
+            Whether a target is one for this controller; else only trajectories are.
+
+        """
+        moved = (INSERTION,)
+        takes = {TARGET: moved, JOINT_TRAJECTORY: moved} if targets else {JOINT_TRAJECTORY: moved}
+        self.requests = RequestLog(takes, ('', ENTRY), self._steady)
 
     def target(
         self, stamp: int, frame: str, depth: float, deflection: float, now: int
     ) -> Answer | None:
         """
-        Take an inserted length to reach [m]; a wanted deflection [m] is ignored.
+        Take a target: an insertion depth to reach [m]; a target deflection [m] is ignored.
 
         Parameters
         ----------
@@ -248,7 +268,7 @@ class Supervisor:
         frame : str
             Its frame.
         depth, deflection : float
-            Inserted length and deflection that are wanted [m].
+            Insertion depth and deflection [m].
         now : int
             Time [ns].
 
@@ -265,11 +285,11 @@ class Supervisor:
                 self._deflection_ignored = True
                 self.journal.say(
                     Severity.WARNING,
-                    f'wanted deflection {deflection:g} m is ignored: force and torque at the '
+                    f'target deflection {deflection:g} m is ignored: force and torque at the '
                     'base cannot reach it; the depth is taken',
                 )
 
-        return self._wish('target', stamp, frame, now, aim)
+        return self._request(TARGET, stamp, frame, now, aim)
 
     def trajectory(
         self,
@@ -306,29 +326,32 @@ class Supervisor:
             if len(times) > MOST_POINTS:
                 raise ParameterError(f'a path may have at most {MOST_POINTS} points')
             lengths, rates = (
-                [one for one in joint_values('insertion', joints, values) if one is not None]
+                [one for one in joint_values(INSERTION, joints, values) if one is not None]
                 for values in (positions, velocities)
             )
             controller.follow(times, lengths, rates or None)
 
-        return self._wish('joint_trajectory', stamp, frame, now, follow)
+        return self._request(JOINT_TRAJECTORY, stamp, frame, now, follow)
 
-    def _wish(
-        self, name: str, stamp: int, frame: str, now: int, act: Callable[[Controller], None]
+    def _request(
+        self, topic: Topic, stamp: int, frame: str, now: int, act: Callable[[Controller], None]
     ) -> Answer | None:
-        """Do what the user wants if it counts; say why if it does not."""
-        if self._active is None:
-            self.journal.refuse(f'{name} refused: the controller is not active')
-            return None
-        answer = self._check_clock(now)
-        refusal = self.safety.streams[name].check(stamp, now, frame)
-        if refusal is None:
-            try:
-                act(self._active)
-            except ParameterError as error:
-                self.journal.refuse(f'{name} refused: {error}')
-        elif not refusal.harmless:
-            self.journal.refuse(f'{name} refused: {refusal.line}')
+        """Execute a request if it is new and valid, and acknowledge it."""
+        answer = self._check_clock(now) if self._active is not None else None
+        known = self.requests.check(topic, stamp, now, frame, (INSERTION,))
+        if known is not None:
+            if known.verdict is Verdict.REJECTED:
+                self.journal.refuse(f'{topic.name} rejected: {known.reason}')
+            return answer
+        verdict, reason = Verdict.ACCEPTED, ''
+        try:
+            if self._active is None:
+                raise JobError('the controller is not active')
+            act(self._active)
+        except (JobError, ParameterError) as error:
+            verdict, reason = Verdict.REJECTED, str(error)
+            self.journal.refuse(f'{topic.name} rejected: {reason}')
+        self.requests.answer(topic, stamp, verdict, reason, (INSERTION,))
         return answer
 
     def emergency_stop(self, now: int) -> Reply:
@@ -346,6 +369,7 @@ class Supervisor:
             Success, and zero force.
 
         """
+        self.requests.supersede(now)
         answer = self._stop_for('emergency stop', now)
         return Reply(True, 'stopped; ~/clear_stop releases', answer)
 
@@ -375,7 +399,7 @@ class Supervisor:
         self.fault = _WAITING
         self.bending.forget()
         self.journal.say(Severity.INFO, 'the stop is cleared')
-        return Reply(True, 'cleared; the motion starts anew', answer)
+        return Reply(True, 'cleared; the motion starts again', answer)
 
     def pause(self, hold: bool) -> Reply:
         """
@@ -399,11 +423,25 @@ class Supervisor:
         self.journal.say(Severity.INFO)
         return Reply(True, 'paused' if hold else 'resumed')
 
-    def retract(self) -> Reply:
-        """Go to `retract_depth`."""
+    def retract(self, now: int) -> Reply:
+        """
+        Go to `retract_depth`.
+
+        Parameters
+        ----------
+        now : int
+            Time [ns].
+
+        Returns
+        -------
+        Reply
+            Refused during a stop, and unless the controller is active.
+
+        """
         if self._active is None or self.safety.stop is not None:
             why = 'stopped; ~/clear_stop releases' if self.safety.stop else 'not active'
             return Reply(False, f'retract refused: the controller is {why}')
+        self.requests.supersede(now)
         self._active.guide.resume()
         self._active.set_target(self.retract_depth)
         return Reply(True, f'goes to {self.retract_depth:g} m')
@@ -705,6 +743,7 @@ class Supervisor:
 
         """
         values: dict[str, object] = {}
+        paused = self._active is not None and self._active.guide.paused
         if self.controller is not None:
             control = self.controller
             name, limit = max(
@@ -713,7 +752,6 @@ class Supervisor:
             values = {
                 'target [m]': control.target,
                 'law': control.law,
-                'paused': control.guide.paused,
                 'least stable axis': name,
                 'spectral radius': f'{limit.radius:.9g} (at most {limit.bound:.9g})',
             }
@@ -725,6 +763,7 @@ class Supervisor:
             'inputs refused': self.journal.refused,
             'last complaint': self.journal.complaint,
             **self.safety.describe(now),
+            **self.requests.status(paused=paused).to_values(),
         }
         if self.safety.stop is not None:
             return Severity.ERROR, f'{self.safety.stop}; ~/clear_stop releases', values

@@ -18,6 +18,7 @@ from geometry_msgs.msg import Point, Pose, PoseArray, Quaternion, TransformStamp
 from needle_dynamics.model_node import ModelNode
 from needle_dynamics.simulated.assembly import defaults_of, LARGEST_SEED, MODES, SETTINGS
 from needle_dynamics.simulated.faults import Fault, FaultParameters, FAULTS, FAULTY
+from needle_dynamics.simulated.indenter import JOINTS as PRESS_JOINTS
 from needle_dynamics.simulated.measured import Outline
 from needle_dynamics.simulated.run import Event, PARAMETERS, PlantRun, RESET, TARE, TRAJECTORY
 from needle_ros import contract
@@ -25,7 +26,8 @@ from needle_ros.errors import JobError, MessageError, NeedleError, ParameterErro
 from needle_ros.publishers_node import offer_lease, Publishers
 from needle_ros.run_node import run
 from needle_ros.sample_clock import SampleClock
-from needle_ros.timing import NANOSECONDS, RateCounter, seconds
+from needle_ros.status import RequestLog, Verdict
+from needle_ros.timing import NANOSECONDS, nanoseconds, RateCounter, seconds
 from needle_ros.trajectories import MOST_POINTS
 from needle_ros.wire import Reading
 from rcl_interfaces.msg import IntegerRange, ParameterDescriptor
@@ -50,6 +52,15 @@ _NO_FAULT = 'none'
 #: Pictures of the needle per second, and width of its line and of that of its path [m].
 _PICTURES = 30.0
 _WIDTH, _PATH_WIDTH = 1e-3, 5e-4
+
+
+def _moved_joints(mode: str, *, steered: bool) -> tuple[str, ...]:
+    """Return the joints that follow trajectories."""
+    if mode == 'indenter':
+        return PRESS_JOINTS
+    insertion = (contract.INSERTION,) if mode == 'robot' else ()
+    guide = tuple(joint.name for joint in contract.STEERING_JOINTS) if steered else ()
+    return (*insertion, *guide)
 
 
 def _message(stamp: int) -> TimeMessage:
@@ -162,6 +173,9 @@ class PlantNode(ModelNode):
         self._looks = 0
         self._sampled = self._made_up = self._saturated = 0
         self._refused_trajectories = 0
+        #: Joints that follow trajectories, and the answers to these.
+        self._moved: tuple[str, ...] = ()
+        self._requests = RequestLog({})
         #: By a steady clock.
         self._command_rate, self._sample_rate = RateCounter(), RateCounter()
 
@@ -258,6 +272,8 @@ class PlantNode(ModelNode):
         if mode != 'simulation' or constants.steered:
             # There `insertion` is the reference of a controller.
             self._trajectories = self.subscribe(contract.JOINT_TRAJECTORY, self._on_trajectory)
+            self._moved = _moved_joints(mode, steered=constants.steered)
+            self._requests = RequestLog({contract.JOINT_TRAJECTORY: self._moved})
 
     def _offer_tf(self, mode: str) -> Publisher:
         """Offer transforms, or say why not; no wheel has their message."""
@@ -290,7 +306,7 @@ class PlantNode(ModelNode):
             self._tf = None
         if self._trajectories is not None:
             self.destroy_subscription(self._trajectories)
-            self._trajectories = None
+            self._trajectories, self._moved, self._requests = None, (), RequestLog({})
 
     def change(self, changes: Mapping[str, Any]) -> None:
         """Go on with other friction, or another fault; the state stays."""
@@ -378,24 +394,49 @@ class PlantNode(ModelNode):
         return self._commands.get_publisher_count(), self._joint_commands.get_publisher_count()
 
     def _on_trajectory(self, message: JointTrajectory) -> None:
-        try:
-            if self._run is None:
-                raise ParameterError('the plant is not configured')
-            points = message.points[: MOST_POINTS + 1]
-            if len(points) > MOST_POINTS:
-                raise ParameterError(f'a path may have at most {MOST_POINTS} points')
-            content = {
-                'joints': list(message.joint_names),
-                'times': [seconds(point.time_from_start) for point in points],
-                'positions': [list(point.positions) for point in points],
-                'efforts': [list(point.effort) for point in points],
-            }
-            self._run.perform(Event(TRAJECTORY, content))
-        except ParameterError as error:
-            self._refused_trajectories += 1
-            self.get_logger().error(
-                printable(f'joint_trajectory: {error}'), throttle_duration_sec=1.0
-            )
+        """Execute a trajectory if it is new and valid, and acknowledge it."""
+        stamp = nanoseconds(message.header.stamp)
+        # In mode `simulation` the insertion is for the controller.
+        moved = [name for name in message.joint_names if name in self._moved]
+        now = self._time.simulated(self.now()) if self.is_active else stamp
+        known = self._requests.check(contract.JOINT_TRAJECTORY, stamp, now, '', moved)
+        if known is not None:
+            if known.verdict is Verdict.REJECTED:
+                self._reject(known.reason)
+        else:
+            verdict, reason = Verdict.ACCEPTED, ''
+            try:
+                self._follow(message)
+            except ParameterError as error:
+                verdict, reason = Verdict.REJECTED, str(error)
+                self._reject(reason)
+            self._requests.answer(contract.JOINT_TRAJECTORY, stamp, verdict, reason, moved)
+        self._publish_answers()
+
+    def _follow(self, message: JointTrajectory) -> None:
+        if self._run is None:
+            raise ParameterError('the plant is not configured')
+        points = message.points[: MOST_POINTS + 1]
+        if len(points) > MOST_POINTS:
+            raise ParameterError(f'a path may have at most {MOST_POINTS} points')
+        content = {
+            'joints': list(message.joint_names),
+            'times': [seconds(point.time_from_start) for point in points],
+            'positions': [list(point.positions) for point in points],
+            'efforts': [list(point.effort) for point in points],
+        }
+        self._run.perform(Event(TRAJECTORY, content))
+
+    def _reject(self, reason: str) -> None:
+        self._refused_trajectories += 1
+        self.get_logger().error(
+            printable(f'joint_trajectory rejected: {reason}'), throttle_duration_sec=1.0
+        )
+
+    def _publish_answers(self) -> None:
+        """Publish answers to requests that no status contains yet."""
+        if self._requests.due():
+            self.publish_diagnostics()
 
     # Services.
 
@@ -438,6 +479,7 @@ class PlantNode(ModelNode):
     def _on_reset(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         def reset(plant_run: PlantRun) -> str:
             plant_run.perform(Event(RESET))
+            self._requests.supersede(self._time.simulated(self.now()))
             self._halted = None
             self._set_fault({})
             return 'needle and noise are reset; time continues'
@@ -462,6 +504,7 @@ class PlantNode(ModelNode):
         if self._run is None:
             return
         self._look_who_commands()
+        self._publish_answers()
         self._looks = self._looks + 1 if self._time.awaited is not None else 0
         if self._looks and self._looks % _REPEAT == 0 and not self._time.paused:
             stamp, (topic, _, values) = self._last
@@ -599,6 +642,7 @@ class PlantNode(ModelNode):
             'commands too old': given.stale,
             'commands overtaken': given.overtaken,
             'saturated readings': self._saturated,
+            **self._requests.status().to_values(),
         }
         if not self.is_active:
             return *super().diagnose()[:2], values

@@ -3,24 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-import time
 from typing import Any, Final, Protocol
 
-#: Time that a node has to answer [s].
-ANSWER_TIME: Final = 5.0
+from needle_ros.status import no_answer
 
 #: Parameters that a running plant can change; it cannot change the others.
 _COEFFICIENTS: Final = ('model.coulomb_friction', 'model.viscous_friction')
 
 
 class Answer(Protocol):
-    """The answer of a node to a SetParameters request, now or later."""
+    """The answer of a node to a SetParameters request, a future."""
 
     def done(self) -> bool:
-        """Return whether it has come."""
+        """Return whether it was received, or the call has failed."""
 
     def result(self) -> Any:
-        """Return the response."""
+        """Return the response; None if the call has failed."""
 
 
 class Application:
@@ -40,14 +38,12 @@ class Application:
         self, values: Mapping[str, float | str], answers: Mapping[str, Answer | None]
     ) -> None:
         self._values, self._answers = values, answers
-        self._deadline = time.monotonic() + ANSWER_TIME
         self._needed = [name for name in _COEFFICIENTS if name in values] or list(values)
 
     @property
     def is_over(self) -> bool:
-        """Whether all nodes have answered or time is up."""
-        done = all(answer is None or answer.done() for answer in self._answers.values())
-        return done or time.monotonic() > self._deadline
+        """Whether all calls are answered or have failed."""
+        return all(answer is None or answer.done() for answer in self._answers.values())
 
     def outcome(self) -> tuple[bool, str]:
         """
@@ -68,9 +64,10 @@ class Application:
     def _of_node(self, node: str, answer: Answer | None) -> tuple[bool | None, str]:
         if answer is None:
             return None, f'{node}: no such node'
-        if not answer.done():
-            return False, f'{node}: no answer within {ANSWER_TIME:g} s'
-        results = dict(zip(self._values, answer.result().results, strict=True))
+        response = answer.result()
+        if response is None:
+            return False, no_answer(f'{node}/set_parameters')
+        results = dict(zip(self._values, response.results, strict=True))
         taken = [name for name, result in results.items() if result.successful]
         words = [f'{name} = {_brief(self._values[name])}' for name in taken]
         words += [

@@ -9,7 +9,7 @@ import sys
 from typing import Any, ClassVar, Final
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from needle_identification.application import ANSWER_TIME, Application
+from needle_identification.application import Application
 from needle_identification.estimation.estimate import Statistic, statistic
 from needle_identification.friction.identify import identify_friction
 from needle_identification.friction.live import LiveFriction
@@ -29,14 +29,13 @@ from needle_identification.stiffness.settings import StiffnessSettings
 from needle_identification.stiffness.summary import summarize_stiffness
 from needle_ros import contract
 from needle_ros.base_node import BaseNode
+from needle_ros.calls_node import Calls
 from needle_ros.errors import NeedleError, ParameterError
 from needle_ros.run_node import run
 from needle_ros.settings import check_constants, constant
 from needle_ros.wire import Reading
 from rcl_interfaces.srv import SetParameters
 from rclpy.client import Client
-from rclpy.clock import Clock
-from rclpy.clock_type import ClockType
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 from rclpy.service import Service
@@ -105,13 +104,11 @@ class IdentificationNode(BaseNode):
         self._live: LiveFriction | None = None
         self._applications: list[tuple[Application, Trigger.Response, Future]] = []
         self._setters: dict[str, Client] = {}
+        self._calls = Calls(self)
         self._friction = self.publisher(contract.FRICTION, always=True)
         self._stiffness = self.publisher(contract.STIFFNESS, always=True)
         self.create_service(Trigger, '~/identify', self._on_identify)
         _answer_later(self.create_service(Trigger, '~/apply', self._on_apply))
-        # A simulation that pauses must not keep a caller waiting.
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(ANSWER_TIME / 10.0, self._answer_applications, clock=steady)
 
     # Transitions.
 
@@ -137,6 +134,7 @@ class IdentificationNode(BaseNode):
 
     def cleanup(self) -> None:
         """Disconnect from the nodes that results are applied to."""
+        self._calls.abandon()
         for client in self._setters.values():
             self.destroy_client(client)
         self._setters.clear()
@@ -302,7 +300,7 @@ class IdentificationNode(BaseNode):
             ]
         )
         answers = {
-            name: client.call_async(request) if client.service_is_ready() else None
+            name: self._calls.call(client, request) if client.service_is_ready() else None
             for name, client in self._setters.items()
         }
         later = Future()
@@ -314,7 +312,7 @@ class IdentificationNode(BaseNode):
         return later
 
     def _answer_applications(self) -> None:
-        """Answer those calls of ``~/apply`` that are complete or have waited long enough."""
+        """Answer those calls of ``~/apply`` of which all calls are answered or have failed."""
         over = [one for one in self._applications if one[0].is_over]
         for one in over:
             self._applications.remove(one)

@@ -67,6 +67,8 @@ class RecorderNode(BaseNode):
         self.declare_text('compression', 'zstd', f'one of {", ".join(COMPRESSIONS)}')
         self._bag: BagWriter | None = None
         self._recordings = 0
+        #: Outcome of the latest recording.
+        self._result = 'not recording'
         self._recorded: dict[str, _Recorded] = {}
         self._left_out: set[str] = set()
         #: Number of the newest message of each topic, by its publisher.
@@ -118,21 +120,23 @@ class RecorderNode(BaseNode):
     # Services.
 
     def _on_start(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        """Begin to record; a repeated request changes nothing."""
         try:
-            if self._bag is not None or not self.is_active:
-                raise RecordingError('recording already' if self._bag else 'not active')
-            self._begin()
+            if not self.is_active:
+                raise RecordingError('not active')
+            if self._bag is None:
+                self._begin()
             response.success, response.message = True, self.diagnose()[1]
         except RecordingError as error:
             response.message = str(error)
         return response
 
     def _on_stop(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        if self._bag is None:
-            response.message = 'not recording'
-        else:
-            response.message = self._end(self._bag)
-            response.success = self.failure is None
+        """Complete the bag; a repeated request is answered as the first one."""
+        if self._bag is not None:
+            self._result = self._end(self._bag)
+        response.success = self.failure is None
+        response.message = self.failure or self._result
         return response
 
     # Recording.

@@ -8,6 +8,7 @@ along the needle are positive into the tissue. Stamps are sample times.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from enum import Enum
 from typing import Final, NamedTuple
 
 from needle_ros.wire import JOINT_STATE, POINT, POSE, Template, WRENCH
@@ -61,6 +62,31 @@ class Qos(NamedTuple):
     depth: int
     lossy: bool = False
     lease: float = 0.0
+
+
+class Stamp(Enum):
+    """
+    Meaning of the stamp of a message, which decides whether its age matters.
+
+    Every node checks stamps by this: `needle_controller.safety.stream.Stream` those of samples,
+    `needle_ros.status.RequestLog` those of requests.
+    """
+
+    #: Time of a sample, or of the sample that a command answers. It counts for a short time only,
+    #: which is a parameter of the reader (``measurement_timeout``, ``sensor_timeout``,
+    #: ``command_timeout``); a message that is older or out of order is left out.
+    SAMPLE = 'sample'
+    #: Time at which the request was sent. It identifies the request and orders it: a duplicate is
+    #: answered but not executed again, one that is older than the request that is followed is not
+    #: executed. It counts for `REQUEST_AGE`. Zero means now.
+    REQUEST = 'request'
+    #: Not checked: the message is a result, or for people.
+    UNCHECKED = 'unchecked'
+
+
+#: Age up to which a request counts [s]: three repetitions, a second apart, and a delay of a second
+#: are within it; a request of a recording that is played back is not.
+REQUEST_AGE: Final = 5.0
 
 
 #: A reader with default settings gets it; for our nodes a late sample is worth no second try. A
@@ -147,6 +173,8 @@ class Topic:
         Frame of the header, '' if it has none.
     joints : tuple of Joint
         Joints of a JointState.
+    stamp : Stamp
+        Whether the age of its stamp matters.
 
     """
 
@@ -157,6 +185,7 @@ class Topic:
     qos: Qos = SENSOR
     frame: str = ''
     joints: tuple[Joint, ...] = ()
+    stamp: Stamp = Stamp.UNCHECKED
 
     @property
     def quantities(self) -> tuple[Quantity, ...]:
@@ -196,6 +225,7 @@ JOINT_STATES: Final = Topic(
     'on the needle; steered: `insertion`, `guide_x`, `guide_z` [m], `guide_tilt_x`, '
     '`guide_tilt_z`, `roll` [rad]',
     joints=(Joint(INSERTION, 'm', 'N'), Joint(ROTATION, 'rad', 'N m')),
+    stamp=Stamp.SAMPLE,
 )
 
 #: The joints beside `insertion` of a needle that is steered.
@@ -225,6 +255,7 @@ BASE_WRENCH: Final = Topic(
     'force sensor, what the base exerts on the needle: `force.y` axial, `force.z` lateral '
     '[N], `torque.x` [N m]; mode `indenter`: force of the end-effector on the tissue',
     frame=BASE,
+    stamp=Stamp.SAMPLE,
 )
 
 TIP_DEFLECTION: Final = Topic(
@@ -234,6 +265,7 @@ TIP_DEFLECTION: Final = Topic(
     'tracker or imager: `point.y` inserted length, `point.z` deflection of the tip [m]; '
     'steered: `point.x` too',
     frame=ENTRY,
+    stamp=Stamp.SAMPLE,
 )
 
 GROUND_TRUTH: Final = Topic(
@@ -244,6 +276,7 @@ GROUND_TRUTH: Final = Topic(
     'steered: d, `tip_x`, `tip_z` [m], `tip_roll` [rad]; effort, in mode `simulation`: '
     'generalized forces that were applied since the sample before',
     joints=(Joint('d', 'm'), Joint('theta', 'rad'), Joint('q1', 'm^1.5'), Joint('q2', 'm^1.5')),
+    stamp=Stamp.SAMPLE,
 )
 
 
@@ -346,6 +379,7 @@ WRENCH_COMMAND: Final = Topic(
     'of the sample it answers',
     qos=COMMAND,
     frame=BASE,
+    stamp=Stamp.SAMPLE,
 )
 
 JOINT_COMMANDS: Final = Topic(
@@ -357,6 +391,7 @@ JOINT_COMMANDS: Final = Topic(
     'in both modes: guide and roll: [howto/ros2-control.md](howto/ros2-control.md)',
     qos=COMMAND,
     joints=(Joint(INSERTION, 'm', 'N'), Joint(ROTATION, 'rad', 'N m')),
+    stamp=Stamp.SAMPLE,
 )
 
 COMMANDER: Final = Topic(
@@ -398,6 +433,7 @@ TARGET: Final = Topic(
     'x, y, z [m]',
     qos=COMMAND,
     frame=ENTRY,
+    stamp=Stamp.REQUEST,
 )
 
 TIP_EXPECTED: Final = Topic(
@@ -429,6 +465,7 @@ JOINT_TRAJECTORY: Final = Topic(
     'steered, in both modes: guide and roll [m, rad]; in mode `indenter`: efforts of `x` and '
     '`z` [N]',
     qos=COMMAND,
+    stamp=Stamp.REQUEST,
 )
 
 ROBOT_DESCRIPTION: Final = Topic(

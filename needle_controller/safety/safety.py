@@ -76,7 +76,7 @@ class Safety:
         self.guard = Guard(limits, settings.depths(parameters))
         self.saturation = RateCounter()
         noise = noise or {}
-        timeout, base = limits.sensor_timeout, ('', 'needle_entry')
+        timeout = limits.sensor_timeout
         # A stamp that is ahead would make those of the true source late.
         ahead = 1.0 / settings.rate
         self.streams = {
@@ -94,8 +94,6 @@ class Safety:
                     jumps=(limits.tip_jump,), noise=noise.get('tip_deflection', ()),
                     ahead=ahead,
                 ),
-                Stream('target', timeout, frames=base, stamped=False),
-                Stream('joint_trajectory', timeout, frames=base, stamped=False),
             )
         }  # fmt: skip
         self._expected = expected

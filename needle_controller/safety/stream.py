@@ -45,8 +45,6 @@ class Stream:
         Age from which a message no longer counts [s]; also how far its stamp may be ahead.
     frames : sequence of str
         Valid frames; none: any.
-    stamped : bool
-        False if a stamp of zero means now.
     jumps : sequence of float
         Change of each value from one message to the next that is not believed.
     noise : sequence of float
@@ -80,7 +78,6 @@ class Stream:
         timeout: float,
         *,
         frames: Sequence[str] = (),
-        stamped: bool = True,
         jumps: Sequence[float] = (),
         noise: Sequence[float] = (),
         ahead: float | None = None,
@@ -90,7 +87,6 @@ class Stream:
         self._ahead = self.timeout if ahead is None else round(ahead * NANOSECONDS) + _ROUNDING
         self.publishers = 1
         self._frames = frames
-        self._stamped = stamped
         self._jumps, self._noise = jumps, noise
         self.counts: Counter[str] = Counter()
         self.window = RateCounter()
@@ -138,10 +134,9 @@ class Stream:
     def _judge(self, stamp: int, now: int, frame: str, values: Sequence[float]) -> Refusal | None:
         if self.publishers > 1:
             return Refusal('disputed', f'{self.publishers} nodes publish {self.name}')
-        if self._stamped or stamp != 0:
-            refusal = self._judge_stamp(stamp, now)
-            if refusal is not None:
-                return refusal
+        refusal = self._judge_stamp(stamp, now)
+        if refusal is not None:
+            return refusal
         if self._frames and frame not in self._frames:
             valid = ' or '.join(map(repr, self._frames))
             return Refusal('frame', f'{self.name} must be in frame {valid}, got {frame!r}')

@@ -25,16 +25,18 @@ _INTERVAL: Final = 0.05
 
 class Move(NamedTuple):
     """
-    A motion, for whoever moves needle and guide.
+    A motion of needle and guide, as a robot or a controller follows it.
 
     Attributes
     ----------
     joints : tuple of str
-        What moves.
+        Names of the joints.
     times : ndarray, shape (n,)
-        Times from now [s].
+        Times from the start [s].
     positions, velocities : ndarray, shape (n, joints)
-        Where to and how fast [m, rad, and these per s].
+        Positions and velocities [m, rad, and these per s].
+    stamp : int
+        Time at which it is sent [ns], which identifies it; 0 until it is sent.
 
     """
 
@@ -42,6 +44,7 @@ class Move(NamedTuple):
     times: FloatArray
     positions: FloatArray
     velocities: FloatArray
+    stamp: int = 0
 
 
 def smooth(joints: tuple[str, ...], begin: FloatArray, end: FloatArray, duration: float) -> Move:

@@ -1,10 +1,10 @@
 """
-The outer loop that steers: look at the tip, move the guide, insert the needle; without ROS.
+The steering executive: plan, measure the tip, move the guide, insert the needle; without ROS.
 
-It asks for motions of needle and guide, whoever makes them: a robot that follows positions, or an
-axis law that turns the insertion into forces. The guide moves while the needle rests, and the
-needle once the guide has arrived: so the path does not depend on how fast either is. If it is
-continuous, the needle goes in without rests, and the guide follows its measured depth.
+It asks for motions of needle and guide, which a robot that follows positions executes, or an axis
+law that turns the insertion into forces. In steps, the guide moves while the needle rests, and
+the needle once the guide has arrived: so the path does not depend on the speed of either. If it
+is continuous, the needle is inserted without rests, and the guide follows its measured depth.
 """
 
 from __future__ import annotations
@@ -24,102 +24,120 @@ from needle_controller.steering.controller import (
     TipEstimate,
 )
 from needle_controller.steering.look import Look, Seen
+from needle_controller.steering.monitor import MotionMonitor
 from needle_controller.steering.motion import duration_of, Move, smooth
+from needle_controller.steering.planning import ComputedJob, Job, Progress, StartJob
 from needle_controller.steering.responses import SteeringModel
 from needle_controller.steering.settings import OuterLoopSettings
-from needle_dynamics.arrays import FloatArray
+from needle_dynamics.arrays import BoolArray, FloatArray
 from needle_dynamics.parameters import NeedleParameters
 from needle_dynamics.steering.parameters import SteeringParameters
-from needle_ros.contract import ENTRY, JOINT_STATES, ROLL, TIP_DEFLECTION
+from needle_ros.contract import ENTRY, INSERTION, JOINT_STATES, ROLL, TARGET, TIP_DEFLECTION
 from needle_ros.errors import JobError, NeedleError, ParameterError
 from needle_ros.journal import Journal, Severity
+from needle_ros.status import RequestLog, RequestStatus, Verdict
 from needle_ros.timing import NANOSECONDS
 from needle_ros.wire import Reading
 import numpy as np
 
-#: Time in which needle and guide come to rest where something is wrong [s].
+#: Time in which needle and guide come to rest after a stop [s].
 _BRAKING: Final = 0.2
 
 #: Time over which the insertion speed is measured [s].
 _SPAN: Final = 0.05
 
-#: Time after which a needle that rests is sent again [s], and how often it is sent.
-_AGAIN, _TRIES = 1.0, 3
+#: Time after which a stop is sent again to a needle that still moves [s], and number of times that
+#: it is sent.
+_STOP_AGAIN, _STOPS = 0.5, 4
 
-#: Changes from one message to the next that are not believed [m, rad].
+#: Changes from one message to the next that are implausible [m, rad].
 _JUMPS: Final = (5e-3, 5e-3, 5e-3, 1.0)
 
-#: How many times the tolerance of a joint at rest one on its way may be off.
+#: Tolerance of a moving joint, as a multiple of its tolerance at rest.
 _LAGGING: Final = 5.0
 
 #: A needle that moves by less while it settles, rests [m].
 _STILL: Final = 1e-4
 
-#: The needle counts as outside tissue up to this depth: there the guide may move at will [m].
+#: The needle counts as outside tissue up to this depth: there the guide may move freely [m].
 _OUTSIDE: Final = 1e-3
 
-#: Depths that are the same [m].
+#: Positions that are the same [m, rad].
 _SAME: Final = 1e-6
 
-#: A plan of so many steps takes some seconds.
+#: Most steps of a plan.
 _MOST_STEPS: Final = 200
 
-#: What to look at when nothing moves.
-_ASKED: Final = 'does what moves it take joint_trajectory?'
-
-#: Readings that scatter so much more than is believed are worth a word.
+#: Noise of the readings of the tip, as a multiple of the configured noise, that is reported.
 _SCATTERED: Final = 3.0
 
 #: Half of an interval of 95 % over the standard deviation.
 _NORMAL: Final = 1.96
 
+_NONE: Final = np.zeros(1)
+
 
 class Phase(Enum):
-    """What the loop does."""
+    """State of the executive; the values are those of the field ``phase`` of its status."""
 
-    IDLE = 'waits for a target'
-    GUIDING = 'the guide moves'
-    INSERTING = 'the needle goes in'
-    LOOKING = 'looks at the tip'
-    DONE = 'is at the target depth'
-    STOPPED = 'has stopped'
+    IDLE = 'idle'
+    PLANNING = 'planning'
+    GUIDING = 'guiding'
+    INSERTING = 'inserting'
+    MEASURING = 'measuring'
+    DONE = 'done'
+    STOPPED = 'stopped'
+
+
+#: Phases for people.
+_DESCRIPTIONS: Final = {
+    Phase.IDLE: 'waits for a target',
+    Phase.PLANNING: 'computes the plan',
+    Phase.GUIDING: 'the guide moves',
+    Phase.INSERTING: 'the needle is inserted',
+    Phase.MEASURING: 'measures the tip',
+}
 
 
 class OuterLoop:
     """
-    Brings the tip to a target in steps, as long as all is well.
+    Execute a steered insertion, and stop it on any fault.
 
     Every event is a method: it takes the time now [ns] of the clock that stamps the messages, and
-    returns how needle and guide shall move because of it; None leaves them to what was asked for
-    last. `journal` has what there is to say.
+    returns a motion of needle and guide to send; None leaves them to the motion that was sent
+    last. A motion is sent again until the joints follow it, see `MotionMonitor`.
 
     Parameters
     ----------
     needle : NeedleParameters
-        Needle and tissue as they are believed.
+        Nominal needle and tissue.
     steering : SteeringParameters
-        What they have beyond.
+        Their constants for steering.
     belief : SteeringBelief
-        How far all that may be wrong.
+        Prior uncertainty of all constants.
     settings : OuterLoopSettings
-        Steps, looks and limits.
+        Steps, tip measurements and limits.
     steady : callable
         As for `Journal`.
+    start : callable
+        Starts the computation of a plan, see `StartJob`.
 
     Attributes
     ----------
     settings : OuterLoopSettings
         As given.
     journal : Journal
-        What there is to say.
+        Lines for the log.
+    requests : RequestLog
+        Targets, and the answers to them.
     phase : Phase
-        What it does.
+        State.
     fault : str
         Why it has stopped, '' if it has not.
     control : SteeringController or None
         The controller of the latest insertion.
     expected : TipEstimate or None
-        Where the tip will be at the target depth; a new one after each look.
+        Expected position of the tip at the target depth; a new one after each measurement.
 
     """
 
@@ -130,71 +148,89 @@ class OuterLoop:
         belief: SteeringBelief,
         settings: OuterLoopSettings,
         steady: Callable[[], float] = monotonic,
+        start: StartJob = ComputedJob,
     ) -> None:
         self._needle, self._steering, self._belief = needle, steering, belief
         self.settings = settings
-        self._steady = steady
         self.journal = Journal(steady)
+        self.requests = RequestLog({TARGET: (INSERTION,)}, ('', ENTRY), steady)
         timeout = settings.measurement_timeout
-        frames = ('', ENTRY)
         self._joint_stream = Stream(JOINT_STATES.name, timeout, jumps=_JUMPS)
-        self._tip_stream = Stream(TIP_DEFLECTION.name, timeout, frames=frames)
-        self._target_stream = Stream('target', timeout, frames=frames, stamped=False)
+        self._tip_stream = Stream(TIP_DEFLECTION.name, timeout, frames=('', ENTRY))
         self.phase, self.fault = Phase.IDLE, ''
         self.control: SteeringController | None = None
         self.expected: TipEstimate | None = None
+        #: The plan that is computed, the target that it is for, and the phase before.
+        self._start_job = start
+        self._job: Job[SteeringController] | None = None
+        self._wanted: tuple[int, tuple[float, float, float], FloatArray] = (
+            0, (0.0, 0.0, 0.0), _NONE,
+        )  # fmt: skip
+        self._before_plan = Phase.IDLE
         self._depths = np.zeros(1)
-        #: Inserted length where the latest insertion began [m].
+        #: Insertion depth where the latest insertion began [m].
         self._begun = 0.0
-        #: Where the joints are, were sent, and when they shall be there.
+        #: Positions of the joints: measured, at the start and at the end of the motion; and the
+        #: time at which it should end [ns].
         self._at: FloatArray | None = None
         self._origin = self._goal = np.zeros(len(settings.joints))
         self._due = 0
-        #: How it was asked to rest, and stamp [ns] and inserted length [m] since then.
-        self._halt: Move | None = None
+        self._monitor = MotionMonitor(settings.joints, settings.tolerances)
+        #: Makes the motion again, from the present positions.
+        self._again: Callable[[int], Move | None] = lambda _now: None
+        #: Stamp of the newest motion [ns]: each has its own.
+        self._stamp = 0
+        #: Positions at which the joints were stopped, stamp [ns] and insertion depth [m] of the
+        #: last check whether they rest, and number of stops that may still be sent.
+        self._halt: FloatArray | None = None
         self._halted: tuple[int, float] | None = None
-        #: Largest deviation of a reading of the tip that was seen [m].
+        self._stops = 0
+        #: Largest deviation of a reading of the tip so far [m].
         self._scatter = 0.0
-        #: Stamp [ns] and inserted length [m] since which the needle rests.
+        #: Stamp [ns] and insertion depth [m] since which the needle rests.
         self._rest: tuple[int, float] | None = None
         self._look: Look | None = None
-        #: Stamps between which readings belong to it [ns].
+        #: Stamps between which readings belong to a measurement at rest [ns].
         self._span = 0, 0
-        #: On the way: looks at the depths, the last depth that was passed, where the guide is
-        #: before and after the next one [m], and when it was sent on, and
-        #: when the needle should have gone some way [ns].
+        #: Continuous: measurements at the depths, the last depth that was passed, positions of the
+        #: guide before and after the next one [m], and when it was sent last [ns].
         self._passing: dict[int, Look] = {}
-        self._passed = self._tries = 0
+        self._passed = 0
         self._between = np.zeros((2, 2))
-        self._sent = self._overdue = 0
-        #: Stamp [ns] and inserted length [m] of some time ago, and insertion speed [m/s].
+        self._sent = 0
+        #: An earlier stamp [ns] and insertion depth [m], and insertion speed [m/s].
         self._before: tuple[int, float] | None = None
         self._speed = 0.0
         self._seen: Seen | None = None
-        #: Depth of the tip less the inserted length, at the first look [m].
+        #: Depth of the tip less the insertion depth, at the first measurement [m].
         self._ahead: float | None = None
         self._warned = False
         self._time = 0
-        #: A plan takes a moment, in which messages wait: when the first look after it was [ns].
-        self._planned: int | None = 0
+        #: Stamp of the latest joint states [ns].
+        self._latest = 0
 
     @property
     def steers(self) -> bool:
         """Whether an insertion is under way."""
-        return self.phase in (Phase.GUIDING, Phase.INSERTING, Phase.LOOKING)
+        return self.phase in (Phase.GUIDING, Phase.INSERTING, Phase.MEASURING)
+
+    @property
+    def busy(self) -> bool:
+        """Whether a plan is being computed: simulated time may wait for it."""
+        return self.phase is Phase.PLANNING
 
     @property
     def depth(self) -> float:
         """Depth of the target of the latest insertion [m]."""
         return float(self._depths[-1])
 
-    # Wishes of the user.
+    # Requests.
 
     def target(
         self, stamp: int, frame: str, point: tuple[float, float, float], now: int
     ) -> Move | None:
         """
-        Begin to steer to a target; while steering to its depth, go on to the new one.
+        Plan an insertion to a target, and begin it; during an insertion, change its target.
 
         Parameters
         ----------
@@ -203,57 +239,76 @@ class OuterLoop:
         frame : str
             Its frame.
         point : tuple of float
-            Where the tip shall be, x, y, z [m].
+            Target of the tip, x, y, z [m].
         now : int
             Time [ns].
 
         Returns
         -------
         Move or None
-            How to move.
+            Motion to send.
 
         """
-        refusal = self._target_stream.check(stamp, now, frame, point)
+        known = self.requests.check(TARGET, stamp, now, frame, (INSERTION,))
+        if known is not None:
+            if known.verdict is Verdict.REJECTED:
+                self.journal.refuse(f'target rejected: {known.reason}')
+            return None
         try:
-            if refusal is not None:
-                raise ParameterError(refusal.line)
+            if not np.isfinite(point).all():
+                raise ParameterError(f'target must be finite, got {list(point)}')
             if self.steers:
                 self._aim(point)
-                return None
-            return self._begin(point, now)
+            else:
+                self._plan(stamp, point, now)
         except NeedleError as error:
-            self.journal.refuse(f'target refused: {error}')
+            self._reject(stamp, error)
             return None
+        if self.phase is not Phase.PLANNING:
+            self.requests.answer(TARGET, stamp, Verdict.ACCEPTED, joints=(INSERTION,))
+            return None
+        self.requests.answer(TARGET, stamp, Verdict.RECEIVED, joints=(INSERTION,))
+        return self._begin_if_planned(now)
+
+    def _reject(self, stamp: int, error: NeedleError) -> None:
+        self.journal.refuse(f'target rejected: {error}')
+        self.requests.answer(TARGET, stamp, Verdict.REJECTED, str(error))
 
     def _aim(self, point: tuple[float, float, float]) -> None:
         depth = self.depth
         if abs(point[1] - depth) > _SAME or self.control is None:
             raise ParameterError(
-                f'it steers to a depth of {1e3 * depth:.2f} mm, got {1e3 * point[1]:.2f} mm; '
-                '~/stop ends that'
+                f'the insertion is to a depth of {1e3 * depth:.2f} mm, got '
+                f'{1e3 * point[1]:.2f} mm; ~/stop ends it'
             )
         self.control.aim((point[0], point[2]))
         self._warned = False
-        self.journal.say(Severity.INFO, f'steers to {_words(point)} from now on')
+        self.journal.say(Severity.INFO, f'target changed to {_words(point)}')
 
-    def _begin(self, point: tuple[float, float, float], now: int) -> Move | None:
-        settings = self.settings
+    def _check_ready(self, now: int) -> FloatArray:
+        """Return the positions of the joints, if an insertion can begin."""
         for stream in (self._joint_stream, self._tip_stream):
             if stream.publishers > 1:
                 raise JobError(f'{stream.publishers} nodes publish {stream.name}')
-            if stream.counted is None or stream.silence(now) > settings.measurement_timeout:
-                raise JobError(f'{stream.name} does not come')
+            timeout = self.settings.measurement_timeout
+            if stream.counted is None or stream.silence(now) > timeout:
+                raise JobError(f'no {stream.name} received within {timeout:g} s')
         if self._at is None:
-            raise JobError('where needle and guide are is not known')
-        if self._at[0] < -_OUTSIDE:
-            raise JobError(f'the needle is {-1e3 * self._at[0]:.2f} mm before the skin')
-        depth = max(0.0, float(self._at[0]))
+            raise JobError('no positions of needle and guide received')
+        return self._at
+
+    def _plan(self, stamp: int, point: tuple[float, float, float], now: int) -> None:
+        """Start to compute a plan."""
+        settings, at = self.settings, self._check_ready(now)
+        if at[0] < -_OUTSIDE:
+            raise JobError(f'the needle is {-1e3 * at[0]:.2f} mm before the skin')
+        depth = max(0.0, float(at[0]))
         if self.control is not None and depth > self._begun + _OUTSIDE:
             raise JobError(
                 f'the needle is at {1e3 * depth:.2f} mm and has been steered; retract it to '
                 f'{1e3 * self._begun:.2f} mm first'
             )
-        off = np.abs(self._at[1:3]).max()
+        off = np.abs(at[1:3]).max()
         begun = self._begun if self.control is not None else 0.0
         if depth > begun + _OUTSIDE and off > settings.guide_tolerance:
             raise JobError(
@@ -268,93 +323,177 @@ class OuterLoop:
         steps = max(1, ceil((point[1] - depth) / settings.step_length - _SAME))
         if steps > _MOST_STEPS:
             raise ParameterError(
-                f'it would take {steps} steps of {1e3 * settings.step_length:g} mm; {_MOST_STEPS} '
-                'may be: make step_length larger'
+                f'it would take {steps} steps of {1e3 * settings.step_length:g} mm, at most '
+                f'{_MOST_STEPS} are possible: increase step_length'
             )
         depths = np.linspace(depth, point[1], steps + 1)
-        asked = self._steady()
-        model = SteeringModel(
-            self._needle,
-            self._steering,
-            depths,
-            self._belief,
-            together=settings.continuous,
-        )
-        roll = float(self._at[3]) if settings.turns else 0.0
-        self.control = SteeringController(
-            model,
-            (point[0], point[2]),
-            settings.guide_limit,
-            settings.turns,
-            settings.load_limit,
-            roll,
-            settings.farthest((point[1] - depth) / steps),
-        )
-        self._planned = None
-        self._depths, self._begun = depths, depth
-        self.expected, self.fault = None, ''
+        roll = float(at[3]) if settings.turns else 0.0
+
+        def work(progress: Progress) -> SteeringController:
+            progress(0, 1)
+            model = SteeringModel(
+                self._needle,
+                self._steering,
+                depths,
+                self._belief,
+                together=settings.continuous,
+            )
+            progress(1, 1)
+            return SteeringController(
+                model,
+                (point[0], point[2]),
+                settings.guide_limit,
+                settings.turns,
+                settings.load_limit,
+                roll,
+                settings.farthest((point[1] - depth) / steps),
+            )
+
+        self._cancel(Verdict.SUPERSEDED, 'a newer target was received')
+        self._wanted = stamp, point, depths
+        self._before_plan, self.phase = self.phase, Phase.PLANNING
+        self._job = self._start_job(work)
+        self.journal.say(Severity.INFO, f'planning to {_words(point)} in {steps} steps')
+
+    def _cancel(self, verdict: Verdict, why: str) -> None:
+        """Cancel the computation of a plan, if there is one."""
+        if self._job is None:
+            return
+        self._job.cancel()
+        self._job, self.phase = None, self._before_plan
+        self.requests.answer(TARGET, self._wanted[0], verdict, why)
+        self.journal.say(Severity.INFO, f'planning cancelled: {why}')
+
+    def _begin_if_planned(self, now: int) -> Move | None:
+        """Begin the insertion once its plan is computed."""
+        job = self._job
+        if job is None or not job.done:
+            return None
+        stamp, point, depths = self._wanted
+        self._job, self.phase = None, self._before_plan
+        try:
+            control, at = job.result(), self._check_ready(now)
+            moved = float(at[0] - depths[0])
+            if at[0] > 0.0 and abs(moved) > self.settings.depth_tolerance:
+                raise JobError(f'the needle has moved by {1e3 * moved:.2f} mm during planning')
+        except NeedleError as error:
+            self._reject(stamp, error)
+            return None
+        self.requests.answer(TARGET, stamp, Verdict.ACCEPTED, joints=(INSERTION,))
+        self.control, self._depths, self._begun = control, depths, float(depths[0])
+        self.expected, self.fault, self._halt = None, '', None
         self._ahead, self._warned, self._scatter = None, False, 0.0
-        self.journal.say(Severity.INFO, f'steers to {_words(point)} in {steps} steps')
-        self._goal = np.array([depth, *self._at[1:]])
+        self.journal.say(
+            Severity.INFO, f'insertion to {_words(point)} in {len(depths) - 1} steps begins'
+        )
+        self._goal = np.array([self._begun, *at[1:]])
         straight = self._goal.copy()
         straight[1:3] = 0.0
-        # Time has gone on since.
-        return self._send(Phase.GUIDING, straight, now + round(1e9 * (self._steady() - asked)))
+        return self._send(Phase.GUIDING, straight, now)
 
-    def stop(self, why: str, silence: float = 0.0) -> Move | None:
+    def stop(self, why: str, now: int, silence: float = 0.0) -> Move | None:
         """
-        End the insertion: needle and guide come to rest where they are.
+        Stop the insertion: needle and guide come to rest at their positions; cancel a plan.
 
         Parameters
         ----------
         why : str
             For people.
+        now : int
+            Time [ns].
         silence : float
-            Age of what is known of where they are [s].
+            Age of the latest positions [s].
 
         Returns
         -------
         Move or None
-            How to move; None if nothing was under way.
+            Motion to send; None if no joint has to be stopped.
 
         """
+        self.requests.supersede(now)
+        self._cancel(Verdict.REJECTED, f'stopped: {why}')
         if not self.steers:
             return None
-        moves = self.phase is not Phase.LOOKING
+        moves = self.phase is not Phase.MEASURING
         self.phase, self.fault, self._look = Phase.STOPPED, why, None
+        self._monitor.forget()
         self.journal.say(Severity.ERROR, f'stopped: {why}')
         if not moves or self._at is None:
             return None
         end, limit = self._at.copy(), self.settings.guide_limit
-        # It cannot rest at once where it is, and what is said of it may be absurd.
+        # It needs a distance to brake, and the positions may be implausible.
         end[0] += (0.5 * _BRAKING + silence) * self.settings.speed
         end[0] = min(max(end[0], self._origin[0]), self._goal[0])
         end[1:3] = np.clip(end[1:3], -limit, limit)
-        joints = self.settings.joints
-        self._halt = Move(joints, np.array([_BRAKING]), end[np.newaxis], np.zeros((1, len(end))))
-        self._halted, self._tries = None, _TRIES
-        return self._halt
+        self._halt, self._halted, self._stops = end, None, _STOPS
+        return self._send_stop(now)
 
-    def _still_moves(self, stamp: int, depth: float) -> Move | None:
-        """Ask a needle to rest again that goes on after a stop."""
+    def _send_stop(self, now: int) -> Move | None:
+        if self._halt is None:
+            return None
+        end, joints = self._halt, self.settings.joints
+        halt = Move(joints, np.array([_BRAKING]), end[np.newaxis], np.zeros((1, len(end))))
+        self._stops -= 1
+        halt = self._stamped(halt, now)
+        self._monitor.forget()
+        self._monitor.stream(halt)
+        return halt
+
+    def _stop_again(self, stamp: int, depth: float, now: int) -> Move | None:
+        """Send the stop again to a needle that still moves."""
         if self._halted is None:
             self._halted = stamp, depth
         since, before = self._halted
-        if self._halt is None or stamp - since < _AGAIN * NANOSECONDS:
+        if self._halt is None or stamp - since < _STOP_AGAIN * NANOSECONDS:
             return None
-        self._halted, halt = (stamp, depth), self._halt
-        self._tries -= 1
-        if abs(depth - before) < _STILL or not self._tries:
+        self._halted = stamp, depth
+        if abs(depth - before) < _STILL:
             self._halt = None
             return None
-        self.journal.say(Severity.ERROR, 'the needle goes on after the stop; it is asked again')
-        return halt
+        if not self._stops:
+            self._halt = None
+            self.journal.say(Severity.ERROR, f'the needle still moves after {_STOPS} stops')
+            return None
+        self.journal.say(
+            Severity.ERROR, 'the needle still moves after the stop; stop command sent again'
+        )
+        return self._send_stop(now)
 
-    # What is measured.
+    def hear(self, node: str, status: RequestStatus, now: int) -> Move | None:
+        """
+        Take the status of another node: its answers to the motions.
+
+        Parameters
+        ----------
+        node : str
+            Its name.
+        status : RequestStatus
+            Its status.
+        now : int
+            Time [ns].
+
+        Returns
+        -------
+        Move or None
+            Motion to send.
+
+        """
+        refusal = self._monitor.hear(node, status)
+        if not refusal:
+            return None
+        if self.steers:
+            return self.stop(refusal, now)
+        # Once: the answer is repeated each second.
+        self._monitor.forget()
+        if self.phase is Phase.STOPPED:
+            self.journal.say(Severity.ERROR, f'the stop failed: {refusal}')
+        return None
+
+    # Measurements.
 
     def joints(self, reading: Reading, now: int) -> Move | None:
         """
-        Take in `joint_states`.
+        Take `joint_states`.
 
         Parameters
         ----------
@@ -366,7 +505,7 @@ class OuterLoop:
         Returns
         -------
         Move or None
-            How to move.
+            Motion to send.
 
         """
         names, (positions, *_) = reading.names, reading.values
@@ -385,17 +524,33 @@ class OuterLoop:
                 self.journal.refuse(f'joint_states refused: {refusal.line}')
             return None
         self._at = np.array(at)
+        elapsed = reading.stamp - self._latest if self._latest else 0
+        self._latest = reading.stamp
         if self.phase is Phase.STOPPED:
-            return self._still_moves(reading.stamp, float(self._at[0]))
+            return self._stop_again(reading.stamp, float(self._at[0]), now)
         if self._astray():
-            return self.stop(self._astray())
+            return self.stop(self._astray(), now)
+        if self.phase is Phase.MEASURING and self._missed():
+            return self.stop(f'during the measurement of the tip {self._missed()}', now)
+        if self.phase not in (Phase.GUIDING, Phase.INSERTING):
+            return None
+        if self._monitor.paused:
+            # A person decides how long.
+            self._due += elapsed
+            self._monitor.wait(elapsed)
+        if self._monitor.is_late(self._at, reading.stamp):
+            return self._repeat(now)
         if self.phase is Phase.INSERTING and self.settings.continuous:
             return self._follow(reading.stamp, now)
-        if self.phase in (Phase.GUIDING, Phase.INSERTING):
-            return self._wait(reading.stamp, now)
-        if self.phase is Phase.LOOKING and self._missed():
-            return self.stop(f'while it looks at the tip {self._missed()}')
-        return None
+        return self._wait(reading.stamp, now)
+
+    def _repeat(self, now: int) -> Move | None:
+        """Send the motion again: the message may have been lost."""
+        failure = f'{self._missed(self._monitor.pending)}: {self._monitor.failure()}'
+        if self._monitor.exhausted:
+            return self.stop(failure, now)
+        self.journal.say(Severity.WARNING, f'{failure}; sent again')
+        return self._again(now)
 
     def _astray(self) -> str:
         """Say which joint has left its way, '' if none has."""
@@ -411,12 +566,13 @@ class OuterLoop:
                 )
         return ''
 
-    def _missed(self) -> str:
-        """Say which joint is not where it was sent, '' if all are."""
+    def _missed(self, which: BoolArray | None = None) -> str:
+        """Name the joints that are not at their goal, '' if all are; of some joints if given."""
         settings, at, goal = self.settings, self._at, self._goal
         if at is None:
             return ''
         far = np.abs(at - goal) > settings.tolerances
+        far = far if which is None else which
         missed = []
         for k, name in enumerate(settings.joints):
             scale, unit = (1.0, 'rad') if name == ROLL else (1e3, 'mm')
@@ -435,21 +591,21 @@ class OuterLoop:
             self._rest = None
             late = (stamp - self._due) / NANOSECONDS
             if late > self.settings.patience:
-                return self.stop(f'{missed}, {late:.1f} s after it should be; {_ASKED}')
+                return self.stop(f'{missed}, {late:.1f} s late', now)
         elif self.phase is Phase.GUIDING and self.control is not None and self.control.step:
             depth = float(self._depths[self.control.step])
             return self._send(Phase.INSERTING, np.array([depth, *self._goal[1:]]), now)
         elif self._rest is None or abs(depth - self._rest[1]) > _STILL:
             self._rest = stamp, depth
         elif stamp - self._rest[0] >= self.settings.settle_time * NANOSECONDS:
-            self.phase = Phase.LOOKING
+            self.phase = Phase.MEASURING
             self._look = Look()
             self._span = stamp, stamp + round(self.settings.look_time * NANOSECONDS)
         return None
 
     def tip(self, reading: Reading, now: int) -> Move | None:
         """
-        Take in `tip_deflection`.
+        Take `tip_deflection`.
 
         Parameters
         ----------
@@ -459,7 +615,7 @@ class OuterLoop:
         Returns
         -------
         Move or None
-            How to move.
+            Motion to send.
 
         """
         tip = reading.values[0]
@@ -484,7 +640,7 @@ class OuterLoop:
 
     def watch(self, now: int) -> Move | None:
         """
-        Look for what does not come, ten times a second or so.
+        Check for missing inputs, and whether a plan is computed; call it ten times a second.
 
         Parameters
         ----------
@@ -494,32 +650,35 @@ class OuterLoop:
         Returns
         -------
         Move or None
-            How to move.
+            Motion to send.
 
         """
         timeout = self.settings.measurement_timeout
         back, self._time = (self._time - now) / NANOSECONDS, now
         if back > timeout:
-            for stream in (self._joint_stream, self._tip_stream, self._target_stream):
+            for stream in (self._joint_stream, self._tip_stream):
                 stream.forget()
-            return self.stop(f'the clock went back by {back:.3f} s')
-        if self._planned is None:
-            self._planned = now
+            self._stamp = 0
+            halt = self.stop(f'the clock went back by {back:.3f} s', now)
+            self.requests.forget()
+            return halt
+        if self.phase is Phase.PLANNING:
+            return self._begin_if_planned(now)
         if not self.steers:
             return None
         for stream in (self._joint_stream, self._tip_stream):
             if stream.publishers > 1:
-                return self.stop(f'{stream.publishers} nodes publish {stream.name}')
-        silence = min(self._joint_stream.silence(now), (now - self._planned) / NANOSECONDS)
+                return self.stop(f'{stream.publishers} nodes publish {stream.name}', now)
+        silence = self._joint_stream.silence(now)
         if silence > timeout:
-            return self.stop(f'no joint_states for {silence:.2f} s', silence)
+            return self.stop(f'no joint_states received within {silence:.2f} s', now, silence)
         if self._look is not None and now > self._span[1] + timeout * NANOSECONDS:
             return self._step(now)
         return None
 
     def count_publishers(self, joint_states: int, tip_deflection: int) -> None:
         """
-        Take note of how many nodes publish what may have one source only.
+        Take the numbers of nodes that publish the measurements: each may have one source only.
 
         Parameters
         ----------
@@ -543,7 +702,7 @@ class OuterLoop:
             self._take(control, self._passing.pop(k - 1, None), k - 1)
             self._take(control, look, k, depth=float(self._at[0]))
         except SteeringFaultError as error:
-            return self.stop(str(error))
+            return self.stop(str(error), now)
         to = self._planned_at(control, k)
         if k == len(self._depths) - 1:
             self.phase = Phase.DONE
@@ -551,8 +710,9 @@ class OuterLoop:
             return None
         if self.settings.continuous:
             self._between = np.array([[0.0, 0.0], [to.x, to.z]])
-            self._tries = _TRIES
-            return self._set_out(now)
+            self._passing, self._passed, self._before, self._speed = {}, 0, None, 0.0
+            self.phase, self._rest, self._sent = Phase.INSERTING, None, 0
+            return self._insert(now, float(self._depths[0]))
         goal = np.array([self._goal[0], to.x, to.z, to.roll])[: len(self._goal)]
         return self._send(Phase.GUIDING, goal, now)
 
@@ -582,40 +742,35 @@ class OuterLoop:
             self.journal.say(Severity.WARNING, f'at {depth:.2f} mm: {control.warning}')
         return to
 
-    # On the way, if it is continuous.
+    # Continuous insertion.
 
-    def _set_out(self, now: int) -> Move:
+    def _insert(self, now: int, begin: float, *, again: bool = False) -> Move:
         """Send the needle to the target depth."""
-        begin, end = self._depths[[0]], self._depths[[-1]]
-        self.phase, self._rest, self._sent = Phase.INSERTING, None, 0
-        self._passing, self._passed, self._before, self._speed = {}, 0, None, 0.0
+        start, end = np.array([begin]), self._depths[[-1]]
         self._goal = np.array([end[0], *self._between[1]])
-        duration = duration_of(np.array([end[0] - begin[0], 0.0, 0.0]), self.settings)
-        self._origin = np.array([begin[0], *self._between[0]])
+        self._origin = np.array([self._depths[0], *self._between[0]])
+        duration = duration_of(np.array([end[0] - begin, 0.0, 0.0]), self.settings)
         self._due = now + round(duration * NANOSECONDS)
-        # A smooth motion begins slowly: when it should have gone some way.
-        part = (10.0 * _STILL / (10.0 * float(end[0] - begin[0]))) ** (1.0 / 3.0)
-        self._overdue = now + round((_AGAIN + min(part, 1.0) * duration) * NANOSECONDS)
-        return smooth(self.settings.joints[:1], begin, end, duration)
+        self._again = lambda later: self._insert(later, self._depth_now, again=True)
+        move = self._stamped(smooth(self.settings.joints[:1], start, end, duration), now)
+        self._monitor.begin(move, np.array([begin, *self._between[0]]), again=again)
+        return move
 
-    def _set_out_again(self, stamp: int, now: int) -> Move | None:
-        """Send a needle that does not move again: the message may have been lost."""
-        if stamp < self._overdue:
-            return None
-        self._tries -= 1
-        if self._tries:
-            return self._set_out(now)
-        return self.stop(f'the needle does not move; {_ASKED}')
+    @property
+    def _depth_now(self) -> float:
+        """Insertion depth now, within the motion [m]."""
+        at = float(self._at[0]) if self._at is not None else 0.0
+        return min(max(at, float(self._origin[0])), float(self._goal[0]))
 
     def _follow(self, stamp: int, now: int) -> Move | None:
-        """Send the guide on as the needle goes, and plan at each depth that it passes."""
+        """Send the guide with the needle, and plan at each depth that the needle passes."""
         control, at = self.control, self._at
         if control is None or at is None:
             return None
         depth, last = float(at[0]), len(self._depths) - 1
         if self._before is None:
             if depth < self._begun + _STILL:
-                return self._set_out_again(stamp, now)
+                return None
             self._before = stamp, depth
         since = (stamp - self._before[0]) / NANOSECONDS
         if since >= _SPAN:
@@ -624,15 +779,14 @@ class OuterLoop:
             self._passed += 1
             fault = self._pass(control, at)
             if fault:
-                return self.stop(fault)
+                return self.stop(fault, now)
         if self._passed == last:
             return self._wait(stamp, now)
         if depth >= self._depths[last] - self.settings.depth_tolerance:
-            # To the end of the last step, once.
             self._passed, self._due = last, stamp
-            return self._guide_to(self._between[1], np.zeros(2), _BRAKING)
+            return self._end_guide(now)
         if stamp > self._due + self.settings.patience * NANOSECONDS:
-            # The guide is where this depth has it.
+            # The guide is at its position of this depth.
             self._goal[1:] = at[1:]
             return self._wait(stamp, now)
         interval = 1.0 / self.settings.rate
@@ -643,18 +797,33 @@ class OuterLoop:
         begin, end = self._between
         part = min(max((depth + self._speed * interval - low) / (high - low), 0.0), 1.0)
         way = end - begin
-        return self._guide_to(begin + part * way, way * self._speed / (high - low), interval)
+        rate = way * self._speed / (high - low)
+        move = self._guide_to(begin + part * way, rate, interval, now)
+        self._monitor.stream(move)
+        return move
 
-    def _guide_to(self, position: FloatArray, velocity: FloatArray, duration: float) -> Move:
-        return Move(
+    def _end_guide(self, now: int, *, again: bool = False) -> Move | None:
+        """Send the guide to the end of the last step, where it must arrive."""
+        if self._at is None:
+            return None
+        self._again = lambda later: self._end_guide(later, again=True)
+        move = self._guide_to(self._between[1], np.zeros(2), _BRAKING, now)
+        self._monitor.begin(move, self._at, again=again, arrives=True)
+        return move
+
+    def _guide_to(
+        self, position: FloatArray, velocity: FloatArray, duration: float, now: int
+    ) -> Move:
+        move = Move(
             self.settings.joints[1:3],
             np.array([duration]),
             position[np.newaxis],
             velocity[np.newaxis],
         )
+        return self._stamped(move, now)
 
     def _pass(self, control: SteeringController, at: FloatArray) -> str:
-        """Look back at the depth before one that is passed, and plan; return what is wrong."""
+        """Take the measurement of the depth before, and plan; return the fault, '' if none."""
         k, there = self._passed, self._between[1]
         if np.abs(at[1:3] - there).max() > _LAGGING * self.settings.guide_tolerance:
             x, z = 1e3 * at[1:3]
@@ -672,10 +841,10 @@ class OuterLoop:
         self._origin[1:], self._goal[1:] = there, self._between[1]
         return ''
 
-    # What is wrong, and where to.
+    # Faults and motions.
 
     def _slip(self, seen: Seen | None, depth: float) -> str:
-        """Say that the tip is not as deep as the needle is inserted, '' if it is."""
+        """Return the fault if the tip is not as deep as the needle is inserted, '' if it is."""
         if seen is None:
             return ''
         ahead = float(seen.tip[1]) - depth
@@ -692,18 +861,35 @@ class OuterLoop:
         )
 
     def _send(self, phase: Phase, goal: FloatArray, now: int) -> Move | None:
-        """Send needle and guide somewhere."""
-        self._origin = begin = self._goal
-        self._goal = goal
+        """Send needle and guide to positions, from the positions where they were sent last."""
         self.phase, self._rest = phase, None
-        duration = duration_of(goal - begin, self.settings)
-        self._due = now + round(duration * NANOSECONDS)
-        return smooth(self.settings.joints, begin, goal, duration) if duration > 0.0 else None
+        self._origin, self._goal = self._goal, goal
+        return self._move(now, self._origin)
 
-    # What is said.
+    def _move(self, now: int, begin: FloatArray, *, again: bool = False) -> Move | None:
+        duration = duration_of(self._goal - begin, self.settings)
+        self._due = now + round(duration * NANOSECONDS)
+        if np.abs(self._goal - begin).max() < _SAME:
+            # Too short to be a motion: the times of its points would be the same.
+            self._monitor.forget()
+            return None
+        # Again from the present positions: it never jumps.
+        self._again = lambda later: (
+            self._move(later, self._at, again=True) if self._at is not None else None
+        )
+        move = self._stamped(smooth(self.settings.joints, begin, self._goal, duration), now)
+        self._monitor.begin(move, begin, again=again)
+        return move
+
+    def _stamped(self, move: Move, now: int) -> Move:
+        """Return a motion with a stamp of its own: simulated time may stand still."""
+        self._stamp = max(now, self._stamp + 1)
+        return move._replace(stamp=self._stamp)
+
+    # Status.
 
     def _outcome(self) -> str:
-        """Say where the tip is thought to be at the end."""
+        """Describe the estimate of the tip at the end."""
         control, there = self.control, self.expected
         if control is None or there is None:
             return ''
@@ -714,9 +900,29 @@ class OuterLoop:
             f'{1e3 * half[1]:.2f} mm (95 %), {1e3 * off:.2f} mm from the target'
         )
 
+    def _describe_control(self) -> tuple[dict[str, object], str]:
+        """Return values of the controller for the status, and its warning."""
+        values: dict[str, object] = {}
+        control = self.control
+        if control is None:
+            return values, ''
+        x, z = control.target.tolist()
+        values['target x, y, z [m]'] = f'{x:.6f}, {self.depth:.6f}, {z:.6f}'
+        steps = len(self._depths) - 1
+        values['step'] = f'{min(control.step, steps)} of {steps}'
+        values['guide x, z [m]'] = f'{self._goal[1]:.6f}, {self._goal[2]:.6f}'
+        values['turns left'] = control.turns
+        values['chance to come within 1 mm'] = f'{control.chance:.3f}'
+        values['bending length over the believed one'] = f'{control.bending:.3f}'
+        if self.expected is not None:
+            half = _NORMAL * np.sqrt(np.diag(self.expected.covariance))
+            for name, mean, wide in zip('xz', self.expected.mean, half, strict=True):
+                values[f'{name} expected at the target depth [m]'] = f'{mean:.6f} +- {wide:.6f}'
+        return values, control.warning if self.steers else ''
+
     def diagnose(self, now: int) -> tuple[Severity, str, dict[str, object]]:
         """
-        Return how bad it is, the state in one line, and values by name.
+        Return severity, the state in one line, and values by name.
 
         Parameters
         ----------
@@ -726,42 +932,25 @@ class OuterLoop:
         Returns
         -------
         severity : Severity
-            How bad it is.
+            Severity of the state.
         state : str
             For people.
         values : dict
             Values by name.
 
         """
-        values: dict[str, object] = {}
-        control, warning = self.control, ''
-        if control is not None:
-            x, z = control.target.tolist()
-            values['target x, y, z [m]'] = f'{x:.6f}, {self.depth:.6f}, {z:.6f}'
-            steps = len(self._depths) - 1
-            values['step'] = f'{min(control.step, steps)} of {steps}'
-            values['guide x, z [m]'] = f'{self._goal[1]:.6f}, {self._goal[2]:.6f}'
-            values['turns left'] = control.turns
-            values['chance to come within 1 mm'] = f'{control.chance:.3f}'
-            values['bending length over the believed one'] = f'{control.bending:.3f}'
-            if self.expected is not None:
-                half = _NORMAL * np.sqrt(np.diag(self.expected.covariance))
-                for name, mean, wide in zip('xz', self.expected.mean, half, strict=True):
-                    values[f'{name} expected at the target depth [m]'] = (
-                        f'{mean:.6f} +- {wide:.6f}'
-                    )
-            if self.steers:
-                warning = control.warning
+        values, warning = self._describe_control()
         if self._seen is not None:
             seen, noise = self._seen, self._belief.noise
             values['readings of the last look'] = seen.readings
             values['standard error of the last look [m]'] = f'{seen.error:.2g}'
             if not warning and seen.error > _SCATTERED * noise:
                 warning = (
-                    f'readings of the tip scatter: a look is good to {1e3 * seen.error:.2f} mm, '
-                    f'believed are {1e3 * noise:.2f} mm (belief.noise)'
+                    f'noise of the tip measurement is {1e3 * seen.error:.2f} mm, above the '
+                    f'configured {1e3 * noise:.2f} mm (belief.noise)'
                 )
         values['phase'] = self.phase.value
+        values |= self.requests.status().to_values()
         values['inputs refused'] = self.journal.refused
         values['last complaint'] = self.journal.complaint
         for stream in (self._joint_stream, self._tip_stream):
@@ -772,7 +961,12 @@ class OuterLoop:
             return Severity.WARNING, warning, values
         if self.phase is Phase.DONE:
             return Severity.INFO, f'done: {self._outcome()}', values
-        return Severity.INFO, self.phase.value, values
+        state = _DESCRIPTIONS[self.phase]
+        if self._job is not None:
+            state = f'{state}: {self._job.fraction:.0%}'
+        elif self.steers and self._monitor.paused:
+            state = f'{state}; {self._monitor.paused} is paused'
+        return Severity.INFO, state, values
 
 
 def _words(point: tuple[float, float, float]) -> str:

@@ -78,12 +78,13 @@ class OuterLoopSettings:
     patience: float = constant(
         5.0,
         's',
-        'how much longer than planned a step, or the whole way if continuous, may take',
+        'additional time for a step, or for the whole insertion if continuous, in which the robot '
+        'moves but is slow; a motion that does not begin is sent again after 1 s, three times',
         open_low=True,
     )
     measurement_timeout: float = constant(
-        0.5, 's', 'age at which joint_states, tip_deflection and stamped targets no longer '
-        'count; how late a reading of a look may be', open_low=True,
+        0.5, 's', 'age at which joint_states and tip_deflection no longer count; largest delay of '
+        'a reading of the tip', open_low=True,
     )  # fmt: skip
 
     def __post_init__(self) -> None:

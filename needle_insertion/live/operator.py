@@ -1,4 +1,4 @@
-"""What a person asks of running nodes: a target, a pause, a retreat, a stop."""
+"""Requests of a person to running nodes: a target, a pause, a retraction, a stop."""
 
 from __future__ import annotations
 
@@ -11,21 +11,29 @@ from geometry_msgs.msg import PointStamped
 from needle_insertion.live.requests import CONTROLLER, Request, REQUESTS, STEERING
 from needle_ros import contract
 from needle_ros.base_node import profile
+from needle_ros.calls_node import Calls
 from needle_ros.errors import printable
+from needle_ros.status import no_answer, PendingRequest, RequestStatus
+from needle_ros.timing import nanoseconds
 from rcl_interfaces.srv import SetParameters
 from rclpy.client import Client
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.task import Future
 from std_srvs.srv import SetBool, Trigger
 
-#: Longest time to find a node that is asked for the first time [s].
-_PATIENCE: Final = 1.0
+#: Longest time to find a node at the first request [s].
+_DISCOVERY: Final = 1.0
+
+#: Time between two checks for answers to a target [s].
+_CHECK: Final = 0.1
 
 
 class State(NamedTuple):
     """
-    What a node last said of itself on /diagnostics.
+    The latest status of a node on /diagnostics.
 
     Attributes
     ----------
@@ -36,7 +44,7 @@ class State(NamedTuple):
     values : dict of str to str
         Values by name.
     heard : float
-        When, by `time.monotonic` [s].
+        Time of receipt, by `time.monotonic` [s].
 
     """
 
@@ -47,20 +55,25 @@ class State(NamedTuple):
 
     @property
     def age(self) -> float:
-        """Time since it was said [s]; a node says it every second."""
+        """Time since it was received [s]; a node publishes it every second."""
         return monotonic() - self.heard
+
+    @property
+    def requests(self) -> RequestStatus:
+        """The requests that the node takes, and its answers."""
+        return RequestStatus.from_values(self.values)
 
 
 class Outcome(NamedTuple):
     """
-    What came of a request.
+    The result of a request.
 
     Attributes
     ----------
     success : bool
-        Whether it was done.
+        Whether it was executed.
     message : str
-        What the nodes said.
+        Answers of the nodes.
 
     """
 
@@ -70,22 +83,25 @@ class Outcome(NamedTuple):
 
 class Operator:
     """
-    Asks nodes of the suite for what a person wants, and hears what they say of themselves.
+    Send requests to nodes of the suite, repeat them until they are answered, collect statuses.
 
     Parameters
     ----------
     node : Node
-        Node of this process that speaks for it; whoever owns it spins it.
+        Node of this process that sends them; its owner spins it.
 
     Attributes
     ----------
     states : dict of str to State
-        What each node last said, by its name without namespace.
+        Latest status of each node, by its name without namespace.
 
     """
 
     def __init__(self, node: Node) -> None:
         self._node = node
+        self._calls = Calls(node)
+        #: Targets without a final answer, with their messages.
+        self._sending: list[tuple[PendingRequest, PointStamped]] = []
         self.states: dict[str, State] = {}
         self._target = node.create_publisher(
             PointStamped, contract.TARGET.name, profile(contract.TARGET.qos)
@@ -101,6 +117,8 @@ class Operator:
             self._hear,
             profile(contract.DIAGNOSTICS.qos),
         )
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        node.create_timer(_CHECK, self._repeat, clock=steady)
 
     def _client(self, kind: Any, node: str, service: str) -> Client:
         if (node, service) not in self._clients:
@@ -110,39 +128,57 @@ class Operator:
 
     def _hear(self, array: DiagnosticArray) -> None:
         for status in array.status:
-            self.states[printable(status.name.rpartition('/')[2])] = State(
+            name = printable(status.name.rpartition('/')[2])
+            self.states[name] = state = State(
                 # A byte, as rclpy has it.
                 int.from_bytes(status.level, 'little'),
                 printable(status.message),
                 {printable(one.key): printable(one.value) for one in status.values},
                 monotonic(),
             )
+            for pending, _ in self._sending:
+                pending.hear(name, state.requests)
+
+    def _repeat(self) -> None:
+        """Send targets without an answer again."""
+        self._sending = [one for one in self._sending if not one[0].done]
+        for pending, message in self._sending:
+            if pending.repeat():
+                self._target.publish(message)
 
     @property
     def aims(self) -> str:
-        """Name of the node that takes targets: `steering` where it is, else `controller`."""
+        """Name of the node that takes targets: `steering` if it runs, else `controller`."""
         return STEERING if STEERING in self.states else CONTROLLER
 
-    def target(self, x: float, y: float, z: float) -> None:
+    def target(self, x: float, y: float, z: float) -> PendingRequest:
         """
         Send a target.
 
         Parameters
         ----------
         x, y, z : float
-            Where the tip shall be, in ``needle_entry`` [m]; without the node `steering` only the
-            depth y counts.
+            Target of the tip, in ``needle_entry`` [m]; without the node `steering` only the depth
+            y counts.
+
+        Returns
+        -------
+        PendingRequest
+            It is sent again until it has an answer.
 
         """
         message = PointStamped()
         message.header.frame_id = contract.ENTRY
         message.header.stamp = self._node.get_clock().now().to_msg()
         message.point.x, message.point.y, message.point.z = x, y, z
+        pending = PendingRequest(contract.TARGET, nanoseconds(message.header.stamp), self.aims)
+        self._sending.append((pending, message))
         self._target.publish(message)
+        return pending
 
     def ask(self, what: str) -> Future:
         """
-        Ask for something without a value.
+        Call the services of a request without a value.
 
         Parameters
         ----------
@@ -152,7 +188,7 @@ class Operator:
         Returns
         -------
         Future
-            Its result is an `Outcome`. It is done at once where no node offers the service.
+            Its result is an `Outcome`. It is done at once if no node offers the service.
 
         """
         ready = [
@@ -164,10 +200,11 @@ class Operator:
             return _done(Outcome(False, f'no node offers {_names(REQUESTS[what])}'))
         return _gathered(
             {
-                request.node: client.call_async(
+                f'{request.node}/{request.service}': self._calls.call(
+                    client,
                     Trigger.Request()
                     if request.data is None
-                    else SetBool.Request(data=request.data)
+                    else SetBool.Request(data=request.data),
                 )
                 for request, client in ready
             },
@@ -190,12 +227,12 @@ class Operator:
         Returns
         -------
         Future
-            Its result is an `Outcome`. It is done at once where there is no such node.
+            Its result is an `Outcome`. It is done at once if there is no such node.
 
         """
         client = self._client(SetParameters, node, 'set_parameters')
-        # It may have been made just now, and know nothing yet.
-        if not client.wait_for_service(timeout_sec=_PATIENCE):
+        # A new client has not discovered the service yet.
+        if not client.wait_for_service(timeout_sec=_DISCOVERY):
             return _done(Outcome(False, f'no node {node}'))
         parameter = Parameter(name, value=value).to_parameter_msg()
 
@@ -204,7 +241,8 @@ class Operator:
             return Outcome(result.successful, printable(result.reason))
 
         request = SetParameters.Request(parameters=[parameter])
-        return _gathered({node: client.call_async(request)}, read)
+        service = f'{node}/set_parameters'
+        return _gathered({service: self._calls.call(client, request)}, read)
 
 
 def _names(requests: tuple[Request, ...]) -> str:
@@ -218,15 +256,22 @@ def _done(outcome: Outcome) -> Future:
 
 
 def _gathered(answers: Mapping[str, Future], read: Callable[[Any], Outcome]) -> Future:
-    """Return one outcome of all answers, when the last has come."""
+    """Return one outcome of all calls, once the last is answered or has failed."""
     gathered = Future()
+
+    def outcome(service: str) -> Outcome:
+        response, node = answers[service].result(), service.partition('/')[0]
+        if response is None:
+            return Outcome(False, no_answer(service))
+        found = read(response)
+        return Outcome(found.success, f'{node}: {found.message or "done"}')
 
     def on_answer(_: Future) -> None:
         if gathered.done() or not all(answer.done() for answer in answers.values()):
             return
-        outcomes = {node: read(answer.result()) for node, answer in answers.items()}
-        words = '; '.join(f'{node}: {one.message or "done"}' for node, one in outcomes.items())
-        gathered.set_result(Outcome(all(one.success for one in outcomes.values()), words))
+        outcomes = [outcome(service) for service in answers]
+        lines = '; '.join(one.message for one in outcomes)
+        gathered.set_result(Outcome(all(one.success for one in outcomes), lines))
 
     for answer in answers.values():
         answer.add_done_callback(on_answer)

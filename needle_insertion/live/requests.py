@@ -1,4 +1,4 @@
-"""What nodes can be asked for, in words."""
+"""Services of the nodes by the word that calls them."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ STEERING: Final = 'steering'
 
 class Request(NamedTuple):
     """
-    One service that a word stands for.
+    One service of a word.
 
     Attributes
     ----------
     node, service : str
         Names.
     data : bool or None
-        What a `SetBool` is asked to set; None for a `Trigger`.
+        Value of the request of a `SetBool`; None for a `Trigger`.
 
     """
 
@@ -27,7 +27,7 @@ class Request(NamedTuple):
     data: bool | None = None
 
 
-#: What can be asked for. A node that is not there is left out, if another one answers.
+#: Services by word. A node that does not run is left out, if another node has a service.
 REQUESTS: Final[Mapping[str, tuple[Request, ...]]] = {
     'pause': (Request(CONTROLLER, 'pause', data=True),),
     'resume': (Request(CONTROLLER, 'pause', data=False),),

@@ -1,4 +1,4 @@
-"""Words that a person types while nodes run, or that a script gives."""
+"""Commands of `needle run`, typed by a person or read from a script."""
 
 from __future__ import annotations
 
@@ -20,33 +20,26 @@ from needle_insertion.live.screen import Screen
 from needle_insertion.report.text import table
 from needle_ros.contract import JOINT_STATES, TIP_DEFLECTION
 from needle_ros.errors import JobError, ParameterError
-import numpy as np
 from rclpy.task import Future
 import yaml
 
-#: Longest time in which a node answers [s].
+#: Longest time until a node reports its state and its first measurements [s].
 _ANSWER: Final = 30.0
-
-#: A target that is the same as before counts as taken when the node speaks this much later [s].
-_LATER: Final = 0.1
-
-#: Targets that differ by less are the same: a node says them in whole micrometers [m].
-_SAME: Final = 1e-6
 
 #: Time for the needle to settle when the reference has arrived [s].
 _SETTLING: Final = 1.0
 
-#: Nodes say something every second: one that was silent for this long is told of [s].
+#: Nodes publish their status every second: a node without one for this time is reported [s].
 _SILENT: Final = 5.0
 
-#: Sensors without which a node refuses all targets.
+#: Sensors without which a node rejects all targets.
 _NEEDED: Final = (
     (CONTROLLER, JOINT_STATES.name),
     (STEERING, JOINT_STATES.name),
     (STEERING, TIP_DEFLECTION.name),
 )
 
-#: A warning that comes and goes is told of once in this time [s].
+#: A warning that appears again and again is printed once in this time [s].
 _AGAIN: Final = 30.0
 
 #: Meters in a unit.
@@ -55,12 +48,12 @@ _UNITS: Final = {'m': 1.0, 'cm': 1e-2, 'mm': 1e-3}
 _LEVELS: Final = ('OK', 'WARN', 'ERROR', 'STALE')
 _ERROR: Final = _LEVELS.index('ERROR')
 
-#: Phases in which the node `steering` has nothing to do.
+#: Phases in which no insertion is under way.
 _AT_REST: Final = (Phase.IDLE.value, Phase.DONE.value)
 
 
 class _Word(NamedTuple):
-    """What a word takes, and what it is for."""
+    """Arguments and meaning of a command."""
 
     takes: str
     meaning: str
@@ -70,7 +63,7 @@ WORDS: Final = {
     'target': _Word(
         'DEPTH | X Y Z', 'insert to a depth, or steer the tip to a point: 0.05 or 50mm [m]'
     ),
-    'wait': _Word('[SECONDS]', 'until the needle is where it was sent'),
+    'wait': _Word('[SECONDS]', 'until the needle has arrived'),
     'pause': _Word('', 'brake to rest and hold'),
     'resume': _Word('', 'go on after a pause'),
     'retract': _Word('', 'withdraw to retract_depth'),
@@ -78,7 +71,7 @@ WORDS: Final = {
     'clear': _Word('', 'clear a stop'),
     'law': _Word('NAME', f'change the control law: {", ".join(LAWS)}'),
     'set': _Word('NODE NAME VALUE', 'set a parameter, such as controller retract_depth 0.02'),
-    'status': _Word('', 'where the needle is, and what the nodes say'),
+    'status': _Word('', 'position of the needle, and state of the nodes'),
     'help': _Word('', 'this list'),
     'quit': _Word('', 'end the nodes and complete the recording'),
 }
@@ -86,18 +79,18 @@ WORDS: Final = {
 
 class Terminal:
     """
-    Does what words say, one line after another.
+    Execute commands, one line after another.
 
     Parameters
     ----------
     graph : Graph
-        The graph; it is spun here.
+        The graph; it is spun by the commands.
     operator : Operator
-        Asks the nodes.
+        Sends requests to the nodes.
     readings : Readings
-        What is measured.
+        Measurements.
     screen : Screen
-        Where the lines come from, and what is answered goes to.
+        Input of the commands and output of the answers.
 
     """
 
@@ -107,17 +100,17 @@ class Terminal:
         self._graph, self._operator, self._readings = graph, operator, readings
         self._screen, self._say = screen, screen.say
         screen.complete([*WORDS, *LAWS])
-        #: What each node said last, without its numbers, and when that was told of.
+        #: Latest message of each node without its numbers, and when it was printed.
         self._last: dict[str, str] = {}
         self._told: dict[tuple[str, str], float] = {}
-        #: Whether the tip was sent to a target last, which the node `steering` brings there.
+        #: Whether the latest motion is a steered insertion.
         self._steers = False
 
     def begin(self, nodes: Sequence[str]) -> None:
         """
-        Wait until nodes have said what state they are in, and those that move the needle see it.
+        Wait until nodes report their state, and those that move the needle measure it.
 
-        What is asked of them before is refused.
+        Requests before that would be rejected.
 
         Parameters
         ----------
@@ -127,7 +120,7 @@ class Terminal:
         Raises
         ------
         GraphError
-            If one does not.
+            If a node does not.
 
         """
         for name in nodes:
@@ -163,24 +156,24 @@ class Terminal:
 
     def do(self, line: str) -> bool:
         """
-        Do what a line says.
+        Execute a command.
 
         Parameters
         ----------
         line : str
-            A word and what it takes; ``#`` begins a comment.
+            The command and its arguments; ``#`` begins a comment.
 
         Returns
         -------
         bool
-            Whether to go on.
+            Whether another command may follow.
 
         Raises
         ------
         ParameterError
             If the line is not understood.
         JobError
-            If a node refuses, or does not answer.
+            If a node rejects it, or does not answer.
 
         """
         try:
@@ -221,12 +214,12 @@ class Terminal:
         self._graph.spin_until(holds, what, timeout)
 
     def _look(self) -> None:
-        """Tell of nodes that have something new to complain about."""
+        """Print new warnings and errors of the nodes."""
         for name, state in self._operator.states.items():
             level, message, now = state.level, state.message, monotonic()
             if state.age > _SILENT:
-                level, message = _ERROR, 'says nothing any more'
-            # Counts that grow say nothing new.
+                level, message = _ERROR, f'no status for {_SILENT:g} s'
+            # A count that grows is no new warning.
             kind = re.sub(r'\d+', '', message)
             again = level >= _ERROR or now - self._told.get((name, kind), -inf) > _AGAIN
             if level and kind != self._last.get(name) and again:
@@ -242,20 +235,19 @@ class Terminal:
             raise _unfit('target', words)
         at = [_length(word) for word in words]
         if len(at) == 3 and aims != STEERING:
-            raise ParameterError('a target beside the axis needs the node steering: --steering')
+            raise ParameterError('a target off the axis needs the node steering: --steering')
         x, y, z = at if len(at) == 3 else (0.0, at[0], 0.0)
-        wanted = (x, y, z) if aims == STEERING else (y,)
-        before, sent = self._state(aims), monotonic()
-        self._operator.target(x, y, z)
+        pending = self._operator.target(x, y, z)
 
         def answered() -> bool:
-            now = self._operator.states[aims]
-            if _refused(now) > _refused(before):
-                raise JobError(now.values.get('last complaint') or 'the target was refused')
-            fresh = now.heard > sent + (_LATER if _aim(now) == _aim(before) else 0.0)
-            return fresh and np.allclose(_aim(now), wanted, rtol=0.0, atol=_SAME)
+            if pending.answer is not None and self._state(aims).age > _SILENT:
+                raise JobError(f'{aims}: no status for {_SILENT:g} s')
+            return pending.done
 
-        self._spin_until(answered, f'the answer of {aims}', _ANSWER)
+        self._spin_until(answered, f'the answer of {aims}', inf)
+        accepted, line = pending.outcome
+        if not accepted:
+            raise JobError(line)
         self._steers = aims == STEERING
         self._say(f'{aims}: on its way')
 
@@ -286,7 +278,7 @@ class Terminal:
                 arrived = inf
             return monotonic() > arrived + _SETTLING
 
-        # Its own limit is above; it says where the needle is.
+        # Its own limit is above, with the position of the needle in its error.
         self._spin_until(done, 'the needle', inf)
         self._say(self._readings.line())
 
@@ -316,13 +308,14 @@ class Terminal:
         self._say(f'{self._readings.line()}\n{table(rows, ("node", "level", "state"))}')
 
     def _state(self, node: str) -> State:
-        """Return what a node last said, once it has said something."""
+        """Return the latest status of a node, once there is one."""
         states = self._operator.states
         self._spin_until(lambda: node in states, f'the node {node}', _ANSWER)
         return states[node]
 
     def _answered(self, future: Future, what: str) -> None:
-        self._spin_until(future.done, f'the answer to {what}', _ANSWER)
+        # Without an answer it is done, too.
+        self._spin_until(future.done, f'the answer to {what}', inf)
         outcome: Outcome = future.result()
         if not outcome.success:
             raise JobError(f'{what}: {outcome.message}')
@@ -347,16 +340,12 @@ def _length(word: str) -> float:
 
 
 def _sees(state: State, topic: str) -> bool:
-    """Tell whether a node has taken a message of a sensor."""
+    """Return whether a node has received a measurement."""
     return ' 0 taken' not in state.values.get(f'input {topic}', ' 0 taken')
 
 
-def _refused(state: State) -> int:
-    return int(state.values.get('inputs refused', 0))
-
-
 def _aim(state: State) -> tuple[float, ...]:
-    """Return where a node says that it aims [m]: a depth, or a point; empty if at nothing."""
+    """Return the target of a node [m]: a depth, or a point; empty without a target."""
     for name, text in state.values.items():
         if name in ('target [m]', 'target x, y, z [m]'):
             with suppress(ValueError):

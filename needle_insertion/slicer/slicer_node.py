@@ -19,6 +19,7 @@ from needle_ros.base_node import BaseNode
 from needle_ros.errors import JobError, MessageError, printable
 from needle_ros.journal import Journal, Severity
 from needle_ros.run_node import run
+from needle_ros.status import PendingRequest, RequestStatus
 from needle_ros.timing import NANOSECONDS, nanoseconds, RateCounter
 from needle_ros.wire import Reading
 from rclpy.clock import Clock
@@ -46,6 +47,9 @@ _FORGOTTEN: Final = 60.0
 _LEVELS: Final = {0: 'OK', 1: 'WARN', 2: 'ERROR', 3: 'STALE'}
 
 _PACKAGE: Final = 'pyigtl'
+
+#: Who takes targets, until a node has answered.
+_TAKER: Final = 'controller or steering'
 
 
 class SlicerNode(BaseNode):
@@ -75,6 +79,8 @@ class SlicerNode(BaseNode):
         self._shapes = self._targets = 0
         self._source = ''
         self._rate = RateCounter()
+        #: The target that has no answer yet, with its message.
+        self._sending: tuple[PendingRequest, PointStamped] | None = None
         #: What each node said last: when, level and words.
         self._said: dict[str, tuple[float, int, str]] = {}
         self._state_told = self._state_changed = -_STATE_PERIOD
@@ -183,6 +189,9 @@ class SlicerNode(BaseNode):
             if self._said.get(name, (0.0, -1, ''))[1:] != (level, words):
                 self._state_changed = now
             self._said[name] = now, level, words
+            if self._sending is not None:
+                values = {one.key: one.value for one in status.values}
+                self._sending[0].hear(name, RequestStatus.from_values(values))
 
     # What comes from the peer, and goes to it.
 
@@ -208,7 +217,21 @@ class SlicerNode(BaseNode):
                 self._state_told = now
                 self._tell_state(link, interpreter, now)
         self._greeted = link.peer
+        self._repeat_target()
         self.tell(self._journal)
+
+    def _repeat_target(self) -> None:
+        """Send the target again until it has an answer, and report a rejection."""
+        if self._sending is None:
+            return
+        pending, message = self._sending
+        if pending.done:
+            self._sending = None
+            accepted, line = pending.outcome
+            if not accepted:
+                self._journal.say(Severity.ERROR, line, 'answer')
+        elif pending.repeat():
+            self._target.publish(message)
 
     def _take(self, interpreter: Interpreter, frames: list[Frame]) -> None:
         """Pass the newest target on."""
@@ -235,6 +258,8 @@ class SlicerNode(BaseNode):
         message.header.stamp = self.get_clock().now().to_msg()
         message.point.x, message.point.y, message.point.z = x, y, z
         self._target.publish(message)
+        stamp = nanoseconds(message.header.stamp)
+        self._sending = PendingRequest(contract.TARGET, stamp, _TAKER), message
         self._targets += 1
         heard = self._target.get_subscription_count()
         words = ', '.join(f'{MILLIMETERS * one:.2f}' for one in (x, y, z))

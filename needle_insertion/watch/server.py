@@ -94,27 +94,32 @@ class Reader(Protocol):
 
 
 class Control(Protocol):
-    """What the buttons of the page do."""
+    """Requests that the buttons of the page send."""
 
-    def target(self, x: float, y: float, z: float) -> None:
+    async def target(self, x: float, y: float, z: float) -> tuple[bool, str]:
         """
-        Aim the tip.
+        Send a target of the tip.
 
         Parameters
         ----------
         x, y, z : float
-            Where it shall be [m].
+            The target [m].
+
+        Returns
+        -------
+        bool, str
+            Whether it is accepted, and the answer of the node.
 
         Raises
         ------
         JobError
-            If nobody takes it.
+            If there is no answer.
 
         """
 
     async def ask(self, what: str) -> tuple[bool, str]:
         """
-        Ask a node for something.
+        Call the services of a request.
 
         Parameters
         ----------
@@ -124,7 +129,7 @@ class Control(Protocol):
         Returns
         -------
         bool, str
-            Whether it was done, and what is said of it.
+            Whether it was executed, and the answers of the nodes.
 
         Raises
         ------
@@ -339,8 +344,7 @@ class Server:
             if message or not isinstance(at, list) or len(at) != 3 or not all(map(_real, at)):
                 raise ParameterError('a target is {"at": [x, y, z]} with numbers in m')
             x, y, z = map(float, at)
-            self._control.target(x, y, z)
-            return True, f'target {1e3 * x:g}, {1e3 * y:g}, {1e3 * z:g} mm sent'
+            return await self._control.target(x, y, z)
         if not isinstance(what, str) or what not in REQUESTS or message:
             raise ParameterError(f'ask must be one of target, {", ".join(REQUESTS)}, got {what!r}')
         return await self._control.ask(what)

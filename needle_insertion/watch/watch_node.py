@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
+from math import inf
 import os
 from time import monotonic
 from typing import Any, Final
@@ -31,8 +32,8 @@ _NEWEST: Final = contract.SENSOR._replace(depth=1)
 #: Needle and path of a picture, and those of the one before.
 _LINES: Final = contract.SENSOR._replace(depth=4)
 
-#: Longest wait for the answer of a node, and time between two looks for it [s].
-_PATIENCE: Final = 5.0
+#: Longest time to plan an insertion, and time between two checks for the answer of a node [s].
+_PLANNED: Final = 60.0
 _LOOK: Final = 0.01
 
 #: Events that are worked off at a time: the rest waits.
@@ -143,29 +144,45 @@ class Buttons:
         for _ in range(_EVENTS):
             self._executor.spin_once(timeout_sec=0.0)
 
-    def target(self, x: float, y: float, z: float) -> None:
+    async def target(self, x: float, y: float, z: float) -> tuple[bool, str]:
         """
-        Aim the tip.
+        Send a target of the tip.
 
         Parameters
         ----------
         x, y, z : float
-            Where it shall be [m].
+            The target [m].
+
+        Returns
+        -------
+        bool, str
+            Whether it is accepted, and the answer of the node.
 
         Raises
         ------
         JobError
-            If nobody takes it.
+            If there is no answer.
 
         """
         # One of them is the `WatchNode` of this process.
         if self._node.count_subscribers(contract.TARGET.name) < 2:
             raise JobError('no node takes targets: start a controller or the node steering')
-        self._operator.target(x, y, z)
+        pending = self._operator.target(x, y, z)
+        await self._spin_until(lambda: pending.done, 'the target', _PLANNED)
+        return pending.outcome
+
+    async def _spin_until(self, done: Callable[[], bool], what: str, timeout: float = inf) -> None:
+        """Spin the node until a request is answered."""
+        end = monotonic() + timeout
+        while not done():
+            if monotonic() > end:
+                raise JobError(f'no answer to {what} within {timeout:g} s')
+            await asyncio.sleep(_LOOK)
+            self.spin()
 
     async def ask(self, what: str) -> tuple[bool, str]:
         """
-        Ask the nodes for something.
+        Call the services of a request.
 
         Parameters
         ----------
@@ -175,21 +192,12 @@ class Buttons:
         Returns
         -------
         bool, str
-            Whether it was done, and what they said.
-
-        Raises
-        ------
-        JobError
-            If there is no answer.
+            Whether it was executed, and the answers of the nodes.
 
         """
         answer = self._operator.ask(what)
-        end = monotonic() + _PATIENCE
-        while not answer.done():
-            if monotonic() > end:
-                raise JobError(f'no answer to {what} within {_PATIENCE:g} s')
-            await asyncio.sleep(_LOOK)
-            self.spin()
+        # Without an answer it is done, too.
+        await self._spin_until(answer.done, what)
         success, words = answer.result()
         return bool(success), str(words)
 

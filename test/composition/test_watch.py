@@ -433,10 +433,11 @@ class Buttons:
         self.done: list[Any] = []
         self.free = asyncio.Event()
 
-    def target(self, x: float, y: float, z: float) -> None:
+    async def target(self, x: float, y: float, z: float) -> tuple[bool, str]:
         if y > 1.0:
             raise JobError('no node takes targets')
         self.done.append((x, y, z))
+        return True, 'steering: target accepted'
 
     async def ask(self, what: str) -> tuple[bool, str]:
         self.done.append(what)
@@ -568,7 +569,7 @@ async def test_commands_need_the_token_of_the_process() -> None:
         said = await page.tell(stream, {'ask': 'clear', 'token': token})
         assert said['success'] is False
         said = await page.tell(stream, {'ask': 'target', 'at': [1e-3, 0.1, 0], 'token': token})
-        assert said['words'] == 'target 1, 100, 0 mm sent'
+        assert said['words'] == 'steering: target accepted'
         assert buttons.done == ['stop', 'clear', (1e-3, 0.1, 0.0)]
     async with served(Buttons()) as page:
         assert page.server.token != token

@@ -62,15 +62,6 @@ def test_a_time_that_starts_at_zero_has_stamps_of_zero() -> None:
     assert wrench.check(MILLISECOND, MILLISECOND) is None
 
 
-def test_a_wish_without_a_stamp_is_of_now() -> None:
-    """`ros2 topic pub` sends no stamp; a wish with one must be of now all the same."""
-    target = Stream('target', 1.0, frames=('', 'needle_entry'), stamped=False)
-    assert [target.check(0, 10 * SECOND, frame) for frame in ('', 'needle_entry', '')] == [
-        None
-    ] * 3
-    assert target.check(SECOND, 10 * SECOND).kind == 'stale'
-
-
 def test_order_is_kept() -> None:
     """One that comes twice, or after a later one, does not count and is no fault."""
     wrench = stream()

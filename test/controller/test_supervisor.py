@@ -115,7 +115,7 @@ EVENTS: list[Callable[[Loop], Answer | None]] = [
     lambda loop: loop.aim(nan),
     lambda loop: loop.supervisor.pause(True).answer,
     lambda loop: loop.supervisor.pause(False).answer,
-    lambda loop: loop.supervisor.retract().answer,
+    lambda loop: loop.supervisor.retract(loop.now).answer,
     Loop.stop,
 ]
 events = st.lists(st.sampled_from(EVENTS), max_size=40)
@@ -301,7 +301,7 @@ def test_before_activation_only_the_stop_is_heard() -> None:
     assert supervisor.emergency_stop(SECOND).answer == Answer(SECOND)
     assert supervisor.encoders(reading, SECOND) is None
     assert supervisor.target(0, '', 0.1, 0.0, SECOND) is None
-    assert supervisor.journal.complaint == 'target refused: the controller is not active'
+    assert supervisor.journal.complaint == 'target rejected: the controller is not active'
     assert supervisor.pause(True).message == 'pause refused: the controller is not active'
     supervisor.configure(Controller(PHANTOM), SafetyLimits())
     supervisor.activate(SECOND, {})
@@ -391,7 +391,7 @@ def test_a_path_of_a_million_points_is_refused_in_a_short_line() -> None:
     times = [float(k) for k in range(MOST_POINTS + 1)]
     loop.supervisor.trajectory(0, '', ['insertion'], times, many, [], loop.now)
     (line,) = loop.said()
-    assert line == f'joint_trajectory refused: a path may have at most {MOST_POINTS} points'
+    assert line == f'joint_trajectory rejected: a path may have at most {MOST_POINTS} points'
     loop.seconds += 1.0
     evil = '\x1b]0;evil\x07\u202e' + 1000 * 'x'
     loop.supervisor.trajectory(0, evil, ['insertion'], [1.0], [[0.03]], [], loop.now)

@@ -852,7 +852,7 @@ def test_before_it_is_active_it_answers_and_waits(ros_graph: RosGraph) -> None:
     assert 'stopped' in bench.call('retract').message
     bench.target.publish(PointStamped())
     ros_graph.spin_until(
-        lambda: 'target refused: the controller is not active' in bench.value('last complaint'),
+        lambda: 'target rejected: the controller is not active' in bench.value('last complaint'),
         'the refusal',
     )
     assert bench.controller.trigger_activate() == TransitionCallbackReturn.SUCCESS

@@ -310,11 +310,11 @@ def test_waits_only_a_limited_time_for_an_answer(
     ros_graph: RosGraph, bags: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The call ends with the reason, and the node is not blocked."""
-    monkeypatch.setattr('needle_identification.application.ANSWER_TIME', 0.3)
+    monkeypatch.setattr('needle_ros.status.CALL_TIMEOUT', 0.3)
     ros_graph.add(IdentificationNode, parameters={'bags': bags, 'apply_to': ['deaf']})
     # A node that does not spin has the service, but does not answer.
     deaf = Node('deaf', context=ros_graph.context)
     try:
-        assert apply(ros_graph, 'deaf') == (False, 'deaf: no answer within 0.3 s')
+        assert apply(ros_graph, 'deaf') == (False, 'deaf/set_parameters: no answer within 0.3 s')
     finally:
         deaf.destroy_node()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+import re
 from typing import Any
 
 from geometry_msgs.msg import PointStamped, PoseWithCovarianceStamped
@@ -37,8 +38,7 @@ STEERING = {
     'acceleration': 0.4,
     'look_time': 0.15,
     'settle_time': 0.02,
-    # A machine that is busy takes its time.
-    'patience': 60.0,
+    # A machine that is busy delays measurements.
     'measurement_timeout': 5.0,
 }
 TARGET = (1.5e-3, 0.051, -1e-3)
@@ -53,6 +53,7 @@ class Bench:
         mode: str = 'robot',
         bevel: float = 0.1,
         prefix: str = '',
+        lockstep: bool = True,
         **options: Any,
     ) -> None:
         self.graph, self.user = graph, graph.node('user')
@@ -64,7 +65,11 @@ class Bench:
         self.stop = self.user.create_client(Trigger, 'steering/stop')
         # Where a controller moves the needle, each sample waits for its answer, however busy the
         # machine is.
-        own = {'mode': mode, 'lockstep': mode == 'simulation', 'steering.bevel_load': [bevel]}
+        own = {
+            'mode': mode,
+            'lockstep': lockstep and mode == 'simulation',
+            'steering.bevel_load': [bevel],
+        }
         remaps = ['--ros-args']
         for name in ('joint_states', 'joint_trajectory'):
             remaps += ['-r', f'{name}:={prefix}{name}']
@@ -90,23 +95,30 @@ class Bench:
         """What the node says of its state."""
         return str(self.steering.diagnose()[1])
 
-    def aim(self, point: tuple[float, float, float] = TARGET) -> None:
-        """Send a target, until it is taken or refused: the first may come before the sensors."""
+    def taken(self, topic: str) -> str:
+        """Return how many messages the node has taken."""
+        return str(self.steering.diagnose()[2][f'input {topic}'])
+
+    def send(self, point: tuple[float, float, float]) -> None:
+        """Send a target."""
         message = PointStamped()
         message.header.frame_id = 'needle_entry'
         message.point.x, message.point.y, message.point.z = point
+        self.target.publish(message)
+
+    def aim(self, point: tuple[float, float, float] = TARGET) -> None:
+        """Send a target once the sensors are there, and wait for the answer."""
         self.until(lambda: self.target.get_subscription_count() >= self.takers, 'who takes it')
         self.until(
             lambda: all(
-                ' 0 taken' not in str(self.steering.diagnose()[2][f'input {topic}'])
-                for topic in ('joint_states', 'tip_deflection')
+                ' 0 taken' not in self.taken(topic) for topic in ('joint_states', 'tip_deflection')
             ),
             'the sensors',
         )
-        self.target.publish(message)
+        self.send(point)
         self.until(
             lambda: (
-                self.said != 'waits for a target'
+                self.steering.diagnose()[2]['phase'] not in ('idle', 'planning')
                 or 'target' in self.steering.diagnose()[2]['last complaint']
             ),
             'the answer',
@@ -273,6 +285,62 @@ def test_it_can_be_stopped(ros_graph: RosGraph, how: str) -> None:
 
     bench.until(rests, 'rest')
     assert depth - 1e-3 <= still[-1] <= depth + 4e-3
+
+
+def test_a_plan_does_not_block_the_node(ros_graph: RosGraph) -> None:
+    """Meanwhile `~/stop` is answered and measurements are taken; the stop cancels the plan."""
+    bench = Bench(ros_graph, step_length=5e-4, depth_tolerance=1e-4)
+    bench.until(lambda: ' 0 taken' not in bench.taken('tip_deflection'), 'the sensors')
+    bench.send(TARGET)
+    bench.until(lambda: bench.steering.diagnose()[2]['phase'] == 'planning', 'the plan')
+    job, before = bench.steering._loop._job, bench.taken('joint_states')
+    bench.until(lambda: bench.taken('joint_states') != before, 'measurements')
+    answer = bench.stop.call_async(Trigger.Request())
+    bench.until(answer.done, 'the answer')
+    assert answer.result().message == 'planning cancelled'
+    assert not job.done
+    assert bench.said == 'waits for a target'
+    assert not bench.moves
+    # The thread ends before the test does.
+    bench.until(lambda: job.done, 'the end of the thread')
+
+
+def test_a_motion_that_the_controller_rejects_stops_it_with_its_reason(
+    ros_graph: RosGraph,
+) -> None:
+    """Its reference may go at 10 mm/s, and `steering` asks for 50 mm/s."""
+    time: dict[str, Any] = {'use_sim_time': True}
+    bench = Bench(ros_graph, mode='simulation', **time)
+    controller = ros_graph.add(
+        ControllerNode,
+        parameters={
+            **time,
+            'steered': True,
+            'rate': 200.0,
+            'reference.speed': 0.01,
+            'model.preset': 'bending_35mm',
+        },
+    )
+    bench.takers = 2
+    bench.until(lambda: 'joint_states yet' not in controller.diagnose()[1], 'the controller')
+    bench.aim()
+    bench.until(lambda: bench.said.startswith(('done', 'stopped')), 'the end')
+    assert re.match(
+        r'stopped: controller rejected the motion: (speed|acceleration) after .* must be',
+        bench.said,
+    )
+    assert bench.at('insertion') == pytest.approx(0.001, abs=1e-4)
+
+
+def test_a_needle_that_no_node_moves_is_reported(ros_graph: RosGraph) -> None:
+    """The plant moves the guide, and there is no controller."""
+    bench = Bench(ros_graph, mode='simulation', lockstep=False)
+    bench.aim()
+    bench.until(lambda: bench.said.startswith(('done', 'stopped')), 'the end')
+    assert bench.said == (
+        'stopped: insertion is at 1.000 mm, not at 11.000 mm: joint_trajectory sent 4 times, '
+        'no node reports that it takes joint_trajectory'
+    )
 
 
 def test_what_cannot_be_is_refused_by_name(ros_graph: RosGraph) -> None:

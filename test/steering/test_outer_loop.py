@@ -8,105 +8,26 @@ from typing import Any
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from needle_controller import OuterLoop, OuterLoopSettings, ReferenceLimits, SteeringBelief
+from needle_controller import OuterLoopSettings, ReferenceLimits, SteeringBelief
 from needle_controller.reference.path import Path
 from needle_controller.steering.look import Look
 from needle_controller.steering.motion import duration_of, Move, smooth
 from needle_controller.steering.outer_loop import Phase
-from needle_dynamics import ParameterError, SteeredNeedle, STEERING_PRESETS
+from needle_dynamics import ParameterError
 from needle_ros.journal import Severity
 from needle_ros.wire import Reading
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest
-
-NEEDLE, STEERING, _ = STEERING_PRESETS['bending_35mm']
-SETTINGS = OuterLoopSettings(look_time=0.2)
-#: A step of time of the robot, and of its tracker [ns].
-PERIOD = 10_000_000
-SECOND = 100 * PERIOD
-TARGET = (2e-3, 0.06, -1e-3)
-NAMES = ('insertion', 'guide_x', 'guide_z')
-
-
-class Robot:
-    """A loop, a robot and its needle in tissue that is softer than believed, and their time."""
-
-    def __init__(
-        self, own: OuterLoopSettings = SETTINGS, belief: SteeringBelief | None = None
-    ) -> None:
-        self.seconds = 0.0
-        self.loop = OuterLoop(
-            NEEDLE, STEERING, belief or SteeringBelief(), own, steady=lambda: self.seconds
-        )
-        softer = replace(NEEDLE, tissue_stiffness=0.6 * NEEDLE.tissue_stiffness)
-        self.needle = SteeredNeedle(softer, STEERING, tilt=(0.01, 0.02))
-        self.now = 1000 * SECOND
-        self.at = np.zeros(3)
-        #: How each joint moves: times [ns] and positions.
-        self.ways = [(np.zeros(1), np.zeros(1)) for _ in NAMES]
-        self.noise = np.random.default_rng(3)
-        #: What goes wrong: how the joints move, and what is said of them and of the tip.
-        self.moves: Callable[[np.ndarray[Any, Any]], np.ndarray[Any, Any]] = lambda at: at
-        self.says: Callable[[Any], Any] = lambda at: at
-        self.sees: Callable[[Any], Any] = lambda tip: tip
-        self.late = 0
-        self.waiting: list[tuple[int, Any]] = []
-        self.tracked: list[np.ndarray[Any, Any]] = []
-
-    def tick(self, count: int = 1) -> None:
-        """Let time pass."""
-        for _ in range(count):
-            self.now += PERIOD
-            self.seconds += 1e-9 * PERIOD
-            self.at = self.moves(np.array([np.interp(self.now, *way) for way in self.ways]))
-            self.needle.move(depth=float(self.at[0]), guide=self.at[1:].tolist())
-            self.tracked.append(self.at)
-            x, y, z = self.needle.tip
-            tip = np.array([x, y, z]) + 1.8e-4 * self.noise.standard_normal(3)
-            self.waiting.append((self.now, self.sees(tip)))
-            said = self.says(self.at)
-            if said is not None:
-                self.follow(self.loop.joints(self.joints(self.now, said), self.now))
-            while self.waiting and self.waiting[0][0] <= self.now - self.late:
-                stamp, seen = self.waiting.pop(0)
-                if seen is not None:
-                    reading = Reading(stamp, 'needle_entry', (), (tuple(seen),))
-                    self.follow(self.loop.tip(reading, self.now))
-            self.follow(self.loop.watch(self.now))
-
-    @staticmethod
-    def joints(stamp: int, at: Any) -> Reading:
-        return Reading(stamp, '', NAMES, (tuple(at), (0.0,) * 3, ()))
-
-    def follow(self, move: Move | None) -> None:
-        """Begin a motion, from where the joints are."""
-        if move is not None:
-            times = self.now + 1e9 * np.concatenate([[0.0], move.times])
-            for name, column in zip(move.joints, move.positions.T, strict=True):
-                k = NAMES.index(name)
-                self.ways[k] = times, np.concatenate([[self.at[k]], column])
-
-    def aim(self, point: tuple[float, float, float] = TARGET, frame: str = '') -> str:
-        """Send a target; return why it was refused."""
-        before = self.loop.journal.refused
-        self.follow(self.loop.target(0, frame, point, self.now))
-        return self.loop.journal.complaint if self.loop.journal.refused > before else ''
-
-    def steer(self, ticks: int = 6000) -> None:
-        """Aim, and go on until the loop has nothing more to do."""
-        self.tick(20)
-        assert self.aim() == ''
-        for _ in range(ticks):
-            self.tick()
-            if not self.loop.steers:
-                return
-        pytest.fail(f'it steers for ever: {self.loop.phase}')
-
-    @property
-    def miss(self) -> float:
-        """Distance of the tip from the target [m]."""
-        return float(np.hypot(*(self.needle.tip[[0, 2]] - np.array(TARGET)[[0, 2]])))
+from support.steered_robot import (
+    CONTINUOUS,
+    NAMES,
+    PERIOD,
+    Robot,
+    SECOND,
+    SETTINGS,
+    TARGET,
+)
 
 
 @settings(max_examples=50, deadline=None)
@@ -207,7 +128,7 @@ def creeps(robot: Robot) -> None:
     """Move the needle by somebody else, while the loop looks at its tip."""
 
     def moves(wanted: Any) -> Any:
-        if robot.loop.phase is Phase.LOOKING and wanted[0] > 0.03:
+        if robot.loop.phase is Phase.MEASURING and wanted[0] > 0.03:
             wanted[0] += 1e-3
         return wanted
 
@@ -220,14 +141,14 @@ def creeps(robot: Robot) -> None:
         (lambda robot: stuck(robot, 1), r'guide_x is at -?0\.500 mm, not at', 0.03),
         (
             lambda robot: stuck(robot, 0),
-            'insertion is at 30.000 mm, not at 35.000 mm, 5.0 s after it should be; does what',
+            'insertion is at 30.000 mm, not at 35.000 mm: joint_trajectory sent 4 times, contr',
             0.031,
         ),
         (frozen, 'the sensor of the tip is frozen: 20 readings are the same', 0.036),
         (lost, 'the tip was not seen in 7 looks', 0.056),
         (slips, 'mm less deep than the needle was inserted: it slips', 0.031),
-        (silent, r'no joint_states for 0\.5\d s', 0.036),
-        (creeps, r'while it looks at the tip insertion is at 3.\.000 mm', 0.037),
+        (silent, r'no joint_states received within 0\.5\d s', 0.036),
+        (creeps, r'during the measurement of the tip insertion is at 3.\.000 mm', 0.037),
     ],
 )
 def test_what_goes_wrong_stops_it_and_is_said(
@@ -249,9 +170,6 @@ def test_what_goes_wrong_stops_it_and_is_said(
     before = robot.at
     robot.tick(100)
     assert_allclose(robot.at, before, atol=1e-9)
-
-
-CONTINUOUS = replace(SETTINGS, continuous=True)
 
 
 @pytest.mark.parametrize(
@@ -302,11 +220,15 @@ def test_the_guide_waits_for_a_needle_that_stalls() -> None:
     [
         (lambda robot: stuck(robot, 1), r'the guide is at x = -?0\.500 mm', 0.02),
         (lambda robot: stuck(robot, 0), 'insertion is at 30.000 mm, not at 60.000 mm', 0.031),
-        (lambda robot: stuck(robot, 0, 0.0), 'the needle does not move; does what', 0.0),
+        (
+            lambda robot: stuck(robot, 0, 0.0),
+            'insertion is at 0.000 mm, not at 60.000 mm: joint_traj',
+            0.0,
+        ),
         (frozen, 'the sensor of the tip is frozen', 0.048),
         (lost, 'the tip was not seen in 7 looks', 0.061),
         (slips, 'deep than the needle was inserted: it slips', 0.04),
-        (silent, r'no joint_states for 0\.5\d s', 0.061),
+        (silent, r'no joint_states received within 0\.5\d s', 0.061),
     ],
 )
 def test_what_goes_wrong_on_the_way_stops_it_and_is_said(
@@ -473,7 +395,7 @@ def test_a_target_that_cannot_be_is_refused(
 ) -> None:
     """Nothing moves, and another target is taken."""
     robot = Robot()
-    assert robot.aim() == 'target refused: joint_states does not come'
+    assert robot.aim() == 'target rejected: no joint_states received within 0.5 s'
     robot.tick(5)
     with pytest.raises(AssertionError, match=complaint):
         raise AssertionError(robot.aim(point, frame))
@@ -487,7 +409,7 @@ def test_too_many_steps_are_refused() -> None:
     """A plan of them would take the memory of the machine."""
     robot = Robot(replace(SETTINGS, step_length=1e-4, depth_tolerance=1e-5))
     robot.tick(5)
-    assert 'it would take 600 steps of 0.1 mm; 200 may be' in robot.aim()
+    assert 'it would take 600 steps of 0.1 mm, at most 200 are possible' in robot.aim()
 
 
 def test_a_needle_must_be_straight_at_the_start() -> None:
@@ -512,7 +434,7 @@ def test_a_target_may_move_but_not_its_depth() -> None:
     robot.aim((0.0, 0.06, 0.0))
     robot.tick(600)
     assert robot.loop.steers
-    assert 'it steers to a depth of 60.00 mm, got 70.00 mm' in robot.aim((0.0, 0.07, 0.0))
+    assert 'the insertion is to a depth of 60.00 mm, got 70.00 mm' in robot.aim((0.0, 0.07, 0.0))
     assert 'out of reach' in robot.aim((0.06, 0.06, 0.0))
     assert_allclose(robot.loop.control.target, 0.0)
     assert robot.aim() == ''
@@ -529,10 +451,10 @@ def test_stop_brings_needle_and_guide_to_rest() -> None:
     while robot.loop.phase is not Phase.INSERTING or robot.at[0] < 0.032:
         robot.tick()
     depth = robot.at[0]
-    robot.follow(robot.loop.stop('~/stop'))
+    robot.follow(robot.loop.stop('~/stop', robot.now))
     robot.tick(200)
     assert depth <= robot.at[0] <= depth + 3e-3
-    assert robot.loop.stop('~/stop') is None
+    assert robot.loop.stop('~/stop', robot.now) is None
     assert 'has been steered; retract it to 0.00 mm first' in robot.aim()
 
 
@@ -544,7 +466,7 @@ def test_readings_that_scatter_are_said() -> None:
     robot.tick(60)
     severity, state, _ = robot.loop.diagnose(robot.now)
     assert severity is Severity.WARNING
-    assert 'readings of the tip scatter: a look is good to 0.0' in state
+    assert 'noise of the tip measurement is 0.0' in state
 
 
 def test_a_look_leaves_out_what_is_absurd() -> None:
@@ -614,3 +536,15 @@ def test_whatever_is_said_no_motion_leaves_the_limits(
         for name, column in zip(move.joints, move.positions.T, strict=True):
             low, high = (0.0, TARGET[1]) if name == 'insertion' else (-6e-3, 6e-3)
             assert low - 1e-12 <= column.min() <= column.max() <= high + 1e-12
+
+
+def test_a_motion_of_rounding_is_none() -> None:
+    """The times of its points would all be the same, which a controller rejects."""
+    robot = Robot()
+    robot.tick(5)
+    robot.aim()
+    loop = robot.loop
+    for way, sent in ((1e-15, False), (5e-7, False), (2e-6, True)):
+        move = loop._send(Phase.GUIDING, loop._goal + [0.0, way, 0.0], robot.now)
+        assert (move is not None) == sent
+        assert move is None or (np.diff(move.times) > 1e-5).all()

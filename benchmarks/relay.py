@@ -1,0 +1,418 @@
+"""
+Steered insertions in which one message is dropped, delayed or duplicated by a relay between nodes.
+
+Plant, controller, steering and operator are real nodes over DDS, in lock-step. All their topics
+pass the relay, each link from one node to another by itself. In each insertion one message of one
+link, at random, gets a fault. The insertion must then reach its target, or stop with one line
+within 5 s. Run it by ``python -m benchmarks.relay --count 200 --seed 1``.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections import Counter
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+import sys
+from tempfile import TemporaryDirectory
+from time import monotonic
+from typing import Any, Final, NamedTuple
+
+from needle_controller.controller_node import ControllerNode
+from needle_controller.steering.outer_loop import Phase
+from needle_controller.steering_node import SteeringNode
+from needle_dynamics.plant_node import PlantNode
+from needle_insertion.experiment.node_process import GraphError
+from needle_insertion.experiment.ros_graph import Graph
+from needle_insertion.live.operator import Operator
+from needle_insertion.report.text import table
+from needle_ros import contract
+from needle_ros.base_node import message_class, profile
+from needle_ros.contract import Topic
+from needle_ros.timing import NANOSECONDS
+import numpy as np
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from rclpy.logging import LoggingSeverity, set_logger_level
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+#: Faults of a message.
+KINDS: Final = ('drop', 'delay', 'duplicate')
+
+#: Longest delay, and time after a fault in which an insertion must stop if it does not reach its
+#: target, of simulated time [s].
+LONGEST_DELAY: Final = 1.0
+LONGEST_STOP: Final = 5.0
+
+#: Wall time after which an insertion hangs [s].
+_HANGS: Final = 120.0
+
+#: Target x, y, z [m], and largest distance of the tip from it at the end [m].
+TARGET: Final = (5e-4, 0.041, -3e-4)
+LARGEST_MISS: Final = 1e-3
+
+#: Time between two checks for messages to deliver [s].
+_CHECK: Final = 2e-3
+
+_RATE: Final = 200.0
+_PLANT: Final[dict[str, object]] = {
+    'model.preset': 'bending_35mm',
+    'mode': 'simulation',
+    'steered': True,
+    'lockstep': True,
+    'real_time_factor': 4.0,
+    'rate': _RATE,
+    'depth': 0.001,
+    'model.tissue_stiffness': 5e4,
+    'steering.bevel_load': [0.1],
+    'tip.noise': 1e-4,
+    'guide.speed_limit': 0.1,
+}
+_STEERING: Final[dict[str, object]] = {
+    'model.preset': 'bending_35mm',
+    'use_sim_time': True,
+    'step_length': 0.01,
+    'speed': 0.05,
+    'guide_speed': 0.05,
+    'acceleration': 0.4,
+    'look_time': 0.15,
+    'settle_time': 0.02,
+}
+_CONTROLLER: Final[dict[str, object]] = {
+    'model.preset': 'bending_35mm',
+    'use_sim_time': True,
+    'steered': True,
+    'rate': _RATE,
+    'deflection_feedback': 'none',
+    'reference.speed': 0.05,
+    'reference.acceleration': 1.0,
+}
+
+
+class Link(NamedTuple):
+    """
+    A topic from one node to another.
+
+    Attributes
+    ----------
+    source, sink : str
+        Names of the nodes.
+    topic : Topic
+        The topic.
+
+    """
+
+    source: str
+    sink: str
+    topic: Topic
+
+    def __str__(self) -> str:
+        return f'{self.topic.name.lstrip("/")}: {self.source} -> {self.sink}'
+
+
+_STATES: Final = (contract.JOINT_STATES, contract.BASE_WRENCH, contract.TIP_DEFLECTION)
+
+#: All links between the nodes of a steered insertion.
+LINKS: Final = (
+    *(Link('plant', 'controller', topic) for topic in (*_STATES, contract.CLOCK)),
+    *(
+        Link('plant', 'steering', topic)
+        for topic in (contract.JOINT_STATES, contract.TIP_DEFLECTION, contract.CLOCK)
+    ),
+    Link('controller', 'plant', contract.WRENCH_COMMAND),
+    Link('steering', 'controller', contract.JOINT_TRAJECTORY),
+    Link('steering', 'plant', contract.JOINT_TRAJECTORY),
+    Link('user', 'steering', contract.TARGET),
+    Link('plant', 'steering', contract.DIAGNOSTICS),
+    Link('controller', 'steering', contract.DIAGNOSTICS),
+    Link('steering', 'user', contract.DIAGNOSTICS),
+    Link('plant', 'user', contract.CLOCK),
+)
+
+
+class Fault(NamedTuple):
+    """
+    A fault of one message.
+
+    Attributes
+    ----------
+    link : Link
+        Link of the message.
+    number : int
+        Number of the message on the link, from 1, since the target was sent.
+    kind : str
+        One of `KINDS`.
+    delay : float
+        Delay of the message, or of its duplicate [s].
+
+    """
+
+    link: Link
+    number: int
+    kind: str
+    delay: float
+
+    def __str__(self) -> str:
+        delay = '' if self.kind == 'drop' else f' {self.delay:.3f} s'
+        return f'{self.kind}{delay} message {self.number} of {self.link}'
+
+
+def _name(node: str, topic: Topic) -> str:
+    """Return the name of a topic at a node."""
+    return f'/at_{node}/{topic.name.lstrip("/")}'
+
+
+def _remaps(node: str) -> list[str]:
+    """Return arguments that give a node its own names of all topics."""
+    topics = {one.topic.name: one.topic for one in LINKS if node in one[:2]}
+    rules = [f'{topic.name}:={_name(node, topic)}' for topic in topics.values()]
+    return ['--ros-args', *(word for rule in rules for word in ('-r', rule))]
+
+
+class Relay(Node):
+    """
+    Passes the messages of all links on, but for one fault.
+
+    Parameters
+    ----------
+    **node_options
+        As for `rclpy.node.Node`.
+
+    Attributes
+    ----------
+    fault : Fault or None
+        The fault.
+    counts : Counter
+        Number of messages of each link since the target was sent.
+    now : float
+        Simulated time [s].
+    struck : float or None
+        Simulated time of the fault [s].
+
+    """
+
+    def __init__(self, **node_options: Any) -> None:
+        super().__init__('relay', **node_options)
+        self.fault: Fault | None = None
+        self.counts: Counter[Link] = Counter()
+        self.armed = False
+        self.now = 0.0
+        self.struck: float | None = None
+        #: Messages that are held: until simulated or wall time [s], and what delivers them.
+        self._held: list[tuple[float, float, Callable[[], None]]] = []
+        for source, topic in {(one.source, one.topic) for one in LINKS}:
+            kind, name = message_class(topic.type_name), _name(source, topic)
+            sinks = []
+            for link in LINKS:
+                if (link.source, link.topic) == (source, topic):
+                    to = self.create_publisher(kind, _name(link.sink, topic), profile(topic.qos))
+                    sinks.append((link, to.publish))
+            take = partial(self._take, sinks)
+            self.create_subscription(kind, name, take, profile(topic.qos, request=True), raw=True)
+        self.create_subscription(
+            message_class(contract.CLOCK.type_name),
+            _name('plant', contract.CLOCK),
+            self._on_clock,
+            profile(contract.CLOCK.qos, request=True),
+        )
+        # Simulated time may stand still, waiting for a message that is held.
+        self.create_timer(_CHECK, self._deliver, clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+    def _on_clock(self, message: Any) -> None:
+        self.now = message.clock.sec + message.clock.nanosec / NANOSECONDS
+
+    def _take(self, sinks: Sequence[tuple[Link, Callable[[bytes], None]]], data: bytes) -> None:
+        for link, publish in sinks:
+            self.counts[link] += self.armed
+            fault = self.fault
+            if not self.armed or fault is None or fault[:2] != (link, self.counts[link]):
+                publish(data)
+                continue
+            self.struck = self.now
+            if fault.kind == 'duplicate':
+                publish(data)
+            if fault.kind != 'drop':
+                later = self.now + fault.delay, monotonic() + fault.delay, partial(publish, data)
+                self._held.append(later)
+
+    def _deliver(self) -> None:
+        wall = monotonic()
+        due = [one for one in self._held if self.now >= one[0] or wall >= one[1]]
+        self._held = [one for one in self._held if one not in due]
+        for _, _, deliver in due:
+            deliver()
+
+
+class Outcome(NamedTuple):
+    """
+    The end of an insertion.
+
+    Attributes
+    ----------
+    end : str
+        ``target``, ``stopped``, ``rejected``, ``missed`` (done, but not at the target), ``late``
+        (stopped too late) or ``hangs``.
+    line : str
+        Why it stopped, or its state.
+    after : float
+        Simulated time from the fault to the end [s].
+    counts : Counter
+        Messages of each link.
+
+    """
+
+    end: str
+    line: str
+    after: float
+    counts: Counter[Link]
+
+    @property
+    def met(self) -> bool:
+        """Whether the insertion reached its target or stopped in time."""
+        return self.end in ('target', 'stopped', 'rejected')
+
+
+def insert(fault: Fault | None, logs: Path, *, continuous: bool = False) -> Outcome:
+    """
+    Insert a needle with one fault.
+
+    Parameters
+    ----------
+    fault : Fault or None
+        The fault.
+    logs : Path
+        Folder for logs.
+    continuous : bool
+        Whether the needle is inserted without rests.
+
+    Returns
+    -------
+    Outcome
+        Its end.
+
+    """
+    with Graph(logs) as graph:
+
+        def add(name: str, kind: Callable[..., Any], **parameters: object) -> Any:
+            overrides = [Parameter(key, value=value) for key, value in parameters.items()]
+            return graph.add(kind, parameter_overrides=overrides, cli_args=_remaps(name))
+
+        relay: Relay = graph.add(Relay)
+        user = add('user', partial(Node, 'user'), use_sim_time=True)
+        operator = Operator(user)
+        plant = add('plant', PlantNode, **_PLANT)
+        steering = add('steering', SteeringNode, **_STEERING, continuous=continuous, rate=50.0)
+        controller = add('controller', ControllerNode, **_CONTROLLER)
+        for node in (steering, controller, plant):
+            set_logger_level(node.get_logger().name, LoggingSeverity.FATAL)
+            if not node.start():
+                raise GraphError(f'{node.get_name()} does not start: {node.failure}')
+
+        def ready() -> bool:
+            seen = steering.diagnose()[2]
+            taken = [str(seen.get(f'input {one.name}', ' 0 taken')) for one in _STATES[::2]]
+            heard = {'controller', 'plant'} <= {*steering._loop._monitor._receivers}
+            known = 'steering' in operator.states
+            return known and heard and not any(' 0 taken' in one for one in taken)
+
+        graph.spin_until(ready, 'the nodes', _HANGS)
+        relay.fault, relay.armed = fault, True
+        pending = operator.target(*TARGET)
+        loop = steering._loop
+        ends = (Phase.DONE, Phase.STOPPED)
+
+        def ended() -> bool:
+            return loop.phase in ends or (pending.done and not pending.outcome[0])
+
+        try:
+            graph.spin_until(ended, 'the end', _HANGS)
+            end = relay.now
+            # A message that is held may still arrive, and must not move anything.
+            later = relay.now + LONGEST_DELAY + 0.5
+            graph.spin_until(lambda: relay.now > later, 'the last message', _HANGS)
+        except GraphError as error:
+            return Outcome('hangs', f'{loop.phase.value}; {error}', np.inf, relay.counts)
+        after = end - relay.struck if relay.struck is not None else 0.0
+        if loop.phase is Phase.DONE:
+            x, y, z = np.array(plant._run.plant.insertion.needle.tip)
+            off = float(np.hypot(x - TARGET[0], z - TARGET[2]))
+            there = off < LARGEST_MISS and abs(y - TARGET[1]) < LARGEST_MISS
+            line = f'{1e3 * off:.2f} mm from the target'
+            return Outcome('target' if there else 'missed', line, after, relay.counts)
+        if loop.phase is Phase.STOPPED:
+            kind = 'stopped' if after <= LONGEST_STOP else 'late'
+            return Outcome(kind, loop.fault, after, relay.counts)
+        return Outcome('rejected', pending.outcome[1], after, relay.counts)
+
+
+def choose(counts: Counter[Link], rng: np.random.Generator) -> Fault:
+    """
+    Choose a link, one of its messages, and a fault.
+
+    Parameters
+    ----------
+    counts : Counter
+        Messages of each link in an insertion without a fault.
+    rng : Generator
+        Source of randomness.
+
+    Returns
+    -------
+    Fault
+        The fault.
+
+    """
+    link = LINKS[int(rng.integers(len(LINKS)))]
+    number = 1 + int(rng.integers(max(1, counts[link])))
+    return Fault(link, number, str(rng.choice(KINDS)), float(rng.uniform(0.0, LONGEST_DELAY)))
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    """Run the insertions, print a table and the verdict; return the exit status."""
+    parser = argparse.ArgumentParser('benchmarks.relay', description=__doc__)
+    parser.add_argument('--count', type=int, default=200, help='number of insertions')
+    parser.add_argument('--seed', type=int, default=1, help='seed of the random choices')
+    given = parser.parse_args(words)
+    rng, begun = np.random.default_rng(given.seed), monotonic()
+    rows: dict[str, Counter[str]] = {str(link): Counter() for link in LINKS}
+    failed = []
+    with TemporaryDirectory() as folder:
+        # Each with rests and without.
+        counts = []
+        for continuous in (False, True):
+            clean = insert(None, Path(folder), continuous=continuous)
+            if clean.end != 'target':
+                sys.stdout.write(f'missed: without a fault: {clean.end}, {clean.line}\n')
+                return 1
+            counts.append(clean.counts)
+        for number in range(given.count):
+            continuous = bool(number % 2)
+            fault = choose(counts[continuous], rng)
+            outcome = insert(fault, Path(folder), continuous=continuous)
+            rows[str(fault.link)][outcome.end] += 1
+            if outcome.end != 'target':
+                kind = 'continuous' if continuous else 'steps'
+                line = f'{number}: {kind}, {fault}: {outcome.end} after {outcome.after:.2f} s'
+                sys.stdout.write(f'{line}: {outcome.line}\n')
+                sys.stdout.flush()
+            if not outcome.met:
+                failed.append(fault)
+    ends = ('target', 'stopped', 'rejected', 'missed', 'late', 'hangs')
+    lines = [
+        (link, *(str(found[end]) for end in ends)) for link, found in rows.items() if found.total()
+    ]
+    sys.stdout.write(f'{table(lines, ("link", *ends))}\n')
+    reached = sum(found['target'] for found in rows.values())
+    verdict = 'missed' if failed else 'met'
+    sys.stdout.write(
+        f'{verdict}: {given.count} insertions with a fault, {reached} at the target, '
+        f'{given.count - reached - len(failed)} stopped in time, {len(failed)} failed; '
+        f'{monotonic() - begun:.0f} s\n'
+    )
+    return int(bool(failed))
+
+
+if __name__ == '__main__':
+    sys.exit(main())

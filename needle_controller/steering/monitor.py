@@ -1,0 +1,215 @@
+"""Monitor of a motion: whether the robot follows it, and which node has rejected it."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from typing import Final
+
+from needle_controller.steering.motion import Move
+from needle_dynamics.arrays import BoolArray, FloatArray
+from needle_ros.contract import JOINT_TRAJECTORY
+from needle_ros.status import Acknowledgement, REPEAT_AFTER, REPEATS, RequestStatus, Verdict
+from needle_ros.timing import NANOSECONDS
+import numpy as np
+
+#: A joint that has moved by more than this, or than its tolerance, follows [m, rad].
+_MOVED: Final = 1e-4
+
+#: Time for a robot to react to a motion [s].
+_REACTION: Final = 0.3
+
+#: Stamps of a stream of motions that are kept: more than are sent in a second.
+_STREAMED: Final = 64
+
+
+class MotionMonitor:
+    """
+    Compares the motion that was sent last with the joints, and with the answers to it.
+
+    Parameters
+    ----------
+    joints : sequence of str
+        Joints of the robot.
+    tolerances : ndarray, shape (joints,)
+        Tolerances of their positions [m, rad].
+
+    """
+
+    def __init__(self, joints: Sequence[str], tolerances: FloatArray) -> None:
+        self._joints, self._tolerances = list(joints), tolerances
+        #: Status of the nodes that take trajectories, by name.
+        self._receivers: dict[str, RequestStatus] = {}
+        #: Stamps of the motion with its repetitions, and of the motions of a stream [ns].
+        self._stamps: list[int] = []
+        self._streamed: deque[int] = deque(maxlen=_STREAMED)
+        self.forget()
+
+    def forget(self) -> None:
+        """Forget the motion: nothing is to be followed."""
+        self._stamps.clear()
+        self._streamed.clear()
+        self._begin = self._goal = np.zeros(len(self._joints))
+        self._pending: BoolArray = np.zeros(len(self._joints), dtype=np.bool_)
+        self._arrives = False
+        self._overdue = 0
+
+    def begin(
+        self, move: Move, at: FloatArray, *, again: bool = False, arrives: bool = False
+    ) -> None:
+        """
+        Begin to monitor a motion.
+
+        Parameters
+        ----------
+        move : Move
+            The motion.
+        at : ndarray, shape (joints,)
+            Positions from which it begins [m, rad].
+        again : bool
+            Whether it repeats the motion before.
+        arrives : bool
+            Whether the joints must arrive in time, where a part of the motion may have been
+            followed already; else they must begin to move in time.
+
+        """
+        if not again:
+            self._stamps.clear()
+        self._stamps.append(move.stamp)
+        columns = [self._joints.index(name) for name in move.joints]
+        self._begin, self._goal = at.copy(), at.copy()
+        self._goal[columns] = move.positions[-1]
+        way, room = np.abs(self._goal - self._begin), self._room
+        self._pending = way > (self._tolerances if arrives else room)
+        self._arrives = arrives
+        visible = 0.0
+        for k in np.flatnonzero(self._pending):
+            gone = np.abs(move.positions[:, columns.index(int(k))] - at[k])
+            seen = len(gone) - 1 if arrives else int(np.argmax(gone >= min(room[k], way[k])))
+            visible = max(visible, float(move.times[seen]))
+        wait = max(REPEAT_AFTER, visible + _REACTION)
+        self._overdue = move.stamp + round(wait * NANOSECONDS)
+
+    @property
+    def _room(self) -> FloatArray:
+        return np.minimum(self._tolerances, _MOVED)
+
+    def stream(self, move: Move) -> None:
+        """
+        Take note of a motion that the next one replaces soon: only its answers count.
+
+        Parameters
+        ----------
+        move : Move
+            The motion.
+
+        """
+        self._streamed.append(move.stamp)
+
+    def wait(self, duration: int) -> None:
+        """
+        Wait longer.
+
+        Parameters
+        ----------
+        duration : int
+            Time in which a person has paused the motion [ns].
+
+        """
+        self._overdue += duration
+
+    def is_late(self, at: FloatArray, stamp: int) -> bool:
+        """
+        Return whether the motion should be followed by now and is not.
+
+        Parameters
+        ----------
+        at : ndarray, shape (joints,)
+            Positions [m, rad].
+        stamp : int
+            Their stamp [ns].
+
+        Returns
+        -------
+        bool
+            Whether it is to be repeated.
+
+        """
+        if not self._pending.any():
+            return False
+        if self._arrives:
+            self._pending &= np.abs(at - self._goal) > self._tolerances
+        else:
+            gone = (at - self._begin) * np.sign(self._goal - self._begin)
+            self._pending &= gone < self._room
+        return bool(self._pending.any()) and stamp >= self._overdue
+
+    @property
+    def exhausted(self) -> bool:
+        """Whether the motion has been repeated as often as it may be."""
+        return len(self._stamps) > REPEATS
+
+    def hear(self, node: str, status: RequestStatus) -> str:
+        """
+        Take the status of a node that takes trajectories.
+
+        Parameters
+        ----------
+        node : str
+            Its name.
+        status : RequestStatus
+            Its status.
+
+        Returns
+        -------
+        str
+            Why it does not execute the motion, '' if it does.
+
+        """
+        if JOINT_TRAJECTORY.name not in status.takes:
+            return ''
+        self._receivers[node] = status
+        for one in status.answers:
+            if one.topic == JOINT_TRAJECTORY.name and self._refuses(one):
+                return f'{node} {one.verdict.value} the motion: {one.reason}'
+        return ''
+
+    def _refuses(self, answer: Acknowledgement) -> bool:
+        """Return whether an answer refuses what was sent last."""
+        if answer.verdict is Verdict.REJECTED:
+            return answer.stamp in self._stamps or answer.stamp in self._streamed
+        # An older one of ours is superseded by the newest of ours.
+        newest = [*self._stamps[-1:], *list(self._streamed)[-1:]]
+        return answer.verdict is Verdict.SUPERSEDED and answer.stamp in newest
+
+    @property
+    def paused(self) -> str:
+        """Name of a node whose motion a person has paused, '' if there is none."""
+        return next((node for node, status in self._receivers.items() if status.paused), '')
+
+    @property
+    def pending(self) -> BoolArray:
+        """Whether each joint still has to follow the motion, shape (joints,)."""
+        return self._pending
+
+    def failure(self) -> str:
+        """Return how a motion was sent that is not followed, and who answered, for people."""
+        names = {self._joints[k] for k in np.flatnonzero(self._pending)}
+        takers = {
+            node: status
+            for node, status in self._receivers.items()
+            if names & {*status.takes[JOINT_TRAJECTORY.name]}
+        }
+        silent = [
+            node
+            for node, status in takers.items()
+            if not any(status.answer_to(JOINT_TRAJECTORY.name, one) for one in self._stamps)
+        ]
+        if not takers:
+            why = f'no node reports that it takes {JOINT_TRAJECTORY.name}'
+        elif silent:
+            why = f'no answer of {" and ".join(silent)}'
+        else:
+            why = f'{" and ".join(takers)} accepted it'
+        count = len(self._stamps)
+        return f'{JOINT_TRAJECTORY.name} sent {count} time{"s" * (count > 1)}, {why}'

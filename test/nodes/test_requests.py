@@ -1,0 +1,90 @@
+"""Requests over DDS: repeated when a message is lost, and answered once."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from needle_controller.controller_node import ControllerNode
+from needle_insertion.live.operator import Operator
+from needle_ros.calls_node import Calls
+from needle_ros.status import CALL_TIMEOUT
+import pytest
+from rclpy.node import Node
+from std_srvs.srv import Trigger
+from support.ros_graph import RosGraph
+
+
+def serve(node: Node, name: str) -> Node:
+    """Offer a service that answers by a name."""
+
+    def answer(_request: Any, response: Any) -> Any:
+        response.success, response.message = True, name
+        return response
+
+    node.create_service(Trigger, 'server/act', answer)
+    return node
+
+
+def test_a_call_that_is_lost_is_repeated(ros_graph: RosGraph) -> None:
+    """The node that got the first one has ended; the next one answers."""
+    caller = ros_graph.node('caller')
+    calls, client = Calls(caller), caller.create_client(Trigger, 'server/act')
+    # It is not spun: so it takes no request.
+    first = serve(Node('server', context=ros_graph.context), 'first')
+    ros_graph.spin_until(client.service_is_ready, 'the service')
+    answer = calls.call(client, Trigger.Request())
+    first.destroy_node()
+    serve(ros_graph.node('server'), 'second')
+    ros_graph.spin_until(answer.done, 'the answer')
+    assert answer.result().message == 'second'
+
+
+def test_a_call_without_an_answer_ends_with_one_line(ros_graph: RosGraph) -> None:
+    operator = Operator(ros_graph.node('operator'))
+    deaf = Node('controller', context=ros_graph.context)
+    deaf.create_service(Trigger, 'controller/retract', lambda _request, response: response)
+    client = operator._clients['controller', 'retract']
+    try:
+        ros_graph.spin_until(client.service_is_ready, 'the service')
+        outcome = operator.ask('retract')
+        ros_graph.spin_until(outcome.done, 'the outcome')
+        line = f'controller/retract: no answer within {CALL_TIMEOUT:g} s'
+        assert outcome.result() == (False, line)
+    finally:
+        deaf.destroy_node()
+
+
+def test_a_target_that_is_lost_is_sent_again(ros_graph: RosGraph) -> None:
+    """The first message is sent before the controller is discovered."""
+    controller = ros_graph.add(ControllerNode)
+    operator = Operator(ros_graph.node('operator'))
+    pending = operator.target(0.0, 0.05, 0.0)
+    assert operator._target.get_subscription_count() == 0
+    ros_graph.spin_until(lambda: pending.done, 'the answer')
+    assert pending.outcome == (True, 'controller: target accepted')
+    assert controller.diagnose()[2]['target [m]'] == 0.05
+
+
+@pytest.mark.parametrize(
+    ('depth', 'steered', 'line'),
+    [
+        (5.0, False, r'controller: target rejected: target depth must be in \[.*\] m, got 5.0'),
+        (0.05, True, 'controller: no answer to target within 6 s'),
+    ],
+)
+def test_a_target_that_is_refused_is_never_under_way(
+    ros_graph: RosGraph, depth: float, steered: bool, line: str
+) -> None:
+    operator = Operator(ros_graph.node('operator'))
+    controller = ros_graph.add(ControllerNode, parameters={'steered': steered})
+    ros_graph.spin_until(
+        lambda: operator._target.get_subscription_count() and 'controller' in operator.states,
+        'the controller',
+    )
+    pending = operator.target(0.0, depth, 0.0)
+    ros_graph.spin_until(lambda: pending.done, 'the answer')
+    accepted, said = pending.outcome
+    assert not accepted
+    with pytest.raises(AssertionError, match=line):
+        raise AssertionError(said)
+    assert controller.diagnose()[2]['target [m]'] is None

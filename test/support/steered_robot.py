@@ -1,0 +1,148 @@
+"""An outer loop with a simulated robot, its needle and its tracker, in simulated time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+from needle_controller import OuterLoop, OuterLoopSettings, SteeringBelief
+from needle_controller.steering.motion import Move
+from needle_dynamics import SteeredNeedle, STEERING_PRESETS
+from needle_ros.contract import JOINT_TRAJECTORY
+from needle_ros.status import RequestLog, Verdict
+from needle_ros.wire import Reading
+import numpy as np
+import pytest
+
+NEEDLE, STEERING, _ = STEERING_PRESETS['bending_35mm']
+SETTINGS = OuterLoopSettings(look_time=0.2)
+#: A step of time of the robot, and of its tracker [ns].
+PERIOD = 10_000_000
+SECOND = 100 * PERIOD
+TARGET = (2e-3, 0.06, -1e-3)
+NAMES = ('insertion', 'guide_x', 'guide_z')
+CONTINUOUS = replace(SETTINGS, continuous=True)
+
+
+class Robot:
+    """A loop, a robot and its needle in tissue that is softer than believed, and their time."""
+
+    def __init__(
+        self, own: OuterLoopSettings = SETTINGS, belief: SteeringBelief | None = None
+    ) -> None:
+        self.seconds = 0.0
+        self.loop = OuterLoop(
+            NEEDLE, STEERING, belief or SteeringBelief(), own, steady=lambda: self.seconds
+        )
+        softer = replace(NEEDLE, tissue_stiffness=0.6 * NEEDLE.tissue_stiffness)
+        self.needle = SteeredNeedle(softer, STEERING, tilt=(0.01, 0.02))
+        self.now = 1000 * SECOND
+        self.at = np.zeros(3)
+        #: How each joint moves: times [ns] and positions.
+        self.ways = [(np.zeros(1), np.zeros(1)) for _ in NAMES]
+        self.noise = np.random.default_rng(3)
+        #: What goes wrong: how the joints move, and what is said of them and of the tip.
+        self.moves: Callable[[np.ndarray[Any, Any]], np.ndarray[Any, Any]] = lambda at: at
+        self.says: Callable[[Any], Any] = lambda at: at
+        self.sees: Callable[[Any], Any] = lambda tip: tip
+        self.late = 0
+        self.waiting: list[tuple[int, Any]] = []
+        self.tracked: list[np.ndarray[Any, Any]] = []
+        #: Who moves which joints, and why a motion is rejected.
+        self.moved = {'controller': NAMES[:1], 'plant': NAMES[1:]}
+        self.logs = {
+            name: RequestLog({JOINT_TRAJECTORY: joints}, steady=lambda: self.seconds)
+            for name, joints in self.moved.items()
+        }
+        self.rejects: Callable[[str, Move], str] = lambda _name, _move: ''
+        self.paused = False
+        #: Stamps of the motions that were executed, by joint.
+        self.begun: list[int] = []
+
+    def tick(self, count: int = 1) -> None:
+        """Let time pass."""
+        for _ in range(count):
+            self.now += PERIOD
+            self.seconds += 1e-9 * PERIOD
+            self.at = self.moves(np.array([np.interp(self.now, *way) for way in self.ways]))
+            self.needle.move(depth=float(self.at[0]), guide=self.at[1:].tolist())
+            self.tracked.append(self.at)
+            x, y, z = self.needle.tip
+            tip = np.array([x, y, z]) + 1.8e-4 * self.noise.standard_normal(3)
+            self.waiting.append((self.now, self.sees(tip)))
+            said = self.says(self.at)
+            if said is not None:
+                states = self.joints(self.now, said)
+                self.post('joint_states', partial(self.take, self.loop.joints, states))
+            while self.waiting and self.waiting[0][0] <= self.now - self.late:
+                stamp, seen = self.waiting.pop(0)
+                if seen is not None:
+                    reading = Reading(stamp, 'needle_entry', (), (tuple(seen),))
+                    self.post('tip_deflection', partial(self.take, self.loop.tip, reading))
+            if self.now % SECOND == 0:
+                self.report()
+            self.follow(self.loop.watch(self.now))
+
+    @staticmethod
+    def joints(stamp: int, at: Any) -> Reading:
+        return Reading(stamp, '', NAMES, (tuple(at), (0.0,) * 3, ()))
+
+    def take(self, take: Callable[[Any, int], Move | None], message: Any) -> None:
+        """Pass a message to the loop, and send the motion that it returns."""
+        self.follow(take(message, self.now))
+
+    def post(self, _topic: str, deliver: Callable[[], None]) -> None:
+        """Pass a message on: here at once."""
+        deliver()
+
+    def follow(self, move: Move | None) -> None:
+        """Send a motion to all that move a joint."""
+        if move is not None:
+            for name, log in self.logs.items():
+                self.post('joint_trajectory', partial(self.execute, name, log, move))
+
+    def execute(self, name: str, log: RequestLog, move: Move) -> None:
+        """Begin a motion of the own joints, from where they are, and acknowledge it."""
+        own = [joint for joint in move.joints if joint in self.moved[name]]
+        if not own:
+            return
+        if log.check(JOINT_TRAJECTORY, move.stamp, self.now, '', own) is None:
+            why = self.rejects(name, move)
+            verdict = Verdict.REJECTED if why else Verdict.ACCEPTED
+            log.answer(JOINT_TRAJECTORY, move.stamp, verdict, why, own)
+            times = self.now + 1e9 * np.concatenate([[0.0], move.times])
+            for joint in own if not why else ():
+                k, column = NAMES.index(joint), move.positions[:, move.joints.index(joint)]
+                self.ways[k] = times, np.concatenate([[self.at[k]], column])
+                self.begun.append(move.stamp)
+        self.report()
+
+    def report(self) -> None:
+        """Publish the status of all that move a joint."""
+        for name, log in self.logs.items():
+            status = log.status(paused=self.paused)
+            hear = partial(self.loop.hear, name)
+            self.post('diagnostics', partial(self.take, hear, status))
+
+    def aim(self, point: tuple[float, float, float] = TARGET, frame: str = '') -> str:
+        """Send a target; return why it was refused."""
+        before = self.loop.journal.refused
+        self.follow(self.loop.target(0, frame, point, self.now))
+        return self.loop.journal.complaint if self.loop.journal.refused > before else ''
+
+    def steer(self, ticks: int = 6000) -> None:
+        """Aim, and go on until the loop has nothing more to do."""
+        self.tick(20)
+        assert self.aim() == ''
+        for _ in range(ticks):
+            self.tick()
+            if not self.loop.steers:
+                return
+        pytest.fail(f'it steers for ever: {self.loop.phase}')
+
+    @property
+    def miss(self) -> float:
+        """Distance of the tip from the target [m]."""
+        return float(np.hypot(*(self.needle.tip[[0, 2]] - np.array(TARGET)[[0, 2]])))
