@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection
 from dataclasses import asdict
 import sys
+from time import monotonic
 from typing import Any
 
 from builtin_interfaces.msg import Duration
@@ -30,6 +31,9 @@ import numpy as np
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
+from rclpy.duration import Duration as Delay
+from rclpy.publisher import Publisher
+from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
@@ -38,6 +42,9 @@ _PRESET = 'bending_35mm'
 
 #: Time between two looks for what does not come [s].
 _WATCH = 0.05
+
+#: Longest time in which a motion arrives, in lock-step.
+_ARRIVAL = Delay(seconds=1.0)
 
 
 class SteeringNode(BaseNode):
@@ -87,6 +94,10 @@ class SteeringNode(BaseNode):
             self.listen(topic, self._passing(take), self._watch)
         self.subscribe(contract.TARGET, self._on_target)
         self.create_service(Trigger, '~/stop', self._on_stop)
+        #: Reports which sample was processed, while the time is that of a plant.
+        self._processed: Publisher | None = None
+        #: Whether a motion was sent since the last report.
+        self._moved = False
         #: A clock that stands still or jumps does not stop the watch.
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
 
@@ -105,7 +116,15 @@ class SteeringNode(BaseNode):
         belief = self.settings('belief.', SteeringBelief)
         # Compile, or load what was compiled, before anything moves; and refuse what cannot be.
         SteeringModel(needle, steering, [0.0, 1e-3], belief)
-        self._loop = OuterLoop(needle, steering, belief, self.settings('', OuterLoopSettings))
+        sim_time = self.get_parameter('use_sim_time').value
+        self._loop = OuterLoop(
+            needle,
+            steering,
+            belief,
+            self.settings('', OuterLoopSettings),
+            # In simulated time planning takes no time.
+            (lambda: self.now() / NANOSECONDS) if sim_time else monotonic,
+        )
 
     def cleanup(self) -> None:
         """Forget the loop."""
@@ -114,12 +133,17 @@ class SteeringNode(BaseNode):
     def activate(self) -> None:
         """Begin to listen, and to watch for what does not come."""
         self._timer = self.create_timer(_WATCH, self._watch, clock=self._steady)
+        if self.get_parameter('use_sim_time').value:
+            self._processed = self.publisher(contract.PROCESSED, always=True)
 
     def deactivate(self) -> None:
         """Bring needle and guide to rest."""
         if self._loop is not None:
             self._act(self._loop.stop('the node was deactivated'))
         self.destroy_timer(self._timer)
+        if self._processed is not None:
+            self.destroy_publisher(self._processed)
+            self._processed = None
 
     def about(self) -> str:
         """Name constants, steps and topics."""
@@ -141,8 +165,23 @@ class SteeringNode(BaseNode):
         def on_reading(reading: Reading) -> None:
             if self._loop is not None and self.is_active:
                 self._act(take(self._loop, reading, self.now()))
+                if take is OuterLoop.joints:
+                    self._report_processed(reading.stamp)
 
         return on_reading
+
+    def _report_processed(self, stamp: int) -> None:
+        """Report to a plant in lock-step that a sample is processed, once all motions arrived."""
+        processed = self._processed
+        if processed is None or not processed.get_subscription_count():
+            return
+        if self._moved:
+            self._trajectory.wait_for_all_acked(_ARRIVAL)
+            self._moved = False
+        whole, part = divmod(stamp, NANOSECONDS)
+        message = Header(frame_id=self.get_fully_qualified_name())
+        message.stamp.sec, message.stamp.nanosec = whole, part
+        processed.publish(message)
 
     def _on_target(self, message: PointStamped) -> None:
         if self._loop is None or not self.is_active:
@@ -181,6 +220,7 @@ class SteeringNode(BaseNode):
             return
         if move is not None:
             self._trajectory.publish(self._message(move))
+            self._moved = True
         if loop.expected is not self._told:
             self._told = loop.expected
             if loop.expected is not None:
