@@ -42,9 +42,10 @@ from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import JointTrajectory
 from visualization_msgs.msg import Marker
 
-#: Time between two looks at the graph [s]; looks after which an unanswered sample is repeated.
+#: Time between two looks at the graph [s]; looks after which an unanswered sample is repeated,
+#: and after which that is reported.
 _WATCH = 0.1
-_REPEAT = 5
+_REPEAT, _LONG = 5, 20
 
 #: More commands per sample than this are reported.
 _TOO_MANY = 3.0
@@ -156,8 +157,9 @@ class PlantNode(ModelNode):
         self._halted: str | None = None
         self._fault: Fault | None = None
         self._faulty = ''
-        #: Looks at the graph since a sample has waited for its answer.
+        #: Looks at the graph since the same sample has waited for its answers, and its stamp.
         self._looks = 0
+        self._awaited: int | None = None
         self._sampled = self._made_up = self._saturated = 0
         self._refused_trajectories = 0
         #: By a steady clock.
@@ -484,7 +486,9 @@ class PlantNode(ModelNode):
         if self._run is None:
             return
         self._look_who_commands()
-        self._looks = self._looks + 1 if self._time.awaited is not None else 0
+        awaited, before = self._time.awaited, self._awaited
+        self._looks = self._looks + 1 if awaited is not None and awaited == before else 0
+        self._awaited = awaited
         if self._looks and self._looks % _REPEAT == 0 and not self._time.paused:
             stamp, (topic, _, values) = self._last
             self._publish[topic](stamp, values)
@@ -634,7 +638,7 @@ class PlantNode(ModelNode):
         warnings = []
         if clock.paused:
             warnings.append(f'paused at {clock.stamp / NANOSECONDS:.6f} s')
-        if self._looks >= _REPEAT:
+        if self._looks >= _LONG:
             warnings.append(f'{clock.missing} the sample of {clock.stamp / NANOSECONDS:.6f} s')
         if clock.lost:
             warnings.append(f'{clock.lost} samples skipped after stalls')
