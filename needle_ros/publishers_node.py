@@ -5,9 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+from builtin_interfaces.msg import Time
+from needle_ros import contract
 from needle_ros.base_node import BaseNode, message_class, profile
 from needle_ros.contract import Topic
 from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.node import Node
 
 
 def offer_lease(node: BaseNode, lease: Topic) -> None:
@@ -28,6 +31,29 @@ def offer_lease(node: BaseNode, lease: Topic) -> None:
 def _name(node: BaseNode, lease: Topic) -> str:
     owner, _, own = lease.name.rpartition('/')
     return f'{node.resolve_topic_name(owner)}/{own}'
+
+
+def request_stamp(node: Node) -> Time:
+    """
+    Return the stamp of a request that is made now.
+
+    Parameters
+    ----------
+    node : Node
+        The node that makes it.
+
+    Returns
+    -------
+    Time
+        The time now; zero, which stands for the time of arrival, where others use the simulated
+        time of a ``/clock`` and this node does not.
+
+    """
+    simulated = node.count_publishers(contract.CLOCK.name) > 0
+    if simulated and not node.get_parameter('use_sim_time').value:
+        return Time()
+    made: Time = node.get_clock().now().to_msg()
+    return made
 
 
 class Publishers:

@@ -12,6 +12,7 @@ from needle_insertion.live.requests import CONTROLLER, Request, REQUESTS, STEERI
 from needle_ros import contract
 from needle_ros.base_node import profile
 from needle_ros.errors import printable
+from needle_ros.publishers_node import request_stamp
 from rcl_interfaces.srv import SetParameters
 from rclpy.client import Client
 from rclpy.node import Node
@@ -136,7 +137,7 @@ class Operator:
         """
         message = PointStamped()
         message.header.frame_id = contract.ENTRY
-        message.header.stamp = self._node.get_clock().now().to_msg()
+        message.header.stamp = request_stamp(self._node)
         message.point.x, message.point.y, message.point.z = x, y, z
         self._target.publish(message)
 
