@@ -331,6 +331,7 @@ class Graph:
         what: str,
         timeout: float = 60.0,
         sign: Callable[[], object] = lambda: None,
+        period: float = 0.0,
     ) -> None:
         """
         Run the nodes of this process until a condition holds.
@@ -345,6 +346,9 @@ class Graph:
             Longest time to wait [s].
         sign : callable
             The time begins again whenever its result changes: a sign of progress.
+        period : float
+            Time between two checks of the condition [s]; 0 for one after each event, which costs
+            more.
 
         Raises
         ------
@@ -362,4 +366,7 @@ class Graph:
                     started.check()
             if time.monotonic() > deadline:
                 raise GraphError(f'{what} did not come within {timeout:g} s')
-            self.executor.spin_once(timeout_sec=0.05)
+            if period:
+                self.executor.spin_until_future_complete(Future(), timeout_sec=period)
+            else:
+                self.executor.spin_once(timeout_sec=0.05)

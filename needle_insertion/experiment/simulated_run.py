@@ -16,15 +16,22 @@ from needle_ros.base_node import COMMAND, profile, SENSOR
 from needle_ros.timing import NANOSECONDS
 from needle_ros.wire import Reader
 from rclpy.duration import Duration
+from rclpy.node import Node
 from rclpy.publisher import Publisher
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
+
+#: Value of /diagnostics of a plant: number of nodes that it waits for.
+IN_LOCKSTEP: Final = 'nodes in lock-step'
 
 #: Longest time in which a message arrives, on a busy machine [s].
 _ARRIVAL: Final = Duration(seconds=30.0)
 
 #: Longest time without a sample, on a busy machine [s].
 _STALL: Final = 60.0
+
+#: Time between two checks whether the run has ended [s].
+_CHECK: Final = 0.05
 
 
 class Sample(NamedTuple):
@@ -45,6 +52,71 @@ class Sample(NamedTuple):
     stamp: int
     time: float
     depth: float
+
+
+class Witness:
+    """
+    Acts at samples of a plant.
+
+    A plant in lock-step waits at each sample until that has been done, and for good from the
+    sample on at which there is nothing more to do until `release`.
+
+    Parameters
+    ----------
+    node : Node
+        Node of this process.
+    act : callable
+        Called with each sample; returns whether time goes on.
+    lockstep : bool
+        Whether the plant runs in lock-step.
+
+    Attributes
+    ----------
+    stamp : int
+        Stamp of the newest sample [ns].
+    ended : bool
+        Whether there is nothing more to do.
+
+    """
+
+    def __init__(self, node: Node, act: Callable[[Sample], bool], *, lockstep: bool) -> None:
+        self._node, self._act = node, act
+        self._first = self.stamp = 0
+        self.ended = False
+        topic = contract.JOINT_STATES
+        self._read = Reader(topic.type_name).read
+        self._processed: Publisher | None = None
+        if lockstep:
+            kind = contract.PROCESSED
+            self._processed = node.create_publisher(Header, kind.name, profile(kind.qos))
+        self._samples = node.create_subscription(
+            JointState, topic.name, self._on_sample, SENSOR, raw=True
+        )
+
+    @property
+    def is_matched(self) -> bool:
+        """Whether there is a plant."""
+        return bool(self._samples.get_publisher_count())
+
+    def release(self) -> None:
+        """Let the plant go on alone."""
+        self._node.destroy_subscription(self._samples)
+        if self._processed is not None:
+            self._node.destroy_publisher(self._processed)
+
+    def _on_sample(self, data: bytes) -> None:
+        if self.ended:
+            return
+        reading = self._read(data)
+        stamp = reading.stamp
+        if stamp != self.stamp:
+            self._first, self.stamp = self._first or stamp, stamp
+            time = (stamp - self._first) / NANOSECONDS
+            self.ended = not self._act(Sample(stamp, time, reading.values[0][0]))
+        if self._processed is not None and not self.ended:
+            message = Header(frame_id=self._node.get_fully_qualified_name())
+            message.stamp.sec, message.stamp.nanosec = divmod(stamp, NANOSECONDS)
+            self._processed.publish(message)
 
 
 class SimulatedRun:
@@ -77,17 +149,7 @@ class SimulatedRun:
         self._graph, self._show, self._lockstep = graph, show, lockstep
         self.node = node = graph.node('demo')
         self.values: dict[str, dict[str, str]] = {}
-        self._read = Reader(contract.JOINT_STATES.type_name).read
-        self._act: Callable[[Sample], bool] | None = None
-        self._first = self._last = 0
-        kind = contract.PROCESSED
-        self._processed: Publisher | None = None
-        if lockstep:
-            self._processed = node.create_publisher(Header, kind.name, profile(kind.qos))
         node.create_subscription(DiagnosticArray, contract.DIAGNOSTICS.name, self._hear, 10)
-        self._samples = node.create_subscription(
-            JointState, contract.JOINT_STATES.name, self._on_sample, SENSOR, raw=True
-        )
 
     def publisher(self, kind: type, topic: str) -> Callable[[Any], None]:
         """
@@ -140,6 +202,7 @@ class SimulatedRun:
 
         """
         graph, node = self._graph, self.node
+        witness = Witness(node, act, lockstep=self._lockstep)
         started = [graph.start('recorder', {'path': str(bag)})]
         time = {'use_sim_time': True} if self._lockstep else {}
         for name, parameters in nodes.items():
@@ -150,18 +213,23 @@ class SimulatedRun:
         self._show('starting plant')
         graph.change(node, 'plant', CONFIGURE)
         # The bag has every sample, and every sample is waited for.
-        participants = str(self._lockstep + ('steering' in nodes and self._lockstep))
+        participants = str(self._lockstep * (1 + ('steering' in nodes)))
         graph.spin_until(
             lambda: (
-                self._samples.get_publisher_count()
+                witness.is_matched
                 and self._is_recorded()
-                and self.values.get('plant', {}).get('nodes in lock-step') == participants
+                and self.values.get('plant', {}).get(IN_LOCKSTEP) == participants
             ),
             'the recorder and the nodes in lock-step',
         )
-        self._act = act
         graph.change(node, 'plant', ACTIVATE)
-        graph.spin_until(lambda: self._act is None, 'the next sample', _STALL, lambda: self._last)
+        graph.spin_until(
+            lambda: witness.ended,
+            'the next sample',
+            _STALL,
+            sign=lambda: witness.stamp,
+            period=_CHECK,
+        )
         for one in started:
             one.interrupt()
 
@@ -183,20 +251,3 @@ class SimulatedRun:
         for status in array.status:
             values = {one.key: one.value for one in status.values}
             self.values[status.name.rpartition('/')[2]] = {**values, '': status.message}
-
-    def _on_sample(self, data: bytes) -> None:
-        """Act at a sample, and let the plant go on."""
-        if self._act is None:
-            return
-        reading = self._read(data)
-        stamp = reading.stamp
-        if stamp != self._last:
-            self._first, self._last = self._first or stamp, stamp
-            time = (stamp - self._first) / NANOSECONDS
-            if not self._act(Sample(stamp, time, reading.values[0][0])):
-                self._act = None
-                return
-        if self._processed is not None:
-            message = Header(frame_id=self.node.get_fully_qualified_name())
-            message.stamp.sec, message.stamp.nanosec = divmod(stamp, NANOSECONDS)
-            self._processed.publish(message)
