@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection
 from dataclasses import asdict
 import sys
+from time import monotonic
 from typing import Any
 
 from builtin_interfaces.msg import Duration
@@ -33,6 +34,9 @@ import numpy as np
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
+from rclpy.duration import Duration as Delay
+from rclpy.publisher import Publisher
+from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
@@ -41,6 +45,9 @@ _PRESET = 'bending_35mm'
 
 #: Time between two checks for missing inputs, and for a plan that is computed [s].
 _WATCH = 0.05
+
+#: Longest time in which a motion arrives, in lock-step.
+_ARRIVAL = Delay(seconds=1.0)
 
 
 class SteeringNode(CompiledNode):
@@ -94,6 +101,12 @@ class SteeringNode(CompiledNode):
         self.subscribe(contract.TARGET, self._on_target)
         self.subscribe(contract.DIAGNOSTICS, self._on_diagnostics)
         self.create_service(Trigger, '~/stop', self._on_stop)
+        #: Reports which sample was processed, while the time is that of a plant.
+        self._processed: Publisher | None = None
+        #: Sample that is processed and not reported yet: a plan is computed first.
+        self._unreported: int | None = None
+        #: Whether a motion was sent since the last report.
+        self._moved = False
         #: A clock that stands still or jumps does not stop the checks.
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
 
@@ -112,8 +125,16 @@ class SteeringNode(CompiledNode):
         belief = self.settings('belief.', SteeringBelief)
         # Compile, or load what was compiled, before anything moves; and refuse what cannot be.
         SteeringModel(needle, steering, [0.0, 1e-3], belief)
-        settings = self.settings('', OuterLoopSettings)
-        self._loop = OuterLoop(needle, steering, belief, settings, start=ThreadJob)
+        # In simulated time a plan takes no time: the plant in lock-step waits for it.
+        sim_time = self.get_parameter('use_sim_time').value
+        self._loop = OuterLoop(
+            needle,
+            steering,
+            belief,
+            self.settings('', OuterLoopSettings),
+            (lambda: self.now() / NANOSECONDS) if sim_time else monotonic,
+            start=ThreadJob,
+        )
 
     def cleanup(self) -> None:
         """Discard the loop."""
@@ -122,12 +143,17 @@ class SteeringNode(CompiledNode):
     def activate(self) -> None:
         """Begin to listen, and to check for missing inputs."""
         self._timer = self.create_timer(_WATCH, self._watch, clock=self._steady)
+        if self.get_parameter('use_sim_time').value:
+            self._processed = self.publisher(contract.PROCESSED, always=True)
 
     def deactivate(self) -> None:
         """Bring needle and guide to rest."""
         if self._loop is not None:
             self._act(self._loop.stop('the node was deactivated', self.now()))
         self.destroy_timer(self._timer)
+        if self._processed is not None:
+            self.destroy_publisher(self._processed)
+            self._processed = None
 
     def about(self) -> str:
         """Name constants, steps and topics."""
@@ -149,8 +175,27 @@ class SteeringNode(CompiledNode):
         def on_reading(reading: Reading) -> None:
             if self._loop is not None and self.is_active:
                 self._act(take(self._loop, reading, self.now()))
+                if take is OuterLoop.joints:
+                    self._unreported = reading.stamp
+                    self._report_processed()
 
         return on_reading
+
+    def _report_processed(self) -> None:
+        """Report to a plant in lock-step that a sample is processed, once all motions arrived."""
+        processed, stamp, loop = self._processed, self._unreported, self._loop
+        if processed is None or stamp is None or loop is None or loop.busy:
+            return
+        self._unreported = None
+        if not processed.get_subscription_count():
+            return
+        if self._moved:
+            self._trajectory.wait_for_all_acked(_ARRIVAL)
+            self._moved = False
+        whole, part = divmod(stamp, NANOSECONDS)
+        message = Header(frame_id=self.get_fully_qualified_name())
+        message.stamp.sec, message.stamp.nanosec = whole, part
+        processed.publish(message)
 
     def _on_target(self, message: PointStamped) -> None:
         stamp = nanoseconds(message.header.stamp)
@@ -196,6 +241,7 @@ class SteeringNode(CompiledNode):
         count = self._measurers.count
         self._loop.count_publishers(count(contract.JOINT_STATES), count(contract.TIP_DEFLECTION))
         self._act(self._loop.watch(self.now()))
+        self._report_processed()
 
     # Outputs.
 
@@ -206,6 +252,7 @@ class SteeringNode(CompiledNode):
             return
         if move is not None:
             self._trajectory.publish(self._message(move))
+            self._moved = True
         if loop.expected is not self._told:
             self._told = loop.expected
             if loop.expected is not None:

@@ -42,14 +42,17 @@ class CompiledNode(BaseNode):
         if self._compiled:
             self.get_logger().info(f'{self._compiled} functions compiled: {where_kept()}')
 
-    def _on_function(self, function: str, loaded: bool) -> None:
+    def _on_function(self, function: str, loaded: bool, prepared: bool) -> None:
         if self.is_active:
-            self.late.append(function)
-            done = 'loaded' if loaded else 'compiled'
-            self.get_logger().error(f'{function} is {done} while the node is active')
-        elif not loaded and not self._compiled:
-            self.get_logger().info('compiling functions for this machine ...')
-        self._compiled += not loaded
+            # Another node of this process may be prepared now.
+            if not prepared:
+                self.late.append(function)
+                done = 'loaded' if loaded else 'compiled'
+                self.get_logger().error(f'{function} is {done} while the node is active')
+        elif not loaded:
+            if not self._compiled:
+                self.get_logger().info('compiling functions for this machine ...')
+            self._compiled += 1
 
     def destroy_node(self) -> None:
         """Destroy the node, and end the report of compilations."""

@@ -22,6 +22,7 @@ from needle_dynamics.simulated.indenter import JOINTS as PRESS_JOINTS
 from needle_dynamics.simulated.measured import Outline
 from needle_dynamics.simulated.run import Event, PARAMETERS, PlantRun, RESET, TARE, TRAJECTORY
 from needle_ros import contract
+from needle_ros.base_node import profile
 from needle_ros.errors import JobError, MessageError, NeedleError, ParameterError, printable
 from needle_ros.publishers_node import offer_lease, Publishers
 from needle_ros.run_node import run
@@ -33,16 +34,19 @@ from needle_ros.wire import Reading
 from rcl_interfaces.msg import IntegerRange, ParameterDescriptor
 from rclpy.clock import Clock as NodeClock
 from rclpy.clock_type import ClockType
+from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.publisher import Publisher
 from rclpy.subscription import Subscription
 from rosgraph_msgs.msg import Clock
+from std_msgs.msg import Header
 from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import JointTrajectory
 from visualization_msgs.msg import Marker
 
-#: Time between two looks at the graph [s]; looks after which an unanswered sample is repeated.
+#: Time between two looks at the graph [s]; looks after which an unanswered sample is repeated,
+#: and after which that is reported.
 _WATCH = 0.1
-_REPEAT = 5
+_REPEAT, _LONG = 5, 20
 
 #: More commands per sample than this are reported.
 _TOO_MANY = 3.0
@@ -107,7 +111,8 @@ class PlantNode(ModelNode):
     Samples are taken at exact multiples of the period of simulated time, see `SampleClock`; with
     ``publish_clock`` or ``lockstep`` it is /clock. `Commands` decides which command acts from one
     sample to the next. A command carries the stamp of the sample that it answers; with
-    ``lockstep`` the next sample waits for it. ``~/pause`` stops time, ``~/step`` takes one
+    ``lockstep`` the next sample waits for it, and for all nodes that report which sample they
+    have processed, such as `steering`. ``~/pause`` stops time, ``~/step`` takes one
     sample, ``~/reset`` puts the needle and its noise back to their start while time goes on.
     ``~/events`` says what was done beside commands, so that the run can be computed again.
     """
@@ -137,7 +142,10 @@ class PlantNode(ModelNode):
         self.declare_text('mode', MODES[0], f'one of {", ".join(MODES)}')
         self.declare_text('publish_clock', False, 'publish the simulated time on /clock')
         self.declare_text(
-            'lockstep', False, 'each sample waits for the command that answers the one before it'
+            'lockstep',
+            False,
+            'each sample waits for the command that answers the one before it, and for the nodes '
+            'that process it',
         )
         self.declare_text('paused', False, 'begin with time paused')
         self.declare_text(
@@ -169,8 +177,9 @@ class PlantNode(ModelNode):
         self._halted: str | None = None
         self._fault: Fault | None = None
         self._faulty = ''
-        #: Looks at the graph since a sample has waited for its answer.
+        #: Looks at the graph since the same sample has waited for its answers, and its stamp.
         self._looks = 0
+        self._awaited: int | None = None
         self._sampled = self._made_up = self._saturated = 0
         self._refused_trajectories = 0
         #: Joints that follow trajectories, and the answers to these.
@@ -202,6 +211,8 @@ class PlantNode(ModelNode):
         #: Publishers of commands that DDS has matched, dead ones too.
         self._matched, self._matched_at = 0, 0
         self._trajectories: Subscription | None = None
+        #: Reports of nodes that have processed a sample, in lock-step.
+        self._processed: Subscription | None = None
         self.create_service(Trigger, '~/tare', self._on_tare)
         self.create_service(SetBool, '~/pause', self._on_pause)
         self.create_service(Trigger, '~/step', self._on_step)
@@ -269,6 +280,14 @@ class PlantNode(ModelNode):
         self._run = plant_run
         if publishes:
             self._clock_topic = self.publisher(contract.CLOCK, always=True)
+        if lockstep:
+            self._processed = self.create_subscription(
+                Header,
+                contract.PROCESSED.name,
+                self._on_processed,
+                profile(contract.PROCESSED.qos),
+                event_callbacks=SubscriptionEventCallbacks(matched=self._on_participant),
+            )
         if mode != 'simulation' or constants.steered:
             # There `insertion` is the reference of a controller.
             self._trajectories = self.subscribe(contract.JOINT_TRAJECTORY, self._on_trajectory)
@@ -307,6 +326,9 @@ class PlantNode(ModelNode):
         if self._trajectories is not None:
             self.destroy_subscription(self._trajectories)
             self._trajectories, self._moved, self._requests = None, (), RequestLog({})
+        if self._processed is not None:
+            self.destroy_subscription(self._processed)
+            self._processed = None
 
     def change(self, changes: Mapping[str, Any]) -> None:
         """Go on with other friction, or another fault; the state stays."""
@@ -388,6 +410,17 @@ class PlantNode(ModelNode):
         if counts and self._time.awaited is not None:
             self._time.answered(plant_run.commands.newest.stamp)
             self._on_timer()
+
+    def _on_processed(self, message: Header) -> None:
+        """Take note that a node has processed a sample."""
+        if self.is_active:
+            self._time.answered(nanoseconds(message.stamp), message.frame_id)
+            self._on_timer()
+
+    def _on_participant(self, event: Any) -> None:
+        """Count the nodes that each sample waits for."""
+        self._time.participants = event.current_count
+        self.publish_diagnostics()
 
     def _count_matched(self) -> tuple[int, int]:
         """Return how many publishers of each topic of commands DDS has matched, dead ones too."""
@@ -505,7 +538,9 @@ class PlantNode(ModelNode):
             return
         self._look_who_commands()
         self._publish_answers()
-        self._looks = self._looks + 1 if self._time.awaited is not None else 0
+        awaited, before = self._time.awaited, self._awaited
+        self._looks = self._looks + 1 if awaited is not None and awaited == before else 0
+        self._awaited = awaited
         if self._looks and self._looks % _REPEAT == 0 and not self._time.paused:
             stamp, (topic, _, values) = self._last
             self._publish[topic](stamp, values)
@@ -643,6 +678,7 @@ class PlantNode(ModelNode):
             'commands overtaken': given.overtaken,
             'saturated readings': self._saturated,
             **self._requests.status().to_values(),
+            'nodes in lock-step': clock.participants,
         }
         if not self.is_active:
             return *super().diagnose()[:2], values
@@ -655,8 +691,8 @@ class PlantNode(ModelNode):
         warnings = []
         if clock.paused:
             warnings.append(f'paused at {clock.stamp / NANOSECONDS:.6f} s')
-        if self._looks >= _REPEAT:
-            warnings.append(f'no command answers the sample of {clock.stamp / NANOSECONDS:.6f} s')
+        if self._looks >= _LONG:
+            warnings.append(f'{clock.missing} the sample of {clock.stamp / NANOSECONDS:.6f} s')
         if clock.lost:
             warnings.append(f'{clock.lost} samples skipped after stalls')
         if commands > _TOO_MANY * max(samples, rate):

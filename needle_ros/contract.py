@@ -409,6 +409,16 @@ MEASURER: Final = replace(
     meaning='no messages: its lease tells the others when a plant has died',
 )
 
+PROCESSED: Final = Topic(
+    'joint_states/_processed',
+    'std_msgs/msg/Header',
+    'steering',
+    'lock-step: stamp of a sample that a node (its name is `frame_id`) has processed, after its '
+    'motions; a plant with `lockstep` waits for all nodes that publish it; not recorded',
+    # Of several nodes.
+    qos=COMMAND._replace(depth=10),
+)
+
 REFERENCE: Final = Topic(
     'reference',
     JOINT_STATE,

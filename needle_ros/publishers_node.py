@@ -5,9 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+from builtin_interfaces.msg import Time
+from needle_ros import contract
 from needle_ros.base_node import BaseNode, message_class, profile
 from needle_ros.contract import Topic
 from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.node import Node
+from rclpy.parameter import Parameter
 
 
 def offer_lease(node: BaseNode, lease: Topic) -> None:
@@ -28,6 +32,27 @@ def offer_lease(node: BaseNode, lease: Topic) -> None:
 def _name(node: BaseNode, lease: Topic) -> str:
     owner, _, own = lease.name.rpartition('/')
     return f'{node.resolve_topic_name(owner)}/{own}'
+
+
+def request_stamp(node: Node) -> Time:
+    """
+    Return the stamp of a request that is made now, in the time of the graph.
+
+    Parameters
+    ----------
+    node : Node
+        The node that makes it. It uses simulated time from now on where there is a ``/clock``.
+
+    Returns
+    -------
+    Time
+        The time now; zero, which stands for the time of arrival, before the first ``/clock``.
+
+    """
+    if node.count_publishers(contract.CLOCK.name) and not node.get_parameter('use_sim_time').value:
+        node.set_parameters([Parameter('use_sim_time', value=True)])
+    stamp: Time = node.get_clock().now().to_msg()
+    return stamp
 
 
 class Publishers:

@@ -15,6 +15,10 @@ _TICK: Final = 1e-3
 _AT_ONCE: Final = 20
 
 
+#: Stands for whoever commands, among the names of the nodes that have answered a sample.
+COMMAND: Final = ''
+
+
 class SampleClock:
     """
     Simulated time, which has samples at exact multiples of the period.
@@ -35,7 +39,7 @@ class SampleClock:
         Whether simulated time is a time of its own, which may wait, and not that of the clock;
         so it is in any case if the factor is not 1, and in lockstep.
     lockstep : bool
-        Whether each sample waits for the answer to the one before it; time then begins at zero.
+        Whether each sample waits for the answers to the one before it; time then begins at zero.
 
     Attributes
     ----------
@@ -49,8 +53,9 @@ class SampleClock:
         Number of samples given up.
     waited : int
         Time that simulated time waited for the machine [ns].
-    awaited : int or None
-        Stamp of the sample whose answer the next one waits for [ns]; None if it waits for none.
+    participants : int
+        Number of nodes that report in lockstep when they have processed a sample: the next one
+        waits for all of them, and for a command.
 
     """
 
@@ -60,6 +65,7 @@ class SampleClock:
         self._rate, self._factor = rate, factor
         self._own, self._lockstep = own or lockstep or factor != 1.0, lockstep
         self._backlog = max(1, int(backlog * rate * factor))
+        self.participants = 0
         # Several samples at a tick are fine: no more ticks than in real time are needed.
         self.tick = max(1.0 / (rate * factor), min(1.0 / rate, _TICK)) if factor else _TICK
         #: Most samples at one tick when time may wait: more would overrun the readers.
@@ -80,7 +86,8 @@ class SampleClock:
         """
         self.paused = paused
         self.lost = self.waited = 0
-        self.awaited: int | None = None
+        #: Which nodes have answered the newest sample in lockstep; None if it needs no answer.
+        self._answers: set[str] | None = None
         self._start = 0 if self._lockstep else now
         self._anchor(now)
 
@@ -89,6 +96,26 @@ class SampleClock:
         #: Time of the clock at which simulated time was the start [ns], and samples since.
         self._clock, self._count = now, 0
         self.stamp = self._start
+
+    @property
+    def commanded(self) -> bool:
+        """Whether a command has answered the newest sample, or none has to."""
+        return self._answers is None or COMMAND in self._answers
+
+    @property
+    def awaited(self) -> int | None:
+        """Stamp of the sample whose answers the next one waits for [ns]; None if for none."""
+        if self._answers is None or (self.commanded and len(self._answers) > self.participants):
+            return None
+        return self.stamp
+
+    @property
+    def missing(self) -> str:
+        """Which answers to the newest sample are missing, for people."""
+        if not self.commanded:
+            return 'no command has answered'
+        done = len(self._answers or ()) - 1
+        return f'{done} of {self.participants} nodes have processed'
 
     def simulated(self, now: int) -> int:
         """
@@ -135,7 +162,7 @@ class SampleClock:
             self._start = self.stamp if self._own and self._clock else now
             self._anchor(now)
             return 0
-        beyond = due - (1 if self._lockstep else self._backlog)
+        beyond = due - self._backlog
         if beyond > 0:
             late = round(beyond / rate * NANOSECONDS)
             self._clock += late
@@ -145,6 +172,9 @@ class SampleClock:
             else:
                 self.lost += beyond
                 self._start += late
+        if self._lockstep:
+            # After a stall the others follow at once, each after the answers to the one before.
+            return min(due, 1)
         return min(due, self._burst) if self._own else due
 
     def take(self) -> int:
@@ -159,10 +189,10 @@ class SampleClock:
         """
         self._count += 1
         self.stamp = self._start + round(self._count / self._rate * NANOSECONDS)
-        self.awaited = self.stamp if self._lockstep else None
+        self._answers = set() if self._lockstep else None
         return self.stamp
 
-    def answered(self, stamp: int) -> None:
+    def answered(self, stamp: int, by: str = COMMAND) -> None:
         """
         Take note of an answer.
 
@@ -170,10 +200,12 @@ class SampleClock:
         ----------
         stamp : int
             Stamp of the sample that was answered [ns].
+        by : str
+            Name of the node that has processed it; by default it is answered by a command.
 
         """
-        if stamp == self.awaited:
-            self.awaited = None
+        if self._answers is not None and stamp == self.stamp:
+            self._answers.add(by)
 
     def pause(self) -> None:
         """Pause time."""
@@ -216,9 +248,7 @@ class SampleClock:
         if not self.paused:
             raise JobError('time is not paused; pause first')
         if self.awaited is not None:
-            raise JobError(
-                f'no command has answered the sample of {self.awaited / NANOSECONDS:.6f} s'
-            )
+            raise JobError(f'{self.missing} the sample of {self.awaited / NANOSECONDS:.6f} s')
         self._go_on(now)
         return self.take()
 

@@ -24,6 +24,7 @@ from needle_dynamics.compiled.store import (
     FOLDER_VARIABLE,
     folders,
     LISTENERS,
+    preparing,
     Store,
     writable_folder,
 )
@@ -222,7 +223,8 @@ def prepare(names: Iterable[str]) -> Iterator[tuple[int, int, str]]:
     for done, name in enumerate(found):
         module, _, own = name.partition(':')
         yield done, len(found), own
-        _KERNELS[module][own].prepare()
+        with preparing():
+            _KERNELS[module][own].prepare()
     yield len(found), len(found), ''
 
 
@@ -250,15 +252,16 @@ def where_kept() -> str:
 
 
 @contextmanager
-def reports(listener: Callable[[str, bool], None]) -> Iterator[None]:
+def reports(listener: Callable[[str, bool, bool], None]) -> Iterator[None]:
     """
     Report each function that this process compiles or loads.
 
     Parameters
     ----------
     listener : callable
-        Called with the name of the function and whether it is loaded from disk; by the thread
-        that does it, before it is compiled or after it is loaded.
+        Called with the name of the function, whether it is loaded from disk, and whether
+        `prepare` does it; by the thread that does it, before it is compiled or after it is
+        loaded.
 
     """
     LISTENERS.append(listener)
@@ -275,7 +278,7 @@ def announce_compilation() -> None:
     Commands call this at their start; libraries and tests stay silent.
     """
 
-    def report(_name: str, loaded: bool) -> None:
+    def report(_name: str, loaded: bool, _prepared: bool) -> None:
         if not loaded:
             LISTENERS.remove(report)
             often = 'once' if writable_folder() else where_kept()

@@ -12,7 +12,8 @@ of the user. New entries go to the first of the two that is writable.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 import errno
 import fcntl
 from functools import cache
@@ -22,6 +23,7 @@ from pathlib import Path
 import pickle
 import sys
 import tempfile
+from threading import local
 from time import monotonic, sleep
 from typing import Any, Final
 import warnings
@@ -39,8 +41,11 @@ _LONGEST, _CHECK = 120.0, 0.05
 
 _DIGEST: Final = 32
 
-#: Called with the name of each function that is loaded or compiled, and whether it is loaded.
-LISTENERS: Final[list[Callable[[str, bool], None]]] = []
+#: Called with the name of each function that is loaded or compiled, whether it is loaded, and
+#: whether that was asked for by `preparing`.
+LISTENERS: Final[list[Callable[[str, bool, bool], None]]] = []
+
+_PREPARED: Final = local()
 
 
 def folders() -> tuple[Path, ...]:
@@ -97,6 +102,16 @@ def _stamp(folder: Path) -> str:
     return digest.hexdigest()
 
 
+@contextmanager
+def preparing() -> Iterator[None]:
+    """Mark functions that this thread loads or compiles as prepared."""
+    _PREPARED.now = True
+    try:
+        yield
+    finally:
+        _PREPARED.now = False
+
+
 class Store:
     """
     The machine code of one function, in the interface of Numba's caches.
@@ -150,7 +165,7 @@ class Store:
             if found is not None:
                 _unlock(folder, name)
         for listener in tuple(LISTENERS):
-            listener(self._name, found is not None)
+            listener(self._name, found is not None, getattr(_PREPARED, 'now', False))
         return found
 
     def save_overload(self, signature: Any, result: Any) -> None:

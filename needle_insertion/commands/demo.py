@@ -19,6 +19,11 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
         help='folder (default demo_output)',
     )
     parser.add_argument('--bags', type=Path, default=SHIPPED_BAGS, help='shipped recordings')
+    parser.add_argument(
+        '--realtime',
+        action='store_true',
+        help='real time instead of lock-step: a busy machine changes the insertions',
+    )
 
 
 def _run(options: argparse.Namespace) -> int:
@@ -26,7 +31,7 @@ def _run(options: argparse.Namespace) -> int:
     check_folder(options.output)
     from needle_insertion.experiment import demo
 
-    return demo.run(options.output, options.bags)
+    return demo.run(options.output, options.bags, lockstep=not options.realtime)
 
 
 COMMAND = Command(_add_arguments, _run)

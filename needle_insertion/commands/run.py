@@ -19,6 +19,12 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--steering', action='store_true', help='a needle that bends, and the node that aims it'
     )
+    parser.add_argument(
+        '--realtime',
+        action='store_true',
+        help='the plant runs in real time instead of lock-step: it does not wait for nodes that a '
+        'busy machine delays',
+    )
     parser.add_argument('--preset', help='constants of the needle (default that of the file)')
     parser.add_argument('--law', help='control law (default that of the file)')
     parser.add_argument(
@@ -75,6 +81,8 @@ def _run(options: argparse.Namespace) -> int:
         node, name, value = _parameter(word)
         if node not in nodes:
             raise ParameterError(f'-p {word}: the nodes are {", ".join(nodes)}, got {node!r}')
+        if name in ('lockstep', 'use_sim_time'):
+            raise ParameterError(f'-p {word}: --realtime decides on that')
         nodes[node][name] = value
     return run(
         Session(
@@ -82,6 +90,7 @@ def _run(options: argparse.Namespace) -> int:
             file=file,
             folder=options.output,
             records=not options.no_recording,
+            lockstep=not (options.hardware or options.realtime),
         )
     )
 

@@ -2,35 +2,38 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Mapping
 from dataclasses import dataclass
 from math import inf
 from pathlib import Path
-from time import monotonic
 from typing import Final
 
-from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import PointStamped
+from geometry_msgs.msg import PointStamped, PoseWithCovarianceStamped
 from matplotlib.figure import Figure
+from needle_controller.steering.outer_loop import Phase
 from needle_dynamics import FloatArray
 from needle_identification import read_topic
 from needle_insertion.experiment.bending import read_needles
-from needle_insertion.experiment.insertion import COUNTED, RATE
-from needle_insertion.experiment.node_process import GraphError, NodeProcess
-from needle_insertion.experiment.ros_graph import ACTIVATE, CONFIGURE, Graph
+from needle_insertion.experiment.insertion import RATE, SETTLING, target_message, WARM_UP
+from needle_insertion.experiment.node_process import GraphError
+from needle_insertion.experiment.progress import Show
+from needle_insertion.experiment.ros_graph import Graph
+from needle_insertion.experiment.simulated_run import Sample, SimulatedRun
 from needle_insertion.replay.rerun import verify
 from needle_insertion.report.animation import Animation
 from needle_insertion.report.insertion import draw_needle
 from needle_insertion.report.text import Check
 from needle_insertion.watch.recorded import Recording
-from needle_ros.base_node import COMMAND, SENSOR
-from needle_ros.timing import seconds
+from needle_ros.base_node import COMMAND
+from needle_ros.timing import NANOSECONDS, nanoseconds
 import numpy as np
-from sensor_msgs.msg import JointState
 
 #: Where the tip shall go, x, y, z [m], and inserted length at the start [m].
 TARGET: Final = (4e-3, 0.1, -2e-3)
 START: Final = 5e-3
+
+#: Insertion speed [m/s].
+SPEED: Final = 0.02
 
 #: What is believed: needle and tissue.
 PRESET: Final = {'model.preset': 'bending_35mm'}
@@ -53,14 +56,11 @@ PLANT: Final[dict[str, object]] = {
 #: The node that steers: half a look of the default, so that the demo is short.
 STEERING: Final[dict[str, object]] = {
     **PRESET,
-    'speed': 0.02,
+    'speed': SPEED,
     'guide_speed': 0.02,
     'settle_time': 0.05,
     'look_time': 0.25,
     'belief.noise': 6e-5,
-    # A machine that is busy takes its time.
-    'patience': 60.0,
-    'measurement_timeout': 2.0,
 }
 
 #: The axis law.
@@ -68,7 +68,7 @@ CONTROLLER: Final[dict[str, object]] = {
     **PRESET,
     'rate': RATE,
     'deflection_feedback': 'none',
-    'reference.speed': 0.02,
+    'reference.speed': SPEED,
     'reference.acceleration': 0.5,
 }
 
@@ -83,18 +83,15 @@ _LARGEST: Final = 13.8
 _DRAWN: Final = 5
 _FRAMES: Final = 80
 
-#: Longest time that the insertion may take, and time after which a target is sent again [s].
-_LONGEST, _AGAIN = 180.0, 2.0
-
-#: A reference that is farther from the start has a target [m].
-_MOVED: Final = 1e-3
+#: Longest simulated time of the insertion, and of the answer to a target [s].
+_LONGEST, _ANSWER = 180.0, 2.0
 
 #: Half of an interval of 95 % over the standard deviation.
 _NORMAL: Final = 1.96
 
 
 def record_aimed(
-    bag: Path, logs: Path, progress: Callable[[float], None], *, steered: bool
+    bag: Path, logs: Path, show: Show, *, steered: bool, lockstep: bool = True
 ) -> None:
     """
     Insert a needle to the target through real nodes, and record everything.
@@ -105,10 +102,12 @@ def record_aimed(
         Bag to write.
     logs : Path
         Folder for what the nodes print.
-    progress : callable
-        Called with the fraction done.
+    show : callable
+        Shows the progress.
     steered : bool
         Whether the node `steering` aims the tip; else the guide rests.
+    lockstep : bool
+        As for `SimulatedRun`.
 
     Raises
     ------
@@ -117,67 +116,41 @@ def record_aimed(
 
     """
     with Graph(logs) as graph:
-        node = graph.node('demo')
-        state = graph.latest(node, JointState, 'joint_states', SENSOR)
-        reference = graph.latest(node, JointState, 'reference', SENSOR)
-        target = node.create_publisher(PointStamped, 'target', COMMAND)
-        said: dict[str, str] = {}
-        sent = -inf
+        run = SimulatedRun(graph, show, lockstep=lockstep)
+        aim = run.publisher(PointStamped, 'target')
+        expected = graph.latest(run.node, PoseWithCovarianceStamped, 'tip_expected', COMMAND)
+        waiting = True
+        end = inf if steered else WARM_UP + (TARGET[1] - START) / SPEED + SETTLING
 
-        def hear(array: DiagnosticArray) -> None:
-            said.update({status.name: status.message for status in array.status})
+        def act(sample: Sample) -> bool:
+            nonlocal waiting, end
+            if waiting and sample.time >= WARM_UP:
+                waiting = False
+                aim(target_message(sample.stamp, TARGET))
+            if steered and end == inf and _is_done(run.values.get('steering', {}), sample.time):
+                # The stamp of the last look; the time since the first sample.
+                last = nanoseconds(expected.message.header.stamp)
+                end = sample.time - (sample.stamp - last) / NANOSECONDS + SETTLING
+            done = (sample.depth - START) / (TARGET[1] - START)
+            show('inserting', min(max(done, 0.0), 1.0))
+            return sample.time < end
 
-        node.create_subscription(DiagnosticArray, '/diagnostics', hear, 10)
-        nodes: list[NodeProcess] = [graph.start('recorder', {'path': str(bag)})]
-        if steered:
-            nodes.append(graph.start('steering', STEERING))
-        nodes.append(graph.start('controller', {**CONTROLLER, 'steered': steered}))
-        nodes.append(graph.start('plant', {**PLANT, 'autostart': False}))
-        # The plant starts when the recorder listens to everything: the bag holds every sample.
-        takers = {'target': 2 + steered, 'joint_states': 3 + steered}
-        graph.spin_until(
-            lambda: all(
-                node.count_subscribers(name) >= takers.get(name, 1)
-                for name in (*takers, *COUNTED, 'wrench_command')
-            ),
-            'the nodes',
-        )
-        graph.change(node, 'plant', CONFIGURE, ACTIVATE)
-        # Of the guide: the plant once it is configured, the controller, the recorder.
-        followers = 3 if steered else 0
-        graph.spin_until(
-            lambda: (
-                state.message and said and node.count_subscribers('joint_trajectory') >= followers
-            ),
-            'the plant',
-        )
-        message = PointStamped()
-        message.header.frame_id = 'needle_entry'
-        message.point.x, message.point.y, message.point.z = TARGET
+        nodes: dict[str, Mapping[str, object]] = {'steering': STEERING} if steered else {}
+        nodes['controller'] = {**CONTROLLER, 'steered': steered}
+        nodes['plant'] = PLANT
+        run.record(bag, nodes, act)
 
-        def arrived() -> bool:
-            done = (state.message.position[0] - START) / (TARGET[1] - START)
-            progress(min(max(done, 0.0), 1.0))
-            nonlocal sent
-            words = said.get('/steering', '')
-            if words.startswith('stopped'):
-                raise GraphError(f'steering {words}')
-            aimed_at = reference.message.position[0] if reference.message else START
-            # What comes before the sensors is refused.
-            idle = words == 'waits for a target' if steered else abs(aimed_at - START) < _MOVED
-            if idle and monotonic() - sent > _AGAIN:
-                sent = monotonic()
-                target.publish(message)
-            return words.startswith('done') if steered else aimed_at == TARGET[1]
 
-        graph.spin_until(arrived, 'the end of the insertion', timeout=_LONGEST)
-        # The loop settles within a second; the recording shows that it stays there.
-        settled = seconds(state.message.header.stamp) + 1.0
-        graph.spin_until(
-            lambda: seconds(state.message.header.stamp) > settled, 'the end of the recording'
-        )
-        for one in nodes:
-            one.interrupt()
+def _is_done(values: Mapping[str, str], time: float) -> bool:
+    """Return whether the node `steering` reports the target depth, or raise what it reports."""
+    phase = values.get('phase')
+    if phase == Phase.STOPPED.value:
+        raise GraphError(f'steering {values[""]}')
+    if time > _LONGEST:
+        raise GraphError(f'steering is not at the target depth after {_LONGEST:g} s: {phase}')
+    if phase == Phase.IDLE.value and time > WARM_UP + _ANSWER:
+        raise GraphError(f'steering: {values["last complaint"]}')
+    return phase == Phase.DONE.value
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from math import pi
 from pathlib import Path
 from typing import Any, Final
@@ -18,6 +17,7 @@ from needle_identification import (
     SteeringSettings,
 )
 from needle_insertion.experiment.insertion import record_insertion
+from needle_insertion.experiment.progress import Show
 from needle_insertion.replay.rerun import verify
 from needle_insertion.report.insertion import draw_needle
 from needle_insertion.report.text import Check
@@ -52,7 +52,7 @@ LARGEST_DISTANCE: Final = 2.0
 _DRAWN: Final = 5
 
 
-def record_bending(bag: Path, logs: Path, progress: Callable[[float], None]) -> None:
+def record_bending(bag: Path, logs: Path, show: Show, *, lockstep: bool = True) -> None:
     """
     Drive a steered needle to the target, with a guide that moves, and record everything.
 
@@ -62,13 +62,15 @@ def record_bending(bag: Path, logs: Path, progress: Callable[[float], None]) -> 
         Bag to write.
     logs : Path
         Folder for what the nodes print.
-    progress : callable
-        Called with the fraction done.
+    show : callable
+        Shows the progress.
+    lockstep : bool
+        As for `SimulatedRun`.
 
     Raises
     ------
     GraphError
-        If a node fails or the target is not reached in time.
+        If a node fails.
 
     """
     course = JointTrajectory(
@@ -78,7 +80,7 @@ def record_bending(bag: Path, logs: Path, progress: Callable[[float], None]) -> 
             for time, at in COURSE
         ],
     )
-    record_insertion('adaptive', bag, logs, progress, PLANT, course)
+    record_insertion('adaptive', bag, logs, show, PLANT, course, lockstep=lockstep)
 
 
 def bending_checks(bag: Path) -> list[Check]:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 import shutil
 import sys
@@ -41,6 +41,7 @@ from needle_insertion.experiment.insertion import (
     START_DEPTH,
     TARGET_DEPTH,
 )
+from needle_insertion.experiment.progress import Progress
 from needle_insertion.experiment.protocol import PROTOCOLS
 from needle_insertion.experiment.record import rig
 from needle_insertion.experiment.truth import (
@@ -58,7 +59,6 @@ from needle_insertion.report.identify_figures import (
 from needle_insertion.report.page import write_page
 from needle_insertion.report.text import Check, CHECK_HEADS, table
 from needle_ros.errors import NeedleError
-from tqdm import tqdm
 
 #: Multiple of real time at which the experiments are recorded.
 EXPERIMENT_SPEED: Final = 25.0
@@ -69,12 +69,20 @@ LARGEST_DISTANCE: Final = 2.0
 
 _MARKER: Final = '.needle-demo'
 
+_INTRODUCTION: Final = (
+    f'Nodes over DDS at {RATE:g} Hz: insertion from {START_DEPTH * 100:g} cm to '
+    f'{TARGET_DEPTH * 100:g} cm at {SPEED * 1000:g} mm/s, of a needle that bends and under two '
+    'control laws, and of one that is steered to a target, recorded to MCAP; friction and tissue '
+    'stiffness identified from the shipped simulated recordings and one fresh recording each, '
+    f'made at {EXPERIMENT_SPEED:g} times real time.'
+)
+
 
 class DemoError(NeedleError):
     """The demo cannot run here."""
 
 
-def run(output: Path, bags: Path) -> int:
+def run(output: Path, bags: Path, *, lockstep: bool = True) -> int:
     """
     Run the demo.
 
@@ -84,6 +92,8 @@ def run(output: Path, bags: Path) -> int:
         Folder for bags, logs, pictures and report. What an earlier demo left there is replaced.
     bags : Path
         Folder of the shipped recordings.
+    lockstep : bool
+        Whether the insertions run in lock-step: the same on any machine; else in real time.
 
     Returns
     -------
@@ -101,75 +111,77 @@ def run(output: Path, bags: Path) -> int:
     shipped = {name: _shipped(bags, name) for name in PROTOCOLS}
     _clear(output)
     insertions, bent = [], output / 'bending'
-    with _progress('insertion, bent needle') as show:
-        record_bending(bent, output / 'logs' / 'bending', show)
+    with Progress('insertion, bent needle') as show:
+        record_bending(bent, output / 'logs' / 'bending', show, lockstep=lockstep)
     for law in ('adaptive', 'pid'):
-        with _progress(f'insertion, {law}') as show:
-            record_insertion(law, output / law, output / 'logs' / law, show)
+        with Progress(f'insertion, {law}') as show:
+            record_insertion(law, output / law, output / 'logs' / law, show, lockstep=lockstep)
         insertions.append(read_insertion(law, output / law))
     aimed, alone = output / 'steered', output / 'guide_at_rest'
     for folder, steered in ((alone, False), (aimed, True)):
-        with _progress(f'insertion, {folder.name.replace("_", " ")}') as show:
-            record_aimed(folder, output / 'logs' / folder.name, show, steered=steered)
+        with Progress(f'insertion, {folder.name.replace("_", " ")}') as show:
+            logs = output / 'logs' / folder.name
+            record_aimed(folder, logs, show, steered=steered, lockstep=lockstep)
     for name, protocol in PROTOCOLS.items():
         # The same noise in each demo: the verdict does not depend on luck.
         campaign = Campaign(protocol=protocol, repeats=1, seed=1, fixed=True)
         (parameters,) = campaign.runs.values()
-        with _progress(f'{name} experiment') as show, rig(output, protocol) as running:
-            running.record(output / name, parameters, EXPERIMENT_SPEED, show)
+        with Progress(f'{name} experiment') as show, rig(output, protocol) as running:
+            running.record(output / name, parameters, EXPERIMENT_SPEED, partial(show, 'recording'))
 
-    friction, stiffness = [], []
+    friction: list[FrictionEstimate] = []
+    stiffness: list[StiffnessEstimate] = []
     compared: dict[str, list[list[Comparison]]] = {'friction': [], 'stiffness': []}
     total = sum(map(len, shipped.values())) + 2
-    with tqdm(total=total, desc='identification', disable=None) as bar:
+    with Progress('identification') as show:
         for bag in (*shipped['friction'], output / 'friction'):
+            show('friction', len(friction) / total)
             recording = read_friction_recording(bag)
             friction.append(identify_friction(recording))
             compared['friction'].append(_known(bag, compare_friction(recording, friction[-1])))
-            bar.update()
         for bag in (*shipped['stiffness'], output / 'stiffness'):
+            show('stiffness', (len(friction) + len(stiffness)) / total)
             indentation = read_indentation_recording(bag)
             stiffness.append(identify_stiffness(indentation))
             compared['stiffness'].append(
                 _known(bag, compare_stiffness(indentation, stiffness[-1]))
             )
-            bar.update()
     write_result(
         output / 'result.yaml', summarize(friction[:-1]), summarize_stiffness(stiffness[:-1])
     )
 
-    checks = [*bending_checks(bent), *aiming_checks(aimed, alone)]
-    checks += [check for insertion in insertions for check in insertion_checks(insertion)]
-    for *recorded, fresh in compared.values():
-        checks += _shipped_checks(f'{len(recorded)} shipped bags', recorded)
-        checks += _fresh_checks(fresh)
-    passed = sum(check.passed for check in checks)
-    # What needs attention comes first.
-    rows = [check.row for check in sorted(checks, key=lambda check: check.passed)]
-    page = output / 'report.html'
-    write_page(
-        page,
-        'checks.html',
-        title='Needle insertion: demo',
-        introduction=f'Nodes over DDS at {RATE:g} Hz: insertion from {START_DEPTH * 100:g} cm to '
-        f'{TARGET_DEPTH * 100:g} cm at {SPEED * 1000:g} mm/s, of a needle that bends and under '
-        'two control laws, and of one that is steered to a target, recorded to MCAP; friction and '
-        'tissue stiffness identified from the '
-        'shipped simulated recordings and one fresh recording each, made at '
-        f'{EXPERIMENT_SPEED:g} times real time.',
-        cards=[
-            ('Checks', f'{passed} of {len(checks)} pass', 'true values beside what was found'),
-            (
-                'Steered',
-                f'{1e3 * read_aimed(aimed).miss:.2f} mm from its target',
-                f'the tip is said to be at {read_aimed(aimed).said} (95 %)',
-            ),
-        ],
-        rows=rows,
-        heads=CHECK_HEADS,
-        pictures=_pictures(bent, (aimed, alone), insertions, friction[-1], stiffness[-1]),
-        animation=animate_aiming(aimed),
-    )
+    with Progress('report') as show:
+        show('checking the bent needle')
+        checks = bending_checks(bent)
+        show('checking the steered needle')
+        checks += aiming_checks(aimed, alone)
+        checks += [check for insertion in insertions for check in insertion_checks(insertion)]
+        for *recorded, fresh in compared.values():
+            checks += _shipped_checks(f'{len(recorded)} shipped bags', recorded)
+            checks += _fresh_checks(fresh)
+        passed = sum(check.passed for check in checks)
+        # What needs attention comes first.
+        rows = [check.row for check in sorted(checks, key=lambda check: check.passed)]
+        page = output / 'report.html'
+        show('drawing')
+        write_page(
+            page,
+            'checks.html',
+            title='Needle insertion: demo',
+            introduction=_INTRODUCTION,
+            cards=[
+                ('Checks', f'{passed} of {len(checks)} pass', 'true values beside what was found'),
+                (
+                    'Steered',
+                    f'{1e3 * read_aimed(aimed).miss:.2f} mm from its target',
+                    f'the tip is said to be at {read_aimed(aimed).said} (95 %)',
+                ),
+            ],
+            rows=rows,
+            heads=CHECK_HEADS,
+            pictures=_pictures(bent, (aimed, alone), insertions, friction[-1], stiffness[-1]),
+            animation=animate_aiming(aimed),
+        )
     sys.stdout.write(f'{table(rows, CHECK_HEADS)}\n\nreport: {page}\n')
     return 0 if all(check.passed for check in checks) else 1
 
@@ -191,13 +203,6 @@ def _clear(output: Path) -> None:
         shutil.rmtree(output)
     output.mkdir(parents=True)
     (output / _MARKER).touch()
-
-
-@contextmanager
-def _progress(what: str) -> Iterator[Callable[[float], None]]:
-    """Show a bar that takes the fraction done; silent when not on a terminal."""
-    with tqdm(total=100, desc=what, disable=None, bar_format='{desc:28}{bar}{n:4.0f} %') as bar:
-        yield lambda fraction: bar.update(100.0 * fraction - bar.n)
 
 
 def _pictures(

@@ -11,13 +11,13 @@ from geometry_msgs.msg import PointStamped
 from matplotlib.figure import Figure
 from needle_dynamics import FloatArray
 from needle_identification import read_topic
-from needle_insertion.experiment.ros_graph import ACTIVATE, CONFIGURE, Graph
+from needle_insertion.experiment.progress import Show
+from needle_insertion.experiment.ros_graph import Graph
+from needle_insertion.experiment.simulated_run import Sample, SimulatedRun
 from needle_insertion.report.text import Check
-from needle_ros.base_node import COMMAND, SENSOR
-from needle_ros.timing import seconds
+from needle_ros.contract import ENTRY
+from needle_ros.timing import NANOSECONDS, seconds
 import numpy as np
-from rclpy.duration import Duration
-from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory
 
 #: The insertion: inserted length at the start and at the end [m], speed [m/s], sample rate [Hz].
@@ -30,8 +30,11 @@ START_DEFLECTION: Final = 5e-4
 COUNTED: Final = ('joint_states', 'base_wrench', 'tip_deflection', 'ground_truth')
 
 
-#: Who takes a trajectory: controller, steered plant and recorder.
-_TAKERS: Final = 3
+#: Time before the target is sent, in which all sensors report [s].
+WARM_UP: Final = 0.1
+
+#: Time that is recorded after the needle should have arrived: ramps, and the loop settles [s].
+SETTLING: Final = 1.6
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,9 +66,11 @@ def record_insertion(
     law: str,
     bag: Path,
     logs: Path,
-    progress: Callable[[float], None],
+    show: Show,
     plant: Mapping[str, object] | None = None,
     course: JointTrajectory | None = None,
+    *,
+    lockstep: bool = True,
 ) -> None:
     """
     Drive the simulated needle to the target under a law and record everything.
@@ -78,67 +83,70 @@ def record_insertion(
         Bag to write.
     logs : Path
         Folder for what the nodes print.
-    progress : callable
-        Called with the fraction done.
+    show : callable
+        Shows the progress.
     plant : mapping of str to object, optional
         Parameters of the plant, and of the controller as far as they are of the model; default
         the needle of the paper, bent at the start.
     course : JointTrajectory, optional
-        Where the guide of a steered needle goes from the beginning.
+        Motion of the guide of a steered needle, from the time of the target on.
+    lockstep : bool
+        As for `SimulatedRun`.
 
     Raises
     ------
     GraphError
-        If a node fails or the target is not reached in time.
+        If a node fails.
 
     """
     with Graph(logs) as graph:
-        node = graph.node('demo')
-        state = graph.latest(node, JointState, 'joint_states', SENSOR)
-        reference = graph.latest(node, JointState, 'reference', SENSOR)
-        target = node.create_publisher(PointStamped, 'target', COMMAND)
-        moves = node.create_publisher(JointTrajectory, 'joint_trajectory', COMMAND)
-        recorder = graph.start('recorder', {'path': str(bag)})
+        run = SimulatedRun(graph, show, lockstep=lockstep)
+        aim = run.publisher(PointStamped, 'target')
+        move = run.publisher(JointTrajectory, 'joint_trajectory')
+        waiting = True
+
+        def act(sample: Sample) -> bool:
+            nonlocal waiting
+            if waiting and sample.time >= WARM_UP:
+                waiting = False
+                aim(target_message(sample.stamp, (0.0, TARGET_DEPTH, 0.0)))
+                if course is not None:
+                    move(course)
+            done = (sample.depth - START_DEPTH) / (TARGET_DEPTH - START_DEPTH)
+            show('inserting', min(max(done, 0.0), 1.0))
+            return sample.time < WARM_UP + (TARGET_DEPTH - START_DEPTH) / SPEED + SETTLING
+
         given = {'tip_deflection': START_DEFLECTION} if plant is None else plant
         model = {name: value for name, value in given.items() if name.startswith('model.')}
-        controller = graph.start(
-            'controller', {'law': law, 'rate': RATE, 'reference.speed': SPEED, **model}
-        )
-        start = {'depth': START_DEPTH, 'rate': RATE, **given}
-        plant_node = graph.start('plant', {'autostart': False, **start})
-        # The plant starts when the recorder listens to everything: the bag holds every sample.
-        listeners = {'target': 2, 'wrench_command': 2, 'reference': 2, 'joint_states': 3}
-        graph.spin_until(
-            lambda: all(
-                node.count_subscribers(name) >= listeners.get(name, 1)
-                for name in (*listeners, *COUNTED)
-            ),
-            'the nodes',
-        )
-        graph.change(node, 'plant', CONFIGURE, ACTIVATE)
-        graph.spin_until(lambda: reference.message and state.message, 'plant and controller')
-        message = PointStamped()
-        message.header.frame_id = 'needle_entry'
-        message.header.stamp = node.get_clock().now().to_msg()
-        message.point.y = TARGET_DEPTH
-        target.publish(message)
-        if course is not None:
-            graph.spin_until(lambda: moves.get_subscription_count() >= _TAKERS, 'the plant')
-            moves.publish(course)
+        nodes = {
+            'controller': {'law': law, 'rate': RATE, 'reference.speed': SPEED, **model},
+            'plant': {'depth': START_DEPTH, 'rate': RATE, **given},
+        }
+        run.record(bag, nodes, act)
 
-        def arrived() -> bool:
-            done = (state.message.position[0] - START_DEPTH) / (TARGET_DEPTH - START_DEPTH)
-            progress(min(max(done, 0.0), 1.0))
-            return bool(reference.message and reference.message.position[0] == TARGET_DEPTH)
 
-        duration = (TARGET_DEPTH - START_DEPTH) / SPEED
-        graph.spin_until(arrived, 'the end of the insertion', timeout=duration + 30.0)
-        # The loop settles within a second; the recording shows that it stays there.
-        end = node.get_clock().now() + Duration(seconds=1.5)
-        graph.spin_until(lambda: node.get_clock().now() > end, 'the end of the recording')
-        recorder.interrupt()
-        controller.interrupt()
-        plant_node.interrupt()
+def target_message(stamp: int, point: tuple[float, float, float]) -> PointStamped:
+    """
+    Return a target.
+
+    Parameters
+    ----------
+    stamp : int
+        Its stamp [ns].
+    point : tuple of float
+        The target, x, y, z [m].
+
+    Returns
+    -------
+    PointStamped
+        The message.
+
+    """
+    message = PointStamped()
+    message.header.frame_id = ENTRY
+    message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp, NANOSECONDS)
+    message.point.x, message.point.y, message.point.z = point
+    return message
 
 
 def read_insertion(law: str, bag: Path) -> Insertion:

@@ -14,7 +14,7 @@ from types import SimpleNamespace
 from typing import Any, Final, IO
 
 from domain_coordinator import domain_id
-from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.msg import State, Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from needle_insertion.experiment.node_process import GraphError, NodeProcess
 from needle_ros.network import domain_of, LOCAL, stay_local
@@ -34,6 +34,9 @@ CLEANUP = Transition.TRANSITION_CLEANUP
 
 #: Longest start of a node, with everything to compile on a busy machine [s].
 _START: Final = 180.0
+
+#: Time after which a node is asked for its state again [s].
+_ASK: Final = 0.2
 
 #: Time in which the nodes may end by themselves at the end of a graph [s].
 _PATIENCE: Final = 3.0
@@ -254,6 +257,46 @@ class Graph:
         self.spin_until(answered, f'the answer of {name}', _START)
         node.destroy_client(probe)
 
+    def wait_active(
+        self, node: Node, name: str, show: Callable[[str], object] = lambda _name: None
+    ) -> None:
+        """
+        Wait until a node that starts by itself is active.
+
+        Parameters
+        ----------
+        node : Node
+            Node of this process.
+        name : str
+            Name of the other node.
+        show : callable
+            Called with the name while it is not active.
+
+        Raises
+        ------
+        GraphError
+            If it ends, or is not active in time.
+
+        """
+        show(name)
+        self.wait_for(node, name)
+        client = node.create_client(GetState, f'{name}/get_state')
+        self.spin_until(client.service_is_ready, f'the node {name}')
+        answer = client.call_async(GetState.Request())
+        sent = time.monotonic()
+
+        def active() -> bool:
+            nonlocal answer, sent
+            show(name)
+            if answer.done() and answer.result().current_state.id == State.PRIMARY_STATE_ACTIVE:
+                return True
+            if time.monotonic() - sent > _ASK:
+                answer, sent = client.call_async(GetState.Request()), time.monotonic()
+            return False
+
+        self.spin_until(active, f'the activation of {name}', _START)
+        node.destroy_client(client)
+
     def change(self, node: Node, name: str, *transitions: int) -> None:
         """
         Change the life cycle state of a node that was started without ``autostart``.
@@ -282,7 +325,14 @@ class Graph:
                 said = [p.last_line for p in self._processes if p.name == name]
                 raise GraphError(f'{name} refused to start: {"".join(said[-1:])}')
 
-    def spin_until(self, condition: Callable[[], Any], what: str, timeout: float = 60.0) -> None:
+    def spin_until(
+        self,
+        condition: Callable[[], Any],
+        what: str,
+        timeout: float = 60.0,
+        sign: Callable[[], object] = lambda: None,
+        period: float = 0.0,
+    ) -> None:
         """
         Run the nodes of this process until a condition holds.
 
@@ -294,6 +344,11 @@ class Graph:
             What is waited for, for the message.
         timeout : float
             Longest time to wait [s].
+        sign : callable
+            The time begins again whenever its result changes: a sign of progress.
+        period : float
+            Time between two checks of the condition [s]; 0 for one after each event, which costs
+            more.
 
         Raises
         ------
@@ -301,12 +356,17 @@ class Graph:
             If it does not hold in time, or a process of the graph has ended.
 
         """
-        deadline = time.monotonic() + timeout
+        deadline, seen = time.monotonic() + timeout, sign()
         while not condition():
+            if (now := sign()) != seen:
+                deadline, seen = time.monotonic() + timeout, now
             for started in self._processes:
                 # A process that was interrupted on purpose ends with status 0.
                 if started.process.poll() not in (None, 0) and not started.killed:
                     started.check()
             if time.monotonic() > deadline:
                 raise GraphError(f'{what} did not come within {timeout:g} s')
-            self.executor.spin_once(timeout_sec=0.05)
+            if period:
+                self.executor.spin_until_future_complete(Future(), timeout_sec=period)
+            else:
+                self.executor.spin_once(timeout_sec=0.05)

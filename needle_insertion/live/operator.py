@@ -13,6 +13,7 @@ from needle_ros import contract
 from needle_ros.base_node import profile
 from needle_ros.calls_node import Calls
 from needle_ros.errors import printable
+from needle_ros.publishers_node import request_stamp
 from needle_ros.status import no_answer, PendingRequest, RequestStatus
 from needle_ros.timing import nanoseconds
 from rcl_interfaces.srv import SetParameters
@@ -169,7 +170,7 @@ class Operator:
         """
         message = PointStamped()
         message.header.frame_id = contract.ENTRY
-        message.header.stamp = self._node.get_clock().now().to_msg()
+        message.header.stamp = request_stamp(self._node)
         message.point.x, message.point.y, message.point.z = x, y, z
         pending = PendingRequest(contract.TARGET, nanoseconds(message.header.stamp), self.aims)
         self._sending.append((pending, message))

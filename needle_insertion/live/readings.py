@@ -8,6 +8,7 @@ from needle_insertion.live.waiting import waiting
 from needle_ros import contract
 from needle_ros.contract import Topic
 from needle_ros.errors import MessageError
+from needle_ros.timing import NANOSECONDS
 from needle_ros.wire import Reader, Reading
 from rclpy.node import Node
 
@@ -92,6 +93,12 @@ class Readings:
         if len(positions) <= at or len(velocities) <= at:
             return None
         return positions[at], velocities[at]
+
+    @property
+    def time(self) -> float:
+        """Stamp of the newest measurement [s], by the clock of the robot; 0 before the first."""
+        reading = self.newest(contract.JOINT_STATES)
+        return 0.0 if reading is None else reading.stamp / NANOSECONDS
 
     def reference_rests_at(self, target: tuple[float, ...]) -> bool:
         """

@@ -258,25 +258,25 @@ class Terminal:
             longest = -inf
         if not longest >= 0.0:
             raise _unfit('wait', words)
-        begin, arrived = monotonic(), inf
+        # The time of the robot: a simulated one may be slower than this machine's.
+        begin, arrived = self._readings.time, inf
 
         def done() -> bool:
             nonlocal arrived
+            now = self._readings.time
             self._screen.show(self._readings.line())
             state = self._state(STEERING if self._steers else CONTROLLER)
             if state.level >= _ERROR:
                 raise JobError(state.message)
-            if monotonic() - begin > longest:
+            if now - begin > longest:
                 raise JobError(f'not there after {longest:g} s: {self._readings.line()}')
             if self._steers:
                 return state.values.get('phase') in _AT_REST
             if not _aim(state):
                 raise JobError('there is no target to wait for')
-            if self._readings.reference_rests_at(_aim(state)):
-                arrived = min(arrived, monotonic())
-            else:
-                arrived = inf
-            return monotonic() > arrived + _SETTLING
+            rests = self._readings.reference_rests_at(_aim(state))
+            arrived = min(arrived, now) if rests else inf
+            return now > arrived + _SETTLING
 
         # Its own limit is above, with the position of the needle in its error.
         self._spin_until(done, 'the needle', inf)

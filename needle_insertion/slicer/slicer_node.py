@@ -18,6 +18,7 @@ from needle_ros import contract
 from needle_ros.base_node import BaseNode
 from needle_ros.errors import JobError, MessageError, printable
 from needle_ros.journal import Journal, Severity
+from needle_ros.publishers_node import request_stamp
 from needle_ros.run_node import run
 from needle_ros.status import PendingRequest, RequestStatus
 from needle_ros.timing import NANOSECONDS, nanoseconds, RateCounter
@@ -255,7 +256,7 @@ class SlicerNode(BaseNode):
         message = PointStamped()
         message.header.frame_id = contract.ENTRY
         # The clock of the peer may be any.
-        message.header.stamp = self.get_clock().now().to_msg()
+        message.header.stamp = request_stamp(self)
         message.point.x, message.point.y, message.point.z = x, y, z
         self._target.publish(message)
         stamp = nanoseconds(message.header.stamp)

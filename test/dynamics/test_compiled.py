@@ -59,7 +59,7 @@ if __name__ == '__main__':
     numba.__version__ = sys.argv[1] if len(sys.argv) > 1 else numba.__version__
     announce_compilation()
     compiled = []
-    with reports(lambda name, loaded: loaded or compiled.append(name)):
+    with reports(lambda name, loaded, _: loaded or compiled.append(name)):
         *_, last = prepare(['toy.caller'])
         assert last == (1, 1, '')
     print(twice(1.0), twice(2.0), len(compiled))

@@ -146,6 +146,7 @@ def test_nodes_offer_what_the_contract_says(ros_graph: RosGraph, tmp_path: Any, 
     """Each topic of the contract with its type and quality of service, and no other topic."""
     parameters: dict[str, dict[str, object]] = {
         'plant': {'publish_clock': True},
+        'steering': {'use_sim_time': True},
         'recorder': {'path': str(tmp_path / 'bag')},
         'player': {'path': str(SHIPPED_BAGS / 'friction_01')},
     }

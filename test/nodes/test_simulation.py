@@ -209,7 +209,7 @@ def test_in_lockstep_the_plant_waits_and_says_for_what(ros_graph: RosGraph) -> N
     bench.until(lambda: len(bench.states) >= 2, 'the repeated sample')
     assert {stamp_ns(message) for message in bench.states} == {PERIOD}
     bench.until(
-        lambda: 'no command answers the sample of 0.005000 s' in bench.plant.diagnose()[1],
+        lambda: 'no command has answered the sample of 0.005000 s' in bench.plant.diagnose()[1],
         'the warning',
     )
     bench.force = 0.0

@@ -103,6 +103,43 @@ def test_in_lockstep_each_sample_waits_for_its_answer(factor: float) -> None:
     assert clock.lost == 0
 
 
+def test_in_lockstep_a_sample_waits_for_all_who_process_it() -> None:
+    """A command and each of two nodes, in any order; an answer that comes twice counts once."""
+    clock = make(lockstep=True)
+    clock.participants = 2
+    (stamp,) = take(clock, BEGIN + 1_000_000)
+    later = BEGIN + 2_000_000
+    for by in ('steering', 'steering', 'demo'):
+        clock.answered(stamp, by)
+        assert take(clock, later) == []
+    assert clock.missing == 'no command has answered'
+    clock.answered(stamp)
+    assert clock.awaited is None
+    (stamp,) = take(clock, later)
+    clock.answered(stamp)
+    clock.answered(stamp - 1_000_000, 'steering')
+    assert clock.awaited == stamp
+    assert clock.missing == '0 of 2 nodes have processed'
+    # Both have gone.
+    clock.participants = 0
+    assert take(clock, later + 1_000_000) == [stamp + 1_000_000]
+
+
+def test_in_lockstep_a_stall_is_made_up() -> None:
+    """Late samples follow each answer at once, as far back as the backlog."""
+    clock = make(lockstep=True, backlog=0.01)
+    now = BEGIN + 5_000_000
+    stamps = []
+    for _ in range(10):
+        for stamp in take(clock, now):
+            stamps.append(stamp)
+            clock.answered(stamp)
+    assert stamps == [k * 1_000_000 for k in range(1, 6)]
+    assert clock.waited == 0
+    assert clock.due(now + NANOSECONDS) == 1
+    assert clock.waited == NANOSECONDS - 10_000_000
+
+
 def test_in_lockstep_it_is_no_faster_than_its_pace() -> None:
     """An answer that comes at once does not make time run faster."""
     clock = make(lockstep=True)

@@ -1,0 +1,101 @@
+"""Progress of a long job: its activity and the time since its start."""
+
+from __future__ import annotations
+
+import re
+import sys
+from threading import Event, Thread
+from time import monotonic
+from typing import Any, Final, Protocol, TextIO
+
+#: Time between two updates on a terminal, and between two lines elsewhere [s].
+_UPDATE: Final = 0.5
+_LINE: Final = 10.0
+
+#: Moves to the start of the line and clears it.
+_CLEAR: Final = '\r\033[K'
+
+
+class Show(Protocol):
+    """Shows the activity of a job and the fraction of it that is done."""
+
+    def __call__(self, activity: str, fraction: float | None = None) -> None:
+        """
+        Show an activity.
+
+        Parameters
+        ----------
+        activity : str
+            In a few words.
+        fraction : float, optional
+            Fraction done.
+
+        """
+
+
+class Progress:
+    """
+    Writes the activity of a job with the elapsed time, also while its thread is busy.
+
+    On a terminal it is one line that changes; elsewhere a line for each new activity, and one
+    every ten seconds.
+
+    Parameters
+    ----------
+    title : str
+        Name of the job.
+    stream : text file, optional
+        Where to write; the standard error by default.
+
+    """
+
+    def __init__(self, title: str, stream: TextIO | None = None) -> None:
+        self._title, self._stream = title, stream or sys.stderr
+        self._terminal = self._stream.isatty()
+        self._text, self._kind = '', ''
+        self._begin = self._written = monotonic()
+        self._end = Event()
+        self._thread = Thread(target=self._update, daemon=True)
+
+    def __enter__(self) -> Progress:
+        self('starting')
+        self._thread.start()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *raised: Any) -> None:
+        self._end.set()
+        self._thread.join()
+        self._text = 'done' if kind is None else 'failed'
+        self._write()
+        if self._terminal:
+            self._stream.write('\n')
+
+    def __call__(self, activity: str, fraction: float | None = None) -> None:
+        """
+        Take note of the activity; see `Show`.
+
+        Parameters
+        ----------
+        activity, fraction
+            As for `Show`.
+
+        """
+        self._text = activity if fraction is None else f'{activity} {100.0 * fraction:.0f} %'
+        # Numbers that change do not make it another activity.
+        before, self._kind = self._kind, re.sub(r'\d+', '', activity)
+        if self._kind != before and not self._terminal:
+            self._write()
+
+    def _update(self) -> None:
+        while not self._end.wait(_UPDATE):
+            if self._terminal or monotonic() - self._written >= _LINE:
+                self._write()
+
+    def _write(self) -> None:
+        self._written = monotonic()
+        elapsed = f'{self._written - self._begin:.0f} s'
+        if self._terminal:
+            self._stream.write(f'{_CLEAR}{self._title:30} {self._text:40} {elapsed:>6}')
+        else:
+            self._stream.write(f'{self._title}: {self._text}, {elapsed}\n')
+        self._stream.flush()
