@@ -1,17 +1,15 @@
-"""All kernels of the packages, compiled once for this machine on all processors."""
+"""Kernels of the packages, compiled once for this machine on all processors."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from concurrent.futures import as_completed
-from contextlib import closing
 import os
-import sys
-from time import monotonic
 from typing import Final
 
 from needle_dynamics.compiled.cache import is_kept, kernels, prepare, where_kept
+from needle_insertion.experiment.progress import Progress
 from needle_ros.process_pool import processes
-from tqdm import tqdm
 
 #: Modules with kernels; those that take longest are first.
 MODULES: Final = (
@@ -34,9 +32,14 @@ MODULES: Final = (
 )
 
 
-def compile_all() -> int:
+def compile_kernels(names: Sequence[str] = MODULES) -> int:
     """
-    Compile the kernels that are not on disk, with a progress bar on standard error.
+    Compile kernels that are not on disk, and show the progress on standard error.
+
+    Parameters
+    ----------
+    names : sequence of str
+        As for `needle_dynamics.compiled.cache.kernels`.
 
     Returns
     -------
@@ -44,20 +47,32 @@ def compile_all() -> int:
         Number of kernels that were compiled.
 
     """
-    missing = [name for name in kernels(MODULES) if not is_kept(name)]
+    missing = [name for name in kernels(names) if not is_kept(name)]
     if not missing:
         return 0
-    begin, count = monotonic(), os.cpu_count() or 1
-    sys.stderr.write(f'compiling {len(missing)} functions for this machine: {where_kept()}\n')
-    with (
-        processes(count) as pool,
-        closing(tqdm(total=len(missing), desc='compiling', disable=None)) as bar,
-    ):
-        for future in as_completed([pool.submit(_compile, name) for name in missing]):
-            bar.set_postfix_str(future.result())
-            bar.update()
-    sys.stderr.write(f'compiled in {monotonic() - begin:.0f} s\n')
+    with Progress('compiling for this machine') as show, processes(os.cpu_count() or 1) as pool:
+        show(where_kept())
+        futures = [pool.submit(_compile, name) for name in missing]
+        for done, future in enumerate(as_completed(futures), 1):
+            show(f'{done} of {len(missing)} ({future.result()})')
     return len(missing)
+
+
+def compile_nodes() -> int:
+    """
+    Compile the kernels of the nodes that are not on disk.
+
+    Returns
+    -------
+    int
+        Number of kernels that were compiled.
+
+    """
+    from needle_controller.controller_node import ControllerNode
+    from needle_controller.steering_node import SteeringNode
+    from needle_dynamics.plant_node import PlantNode
+
+    return compile_kernels([*ControllerNode.KERNELS, *PlantNode.KERNELS, *SteeringNode.KERNELS])
 
 
 def _compile(name: str) -> str:

@@ -16,9 +16,9 @@ def _run(_options: argparse.Namespace) -> int:
     """Compile; return 1 if no folder is writable."""
     from needle_dynamics.compiled.cache import kernels, where_kept
     from needle_dynamics.compiled.store import writable_folder
-    from needle_insertion.compilation import compile_all, MODULES
+    from needle_insertion.compilation import compile_kernels, MODULES
 
-    if compile_all() and writable_folder() is None:
+    if compile_kernels() and writable_folder() is None:
         sys.stderr.write(f'error: {where_kept()}\n')
         return 1
     sys.stdout.write(f'{len(kernels(MODULES))} compiled functions: {where_kept()}\n')

@@ -53,6 +53,7 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
 def _run(options: argparse.Namespace) -> int:
     """Run the nodes until `quit`; return 0."""
     # Imported here: rclpy takes a second.
+    from needle_insertion.compilation import compile_nodes
     from needle_insertion.live.session import config_file, run, Session
 
     if options.output is None:
@@ -84,6 +85,7 @@ def _run(options: argparse.Namespace) -> int:
         if name in ('lockstep', 'use_sim_time'):
             raise ParameterError(f'-p {word}: --realtime decides on that')
         nodes[node][name] = value
+    compile_nodes()
     return run(
         Session(
             nodes=nodes,

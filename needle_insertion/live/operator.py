@@ -15,7 +15,7 @@ from needle_ros.calls_node import Calls
 from needle_ros.errors import printable
 from needle_ros.publishers_node import request_stamp
 from needle_ros.status import no_answer, PendingRequest, RequestStatus
-from needle_ros.timing import nanoseconds
+from needle_ros.timing import NANOSECONDS, nanoseconds
 from rcl_interfaces.srv import SetParameters
 from rclpy.client import Client
 from rclpy.clock import Clock
@@ -103,6 +103,8 @@ class Operator:
         self._calls = Calls(node)
         #: Targets without a final answer, with their messages.
         self._sending: list[tuple[PendingRequest, PointStamped]] = []
+        #: Stamp of the latest target [ns].
+        self._stamp = 0
         self.states: dict[str, State] = {}
         self._target = node.create_publisher(
             PointStamped, contract.TARGET.name, profile(contract.TARGET.qos)
@@ -170,9 +172,12 @@ class Operator:
         """
         message = PointStamped()
         message.header.frame_id = contract.ENTRY
-        message.header.stamp = request_stamp(self._node)
+        stamp = nanoseconds(request_stamp(self._node))
+        # A stamp identifies the request: simulated time may stand still.
+        self._stamp = max(stamp, self._stamp + 1) if stamp else 0
+        message.header.stamp.sec, message.header.stamp.nanosec = divmod(self._stamp, NANOSECONDS)
         message.point.x, message.point.y, message.point.z = x, y, z
-        pending = PendingRequest(contract.TARGET, nanoseconds(message.header.stamp), self.aims)
+        pending = PendingRequest(contract.TARGET, self._stamp, self.aims)
         self._sending.append((pending, message))
         self._target.publish(message)
         return pending

@@ -134,7 +134,7 @@ def run(session: Session) -> int:
         node = graph.node('operator')
         operator = Operator(node)
         readings = Readings(Node('readings', context=graph.context))
-        screen.say(f'starting {", ".join(session.names)}; the very first start takes a minute')
+        screen.say(f'starting {", ".join(session.names)}')
         # What a script asks for first is asked for at the same sample every time.
         holds = session.lockstep and not screen.typed
         witness = Witness(node, _warms_up, lockstep=True) if holds else None
