@@ -1,0 +1,182 @@
+"""
+A pool of worker processes that cannot hang.
+
+Workers share nothing. The pools of the standard library and of joblib give all workers one queue:
+a worker that is killed while it holds the lock of the queue, or while it writes a result that the
+pipe cannot hold, blocks the others or the parent for ever. Here each worker has its own pipe. The
+kernel closes it when the worker ends, at any moment from its first instruction, and the parent
+gives the job to a new worker.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from contextlib import contextmanager, suppress
+from multiprocessing import get_context, parent_process
+from multiprocessing.connection import Connection
+import os
+import pickle
+import signal
+from threading import Lock, Thread
+from traceback import format_exc
+from typing import Any, Final, ParamSpec, TypeVar
+
+from needle_ros.errors import JobError
+
+#: Workers that are lost before a job is given up.
+_TRIES: Final = 10
+
+_P = ParamSpec('_P')
+_T = TypeVar('_T')
+
+
+class _WorkerError(Exception):
+    """The traceback of an exception in a worker, as its cause."""
+
+    def __str__(self) -> str:
+        return f'\n{self.args[0]}'
+
+
+class _Worker:
+    """A process and the only pipe to it."""
+
+    def __init__(self) -> None:
+        context = get_context('spawn')
+        self._pipe, end = context.Pipe()
+        self.process = context.Process(target=_work, args=(end,), daemon=True)
+        # With the end of the worker open here, the pipe would outlive the worker.
+        with end:
+            self.process.start()
+
+    def run(self, job: bytes) -> bytes:
+        """Return the result of a job; EOFError or OSError if the worker ends before."""
+        self._pipe.send_bytes(job)
+        return self._pipe.recv_bytes()
+
+    def end(self) -> int | None:
+        """End the worker; return its exit code."""
+        self.process.kill()
+        self.process.join()
+        self._pipe.close()
+        return self.process.exitcode
+
+
+class _Pool(ThreadPoolExecutor):
+    """Threads that pass each job to a worker, and wait for the result or the end of the worker."""
+
+    def __init__(self, workers: int) -> None:
+        super().__init__(workers)
+        self._guard = Lock()
+        self._workers = set[_Worker]()
+        self._idle = list[_Worker]()
+        self._open = True
+
+    def submit(
+        self, function: Callable[_P, _T], /, *args: _P.args, **kwargs: _P.kwargs
+    ) -> Future[_T]:
+        return super().submit(self._run, function, *args, **kwargs)
+
+    def _run(self, *job: Any, **kwargs: Any) -> Any:
+        """Compute a job, with another worker each time that one is lost."""
+        data = pickle.dumps((job, kwargs))
+        code = None
+        for _ in range(_TRIES):
+            worker = self._take()
+            try:
+                answer = worker.run(data)
+            except (EOFError, OSError):
+                with self._guard:
+                    self._workers.remove(worker)
+                code = worker.end()
+                continue
+            with self._guard:
+                self._idle.append(worker)
+            result, error, trace = pickle.loads(answer)  # noqa: S301
+            if error is not None:
+                raise error from _WorkerError(trace)
+            return result
+        raise JobError(
+            f'{_TRIES} worker processes ended in a row without a result, the last one '
+            f'{_reason(code)}'
+        )
+
+    def _take(self) -> _Worker:
+        with self._guard:
+            if not self._open:
+                raise JobError('the pool of worker processes has ended')
+            if self._idle:
+                return self._idle.pop()
+            worker = _Worker()
+            self._workers.add(worker)
+            return worker
+
+    def end(self) -> None:
+        """Kill all workers: a thread that waits for one wakes, and no new one starts."""
+        with self._guard:
+            self._open = False
+            for worker in self._workers:
+                worker.process.kill()
+        self.shutdown(cancel_futures=True)
+        for worker in self._workers:
+            worker.end()
+
+
+@contextmanager
+def processes(workers: int) -> Iterator[Executor]:
+    """
+    Start worker processes of this machine.
+
+    A job must be a pure function: it is computed again if its worker is killed, by the kernel for
+    example. Workers are spawned, ignore SIGINT, and end when this process ends, also by SIGKILL.
+
+    Parameters
+    ----------
+    workers : int
+        Largest number of workers; each is started when the first job needs it.
+
+    Yields
+    ------
+    Executor
+        A job whose worker is lost 10 times in a row raises `JobError`. Jobs that have not
+        finished at the end of the context are ended.
+
+    """
+    pool = _Pool(workers)
+    try:
+        yield pool
+    finally:
+        pool.end()
+
+
+def _work(pipe: Connection) -> None:
+    """Compute jobs until the parent closes the pipe."""
+    # Only the parent answers Ctrl-C.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # A worker that computes does not read its pipe, and would outlive a parent that was killed.
+    Thread(target=_end_with_parent, daemon=True).start()
+    with suppress(EOFError, OSError):
+        while True:
+            pipe.send_bytes(_answer(pipe.recv_bytes()))
+
+
+def _answer(data: bytes) -> bytes:
+    """Return the result of a job, or its exception with the traceback."""
+    try:
+        (function, *args), kwargs = pickle.loads(data)  # noqa: S301
+        return pickle.dumps((function(*args, **kwargs), None, ''))
+    except BaseException as error:  # noqa: BLE001
+        return pickle.dumps((None, error, format_exc()))
+
+
+def _end_with_parent() -> None:
+    parent = parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
+
+
+def _reason(code: int | None) -> str:
+    if code is None or code >= 0:
+        return f'with status {code}'
+    return f'by {signal.Signals(-code).name}'
