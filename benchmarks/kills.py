@@ -98,7 +98,7 @@ def kill_workers(
                 break
             if killed == times or time.monotonic() < moment:
                 continue
-            age = _kill_one(process.pid, rng, youngest=row > 0)
+            age = kill_worker(process.pid, rng, youngest=row > 0)
             if age is not None:
                 killed += 1
                 young += age < _SPAWNED
@@ -123,22 +123,56 @@ class _Progress:
         return now - self._last > _PATIENCE
 
 
-def _kill_one(parent: int, rng: np.random.Generator, *, youngest: bool) -> float | None:
-    """Kill a worker of a process; return its age [s], or None if there is no worker."""
+def kill_worker(parent: int, rng: np.random.Generator, *, youngest: bool) -> float | None:
+    """
+    Kill a worker of a process.
+
+    Parameters
+    ----------
+    parent : int
+        The process.
+    rng : Generator
+        Random numbers.
+    youngest : bool
+        Kill the youngest worker, instead of a random one.
+
+    Returns
+    -------
+    float or None
+        Age of the worker [s]; None if there is no worker, or one has just ended.
+
+    """
     with suppress(psutil.NoSuchProcess):
-        workers = [
-            one
-            for one in psutil.Process(parent).children()
-            if one.status() != psutil.STATUS_ZOMBIE
-            and 'resource_tracker' not in ' '.join(one.cmdline())
-        ]
-        if workers:
-            workers.sort(key=psutil.Process.create_time)
-            one = workers[-1 if youngest else rng.integers(len(workers))]
+        if found := workers(parent):
+            one = found[-1 if youngest else rng.integers(len(found))]
             age = time.time() - float(one.create_time())
             one.kill()
             return age
     return None
+
+
+def workers(parent: int) -> list[psutil.Process]:
+    """
+    Return the workers of a process.
+
+    Parameters
+    ----------
+    parent : int
+        The process.
+
+    Returns
+    -------
+    list of Process
+        Its children that have not ended, the oldest first.
+
+    """
+    found = [
+        one
+        for one in psutil.Process(parent).children()
+        if one.status() != psutil.STATUS_ZOMBIE
+        and 'resource_tracker' not in ' '.join(one.cmdline())
+    ]
+    return sorted(found, key=psutil.Process.create_time)
 
 
 class Kills(NamedTuple):
