@@ -11,11 +11,9 @@ beat.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from math import pi, sqrt
-from multiprocessing import get_context
 import os
 from typing import Any, Final, NamedTuple, TypeVar
 from unittest import mock
@@ -55,6 +53,7 @@ from needle_insertion.experiment.protocol import (
     START_DEPTH,
 )
 from needle_insertion.paper.tables import FORCE_LEVELS
+from needle_ros.process_pool import processes
 import numpy as np
 
 #: Limits of the coverage, and of the mean squared error over the Cramer-Rao bound.
@@ -69,9 +68,6 @@ _STEP: Final = 1e-3
 
 #: Cases beside the default ones are identified in every so many recordings.
 _SIDE: Final = 2
-
-#: Recordings that a process takes at a time.
-_CHUNK: Final = 5
 
 _MOST_RECORDINGS: Final = 100_000
 
@@ -508,9 +504,9 @@ def studied(
     # Processes share the cores already.
     with (
         mock.patch.dict(os.environ, OPENBLAS_NUM_THREADS='1', OMP_NUM_THREADS='1'),
-        ProcessPoolExecutor(workers, mp_context=get_context('spawn')) as pool,
+        processes(workers) as pool,
     ):
-        yield from pool.map(job, range(recordings), chunksize=_CHUNK)
+        yield from pool.map(job, range(recordings))
 
 
 def compare(tick: Tick, recordings: int = 1000, seed: int = 2014) -> Answer:

@@ -1,4 +1,8 @@
-"""A study that is killed again and again: what was lost, computed twice, or left behind."""
+"""
+A study that is killed again and again: what was lost, computed twice, or left behind.
+
+The command is killed, or its workers are.
+"""
 
 from __future__ import annotations
 
@@ -21,6 +25,154 @@ _LATEST: Final = 0.3
 
 #: Time in which the processes of a study that was killed must end [s].
 _ORPHANED: Final = 5.0
+
+
+#: Age up to which a worker that replaces a killed one is killed [s]: Python starts in that time.
+_SPAWNED: Final = 0.2
+
+#: Probability that the worker that replaces a killed one is killed so, and how many in a row.
+_YOUNG, _ROW = 0.6, 3
+
+
+class Losses(NamedTuple):
+    """
+    What became of a study whose workers were killed.
+
+    Attributes
+    ----------
+    killed : int
+        Workers that were killed.
+    young : int
+        Those of them that had been started less than 0.2 s before.
+    errors : int
+        How often the command ended with an error, and was started again.
+    hangs : int
+        How often it wrote nothing for 120 s, and was ended.
+
+    """
+
+    killed: int
+    young: int
+    errors: int
+    hangs: int
+
+
+def kill_workers(
+    words: Sequence[str], folder: Path, times: int, between: float, rng: np.random.Generator
+) -> Losses:
+    """
+    Compute a study, and kill its workers at random times.
+
+    Most workers that replace killed ones are killed while they are spawned.
+
+    Parameters
+    ----------
+    words : sequence of str
+        Command that begins the study, or continues it.
+    folder : Path
+        Folder of its results.
+    times : int
+        Largest number of kills.
+    between : float
+        Longest time between kills [s], except those of workers that are spawned.
+    rng : Generator
+        Random numbers.
+
+    Returns
+    -------
+    Losses
+        What became of it.
+
+    """
+    killed = young = errors = hangs = 0
+    while not (folder / TABLE).exists() and hangs + errors <= times:
+        process = subprocess.Popen(words, stdout=subprocess.DEVNULL)
+        progress = _Progress(folder / 'parts')
+        row, moment = 0, time.monotonic() + rng.uniform(0.0, between)
+        while process.poll() is None:
+            # The moment is random: no condition is waited for.
+            time.sleep(0.01)
+            if progress.stalled():
+                hangs += 1
+                process.kill()
+                break
+            if killed == times or time.monotonic() < moment:
+                continue
+            age = kill_worker(process.pid, rng, youngest=row > 0)
+            if age is not None:
+                killed += 1
+                young += age < _SPAWNED
+                row = row + 1 if row < _ROW and rng.random() < _YOUNG else 0
+                moment = time.monotonic() + rng.uniform(0.0, _SPAWNED if row else between)
+        errors += process.wait() > 0
+    return Losses(killed, young, errors, hangs)
+
+
+class _Progress:
+    """Whether a study still writes results."""
+
+    def __init__(self, parts: Path) -> None:
+        self._parts = parts
+        self._seen, self._last = 0, time.monotonic()
+
+    def stalled(self) -> bool:
+        """Whether nothing was written for too long."""
+        now = time.monotonic()
+        if (seen := len(written(self._parts))) != self._seen:
+            self._seen, self._last = seen, now
+        return now - self._last > _PATIENCE
+
+
+def kill_worker(parent: int, rng: np.random.Generator, *, youngest: bool) -> float | None:
+    """
+    Kill a worker of a process.
+
+    Parameters
+    ----------
+    parent : int
+        The process.
+    rng : Generator
+        Random numbers.
+    youngest : bool
+        Kill the youngest worker, instead of a random one.
+
+    Returns
+    -------
+    float or None
+        Age of the worker [s]; None if there is no worker, or one has just ended.
+
+    """
+    with suppress(psutil.NoSuchProcess):
+        if found := workers(parent):
+            one = found[-1 if youngest else rng.integers(len(found))]
+            age = time.time() - float(one.create_time())
+            one.kill()
+            return age
+    return None
+
+
+def workers(parent: int) -> list[psutil.Process]:
+    """
+    Return the workers of a process.
+
+    Parameters
+    ----------
+    parent : int
+        The process.
+
+    Returns
+    -------
+    list of Process
+        Its children that have not ended, the oldest first.
+
+    """
+    found = [
+        one
+        for one in psutil.Process(parent).children()
+        if one.status() != psutil.STATUS_ZOMBIE
+        and 'resource_tracker' not in ' '.join(one.cmdline())
+    ]
+    return sorted(found, key=psutil.Process.create_time)
 
 
 class Kills(NamedTuple):

@@ -34,6 +34,7 @@ MODULES = {
     'graph': ('graph',),
     'slicer': ('slicer',),
     'study': ('study', 'environments'),
+    'pool': ('pool',),
 }
 
 
@@ -103,6 +104,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         const='quick',
         help='a trial, too short for reliable figures',
     )
+    pool = add('pool', help='a study whose workers are killed at random times')
+    pool.add_argument('--kills', type=int, metavar='N', help='workers that are killed')
 
 
 def run(options: argparse.Namespace) -> int:

@@ -8,7 +8,6 @@ ones are real nodes, with strangers and kills.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache
 from math import inf, nan
@@ -21,6 +20,7 @@ from benchmarks.measure import Bar
 from benchmarks.page import Answer, Section, Tick
 from needle_ros.contract import BASE_WRENCH, JOINT_STATES, TIP_DEFLECTION, WRENCH_COMMAND
 from needle_ros.errors import ParameterError
+from needle_ros.process_pool import processes
 from needle_ros.timing import NANOSECONDS
 import numpy as np
 
@@ -362,8 +362,8 @@ def compare(tick: Tick, fault: str = '') -> Answer:
         known = ', '.join(dict.fromkeys(cell.fault for cell in cells()))
         raise ParameterError(f'--fault must be one of {known}, got {fault!r}')
     tick('simulated time')
-    with ProcessPoolExecutor(max_workers=os.cpu_count()) as pool:
-        found = list(pool.map(measure, chosen, chunksize=8))
+    with processes(os.cpu_count() or 1) as pool:
+        found = list(pool.map(measure, chosen))
     sections = [_section(topic, chosen, found) for topic in dict.fromkeys(c.topic for c in chosen)]
     bars = [
         Bar('worst force', max(one.force for one in found), _FORCE, 'N'),

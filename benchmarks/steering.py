@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from functools import lru_cache, partial
 from math import cos, inf, pi, sin, sqrt
-from multiprocessing import get_context
+import os
 from time import perf_counter
 from typing import Final, NamedTuple
 
@@ -26,6 +25,7 @@ from needle_controller.steering.responses import SteeringModel
 from needle_controller.steering.trial import drawn
 from needle_dynamics import FloatArray, NeedleParameters, SteeringParameters
 from needle_dynamics.steering.parameters import NEEDLES, tissue_of
+from needle_ros.process_pool import processes
 import numpy as np
 from scipy.optimize import lsq_linear
 
@@ -374,11 +374,11 @@ def compare(tick: Tick, needles: int = 1000) -> Answer:
         ('ultrasound', 0.3): {'mean': 0.35},
     }
     others: list[tuple[str, ...]] = []
-    with ProcessPoolExecutor(mp_context=get_context('spawn')) as pool:
+    with processes(os.cpu_count() or 1) as pool:
         for sensor, spread in CASES:
             case = f'{sensor}, +-{100.0 * spread:g} %'
             tick(case)
-            found = list(pool.map(partial(insert, sensor, spread), range(needles), chunksize=5))
+            found = list(pool.map(partial(insert, sensor, spread), range(needles)))
             counted = [one for one in found if one.reachable and not one.refused]
             for medium in (*MEDIA, 'all'):
                 of = [one for one in counted if medium in (one.medium, 'all')]
@@ -411,7 +411,7 @@ def compare(tick: Tick, needles: int = 1000) -> Answer:
             bars.append(Bar(f'a step, {case}', step, 2.0, 'ms'))
             bars.append(Bar(f'a look, {case}', look, 0.2, 'ms'))
         tick('roll')
-        turned = list(pool.map(turn, range(needles), chunksize=5))
+        turned = list(pool.map(turn, range(needles)))
     every = [one for one in turned if one.reachable and not one.refused]
     bars.append(
         Bar(

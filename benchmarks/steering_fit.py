@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
-from multiprocessing import get_context
+import os
 from typing import Final
 
 from benchmarks.calibration import COVERAGE
@@ -15,6 +14,7 @@ from benchmarks.page import Answer, Section, Tick
 from needle_dynamics import NeedleParameters, SteeredNeedle, SteeringParameters
 from needle_dynamics.steering.parameters import tissue_of
 from needle_identification import identify_steering, SteeringRecording, SteeringSettings
+from needle_ros.process_pool import processes
 import numpy as np
 
 #: The paper's needle; its bending stiffness [N m^2].
@@ -163,11 +163,11 @@ def compare(tick: Tick, recordings: int = 1000) -> Answer:
 
     """
     rows, bars = [], []
-    with ProcessPoolExecutor(mp_context=get_context('spawn')) as pool:
+    with processes(os.cpu_count() or 1) as pool:
         for k, (name, truth, count) in enumerate(_CASES):
             tick(name)
             fits = recordings if count == 1 else max(1, recordings // 10)
-            found = np.array(list(pool.map(partial(_one, k), range(fits), chunksize=5)))
+            found = np.array(list(pool.map(partial(_one, k), range(fits))))
             low, high, off, rms = found.T
             known = np.isfinite(off)
             held = (low <= truth.length) & (truth.length <= high)

@@ -30,6 +30,7 @@ from distributed import Client, LocalCluster
 from needle_dynamics import FloatArray
 from needle_insertion.study import engine
 from needle_insertion.study.study import made, read_study, Study
+from needle_ros.process_pool import processes
 import numpy as np
 import psutil
 import yaml
@@ -193,7 +194,7 @@ def pool(text: str, workers: int) -> Iterator[_Factory]:
         As `engine.compute` takes it.
 
     """
-    with engine.processes(workers) as executor:
+    with processes(workers) as executor:
         ready: set[int] = set()
         while len(ready) < workers:
             ready |= set(executor.map(_ready, [text] * workers))

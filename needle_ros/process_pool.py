@@ -113,11 +113,12 @@ class _Pool(ThreadPoolExecutor):
 
     def end(self) -> None:
         """Kill all workers: a thread that waits for one wakes, and no new one starts."""
+        self.shutdown(wait=False, cancel_futures=True)
         with self._guard:
             self._open = False
             for worker in self._workers:
                 worker.process.kill()
-        self.shutdown(cancel_futures=True)
+        self.shutdown()
         for worker in self._workers:
             worker.end()
 
@@ -138,8 +139,8 @@ def processes(workers: int) -> Iterator[Executor]:
     Yields
     ------
     Executor
-        A job whose worker is lost 10 times in a row raises `JobError`. Jobs that have not
-        finished at the end of the context are ended.
+        A job whose worker is lost 10 times in a row raises `JobError`. At the end of the
+        context, jobs that run are ended with their workers, and the others are cancelled.
 
     """
     pool = _Pool(workers)

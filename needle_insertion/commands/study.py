@@ -14,6 +14,7 @@ from typing import Any, Final
 
 from needle_insertion.commands.common import check_folder, Command
 from needle_ros.errors import JobError, ParameterError
+from needle_ros.process_pool import processes
 
 #: Time in which a scheduler must answer, and have a worker [s].
 _PATIENCE: Final = 10
@@ -85,7 +86,7 @@ def _executor(
     from needle_insertion.study import engine
 
     if scheduler is None:
-        yield partial(engine.processes, workers), workers
+        yield partial(processes, workers), workers
         return
     try:
         from distributed import Client

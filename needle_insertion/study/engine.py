@@ -9,27 +9,16 @@ whose bytes depend neither on the chunks nor on the number of workers.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from concurrent.futures import (
-    BrokenExecutor,
-    CancelledError,
-    Executor,
-    FIRST_COMPLETED,
-    Future,
-    ProcessPoolExecutor,
-    wait,
-)
+from concurrent.futures import CancelledError, Executor, FIRST_COMPLETED, Future, wait
 from contextlib import AbstractContextManager, contextmanager, ExitStack, suppress
 import fcntl
 from functools import lru_cache
 from importlib.metadata import version
 import json
-from multiprocessing import get_context, parent_process
 import os
 from pathlib import Path
 import re
 import shutil
-import signal
-from threading import Thread
 from time import monotonic
 from typing import Any, Final
 
@@ -46,9 +35,6 @@ _LARGEST: Final = 2**13
 
 #: Rows of the table that are written at once: its bytes depend on it.
 _GROUP: Final = 2**13
-
-#: How often workers may be lost without a chunk in between.
-_TRIES: Final = 5
 
 # The other pools keep what they are given back.
 pa.set_memory_pool(pa.system_memory_pool())
@@ -309,42 +295,29 @@ def compute(
     progress: Callable[[int], object],
 ) -> None:
     """
-    Compute what is missing.
+    Compute the missing samples.
 
     Parameters
     ----------
     results : Results
-        Where it goes.
+        Folder of the study.
     executor : callable
-        Makes what runs it; called again if its workers are lost.
+        Returns a context with the executor of the chunks. The executor replaces lost workers.
     workers : int
-        How many they are.
+        Number of workers.
     progress : callable
         Called with the number of samples of each chunk that is written.
 
     Raises
     ------
     JobError
-        If it cannot be computed or written.
+        If a sample cannot be computed or written.
 
     """
-    losses = 0
     with results.alone():
-        while todo := results.missing():
-            done = 0
-
-            def written(count: int) -> None:
-                nonlocal done
-                done += count
-                progress(count)
-
-            try:
-                with executor() as running:
-                    _compute(results, running, workers, todo, written)
-            except BrokenExecutor as error:
-                losses = 0 if done else losses + 1
-                if losses == _TRIES:
-                    raise JobError(f'workers end without a result: {error}') from error
+        if todo := results.missing():
+            with executor() as running:
+                _compute(results, running, workers, todo, progress)
         results.complete()
 
 
@@ -377,43 +350,6 @@ def _compute(
     finally:
         for future in running:
             future.cancel()
-
-
-def _serve() -> None:
-    # The process that has started the workers ends them ...
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    # ... and if it is killed, they end with it: the pool alone would have them wait for ever.
-    Thread(target=_end_with_parent, daemon=True).start()
-
-
-def _end_with_parent() -> None:
-    parent = parent_process()
-    if parent is not None:
-        parent.join()
-        os._exit(1)
-
-
-@contextmanager
-def processes(workers: int) -> Iterator[Executor]:
-    """
-    Make processes of this machine that compute.
-
-    Parameters
-    ----------
-    workers : int
-        How many.
-
-    Yields
-    ------
-    Executor
-        They end with the context.
-
-    """
-    pool = ProcessPoolExecutor(workers, get_context('spawn'), _serve)
-    try:
-        yield pool
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)
 
 
 @contextmanager

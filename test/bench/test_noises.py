@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
 from pathlib import Path
 
 from benchmarks import damage, noises
 from benchmarks.noises import Kind, LINES, recorded
 from needle_identification import identify_friction, read_friction_recording
+from needle_ros.process_pool import processes
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest
@@ -55,7 +54,7 @@ def test_every_form_holds_the_same_recording(tmp_path: Path) -> None:
 
 def test_damaged_recordings_end_well() -> None:
     # In a process of its own, whose memory is that of no other test.
-    with ProcessPoolExecutor(1, get_context('spawn')) as pool:
+    with processes(1) as pool:
         [section], bars = pool.submit(damage.compare, print, files=120, seed=3).result()
     assert sum(int(count) for row in section.rows for count in row[2:]) == 120
     assert all(not bar.missed for bar in bars), (bars, section.notes)

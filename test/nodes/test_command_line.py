@@ -69,7 +69,7 @@ def test_a_node_says_that_it_runs_and_a_second_ctrl_c_changes_nothing(
     while node.poll() is None and time.monotonic() < deadline:
         node.send_signal(signal.SIGINT)
         time.sleep(0.005)
-    node.communicate()
+    node.communicate(timeout=60.0)
     assert node.returncode == 0
 
 

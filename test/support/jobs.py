@@ -1,0 +1,38 @@
+"""Jobs for worker processes, which can import this file."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+import signal
+from threading import Event, Timer
+
+from needle_ros.errors import ParameterError
+
+#: Size of a result that takes some 0.02 s to write [bytes].
+LARGE = 50_000_000
+
+
+def divide(a: float, b: float) -> float:
+    return a / b
+
+
+def refuse(value: float) -> None:
+    raise ParameterError(f'value must be > 0, got {value:g}')
+
+
+def kill_once(marker: str, delay: float) -> bytes:
+    """Return a large result; the first time the worker is killed after a delay [s]."""
+    if not Path(marker).exists():
+        Path(marker).touch()
+        Timer(delay, os.kill, (os.getpid(), signal.SIGKILL)).start()
+    return bytes(LARGE)
+
+
+def die() -> None:
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def wait_for_ever(marker: str) -> None:
+    Path(marker).write_text(str(os.getpid()))
+    Event().wait()
