@@ -109,7 +109,7 @@ class SteeringNode(BaseNode):
         needle = from_values(NeedleParameters, given('model.', OF_NEEDLE), 'model.')
         steering = from_values(SteeringParameters, given('steering.', OF_STEERING), 'steering.')
         belief = self.settings('belief.', SteeringBelief)
-        # Compile, or load what was compiled, before anything moves; and refuse what cannot be.
+        # Load or compile the functions before anything moves; and reject invalid constants.
         SteeringModel(needle, steering, [0.0, 1e-3], belief)
         settings = self.settings('', OuterLoopSettings)
         self._loop = OuterLoop(needle, steering, belief, settings, start=ThreadJob)

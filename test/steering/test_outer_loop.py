@@ -545,6 +545,6 @@ def test_a_motion_of_rounding_is_none() -> None:
     robot.aim()
     loop = robot.loop
     for way, sent in ((1e-15, False), (5e-7, False), (2e-6, True)):
-        move = loop._send(Phase.GUIDING, loop._goal + [0.0, way, 0.0], robot.now)
+        move = loop._send(Phase.GUIDING, loop._goal + np.array([0.0, way, 0.0]), robot.now)
         assert (move is not None) == sent
         assert move is None or (np.diff(move.times) > 1e-5).all()
