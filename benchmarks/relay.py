@@ -2,7 +2,7 @@
 Steered insertions in which one message is dropped, delayed or duplicated by a relay between nodes.
 
 Plant, controller, steering and operator are real nodes over DDS, in lock-step. All their topics
-pass the relay, each link from one node to another by itself. In each insertion one message of one
+pass the relay, each link from one node to another separately. In each insertion one message of one
 link, at random, gets a fault. The insertion must then reach its target, or stop with one line
 within 5 s. Run it by ``python -m benchmarks.relay --count 200 --seed 1``.
 """
@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import argparse
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 import sys
@@ -34,9 +34,11 @@ from needle_ros.timing import NANOSECONDS
 import numpy as np
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
-from rclpy.logging import LoggingSeverity, set_logger_level
+from rclpy.impl.logging_severity import LoggingSeverity
+from rclpy.logging import set_logger_level
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from tqdm import trange
 
 #: Faults of a message.
 KINDS: Final = ('drop', 'delay', 'duplicate')
@@ -200,7 +202,7 @@ class Relay(Node):
         self.armed = False
         self.now = 0.0
         self.struck: float | None = None
-        #: Messages that are held: until simulated or wall time [s], and what delivers them.
+        #: Messages that are held: simulated and wall time of delivery [s], and the delivery.
         self._held: list[tuple[float, float, Callable[[], None]]] = []
         for source, topic in {(one.source, one.topic) for one in LINKS}:
             kind, name = message_class(topic.type_name), _name(source, topic)
@@ -347,13 +349,13 @@ def insert(fault: Fault | None, logs: Path, *, continuous: bool = False) -> Outc
         return Outcome('rejected', pending.outcome[1], after, relay.counts)
 
 
-def choose(counts: Counter[Link], rng: np.random.Generator) -> Fault:
+def choose(counts: Mapping[Link, int], rng: np.random.Generator) -> Fault:
     """
     Choose a link, one of its messages, and a fault.
 
     Parameters
     ----------
-    counts : Counter
+    counts : Mapping of Link to int
         Messages of each link in an insertion without a fault.
     rng : Generator
         Source of randomness.
@@ -387,7 +389,7 @@ def main(words: Sequence[str] | None = None) -> int:
                 sys.stdout.write(f'missed: without a fault: {clean.end}, {clean.line}\n')
                 return 1
             counts.append(clean.counts)
-        for number in range(given.count):
+        for number in trange(given.count, unit=' insertions', disable=None):
             continuous = bool(number % 2)
             fault = choose(counts[continuous], rng)
             outcome = insert(fault, Path(folder), continuous=continuous)

@@ -50,13 +50,13 @@ _RETRACT_DEPTH = 0.01
 #: no timeout, and time between them [s].
 _AGAIN, _PAUSE = 5, 0.02
 
-#: Looks for joint states that do not come until there is a word about it.
+#: Checks without joint states until that is logged.
 _PATIENCE = 20
 
 #: Joints that no axis law moves.
 _GUIDE = {joint.name for joint in contract.STEERING_JOINTS}
 
-#: Sources of what is known of the bending.
+#: Sources of the load of the bent needle.
 FEEDBACKS = ('observer', 'ground_truth', 'none')
 
 
@@ -71,14 +71,13 @@ class ControllerNode(ModelNode):
     commands too. It is also zero from ``~/emergency_stop`` or a measurement beyond a limit until
     ``~/clear_stop``. It carries the stamp of the measurement that it answers; one that answers
     none is of now. ``~/pause`` brakes the reference and holds it, ``~/retract`` goes to
-    ``retract_depth``. ``reference`` and ``tracking_error`` show what it aims at and how far off
-    it is.
+    ``retract_depth``. ``reference`` and ``tracking_error`` are the reference and its error.
 
-    What the bending adds to the insertion force comes from an observer that takes in
-    ``tip_deflection`` and ``base_wrench``, as far as these come. Both are held against the limits
-    in any case.
+    An observer estimates the load of the bent needle from ``tip_deflection`` and ``base_wrench``,
+    if these are published. Both are checked against the limits in any case.
 
-    The node passes messages to a `Supervisor`, which decides, and publishes what comes back.
+    The node passes messages to a `Supervisor`, which decides, and publishes its commands. Each
+    target and trajectory is acknowledged in the status, see `needle_ros.status`.
     """
 
     LIVE = frozenset(
@@ -117,7 +116,7 @@ class ControllerNode(ModelNode):
             f'one of {", ".join(FEEDBACKS)} (ground_truth: simulation only)',
         )
         self.declare_text(
-            'steered', False, 'the target is for the node steering: only paths are followed'
+            'steered', False, 'targets are for the node steering: only trajectories are followed'
         )
         self.declare_parameter(
             _RETRACT,
@@ -139,7 +138,7 @@ class ControllerNode(ModelNode):
 
         self._supervisor = supervisor = Supervisor()
         self._truths: Subscription | None = None
-        #: What reads and commands a robot that does not know the contract; why there is none.
+        #: Adapter of a robot with topics of its own; why it could not be created.
         self._driver: Driver | None = None
         self._no_driver: NeedleError | None = None
         self._hardware = HardwareSettings()
@@ -159,7 +158,7 @@ class ControllerNode(ModelNode):
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
 
     def _connect(self) -> None:
-        """Offer the commands and subscribe to what is measured; `configure` says what is wrong."""
+        """Offer the commands and subscribe to measurements; `configure` raises the errors."""
         try:
             self._hardware = self.settings('hardware.', HardwareSettings)
             if self._hardware != HardwareSettings():
@@ -170,7 +169,7 @@ class ControllerNode(ModelNode):
         offer_lease(self, topics.commander)
         commanders = Publishers(self, topics.commander, self._look)
         measurers = Publishers(self, topics.measurer, self._look)
-        #: Who counts the nodes that publish what may have one source only, by its contract's name.
+        #: Counters of the publishers of commands and measurements, by name in the contract.
         self._sources = {
             contract.WRENCH_COMMAND.name: (topics.command, commanders),
             contract.JOINT_STATES.name: (topics.state, measurers),
@@ -190,7 +189,7 @@ class ControllerNode(ModelNode):
     # Transitions.
 
     def configure(self) -> None:
-        """Make the controller from the parameters; reject unstable gains."""
+        """Create the controller from the parameters; reject unstable gains."""
         if self.settings('hardware.', HardwareSettings) != self._hardware:
             raise ParameterError(
                 'hardware.* is read when the node starts: give it on its command line or in its '
@@ -230,11 +229,11 @@ class ControllerNode(ModelNode):
         return gains
 
     def _retract_depth(self, changes: Mapping[str, Any]) -> float:
-        """Return the depth to retract to, or refuse it."""
+        """Return the depth to retract to, or reject it."""
         value = changes.get(_RETRACT, self.get_parameter(_RETRACT).value)
         low, high = self.settings('', ControllerSettings).depths(self.model_parameters())
         if _RETRACT not in changes and value == _RETRACT_DEPTH:
-            # No farther than the range allows by default, whatever the needle.
+            # The default is limited to the range of the needle.
             return min(max(_RETRACT_DEPTH, low), high)
         number = isinstance(value, (int, float)) and not isinstance(value, bool)
         if not number or not low <= value <= high:
@@ -242,7 +241,7 @@ class ControllerNode(ModelNode):
         return float(value)
 
     def change(self, changes: Mapping[str, Any]) -> None:
-        """Go on with other gains, friction or law; reject what is unstable."""
+        """Continue with other gains, friction or law; reject unstable gains."""
         try:
             parameters = self.model_parameters(changes)
             depth = self._retract_depth(changes)
@@ -257,7 +256,7 @@ class ControllerNode(ModelNode):
             self._driver.robot.believe(parameters)
 
     def cleanup(self) -> None:
-        """Forget the controller, the bending and who tells of it."""
+        """Discard the controller, the load estimate and its source."""
         self._supervisor.cleanup()
         if self._truths is not None:
             self.destroy_subscription(self._truths)
@@ -285,7 +284,7 @@ class ControllerNode(ModelNode):
         )
 
     def deactivate(self) -> None:
-        """Let go: zero force, and no memory of the motion nor of its target."""
+        """Command zero force, and discard the motion and its target."""
         answer = self._supervisor.deactivate(self.now())
         self._act(answer)
         for _ in range(_AGAIN if self._driver is not None else 0):
@@ -293,10 +292,10 @@ class ControllerNode(ModelNode):
             self._act(answer)
         self.destroy_timer(self._watchdog)
 
-    # What comes in.
+    # Inputs.
 
     def _passing(self, take: Callable[[Reading, int], Answer | None]) -> Callable[[Reading], None]:
-        """Return what passes a reading on, and does what comes of it."""
+        """Return a callback that passes a measurement on, and publishes the command."""
 
         def on_reading(reading: Reading) -> None:
             self._act(take(reading, self.now()))
@@ -304,7 +303,7 @@ class ControllerNode(ModelNode):
         return on_reading
 
     def _serve(self, kind: Any, name: str, act: Callable[[Any], Reply]) -> None:
-        """Offer a service that does what comes of a request."""
+        """Offer a service that executes a request, and publishes the command."""
 
         def on_request(request: Any, response: Any) -> Any:
             response.success, response.message, answer = act(request)
@@ -325,9 +324,9 @@ class ControllerNode(ModelNode):
 
     def _on_trajectory(self, message: JointTrajectory) -> None:
         if message.joint_names and {*message.joint_names} <= _GUIDE:
-            # The guide of a needle that is steered: that is for the plant.
+            # The guide of a steered needle is moved by the plant.
             return
-        # One more than may be is enough to refuse it.
+        # One more than permitted is enough to reject it.
         points = message.points[: MOST_POINTS + 1]
         self._act(
             self._supervisor.trajectory(
@@ -342,18 +341,18 @@ class ControllerNode(ModelNode):
         )
 
     def _who_publishes(self) -> dict[str, int]:
-        """Count who publishes what may have one source only; active or not."""
+        """Count the publishers of commands and measurements; active or not."""
         return {name: sources.count(topic) for name, (topic, sources) in self._sources.items()}
 
     def _look(self, _came: int = 0) -> None:
-        """Look for what does not come, and who has come, from time to time and when one comes."""
+        """Check for missing inputs and for duplicate publishers."""
         if self.is_active:
             self._act(self._supervisor.watch(self.now(), self._who_publishes()))
             if self._driver is not None and self._supervisor.waits:
                 self._look_for(self._driver)
 
     def _look_for(self, driver: Driver) -> None:
-        """Say why no joint states come, once each reason, and not before the graph is known."""
+        """Log why no joint states are received, once each reason, after discovery."""
         self._looks += 1
         missing = driver.missing() if self._looks > _PATIENCE else ''
         if missing != self._missing:
@@ -361,10 +360,10 @@ class ControllerNode(ModelNode):
             self._supervisor.journal.say(Severity.WARNING, missing)
             self.tell(self._supervisor.journal)
 
-    # What goes out.
+    # Outputs.
 
     def _act(self, answer: Answer | None) -> None:
-        """Publish a command, and what there is to say."""
+        """Publish a command, lines for the log, and answers to requests."""
         if answer is not None:
             stamp, force, torque, reference, error = answer
             driver, supervisor = self._driver, self._supervisor
@@ -383,7 +382,7 @@ class ControllerNode(ModelNode):
             self.publish_diagnostics()
 
     def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
-        """Say what it aims at and what holds it back."""
+        """Report target, state, faults and answers to requests."""
         severity, held, values = self._supervisor.diagnose(self.now())
         if self._driver is not None:
             values |= self._driver.describe()

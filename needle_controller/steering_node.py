@@ -123,7 +123,7 @@ class SteeringNode(CompiledNode):
         needle = from_values(NeedleParameters, given('model.', OF_NEEDLE), 'model.')
         steering = from_values(SteeringParameters, given('steering.', OF_STEERING), 'steering.')
         belief = self.settings('belief.', SteeringBelief)
-        # Compile, or load what was compiled, before anything moves; and refuse what cannot be.
+        # Load or compile the functions before anything moves; and reject invalid constants.
         SteeringModel(needle, steering, [0.0, 1e-3], belief)
         # In simulated time a plan takes no time: the plant in lock-step waits for it.
         sim_time = self.get_parameter('use_sim_time').value

@@ -1,4 +1,4 @@
-"""The life of a control loop, without ROS: what counts, what stops, and what to command."""
+"""Supervise the axial control loop, without ROS: checks of inputs, stops, requests, commands."""
 
 from __future__ import annotations
 
@@ -36,11 +36,11 @@ _SENSORS: Final = ('base_wrench', 'tip_deflection')
 
 class Supervisor:
     """
-    Answers measurements by forces as long as all is well.
+    Answer measurements by forces, and command none on any fault.
 
     Every event is a method: it takes the time now [ns] of the clock that stamps the messages, and
-    returns what to command because of it. None leaves the last command as it is. `journal` has
-    what there is to say. Without a target, during a fault, and from a stop until it is cleared,
+    returns a command. None leaves the last command as it is. `journal` has lines for the
+    log. Without a target, during a fault, and from a stop until it is cleared,
     all forces are zero.
 
     Parameters
@@ -51,7 +51,7 @@ class Supervisor:
     Attributes
     ----------
     journal : Journal
-        What there is to say.
+        Lines for the log.
     requests : RequestLog
         Targets and trajectories, and the answers to them.
     safety : Safety
@@ -59,11 +59,11 @@ class Supervisor:
     controller : Controller or None
         Reference and laws, while configured.
     bending : Bending
-        What is known of the bending.
+        Load of the bent needle.
     fault : str or None
-        Why no force is commanded, beside a stop.
+        Why no force is commanded, apart from a stop.
     retract_depth : float
-        Inserted length that `retract` goes to [m].
+        Insertion depth of `retract` [m].
 
     """
 
@@ -85,7 +85,7 @@ class Supervisor:
         self.controller: Controller | None = None
         self.cleanup()
 
-    # Its life.
+    # Transitions.
 
     def configure(
         self,
@@ -95,23 +95,23 @@ class Supervisor:
         robot: Robot | None = None,
     ) -> None:
         """
-        Take a controller; a stop that is latched stays.
+        Set the controller; a latched stop stays.
 
         Parameters
         ----------
         controller : Controller
             Reference and laws.
         limits : SafetyLimits
-            Limits of what is measured.
+            Limits of the measurements.
         observed : ObserverSettings, optional
             Noise and sensors, for the load of the bent needle from an observer.
         robot : Robot, optional
-            Reads the joint states of a robot that does not know the contract.
+            Reads the joint states of a robot with topics of its own.
 
         Raises
         ------
         ParameterError
-            If the observer cannot have such settings.
+            If the settings of the observer are not valid.
 
         """
         noise: dict[str, tuple[float, ...]] = {}
@@ -139,7 +139,7 @@ class Supervisor:
         self.safety.stop = stop
 
     def cleanup(self) -> None:
-        """Forget controller and bending."""
+        """Discard controller and load estimate."""
         self.controller = None
         self.bending = Bending(NeedleParameters())
         #: The controller while measurements are answered.
@@ -149,7 +149,7 @@ class Supervisor:
         self, parameters: NeedleParameters, law: str, gains: Mapping[str, Mapping[str, Gains]]
     ) -> None:
         """
-        Go on with other constants, gains or law; see `Controller.change`.
+        Continue with other constants, gains or law; see `Controller.change`.
 
         Parameters
         ----------
@@ -178,7 +178,7 @@ class Supervisor:
 
     @property
     def waits(self) -> bool:
-        """Whether no measurement has come yet."""
+        """Whether no measurement was received yet."""
         return self.fault == _WAITING
 
     def activate(self, now: int, publishers: Mapping[str, int]) -> None:
@@ -195,7 +195,7 @@ class Supervisor:
         if self.controller is not None:
             self._lateness = Lateness(self.controller.delay, self.controller.period)
             settings, robot = self.controller.settings, self._robot
-            # Times of arrival say nothing of single periods.
+            # Times of arrival do not show single periods.
             stamped = robot is None or robot.settings.stamps == STAMPS[0]
             pace = Pace(settings.rate, settings.measurement_timeout)
             self._pace = pace if stamped else None
@@ -205,7 +205,7 @@ class Supervisor:
 
     def deactivate(self, now: int) -> Answer:
         """
-        Let go, without memory of the motion nor of its target.
+        Command zero force, and discard the motion and its target.
 
         Parameters
         ----------
@@ -232,7 +232,7 @@ class Supervisor:
             self._robot.begin()
 
     def _check_clock(self, now: int) -> Answer | None:
-        """Let go and know nothing if the clock was set back."""
+        """Command zero force and discard measurements and requests if the clock was set back."""
         back = self.safety.clock_went_back(now)
         if not back:
             return None
@@ -248,7 +248,7 @@ class Supervisor:
         Parameters
         ----------
         targets : bool
-            Whether a target is one for this controller; else only trajectories are.
+            Whether this controller takes targets; else only trajectories.
 
         """
         moved = (INSERTION,)
@@ -275,7 +275,7 @@ class Supervisor:
         Returns
         -------
         Answer or None
-            What to command, if anything.
+            The command, if there is a new value.
 
         """
 
@@ -318,7 +318,7 @@ class Supervisor:
         Returns
         -------
         Answer or None
-            What to command, if anything.
+            The command, if there is a new value.
 
         """
 
@@ -347,6 +347,8 @@ class Supervisor:
         try:
             if self._active is None:
                 raise JobError('the controller is not active')
+            if self.safety.stop is not None:
+                raise JobError(f'stopped: {self.safety.stop}; ~/clear_stop releases')
             act(self._active)
         except (JobError, ParameterError) as error:
             verdict, reason = Verdict.REJECTED, str(error)
@@ -462,7 +464,7 @@ class Supervisor:
         Returns
         -------
         Answer or None
-            What to command, if anything.
+            The command, if there is a new value.
 
         """
         if self._active is None:
@@ -470,7 +472,7 @@ class Supervisor:
         answer, deflection = self._check_clock(now), reading.values[0][2]
         if self._counts('tip_deflection', reading, [deflection], now):
             answer = self._stop_for(self.safety.guard.tip(deflection), now) or answer
-            # What is beyond a limit is not believed, be it a single reading.
+            # A reading beyond a limit is left out, even a single one.
             if not self.safety.guard.is_beyond('tip_deflection'):
                 self.bending.take_tip(reading.stamp, deflection)
         return answer
@@ -487,7 +489,7 @@ class Supervisor:
         Returns
         -------
         Answer or None
-            What to command, if anything.
+            The command, if there is a new value.
 
         """
         if self._active is None:
@@ -516,7 +518,7 @@ class Supervisor:
         Returns
         -------
         Answer or None
-            What to command, if anything.
+            The command, if there is a new value.
 
         """
         if self._active is None:
@@ -531,7 +533,7 @@ class Supervisor:
         return answer
 
     def _counts(self, name: str, reading: Reading, values: Sequence[float], now: int) -> bool:
-        """Return whether a reading counts; say once a second why if it does not."""
+        """Return whether a measurement is valid; log once a second why not."""
         refusal = self.safety.streams[name].check(reading.stamp, now, reading.frame, values)
         if refusal is not None and not refusal.harmless:
             self._warn(f'{name} {refusal.kind}', f'{refusal.line}; not taken in')
@@ -592,7 +594,7 @@ class Supervisor:
         return self._command(Answer(stamp))
 
     def _answer(self, controller: Controller, stamp: int, measured: Measurement) -> Answer | None:
-        """Command what the controller says."""
+        """Command the output of the controller."""
         safety = self.safety
         if safety.stop is not None:
             return self._command(Answer(stamp))
@@ -602,7 +604,7 @@ class Supervisor:
         if command.fault is not None:
             return self._let_go(command.fault, stamp)
         if not command.is_finite():
-            # Whatever the laws remember, it is not good any more.
+            # The memory of the laws is not valid any more.
             controller.forget()
             return self._stop_for('the command is not finite', stamp)
         if command.notice is not None:
@@ -642,19 +644,19 @@ class Supervisor:
 
     def watch(self, now: int, publishers: Mapping[str, int]) -> Answer | None:
         """
-        Look for what does not come, and for who else publishes what may have one source only.
+        Check for missing inputs, and for duplicate publishers of commands and measurements.
 
         Parameters
         ----------
         now : int
             Time [ns].
         publishers : Mapping[str, int]
-            How many nodes publish them, this one included, by topic.
+            Number of nodes that publish a topic, with this node, by topic.
 
         Returns
         -------
         Answer or None
-            What to command, if anything.
+            The command, if there is a new value.
 
         """
         answer, safety = self._check_clock(now), self.safety
@@ -676,7 +678,7 @@ class Supervisor:
         return answer
 
     def _watch_pace(self) -> None:
-        """Say when measurements begin to come at another rate than the laws are made for."""
+        """Log when the rate of the measurements begins to differ from the rate of the laws."""
         if self._pace is None:
             return
         joints = self.safety.streams['joint_states']
@@ -698,13 +700,13 @@ class Supervisor:
         return self._release(stamp)
 
     def _let_go(self, fault: str, stamp: int) -> Answer:
-        """Command zero force for a reason, said when it begins."""
+        """Command zero force for a fault, which is logged when it begins."""
         self._say_fault(fault, 'no force is commanded')
         return self._release(stamp)
 
     def _say_fault(self, fault: str, consequence: str) -> None:
-        """Take note of a fault, said when it begins."""
-        # Those of one kind begin alike, whatever their numbers.
+        """Record a fault, which is logged when it begins."""
+        # Faults of one kind begin with the same word.
         kind = fault.partition(' ')[0]
         if self.fault is None or not self.fault.startswith(kind):
             self.journal.say(Severity.ERROR, f'{fault}; {consequence}', kind)
@@ -721,11 +723,11 @@ class Supervisor:
         self._last = answer
         return answer
 
-    # What /diagnostics say.
+    # Status.
 
     def diagnose(self, now: int) -> tuple[Severity, str | None, dict[str, object]]:
         """
-        Return how bad it is, what holds it back if anything, and values by name.
+        Return severity, fault if there is any, and values by name.
 
         Parameters
         ----------
@@ -735,9 +737,9 @@ class Supervisor:
         Returns
         -------
         severity : Severity
-            How bad it is.
+            Severity of the state.
         held : str or None
-            What holds it back.
+            The fault.
         values : dict
             Values by name.
 

@@ -47,7 +47,7 @@ class Application:
 
     def outcome(self) -> tuple[bool, str]:
         """
-        Say what was set where, or why not.
+        Return the parameters that each node has set, or why not.
 
         Returns
         -------

@@ -72,7 +72,7 @@ class Calls:
         Returns
         -------
         Future
-            Its result is the response; None if there is none within `CALL_TIMEOUT`.
+            Its result is the response; None if the node does not answer within `CALL_TIMEOUT`.
 
         """
         made = _Call(client, request, Future(), monotonic())

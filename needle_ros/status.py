@@ -132,7 +132,7 @@ class RequestStatus:
         return cls(takes, tuple(answers), values.get(_PAUSED) == str(True))
 
     def answer_to(self, topic: str, stamp: int) -> Acknowledgement | None:
-        """Return the answer to a request; None if there is none."""
+        """Return the answer to a request; None without an answer."""
         for one in self.answers:
             if (one.topic, one.stamp) == (topic, stamp):
                 return one
@@ -218,7 +218,7 @@ class RequestLog:
             valid = ' or '.join(map(repr, self._frames))
             reason = f'{topic.name} must be in frame {valid}, got {frame!r}'
         elif stamp and any(stamp < self._follows(joint, now) for joint in joints):
-            verdict, reason = Verdict.SUPERSEDED, f'a newer {topic.name} is followed'
+            verdict, reason = Verdict.SUPERSEDED, 'a newer request has priority'
         return self.answer(topic, stamp, verdict, reason) if reason else None
 
     def _follows(self, joint: str, now: int) -> int:
@@ -319,7 +319,7 @@ class PendingRequest:
     topic : Topic
         Its topic.
     stamp : int
-        Its stamp [ns]: that of all repetitions, so that it is executed once.
+        Its stamp [ns], which all repetitions have, so that it is executed once.
     node : str
         Name of the node that should answer.
     steady : callable

@@ -175,16 +175,15 @@ class MotionMonitor:
         return ''
 
     def _refuses(self, answer: Acknowledgement) -> bool:
-        """Return whether an answer refuses what was sent last."""
+        """Return whether an answer refuses the motion that was sent last."""
         if answer.verdict is Verdict.REJECTED:
             return answer.stamp in self._stamps or answer.stamp in self._streamed
-        # An older one of ours is superseded by the newest of ours.
-        newest = [*self._stamps[-1:], *list(self._streamed)[-1:]]
-        return answer.verdict is Verdict.SUPERSEDED and answer.stamp in newest
+        # The motions before the newest are superseded by it.
+        return answer.verdict is Verdict.SUPERSEDED and answer.stamp in self._stamps[-1:]
 
     @property
     def paused(self) -> str:
-        """Name of a node whose motion a person has paused, '' if there is none."""
+        """Name of a node whose motion a person has paused, '' if none is paused."""
         return next((node for node, status in self._receivers.items() if status.paused), '')
 
     @property

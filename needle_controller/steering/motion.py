@@ -12,8 +12,8 @@ import numpy as np
 #: Highest speed of a smooth motion from rest to rest over its mean.
 _PEAK: Final = 1.875
 
-#: Highest acceleration of such a motion by its way over its squared duration; with what cubics
-#: between its points add.
+#: Highest acceleration of such a motion, times its squared duration over its distance; cubics
+#: between its points add 5 %.
 _STEEPEST: Final = 1.05 * 10.0 / sqrt(3.0)
 
 #: Fewest points of a motion.
@@ -54,7 +54,7 @@ def smooth(joints: tuple[str, ...], begin: FloatArray, end: FloatArray, duration
     Parameters
     ----------
     joints : tuple of str
-        What moves.
+        Names of the joints.
     begin, end : ndarray, shape (joints,)
         Positions [m, rad].
     duration : float
@@ -71,7 +71,7 @@ def smooth(joints: tuple[str, ...], begin: FloatArray, end: FloatArray, duration
     gone = part**3 * (10.0 - 15.0 * part + 6.0 * part**2)
     rate = 30.0 * (part * (1.0 - part)) ** 2 / duration
     way = end - begin
-    # Exactly where it shall end.
+    # Exactly at the end.
     positions = np.vstack([begin + np.outer(gone[:-1], way), end])
     return Move(joints, duration * part, positions, np.outer(rate, way))
 

@@ -40,7 +40,7 @@ from needle_ros.timing import NANOSECONDS
 from needle_ros.wire import Reading
 import numpy as np
 
-#: Time in which needle and guide come to rest after a stop [s].
+#: Time in which needle and guide brake to rest after a stop [s].
 _BRAKING: Final = 0.2
 
 #: Time over which the insertion speed is measured [s].
@@ -78,7 +78,7 @@ _NONE: Final = np.zeros(1)
 
 
 class Phase(Enum):
-    """State of the executive; the values are those of the field ``phase`` of its status."""
+    """State of the executive; the values are in the field ``phase`` of its status."""
 
     IDLE = 'idle'
     PLANNING = 'planning'
@@ -160,11 +160,12 @@ class OuterLoop:
         self.phase, self.fault = Phase.IDLE, ''
         self.control: SteeringController | None = None
         self.expected: TipEstimate | None = None
-        #: The plan that is computed, the target that it is for, and the phase before.
+        #: The plan that is computed; stamp [ns] and target [m] of the request, depths of the steps
+        #: and positions of the joints [m, rad] that it is for, and the phase before.
         self._start_job = start
         self._job: Job[SteeringController] | None = None
-        self._wanted: tuple[int, tuple[float, float, float], FloatArray] = (
-            0, (0.0, 0.0, 0.0), _NONE,
+        self._wanted: tuple[int, tuple[float, float, float], FloatArray, FloatArray] = (
+            0, (0.0, 0.0, 0.0), _NONE, _NONE,
         )  # fmt: skip
         self._before_plan = Phase.IDLE
         self._depths = np.zeros(1)
@@ -350,13 +351,13 @@ class OuterLoop:
             )
 
         self._cancel(Verdict.SUPERSEDED, 'a newer target was received')
-        self._wanted = stamp, point, depths
+        self._wanted = stamp, point, depths, at
         self._before_plan, self.phase = self.phase, Phase.PLANNING
         self._job = self._start_job(work)
         self.journal.say(Severity.INFO, f'planning to {_words(point)} in {steps} steps')
 
     def _cancel(self, verdict: Verdict, why: str) -> None:
-        """Cancel the computation of a plan, if there is one."""
+        """Cancel the computation of a plan, if it is under way."""
         if self._job is None:
             return
         self._job.cancel()
@@ -369,13 +370,13 @@ class OuterLoop:
         job = self._job
         if job is None or not job.done:
             return None
-        stamp, point, depths = self._wanted
+        stamp, point, depths, planned = self._wanted
         self._job, self.phase = None, self._before_plan
         try:
             control, at = job.result(), self._check_ready(now)
-            moved = float(at[0] - depths[0])
-            if at[0] > 0.0 and abs(moved) > self.settings.depth_tolerance:
-                raise JobError(f'the needle has moved by {1e3 * moved:.2f} mm during planning')
+            moved = np.flatnonzero(np.abs(at - planned) > self.settings.tolerances)
+            if len(moved):
+                raise JobError(f'{self.settings.joints[moved[0]]} has moved during planning')
         except NeedleError as error:
             self._reject(stamp, error)
             return None
@@ -393,7 +394,7 @@ class OuterLoop:
 
     def stop(self, why: str, now: int, silence: float = 0.0) -> Move | None:
         """
-        Stop the insertion: needle and guide come to rest at their positions; cancel a plan.
+        Stop the insertion: needle and guide brake to rest at their positions; cancel a plan.
 
         Parameters
         ----------
@@ -692,13 +693,13 @@ class OuterLoop:
     # Steps.
 
     def _step(self, now: int) -> Move | None:
-        """End a look, and go on by a step."""
+        """End a measurement of the tip, and begin the next step."""
         control, look, self._look = self.control, self._look, None
         if control is None or look is None or self._at is None:
             return None
         k = control.step
         try:
-            # What came late on the way.
+            # Readings of the step before that were late.
             self._take(control, self._passing.pop(k - 1, None), k - 1)
             self._take(control, look, k, depth=float(self._at[0]))
         except SteeringFaultError as error:
@@ -719,7 +720,7 @@ class OuterLoop:
     def _take(
         self, control: SteeringController, look: Look | None, at: int, depth: float | None = None
     ) -> None:
-        """Pass a look on, if there is one; without readings it is one that saw nothing."""
+        """Update the controller by a measurement of the tip, which may have no readings."""
         if look is None:
             return
         self._seen = seen = look.seen(self._belief.noise)
@@ -733,7 +734,7 @@ class OuterLoop:
         control.see(seen.tip[[0, 2]], at, max(seen.error, self._scatter / sqrt(seen.readings)))
 
     def _planned_at(self, control: SteeringController, k: int) -> Guidance:
-        """Plan the next step, and say what is to be said of it."""
+        """Plan the next step, and log a new warning."""
         to = control.plan()
         self.expected = control.expected()
         if k < len(self._depths) - 1 and control.warning and not self._warned:
@@ -857,7 +858,7 @@ class OuterLoop:
             return f'the sensor of the tip is frozen: {seen.readings} readings are the same'
         return (
             f'the tip is {1e3 * abs(slipped):.2f} mm {"less" if slipped < 0.0 else "more"} deep '
-            'than the needle was inserted: it slips, or the sensor is not that of this needle'
+            'than the needle was inserted: it slips, or the sensor is of another needle'
         )
 
     def _send(self, phase: Phase, goal: FloatArray, now: int) -> Move | None:

@@ -24,14 +24,14 @@ class OuterLoopSettings:
     """Steps, looks and limits of a needle that is steered."""
 
     step_length: float = constant(
-        5e-3, 'm', 'way of the needle from one look at the tip to the next', open_low=True
+        5e-3, 'm', 'insertion from one tip measurement to the next', open_low=True
     )
     speed: float = constant(0.01, 'm/s', 'highest insertion speed', open_low=True)
     guide_limit: float = constant(
-        6e-3, 'm', 'farthest position of the guide along x and along z; 0: it stays at 0'
+        6e-3, 'm', 'largest position of the guide along x and along z; 0: it stays at 0'
     )
     guide_step: float = constant(
-        2e-3, 'm', 'farthest that the guide goes from one step to the next along x and along z',
+        2e-3, 'm', 'largest change of the guide from one step to the next along x and along z',
         open_low=True,
     )  # fmt: skip
     guide_speed: float = constant(0.02, 'm/s', 'highest speed of the guide', open_low=True)
@@ -44,8 +44,8 @@ class OuterLoopSettings:
     turns: int = constant(0, '1', 'how often the needle may be turned')
     roll_speed: float = constant(2.0, 'rad/s', 'fastest roll', open_low=True)
     load_limit: float = constant(
-        8.0, 'N', 'largest lateral force of the guide that is planned, along x and along z; reach '
-        'does not know it',
+        8.0, 'N', 'largest lateral force of the guide that is planned, along x and along z; the '
+        'reachable set is computed without it',
         open_low=True,
     )  # fmt: skip
     continuous: bool = field(
@@ -58,18 +58,18 @@ class OuterLoopSettings:
     rate: float = constant(
         20.0, 'Hz', 'continuous: how often the guide is sent on', low=1.0, high=50.0
     )
-    settle_time: float = constant(0.1, 's', 'time at rest before a look')
+    settle_time: float = constant(0.1, 's', 'time at rest before a tip measurement')
     look_time: float = constant(
-        0.5, 's', 'duration of a look, whose readings are averaged', open_low=True
+        0.5, 's', 'duration of a tip measurement, whose readings are averaged', open_low=True
     )
     depth_tolerance: float = constant(
-        3e-4, 'm', 'how far from the end of a step the needle may rest', open_low=True
+        3e-4, 'm', 'largest distance of the needle at rest from the end of a step', open_low=True
     )
     guide_tolerance: float = constant(
-        1e-4, 'm', 'how far the guide may be from where it was sent', open_low=True
+        1e-4, 'm', 'largest distance of the guide at rest from its goal', open_low=True
     )
     roll_tolerance: float = constant(
-        0.02, 'rad', 'how far the roll may be from where it was sent', open_low=True
+        0.02, 'rad', 'largest difference of the roll at rest from its goal', open_low=True
     )
     slip_tolerance: float = constant(
         3e-3, 'm', 'how much the depth of the tip may differ from the inserted length, beyond '
@@ -117,7 +117,7 @@ class OuterLoopSettings:
 
     def farthest(self, step: float) -> float:
         """
-        Return how far the guide may go from one step to the next along each axis.
+        Return the largest change of the guide from one step to the next along each axis.
 
         Parameters
         ----------
@@ -127,7 +127,7 @@ class OuterLoopSettings:
         Returns
         -------
         float
-            The way of the guide [m].
+            The change [m].
 
         """
         if not self.continuous:

@@ -182,13 +182,13 @@ class Operator:
         self._target.publish(message)
         return pending
 
-    def ask(self, what: str) -> Future:
+    def ask(self, word: str) -> Future:
         """
         Call the services of a request without a value.
 
         Parameters
         ----------
-        what : str
+        word : str
             A key of `REQUESTS`.
 
         Returns
@@ -199,11 +199,11 @@ class Operator:
         """
         ready = [
             (request, client)
-            for request in REQUESTS[what]
+            for request in REQUESTS[word]
             if (client := self._clients[request.node, request.service]).service_is_ready()
         ]
         if not ready:
-            return _done(Outcome(False, f'no node offers {_names(REQUESTS[what])}'))
+            return _done(Outcome(False, f'no node offers {_names(REQUESTS[word])}'))
         return _gathered(
             {
                 f'{request.node}/{request.service}': self._calls.call(

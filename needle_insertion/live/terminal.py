@@ -65,7 +65,7 @@ WORDS: Final = {
     ),
     'wait': _Word('[SECONDS]', 'until the needle has arrived'),
     'pause': _Word('', 'brake to rest and hold'),
-    'resume': _Word('', 'go on after a pause'),
+    'resume': _Word('', 'continue after a pause'),
     'retract': _Word('', 'withdraw to retract_depth'),
     'stop': _Word('', 'no force at all, until `clear`'),
     'clear': _Word('', 'clear a stop'),
@@ -198,7 +198,7 @@ class Terminal:
             return False
         elif word == 'help':
             rows = [(f'{name} {one.takes}', one.meaning) for name, one in WORDS.items()]
-            self._say(table(rows, ('word', 'what it does')))
+            self._say(table(rows, ('word', 'effect')))
         elif word == 'status':
             self._status()
         else:
@@ -308,7 +308,7 @@ class Terminal:
         self._say(f'{self._readings.line()}\n{table(rows, ("node", "level", "state"))}')
 
     def _state(self, node: str) -> State:
-        """Return the latest status of a node, once there is one."""
+        """Return the latest status of a node, once it has published its first."""
         states = self._operator.states
         self._spin_until(lambda: node in states, f'the node {node}', _ANSWER)
         return states[node]

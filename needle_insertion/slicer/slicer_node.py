@@ -30,17 +30,17 @@ if TYPE_CHECKING:
     from needle_insertion.slicer.frames import Frame
     from needle_insertion.slicer.messages import Interpreter
 
-#: Time between two looks at the connection, and between two shapes [s].
+#: Time between two checks of the connection, and between two shapes [s].
 _LOOK: Final = 0.02
 _PERIOD: Final = 0.05
 
 #: Time between two states, unless something changes [s].
 _STATE_PERIOD: Final = 1.0
 
-#: Messages that are read of those that have come at once.
+#: Most messages that are read at a time.
 _AT_ONCE: Final = 16
 
-#: Nodes whose state is told, and the time after which one is silent, or forgotten [s].
+#: Most nodes whose state is sent, and time after which a node is silent, or left out [s].
 _MOST_NODES: Final = 20
 _SILENT: Final = 5.0
 _FORGOTTEN: Final = 60.0
@@ -55,15 +55,16 @@ _TAKER: Final = 'controller or steering'
 
 class SlicerNode(BaseNode):
     """
-    Passes targets of 3D Slicer on to ``target``, and tells it the needle, by OpenIGTLink.
+    Connect 3D Slicer by OpenIGTLink: targets to ``target``, the needle to 3D Slicer.
 
-    In come POINT, TRANSFORM and STRING messages with a target, in mm in the frame of the images.
-    Out go, 20 times a second, the shape of the needle and the pose of its tip; also where the tip
-    is expected, and what all nodes say on ``/diagnostics``. ``registration.*`` says where the
-    frame ``needle_entry`` is in the images. The tip goes to ``tip_pose``, too.
+    It receives POINT, TRANSFORM and STRING messages with a target, in mm in the frame of the
+    images, and sends each target until a node acknowledges it. It transmits, 20 times a second,
+    the shape of the needle and the pose of its tip; also the expected tip, and the state of all
+    nodes from ``/diagnostics``. ``registration.*`` is the pose of ``needle_entry`` in the images.
+    The pose of the tip is published on ``tip_pose``, too.
 
-    The shape is that of ``needle_poses``. If these do not come it is the line from the guide
-    (``joint_states``) to the tip (``tip_deflection``), and is said to be no measurement.
+    The shape is from ``needle_poses``. Without them it is the line from the guide
+    (``joint_states``) to the tip (``tip_deflection``), and is marked as not measured.
 
     The connection is looked after by a timer of the node: there is no thread, and nothing waits.
     """
@@ -82,7 +83,7 @@ class SlicerNode(BaseNode):
         self._rate = RateCounter()
         #: The target that has no answer yet, with its message.
         self._sending: tuple[PendingRequest, PointStamped] | None = None
-        #: What each node said last: when, level and words.
+        #: Latest status of each node: time, level and message.
         self._said: dict[str, tuple[float, int, str]] = {}
         self._state_told = self._state_changed = -_STATE_PERIOD
 
@@ -100,7 +101,7 @@ class SlicerNode(BaseNode):
     # Transitions.
 
     def configure(self) -> None:
-        """Read where the peer is, and load what speaks with it."""
+        """Read the address of the peer, and load the protocol."""
         if find_spec(_PACKAGE) is None:
             raise JobError(
                 f'the Python package {_PACKAGE} is not installed: '
@@ -138,7 +139,7 @@ class SlicerNode(BaseNode):
             f'{contract.TIP_DEFLECTION.name}'
         )
 
-    # What comes from the nodes.
+    # Messages of the nodes.
 
     def _on_poses(self, message: PoseArray) -> None:
         points = [(p.position.x, p.position.y, p.position.z) for p in message.poses]
@@ -194,10 +195,10 @@ class SlicerNode(BaseNode):
                 values = {one.key: one.value for one in status.values}
                 self._sending[0].hear(name, RequestStatus.from_values(values))
 
-    # What comes from the peer, and goes to it.
+    # Messages of the peer.
 
     def _tick(self) -> None:
-        """Take what has come, and tell what is known."""
+        """Receive messages of the peer, and send shape and state."""
         link, interpreter = self._link, self._interpreter
         if link is None or interpreter is None:
             return
@@ -206,7 +207,7 @@ class SlicerNode(BaseNode):
         shape = self._view.shape(now)
         self._source = '' if shape is None else shape.source
         if now >= self._due:
-            # What is late by less than a period does not make the next one late.
+            # A delay of less than a period does not delay the next shape.
             self._due = max(self._due + _PERIOD, now - _PERIOD)
             if shape is not None:
                 self._publish_tip(shape)
@@ -303,13 +304,13 @@ class SlicerNode(BaseNode):
         if self._view.expected is not None:
             link.send(interpreter.tip_expected(self._view.expected))
 
-    # What it says of itself.
+    # Status.
 
     def _steady_ns(self) -> int:
         return int(monotonic() * NANOSECONDS)
 
     def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
-        """Say whether there is a peer, what it is told and what it said."""
+        """Report the connection, the shapes sent and the targets received."""
         link = self._link
         if link is None or not self.is_active:
             return super().diagnose()

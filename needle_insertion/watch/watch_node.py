@@ -1,4 +1,4 @@
-"""Node `watch`: listens to what the page shows, and costs the others as little as it can."""
+"""Node `watch`: subscribes to the topics of the page, at the least cost for the other nodes."""
 
 from __future__ import annotations
 
@@ -122,7 +122,7 @@ class WatchNode(Node):
 
 class Buttons:
     """
-    What the buttons of the page do, through an `Operator`.
+    Requests of the buttons of the page, through an `Operator`.
 
     Parameters
     ----------
@@ -140,7 +140,7 @@ class Buttons:
         self._executor.add_node(self._node)
 
     def spin(self) -> None:
-        """Take what nodes have answered."""
+        """Receive the answers of nodes."""
         for _ in range(_EVENTS):
             self._executor.spin_once(timeout_sec=0.0)
 

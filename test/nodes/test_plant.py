@@ -575,11 +575,12 @@ def test_trajectories_are_refused_with_their_reason(
     message: JointTrajectory,
     reason: str,
 ) -> None:
-    """What a mode cannot follow is refused in one line, counted, and changes nothing."""
+    """With one line, in the log and in the answer to the sender; nothing moves."""
     bench = Bench(ros_graph, mode=mode, depth=0.1)
     bench.course.publish(message)
     bench.refused(1)
-    assert f'joint_trajectory: {reason}\n' in capfd.readouterr().err
+    assert f'joint_trajectory rejected: {reason}\n' in capfd.readouterr().err
+    assert bench.plant.diagnose()[2]['request joint_trajectory 0'] == f'rejected: {reason}'
     if bench.states:
         assert bench.states[-1].position[0] == 0.1
 
