@@ -77,6 +77,8 @@ class Supervisor:
         self._deflection_ignored = False
         self._last = Answer(0)
         self._following = Following()
+        #: What the user wants, and from which stamp on [ns].
+        self._due: tuple[int, str, Callable[[Controller], None]] | None = None
         self.controller: Controller | None = None
         self.cleanup()
 
@@ -220,6 +222,7 @@ class Supervisor:
 
     def _begin(self, now: int) -> None:
         """Know nothing of what was measured."""
+        self._due = None
         self.safety.begin(now)
         self.bending.forget()
         if self._robot is not None:
@@ -323,13 +326,23 @@ class Supervisor:
         answer = self._check_clock(now)
         refusal = self.safety.streams[name].check(stamp, now, frame)
         if refusal is None:
-            try:
-                act(self._active)
-            except ParameterError as error:
-                self.journal.refuse(f'{name} refused: {error}')
+            # It counts from the first sample after its stamp on, also if it overtook a sample.
+            self._due = stamp, name, act
+            self._do_due(max(self.safety.streams['joint_states'].last, 0) + 1)
         elif not refusal.harmless:
             self.journal.refuse(f'{name} refused: {refusal.line}')
         return answer
+
+    def _do_due(self, stamp: int) -> None:
+        """Do what the user wants if it was wanted before a stamp [ns]; say why if it cannot be."""
+        if self._due is None or self._due[0] >= stamp:
+            return
+        (_, name, act), self._due = self._due, None
+        try:
+            if self._active is not None:
+                act(self._active)
+        except ParameterError as error:
+            self.journal.refuse(f'{name} refused: {error}')
 
     def emergency_stop(self, now: int) -> Reply:
         """
@@ -404,6 +417,7 @@ class Supervisor:
         if self._active is None or self.safety.stop is not None:
             why = 'stopped; ~/clear_stop releases' if self.safety.stop else 'not active'
             return Reply(False, f'retract refused: the controller is {why}')
+        self._due = None
         self._active.guide.resume()
         self._active.set_target(self.retract_depth)
         return Reply(True, f'goes to {self.retract_depth:g} m')
@@ -527,6 +541,7 @@ class Supervisor:
                 return self._again(stamp)
             return answer if refusal.harmless else self._let_go(refusal.line, now)
         self._lateness.add(now, (now - stamp) / NANOSECONDS)
+        self._do_due(stamp)
         try:
             measured = self._read(reading)
         except ParameterError as error:
