@@ -82,6 +82,8 @@ class Supervisor:
         self._deflection_ignored = False
         self._last = Answer(0)
         self._following = Following()
+        #: Stamp of a request that waits for the next sample [ns], its topic and its execution.
+        self._due: tuple[int, Topic, Callable[[Controller], None]] | None = None
         self.controller: Controller | None = None
         self.cleanup()
 
@@ -221,10 +223,12 @@ class Supervisor:
         if self.controller is not None:
             self.controller.forget()
         self._active = None
+        self._drop_due('the controller is not active')
         return self._command(Answer(now))
 
     def _begin(self, now: int) -> None:
         """Forget all measurements and requests."""
+        self._due = None
         self.safety.begin(now)
         self.requests.forget()
         self.bending.forget()
@@ -343,6 +347,20 @@ class Supervisor:
             if known.verdict is Verdict.REJECTED:
                 self.journal.refuse(f'{topic.name} rejected: {known.reason}')
             return answer
+        self._drop_due(f'a newer {topic.name} is followed', Verdict.SUPERSEDED)
+        # It counts from the first sample after its stamp on, also if it overtook a sample.
+        self._due = stamp, topic, act
+        self.requests.answer(topic, stamp, Verdict.RECEIVED)
+        held = self._active is None or self.safety.stop is not None
+        newest = self.safety.streams['joint_states'].last
+        self._do_due(stamp + 1 if held else max(newest, 0) + 1)
+        return answer
+
+    def _do_due(self, stamp: int) -> None:
+        """Execute the request that was sent before a stamp [ns], if any, and acknowledge it."""
+        if self._due is None or self._due[0] >= stamp:
+            return
+        (sent, topic, act), self._due = self._due, None
         verdict, reason = Verdict.ACCEPTED, ''
         try:
             if self._active is None:
@@ -353,8 +371,13 @@ class Supervisor:
         except (JobError, ParameterError) as error:
             verdict, reason = Verdict.REJECTED, str(error)
             self.journal.refuse(f'{topic.name} rejected: {reason}')
-        self.requests.answer(topic, stamp, verdict, reason, (INSERTION,))
-        return answer
+        self.requests.answer(topic, sent, verdict, reason, (INSERTION,))
+
+    def _drop_due(self, reason: str, verdict: Verdict = Verdict.REJECTED) -> None:
+        """Refuse a request that still waits for a sample, if any."""
+        if self._due is not None:
+            (sent, topic, _), self._due = self._due, None
+            self.requests.answer(topic, sent, verdict, reason)
 
     def emergency_stop(self, now: int) -> Reply:
         """
@@ -444,6 +467,7 @@ class Supervisor:
             why = 'stopped; ~/clear_stop releases' if self.safety.stop else 'not active'
             return Reply(False, f'retract refused: the controller is {why}')
         self.requests.supersede(now)
+        self._drop_due('the needle is retracted', Verdict.SUPERSEDED)
         self._active.guide.resume()
         self._active.set_target(self.retract_depth)
         return Reply(True, f'goes to {self.retract_depth:g} m')
@@ -567,6 +591,7 @@ class Supervisor:
                 return self._again(stamp)
             return answer if refusal.harmless else self._let_go(refusal.line, now)
         self._lateness.add(now, (now - stamp) / NANOSECONDS)
+        self._do_due(stamp)
         try:
             measured = self._read(reading)
         except ParameterError as error:
@@ -713,6 +738,7 @@ class Supervisor:
         self.fault = fault
 
     def _release(self, stamp: int) -> Answer:
+        self._drop_due(self.fault or 'no force is commanded')
         self._following.forget()
         if self.controller is not None:
             self.controller.guide.wait(False)

@@ -31,8 +31,8 @@ class CompiledNode(BaseNode):
         self._compiled = 0
         self.late: list[str] = []
         super().__init__(name, **node_options)
-        self._reports = reports(self._on_function)
-        self._reports.__enter__()
+        self._listening = reports(self._on_function)
+        self._listening.__enter__()
 
     def preparation(self) -> Iterable[Progress]:
         """Import modules, then load or compile kernels."""
@@ -56,5 +56,5 @@ class CompiledNode(BaseNode):
 
     def destroy_node(self) -> None:
         """Destroy the node, and end the report of compilations."""
-        self._reports.__exit__(None, None, None)
+        self._listening.__exit__(None, None, None)
         super().destroy_node()

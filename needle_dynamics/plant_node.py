@@ -211,8 +211,8 @@ class PlantNode(ModelNode):
         #: Publishers of commands that DDS has matched, dead ones too.
         self._matched, self._matched_at = 0, 0
         self._trajectories: Subscription | None = None
-        #: Reports of nodes that have processed a sample, in lock-step.
-        self._processed: Subscription | None = None
+        #: Reports of nodes that have processed or recorded a sample, in lock-step.
+        self._reports: list[Subscription] = []
         self.create_service(Trigger, '~/tare', self._on_tare)
         self.create_service(SetBool, '~/pause', self._on_pause)
         self.create_service(Trigger, '~/step', self._on_step)
@@ -281,13 +281,10 @@ class PlantNode(ModelNode):
         if publishes:
             self._clock_topic = self.publisher(contract.CLOCK, always=True)
         if lockstep:
-            self._processed = self.create_subscription(
-                Header,
-                contract.PROCESSED.name,
-                self._on_processed,
-                profile(contract.PROCESSED.qos),
-                event_callbacks=SubscriptionEventCallbacks(matched=self._on_participant),
-            )
+            self._reports = [
+                self._hear(contract.PROCESSED, self._on_processed, self._on_participant),
+                self._hear(contract.RECORDED, self._on_recorded, self._on_recorder),
+            ]
         if mode != 'simulation' or constants.steered:
             # There `insertion` is the reference of a controller.
             self._trajectories = self.subscribe(contract.JOINT_TRAJECTORY, self._on_trajectory)
@@ -326,9 +323,9 @@ class PlantNode(ModelNode):
         if self._trajectories is not None:
             self.destroy_subscription(self._trajectories)
             self._trajectories, self._moved, self._requests = None, (), RequestLog({})
-        if self._processed is not None:
-            self.destroy_subscription(self._processed)
-            self._processed = None
+        for report in self._reports:
+            self.destroy_subscription(report)
+        self._reports = []
 
     def change(self, changes: Mapping[str, Any]) -> None:
         """Go on with other friction, or another fault; the state stays."""
@@ -411,6 +408,18 @@ class PlantNode(ModelNode):
             self._time.answered(plant_run.commands.newest.stamp)
             self._on_timer()
 
+    def _hear(
+        self, topic: contract.Topic, take: Callable[[Header], None], matched: Callable[[Any], None]
+    ) -> Subscription:
+        """Subscribe to reports."""
+        return self.create_subscription(
+            Header,
+            topic.name,
+            take,
+            profile(topic.qos),
+            event_callbacks=SubscriptionEventCallbacks(matched=matched),
+        )
+
     def _on_processed(self, message: Header) -> None:
         """Take note that a node has processed a sample."""
         if self.is_active:
@@ -421,6 +430,24 @@ class PlantNode(ModelNode):
         """Count the nodes that each sample waits for."""
         self._time.participants = event.current_count
         self.publish_diagnostics()
+
+    def _on_recorded(self, message: Header) -> None:
+        """Take note of what a recorder has."""
+        recorded, stamp = self._time.recorded, nanoseconds(message.stamp)
+        before = len(recorded)
+        recorded[message.frame_id] = stamp
+        if not stamp:
+            # It has ended.
+            del recorded[message.frame_id]
+        if len(recorded) != before:
+            self.publish_diagnostics()
+        if self.is_active:
+            self._on_timer()
+
+    def _on_recorder(self, event: Any) -> None:
+        """Forget the recorders if one has gone; the others report again."""
+        if event.current_count_change < 0:
+            self._time.recorded.clear()
 
     def _count_matched(self) -> tuple[int, int]:
         """Return how many publishers of each topic of commands DDS has matched, dead ones too."""
@@ -678,7 +705,7 @@ class PlantNode(ModelNode):
             'commands overtaken': given.overtaken,
             'saturated readings': self._saturated,
             **self._requests.status().to_values(),
-            'nodes in lock-step': clock.participants,
+            'nodes in lock-step': clock.participants + len(clock.recorded),
         }
         if not self.is_active:
             return *super().diagnose()[:2], values

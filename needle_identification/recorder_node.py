@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 import sys
 import time
@@ -12,15 +13,18 @@ from needle_identification.bags.topics import OfferedQos
 from needle_identification.bags.writer import BagWriter, COMPRESSIONS, described
 from needle_identification.errors import RecordingError
 from needle_ros.base_node import BaseNode, message_class
-from needle_ros.contract import TOPICS
+from needle_ros.contract import JOINT_STATES, RECORDED, TOPICS
 from needle_ros.errors import MessageError
 from needle_ros.run_node import run
+from needle_ros.timing import NANOSECONDS
+from needle_ros.wire import Reader
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
+from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
 #: Time between checks for new topics, between writes that survive a crash, and between looks at
@@ -71,6 +75,11 @@ class RecorderNode(BaseNode):
         self._result = 'not recording'
         self._recorded: dict[str, _Recorded] = {}
         self._left_out: set[str] = set()
+        #: Tells a plant in lock-step which sample was recorded: its stamp [ns].
+        self._recorded_stamp = 0
+        self._reports = self.publisher(RECORDED, always=True)
+        self._sampled = self.resolve_topic_name(JOINT_STATES.name)
+        self._read = Reader(JOINT_STATES.type_name).read
         #: Number of the newest message of each topic, by its publisher.
         self._newest: dict[str, int] = {}
         self.create_service(Trigger, '~/start', self._on_start)
@@ -176,6 +185,8 @@ class RecorderNode(BaseNode):
         for recorded in self._recorded.values():
             recorded.subscription.destroy()
         self._recorded.clear()
+        self._recorded_stamp = 0
+        self._report_recorded(0)
         self._bag = None
 
     def _give_up(self, bag: BagWriter, error: OSError) -> str:
@@ -207,14 +218,23 @@ class RecorderNode(BaseNode):
                 return
         if self._bag is not None and self._bag.lost:
             self.report_change()
+        if self._sampled in self._recorded:
+            self._report_recorded(self._recorded_stamp or 1)
+
+    def _report_recorded(self, stamp: int) -> None:
+        """Report the newest sample to a plant in lock-step; zero: it need not wait any more."""
+        if self._reports.get_subscription_count():
+            message = Header(frame_id=self.get_fully_qualified_name())
+            message.stamp.sec, message.stamp.nanosec = divmod(stamp, NANOSECONDS)
+            self._reports.publish(message)
 
     def _take_from(self, bag: BagWriter, topic: str, recorded: _Recorded, most: int) -> None:
-        handle, kind = recorded.subscription.handle, recorded.kind
+        handle, kind, data = recorded.subscription.handle, recorded.kind, b''
         with handle:
             for _ in range(most):
                 taken = handle.take_message(kind, True)
                 if taken is None:
-                    return
+                    break
                 data, about = taken
                 # Not every middleware says when, nor which.
                 bag.write(topic, data, about['received_timestamp'] or time.time_ns())
@@ -226,6 +246,9 @@ class RecorderNode(BaseNode):
                 # Two publishers count on their own.
                 if missing > 0 and len(recorded.offered) == 1:
                     bag.lose(topic, missing)
+        if data and topic == self._sampled:
+            with suppress(MessageError):
+                self._recorded_stamp = self._read(data).stamp
 
     def _discover(self) -> None:
         for topic, types in self.get_topic_names_and_types():

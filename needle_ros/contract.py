@@ -419,6 +419,14 @@ PROCESSED: Final = Topic(
     qos=COMMAND._replace(depth=10),
 )
 
+RECORDED: Final = replace(
+    PROCESSED,
+    name='joint_states/_recorded',
+    publisher='recorder',
+    meaning='lock-step: stamp of the newest sample that a recorder has; a plant with `lockstep` '
+    'is at most 25 samples ahead of it; zero at the end of a recording; not recorded',
+)
+
 REFERENCE: Final = Topic(
     'reference',
     JOINT_STATE,

@@ -15,6 +15,9 @@ _TICK: Final = 1e-3
 _AT_ONCE: Final = 20
 
 
+#: Most samples that lockstep is ahead of a recorder: what waits for it fits into its queues.
+_AHEAD: Final = 25
+
 #: Stands for whoever commands, among the names of the nodes that have answered a sample.
 COMMAND: Final = ''
 
@@ -56,6 +59,9 @@ class SampleClock:
     participants : int
         Number of nodes that report in lockstep when they have processed a sample: the next one
         waits for all of them, and for a command.
+    recorded : dict of str to int
+        Stamp of the newest sample of each recorder, by its name [ns]: no sample is more than 25
+        periods ahead of that in lockstep.
 
     """
 
@@ -66,6 +72,7 @@ class SampleClock:
         self._own, self._lockstep = own or lockstep or factor != 1.0, lockstep
         self._backlog = max(1, int(backlog * rate * factor))
         self.participants = 0
+        self.recorded: dict[str, int] = {}
         # Several samples at a tick are fine: no more ticks than in real time are needed.
         self.tick = max(1.0 / (rate * factor), min(1.0 / rate, _TICK)) if factor else _TICK
         #: Most samples at one tick when time may wait: more would overrun the readers.
@@ -105,15 +112,24 @@ class SampleClock:
     @property
     def awaited(self) -> int | None:
         """Stamp of the sample whose answers the next one waits for [ns]; None if for none."""
-        if self._answers is None or (self.commanded and len(self._answers) > self.participants):
+        if self._answers is None:
             return None
-        return self.stamp
+        answered = self.commanded and len(self._answers) > self.participants
+        return None if answered and self._is_recorded else self.stamp
+
+    @property
+    def _is_recorded(self) -> bool:
+        """Whether all recorders have samples that are new enough."""
+        first = max(self._start, self.stamp - round(_AHEAD * NANOSECONDS / self._rate))
+        return all(max(stamp, self._start) >= first for stamp in self.recorded.values())
 
     @property
     def missing(self) -> str:
         """Which answers to the newest sample are missing, for people."""
         if not self.commanded:
             return 'no command has answered'
+        if not self._is_recorded:
+            return 'a recorder is 25 samples behind'
         done = len(self._answers or ()) - 1
         return f'{done} of {self.participants} nodes have processed'
 

@@ -213,7 +213,7 @@ class SimulatedRun:
         self._show('starting plant')
         graph.change(node, 'plant', CONFIGURE)
         # The bag has every sample, and every sample is waited for.
-        participants = str(self._lockstep * (1 + ('steering' in nodes)))
+        participants = str(self._lockstep * (2 + ('steering' in nodes)))
         graph.spin_until(
             lambda: (
                 witness.is_matched

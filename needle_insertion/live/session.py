@@ -203,7 +203,7 @@ def _bring_up(
     _check_alone(graph, node)
     if own:
         show('plant')
-        number = session.lockstep * (holds + ('steering' in session.names))
+        number = session.lockstep * (holds + session.records + ('steering' in session.names))
         _begin_plant(graph, node, operator, number)
     return processes
 

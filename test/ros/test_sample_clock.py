@@ -125,6 +125,28 @@ def test_in_lockstep_a_sample_waits_for_all_who_process_it() -> None:
     assert take(clock, later + 1_000_000) == [stamp + 1_000_000]
 
 
+def test_in_lockstep_a_recorder_is_at_most_25_samples_behind() -> None:
+    """Time stands still until the recorder has more, or has ended."""
+    clock, now = make(factor=0.0, lockstep=True), BEGIN
+    clock.recorded['recorder'] = 1
+    stamps = []
+
+    def run() -> None:
+        for stamp in (stamp for _ in range(100) for stamp in take(clock, now)):
+            stamps.append(stamp)
+            clock.answered(stamp)
+
+    run()
+    assert len(stamps) == 26
+    assert clock.missing == 'a recorder is 25 samples behind'
+    clock.recorded['recorder'] = stamps[9]
+    run()
+    assert len(stamps) == 36
+    clock.recorded.clear()
+    run()
+    assert len(stamps) == 136
+
+
 def test_in_lockstep_a_stall_is_made_up() -> None:
     """Late samples follow each answer at once, as far back as the backlog."""
     clock = make(lockstep=True, backlog=0.01)
