@@ -30,6 +30,9 @@ _ORPHANED: Final = 5.0
 #: Age up to which a worker that replaces a killed one is killed [s]: Python starts in that time.
 _SPAWNED: Final = 0.2
 
+#: Kills without a result in between: one more would end the study (`needle_ros.process_pool`).
+_MOST: Final = 9
+
 #: Probability that the worker that replaces a killed one is killed so, and how many in a row.
 _YOUNG, _ROW = 0.6, 3
 
@@ -47,7 +50,8 @@ class Losses(NamedTuple):
     errors : int
         How often the command ended with an error, and was started again.
     hangs : int
-        How often it wrote nothing for 120 s, and was ended.
+        How often it wrote nothing for 120 s and ten times the longest time between kills, and was
+        ended.
 
     """
 
@@ -63,7 +67,8 @@ def kill_workers(
     """
     Compute a study, and kill its workers at random times.
 
-    Most workers that replace killed ones are killed while they are spawned.
+    Most workers that replace killed ones are killed while they are spawned. After nine kills the
+    next result is awaited.
 
     Parameters
     ----------
@@ -87,16 +92,19 @@ def kill_workers(
     killed = young = errors = hangs = 0
     while not (folder / TABLE).exists() and hangs + errors <= times:
         process = subprocess.Popen(words, stdout=subprocess.DEVNULL)
-        progress = _Progress(folder / 'parts')
-        row, moment = 0, time.monotonic() + rng.uniform(0.0, between)
+        progress = _Progress(folder / 'parts', _PATIENCE + (_MOST + 1) * between)
+        row, before = 0, killed
+        moment = time.monotonic() + rng.uniform(0.0, between)
         while process.poll() is None:
             # The moment is random: no condition is waited for.
             time.sleep(0.01)
+            if progress.made():
+                before = killed
             if progress.stalled():
                 hangs += 1
                 process.kill()
                 break
-            if killed == times or time.monotonic() < moment:
+            if min(times, before + _MOST) <= killed or time.monotonic() < moment:
                 continue
             age = kill_worker(process.pid, rng, youngest=row > 0)
             if age is not None:
@@ -109,18 +117,22 @@ def kill_workers(
 
 
 class _Progress:
-    """Whether a study still writes results."""
+    """The results that a study writes."""
 
-    def __init__(self, parts: Path) -> None:
-        self._parts = parts
+    def __init__(self, parts: Path, patience: float) -> None:
+        self._parts, self._patience = parts, patience
         self._seen, self._last = 0, time.monotonic()
+
+    def made(self) -> bool:
+        """Whether something was written since the last call."""
+        before, self._seen = self._seen, len(written(self._parts))
+        if self._seen != before:
+            self._last = time.monotonic()
+        return self._seen != before
 
     def stalled(self) -> bool:
         """Whether nothing was written for too long."""
-        now = time.monotonic()
-        if (seen := len(written(self._parts))) != self._seen:
-            self._seen, self._last = seen, now
-        return now - self._last > _PATIENCE
+        return time.monotonic() - self._last > self._patience
 
 
 def kill_worker(parent: int, rng: np.random.Generator, *, youngest: bool) -> float | None:

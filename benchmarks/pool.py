@@ -84,7 +84,8 @@ def compare(tick: Tick, kills: int = 500, samples: int = _SAMPLES) -> Answer:
         ('studies', 'workers killed', 'younger than 0.2 s', 'errors', 'hangs', 'time [s]'),
         [tuple(map(str, (len(found), killed, young, errors, hangs, round(taken))))],
         f'Each study has {samples} insertions, two workers, and up to {_KILLS} kills; {_BUSY} '
-        'other processes compute all the time. A hang is 120 s without a result. After an error '
+        f'other processes compute all the time. A hang is {120 + 10 * between:.0f} s '
+        'without a result. After an error '
         '(a chunk that has lost its worker ten times in a row) the study is continued. '
         f'Kills are up to {between:.1f} s apart, the time from the start of a worker to its first '
         'result; most workers that replace a killed one are killed within 0.2 s.',
