@@ -1,16 +1,16 @@
 r"""
-What the tip does for all that may happen, in each of the tissues that may be true.
+Linear responses of the tip to guide, tilt, bevel and path noise, for each hypothesis.
 
 At given depths the tip is linear in the positions of the guide, in its tilt, in the load of the
-bevel, and in the loads with which the path strays from what is expected:
+bevel, and in the loads that bend its path away from the nominal one:
 
 .. math:: z_k = \sum_j A_{kj} b_j + H_k \theta
 
 with positions :math:`b_j` of the guide in the steps, and unknown constants
-:math:`\theta`: origin and turn of the sensor's frame, tilt, bevel, and a curvature of the path
-at each depth, with straight lines between. A and H depend on the bending length and on the skin,
-and so there is one of them for each of a grid of these: the hypotheses. What is between two of
-them is two more unknown constants, with how A changes from one to the next.
+:math:`\theta`: origin and rotation of the sensor's frame, tilt, bevel, and a curvature of the
+path at each depth, linear between the depths. A and H depend on the bending length and on the
+stiffness of the skin. A hypothesis is a point of a grid of these two. A position between two points
+of the grid is two more unknown constants, with the difference of A from one point to the next.
 
 Both planes have the same, so that everything is a complex number, x + i z. At a roll
 :math:`\varphi` the bevel pushes along :math:`i e^{-i \varphi}`.
@@ -40,8 +40,7 @@ from needle_ros.errors import ParameterError
 import numpy as np
 from numpy.typing import ArrayLike
 
-#: Constants of `NeedleParameters` and of `SteeringParameters` that count here; what nobody knows
-#: is of the belief.
+#: Constants of `NeedleParameters` and of `SteeringParameters` on which the responses depend.
 OF_NEEDLE: Final = (
     'length', 'youngs_modulus', 'area_moment', 'tissue_stiffness', 'layer_depths',
     'layer_stiffnesses',
@@ -51,7 +50,7 @@ OF_STEERING: Final = ('free_length', 'skin_stiffness', 'bevel_load')
 #: Hypotheses of the bending length and of the skin.
 _LENGTHS, _SKINS = 13, 4
 
-#: The grid goes so much farther than the spread.
+#: Half width of the grid over the spread.
 _BEYOND: Final = 1.1
 
 #: Longest element [m]: good to a few micrometers.
@@ -60,7 +59,7 @@ _ELEMENT: Final = 1.25e-3
 #: Depths that are no farther apart are the same [m].
 _SAME: Final = 1e-9
 
-#: Standard deviation of what is anywhere within a cell of the grid.
+#: Standard deviation of a uniform distribution over a cell of the grid.
 _EVEN: Final = 12.0**-0.5
 
 
@@ -71,16 +70,16 @@ class SteeringModel:
     Parameters
     ----------
     needle : NeedleParameters
-        Needle and tissue as they are believed.
+        Nominal needle and tissue.
     steering : SteeringParameters
-        What they have beyond; path noise and bevel are those of the belief.
+        Nominal constants of steering; path noise and bevel are taken from the belief.
     depths : array_like, shape (n + 1,)
-        Depths at which the tip is looked at [m], increasing; the first one is reached straight.
+        Depths of the tip measurements [m], increasing; the needle reaches the first one straight.
     belief : SteeringBelief, optional
-        How far all that may be wrong.
+        Prior uncertainty.
     together : bool
-        Whether the guide goes evenly with the depth, to be at the position of a step at its end;
-        else it moves there while the needle rests, and stays while the needle goes in.
+        Whether the guide moves in proportion to the depth and reaches the position of a step at
+        its end; otherwise it moves while the needle rests, and rests during the insertion.
     progress : callable, optional
         Called before each hypothesis, with the number of those done and of all. An exception that
         it raises cancels the construction and reaches the caller. A hypothesis of 200 steps takes
@@ -93,7 +92,7 @@ class SteeringModel:
     belief : SteeringBelief
         As given.
     lengths, skins : ndarray, shape (h,)
-        Bending length and skin of each hypothesis, over the believed ones.
+        Bending length and skin stiffness of each hypothesis, relative to the nominal ones.
     guide : ndarray, shape (h, n + 1, n)
         Shift of the tip at each depth per position of the guide in each step.
     causes : ndarray, shape (h, n + 1, 5 + n)
@@ -102,18 +101,17 @@ class SteeringModel:
     bevel : ndarray, shape (h, n + 1, n + 1)
         The same per load of the bevel [N] on the skin, and in each step.
     elastic : ndarray, shape (h, n + 1)
-        What a load of the bevel on the resting tip adds at once [m/N].
+        Elastic shift of the resting tip per load of the bevel [m/N].
     guide_load, causes_load, bevel_load : ndarray, shape (h, n, n), (h, n, 5 + n), (h, n, n + 1)
-        What the guide feels [N] when it is where it shall be in each step, of the same.
+        The same for the force on the guide at its position of each step [N].
     push : float
-        Believed load of the bevel, along z at zero roll [N].
+        Nominal load of the bevel, along z at zero roll [N].
     between : ndarray, shape (2, h, n + 1, n)
         Change of `guide` from one hypothesis to the next in bending length, and in skin.
     prior : ndarray, shape (7 + n, 7 + n)
-        Covariance of the causes, before anything is seen, and of the places between two
-        hypotheses.
+        Prior covariance of the causes, and of the position between two hypotheses.
     responses : Responses
-        All responses, as compiled functions take them.
+        All responses, as arguments of compiled functions.
 
     Raises
     ------
@@ -158,7 +156,7 @@ class SteeringModel:
         self.causes, self.causes_load = np.empty((h, n + 1, n + 5)), np.empty((h, n, n + 5))
         self.bevel, self.bevel_load = np.empty((h, n + 1, n + 1)), np.empty((h, n, n + 1))
         self.elastic = np.empty((h, n + 1))
-        # Of layers with different loads of the bevel their ratio is believed.
+        # The responses are per load in the layer with the largest load of the bevel.
         most = max(steering.bevel_load)
         loads = tuple(one / most for one in steering.bevel_load) if most else (1.0,)
         beyond = replace(steering, element=_ELEMENT, bevel_load=loads, path_noise=0.0)
@@ -211,7 +209,7 @@ class SteeringModel:
         )  # fmt: skip
         tip, moved = tips[rows.ends[::2]], tips[rows.ends[1::2]]
         force = felt[rows.ends[2 if self._together else 1 :: 2]]
-        # The sensor has no part in what the guide feels.
+        # The frame of the sensor has no effect on the force on the guide.
         for found, origin, turn, to in (
             (tip, 1.0, self.depths, (self.guide[i], self.causes[i], self.bevel[i])),
             (force, 0.0, 0.0, (self.guide_load[i], self.causes_load[i], self.bevel_load[i])),
@@ -226,12 +224,12 @@ class SteeringModel:
 
 class _Rows:
     """
-    What `insert_causes` takes, without the numbers of a hypothesis.
+    Arguments of `insert_causes` that are the same for all hypotheses.
 
     Causes are the guide in each step, its tilt, the bevel on the skin and in each step, and the
-    curvature of the path at each depth. A row ends an element, a motion at rest, or a layer, where
-    the load of the bevel changes at rest. `ends` are the rows that end a pose: pose 2k is the
-    needle at depth k, and in pose 2k + 1 guide and roll have changed there.
+    curvature of the path at each depth. A row is the end of an element, of a motion at rest, or of
+    a layer, where the load of the bevel changes at rest. `ends` are the rows at the end of a pose:
+    pose 2k is the needle at depth k, and in pose 2k + 1 guide and roll have changed there.
     """
 
     def __init__(
@@ -271,7 +269,7 @@ class _Rows:
         self.guide, self.bevel = (1.0 - part) * posed[:, whole] + part * posed[:, later]
         self.tilt = np.zeros(3 * n + 3)
         self.tilt[n] = 1.0
-        # The load by which the path bends is that half of a smallest element further on.
+        # The tip load is the turning load half of the shortest element ahead of the tip.
         smallest = float(np.diff(at).min())
         ahead = self.depths + 0.5 * smallest / ceil(smallest / longest - 1e-9)
         self.layers_ahead = _layers(borders, ahead)
@@ -284,7 +282,7 @@ def _layers(starts: FloatArray, depths: ArrayLike) -> IntArray:
 
 
 def _sums_from(values: FloatArray, count: int) -> FloatArray:
-    """Return the sums of absolute values from each column on, shape (h, count): 0 beyond."""
+    """Return sums of absolute values from each column to the last, shape (h, count), then 0."""
     found = np.zeros((len(values), count))
     found[:, : values.shape[1]] = np.abs(values)[:, ::-1].cumsum(axis=1)[:, ::-1]
     return found
