@@ -9,8 +9,9 @@ bevel, and in the loads that bend its path away from the nominal one:
 with positions :math:`b_j` of the guide in the steps, and unknown constants
 :math:`\theta`: origin and rotation of the sensor's frame, tilt, bevel, and a curvature of the
 path at each depth, linear between the depths. A and H depend on the bending length and on the
-stiffness of the skin. A hypothesis is a point of a grid of these two. A position between two points
-of the grid is two more unknown constants, with the difference of A from one point to the next.
+stiffness of the skin. A hypothesis is a point of a grid of these two. A position between two
+points of the grid is two more unknown constants, with the difference of A from one point to the
+next.
 
 Both planes have the same, so that everything is a complex number, x + i z. At a roll
 :math:`\varphi` the bevel pushes along :math:`i e^{-i \varphi}`.
