@@ -21,6 +21,7 @@ from needle_controller.compiled.bending import (
 from needle_controller.compiled.kalman import add_to_mean, clear_mean, measure, propagate
 from needle_dynamics.arrays import Array3, FloatArray, Matrix, Shaped, Vector
 from needle_dynamics.compiled.cache import compiled, inlined, kernel
+from needle_dynamics.compiled.matrices import copy
 from needle_dynamics.compiled.normal_modes import coupling, empty_normal_modes, NormalModes
 from needle_dynamics.compiled.step import Needle
 from needle_dynamics.compiled.tissue import growth_at
@@ -330,8 +331,9 @@ def _advance(f: Filter, count: int, old: int, new: int) -> None:  # noqa: C901
     drivers = modal + LOADS
     work = np.empty((size + 2, size))
     x, covariance = f.states[new], f.covariances[new]
-    x[:] = f.states[old]
-    covariance[:] = f.covariances[old]
+    copy(f.covariances[old], covariance)
+    for i in range(size):
+        x[i] = f.states[old, i]
     sample = f.samples[new]
     t0, t1, span = f.samples[old]['time'], sample['time'], sample['span']
     # White noise of the sample, half of it at either end: the trapezoidal rule.

@@ -111,7 +111,7 @@ def learn(
 
     """
     covariance = block[TERMS:].reshape((TERMS, TERMS))
-    prior = np.array(limits) * 0.5
+    prior = (0.5 * limits[0], 0.5 * limits[1], 0.5 * limits[2])
     for i in range(TERMS):
         if covariance[i, i] == 0.0:
             covariance[i, i] = prior[i] * prior[i]
@@ -120,15 +120,21 @@ def learn(
         most = prior[i] * prior[i]
         if covariance[i, i] > most:
             shrink = sqrt(most / covariance[i, i])
-            covariance[i, :] *= shrink
-            covariance[:, i] *= shrink
-    regressors = np.array([1.0, speed, depth - LENGTH])
-    gain = covariance @ regressors
+            for j in range(TERMS):
+                covariance[i, j] *= shrink
+            for j in range(TERMS):
+                covariance[j, i] *= shrink
+    regressors = (1.0, speed, depth - LENGTH)
+    weights = np.zeros(TERMS)
     variance = noise * noise * max(_CORRELATED / period, 1.0)
-    gain /= variance + regressors @ gain
-    error = missing - regressors @ block[:TERMS]
-    weights = covariance @ regressors
+    error = missing
     for i in range(TERMS):
-        block[i] += gain[i] * error
         for j in range(TERMS):
-            covariance[i, j] -= gain[i] * weights[j]
+            weights[i] += covariance[i, j] * regressors[j]
+        variance += regressors[i] * weights[i]
+        error -= regressors[i] * block[i]
+    for i in range(TERMS):
+        gain = weights[i] / variance
+        block[i] += gain * error
+        for j in range(TERMS):
+            covariance[i, j] -= gain * weights[j]

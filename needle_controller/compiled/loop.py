@@ -81,7 +81,7 @@ def run_loop(  # noqa: C901
         Number of periods completed: fewer than k if the needle left its range.
 
     """
-    memory = np.zeros(MEMORY)
+    memory, none = np.zeros(MEMORY), np.empty((0, 3))
     period, delay, m = LawConstants(*law).period, pending.shape[0], state.shape[0] // 2
     count = setpoints.shape[0]
     largest, squares, acts = 0.0, 0.0, 0.0
@@ -90,7 +90,8 @@ def run_loop(  # noqa: C901
         if depths.shape[0] > 0:
             depths[k] = depth
         if states.shape[0] > 0:
-            states[k] = state
+            for i in range(len(state)):
+                states[k, i] = state[i]
         error = goal[k] - depth
         largest = max(largest, abs(error))
         squares += error * error
@@ -124,7 +125,7 @@ def run_loop(  # noqa: C901
                 needle = adapted(
                     c, c.friction.coulomb + row[1], c.friction.viscous + row[2], c.layers
                 )
-        left, _ = advance(needle, state, k * period, inputs, longest, False, period)
+        left, _ = advance(needle, state, k * period, inputs, longest, False, period, none)
         if left != 0.0:
             return k
     return int(count)

@@ -17,7 +17,7 @@ def _value(c: FloatArray, x: float) -> float:
 
 
 @kernel
-def quintic_extremes(c: Vector) -> FloatArray:
+def quintic_extremes(c: Vector) -> FloatArray:  # noqa: C901
     """
     Return the extreme values of a quintic and of its first two derivatives on [0, 1].
 
@@ -33,18 +33,22 @@ def quintic_extremes(c: Vector) -> FloatArray:
 
     """
     derivatives, extremes = np.zeros((6, 6)), np.empty((3, 2))
-    derivatives[0] = c
+    for j in range(6):
+        derivatives[0, j] = c[j]
     for k in range(1, 6):
         for j in range(6 - k):
             derivatives[k, j] = (j + 1) * derivatives[k - 1, j + 1]
     # Between two turning points a polynomial has at most one root. The roots of each derivative,
     # beginning with the linear one, are the turning points of the derivative before it.
-    turns, count = np.array([0.0, 1.0, 0.0, 0.0, 0.0, 0.0]), 2
-    found = turns.copy()
+    turns, found, values, count = np.zeros(6), np.zeros(6), np.empty(6), 2
+    turns[1] = 1.0
     for k in range(4, -1, -1):
-        values = np.array([_value(derivatives[k], turns[i]) for i in range(count)])
+        least = most = values[0] = _value(derivatives[k], turns[0])
+        for i in range(1, count):
+            values[i] = _value(derivatives[k], turns[i])
+            least, most = min(least, values[i]), max(most, values[i])
         if k < 3:
-            extremes[k, 0], extremes[k, 1] = values.min(), values.max()
+            extremes[k, 0], extremes[k, 1] = least, most
         if k == 0:
             break
         number = 1
@@ -63,5 +67,6 @@ def quintic_extremes(c: Vector) -> FloatArray:
             number += 1
         found[number] = 1.0
         count = number + 1
-        turns[:] = found
+        for i in range(count):
+            turns[i] = found[i]
     return extremes

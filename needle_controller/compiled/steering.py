@@ -10,7 +10,7 @@ rank one.
 
 from __future__ import annotations
 
-from math import cos, inf, isfinite, log, sin, sqrt, tau
+from math import cos, exp, inf, isfinite, log, sin, sqrt, tau
 from typing import Final, NamedTuple, TYPE_CHECKING
 
 from needle_dynamics.arrays import (
@@ -246,8 +246,15 @@ def weights(logs: Vector) -> FloatArray:
         The probabilities.
 
     """
-    found = np.exp(logs - logs.max())
-    return np.asarray(found / found.sum())
+    largest, whole, found = -inf, 0.0, np.empty(len(logs))
+    for value in logs:
+        largest = max(largest, value)
+    for i in range(len(logs)):
+        found[i] = exp(logs[i] - largest)
+        whole += found[i]
+    for i in range(len(logs)):
+        found[i] /= whole
+    return found
 
 
 @inlined
@@ -255,7 +262,8 @@ def _held(c: Steering) -> ComplexArray:
     """Return where the guide was, and is if it rests from now on, shape (n,)."""
     guide, done = c.guide.copy(), min(c.counts[STEP], len(c.guide))
     if done > 0:
-        guide[done:] = guide[done - 1]
+        for j in range(done, len(guide)):
+            guide[j] = guide[done - 1]
     return guide
 
 
@@ -267,7 +275,8 @@ def _tip(c: Steering, at: int, guide: ComplexArray) -> Tip:
     means, variances = np.zeros(h, np.complex128), np.zeros(h)
     shared, row = np.zeros((h, m), np.complex128), np.empty(m, np.complex128)
     for i in range(h):
-        row[: m - 2] = r.causes[i, at]
+        for j in range(m - 2):
+            row[j] = r.causes[i, at, j]
         row[BEVEL] = row[m - 2] = row[m - 1] = 0.0
         for j in range(len(c.turned)):
             row[BEVEL] += r.bevel[i, at, j] * c.turned[j]
@@ -415,7 +424,10 @@ def _ends(c: Steering, turns: int, first: int) -> Ends:
             for j in range(first, last + 1):
                 means[i] -= load * r.bevel[i, last, j] * c.turned[j]
             turned[i] = _COUNTED * sqrt(0.5) * abs(load) * r.later_bevel[i, first]
-    return Ends(means, np.sqrt(tip.variances), turned)
+    errors = np.empty(len(means))
+    for i in range(len(means)):
+        errors[i] = sqrt(tip.variances[i])
+    return Ends(means, errors, turned)
 
 
 @inlined
@@ -540,13 +552,17 @@ def choose(held: Held[Steering]) -> complex:
             means[i] += c.mean[i, BEVEL] * push * (_direction(other) - c.turned[k + 1])
         ends = Ends(means, base.errors, base.turned)
         costs = _costs(c, w, ends, few)
-        found = costs[0].min() + costs[1].min()
+        along_x = along_z = inf
+        for t in range(costs.shape[1]):
+            along_x, along_z = min(along_x, costs[0, t]), min(along_z, costs[1, t])
+        found = along_x + along_z
         if found < best:
             best, roll, chosen = found, other, ends
     if best + _TURN > cost:
         return guide
     c.roll[0], c.counts[TURNS] = roll, turns - 1
-    c.turned[k + 1 :] = _direction(roll)
+    for j in range(k + 1, len(c.turned)):
+        c.turned[j] = _direction(roll)
     return _best(c, w, chosen, tried)[1]
 
 
@@ -564,7 +580,8 @@ def _tried(c: Steering, parts: FloatArray) -> FloatArray:
     there, found = _there(c), np.empty((2, len(parts)))
     for plane in range(2):
         middle, half = _room(c, there.imag if plane else there.real, 0)
-        found[plane] = middle + half * parts
+        for t in range(len(parts)):
+            found[plane, t] = middle + half * parts[t]
     return found
 
 
@@ -650,7 +667,9 @@ def _plan(c: Steering, w: FloatArray, ends: Ends) -> tuple[float, float]:
     """Return the next position in a plan for the mean: least squares, with a price of motion."""
     k, last = c.counts[STEP], len(c.guide)
     count = last - k
-    normal, factor = _MOTION * np.eye(count), np.zeros((count, count))
+    normal, factor = np.zeros((count, count)), np.zeros((count, count))
+    for j in range(count):
+        normal[j, j] = _MOTION
     x, z = np.zeros(count), np.zeros(count)
     for i in range(len(w)):
         shifts = c.responses.guide[i, last, k:]

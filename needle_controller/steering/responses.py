@@ -1,16 +1,17 @@
 r"""
-What the tip does for all that may happen, in each of the tissues that may be true.
+Linear responses of the tip to guide, tilt, bevel and path noise, for each hypothesis.
 
 At given depths the tip is linear in the positions of the guide, in its tilt, in the load of the
-bevel, and in the loads with which the path strays from what is expected:
+bevel, and in the loads that bend its path away from the nominal one:
 
 .. math:: z_k = \sum_j A_{kj} b_j + H_k \theta
 
 with positions :math:`b_j` of the guide in the steps, and unknown constants
-:math:`\theta`: origin and turn of the sensor's frame, tilt, bevel, and a curvature of the path
-at each depth, with straight lines between. A and H depend on the bending length and on the skin,
-and so there is one of them for each of a grid of these: the hypotheses. What is between two of
-them is two more unknown constants, with how A changes from one to the next.
+:math:`\theta`: origin and rotation of the sensor's frame, tilt, bevel, and a curvature of the
+path at each depth, linear between the depths. A and H depend on the bending length and on the
+stiffness of the skin. A hypothesis is a point of a grid of these two. A position between two
+points of the grid is two more unknown constants, with the difference of A from one point to the
+next.
 
 Both planes have the same, so that everything is a complex number, x + i z. At a roll
 :math:`\varphi` the bevel pushes along :math:`i e^{-i \varphi}`.
@@ -18,23 +19,29 @@ Both planes have the same, so that everything is a complex number, x + i z. At a
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from math import ceil, pi
+from math import ceil
 from typing import Final
 
 from needle_controller.compiled.steering import Responses
 from needle_controller.steering.belief import SteeringBelief
-from needle_dynamics.arrays import FloatArray
-from needle_dynamics.compiled.cut import insert
+from needle_dynamics.arrays import FloatArray, IntArray
+from needle_dynamics.compiled.cut import Steered
+from needle_dynamics.compiled.superposition import insert_causes
 from needle_dynamics.parameters import NeedleParameters
-from needle_dynamics.steering.needle import empty_cut, steered
-from needle_dynamics.steering.parameters import SteeringParameters, turning_load, with_lengths
+from needle_dynamics.steering.needle import steered
+from needle_dynamics.steering.parameters import (
+    longest_element,
+    SteeringParameters,
+    turning_load,
+    with_lengths,
+)
 from needle_ros.errors import ParameterError
 import numpy as np
 from numpy.typing import ArrayLike
 
-#: Constants of `NeedleParameters` and of `SteeringParameters` that count here; what nobody knows
-#: is of the belief.
+#: Constants of `NeedleParameters` and of `SteeringParameters` on which the responses depend.
 OF_NEEDLE: Final = (
     'length', 'youngs_modulus', 'area_moment', 'tissue_stiffness', 'layer_depths',
     'layer_stiffnesses',
@@ -44,13 +51,16 @@ OF_STEERING: Final = ('free_length', 'skin_stiffness', 'bevel_load')
 #: Hypotheses of the bending length and of the skin.
 _LENGTHS, _SKINS = 13, 4
 
-#: The grid goes so much farther than the spread.
+#: Half width of the grid over the spread.
 _BEYOND: Final = 1.1
 
 #: Longest element [m]: good to a few micrometers.
 _ELEMENT: Final = 1.25e-3
 
-#: Standard deviation of what is anywhere within a cell of the grid.
+#: Depths that are no farther apart are the same [m].
+_SAME: Final = 1e-9
+
+#: Standard deviation of a uniform distribution over a cell of the grid.
 _EVEN: Final = 12.0**-0.5
 
 
@@ -61,16 +71,20 @@ class SteeringModel:
     Parameters
     ----------
     needle : NeedleParameters
-        Needle and tissue as they are believed.
+        Nominal needle and tissue.
     steering : SteeringParameters
-        What they have beyond; path noise and bevel are those of the belief.
+        Nominal constants of steering; path noise and bevel are taken from the belief.
     depths : array_like, shape (n + 1,)
-        Depths at which the tip is looked at [m], increasing; the first one is reached straight.
+        Depths of the tip measurements [m], increasing; the needle reaches the first one straight.
     belief : SteeringBelief, optional
-        How far all that may be wrong.
+        Prior uncertainty.
     together : bool
-        Whether the guide goes evenly with the depth, to be at the position of a step at its end;
-        else it moves there while the needle rests, and stays while the needle goes in.
+        Whether the guide moves in proportion to the depth and reaches the position of a step at
+        its end; otherwise it moves while the needle rests, and rests during the insertion.
+    progress : callable, optional
+        Called before each hypothesis, with the number of those done and of all. An exception that
+        it raises cancels the construction and reaches the caller. A hypothesis of 200 steps takes
+        some 10 ms, in compiled code that releases the GIL.
 
     Attributes
     ----------
@@ -79,7 +93,7 @@ class SteeringModel:
     belief : SteeringBelief
         As given.
     lengths, skins : ndarray, shape (h,)
-        Bending length and skin of each hypothesis, over the believed ones.
+        Bending length and skin stiffness of each hypothesis, relative to the nominal ones.
     guide : ndarray, shape (h, n + 1, n)
         Shift of the tip at each depth per position of the guide in each step.
     causes : ndarray, shape (h, n + 1, 5 + n)
@@ -88,18 +102,17 @@ class SteeringModel:
     bevel : ndarray, shape (h, n + 1, n + 1)
         The same per load of the bevel [N] on the skin, and in each step.
     elastic : ndarray, shape (h, n + 1)
-        What a load of the bevel on the resting tip adds at once [m/N].
+        Elastic shift of the resting tip per load of the bevel [m/N].
     guide_load, causes_load, bevel_load : ndarray, shape (h, n, n), (h, n, 5 + n), (h, n, n + 1)
-        What the guide feels [N] when it is where it shall be in each step, of the same.
+        The same for the force on the guide at its position of each step [N].
     push : float
-        Believed load of the bevel, along z at zero roll [N].
+        Nominal load of the bevel, along z at zero roll [N].
     between : ndarray, shape (2, h, n + 1, n)
         Change of `guide` from one hypothesis to the next in bending length, and in skin.
     prior : ndarray, shape (7 + n, 7 + n)
-        Covariance of the causes, before anything is seen, and of the places between two
-        hypotheses.
+        Prior covariance of the causes, and of the position between two hypotheses.
     responses : Responses
-        All responses, as compiled functions take them.
+        All responses, as arguments of compiled functions.
 
     Raises
     ------
@@ -116,6 +129,7 @@ class SteeringModel:
         belief: SteeringBelief | None = None,
         *,
         together: bool = False,
+        progress: Callable[[int, int], object] | None = None,
     ) -> None:
         at = np.array(depths, dtype=np.float64)
         if at.ndim != 1 or len(at) < 2 or not np.isfinite(at).all() or (np.diff(at) <= 0.0).any():
@@ -137,12 +151,22 @@ class SteeringModel:
         if width and steering.skin_stiffness > 0.0:
             skins = np.linspace(1.0 - width, 1.0 + width, _SKINS)
         self.lengths, self.skins = (grid.ravel() for grid in np.meshgrid(lengths, skins))
-        pairs = zip(self.lengths.tolist(), self.skins.tolist(), strict=True)
-        found = [self._respond(needle, steering, *pair) for pair in pairs]
-        (
-            self.guide, self.causes, self.bevel, self.elastic,
-            self.guide_load, self.causes_load, self.bevel_load,
-        ) = map(np.array, zip(*found, strict=True))  # fmt: skip
+        pairs = list(zip(self.lengths.tolist(), self.skins.tolist(), strict=True))
+        n, h = self.steps, len(pairs)
+        self.guide, self.guide_load = np.empty((h, n + 1, n)), np.empty((h, n, n))
+        self.causes, self.causes_load = np.empty((h, n + 1, n + 5)), np.empty((h, n, n + 5))
+        self.bevel, self.bevel_load = np.empty((h, n + 1, n + 1)), np.empty((h, n, n + 1))
+        self.elastic = np.empty((h, n + 1))
+        # The responses are per load in the layer with the largest load of the bevel.
+        most = max(steering.bevel_load)
+        loads = tuple(one / most for one in steering.bevel_load) if most else (1.0,)
+        beyond = replace(steering, element=_ELEMENT, bevel_load=loads, path_noise=0.0)
+        shortest = with_lengths(needle, beyond, float(lengths[0]))
+        rows = _Rows(at, needle.tissue.starts, longest_element(*shortest), together)
+        for i, pair in enumerate(pairs):
+            if progress is not None:
+                progress(i, h)
+            self._respond(i, steered(*with_lengths(needle, beyond, *pair)), beyond, rows)
         self.push = max(steering.bevel_load)
         grid = self.guide.reshape(len(skins), len(lengths), *self.guide.shape[1:])
         self.between = np.array(
@@ -172,79 +196,94 @@ class SteeringModel:
         """Number of steps n."""
         return len(self.depths) - 1
 
-    def _respond(
-        self, needle: NeedleParameters, steering: SteeringParameters, length: float, skin: float
-    ) -> tuple[FloatArray, ...]:
-        """Insert a needle once for each cause."""
-        n, at = self.steps, self.depths
-        smallest = float(np.diff(at).min())
-        wanted = smallest / ceil(smallest / _ELEMENT - 1e-9)
-        # Of layers with different loads of the bevel their ratio is believed.
-        most = max(steering.bevel_load)
-        loads = tuple(one / most for one in steering.bevel_load) if most else (1.0,)
-        beyond = replace(steering, element=wanted, bevel_load=loads, path_noise=0.0)
-        other, beyond = with_lengths(needle, beyond, length, skin)
-        base = steered(other, beyond)
-        reach = at[-1] + steering.free_length
-        runs = 3 * n + 3
-        # First the guide, then the needle.
-        poses = np.zeros((runs, 2 * n + 1, 6))
-        poses[:, ::2, 0], poses[:, 1::2, 0] = at, at[:-1]
-        for k in range(n):
-            first = 2 * k + (2 if self._together else 1)
-            poses[k, first : first + 2, 1] = 1.0
-        poses[n, :, 2] = 1.0
-        # A bevel that pushes along z in one step, and along x in all others.
-        bevels = slice(n + 1, 2 * n + 2)
-        poses[bevels, :, 5] = 0.5 * pi
-        poses[n + 1, 0, 5] = 0.0
-        for k in range(n):
-            poses[n + 2 + k, 2 * k + 1 : 2 * k + 3, 5] = 0.0
-        layers = np.zeros((runs, 3, len(base.starts)))
-        layers[:, 0], layers[:, 1] = base.starts, base.stiffness
-        layers[bevels, 2] = base.bevel
-        cells = ceil(reach / base.element) + 2
-        middle = (np.arange(cells) + 0.5) * base.element
-        turning = np.array([turning_load(base.ei, other.tissue.stiffness(y)) for y in middle])
-        wander = np.zeros((runs, cells, 2))
-        hats = [np.interp(middle, at, one) for one in np.eye(n + 1)]
-        wander[2 * n + 2 :, :, 0] = hats * turning
-        numbers = [base.ei, base.element, base.skin, 0.0, 0.0, reach]
-        tips, felt = np.empty((2, runs, 2 * n + 1, 2))
-        insert(
-            np.array([[*numbers, steering.free_length]]),
-            layers,
-            base.element,
-            wander,
-            poses,
-            np.arange(runs),
-            empty_cut(reach, base.element, len(base.starts)),
-            tips,
-            felt,
-        )
-
-        def sorted_by_cause(
-            found: FloatArray, origin: FloatArray, turn: FloatArray
-        ) -> tuple[FloatArray, FloatArray, FloatArray]:
-            x, bevel = found[:, :, 0].T, found[bevels, :, 1].T
-            causes = [origin, turn, x[:, n], bevel.sum(axis=1), *x[:, 2 * n + 2 :].T]
-            return x[:, :n], np.array(causes).T, bevel
-
+    def _respond(self, i: int, base: Steered, steering: SteeringParameters, rows: _Rows) -> None:
+        """Insert the needle of a hypothesis once for each cause."""
+        n = self.steps
+        guide, bevel, curvature = slice(n), slice(n + 1, 2 * n + 2), slice(2 * n + 2, None)
+        loads = rows.bevel * base.bevel[rows.layers, np.newaxis]
+        turning = np.array([turning_load(base.ei, k) for k in base.stiffness.tolist()])
+        loads[:, curvature] = rows.curvature * turning[rows.layers_ahead, np.newaxis]
+        tips, felt = np.empty((2, *loads.shape))
+        insert_causes(
+            base.ei, base.skin, steering.free_length, rows.depths, base.stiffness[rows.layers],
+            rows.tilt, rows.guide, loads, tips, felt,
+        )  # fmt: skip
+        tip, moved = tips[rows.ends[::2]], tips[rows.ends[1::2]]
+        force = felt[rows.ends[2 if self._together else 1 :: 2]]
+        # The frame of the sensor has no effect on the force on the guide.
+        for found, origin, turn, to in (
+            (tip, 1.0, self.depths, (self.guide[i], self.causes[i], self.bevel[i])),
+            (force, 0.0, 0.0, (self.guide_load[i], self.causes_load[i], self.bevel_load[i])),
+        ):
+            to[0][:], to[2][:] = found[:, guide], found[:, bevel]
+            to[1][:, 0], to[1][:, 1], to[1][:, 2] = origin, turn, found[:, n]
+            to[1][:, 3], to[1][:, 4:] = found[:, bevel].sum(axis=1), found[:, curvature]
         # A bevel that is turned at rest moves the tip at once.
-        rests = np.arange(n)
-        own = tips[n + 2 + rests, :, 1]
-        elastic = own[rests, 2 * rests + 1] - own[rests, 2 * rests]
-        # The sensor has no part in what the guide feels.
-        none = np.zeros(n)
-        return (
-            *sorted_by_cause(tips[:, ::2], np.ones(n + 1), at),
-            np.append(elastic, elastic[-1]),
-            *sorted_by_cause(felt[:, 2 if self._together else 1 :: 2], none, none),
-        )
+        self.elastic[i, :n] = (moved - tip[:-1])[:, n + 2 : 2 * n + 2].diagonal()
+        self.elastic[i, n] = self.elastic[i, n - 1]
+
+
+class _Rows:
+    """
+    Arguments of `insert_causes` that are the same for all hypotheses.
+
+    Causes are the guide in each step, its tilt, the bevel on the skin and in each step, and the
+    curvature of the path at each depth. A row is the end of an element, of a motion at rest, or of
+    a layer, where the load of the bevel changes at rest. `ends` are the rows at the end of a pose:
+    pose 2k is the needle at depth k, and in pose 2k + 1 guide and roll have changed there.
+    """
+
+    def __init__(
+        self, at: FloatArray, starts: Sequence[float], longest: float, together: bool
+    ) -> None:
+        n, borders = len(at) - 1, np.array(starts)
+        found, ends = [(0.0, 0.0, int(_layers(borders, 0.0)))], []
+        for pose in range(2 * n + 1):
+            begun, _, layer = found[-1]
+            to = float(at[pose // 2])
+            if to - begun < _SAME:
+                found.append((begun, float(pose), layer))
+            else:
+                inside = borders[(begun + _SAME < borders) & (borders < to - _SAME)]
+                for stop in [*inside.tolist(), to]:
+                    here, before, layer = found[-1]
+                    count = ceil((stop - here) / longest - 1e-9)
+                    for depth in np.linspace(here, stop, count + 1)[1:].tolist():
+                        before = max(0.0, pose - (to - depth) / (to - begun))
+                        found.append((depth, before, layer))
+                    if _layers(borders, stop) != layer:
+                        found.append((stop, before, int(_layers(borders, stop))))
+            ends.append(len(found) - 1)
+        depths, poses, layers = zip(*found, strict=True)
+        self.ends, self.depths = np.array(ends), np.array(depths)
+        self.layers = np.array(layers)
+        posed = np.zeros((2, 2 * n + 1, 3 * n + 3))
+        posed[1, 0, n + 1] = 1.0
+        for k in range(n):
+            first = 2 * k + (2 if together else 1)
+            posed[0, first : first + 2, k] = 1.0
+            posed[1, 2 * k + 1 : 2 * k + 3, n + 2 + k] = 1.0
+        whole = np.array(poses).astype(np.int64)
+        part = (np.array(poses) - whole)[:, np.newaxis]
+        # Evenly from pose to pose.
+        later = np.minimum(whole + 1, 2 * n)
+        self.guide, self.bevel = (1.0 - part) * posed[:, whole] + part * posed[:, later]
+        self.tilt = np.zeros(3 * n + 3)
+        self.tilt[n] = 1.0
+        # The tip load is the turning load half of the shortest element ahead of the tip.
+        smallest = float(np.diff(at).min())
+        ahead = self.depths + 0.5 * smallest / ceil(smallest / longest - 1e-9)
+        self.layers_ahead = _layers(borders, ahead)
+        self.curvature = np.array([np.interp(ahead, at, one) for one in np.eye(n + 1)]).T
+
+
+def _layers(starts: FloatArray, depths: ArrayLike) -> IntArray:
+    """Return the layers that begin at depths or hold them."""
+    return np.asarray(np.searchsorted(starts, np.asarray(depths) + _SAME, side='right') - 1)
 
 
 def _sums_from(values: FloatArray, count: int) -> FloatArray:
-    """Return the sums of absolute values from each column on, shape (h, count): 0 beyond."""
+    """Return sums of absolute values from each column to the last, shape (h, count), then 0."""
     found = np.zeros((len(values), count))
     found[:, : values.shape[1]] = np.abs(values)[:, ::-1].cumsum(axis=1)[:, ::-1]
     return found

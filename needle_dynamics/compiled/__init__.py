@@ -15,6 +15,7 @@ Compiled functions, one concept a file.
 `force_sensor`        samples of the force sensor
 `beam`                the needle as a beam about the path that it cut
 `cut`                 how it cuts that path, and follows it
+`superposition`       the same needle in one plane, for many causes at once
 `axis`                motion along the axis: friction per length, cutting, membranes
 ====================  ============================================================================
 """

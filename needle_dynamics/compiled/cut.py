@@ -38,7 +38,7 @@ ANEW: Final = 1
 _RELEASE: Final = 1e-3
 
 #: Shift of the tip at rest that begins a new path [m]: more than rounding, less than matters.
-_SHIFT: Final = 1e-9
+SHIFT: Final = 1e-9
 
 #: A path begins anew within an element only if that is then at least this part of its length.
 _PART: Final = 0.5
@@ -339,7 +339,7 @@ def _resume(n: Steered, c: Cut) -> None:
             shift = max(shift, abs(c.tip[plane, 0] - _path_end(s, last, plane, part)))
         else:
             shift = max(shift, abs(c.tip[plane, 0] - s.path[last, plane, 0]))
-    if shift <= _SHIFT:
+    if shift <= SHIFT:
         return
     if part > _NOTHING:
         if part < _PART * (_next_node(n, s.depths[last]) - s.depths[last]):

@@ -381,7 +381,8 @@ def run(
             waiting += 1
             _load(w, n, needles[i if len(needles) > 1 else 0], states[i], table)
             if kept.shape[1] > 1:
-                kept[i, 0] = states[i]
+                for k in range(states.shape[1]):
+                    kept[i, 0, k] = states[i, k]
             which[n], at[n] = i, 0
             w[_FORCE + n] = _input(course.forces, i, 0)
             w[_LEFT + n], w[_INSIDE + n] = course.interval, 1.0
@@ -431,7 +432,8 @@ def _next(
         return False
     at[i] += 1
     if kept.shape[1] > 1:
-        kept[which, at[i]] = state
+        for k in range(len(state)):
+            kept[which, at[i], k] = state[k]
     w[_FORCE + i] = _input(course.forces, which, min(at[i], course.intervals - 1))
     w[_LEFT + i], w[_A + i] = time, 0.0
     return bool(at[i] < course.intervals)

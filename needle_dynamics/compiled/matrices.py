@@ -9,6 +9,24 @@ from needle_dynamics.compiled.cache import compiled
 
 
 @compiled
+def copy(matrix: FloatArray, to: FloatArray) -> None:
+    """
+    Copy a matrix: an assignment to a slice would compile its error message, too.
+
+    Parameters
+    ----------
+    matrix : ndarray, shape (n, m)
+        The matrix.
+    to : ndarray, shape (n, m)
+        Overwritten.
+
+    """
+    for i in range(matrix.shape[0]):
+        for j in range(matrix.shape[1]):
+            to[i, j] = matrix[i, j]
+
+
+@compiled
 def cholesky(matrix: FloatArray, factor: FloatArray) -> None:
     """
     Write the lower Cholesky factor L of a matrix, L L^T.

@@ -12,7 +12,7 @@ from typing import NamedTuple
 from needle_dynamics.arrays import FloatArray, Matrix, Vector
 from needle_dynamics.compiled.cache import compiled, kernel
 from needle_dynamics.compiled.integrals import ModeIntegrals
-from needle_dynamics.compiled.matrices import backward, cholesky, diagonalize, forward
+from needle_dynamics.compiled.matrices import backward, cholesky, copy, diagonalize, forward
 from needle_dynamics.compiled.tissue import Layers
 import numpy as np
 
@@ -139,7 +139,7 @@ def normal_modes(
                 stiffness[k, i] += modes.shapes[j, k] * factor[i, j]
     for k in range(n):
         backward(factor, modes.shapes[:, k])
-    modes.inverse[:] = stiffness
+    copy(stiffness, modes.inverse)
 
 
 @kernel

@@ -70,8 +70,12 @@ def run_refined(
     grids, rows = np.empty((2, n, n)), np.empty((4, n))
     at = ModeIntegrals(grids[0], grids[1], rows[0], rows[1], rows[2], rows[3])
     work = np.empty(c.modes.series.shape[1] + 4 * n)
-    tissue, slowest, largest = c.layers.stiffnesses.max(), c.modes.modes[0, 0], 0.0
-    states[0] = state
+    tissue, slowest, largest = 0.0, c.modes.modes[0, 0], 0.0
+    for stiffness in c.layers.stiffnesses:
+        tissue = max(tissue, stiffness)
+    none = np.empty((0, 3))
+    for i in range(state.shape[0]):
+        states[0, i] = state[i]
     for k in range(forces.shape[0]):
         inputs = Inputs(forces[k], 0.0, 0.0, False)
         rest, steps[k] = interval, interval
@@ -97,10 +101,11 @@ def run_refined(
             step = span / (taken * finer)
             steps[k] = min(steps[k], step)
             left, _ = advance(
-                c, state, k * interval + (interval - rest), inputs, step, False, span
+                c, state, k * interval + (interval - rest), inputs, step, False, span, none
             )
             if left != 0.0:
                 return k, left
             rest = rest - span if taken < count else 0.0
-        states[k + 1] = state
+        for i in range(state.shape[0]):
+            states[k + 1, i] = state[i]
     return len(forces), 0.0

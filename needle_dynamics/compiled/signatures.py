@@ -77,9 +77,6 @@ def numba_type(hint: Any) -> Any:
     if hint in _SCALARS:
         return _SCALARS[hint]
     origin, arguments = get_origin(hint), get_args(hint)
-    if type(None) in arguments:
-        # Python code gives it always.
-        return numba_type(next(one for one in arguments if one is not type(None)))
     if origin is Annotated:
         shaped = hint.__metadata__[0]
         if isinstance(shaped, int):

@@ -342,7 +342,8 @@ def _steps(  # noqa: C901
         stopped = c.hub_stop and s + travel >= c.length
         if s + travel < c.minimum_depth or (s + travel > c.maximum_depth and not stopped):
             # The last valid state is the one before this step.
-            q[:], z[:] = q_before, z_before
+            for i in range(q.shape[0]):
+                q[i], z[i] = q_before[i], z_before[i]
             break
         if stopped:
             travel = c.length - s
@@ -380,7 +381,7 @@ def advance(
     longest: float,
     graded: bool,
     duration: float,
-    felt: Matrix | None = None,
+    felt: Matrix,
 ) -> tuple[float, Sums]:
     """
     Advance a state under constant inputs, in place.
@@ -402,10 +403,10 @@ def advance(
         modes slow down.
     duration : float
         Time to advance [s].
-    felt : ndarray, shape (parts, 3), optional
-        Takes what the base feels in equal parts of the duration, where steps then end: the mean
-        force of the base on the needle along y and along z [N], and the mean moment about x at
-        the base [N m]. That is by balance of momentum, exact whatever the modes do.
+    felt : ndarray, shape (parts, 3) or (0, 3)
+        Overwritten with the load on the base in equal parts of the duration, where steps then end:
+        the mean force of the base on the needle along y and along z [N], and the mean moment about
+        x at the base [N m], by the balance of momentum. Not computed if it is empty.
 
     Returns
     -------
@@ -431,12 +432,13 @@ def advance(
             z[i] = 0.0
             for j in range(n):
                 z[i] += c.linear_density * at.gram[i, j] * state[4 + n + j]
-    parts = 1 if felt is None else felt.shape[0]
+    sensed = felt.shape[0] > 0
+    parts = felt.shape[0] if sensed else 1
     motion = _Motion(c.length - state[0], -state[2 + n], 0.0)
     sums = Sums(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0)
     gain = (inputs.velocity - motion.velocity) / duration
     span, left, later = duration / parts, 0.0, 0.0
-    if felt is not None:
+    if sensed:
         border = _border(c, at, z, factor, rates, motion, sums)
     for part in range(parts):
         later = (parts - 1 - part) * span
@@ -444,14 +446,13 @@ def advance(
             c, at, work, rows[4:], inputs, gain, motion, sums, span, time + duration, later,
             longest, graded,
         )  # fmt: skip
+        mode_integrals(c.modes, motion.depth, work, at)
         if left > 0.0:
             break
-        if felt is not None:
-            mode_integrals(c.modes, motion.depth, work, at)
+        if sensed:
             now = _border(c, at, z, factor, rates, motion, sums)
             _write_felt(c, inputs, border, now, span, felt[part])
             border = now
-    mode_integrals(c.modes, motion.depth, work, at)
     left += later
     done = duration - left
     turn = 2.0 * inputs.torque / c.rotary_inertia
@@ -512,14 +513,16 @@ def run(
         Number of intervals that were completed.
 
     """
-    keep = states.shape[0] > 1
+    keep, none = states.shape[0] > 1, np.empty((0, 3))
     if keep:
-        states[0] = state
+        for i in range(state.shape[0]):
+            states[0, i] = state[i]
     for k in range(forces.shape[0]):
         inputs = Inputs(forces[k], torques[k], 0.0, False)
-        left, _ = advance(c, state, k * interval, inputs, longest, graded, interval)
+        left, _ = advance(c, state, k * interval, inputs, longest, graded, interval, none)
         if left != 0.0:
             return k
         if keep:
-            states[k + 1] = state
+            for i in range(state.shape[0]):
+                states[k + 1, i] = state[i]
     return len(forces)

@@ -106,6 +106,7 @@ def push(held: Held[Pushed], actions: Vector, which: BoolVector) -> tuple[FloatA
     c, friction, layers, times, states, targets = held.value
     n, u = states.shape[0], states.shape[1] // 2
     rewards, over = np.zeros(n), np.zeros(n, dtype=np.bool_)
+    none = np.empty((0, 3))
     for k in range(n):
         if not which[k]:
             continue
@@ -116,7 +117,7 @@ def push(held: Held[Pushed], actions: Vector, which: BoolVector) -> tuple[FloatA
         needle = adapted(c, friction[k, 0], friction[k, 1], tissue)
         force = FORCE * min(max(actions[k], -1.0), 1.0)
         inputs = Inputs(force, 0.0, 0.0, False)
-        left, _ = advance(needle, states[k], times[k], inputs, STEP, False, PERIOD)
+        left, _ = advance(needle, states[k], times[k], inputs, STEP, False, PERIOD, none)
         times[k] += PERIOD - left
         error = abs(targets[k] - (c.length - states[k, 0]))
         if left > 0.0:
