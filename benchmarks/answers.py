@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 import sys
 from tempfile import TemporaryDirectory
@@ -33,6 +34,17 @@ _DEPTHS: Final = {Verdict.ACCEPTED: 0.02, Verdict.REJECTED: 5.0}
 
 #: Longest pause between two trajectories [s]: shorter and longer than between two statuses.
 _PAUSE: Final = 0.15
+
+
+class Countdown:
+    """A time [s] from now."""
+
+    def __init__(self, duration: float) -> None:
+        self._end = monotonic() + duration
+
+    def over(self) -> bool:
+        """Return whether it is over."""
+        return monotonic() > self._end
 
 
 def measure(count: int, seed: int, logs: Path) -> dict[Verdict, list[float]]:
@@ -85,12 +97,12 @@ def measure(count: int, seed: int, logs: Path) -> dict[Verdict, list[float]]:
             message.header.stamp = node.get_clock().now().to_msg()
             stamp, begun = nanoseconds(message.header.stamp), monotonic()
             publisher.publish(message)
-            graph.spin_until(lambda at=stamp: at in heard, 'the answer')
+            graph.spin_until(partial(heard.__contains__, stamp), 'the answer')
             at, found = heard[stamp]
             if found is verdict:
                 times[verdict].append(at - begun)
-            pause = monotonic() + rng.uniform(0.0, _PAUSE)
-            graph.spin_until(lambda until=pause: monotonic() > until, 'the next one')
+            pause = Countdown(float(rng.uniform(0.0, _PAUSE)))
+            graph.spin_until(pause.over, 'the next one')
     return times
 
 
