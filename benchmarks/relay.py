@@ -262,6 +262,8 @@ class Outcome(NamedTuple):
         Simulated time from the fault to the end [s].
     counts : Counter
         Messages of each link.
+    struck : bool
+        Whether the fault has happened.
 
     """
 
@@ -269,6 +271,7 @@ class Outcome(NamedTuple):
     line: str
     after: float
     counts: Counter[Link]
+    struck: bool
 
     @property
     def met(self) -> bool:
@@ -335,18 +338,20 @@ def insert(fault: Fault | None, logs: Path, *, continuous: bool = False) -> Outc
             later = relay.now + LONGEST_DELAY + 0.5
             graph.spin_until(lambda: relay.now > later, 'the last message', _HANGS)
         except GraphError as error:
-            return Outcome('hangs', f'{loop.phase.value}; {error}', np.inf, relay.counts)
+            line = f'{loop.phase.value}; {error}'
+            return Outcome('hangs', line, np.inf, relay.counts, relay.struck is not None)
+        struck = relay.struck is not None
         after = end - relay.struck if relay.struck is not None else 0.0
         if loop.phase is Phase.DONE:
             x, y, z = np.array(plant._run.plant.insertion.needle.tip)
             off = float(np.hypot(x - TARGET[0], z - TARGET[2]))
             there = off < LARGEST_MISS and abs(y - TARGET[1]) < LARGEST_MISS
             line = f'{1e3 * off:.2f} mm from the target'
-            return Outcome('target' if there else 'missed', line, after, relay.counts)
+            return Outcome('target' if there else 'missed', line, after, relay.counts, struck)
         if loop.phase is Phase.STOPPED:
             kind = 'stopped' if after <= LONGEST_STOP else 'late'
-            return Outcome(kind, loop.fault, after, relay.counts)
-        return Outcome('rejected', pending.outcome[1], after, relay.counts)
+            return Outcome(kind, loop.fault, after, relay.counts, struck)
+        return Outcome('rejected', pending.outcome[1], after, relay.counts, struck)
 
 
 def choose(counts: Mapping[Link, int], rng: np.random.Generator) -> Fault:
@@ -379,7 +384,7 @@ def main(words: Sequence[str] | None = None) -> int:
     given = parser.parse_args(words)
     rng, begun = np.random.default_rng(given.seed), monotonic()
     rows: dict[str, Counter[str]] = {str(link): Counter() for link in LINKS}
-    failed = []
+    failed, struck = [], 0
     with TemporaryDirectory() as folder:
         # Each with rests and without.
         counts = []
@@ -394,6 +399,7 @@ def main(words: Sequence[str] | None = None) -> int:
             fault = choose(counts[continuous], rng)
             outcome = insert(fault, Path(folder), continuous=continuous)
             rows[str(fault.link)][outcome.end] += 1
+            struck += outcome.struck
             if outcome.end != 'target':
                 kind = 'continuous' if continuous else 'steps'
                 line = f'{number}: {kind}, {fault}: {outcome.end} after {outcome.after:.2f} s'
@@ -409,7 +415,7 @@ def main(words: Sequence[str] | None = None) -> int:
     reached = sum(found['target'] for found in rows.values())
     verdict = 'missed' if failed else 'met'
     sys.stdout.write(
-        f'{verdict}: {given.count} insertions with a fault, {reached} at the target, '
+        f'{verdict}: {given.count} insertions, {struck} with a fault, {reached} at the target, '
         f'{given.count - reached - len(failed)} stopped in time, {len(failed)} failed; '
         f'{monotonic() - begun:.0f} s\n'
     )

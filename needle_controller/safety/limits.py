@@ -57,8 +57,8 @@ class SafetyLimits:
         'sensor', open_low=True,
     )  # fmt: skip
     sensor_timeout: float = constant(
-        1.0, 's', 'age at which base_wrench, tip_deflection and stamped targets no longer count; '
-        'time without a reading, or without a change of a noisy one, that is reported',
+        1.0, 's', 'age at which base_wrench and tip_deflection no longer count; time without a '
+        'reading, or without a change of a noisy one, that is reported',
         open_low=True, high=3600.0,
     )  # fmt: skip
     sensors_required: bool = field(

@@ -29,7 +29,7 @@ MISTAKES = [
     ('target', 'target takes DEPTH | X Y Z, got nothing'),
     ('target deep', "'deep' is not a length, such as 0.05 or 50mm"),
     ('target 1e400', "'1e400' is not a length"),
-    ('target 0.001 0.05 0', 'a target beside the axis needs the node steering: --steering'),
+    ('target 0.001 0.05 0', 'a target off the axis needs the node steering: --steering'),
     ('wait soon', 'wait takes [SECONDS], got soon'),
     ('wait 1', 'there is no target to wait for'),
     ('law bang', "law takes one of adaptive, inverse_dynamics, pid, got 'bang'"),
@@ -122,11 +122,13 @@ def test_a_script_inserts_changes_the_law_and_retracts(
 
 
 def test_a_script_ends_with_what_cannot_be_done(ros_graph: RosGraph, tmp_path: Path) -> None:
-    """A refused target is an error of the script: what follows it is not done."""
+    """A rejected target is an error of the script: no command after it is executed."""
     script = ['target 5', 'target 0.03', 'wait']
     status, said, complained = told(ros_graph, tmp_path / 'run', script, '--no-recording')
     assert status == 1
-    assert re.fullmatch(r'error: target refused: .* 5 m.*\n|error: target .*\n', complained)
+    assert re.fullmatch(
+        r'error: controller: target rejected: target depth must be in .*, got 5.0\n', complained
+    )
     assert 'needle> target 0.03' not in said
     assert not (tmp_path / 'run' / 'bag').exists()
 
@@ -220,7 +222,7 @@ def test_typed_words_are_completed_and_errors_do_not_end_it(
     with Typed(ros_graph, tmp_path / 'run') as typed:
         typed.expect('needle> ')
         typed.type('targ\t 5\n')
-        typed.expect('error: target')
+        typed.expect('error: controller: target rejected')
         typed.expect('needle> ')
         typed.type('target 21mm\n')
         typed.expect('controller: on its way')

@@ -1,0 +1,129 @@
+"""
+Time from a trajectory to the answer of the controller, accepted or rejected.
+
+The controller and a plant at 1 kHz are processes; the answer is read from ``/diagnostics``. Run it
+by ``python -m benchmarks.answers --count 300``.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+import sys
+from tempfile import TemporaryDirectory
+from time import monotonic
+from typing import Final
+
+from diagnostic_msgs.msg import DiagnosticArray
+from needle_insertion.experiment.ros_graph import Graph
+from needle_insertion.report.text import table
+from needle_ros import contract
+from needle_ros.base_node import COMMAND
+from needle_ros.status import RequestStatus, Verdict
+from needle_ros.timing import nanoseconds
+import numpy as np
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+
+#: Longest time to an answer that is permitted [s].
+LONGEST: Final = 0.2
+
+#: Insertion depths [m]: where the needle is, and beyond its range.
+_DEPTHS: Final = {Verdict.ACCEPTED: 0.02, Verdict.REJECTED: 5.0}
+
+#: Longest pause between two trajectories [s]: shorter and longer than between two statuses.
+_PAUSE: Final = 0.15
+
+
+class Countdown:
+    """A time [s] from now."""
+
+    def __init__(self, duration: float) -> None:
+        self._end = monotonic() + duration
+
+    def over(self) -> bool:
+        """Return whether it is over."""
+        return monotonic() > self._end
+
+
+def measure(count: int, seed: int, logs: Path) -> dict[Verdict, list[float]]:
+    """
+    Send trajectories, of which every second one is invalid.
+
+    Parameters
+    ----------
+    count : int
+        Number of trajectories.
+    seed : int
+        Seed of the pauses.
+    logs : Path
+        Folder for logs.
+
+    Returns
+    -------
+    dict of Verdict to list of float
+        Times to the answers [s].
+
+    """
+    rng = np.random.default_rng(seed)
+    times: dict[Verdict, list[float]] = {verdict: [] for verdict in _DEPTHS}
+    with Graph(logs) as graph:
+        node = graph.node('sender')
+        heard: dict[int, tuple[float, Verdict]] = {}
+        active: list[bool] = []
+
+        def hear(array: DiagnosticArray) -> None:
+            for status in array.status:
+                if status.name == '/controller':
+                    active.append(status.message == 'active')
+                    values = {one.key: one.value for one in status.values}
+                    for answer in RequestStatus.from_values(values).answers:
+                        heard.setdefault(answer.stamp, (monotonic(), answer.verdict))
+
+        node.create_subscription(DiagnosticArray, contract.DIAGNOSTICS.name, hear, COMMAND)
+        topic = contract.JOINT_TRAJECTORY.name
+        publisher = node.create_publisher(JointTrajectory, topic, COMMAND)
+        graph.start('plant', {'depth': _DEPTHS[Verdict.ACCEPTED]})
+        graph.start('controller')
+        graph.spin_until(
+            lambda: publisher.get_subscription_count() and any(active), 'the controller', 180.0
+        )
+        for number in range(count):
+            verdict = list(_DEPTHS)[number % 2]
+            point = JointTrajectoryPoint(positions=[_DEPTHS[verdict]])
+            point.time_from_start.sec = 1
+            message = JointTrajectory(joint_names=[contract.INSERTION], points=[point])
+            message.header.stamp = node.get_clock().now().to_msg()
+            stamp, begun = nanoseconds(message.header.stamp), monotonic()
+            publisher.publish(message)
+            graph.spin_until(partial(heard.__contains__, stamp), 'the answer')
+            at, found = heard[stamp]
+            if found is verdict:
+                times[verdict].append(at - begun)
+            pause = Countdown(float(rng.uniform(0.0, _PAUSE)))
+            graph.spin_until(pause.over, 'the next one')
+    return times
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    """Measure, print a table and the verdict; return the exit status."""
+    parser = argparse.ArgumentParser('benchmarks.answers', description=__doc__)
+    parser.add_argument('--count', type=int, default=300, help='number of trajectories')
+    parser.add_argument('--seed', type=int, default=1, help='seed of the pauses')
+    given = parser.parse_args(words)
+    with TemporaryDirectory() as folder:
+        found = measure(given.count, given.seed, Path(folder))
+    rows, slowest = [], 0.0
+    for verdict, times in found.items():
+        p50, p99, longest = 1e3 * np.percentile(times, [50.0, 99.0, 100.0])
+        rows.append((verdict.value, str(len(times)), f'{p50:.2f}', f'{p99:.2f}', f'{longest:.2f}'))
+        slowest = max(slowest, float(longest))
+    sys.stdout.write(f'{table(rows, ("answer", "count", "p50 ms", "p99 ms", "longest ms"))}\n')
+    state, bar = ('met' if slowest < 1e3 * LONGEST else 'missed'), 1e3 * LONGEST
+    sys.stdout.write(f'{state}: answers within {slowest:.1f} ms, bar {bar:g} ms\n')
+    return int(state == 'missed')
+
+
+if __name__ == '__main__':
+    sys.exit(main())
