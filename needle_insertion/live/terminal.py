@@ -110,6 +110,8 @@ class Terminal:
         #: What each node said last, without its numbers, and when that was told of.
         self._last: dict[str, str] = {}
         self._told: dict[tuple[str, str], float] = {}
+        #: Whether all nodes have begun.
+        self._begun = False
         #: Whether the tip was sent to a target last, which the node `steering` brings there.
         self._steers = False
 
@@ -135,6 +137,7 @@ class Terminal:
         for name, topic in _NEEDED:
             if name in nodes:
                 self._wait_for(name, topic)
+        self._begun = True
 
     def _wait_for(self, name: str, topic: str) -> None:
         def sees() -> bool:
@@ -222,6 +225,9 @@ class Terminal:
 
     def _look(self) -> None:
         """Tell of nodes that have something new to complain about."""
+        if not self._begun:
+            # They wait for each other.
+            return
         for name, state in self._operator.states.items():
             level, message, now = state.level, state.message, monotonic()
             if state.age > _SILENT:
