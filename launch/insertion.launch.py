@@ -50,7 +50,7 @@ ARGUMENTS = {
     'law': ('', 'law of the controller', ['', 'adaptive', 'inverse_dynamics', 'pid']),
     'lockstep': (
         '',
-        'each sample waits for the command that answers the sample before',
+        'each sample waits for the command that answers the sample before, and for steering',
         ['', 'true', 'false'],
     ),
     'real_time_factor': ('', 'simulated seconds per second; 0: as fast as possible', []),

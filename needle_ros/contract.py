@@ -424,7 +424,7 @@ RECORDED: Final = replace(
     name='joint_states/_recorded',
     publisher='recorder',
     meaning='lock-step: stamp of the newest sample that a recorder has; a plant with `lockstep` '
-    'is at most 25 samples ahead of it; zero at the end of a recording; not recorded',
+    'is at most 10 samples ahead of it; zero at the end of a recording; not recorded',
 )
 
 REFERENCE: Final = Topic(

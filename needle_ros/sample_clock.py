@@ -16,7 +16,7 @@ _AT_ONCE: Final = 20
 
 
 #: Most samples that lockstep is ahead of a recorder: what waits for it fits into its queues.
-_AHEAD: Final = 25
+_AHEAD: Final = 10
 
 #: Stands for whoever commands, among the names of the nodes that have answered a sample.
 COMMAND: Final = ''
@@ -60,7 +60,7 @@ class SampleClock:
         Number of nodes that report in lockstep when they have processed a sample: the next one
         waits for all of them, and for a command.
     recorded : dict of str to int
-        Stamp of the newest sample of each recorder, by its name [ns]: no sample is more than 25
+        Stamp of the newest sample of each recorder, by its name [ns]: no sample is more than 10
         periods ahead of that in lockstep.
 
     """
@@ -129,7 +129,7 @@ class SampleClock:
         if not self.commanded:
             return 'no command has answered'
         if not self._is_recorded:
-            return 'a recorder is 25 samples behind'
+            return 'a recorder is 10 samples behind'
         done = len(self._answers or ()) - 1
         return f'{done} of {self.participants} nodes have processed'
 

@@ -243,7 +243,7 @@ class Graph:
             return
         self._life_cycles[name] = node.create_client(ChangeState, f'{name}/change_state')
         probe = node.create_client(GetState, f'{name}/get_state')
-        self.spin_until(probe.service_is_ready, f'the node {name}')
+        self.spin_until(probe.service_is_ready, f'the node {name}', _START)
         # The answer to a client that the other side does not know yet is lost. Clients become
         # known in the order in which they were made: once the last has an answer, all will.
         answers: list[Future] = []
@@ -281,7 +281,7 @@ class Graph:
         show(name)
         self.wait_for(node, name)
         client = node.create_client(GetState, f'{name}/get_state')
-        self.spin_until(client.service_is_ready, f'the node {name}')
+        self.spin_until(client.service_is_ready, f'the node {name}', _START)
         answer = client.call_async(GetState.Request())
         sent = time.monotonic()
 

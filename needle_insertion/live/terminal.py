@@ -103,6 +103,8 @@ class Terminal:
         #: Latest message of each node without its numbers, and when it was printed.
         self._last: dict[str, str] = {}
         self._told: dict[tuple[str, str], float] = {}
+        #: Whether all nodes have begun.
+        self._begun = False
         #: Whether the latest motion is a steered insertion.
         self._steers = False
 
@@ -128,6 +130,7 @@ class Terminal:
         for name, topic in _NEEDED:
             if name in nodes:
                 self._wait_for(name, topic)
+        self._begun = True
 
     def _wait_for(self, name: str, topic: str) -> None:
         def sees() -> bool:
@@ -215,6 +218,9 @@ class Terminal:
 
     def _look(self) -> None:
         """Print new warnings and errors of the nodes."""
+        if not self._begun:
+            # They wait for each other.
+            return
         for name, state in self._operator.states.items():
             level, message, now = state.level, state.message, monotonic()
             if state.age > _SILENT:

@@ -411,3 +411,46 @@ def test_a_push_beyond_eulers_load_is_warned_of() -> None:
         said += loop.said()
     (line,) = (one for one in said if 'Euler' in one)
     assert "is more than Euler's load 13.2 N of the part outside" in line
+
+
+@pytest.mark.parametrize('what', ['target', 'trajectory'])
+def test_a_request_counts_from_its_stamp_on_whether_it_overtakes_a_sample_or_not(
+    what: str,
+) -> None:
+    """It may come before or after the sample of its stamp: the answers are the same."""
+
+    def run(before: int) -> list[Answer | None]:
+        loop, answers = Loop(target=None), []
+        for k in range(20):
+            if k == before:
+                stamp = 100 * SECOND + 11 * PERIOD
+                # The clock is published before the sample.
+                now = max(loop.now, stamp)
+                if what == 'target':
+                    loop.supervisor.target(stamp, '', 0.1, 0.0, now)
+                else:
+                    loop.supervisor.trajectory(
+                        stamp, '', ['insertion'], [0.0, 1.0], [[0.02], [0.0205]], [], now
+                    )
+            answers.append(loop.measure())
+        assert loop.said() == []
+        return answers
+
+    # That with index 10 is of the stamp.
+    late = run(before=11)
+    assert late == run(before=10)
+    forces = [answer.force for answer in late if answer is not None]
+    assert forces[:11] == [0.0] * 11
+    assert all(forces[11:])
+
+
+def test_a_stamp_ahead_is_waited_for_and_a_retreat_supersedes_it() -> None:
+    """Of two requests the later one counts."""
+    loop = Loop(target=None)
+    loop.measure()
+    loop.supervisor.target(loop.now + 10 * PERIOD, '', 0.1, 0.0, loop.now)
+    assert loop.supervisor.retract().success
+    for _ in range(30):
+        loop.measure()
+    assert loop.supervisor.controller is not None
+    assert loop.supervisor.controller.target == 0.01

@@ -125,7 +125,7 @@ def test_in_lockstep_a_sample_waits_for_all_who_process_it() -> None:
     assert take(clock, later + 1_000_000) == [stamp + 1_000_000]
 
 
-def test_in_lockstep_a_recorder_is_at_most_25_samples_behind() -> None:
+def test_in_lockstep_a_recorder_is_at_most_10_samples_behind() -> None:
     """Time stands still until the recorder has more, or has ended."""
     clock, now = make(factor=0.0, lockstep=True), BEGIN
     clock.recorded['recorder'] = 1
@@ -137,14 +137,14 @@ def test_in_lockstep_a_recorder_is_at_most_25_samples_behind() -> None:
             clock.answered(stamp)
 
     run()
-    assert len(stamps) == 26
-    assert clock.missing == 'a recorder is 25 samples behind'
+    assert len(stamps) == 11
+    assert clock.missing == 'a recorder is 10 samples behind'
     clock.recorded['recorder'] = stamps[9]
     run()
-    assert len(stamps) == 36
+    assert len(stamps) == 21
     clock.recorded.clear()
     run()
-    assert len(stamps) == 136
+    assert len(stamps) == 121
 
 
 def test_in_lockstep_a_stall_is_made_up() -> None:
