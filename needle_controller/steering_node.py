@@ -71,7 +71,7 @@ class SteeringNode(CompiledNode):
     The node passes messages to an `OuterLoop`, which decides, and publishes its motions.
     """
 
-    KERNELS = ('needle_controller.compiled.steering', 'needle_dynamics.compiled.cut:insert')
+    KERNELS = ('needle_controller.compiled.steering', 'needle_dynamics.compiled.superposition')
 
     def __init__(self, **node_options: Any) -> None:
         super().__init__('steering', **node_options)

@@ -20,6 +20,7 @@ MODULES: Final = (
     'needle_dynamics.compiled.lanes',
     'needle_dynamics.compiled.refined',
     'needle_dynamics.compiled.cut',
+    'needle_dynamics.compiled.superposition',
     'needle_insertion.gym.pushed',
     'needle_controller.compiled.laws',
     'needle_controller.compiled.quintic',

@@ -331,15 +331,14 @@ class OuterLoop:
         roll = float(at[3]) if settings.turns else 0.0
 
         def work(progress: Progress) -> SteeringController:
-            progress(0, 1)
             model = SteeringModel(
                 self._needle,
                 self._steering,
                 depths,
                 self._belief,
                 together=settings.continuous,
+                progress=progress,
             )
-            progress(1, 1)
             return SteeringController(
                 model,
                 (point[0], point[2]),

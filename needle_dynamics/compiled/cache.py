@@ -43,11 +43,26 @@ class _Compiled:
         self.py_func = function
         update_wrapper(self, function)
         # error_model: divide as C does; every divisor is positive by construction.
-        # nogil: batches run in threads.
-        self._options = {'error_model': 'numpy', 'nogil': True, **options}
+        # nogil: batches run in threads. no_cfunc_wrapper: C never calls them.
+        self._options = {
+            'error_model': 'numpy',
+            'nogil': True,
+            'no_cfunc_wrapper': True,
+            **options,
+        }
 
     def __call__(self, *arguments: object) -> object:
-        return self.dispatcher(*arguments)
+        return self._called(*arguments)
+
+    @cached_property
+    def _called(self) -> Any:
+        """The function that Python calls: one without a wrapper for Python gets a caller."""
+        import numba
+
+        if 'no_cpython_wrapper' not in self._options:
+            return self.dispatcher
+        callee = self.dispatcher
+        return numba.njit(lambda *arguments: callee(*arguments))
 
     @cached_property
     def dispatcher(self) -> Any:
@@ -134,7 +149,7 @@ def compiled(function: _Function) -> _Function:
         The compiled function; its Python source is the attribute ``py_func``.
 
     """
-    return cast(_Function, _Compiled(function))
+    return cast(_Function, _Compiled(function, no_cpython_wrapper=True))
 
 
 def inlined(function: _Function) -> _Function:
@@ -154,7 +169,7 @@ def inlined(function: _Function) -> _Function:
         The compiled function.
 
     """
-    return cast(_Function, _Compiled(function, forceinline=True))
+    return cast(_Function, _Compiled(function, forceinline=True, no_cpython_wrapper=True))
 
 
 # Preparation.

@@ -2,25 +2,25 @@
 
 from __future__ import annotations
 
-from needle_dynamics.arrays import FloatArray
+from needle_dynamics.arrays import Matrix, Vector
 from needle_dynamics.compiled.beam import begin, cross, element, Springs
-from needle_dynamics.compiled.cache import compiled
+from needle_dynamics.compiled.cache import kernel
 from needle_dynamics.compiled.cut import SHIFT
 import numpy as np
 
 
-@compiled
+@kernel
 def insert_causes(
     ei: float,
     skin: float,
     free: float,
-    depths: FloatArray,
-    stiffness: FloatArray,
-    tilts: FloatArray,
-    guides: FloatArray,
-    loads: FloatArray,
-    tips: FloatArray,
-    felt: FloatArray,
+    depths: Vector,
+    stiffness: Vector,
+    tilts: Vector,
+    guides: Matrix,
+    loads: Matrix,
+    tips: Matrix,
+    felt: Matrix,
 ) -> None:
     """
     Insert a needle in one plane, for each cause alone, with the same nodes for all causes.

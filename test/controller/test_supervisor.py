@@ -449,7 +449,7 @@ def test_a_stamp_ahead_is_waited_for_and_a_retreat_supersedes_it() -> None:
     loop = Loop(target=None)
     loop.measure()
     loop.supervisor.target(loop.now + 10 * PERIOD, '', 0.1, 0.0, loop.now)
-    assert loop.supervisor.retract().success
+    assert loop.supervisor.retract(loop.now).success
     for _ in range(30):
         loop.measure()
     assert loop.supervisor.controller is not None
