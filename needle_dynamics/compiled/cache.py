@@ -62,7 +62,11 @@ class _Compiled:
         if 'no_cpython_wrapper' not in self._options:
             return self.dispatcher
         callee = self.dispatcher
-        return numba.njit(lambda *arguments: callee(*arguments))
+
+        def call(*arguments: Any) -> Any:
+            return callee(*arguments)
+
+        return numba.njit(call)
 
     @cached_property
     def dispatcher(self) -> Any:
