@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import as_completed
+from importlib.util import find_spec
 import os
 from typing import Final
 
@@ -21,7 +22,6 @@ MODULES: Final = (
     'needle_dynamics.compiled.refined',
     'needle_dynamics.compiled.cut',
     'needle_dynamics.compiled.superposition',
-    'needle_insertion.gym.pushed',
     'needle_controller.compiled.laws',
     'needle_controller.compiled.quintic',
     'needle_dynamics.compiled.axis',
@@ -30,6 +30,8 @@ MODULES: Final = (
     'needle_dynamics.compiled.integrals',
     'needle_dynamics.compiled.normal_modes',
     'needle_dynamics.compiled.oscillator',
+    # Needs Gymnasium, which is optional.
+    *(('needle_insertion.gym.pushed',) if find_spec('gymnasium') else ()),
 )
 
 
