@@ -281,10 +281,14 @@ class PlantNode(ModelNode):
         if publishes:
             self._clock_topic = self.publisher(contract.CLOCK, always=True)
         if lockstep:
-            self._reports = [
-                self._hear(contract.PROCESSED, self._on_processed, self._on_participant),
-                self._hear(contract.RECORDED, self._on_recorded, self._on_recorder),
-            ]
+            self._reports.append(
+                self._hear(contract.PROCESSED, self._on_processed, self._on_participant)
+            )
+        if publishes or own.real_time_factor != 1.0:
+            # A time of its own waits for recorders.
+            self._reports.append(
+                self._hear(contract.RECORDED, self._on_recorded, self._on_recorder)
+            )
         if mode != 'simulation' or constants.steered:
             # There `insertion` is the reference of a controller.
             self._trajectories = self.subscribe(contract.JOINT_TRAJECTORY, self._on_trajectory)

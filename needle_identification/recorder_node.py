@@ -13,7 +13,7 @@ from needle_identification.bags.topics import OfferedQos
 from needle_identification.bags.writer import BagWriter, COMPRESSIONS, described
 from needle_identification.errors import RecordingError
 from needle_ros.base_node import BaseNode, message_class
-from needle_ros.contract import JOINT_STATES, RECORDED, TOPICS
+from needle_ros.contract import BASE_WRENCH, JOINT_STATES, RECORDED, TOPICS
 from needle_ros.errors import MessageError
 from needle_ros.run_node import run
 from needle_ros.timing import NANOSECONDS
@@ -75,11 +75,14 @@ class RecorderNode(BaseNode):
         self._result = 'not recording'
         self._recorded: dict[str, _Recorded] = {}
         self._left_out: set[str] = set()
-        #: Tells a plant in lock-step which sample was recorded: its stamp [ns].
+        #: Stamp of the newest sample that was recorded [ns]; a plant may wait for it.
         self._recorded_stamp = 0
         self._reports = self.publisher(RECORDED, always=True)
-        self._sampled = self.resolve_topic_name(JOINT_STATES.name)
-        self._read = Reader(JOINT_STATES.type_name).read
+        #: What reads the topics that have every sample.
+        self._sampled = {
+            self.resolve_topic_name(topic.name): Reader(topic.type_name).read
+            for topic in (JOINT_STATES, BASE_WRENCH)
+        }
         #: Number of the newest message of each topic, by its publisher.
         self._newest: dict[str, int] = {}
         self.create_service(Trigger, '~/start', self._on_start)
@@ -218,11 +221,11 @@ class RecorderNode(BaseNode):
                 return
         if self._bag is not None and self._bag.lost:
             self.report_change()
-        if self._sampled in self._recorded:
+        if self._sampled.keys() & self._recorded.keys():
             self._report_recorded(self._recorded_stamp or 1)
 
     def _report_recorded(self, stamp: int) -> None:
-        """Report the newest sample to a plant in lock-step; zero: it need not wait any more."""
+        """Report the newest sample to a plant; zero: it need not wait any more."""
         if self._reports.get_subscription_count():
             message = Header(frame_id=self.get_fully_qualified_name())
             message.stamp.sec, message.stamp.nanosec = divmod(stamp, NANOSECONDS)
@@ -246,9 +249,10 @@ class RecorderNode(BaseNode):
                 # Two publishers count on their own.
                 if missing > 0 and len(recorded.offered) == 1:
                     bag.lose(topic, missing)
-        if data and topic == self._sampled:
+        if data and topic in self._sampled:
             with suppress(MessageError):
-                self._recorded_stamp = self._read(data).stamp
+                stamp = self._sampled[topic](data).stamp
+                self._recorded_stamp = max(self._recorded_stamp, stamp)
 
     def _discover(self) -> None:
         for topic, types in self.get_topic_names_and_types():

@@ -423,8 +423,8 @@ RECORDED: Final = replace(
     PROCESSED,
     name='joint_states/_recorded',
     publisher='recorder',
-    meaning='lock-step: stamp of the newest sample that a recorder has; a plant with `lockstep` '
-    'is at most 10 samples ahead of it; zero at the end of a recording; not recorded',
+    meaning='stamp of the newest sample that a recorder has, zero at its end; a plant with a '
+    'time of its own is at most 80 samples ahead of it, with `lockstep` 10; not recorded',
 )
 
 REFERENCE: Final = Topic(

@@ -15,8 +15,9 @@ _TICK: Final = 1e-3
 _AT_ONCE: Final = 20
 
 
-#: Most samples that lockstep is ahead of a recorder: what waits for it fits into its queues.
-_AHEAD: Final = 10
+#: Most samples that a time of its own is ahead of a recorder, in lockstep and else: what waits for
+#: the recorder fits into its queues, in lockstep with the messages of others.
+_AHEAD: Final = {True: 10, False: 80}
 
 #: Stands for whoever commands, among the names of the nodes that have answered a sample.
 COMMAND: Final = ''
@@ -60,8 +61,8 @@ class SampleClock:
         Number of nodes that report in lockstep when they have processed a sample: the next one
         waits for all of them, and for a command.
     recorded : dict of str to int
-        Stamp of the newest sample of each recorder, by its name [ns]: no sample is more than 10
-        periods ahead of that in lockstep.
+        Stamp of the newest sample of each recorder, by its name [ns]: a time of its own is never
+        more than 80 samples ahead of that, in lockstep 10.
 
     """
 
@@ -120,7 +121,8 @@ class SampleClock:
     @property
     def _is_recorded(self) -> bool:
         """Whether all recorders have samples that are new enough."""
-        first = max(self._start, self.stamp - round(_AHEAD * NANOSECONDS / self._rate))
+        ahead = round(_AHEAD[self._lockstep] * NANOSECONDS / self._rate)
+        first = max(self._start, self.stamp - ahead)
         return all(max(stamp, self._start) >= first for stamp in self.recorded.values())
 
     @property
@@ -129,7 +131,7 @@ class SampleClock:
         if not self.commanded:
             return 'no command has answered'
         if not self._is_recorded:
-            return 'a recorder is 10 samples behind'
+            return f'a recorder is {_AHEAD[True]} samples behind'
         done = len(self._answers or ()) - 1
         return f'{done} of {self.participants} nodes have processed'
 
@@ -167,7 +169,7 @@ class SampleClock:
             Number of samples to take now.
 
         """
-        if self.paused or self.awaited is not None:
+        if self.paused or self.awaited is not None or not self._is_recorded:
             return 0
         if not self._factor:
             return 1 if self._lockstep else self._burst
