@@ -1,7 +1,7 @@
 """
 Time from a trajectory to the answer of the controller, accepted or rejected.
 
-The controller and a plant at 1 kHz are processes; the answer is read from ``/diagnostics``. Run it
+The controller and a plant are processes; the answer is read from ``/diagnostics``. Run it
 by ``python -m benchmarks.answers --count 300``.
 """
 
@@ -47,7 +47,7 @@ class Countdown:
         return monotonic() > self._end
 
 
-def measure(count: int, seed: int, logs: Path) -> dict[Verdict, list[float]]:
+def measure(count: int, seed: int, rate: float, logs: Path) -> dict[Verdict, list[float]]:
     """
     Send trajectories, of which every second one is invalid.
 
@@ -57,6 +57,8 @@ def measure(count: int, seed: int, logs: Path) -> dict[Verdict, list[float]]:
         Number of trajectories.
     seed : int
         Seed of the pauses.
+    rate : float
+        Rate of plant and controller [Hz].
     logs : Path
         Folder for logs.
 
@@ -84,8 +86,8 @@ def measure(count: int, seed: int, logs: Path) -> dict[Verdict, list[float]]:
         node.create_subscription(DiagnosticArray, contract.DIAGNOSTICS.name, hear, COMMAND)
         topic = contract.JOINT_TRAJECTORY.name
         publisher = node.create_publisher(JointTrajectory, topic, COMMAND)
-        graph.start('plant', {'depth': _DEPTHS[Verdict.ACCEPTED]})
-        graph.start('controller')
+        graph.start('plant', {'depth': _DEPTHS[Verdict.ACCEPTED], 'rate': rate})
+        graph.start('controller', {'rate': rate})
         graph.spin_until(
             lambda: publisher.get_subscription_count() and any(active), 'the controller', 180.0
         )
@@ -111,9 +113,10 @@ def main(words: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser('benchmarks.answers', description=__doc__)
     parser.add_argument('--count', type=int, default=300, help='number of trajectories')
     parser.add_argument('--seed', type=int, default=1, help='seed of the pauses')
+    parser.add_argument('--rate', type=float, default=1000.0, help='rate of the nodes [Hz]')
     given = parser.parse_args(words)
     with TemporaryDirectory() as folder:
-        found = measure(given.count, given.seed, Path(folder))
+        found = measure(given.count, given.seed, given.rate, Path(folder))
     rows, slowest = [], 0.0
     for verdict, times in found.items():
         p50, p99, longest = 1e3 * np.percentile(times, [50.0, 99.0, 100.0])

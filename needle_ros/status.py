@@ -118,7 +118,20 @@ class RequestStatus:
 
     @classmethod
     def from_values(cls, values: Mapping[str, str]) -> RequestStatus:
-        """Read the fields from values of a DiagnosticStatus; other values are left out."""
+        """
+        Read the fields from values of a DiagnosticStatus.
+
+        Parameters
+        ----------
+        values : Mapping of str to str
+            Values by key; other values are left out.
+
+        Returns
+        -------
+        RequestStatus
+            The fields.
+
+        """
         takes: dict[str, tuple[str, ...]] = {}
         answers = []
         for key, value in values.items():
@@ -132,7 +145,22 @@ class RequestStatus:
         return cls(takes, tuple(answers), values.get(_PAUSED) == str(True))
 
     def answer_to(self, topic: str, stamp: int) -> Acknowledgement | None:
-        """Return the answer to a request; None without an answer."""
+        """
+        Return the answer to a request.
+
+        Parameters
+        ----------
+        topic : str
+            Its topic.
+        stamp : int
+            Its stamp [ns].
+
+        Returns
+        -------
+        Acknowledgement or None
+            The answer; None without an answer.
+
+        """
         for one in self.answers:
             if (one.topic, one.stamp) == (topic, stamp):
                 return one
