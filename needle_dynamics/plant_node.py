@@ -574,6 +574,9 @@ class PlantNode(ModelNode):
         self._awaited = awaited
         if self._looks and self._looks % _REPEAT == 0 and not self._time.paused:
             stamp, (topic, _, values) = self._last
+            if self._clock_topic is not None:
+                # An older one may have arrived late: then the sample would be ahead of the time.
+                self._clock_topic.publish(Clock(clock=_message(stamp)))
             self._publish[topic](stamp, values)
         self.report_change()
 

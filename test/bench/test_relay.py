@@ -1,8 +1,9 @@
 """Steered insertions through real nodes, with a relay that drops or delays a message."""
 
 from pathlib import Path
+from typing import Any
 
-from benchmarks.relay import choose, Fault, insert, Link, LINKS
+from benchmarks.relay import choose, Fault, insert, Link, LINKS, Relay
 from needle_ros import contract
 import numpy as np
 import pytest
@@ -49,3 +50,22 @@ def test_faults_are_chosen_among_all_links_and_messages() -> None:
 def insert_counts() -> dict[Link, int]:
     """Return some numbers of messages."""
     return {link: 5 + k for k, link in enumerate(LINKS)}
+
+
+def test_a_clock_that_is_set_back_by_a_late_message_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An older one arrives last, while the plant waits for the answer to a newer sample."""
+    clock, before = Link('plant', 'controller', contract.CLOCK), []
+    take = Relay._take
+
+    def late(self: Relay, sinks: Any, data: bytes) -> None:
+        take(self, sinks, data)
+        if self.armed and clock in [link for link, _ in sinks]:
+            before.append(data)
+            if len(before) == 300:
+                dict(sinks)[clock](before[260])
+
+    monkeypatch.setattr(Relay, '_take', late)
+    assert insert(None, tmp_path).end == 'target'
+    assert len(before) > 300
