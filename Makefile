@@ -76,7 +76,7 @@ results: setup
 
 # The figures of docs/benchmarks.md, on a machine that does nothing else. A missed bar does not end it.
 bench: $(VENV)/.bench
-	status=0; for name in control laws dynamics steering-model steering-fit steering safety identification 'graph --full' slicer study calibration; do \
+	status=0; for name in control laws dynamics steering-model steering-fit steering safety identification 'graph --full' slicer study pool calibration; do \
 	$(BIN)/needle bench $$name -o docs/results/$${name%% *}.md || status=1; \
 	done; exit $$status
 
