@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Collection
 from dataclasses import asdict
 import sys
-from time import monotonic
 from typing import Any
 
 from builtin_interfaces.msg import Duration
@@ -125,16 +124,8 @@ class SteeringNode(CompiledNode):
         belief = self.settings('belief.', SteeringBelief)
         # Load or compile the functions before anything moves; and reject invalid constants.
         SteeringModel(needle, steering, [0.0, 1e-3], belief)
-        # In simulated time a plan takes no time: the plant in lock-step waits for it.
-        sim_time = self.get_parameter('use_sim_time').value
-        self._loop = OuterLoop(
-            needle,
-            steering,
-            belief,
-            self.settings('', OuterLoopSettings),
-            (lambda: self.now() / NANOSECONDS) if sim_time else monotonic,
-            start=ThreadJob,
-        )
+        settings = self.settings('', OuterLoopSettings)
+        self._loop = OuterLoop(needle, steering, belief, settings, start=ThreadJob)
 
     def cleanup(self) -> None:
         """Discard the loop."""

@@ -143,7 +143,9 @@ class Operator:
                 pending.hear(name, state.requests)
 
     def _repeat(self) -> None:
-        """Send targets without an answer again."""
+        """Send targets without an answer again; use the simulated time if there is one."""
+        # Before the first target: a node that has not received the time has no stamp.
+        request_stamp(self._node)
         self._sending = [one for one in self._sending if not one[0].done]
         for pending, message in self._sending:
             if pending.repeat():
