@@ -101,8 +101,10 @@ class Witness:
     def release(self) -> None:
         """Let the plant go on alone."""
         self._node.destroy_subscription(self._samples)
-        if self._processed is not None:
-            self._node.destroy_publisher(self._processed)
+        # A sample that was received before is still passed on.
+        processed, self._processed = self._processed, None
+        if processed is not None:
+            self._node.destroy_publisher(processed)
 
     def _on_sample(self, data: bytes) -> None:
         if self.ended:
