@@ -11,6 +11,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from lifecycle_msgs.srv import GetState
 from needle_controller import LAWS
 from needle_controller.reference.guide import REFERENCES
+from needle_controller.steering.outer_loop import Phase
 from needle_dynamics.compiled.store import SUFFIX
 from needle_insertion.live.operator import Operator
 from needle_ros.base_node import COMMAND, SENSOR
@@ -189,10 +190,10 @@ def test_steering_has_everything(
     one = rig(**nodes)
 
     def ended() -> bool:
-        state = one.operator.states['steering']
-        if state.values.get('phase', '') == 'waits for a target':
+        phase = one.operator.states['steering'].values.get('phase')
+        if phase == Phase.IDLE.value:
             one.operator.target(1e-3, 0.031, -1e-3)
-        return state.message.startswith(('done', 'stopped'))
+        return phase in (Phase.DONE.value, Phase.STOPPED.value)
 
     one.until(ended, 'the end of the insertion')
 
