@@ -351,9 +351,9 @@ class Supervisor:
         # It counts from the first sample after its stamp on, also if it overtook a sample.
         self._due = stamp, topic, act
         self.requests.answer(topic, stamp, Verdict.RECEIVED)
-        held = self._active is None or self.safety.stop is not None
         newest = self.safety.streams['joint_states'].last
-        self._do_due(stamp + 1 if held else max(newest, 0) + 1)
+        waits = self._active is not None and self.safety.stop is None and newest >= 0
+        self._do_due((newest if waits else stamp) + 1)
         return answer
 
     def _do_due(self, stamp: int) -> None:

@@ -15,10 +15,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from functools import cached_property, partial, update_wrapper
+from functools import cached_property, update_wrapper
 from importlib import import_module
 import sys
-from typing import Any, cast, Final, overload, TypeVar
+from typing import Any, cast, Final, TypeVar
 
 from needle_dynamics.compiled.store import (
     FOLDER_VARIABLE,
@@ -104,15 +104,7 @@ class _Compiled:
         self.dispatcher.compile(found)
 
 
-@overload
-def kernel(function: _Function) -> _Function: ...
-
-
-@overload
-def kernel(*, inline: bool) -> Callable[[_Function], _Function]: ...
-
-
-def kernel(function: _Function | None = None, *, inline: bool = False) -> Any:
+def kernel(function: _Function) -> _Function:
     """
     Compile a function that is called from Python.
 
@@ -122,8 +114,6 @@ def kernel(function: _Function | None = None, *, inline: bool = False) -> Any:
         Function in the subset of Python that Numba compiles. It may call compiled functions of
         its own folder and of `needle_dynamics.compiled`. Its annotations determine the types for
         which `prepare` compiles it; for others it is compiled at the first call.
-    inline : bool
-        Whether compiled functions that call it inline it, see `inlined`.
 
     Returns
     -------
@@ -131,11 +121,31 @@ def kernel(function: _Function | None = None, *, inline: bool = False) -> Any:
         The compiled function; its Python source is the attribute ``py_func``.
 
     """
-    if function is None:
-        return partial(kernel, inline=inline)
-    made = _Compiled(function, **({'forceinline': True} if inline else {}))
+    return _kernel(function)
+
+
+def inlined_kernel(function: _Function) -> _Function:
+    """
+    Do the same as `kernel` for a function that is also a part of a hot loop, as `inlined`.
+
+    Parameters
+    ----------
+    function : callable
+        As for `kernel`.
+
+    Returns
+    -------
+    callable
+        The compiled function.
+
+    """
+    return _kernel(function, forceinline=True)
+
+
+def _kernel(function: _Function, **options: bool) -> _Function:
+    made = _Compiled(function, **options)
     _KERNELS.setdefault(function.__module__, {})[function.__name__] = made
-    return made
+    return cast(_Function, made)
 
 
 def compiled(function: _Function) -> _Function:

@@ -11,7 +11,7 @@ from __future__ import annotations
 from math import exp, inf, log1p, sqrt, tanh
 from typing import Final, NamedTuple
 
-from needle_dynamics.compiled.cache import compiled, kernel
+from needle_dynamics.compiled.cache import compiled, inlined_kernel, kernel
 from needle_dynamics.compiled.oscillator import glide
 
 #: Laws by name; a law's number is its place here.
@@ -175,7 +175,7 @@ def slide(
     return velocity, distance + further
 
 
-@kernel(inline=True)
+@inlined_kernel
 def friction_flow(
     f: FrictionConstants, mass: float, u: float, drive: float, h: float
 ) -> tuple[float, float]:

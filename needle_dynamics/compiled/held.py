@@ -61,12 +61,33 @@ structref.define_proxy(Held, _HeldType, ['value'])
 
 
 def held_type(value: Any) -> Any:
-    """Return Numba's type of a `Held` value of a type."""
+    """
+    Return Numba's type of a `Held` value.
+
+    Parameters
+    ----------
+    value : object
+        Numba's type of the value.
+
+    Returns
+    -------
+    object
+        The type.
+
+    """
     return _HeldType([('value', value)])
 
 
 def prepare_hold(kind: Any) -> None:
-    """Load or compile the conversion to a `Held` type; other types need none."""
+    """
+    Load or compile the conversion of a value to `Held`.
+
+    Parameters
+    ----------
+    kind : object
+        Numba's type; one that is not of a `Held` value needs no conversion.
+
+    """
     if isinstance(kind, _HeldType):
         _hold.dispatcher.compile((kind.field_dict['value'],))  # type: ignore[attr-defined]
 

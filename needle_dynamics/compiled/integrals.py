@@ -12,7 +12,7 @@ from math import cos, exp, isfinite, nan, sin
 from typing import Final, NamedTuple
 
 from needle_dynamics.arrays import FixedMatrix, FixedVector, FloatArray, Matrix, Vector
-from needle_dynamics.compiled.cache import compiled, inlined, kernel
+from needle_dynamics.compiled.cache import compiled, inlined, inlined_kernel, kernel
 import numpy as np
 
 #: Below this argument k_i s the series of a mode is used, above it the closed form.
@@ -233,7 +233,7 @@ def many_modes(tables: ModeTables, depth: float, work: FloatArray, out: ModeInte
             pair += 1
 
 
-@kernel(inline=True)
+@inlined_kernel
 def mode_integrals(tables: ModeTables, depth: float, work: Vector, out: ModeIntegrals) -> None:
     """
     Evaluate the modes and their integrals at an inserted length.

@@ -147,12 +147,40 @@ class Store:
         """Do nothing: entries do not become invalid."""
 
     def has(self, signature: Any, target_context: Any) -> bool:
-        """Return whether there is an entry for a signature."""
+        """
+        Return whether there is an entry for a signature.
+
+        Parameters
+        ----------
+        signature : tuple
+            Numba's types of the arguments.
+        target_context : object
+            Numba's context of the processor.
+
+        Returns
+        -------
+        bool
+            Whether one of the folders has it.
+
+        """
         name = self._file_name(signature, target_context.codegen())
         return any((folder / name).is_file() for folder in folders())
 
     def load_overload(self, signature: Any, target_context: Any) -> Any:
-        """Return the machine code for a signature, or None; Numba calls this."""
+        """
+        Load the machine code for a signature; Numba calls this.
+
+        Parameters
+        ----------
+        signature, target_context
+            As for `has`.
+
+        Returns
+        -------
+        object
+            The result of the compiler; None if Numba must compile the function.
+
+        """
         target_context.refresh()
         name = self._file_name(signature, target_context.codegen())
         found, folder = self._read(name, signature, target_context), writable_folder()
@@ -169,7 +197,17 @@ class Store:
         return found
 
     def save_overload(self, signature: Any, result: Any) -> None:
-        """Write machine code for a signature; Numba calls this after compiling it."""
+        """
+        Write machine code for a signature; Numba calls this after compiling it.
+
+        Parameters
+        ----------
+        signature : tuple
+            Numba's types of the arguments.
+        result : object
+            The result of the compiler.
+
+        """
         folder = writable_folder()
         if folder is None:
             return

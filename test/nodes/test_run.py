@@ -142,7 +142,7 @@ def test_a_robot_takes_the_place_of_the_plant(ros_graph: RosGraph, tmp_path: Pat
         '--hardware',
     )
     assert (status, complained) == (0, ''), said
-    assert 'starting recorder, controller;' in said
+    assert 'starting recorder, controller\n' in said
     assert 'depth 22.' in said or 'depth 21.9' in said
 
 
