@@ -856,11 +856,16 @@ def test_before_it_is_active_it_answers_and_waits(ros_graph: RosGraph) -> None:
         'the refusal',
     )
     assert bench.controller.trigger_activate() == TransitionCallbackReturn.SUCCESS
-    bench.aim(0.1)
+    bench.target.publish(PointStamped())
+    ros_graph.spin_until(
+        lambda: 'target rejected: stopped: emergency stop' in bench.value('last complaint'),
+        'the rejection',
+    )
     assert [bench.measure(0.02) for _ in range(5)] == [0.0] * 5
     assert bench.value('stop') == 'emergency stop'
     assert bench.call('clear_stop').success
     assert bench.call('clear_stop').message == 'there was no stop'
+    bench.aim(0.1)
     assert bench.push() > 0.5
 
 
