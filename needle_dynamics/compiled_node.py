@@ -23,6 +23,8 @@ class CompiledNode(BaseNode):
         Functions that were compiled or loaded while the node was active.
     """
 
+    #: Numba imports these when it converts the first array.
+    IMPORTS = ('numba.core.boxing', 'numba.core.runtime.context')
     #: Kernels that the node can call, in any mode and with any parameters: modules, or
     #: ``module:kernel``.
     KERNELS: ClassVar[tuple[str, ...]] = ()

@@ -267,7 +267,9 @@ class _Rows:
         part = (np.array(poses) - whole)[:, np.newaxis]
         # Evenly from pose to pose.
         later = np.minimum(whole + 1, 2 * n)
-        self.guide, self.bevel = (1.0 - part) * posed[:, whole] + part * posed[:, later]
+        posed = (1.0 - part) * posed[:, whole] + part * posed[:, later]
+        # Compiled code takes contiguous arrays.
+        self.guide, self.bevel = np.ascontiguousarray(posed)
         self.tilt = np.zeros(3 * n + 3)
         self.tilt[n] = 1.0
         # The tip load is the turning load half of the shortest element ahead of the tip.
