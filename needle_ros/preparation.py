@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from importlib import import_module
-from threading import Event, Thread
+from threading import Thread
 from typing import NamedTuple
 
 
@@ -76,7 +76,7 @@ class Preparation:
         self.progress = Progress(0, 1, '')
         self.error: Exception | None = None
         self._thread: Thread | None = None
-        self.is_complete, self._cancelled = False, Event()
+        self.is_complete = False
 
     @property
     def is_running(self) -> bool:
@@ -118,16 +118,10 @@ class Preparation:
         self._thread = Thread(target=work, name='preparation', daemon=True)
         self._thread.start()
 
-    def cancel(self) -> None:
-        """End the thread after its present step."""
-        self._cancelled.set()
-
     def _run(self) -> None:
         try:
             for progress in self._steps:
                 self.progress = progress
-                if self._cancelled.is_set():
-                    break
         # Raised by `complete`, in the thread that waits for it.
         except Exception as error:  # noqa: BLE001
             self.error = error
