@@ -311,7 +311,6 @@ def insert(fault: Fault | None, logs: Path, *, continuous: bool = False) -> Outc
         steering = add('steering', SteeringNode, **_STEERING, continuous=continuous, rate=50.0)
         controller = add('controller', ControllerNode, **_CONTROLLER)
         for node in (steering, controller, plant):
-            set_logger_level(node.get_logger().name, LoggingSeverity.FATAL)
             if not node.start():
                 raise GraphError(f'{node.get_name()} does not start: {node.failure}')
 
@@ -382,6 +381,9 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument('--count', type=int, default=200, help='number of insertions')
     parser.add_argument('--seed', type=int, default=1, help='seed of the random choices')
     given = parser.parse_args(words)
+    # The outcomes are printed; a level holds for all nodes of that name in this process.
+    for name in ('plant', 'controller', 'steering'):
+        set_logger_level(name, LoggingSeverity.FATAL)
     rng, begun = np.random.default_rng(given.seed), monotonic()
     rows: dict[str, Counter[str]] = {str(link): Counter() for link in LINKS}
     failed, struck = [], 0
