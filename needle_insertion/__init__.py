@@ -1,1 +1,1 @@
-"""Command line, demo and reports: the composition of plant, controller and identification."""
+"""Command line, demo, experiments and reports of the needle insertion suite."""

@@ -1,4 +1,4 @@
-"""``python -m needle_insertion`` is the command ``needle``."""
+"""Run the command ``needle`` by ``python -m needle_insertion``."""
 
 import sys
 

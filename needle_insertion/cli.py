@@ -1,4 +1,4 @@
-"""Command line `needle`: exit status 0 done, 1 the job failed, 2 bad usage or bad input."""
+"""Run the command line `needle`: exit status 0 success, 1 failed job, 2 invalid usage or input."""
 
 from __future__ import annotations
 
@@ -19,54 +19,41 @@ from needle_insertion.commands.common import Command
 from needle_insertion.report.made import COMMAND
 from needle_ros.errors import JobError, NeedleError
 
-#: Subcommands, each a module of `needle_insertion.commands`, and what the help says of them.
+#: Help text of each subcommand; the key is its module in `needle_insertion.commands`.
 COMMANDS: Final[Mapping[str, str]] = {
     'compile': 'compile all functions for this machine, once',
     'demo': 'insertion, recording, identification and a report',
-    'run': 'bring the nodes up, and tell them where to go',
-    'watch': 'a page in a browser: live, or of a bag',
-    'inspect': 'what recordings hold, and how to identify from them',
+    'run': 'start the nodes and send them targets',
+    'watch': 'show a live insertion or a bag in a browser',
+    'inspect': 'list the contents of recordings, and how to identify from them',
     'identify': 'fit parameters to recordings',
     'experiment': 'record an experiment on the simulated robot',
     'reproduce': "compute the paper's results and compare them with the paper",
     'simulate': 'simulate the needle in open loop, without ROS',
-    'steer': 'bring the tip of a simulated needle to a target, without ROS',
-    'study': 'how often it hits: a population of insertions',
+    'steer': 'steer a simulated needle to a target, without ROS',
+    'study': 'estimate the hit probability in a population of insertions',
     'analyze': 'controllability and observability',
     'verify': 'compute recorded runs again and compare',
     'bench': 'measure speed and accuracy (from a clone)',
 }
 
-#: Characters of tables, for terminals that do not have them.
+#: ASCII substitutes of table characters, by character.
 _PLAIN: Final = {'±': '+-', '−': '-', '–': '-'}
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """
-    Run the command line.
-
-    Parameters
-    ----------
-    arguments : sequence of str, optional
-        Words after the program's name; those of the process if not given.
-
-    Returns
-    -------
-    int
-        Exit status.
-
-    """
+    """Run the command line with the words after the program name; return the exit status."""
     words = list(sys.argv[1:] if arguments is None else arguments)
     if '_ARGCOMPLETE' in os.environ:
-        # The shell asks what may follow.
+        # Shell completion request.
         words = os.environ.get('COMP_LINE', '').split()[1:]
     register_error('plain', _plain)
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):
             stream.reconfigure(errors='plain')
-    # Imports take up to a second and leave nothing to clean up: until then a signal just ends it.
+    # Imports take up to a second and need no clean-up: a signal ends the process at once.
     previous = {name: signal.signal(name, signal.SIG_DFL) for name in _SIGNALS}
     try:
         return _run(words)
@@ -76,7 +63,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _plain(error: UnicodeError) -> tuple[str, int]:
-    """Write what a terminal cannot show with characters that it can, for `codecs`."""
+    """Replace characters that the terminal cannot encode, as an error handler of `codecs`."""
     if not isinstance(error, UnicodeEncodeError):
         raise error
     text = error.object[error.start : error.end]
@@ -101,7 +88,7 @@ def _run(words: list[str]) -> int:
 
         announce_compilation()
     try:
-        # From here on a signal must clean up: it ends the nodes that the command has started.
+        # From here on a signal must end the nodes that the command has started.
         for name in _SIGNALS:
             signal.signal(name, _interrupt)
         status: int = command.run(options)  # type: ignore[union-attr]
@@ -118,14 +105,14 @@ def _run(words: list[str]) -> int:
 
 
 def _interrupt(_signal: int, _frame: FrameType | None) -> NoReturn:
-    # Another signal must not break off the clean-up.
+    # A second signal must not interrupt the clean-up.
     for name in _SIGNALS:
         signal.signal(name, signal.SIG_IGN)
     raise KeyboardInterrupt
 
 
 def _parser(chosen: str, command: Command | None) -> argparse.ArgumentParser:
-    """Return a parser that has the options of the chosen command only: others cost imports."""
+    """Return a parser with the options of the chosen command only: other commands cost imports."""
     parser = _Parser(prog='needle', description='Robot-assisted needle insertion.')
     parser.add_argument('--version', action=_Version, nargs=0, help='show the version and exit')
     commands = parser.add_subparsers(required=True, metavar='COMMAND')
@@ -137,7 +124,7 @@ def _parser(chosen: str, command: Command | None) -> argparse.ArgumentParser:
 
 
 class _Parser(argparse.ArgumentParser):
-    """A parser that names the nearest valid word when one is mistyped."""
+    """Argument parser that suggests the nearest valid word."""
 
     def error(self, message: str) -> NoReturn:
         # Imported here: the help does not need it.
@@ -167,7 +154,7 @@ class _Parser(argparse.ArgumentParser):
 
 class _Version(argparse.Action):
     def __call__(self, parser: argparse.ArgumentParser, *_rest: Any) -> None:
-        # Imported here: it takes as long as all other imports of the help.
+        # Imported here: takes as long as all other imports of the help.
         from importlib.metadata import version
 
         sys.stdout.write(f'{version("needle_insertion")}\n')
@@ -175,7 +162,7 @@ class _Version(argparse.Action):
 
 
 def _as_value(word: str) -> str:
-    """Shield ``-5e-3``, which argparse would take for an option, by a space before it."""
+    """Prefix a negative number such as ``-5e-3`` with a space, or argparse reads an option."""
     try:
         float(word)
     except ValueError:
@@ -184,7 +171,7 @@ def _as_value(word: str) -> str:
 
 
 def _joined(words: list[str], signed: Sequence[str]) -> list[str]:
-    """Join ``--force-axis -y``, which argparse would take for two options."""
+    """Join ``--force-axis -y`` with an equals sign, or argparse reads a second option."""
     joined: list[str] = []
     for word in words:
         has_sign = word.startswith('-') and not word.startswith('--')

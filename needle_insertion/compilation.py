@@ -1,4 +1,4 @@
-"""Kernels of the packages, compiled once for this machine on all processors."""
+"""Compile the kernels of all packages for this machine, on all processors."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from needle_dynamics.compiled.cache import is_kept, kernels, prepare, where_kept
 from needle_insertion.experiment.progress import Progress
 from needle_ros.process_pool import processes
 
-#: Modules with kernels; those that take longest are first.
+#: Modules with kernels, the slowest to compile first.
 MODULES: Final = (
     'needle_controller.compiled.filter',
     'needle_dynamics.compiled.step',
@@ -37,18 +37,9 @@ MODULES: Final = (
 
 def compile_kernels(names: Sequence[str] = MODULES) -> int:
     """
-    Compile kernels that are not on disk, and show the progress on standard error.
+    Compile the kernels that are not in the cache, with progress on stderr; return their number.
 
-    Parameters
-    ----------
-    names : sequence of str
-        As for `needle_dynamics.compiled.cache.kernels`.
-
-    Returns
-    -------
-    int
-        Number of kernels that were compiled.
-
+    `names` are as for `needle_dynamics.compiled.cache.kernels`.
     """
     missing = [name for name in kernels(names) if not is_kept(name)]
     if not missing:
@@ -62,15 +53,7 @@ def compile_kernels(names: Sequence[str] = MODULES) -> int:
 
 
 def compile_nodes() -> int:
-    """
-    Compile the kernels of the nodes that are not on disk.
-
-    Returns
-    -------
-    int
-        Number of kernels that were compiled.
-
-    """
+    """Compile the kernels of the nodes that are not in the cache; return their number."""
     from needle_controller.controller_node import ControllerNode
     from needle_controller.steering_node import SteeringNode
     from needle_dynamics.plant_node import PlantNode
@@ -79,7 +62,7 @@ def compile_nodes() -> int:
 
 
 def _compile(name: str) -> str:
-    """Compile a kernel in a worker; return its name."""
+    """Compile one kernel in a worker process; return its name."""
     for _ in prepare([name]):
         pass
     return name.partition(':')[2]

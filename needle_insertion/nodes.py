@@ -1,4 +1,4 @@
-"""The programs of the nodes, as started by ``ros2 run needle_insertion plant`` or needle-plant."""
+"""Entry points of the nodes: ``ros2 run needle_insertion plant``, or needle-plant."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import signal
 import sys
 from typing import Final
 
-#: Module of each node; setup.py installs them by these names.
+#: Module of each node by its program name in setup.py.
 NODES: Final = {
     'plant': 'needle_dynamics.plant_node',
     'controller': 'needle_controller.controller_node',
@@ -21,15 +21,7 @@ NODES: Final = {
 
 
 def main() -> int:
-    """
-    Run the node that this program is named after.
-
-    Returns
-    -------
-    int
-        Exit status.
-
-    """
+    """Run the node with the name of this program; return the exit status."""
     # Imports take a second: Ctrl-C ends them at once, without a traceback.
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     name = Path(sys.argv[0]).stem.removeprefix('needle-')

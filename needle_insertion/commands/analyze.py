@@ -1,4 +1,4 @@
-"""`needle analyze`: what the inputs steer and the tip deflection shows."""
+"""`needle analyze`: controllability and observability of the linearized needle model."""
 
 from __future__ import annotations
 
@@ -23,7 +23,6 @@ from needle_ros.errors import ParameterError
 
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `needle analyze`."""
     add_needle(parser)
     parser.add_argument('--formulation', choices=FORMULATIONS, default='complete')
     parser.add_argument('--modes', type=int, default=2, metavar='N', help='shape modes')
@@ -31,9 +30,9 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
         'operating points', 'every combination of the values given; SI units'
     )
     for name, unit, default, text in (
-        ('depth', 'm', [0.1], 'inserted lengths (default 0.1)'),
-        ('tip-deflection', 'm', [0.0, 5e-4], 'deflections of the tip (default 0 5e-4)'),
-        ('speed', 'm/s', [5e-3], 'insertion speeds, negative out of the tissue (default 5e-3)'),
+        ('depth', 'm', [0.1], 'insertion depths (default 0.1)'),
+        ('tip-deflection', 'm', [0.0, 5e-4], 'tip deflections (default 0 5e-4)'),
+        ('speed', 'm/s', [5e-3], 'insertion velocities, negative for retraction (default 5e-3)'),
     ):
         points.add_argument(
             f'--{name}', type=float, nargs='+', default=default, metavar=unit, help=text
@@ -56,7 +55,7 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(options: argparse.Namespace) -> int:
-    """Analyze the operating points and print what was found."""
+    """Analyze the operating points and print the results."""
     if options.map and (options.output is None or len(options.speed) > 1):
         raise ParameterError('--map needs a folder, -o DIR, and a single --speed')
     if options.output is not None and not options.map:

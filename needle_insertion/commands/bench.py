@@ -1,4 +1,4 @@
-"""`needle bench`: the benchmarks, which are run from a clone and not installed."""
+"""`needle bench`: the benchmarks, which run from a clone and are not installed."""
 
 from __future__ import annotations
 
@@ -13,10 +13,9 @@ _ROOT = Path(__file__).parents[2]
 
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `needle bench`."""
     if not (_ROOT / 'benchmarks').is_dir():
         parser.error('only a clone of the repository has the benchmarks; run it from there')
-    # A clone is not on the path.
+    # The clone is not on the import path.
     sys.path.insert(0, str(_ROOT))
     import_module('benchmarks.run').add_arguments(parser)
 

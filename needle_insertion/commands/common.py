@@ -1,4 +1,4 @@
-"""What the commands share: their form, model constants as words, folders for results."""
+"""Shared parts of the commands: `Command`, model constants from words, output folders."""
 
 from __future__ import annotations
 
@@ -14,35 +14,20 @@ from needle_ros.errors import ParameterError
 
 class Command(NamedTuple):
     """
-    A subcommand of `needle`: ``COMMAND`` of the module of its name.
+    Subcommand of `needle`: the constant ``COMMAND`` of its module.
 
-    Attributes
-    ----------
-    add_arguments : callable
-        Declares its options on a parser.
-    run : callable
-        Does the work, given the options, and returns the exit status. Raises a `JobError` if the
-        job fails, and any other `NeedleError` if an option or an input is not valid.
-    signed : tuple of str
-        Options whose value may begin with a minus sign.
-
+    `run` returns the exit status. It raises a `JobError` if the job fails, and any other
+    `NeedleError` if an option or an input is not valid.
     """
 
     add_arguments: Callable[[ArgumentParser], None]
     run: Callable[[Namespace], int]
+    #: Options whose value may begin with a minus sign.
     signed: tuple[str, ...] = ()
 
 
 def add_needle(parser: ArgumentParser) -> None:
-    """
-    Add the options that choose the constants of the model, ``--preset`` and ``--set``.
-
-    Parameters
-    ----------
-    parser : ArgumentParser
-        Parser of a command.
-
-    """
+    """Add the options of the model constants, ``--preset`` and ``--set``."""
     from needle_dynamics import DEFAULT_PRESET, PRESETS
 
     parser.add_argument(
@@ -61,25 +46,7 @@ def add_needle(parser: ArgumentParser) -> None:
 
 
 def constants(words: Sequence[str]) -> dict[str, Any]:
-    """
-    Read model constants given as words.
-
-    Parameters
-    ----------
-    words : sequence of str
-        ``name=value`` each; the value is JSON, or a plain word.
-
-    Returns
-    -------
-    dict
-        Values by name, for `NeedleParameters.preset`.
-
-    Raises
-    ------
-    ParameterError
-        If a word is not of that form.
-
-    """
+    """Parse ``name=value`` words into values by name; a value is JSON or a plain word."""
     values: dict[str, Any] = {}
     for word in words:
         name, sign, text = word.partition('=')
@@ -93,42 +60,16 @@ def constants(words: Sequence[str]) -> dict[str, Any]:
 
 
 def check_file(path: Path) -> None:
-    """
-    Check that a file can be written, before the work that gives its content.
-
-    Parameters
-    ----------
-    path : Path
-        The file; its folder must exist.
-
-    Raises
-    ------
-    ParameterError
-        If it cannot be written.
-
-    """
+    """Raise `ParameterError` if a file cannot be written, before its content is computed."""
     if not path.name or path.is_dir():
         raise ParameterError(f'{path} cannot be written: it is not the name of a file')
     if not path.absolute().parent.is_dir():
-        raise ParameterError(f'{path} cannot be written: the folder it is in does not exist')
+        raise ParameterError(f'{path} cannot be written: its folder does not exist')
     check_folder(path.absolute().parent)
 
 
 def check_folder(folder: Path) -> None:
-    """
-    Check that a folder can be made and written to, before the work for it; nothing is made.
-
-    Parameters
-    ----------
-    folder : Path
-        May exist, or lack some of the folders that it is in.
-
-    Raises
-    ------
-    ParameterError
-        If it cannot be made or written to.
-
-    """
+    """Raise `ParameterError` if a folder cannot be created and written to; create nothing."""
     there = folder.absolute()
     while not there.exists():
         there = there.parent
@@ -139,20 +80,7 @@ def check_folder(folder: Path) -> None:
 
 
 def make_folder(folder: Path) -> None:
-    """
-    Make a folder for results, with those that it is in.
-
-    Parameters
-    ----------
-    folder : Path
-        May exist.
-
-    Raises
-    ------
-    ParameterError
-        If it cannot be made.
-
-    """
+    """Create a folder for results with its parents; raise `ParameterError` if that fails."""
     check_folder(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)

@@ -13,7 +13,7 @@ def _add_arguments(_parser: argparse.ArgumentParser) -> None:
 
 
 def _run(_options: argparse.Namespace) -> int:
-    """Compile; return 1 if no folder is writable."""
+    """Compile all kernels; return 1 if no folder is writable."""
     from needle_dynamics.compiled.cache import kernels, where_kept
     from needle_dynamics.compiled.store import writable_folder
     from needle_insertion.compilation import compile_kernels, MODULES

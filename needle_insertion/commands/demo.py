@@ -10,7 +10,6 @@ from needle_insertion.experiment.protocol import SHIPPED_BAGS
 
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `needle demo`."""
     parser.add_argument(
         '-o',
         '--output',

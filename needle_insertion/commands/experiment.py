@@ -11,8 +11,9 @@ from needle_ros.errors import ParameterError
 
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `needle experiment`."""
-    parser.add_argument('which', choices=tuple(PROTOCOLS), help='what to identify from it')
+    parser.add_argument(
+        'which', choices=tuple(PROTOCOLS), help='quantity to identify from the recordings'
+    )
     parser.add_argument('output', type=Path, metavar='DIR', help='folder for the bags')
     for name, kind, default, unit, words in (
         ('repeats', int, 20, 'N', 'number of bags to record'),
@@ -41,7 +42,7 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(options: argparse.Namespace) -> int:
-    """Record the bags that the folder does not hold yet."""
+    """Record the bags that are missing in the folder."""
     # Takes a second to import; invalid options of the parser are reported without it.
     from needle_insertion.experiment.campaign import Campaign
 

@@ -1,4 +1,4 @@
-"""`needle identify`: parameters from recordings, as tables, JSON, a parameter file and a page."""
+"""`needle identify`: fit parameters to recordings; write tables, JSON, parameter file and page."""
 
 from __future__ import annotations
 
@@ -34,7 +34,6 @@ from needle_ros.errors import NeedleError, ParameterError, shown
 
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `needle identify`."""
     what = parser.add_subparsers(required=True, metavar='WHAT')
     friction = what.add_parser(
         'friction',
@@ -49,40 +48,40 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
         '--force-axis',
         default='y',
         metavar='AXIS',
-        help='x, y or z: where the force on the needle points into the tissue; -x, -y or -z '
-        'turns it around (default y)',
+        help='axis of the wrench, x, y or z, that points into the tissue for the force on the '
+        'needle; -x, -y or -z inverts the sign (default y)',
     )
     reading.add_argument(
         '--motion-axis',
         metavar='AXIS',
-        help='likewise for the motion; of a JointState the name of the joint, or -name '
-        '(default y; the joint insertion or the only one)',
+        help='axis of the motion, likewise; for a JointState the name of the joint, or -name '
+        '(default y; the joint insertion or the only joint)',
     )
     reading.add_argument(
         '--columns',
         metavar='ROLE=[-]NAME[*FACTOR][UNIT],...',
-        help='columns of a table (CSV, MATLAB) by role, of '
-        f'{", ".join(ROLES)}: time=sec:nanosec,depth=-q[mm],force=Fz (default by usual names)',
+        help=f'columns of a table (CSV, MATLAB) by role ({", ".join(ROLES)}), such as '
+        'time=sec:nanosec,depth=-q[mm],force=Fz (default: recognized by usual names)',
     )
     fitting.add_argument(
         '--terms',
         type=_words,
         action='extend',
         metavar='TERM,...',
-        help=f'terms of the force, of {", ".join(TERMS)} '
+        help=f'terms of the force model, from {", ".join(TERMS)} '
         f'(default {",".join(FrictionSettings().terms)})',
     )
     fitting.add_argument(
         '--layers',
         type=_lengths,
         metavar='M,...',
-        help='inserted lengths at which layers begin [m], for the term layers',
+        help='insertion depths at which layers begin [m], for the term layers',
     )
     friction.set_defaults(identify=_run_friction)
 
     stiffness = what.add_parser(
         'stiffness',
-        help='2 x 2 stiffness of the tissue by force, as Table 2',
+        help='2 x 2 tissue stiffness by force level, as in Table 2',
         description='Fit the 2 x 2 stiffness of the tissue to force and position of an '
         'end-effector that presses it in several directions and rests in between.',
         epilog='example: needle identify stiffness place_1 place_2.mcap --axes x,-z '
@@ -94,20 +93,20 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
         type=_words,
         default=['x', 'z'],
         metavar='X,Z',
-        help='axes across the needle and along its deflection; -x turns one around (default x,z)',
+        help='axes across the needle and along its deflection; -x inverts an axis (default x,z)',
     )
     fitting.add_argument(
         '--level',
         type=float,
         metavar='N',
-        help='force level whose stiffness is the result (default the largest)',
+        help='force level of the stiffness to report (default: the largest)',
     )
     stiffness.set_defaults(identify=_run_stiffness)
     add_steering(what)
 
 
 def _run(options: argparse.Namespace) -> int:
-    """Identify friction or stiffness; return 2 if a recording cannot be used."""
+    """Run the chosen identification; return 2 if a recording cannot be used."""
     status: int = options.identify(options)
     return status
 
@@ -128,17 +127,16 @@ def _lengths(text: str) -> list[float]:
 def _add_common(
     parser: argparse.ArgumentParser, defaults: FrictionSettings | StiffnessSettings
 ) -> tuple[argparse._ArgumentGroup, argparse._ArgumentGroup]:
-    """Add what both have; return the groups of options of reading and of fitting."""
+    """Add the options of all kinds; return the option groups of reading and of fitting."""
     parser.add_argument(
         'bags',
         type=Path,
         nargs='+',
         metavar='BAG',
-        help='rosbag2 folder, .mcap, .db3 or ROS 1 .bag file, or a table (.csv, .mat); one that '
-        'cannot be used is named, the others '
-        'go on, and the exit status is 2',
+        help='rosbag2 folder, .mcap, .db3 or ROS 1 .bag file, or a table (.csv, .mat); an '
+        'unusable recording is reported and skipped, and the exit status is 2',
     )
-    writing = parser.add_argument_group('what to write')
+    writing = parser.add_argument_group('output')
     writing.add_argument(
         '-o', '--output', type=Path, metavar='FILE', help='ROS parameter file with the result'
     )
@@ -148,36 +146,36 @@ def _add_common(
     writing.add_argument(
         '--all-warnings',
         action='store_true',
-        help='print the warnings of each recording, not one of each kind',
+        help='print the warnings of each recording, not one warning of each kind',
     )
     writing.add_argument('--json', action='store_true', help='print JSON instead of tables')
-    reading = parser.add_argument_group('what to read')
+    reading = parser.add_argument_group('input')
     reading.add_argument(
         '--wrench-topic',
         metavar='TOPIC',
-        help='topic of the force, a WrenchStamped (default the only one, or base_wrench)',
+        help='topic of the force, a WrenchStamped (default: the only such topic, or base_wrench)',
     )
     reading.add_argument(
         '--motion-topic',
         metavar='TOPIC',
-        help='topic of the motion (default the only one of a type that tells it, or joint_states '
-        'or end_effector_pose)',
+        help='topic of the motion (default: the only topic of a suitable type, or joint_states or '
+        'end_effector_pose)',
     )
     reading.add_argument(
         '--time',
         choices=TIMES,
         default='header',
-        help='go by the stamps of the messages or by when they were received (default header)',
+        help='time of a sample: stamp of its message or time of receipt (default header)',
     )
-    fitting = parser.add_argument_group('how to identify')
-    # What may be chosen by the data is, unless asked otherwise.
+    fitting = parser.add_argument_group('identification')
+    # The default of the settings is the first choice.
     estimators = tuple(dict.fromkeys([defaults.estimator, *ESTIMATORS]))
     fitting.add_argument(
         '--estimator',
         choices=estimators,
         default=estimators[0],
-        help='least squares: ordinary, weighted by the noise measured, huber against outliers, '
-        f'total for noise in the motion too (default {estimators[0]})',
+        help='least squares: ordinary; weighted by the measured noise; huber, robust to outliers; '
+        f'total, with noise in the motion (default {estimators[0]})',
     )
     for item in fields(defaults):
         if 'unit' in item.metadata:
@@ -194,7 +192,7 @@ def _add_common(
 
 
 def _settings(kind: Callable[..., Any], options: argparse.Namespace) -> Any:
-    """Make settings from the options of the same name; what was not given has its default."""
+    """Create settings from the options of the same names; missing options keep their defaults."""
     names = [item.name for item in fields(kind)]  # type: ignore[arg-type]
     given = {name: getattr(options, name, None) for name in names}
     values = {
@@ -252,7 +250,7 @@ def _identify(
     write: Callable[[Path, Any], None],
     other: tuple[str, Callable[[Path], Any]],
 ) -> int:
-    """Identify all bags, write the results, warn and print; return the exit status."""
+    """Identify all bags, write the results, print warnings and tables; return the exit status."""
     if options.output is not None:
         check_file(options.output)
     if options.report is not None:
@@ -279,7 +277,7 @@ def _identify(
         except IdentificationError as error:
             complaint = f'{options.output} is not written: {error}'
     if options.report is not None:
-        # Draws: not wanted for tables.
+        # Imports plotting: not needed for tables.
         from needle_insertion.report.identify_page import write_identified_page
 
         make_folder(options.report)
@@ -302,7 +300,7 @@ def _identify(
 
 
 def _report_failures(origin: Origin, other: str, identify: Callable[[Path], Any]) -> None:
-    """Name the recordings that cannot be used, and the other subcommand if that can use them."""
+    """Print the recordings that cannot be used, and the other subcommand if it accepts them."""
     for line in origin.failed:
         sys.stderr.write(shown(f'error: {line}') + '\n')
     for name, _reason in origin.failures:

@@ -1,4 +1,4 @@
-"""`needle identify steering`: bending of a needle that cuts its path, from recordings."""
+"""`needle identify steering`: fit the bending of a needle that cuts its path to recordings."""
 
 from __future__ import annotations
 
@@ -27,25 +27,17 @@ from needle_ros.errors import NeedleError, ParameterError, shown
 from needle_ros.files import write_whole
 from tqdm import tqdm
 
-#: What stands for a medium without a name.
+#: Name of a medium without a name.
 _ONE = 'all'
 
 
 def add_steering(what: Any) -> None:
-    """
-    Add the options of `needle identify steering`.
-
-    Parameters
-    ----------
-    what : object
-        Subparsers of ``needle identify``.
-
-    """
+    """Add the subcommand to the subparsers of ``needle identify``."""
     parser = what.add_parser(
         'steering',
-        help='bending length, free length, skin, tilt, bevel: a needle that cuts its path',
-        description='Fit the bending of a needle to where its guide went and where its tip did, '
-        'in one or several media, all recordings together.',
+        help='bending length, free length, skin, tilt and bevel of a needle that cuts its path',
+        description='Fit the bending of a needle to the recorded positions of guide and tip, in '
+        'one or several media, all recordings together.',
         epilog='example: needle identify steering gel/*.csv liver/*.csv --columns '
         "'depth=-robot[m],guide_x=base.x[mm]@1,guide_z=base.z[mm]@1,tip_x=tip.x[mm],"
         "tip_z=tip.z[mm]'",
@@ -55,64 +47,63 @@ def add_steering(what: Any) -> None:
         type=Path,
         nargs='+',
         metavar='BAG',
-        help='insertions as bags, or as tables (.csv, .tsv, .mat); one that cannot be used is '
-        'named, the others go on, and the exit status is 2',
+        help='insertions as bags, or as tables (.csv, .tsv, .mat); an unusable recording is '
+        'reported and skipped, and the exit status is 2',
     )
     parser.add_argument(
         '-o',
         '--output',
         type=Path,
         metavar='FILE',
-        help='ROS parameter file with the result for a plant that is steered; of one medium',
+        help='ROS parameter file with the result, for a steered plant; for a single medium only',
     )
     parser.add_argument('--json', action='store_true', help='print JSON instead of tables')
-    reading = parser.add_argument_group('what to read')
+    reading = parser.add_argument_group('input')
     reading.add_argument(
         '--columns',
         metavar='ROLE=[-]NAME[*FACTOR][UNIT][@ROWS],...',
-        help=f'columns by role, of {", ".join(STEERING_ROLES)}; @1: the value of one row before '
-        '(default by usual names); of a bag, the joints of depth, guide and roll, and the axes '
-        'of the tip',
+        help=f'columns by role ({", ".join(STEERING_ROLES)}); @1: the value of the previous row '
+        '(default: recognized by usual names); for a bag, the joints of depth, guide and roll, '
+        'and the axes of the tip',
     )
     reading.add_argument(
         '--tip-topic',
         metavar='TOPIC',
-        help='topic of the tip, a PointStamped or PoseStamped (default the only one, or '
+        help='topic of the tip, a PointStamped or PoseStamped (default: the only such topic, or '
         'tip_deflection)',
     )
     reading.add_argument(
         '--motion-topic',
         metavar='TOPIC',
-        help='topic of the joints, a JointState (default the only one, or joint_states)',
+        help='topic of the joints, a JointState (default: the only such topic, or joint_states)',
     )
     reading.add_argument(
         '--time',
         choices=TIMES,
         default='header',
-        help='go by the stamps of the messages or by when they were received (default header)',
+        help='time of a sample: stamp of its message or time of receipt (default header)',
     )
     reading.add_argument(
         '--medium',
         type=_pattern,
         metavar='REGEX',
-        help='what in the path of a recording names its medium, a regular expression with one '
-        'group (default its folder)',
+        help='regular expression with one group, which matches the medium in the path of a '
+        'recording (default: the folder of the recording)',
     )
-    fitting = parser.add_argument_group('how to identify')
+    fitting = parser.add_argument_group('identification')
     fitting.add_argument(
         '--terms',
         metavar='TERM,...',
-        help=f'what makes the needle drift, of {", ".join(TERMS)} (default the one that explains '
-        'the most)',
+        help=f'causes of drift, from {", ".join(TERMS)} (default: the cause with the best fit)',
     )
     fitting.add_argument(
         '--order',
         choices=ORDERS,
-        help='whether guide and needle move together between samples, or the guide first '
-        '(default what explains more)',
+        help='order of motion between samples: guide and needle together, or the guide first '
+        '(default: the order with the best fit)',
     )
     fitting.add_argument(
-        '--free-length', type=float, metavar='M', help='free length if it is known [m]'
+        '--free-length', type=float, metavar='M', help='known free length [m] (default: fitted)'
     )
     parser.set_defaults(identify=_run)
 
@@ -138,7 +129,7 @@ def _medium_of(path: Path, pattern: re.Pattern[str] | None) -> str:
 def _read(
     path: Path, columns: Mapping[str, str], options: argparse.Namespace
 ) -> SteeringRecording | None:
-    """Read a recording; say why if that is not possible."""
+    """Read a recording, or print the error and return None."""
     try:
         return read_steering_recording(
             path,
@@ -154,7 +145,7 @@ def _read(
 
 
 def _run(options: argparse.Namespace) -> int:
-    # The search takes a large import, which other commands of this parser do not need.
+    # A large import, which the other subcommands do not need.
     from needle_identification import identify_steering, SteeringSettings
     from needle_identification.steering.result import steering_yaml
 
@@ -192,7 +183,7 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _alike(recordings: Sequence[SteeringRecording]) -> list[tuple[str, str]]:
-    """Return what was lost, each with the recordings that have it."""
+    """Group the losses of all recordings: message, and the recordings with it."""
     groups: dict[str, list[str]] = {}
     for one in recordings:
         for words in one.losses:
@@ -208,20 +199,7 @@ def _cell(one: ParameterEstimate) -> str:
 
 
 def steering_text(found: SteeringEstimate) -> str:
-    """
-    Return a result as tables for the terminal.
-
-    Parameters
-    ----------
-    found : SteeringEstimate
-        The result.
-
-    Returns
-    -------
-    str
-        Lines.
-
-    """
+    """Return a result as tables for the terminal."""
     rows = []
     for medium in found.media:
         for one in medium.parameters:
@@ -259,22 +237,7 @@ def steering_text(found: SteeringEstimate) -> str:
 def steering_document(
     found: SteeringEstimate, recordings: Sequence[SteeringRecording]
 ) -> dict[str, Any]:
-    """
-    Return a result as JSON holds it.
-
-    Parameters
-    ----------
-    found : SteeringEstimate
-        The result.
-    recordings : sequence of SteeringRecording
-        The recordings.
-
-    Returns
-    -------
-    dict
-        Values in SI units.
-
-    """
+    """Return a result as a JSON document in SI units."""
 
     def entry(one: ParameterEstimate) -> dict[str, Any]:
         if not one.determined:

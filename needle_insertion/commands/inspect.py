@@ -1,4 +1,4 @@
-"""`needle inspect`: what a recording holds, and the command that identifies from it."""
+"""`needle inspect`: list the contents of recordings, and the command that identifies from them."""
 
 from __future__ import annotations
 
@@ -16,7 +16,6 @@ from needle_ros.errors import NeedleError, shown
 
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `needle inspect`."""
     parser.add_argument(
         'recordings',
         type=Path,
@@ -28,7 +27,7 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(options: argparse.Namespace) -> int:
-    """Look into each recording and print what it holds; return 2 if one cannot be read."""
+    """Print the contents of each recording; return 2 if a recording cannot be read."""
     found: list[Inspection] = []
     bad = 0
     for path in options.recordings:
@@ -44,7 +43,7 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _inspected(path: Path) -> list[Inspection]:
-    """Look into a recording; say what is wrong with it if that cannot be done."""
+    """Inspect a recording, or print the error and return an empty list."""
     try:
         return [inspect_recording(path)]
     except (NeedleError, OSError) as error:

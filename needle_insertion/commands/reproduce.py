@@ -1,4 +1,4 @@
-"""`needle reproduce`: the paper's results computed again, beside what the paper prints."""
+"""`needle reproduce`: compute the paper's results again and compare them with the paper."""
 
 from __future__ import annotations
 
@@ -11,19 +11,18 @@ from typing import Any, Final
 from needle_insertion.commands.common import check_folder, Command, make_folder
 from needle_insertion.report.text import table
 
-#: What there is to reproduce.
+#: Results to choose from.
 RESULTS: Final = (
     *(f'figure-{number}' for number in range(4, 9)),
     *(f'table-{number}' for number in range(1, 4)),
     *('controllability', 'claims', 'mismatch', 'all'),
 )
 
-#: Folder of the whole page if none is given.
+#: Default folder of the page of all results.
 _OUTPUT: Final = Path('reproduce_output')
 
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `needle reproduce`."""
     parser.add_argument('what', choices=RESULTS)
     parser.add_argument(
         '-o',
@@ -42,7 +41,7 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(options: argparse.Namespace) -> int:
-    """Print a result and write its page; return 1 if a table does not come out."""
+    """Print a result and write its page; return 1 if a result does not hold."""
     # Takes two seconds to import; invalid options are reported without it.
     from needle_insertion.paper.results import campaigns, results, VERDICT_HEADS, write_results
 
@@ -68,7 +67,7 @@ def _run(options: argparse.Namespace) -> int:
             document['holds'] = passed
         else:
             document |= found[options.what].document
-        # What is not finite, as the STD of a single recording, is null.
+        # Values that are not finite, such as the STD of a single recording, become null.
         finite = json.loads(json.dumps(document), parse_constant=lambda _name: None)
         sys.stdout.write(f'{json.dumps(finite, indent=2)}\n')
     elif options.what == 'all':

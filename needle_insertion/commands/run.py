@@ -1,4 +1,4 @@
-"""`needle run`: the nodes of an insertion, and a person who tells them where to go."""
+"""`needle run`: start the nodes of an insertion, execute commands of a person or a script."""
 
 from __future__ import annotations
 
@@ -12,21 +12,24 @@ from needle_ros.errors import ParameterError
 
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `needle run`."""
     parser.add_argument(
-        '--hardware', action='store_true', help='no plant: a robot publishes joint_states'
+        '--hardware', action='store_true', help='start no plant: a robot publishes joint_states'
     )
     parser.add_argument(
-        '--steering', action='store_true', help='a needle that bends, and the node that aims it'
+        '--steering',
+        action='store_true',
+        help='bending needle: also start the node steering, which aims its tip',
     )
     parser.add_argument(
         '--realtime',
         action='store_true',
-        help='the plant runs in real time instead of lock-step: it does not wait for nodes that a '
+        help='run the plant in real time instead of lock-step: it does not wait for nodes that a '
         'busy machine delays',
     )
-    parser.add_argument('--preset', help='constants of the needle (default that of the file)')
-    parser.add_argument('--law', help='control law (default that of the file)')
+    parser.add_argument(
+        '--preset', help='constants of the needle (default: from the parameter file)'
+    )
+    parser.add_argument('--law', help='control law (default: from the parameter file)')
     parser.add_argument(
         '--params-file',
         type=Path,
@@ -83,7 +86,7 @@ def _run(options: argparse.Namespace) -> int:
         if node not in nodes:
             raise ParameterError(f'-p {word}: the nodes are {", ".join(nodes)}, got {node!r}')
         if name in ('lockstep', 'use_sim_time'):
-            raise ParameterError(f'-p {word}: --realtime decides on that')
+            raise ParameterError(f'-p {word}: this parameter is set by --realtime')
         nodes[node][name] = value
     compile_nodes()
     return run(
@@ -98,7 +101,7 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _parameter(word: str) -> tuple[str, str, Any]:
-    """Read NODE.NAME=VALUE."""
+    """Parse NODE.NAME=VALUE."""
     # Imported here: the help does not need it.
     import yaml
 

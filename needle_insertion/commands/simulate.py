@@ -1,4 +1,4 @@
-"""`needle simulate`: the needle in open loop without ROS, to a table, CSV, picture or bag."""
+"""`needle simulate`: simulate the needle in open loop; write a table, CSV, picture or bag."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from needle_insertion.report import trajectory as report
 from needle_insertion.report.text import table
 from needle_ros.errors import ParameterError
 
-#: Deflection of the tip at the start by default [m], that of section 3.2.8.
+#: Default tip deflection at the start [m], from section 3.2.8.
 _DEFLECTION: Final = 5e-4
 
-#: Duration where the force does not insert the needle [s].
+#: Default duration if the force does not insert the needle [s].
 _NO_WAY: Final = 1.0
 
-#: Time simulated before the others [s].
+#: Duration of the warm-up simulation [s].
 _MOMENT: Final = 1e-6
 
-#: Inserted length at the start [m] and force [N] by default.
+#: Default insertion depth at the start [m] and default force [N].
 _DEPTH, _FORCE = 0.02, 3.0
 
-#: Options that only one model has.
+#: Options of a single model.
 _MODES: Final = 'modes'
 _ONLY: Final = {
     _MODES: ('preset', 'force', 'duration', 'tolerance', 'tip_deflection', 'modal'),
@@ -39,23 +39,26 @@ _ONLY: Final = {
 
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `needle simulate`."""
     parser.add_argument(
         '--model',
         choices=tuple(_ONLY),
         default=_MODES,
-        help='modes: the needle of the paper; steering: one that bends about the path that it '
-        f'cuts (default {_MODES})',
+        help='modes: the needle of the paper; steering: a needle that bends about the path that '
+        f'it cuts (default {_MODES})',
     )
     add_needle(parser)
-    # Whether it was given says whether it is of the model.
+    # None if not given: an option of another model is an error.
     parser.set_defaults(preset=None)
     for name, unit, words in (
-        ('depth', 'm', f'inserted length at the start (default {_DEPTH:g}; model steering: 0)'),
+        ('depth', 'm', f'insertion depth at the start (default {_DEPTH:g}; model steering: 0)'),
         ('force', 'N', f'insertion force (default {_FORCE:g})'),
         ('duration', 's', 'time to simulate (default: until the hub is at the skin)'),
-        ('interval', 's', f'time between samples (default {DEFAULT_SAMPLES} of them, or 1 mm)'),
-        ('tolerance', 'X', f'largest change by a halved step (default {DEFAULT_TOLERANCE:g})'),
+        ('interval', 's', f'time between samples (default {DEFAULT_SAMPLES} samples, or 1 mm)'),
+        (
+            'tolerance',
+            'X',
+            f'largest change when the step is halved (default {DEFAULT_TOLERANCE:g})',
+        ),
     ):
         parser.add_argument(f'--{name}', type=float, metavar=unit, help=words)
     start = parser.add_mutually_exclusive_group()
@@ -63,7 +66,8 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
         '--tip-deflection',
         type=float,
         metavar='m',
-        help=f'at the start, with the least elastic energy (default {_DEFLECTION:g})',
+        help='tip deflection at the start, in the shape of least elastic energy (default '
+        f'{_DEFLECTION:g})',
     )
     start.add_argument(
         '--modal',
@@ -85,11 +89,11 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _time_to_hub(parameters: NeedleParameters, depth: float, force: float) -> float:
-    """Return a time in which a constant force inserts the needle, to two digits [s]."""
+    """Return the time of insertion up to the hub under a constant force, to two digits [s]."""
     drive, way = force - parameters.coulomb_friction, parameters.length - depth
     if drive <= 0.0 or way <= 0.0:
         return _NO_WAY
-    # Speeding up and steady motion, one after the other, take longer than both at once.
+    # Upper bound: acceleration and steady motion, one after the other.
     longest = way * parameters.viscous_friction / drive + sqrt(
         2.0 * way * parameters.moving_mass / drive
     )
@@ -108,7 +112,8 @@ def _run(options: argparse.Namespace) -> int:
         given = [name for name in names if getattr(options, name) is not None]
         if given and model != options.model:
             raise ParameterError(
-                f'--{given[0].replace("_", "-")} is of --model {model}, not of {options.model}'
+                f'--{given[0].replace("_", "-")} is an option of --model {model}, not of '
+                f'{options.model}'
             )
     return _run_modes(options) if options.model == _MODES else run_steering(options)
 
@@ -125,7 +130,7 @@ def _run_modes(options: argparse.Namespace) -> int:
     if duration is None:
         duration = _time_to_hub(parameters, depth, force)
     start = NeedleModel(parameters).state_at(depth, deflection, modal)
-    # Loads the machine code, which takes longer than most runs do.
+    # Loads the machine code, which takes longer than most runs.
     simulate(parameters, start, force, duration=_MOMENT, interval=_MOMENT)
     begin = perf_counter()
     trajectory = simulate(
@@ -145,7 +150,7 @@ def _run_modes(options: argparse.Namespace) -> int:
     if options.json:
         sys.stdout.write(f'{json.dumps(summary, indent=2)}\n')
     else:
-        # What has faded has no digits left.
+        # Decayed values have no significant digits left.
         rows = [(name, f'{round(value, 15):.6g}') for name, value in summary.items()]
         sys.stdout.write(
             f'{preset}: inserted {depth:g} m at the start, force '
@@ -159,7 +164,7 @@ def _run_modes(options: argparse.Namespace) -> int:
 
 
 def _pace(ratio: float) -> str:
-    """Return to two digits how a pace compares."""
+    """Format the ratio of simulated to real time to two digits."""
     times, word = (ratio, 'faster') if ratio >= 1.0 else (1.0 / ratio, 'slower')
     return f'{float(f"{times:.2g}"):g} times {word} than'
 

@@ -1,4 +1,4 @@
-"""`needle simulate --model steering`: a needle that bends about the path that it cuts."""
+"""`needle simulate --model steering`: simulate a needle that bends about the path that it cuts."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ from needle_ros.errors import ParameterError
 from needle_ros.settings import from_values, unknown_name
 import numpy as np
 
-#: Depth to reach [m], speed [m/s] and way between samples [m] by default.
+#: Default target depth [m], speed [m/s] and distance between samples [m].
 TO, SPEED, WAY = 0.1, 5e-3, 1e-3
 
-#: Columns of a way beside the depth.
+#: Columns of a table of guide motion, in addition to the depth.
 COLUMNS = ('guide_x', 'guide_z', 'tilt_x', 'tilt_z', 'roll')
 
 #: Most samples of a run.
@@ -34,22 +34,14 @@ _MOST = 1_000_000
 
 
 def add_steering(parser: argparse.ArgumentParser) -> None:
-    """
-    Add the options of this model only.
-
-    Parameters
-    ----------
-    parser : ArgumentParser
-        Parser of ``needle simulate``.
-
-    """
+    """Add the options of this model to the parser of ``needle simulate``."""
     group = parser.add_argument_group('model steering only')
     group.add_argument(
         '--needle',
         choices=tuple(STEERING_PRESETS),
         help='needle and tissue (default bending_35mm); --set takes the constants of both',
     )
-    group.add_argument('--to', type=float, metavar='m', help=f'depth to reach (default {TO:g})')
+    group.add_argument('--to', type=float, metavar='m', help=f'target depth (default {TO:g})')
     group.add_argument(
         '--speed', type=float, metavar='m/s', help=f'insertion velocity (default {SPEED:g})'
     )
@@ -58,33 +50,13 @@ def add_steering(parser: argparse.ArgumentParser) -> None:
         type=Path,
         metavar='FILE',
         help='table (.csv, .mat) with the columns depth and any of '
-        f'{", ".join(COLUMNS)}: where guide and roll are at each depth',
+        f'{", ".join(COLUMNS)}: positions of guide and roll at each depth',
     )
     group.add_argument('--seed', type=int, help='seed of the noise of the path (default 0)')
 
 
 def made(name: str, words: list[str]) -> tuple[NeedleParameters, SteeringParameters]:
-    """
-    Return a needle that is steered, with changes.
-
-    Parameters
-    ----------
-    name : str
-        One of `STEERING_PRESETS`.
-    words : list of str
-        ``name=value`` each; the name is of one of the two.
-
-    Returns
-    -------
-    NeedleParameters, SteeringParameters
-        Constants.
-
-    Raises
-    ------
-    ParameterError
-        If a name is unknown, or a value is not valid.
-
-    """
+    """Return the constants of a preset of `STEERING_PRESETS`, changed by ``name=value`` words."""
     needle, steering, _ = STEERING_PRESETS[name]
     own = [item.name for item in fields(steering)]
     given = constants(words)
@@ -109,26 +81,8 @@ def _single(value: object) -> bool:
 
 
 def read_way(path: Path) -> dict[str, FloatArray]:
-    """
-    Read where guide and roll are by depth.
-
-    Parameters
-    ----------
-    path : Path
-        A table.
-
-    Returns
-    -------
-    dict
-        Columns by name, ``depth`` and at least one of `COLUMNS`.
-
-    Raises
-    ------
-    RecordingError
-        If it has no such columns, or its depth does not increase.
-
-    """
-    # As the report below, not needed by the model of modes: together half a second.
+    """Read guide, tilt and roll by depth from a table: ``depth`` and at least one of `COLUMNS`."""
+    # Imported here, as the report below: the modal model does not need these 0.5 s.
     from needle_identification import RecordingError
     from needle_identification.recordings.tables import column_values, guessed, read_table
 
@@ -142,27 +96,14 @@ def read_way(path: Path) -> dict[str, FloatArray]:
         )
     way = {name: column_values(read, name, column, []) for name, column in found.items()}
     if not all(np.isfinite(values).all() for values in way.values()):
-        raise RecordingError(f'{path} has values that are no numbers')
+        raise RecordingError(f'{path} has values that are not numbers')
     if len(way['depth']) < 1 or not (np.diff(way['depth']) > 0.0).all():
         raise RecordingError(f'{path}: depth must increase from row to row')
     return way
 
 
 def run_steering(options: argparse.Namespace) -> int:
-    """
-    Simulate, write the outputs, and print a summary.
-
-    Parameters
-    ----------
-    options : Namespace
-        Options of ``needle simulate``.
-
-    Returns
-    -------
-    int
-        Exit status.
-
-    """
+    """Simulate, write the outputs, and print a summary."""
     from needle_insertion.report import insertion as report
 
     for path in options.output:
@@ -185,7 +126,7 @@ def run_steering(options: argparse.Namespace) -> int:
     one = Insertion(needle, steering, depth=start, seed=options.seed or 0)
     recorder = report.InsertionRecord(one)
     while one.depth < to:
-        # Brought to its speed in the first interval, and to its depth in the last.
+        # The first interval accelerates to the speed, the last ends at the target depth.
         ahead = min(one.depth + 0.5 * (one.velocity + speed) * interval, to)
         at = {key: float(np.interp(ahead, way['depth'], way[key])) for key in way}
         duration = interval

@@ -1,4 +1,4 @@
-"""`needle steer`: the guide moves so that the tip hits a target, beside one that rests."""
+"""`needle steer`: steer a simulated needle to a target, and compare with a guide at rest."""
 
 from __future__ import annotations
 
@@ -38,74 +38,77 @@ from needle_ros.files import write_whole
 from needle_ros.settings import from_values, unknown_name
 import numpy as np
 
-#: Target [m], step [m] and limit of the guide [m] by default.
+#: Default target [m], step [m] and limit of the guide [m].
 TARGET, STEP, LIMIT = '0.004,0.1,-0.002', 5e-3, 6e-3
 
-#: Constants of needle and tissue that matter here; what nobody knows is of the belief.
+#: Constants of needle and tissue with an effect here; unknown disturbances are in the belief.
 CONSTANTS: Final = (*OF_NEEDLE, *OF_STEERING)
 
-#: What nobody knows is drawn with this part of the deviations that are believed.
+#: Standard deviation of the sampled disturbances, as a fraction of the prior.
 _DRAWN: Final = 0.5
 
-#: Needles that are drawn.
+#: Number of needle shapes in the picture.
 _SHOWN: Final = 4
 
-#: Half of an interval of 95 % over the standard deviation.
+#: Half-width of a 95 % interval over the standard deviation.
 _NORMAL: Final = 1.96
 
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `needle steer`."""
     parser.description = (
-        'Insert a simulated needle that differs from what is believed of it, in steps: look at '
-        'the tip, move the guide, go on. Beside it the same insertion with a guide at rest.'
+        'Insert a simulated needle that differs from the nominal model, in steps: measure the '
+        'tip, move the guide, insert. For comparison, repeat the insertion with a guide at rest.'
     )
     parser.add_argument(
         '--target',
         default=TARGET,
         metavar='X,Y,Z',
-        help=f'where the tip shall be [m], Y the depth (default {TARGET})',
+        help=f'target of the tip [m], Y is the depth (default {TARGET})',
     )
     parser.add_argument(
         '--needle',
         choices=tuple(STEERING_PRESETS),
         default='bending_35mm',
-        help='needle and tissue as they are believed (default bending_35mm)',
+        help='nominal model of needle and tissue (default bending_35mm)',
     )
     parser.add_argument(
         '--set',
         action='append',
         default=[],
         metavar='NAME=VALUE',
-        help=f'a constant of these, of {", ".join(CONSTANTS)}, SI units; repeatable',
+        help=f'constant of the nominal model, one of {", ".join(CONSTANTS)}, SI units; repeatable',
     )
     parser.add_argument(
         '--belief',
         action='append',
         default=[],
         metavar='NAME=VALUE',
-        help='how far they may be wrong, of '
+        help='prior uncertainty of the model, one of '
         f'{", ".join(asdict(SteeringBelief()))}, SI units; repeatable',
     )
     parser.add_argument(
-        '--step', type=float, default=STEP, metavar='M', help=f'way of a step (default {STEP:g} m)'
+        '--step',
+        type=float,
+        default=STEP,
+        metavar='M',
+        help=f'depth per step (default {STEP:g} m)',
     )
     parser.add_argument(
         '--limit',
         type=float,
         default=LIMIT,
         metavar='M',
-        help=f'farthest position of the guide along x and z (default {LIMIT:g} m)',
+        help=f'largest displacement of the guide along x and z (default {LIMIT:g} m)',
     )
     parser.add_argument(
-        '--turns', type=int, default=0, help='how often the needle may be turned (default 0)'
+        '--turns', type=int, default=0, help='largest number of needle rotations (default 0)'
     )
     parser.add_argument(
         '--load-limit',
         type=float,
         default=inf,
         metavar='N',
-        help='largest lateral force of the guide that is planned (default: none)',
+        help='largest planned lateral force on the guide (default: no limit)',
     )
     parser.add_argument(
         '--seed', type=int, default=0, help='seed of the true needle and of all noise (default 0)'
@@ -132,7 +135,7 @@ def _target(text: str) -> FloatArray:
 
 
 class _Task(NamedTuple):
-    """What the options ask for."""
+    """Inputs of a steered insertion, from the options."""
 
     target: FloatArray
     needle: NeedleParameters
@@ -142,7 +145,7 @@ class _Task(NamedTuple):
 
 
 def _task(options: argparse.Namespace) -> _Task:
-    """Read the options, or say which of them is not valid."""
+    """Parse and check the options."""
     if options.output is not None:
         if options.output.suffix != '.png':
             raise ParameterError(f'{options.output}: the picture must be .png')
@@ -171,7 +174,7 @@ def _task(options: argparse.Namespace) -> _Task:
 def _truth(
     needle: NeedleParameters, steering: SteeringParameters, belief: SteeringBelief, seed: int
 ) -> Truth:
-    """Draw the true needle; its bevel is the believed one with what nobody knows."""
+    """Sample the true needle; its bevel load is the nominal load plus the sampled deviation."""
     nearer = {name: _DRAWN * getattr(belief, name) for name in ('tilt', 'frame', 'bevel')}
     found = drawn(needle, steering, replace(belief, **nearer), np.random.default_rng(seed), seed)
     bevel = found.bevel + np.array([0.0, max(steering.bevel_load)])
@@ -180,7 +183,7 @@ def _truth(
 
 
 def _run(options: argparse.Namespace) -> int:
-    """Steer, write the picture, and print where both needles end."""
+    """Steer, write the picture, and print the final tip positions of both needles."""
     target, needle, steering, belief, depths = _task(options)
     aim = target[[0, 2]]
     model = SteeringModel(needle, steering, depths, belief)
@@ -227,7 +230,7 @@ def _run(options: argparse.Namespace) -> int:
         sys.stderr.write(f'warning: {words}\n')
     if options.output is not None:
         at = np.linspace(0, len(shapes) - 1, min(_SHOWN, len(shapes))).round().astype(int)
-        # In the frame of the needle: the sensor's is turned against it.
+        # In the frame of the needle, to which the sensor frame is rotated.
         mark = target - np.array([truth.frame[0], 0.0, truth.frame[1]]) * target[1]
         figure = draw_needle(
             [shapes[k] for k in at.tolist()], _line(ours.path), mark, _line(alone.shape)
@@ -248,7 +251,7 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _text(found: Mapping[str, Any]) -> str:
-    """Return where the needles end as a table."""
+    """Return the final tip positions as a table."""
     rows = [
         (name, f'{1e3 * x:.3f}', f'{1e3 * z:.3f}', '' if miss is None else f'{1e3 * miss:.3f}')
         for name, (x, z), miss in (

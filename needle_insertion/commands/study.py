@@ -1,4 +1,4 @@
-"""`needle study`: a population of insertions, on all cores or on a cluster."""
+"""`needle study`: simulate a population of insertions on all cores or on a cluster."""
 
 from __future__ import annotations
 
@@ -16,17 +16,15 @@ from needle_insertion.commands.common import check_folder, Command
 from needle_ros.errors import JobError, ParameterError
 from needle_ros.process_pool import processes
 
-#: Time in which a scheduler must answer, and have a worker [s].
+#: Timeout for the answer of a scheduler, and for its first worker [s].
 _PATIENCE: Final = 10
 
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `needle study`."""
-    parser.add_argument('study', type=Path, metavar='STUDY.yaml', help='the study')
+    parser.add_argument('study', type=Path, metavar='STUDY.yaml', help='definition of the study')
     parser.add_argument(
         '-o', '--output', type=Path, metavar='DIR',
-        help='folder of the results (default: named as the study); what is in it is not computed '
-        'again',
+        help='folder of the results (default: named as the study); existing results are kept',
     )  # fmt: skip
     parser.add_argument(
         '--workers', type=int, help='processes of this machine (default: one per core)'
@@ -35,12 +33,15 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
         '--scheduler', metavar='ADDRESS', help='Dask scheduler, such as tcp://host:8786'
     )
     parser.add_argument(
-        '--replay', type=int, metavar='NUMBER', help='compute one sample again, into a bag'
+        '--replay',
+        type=int,
+        metavar='NUMBER',
+        help='compute one sample again and record it to a bag',
     )
 
 
 def _run(options: argparse.Namespace) -> int:
-    """Compute what is missing, and write table and page."""
+    """Compute the missing samples, and write table and page."""
     try:
         from needle_insertion.study import engine, page
         from needle_insertion.study.replay import replay

@@ -1,4 +1,4 @@
-"""`needle verify`: recorded runs computed again, beside what was recorded."""
+"""`needle verify`: compute recorded runs again and compare them with the recordings."""
 
 from __future__ import annotations
 
@@ -18,21 +18,20 @@ from tqdm import tqdm
 
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `needle verify`."""
     parser.add_argument('bags', type=Path, nargs='+', metavar='BAG', help='recording of a plant')
     parser.add_argument(
         '--tolerance',
         type=float,
         default=TOLERANCE,
-        metavar='PART',
-        help='largest difference, relative to the largest value of its topic and unit; a value '
-        f'that is rounded to counts may also differ by one count (default {TOLERANCE:g})',
+        metavar='FRACTION',
+        help='largest difference as a fraction of the largest value of its topic and unit; a '
+        f'value that is rounded to counts may also differ by one count (default {TOLERANCE:g})',
     )
     parser.add_argument('--json', action='store_true', help='print JSON instead of a table')
 
 
 def _run(options: argparse.Namespace) -> int:
-    """Verify each bag and print what was found; return 1 if a run differs, 2 if one is bad."""
+    """Verify each bag and print the results; return 1 if a run differs, 2 if a bag is unusable."""
     if not 0.0 <= options.tolerance < 1.0:
         raise ParameterError(f'--tolerance must be in [0, 1), got {options.tolerance}')
     results: list[Rerun] = []
@@ -50,7 +49,7 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _verified(path: Path, tolerance: float) -> list[Rerun]:
-    """Verify a bag; say what is wrong with it, and return nothing, if that cannot be done."""
+    """Verify a bag, or print the error and return an empty list."""
     try:
         return verify(path, tolerance)
     except (NeedleError, OSError) as error:

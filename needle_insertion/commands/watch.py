@@ -1,4 +1,4 @@
-"""`needle watch`: one page in a browser, of what is happening or of a bag."""
+"""`needle watch`: show a live insertion or a recorded bag on a page in a browser."""
 
 from __future__ import annotations
 
@@ -17,18 +17,17 @@ if TYPE_CHECKING:
     # Takes long to import.
     from needle_insertion.watch.server import Server
 
-#: What ends it.
+#: Signals that end the server.
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
-#: Address and port by default; the port is that of `watch.server`, which takes long to import.
+#: Default address and port, as in `watch.server`, which takes long to import.
 HOST, PORT = '127.0.0.1', 8642
 
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options of `needle watch`."""
     parser.description = (
-        'Show needle, forces, limits and what the nodes say on a page in a browser: live, or '
-        'from a bag.'
+        'Show needle, forces, limits and node messages on a page in a browser: live, or from a '
+        'bag.'
     )
     parser.add_argument(
         'bag', type=Path, nargs='?', metavar='BAG', help='recording to show (default: live)'
@@ -36,14 +35,14 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--control',
         action='store_true',
-        help='buttons: target, pause, retract, stop (default: looking only)',
+        help='buttons: target, pause, retract, stop (default: view only)',
     )
     parser.add_argument(
         '--host',
         default=HOST,
         metavar='ADDRESS',
-        help=f'address to listen on; another than {HOST} lets other machines look, and is not '
-        'for --control',
+        help=f'address to listen on; any address except {HOST} admits viewers from other '
+        'machines, and excludes --control',
     )
     parser.add_argument(
         '--port', type=int, default=PORT, help=f'port, 0 for a free one (default {PORT})'
@@ -51,10 +50,10 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(options: argparse.Namespace) -> int:
-    """Serve the page until a signal comes."""
+    """Serve the page until a signal arrives."""
     if options.bag is not None and options.control:
-        raise ParameterError('--control is for what is happening now: leave out it or the BAG')
-    # One that comes before the page is served, or again at the end, ends it as well.
+        raise ParameterError('--control needs a live insertion: omit --control or the BAG')
+    # A signal before the page is served, or a second signal at the end, also ends the command.
     with suppress(KeyboardInterrupt):
         asyncio.run(_recorded(options) if options.bag is not None else _live(options))
     return 0
@@ -89,7 +88,7 @@ async def _live(options: argparse.Namespace) -> None:
 
 
 async def _serve(server: Server, making: asyncio.Task[None] | None = None) -> None:
-    """Serve the page until a signal comes, or the frames end, which is an error."""
+    """Serve the page until a signal arrives; raise the error of the frame loop if it ends."""
     loop, ending = asyncio.get_running_loop(), asyncio.Event()
     for one in _SIGNALS:
         loop.add_signal_handler(one, ending.set)

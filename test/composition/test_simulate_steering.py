@@ -67,8 +67,8 @@ def test_a_membrane_and_a_start_on_the_way(capsys: pytest.CaptureFixture[str]) -
 @pytest.mark.parametrize(
     ('words', 'complaint'),
     [
-        (['--model', 'steering', '--force', '3'], '--force is of --model modes, not of steering'),
-        (['--to', '0.1'], '--to is of --model steering, not of modes'),
+        (['--model', 'steering', '--force', '3'], '--force is an option of --model modes, not of steering'),
+        (['--to', '0.1'], '--to is an option of --model steering, not of modes'),
         (['--model', 'steering', '--to', '0.3'], 'the needle reached 160 mm, where its hub stops'),
         (['--model', 'steering', '--speed', '0'], '--speed must be positive and finite'),
         (['--model', 'steering', '--depth', '0.2'], '--to must be beyond --depth'),
@@ -90,7 +90,7 @@ def test_bad_input_is_named(
     [
         ('depth,roll\n0,0\n0,1\n', 'depth must increase from row to row'),
         ('depth,force\n0,0\n1,1\n', 'must have the columns depth and any of guide_x'),
-        ('depth,roll\n0,0\n0.1,nan\n', 'has values that are no numbers'),
+        ('depth,roll\n0,0\n0.1,nan\n', 'has values that are not numbers'),
     ],
 )
 def test_bad_ways_are_named(

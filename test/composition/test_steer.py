@@ -92,7 +92,7 @@ def test_out_of_reach_is_said_before_or_on_the_way(
         (['--seed', '-1'], '--seed must be >= 0, got -1'),
         (['--target=0,-0.1,0'], 'with a depth Y > 0, got'),
         (['-o', 'needle.csv'], 'the picture must be .png'),
-        (['-o', '/no/such/folder/x.png'], 'the folder it is in does not exist'),
+        (['-o', '/no/such/folder/x.png'], 'its folder does not exist'),
     ],
 )
 def test_bad_input_is_one_line(

@@ -822,4 +822,4 @@ def test_options_that_exclude_each_other_are_refused(
 ) -> None:
     """A recording cannot be commanded."""
     assert cli.main(['watch', str(watched), '--control']) == 2
-    assert 'error: --control is for what is happening now' in capsys.readouterr().err
+    assert 'error: --control needs a live insertion' in capsys.readouterr().err
