@@ -1,1 +1,1 @@
-"""The protocols of the paper, run in a graph of nodes."""
+"""Run the experiments of the paper and the demo in a graph of nodes."""

@@ -1,4 +1,4 @@
-"""An insertion that is steered to a target beside the same one with a guide at rest."""
+"""Record, check and draw a steered insertion, and the same insertion with a guide at rest."""
 
 from __future__ import annotations
 
@@ -28,17 +28,17 @@ from needle_ros.base_node import COMMAND
 from needle_ros.timing import NANOSECONDS, nanoseconds
 import numpy as np
 
-#: Where the tip shall go, x, y, z [m], and inserted length at the start [m].
+#: Target of the tip, x, y, z [m], and insertion depth at the start [m].
 TARGET: Final = (4e-3, 0.1, -2e-3)
 START: Final = 5e-3
 
 #: Insertion speed [m/s].
 SPEED: Final = 0.02
 
-#: What is believed: needle and tissue.
+#: Nominal model of needle and tissue.
 PRESET: Final = {'model.preset': 'bending_35mm'}
 
-#: The plant: softer tissue than believed, a bevel, a path that strays, an EM tracker.
+#: Plant: tissue softer than the nominal model, bevel, random path deviation, EM tracker.
 PLANT: Final[dict[str, object]] = {
     **PRESET,
     'steered': True,
@@ -53,7 +53,7 @@ PLANT: Final[dict[str, object]] = {
     'tip.delay': 0.02,
 }
 
-#: The node that steers: half a look of the default, so that the demo is short.
+#: Node `steering`: half the default measurement time of the tip, for a short demo.
 STEERING: Final[dict[str, object]] = {
     **PRESET,
     'speed': SPEED,
@@ -63,7 +63,7 @@ STEERING: Final[dict[str, object]] = {
     'belief.noise': 6e-5,
 }
 
-#: The axis law.
+#: Node `controller`.
 CONTROLLER: Final[dict[str, object]] = {
     **PRESET,
     'rate': RATE,
@@ -72,21 +72,21 @@ CONTROLLER: Final[dict[str, object]] = {
     'reference.acceleration': 0.5,
 }
 
-#: A steered needle ends within this of its target [m]; one that nobody steers does not.
+#: Largest miss of the steered needle [m]; without steering the miss is larger.
 LARGEST_MISS: Final = 1e-3
 
-#: Largest squared distance of the tip from where it is said to be, in standard deviations: by
-#: chance one in a thousand is farther.
+#: Largest squared Mahalanobis distance of the tip from its estimate: quantile 0.999 of the
+#: chi-squared distribution with two degrees of freedom.
 _LARGEST: Final = 13.8
 
-#: Needles that are drawn, and frames of the needle that moves.
+#: Number of needles in the picture, and of frames in the animation.
 _DRAWN: Final = 5
 _FRAMES: Final = 80
 
-#: Longest simulated time of the insertion, and of the answer to a target [s].
+#: Timeout of the insertion, and of the answer to a target, in simulated time [s].
 _LONGEST, _ANSWER = 180.0, 2.0
 
-#: Half of an interval of 95 % over the standard deviation.
+#: Half-width of a 95 % interval over the standard deviation.
 _NORMAL: Final = 1.96
 
 
@@ -94,26 +94,10 @@ def record_aimed(
     bag: Path, logs: Path, show: Show, *, steered: bool, lockstep: bool = True
 ) -> None:
     """
-    Insert a needle to the target through real nodes, and record everything.
+    Insert a needle to the target with real nodes and record everything.
 
-    Parameters
-    ----------
-    bag : Path
-        Bag to write.
-    logs : Path
-        Folder for what the nodes print.
-    show : callable
-        Shows the progress.
-    steered : bool
-        Whether the node `steering` aims the tip; else the guide rests.
-    lockstep : bool
-        As for `SimulatedRun`.
-
-    Raises
-    ------
-    GraphError
-        If a node fails, stops, or the target is not reached in time.
-
+    `logs` is the folder of the node output. If not `steered`, the guide rests. Raises `GraphError`
+    if a node fails or stops, or the target depth is not reached in time.
     """
     with Graph(logs) as graph:
         run = SimulatedRun(graph, show, lockstep=lockstep)
@@ -128,7 +112,7 @@ def record_aimed(
                 waiting = False
                 aim(target_message(sample.stamp, TARGET))
             if steered and end == inf and _is_done(run.values.get('steering', {}), sample.time):
-                # The stamp of the last look; the time since the first sample.
+                # Stamp of the last tip measurement; time since the first sample.
                 last = nanoseconds(expected.message.header.stamp)
                 end = sample.time - (sample.stamp - last) / NANOSECONDS + SETTLING
             done = (sample.depth - START) / (TARGET[1] - START)
@@ -142,7 +126,7 @@ def record_aimed(
 
 
 def _is_done(values: Mapping[str, str], time: float) -> bool:
-    """Return whether the node `steering` reports the target depth, or raise what it reports."""
+    """Return whether `steering` has reached the target depth; raise `GraphError` on its errors."""
     phase = values.get('phase')
     if phase == Phase.STOPPED.value:
         raise GraphError(f'steering {values[""]}')
@@ -155,22 +139,12 @@ def _is_done(values: Mapping[str, str], time: float) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class Aimed:
-    """
-    How an insertion ended.
+    """Final tip position of an insertion, and its estimate."""
 
-    Attributes
-    ----------
-    tip : ndarray, shape (2,)
-        Where the tip is, x and z [m].
-    expected : ndarray, shape (2,)
-        Where it is said to be [m].
-    covariance : ndarray, shape (2, 2)
-        Covariance of that [m^2].
-
-    """
-
+    #: True and expected tip position, x and z, shape (2,) [m].
     tip: FloatArray
     expected: FloatArray
+    #: Covariance of the expected position, shape (2, 2) [m^2].
     covariance: FloatArray
 
     @property
@@ -180,7 +154,7 @@ class Aimed:
 
     @property
     def said(self) -> str:
-        """Where the tip is said to be, with an interval of 95 %."""
+        """Text of the expected tip position with its 95 % interval."""
         half = _NORMAL * np.sqrt(np.diag(self.covariance))
         return ', '.join(
             f'{name} = {1e3 * at:.2f} ± {1e3 * wide:.2f} mm'
@@ -189,32 +163,14 @@ class Aimed:
 
 
 def _tip(bag: Path) -> FloatArray:
-    """Return where the tip was at the end, x and z [m]."""
+    """Return the final tip position, x and z [m]."""
     *_, (_, last) = read_topic(bag, '/ground_truth')
     at = dict(zip(last.name, last.position, strict=True))
     return np.array([at['tip_x'], at['tip_z']])
 
 
 def read_aimed(bag: Path) -> Aimed:
-    """
-    Read how a steered insertion ended.
-
-    Parameters
-    ----------
-    bag : Path
-        The bag.
-
-    Returns
-    -------
-    Aimed
-        Tip, and what was said of it.
-
-    Raises
-    ------
-    RecordingError
-        If the bag is not readable or lacks a topic.
-
-    """
+    """Read the final tip position and its estimate from the bag of a steered insertion."""
     *_, (_, last) = read_topic(bag, '/tip_expected')
     pose = last.pose
     at = np.array([pose.pose.position.x, pose.pose.position.z])
@@ -224,23 +180,9 @@ def read_aimed(bag: Path) -> Aimed:
 
 def aiming_checks(bag: Path, other: Path) -> list[Check]:
     """
-    Check that the needle hits, that what is said of it holds, and that its run can be repeated.
+    Check the miss, the calibration of the expected tip, and the replay of the steered run.
 
-    Parameters
-    ----------
-    bag, other : Path
-        Bags of the steered insertion, and of that with a guide at rest.
-
-    Returns
-    -------
-    list of Check
-        One for each.
-
-    Raises
-    ------
-    NeedleError
-        If a bag cannot be used.
-
+    `other` is the bag of the insertion with a guide at rest.
     """
     found = read_aimed(bag)
     off = found.tip - found.expected
@@ -250,20 +192,18 @@ def aiming_checks(bag: Path, other: Path) -> list[Check]:
     x, z = 1e3 * found.tip
     return [
         Check(
-            'tip from its target, steered',
+            'distance of the tip from its target, steered',
             f'< {1e3 * LARGEST_MISS:g} mm',
             f'{1e3 * found.miss:.2f} mm',
             found.miss < LARGEST_MISS,
         ),
         Check(
-            'tip from its target, guide at rest',
+            'distance of the tip from its target, guide at rest',
             f'> {1e3 * LARGEST_MISS:g} mm',
             f'{1e3 * alone:.2f} mm',
             alone > LARGEST_MISS,
         ),
-        Check(
-            'what is said of the tip, steered', f'x = {x:.2f} mm, z = {z:.2f} mm', found.said, held
-        ),
+        Check('expected tip, steered', f'x = {x:.2f} mm, z = {z:.2f} mm', found.said, held),
         Check(
             'computed again from its bag, steered',
             'identical or within tolerance',
@@ -274,20 +214,7 @@ def aiming_checks(bag: Path, other: Path) -> list[Check]:
 
 
 def draw_aiming(bag: Path, other: Path) -> Figure:
-    """
-    Draw the steered needle on its way, its target, and the needle of a guide at rest.
-
-    Parameters
-    ----------
-    bag, other
-        As for `aiming_checks`.
-
-    Returns
-    -------
-    Figure
-        Both planes, to scale.
-
-    """
+    """Draw the steered needle and its target in both planes, and the needle of a guide at rest."""
     needles, path = read_needles(bag)
     at = np.linspace(0, len(needles) - 1, _DRAWN).round().astype(int).tolist()
     return draw_needle(
@@ -296,27 +223,14 @@ def draw_aiming(bag: Path, other: Path) -> Figure:
 
 
 def animate_aiming(bag: Path) -> Animation:
-    """
-    Return the steered needle on its way, to play on a page.
-
-    Parameters
-    ----------
-    bag : Path
-        Bag of the steered insertion.
-
-    Returns
-    -------
-    Animation
-        It has some 80 frames.
-
-    """
+    """Return an animation of the steered needle with some 80 frames."""
     recording = Recording(bag)
     times = np.linspace(0.0, recording.duration, _FRAMES).tolist()
     frames = [recording.view(time).frame(time) for time in times]
     return Animation(
-        'The steered needle on its way, to scale: it rests at each look at its tip (ring), then '
-        'the guide moves and the needle goes in. The bar at the target (cross) is where the tip '
-        'is expected there, with an interval of 95 %.',
+        'The steered needle during the insertion, to scale: the needle rests at each measurement '
+        'of its tip (ring), then the guide moves and the insertion continues. The bar at the '
+        'target (cross) is the expected tip position at the target depth, with a 95 % interval.',
         recording.view(recording.duration).scene,
         [frame for frame in frames if frame['needle']],
     )

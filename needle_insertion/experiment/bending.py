@@ -1,4 +1,4 @@
-"""An insertion of a needle that bends: guide and roll move, and what it recorded is judged."""
+"""Record, check and draw an insertion of a bending needle whose guide and roll move."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from needle_ros.errors import NeedleError
 import numpy as np
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-#: Needle and tissue, and its plant: a bevel that bends it, and a tracker in the tip.
+#: Preset of needle and tissue, and plant with a bevel load and a tracker in the tip.
 PRESET: Final = 'bending_35mm'
 PLANT: Final[dict[str, object]] = {
     'model.preset': PRESET,
@@ -37,41 +37,26 @@ PLANT: Final[dict[str, object]] = {
     'tip.delay': 0.02,
 }
 
-#: Joints that move, times [s], and where they then are [m, rad]: the guide goes aside early, and
-#: the needle is turned half way.
+#: Moving joints, and their trajectory: times [s] and positions [m, rad]. The guide is displaced
+#: early, and the needle is rotated by half a turn in the middle of the insertion.
 JOINTS: Final = ('guide_x', 'roll')
 COURSE: Final = ((1, (4e-3, 0.0)), (5, (4e-3, 0.0)), (6, (4e-3, pi)))
 
-#: A needle that bends has its tip this far off the axis at least [m].
+#: Least distance of the tip of a bending needle from the axis [m].
 LEAST_DEFLECTION: Final = 2e-3
 
-#: Largest distance of the bending length from the truth, in 95 % intervals.
+#: Largest error of the bending length, in half-widths of the 95 % interval.
 LARGEST_DISTANCE: Final = 2.0
 
-#: Needles that are drawn.
+#: Number of needles in the picture.
 _DRAWN: Final = 5
 
 
 def record_bending(bag: Path, logs: Path, show: Show, *, lockstep: bool = True) -> None:
     """
-    Drive a steered needle to the target, with a guide that moves, and record everything.
+    Insert a bending needle with a moving guide and record everything.
 
-    Parameters
-    ----------
-    bag : Path
-        Bag to write.
-    logs : Path
-        Folder for what the nodes print.
-    show : callable
-        Shows the progress.
-    lockstep : bool
-        As for `SimulatedRun`.
-
-    Raises
-    ------
-    GraphError
-        If a node fails.
-
+    `logs` is the folder of the node output. Raises `GraphError` if a node fails.
     """
     course = JointTrajectory(
         joint_names=list(JOINTS),
@@ -84,25 +69,7 @@ def record_bending(bag: Path, logs: Path, show: Show, *, lockstep: bool = True) 
 
 
 def bending_checks(bag: Path) -> list[Check]:
-    """
-    Check that the needle bends, that its run can be computed again, and what is identified.
-
-    Parameters
-    ----------
-    bag : Path
-        The bag.
-
-    Returns
-    -------
-    list of Check
-        One for each.
-
-    Raises
-    ------
-    NeedleError
-        If the bag cannot be used.
-
-    """
+    """Check the deflection, the replay of the run, and the identified bending length."""
     needle = NEEDLES[PRESET]
     truth = bending_length(needle.bending_stiffness, needle.tissue_stiffness)
     (tip, _) = read_needles(bag)
@@ -137,20 +104,7 @@ def bending_checks(bag: Path) -> list[Check]:
 
 
 def draw_bending(bag: Path) -> Figure:
-    """
-    Draw the needle on its way, as the plant has shown it.
-
-    Parameters
-    ----------
-    bag : Path
-        The bag.
-
-    Returns
-    -------
-    Figure
-        Both planes, to scale.
-
-    """
+    """Draw the needle during the insertion in both planes, to scale."""
     needles, path = read_needles(bag)
     at = np.linspace(0, len(needles) - 1, _DRAWN).round().astype(int).tolist()
     return draw_needle([needles[k] for k in at], path)
@@ -158,25 +112,10 @@ def draw_bending(bag: Path) -> Figure:
 
 def read_needles(bag: Path) -> tuple[list[FloatArray], FloatArray]:
     """
-    Read the needle as its plant has shown it.
+    Read the published shapes of the needle and the path that it cut.
 
-    Parameters
-    ----------
-    bag : Path
-        The bag.
-
-    Returns
-    -------
-    list of ndarray, shape (k, 3)
-        The needle now and then, without its straight part outside [m].
-    ndarray, shape (m, 3)
-        The path that it cut [m].
-
-    Raises
-    ------
-    NeedleError
-        If the bag has none.
-
+    Returns the needle at successive times, without its straight part outside, each of shape (k, 3)
+    [m], and the path, shape (m, 3) [m]. Raises `NeedleError` if the bag has no needle with a path.
     """
     needles, path = [], None
     for _, message in read_topic(bag, '/needle_shape'):

@@ -1,4 +1,4 @@
-"""Repeats of an experiment: the parameters of the simulated robot in each."""
+"""Parameters of the simulated robot in each repeat of an experiment."""
 
 from __future__ import annotations
 
@@ -19,33 +19,15 @@ _MOST_REPEATS: Final = 1000
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Campaign:
-    """
-    Repeats of one experiment.
-
-    Attributes
-    ----------
-    protocol : Protocol
-        What is done in each run.
-    repeats : int
-        Number of runs.
-    seed : int
-        Seed of the true values; run k, counted from zero, has sensor noise of the seed plus k.
-    rate : float
-        Samples per second [Hz].
-    fixed : bool
-        Take the means of the paper's tables in each run instead of values drawn around them.
-
-    Raises
-    ------
-    ParameterError
-        If a number is out of range.
-
-    """
+    """Repeats of one experiment."""
 
     protocol: Protocol
     repeats: int = EXPERIMENTS
+    #: Seed of the true values; the sensor noise of run k, from 0, has the seed plus k.
     seed: int = 2014
+    #: Sample rate [Hz].
     rate: float = 250.0
+    #: Use the means of the paper's tables in each run instead of sampled values.
     fixed: bool = False
 
     def __post_init__(self) -> None:
@@ -60,12 +42,12 @@ class Campaign:
 
     @property
     def runs(self) -> dict[str, dict[str, object]]:
-        """Parameters of the plant in each run, by the name of the bag."""
+        """Parameters of the plant in each run, by the name of its bag."""
         digits = max(2, len(str(self.repeats)))
         common = {
             **self.protocol.plant,
             'rate': self.rate,
-            # The plant wants a whole multiple of its own rate.
+            # The plant requires an integer multiple of its own rate.
             'sensor.rate': HIGHEST_RATE // self.rate * self.rate,
         }
         return {

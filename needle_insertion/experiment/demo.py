@@ -1,4 +1,4 @@
-"""The demo: insertion under control, and friction and stiffness identified, in one report."""
+"""Run the demo: insertions, identification of friction and stiffness, and one report."""
 
 from __future__ import annotations
 
@@ -60,11 +60,11 @@ from needle_insertion.report.page import write_page
 from needle_insertion.report.text import Check, CHECK_HEADS, table
 from needle_ros.errors import NeedleError
 
-#: Multiple of real time at which the experiments are recorded.
+#: Speed of the recorded experiments, as a multiple of real time.
 EXPERIMENT_SPEED: Final = 25.0
 
-#: Largest distance of a fresh estimate from the truth, in 95 % intervals, at every force. With new
-#: noise one of the 22 would exceed it once in some twenty runs, but the noise is always the same.
+#: Largest error of a fresh estimate at every force, in half-widths of the 95 % interval. With new
+#: noise one of the 22 estimates would exceed it in one of 20 runs, but the noise seed is fixed.
 LARGEST_DISTANCE: Final = 2.0
 
 _MARKER: Final = '.needle-demo'
@@ -79,34 +79,16 @@ _INTRODUCTION: Final = (
 
 
 class DemoError(NeedleError):
-    """The demo cannot run here."""
+    """The demo cannot run in this folder."""
 
 
 def run(output: Path, bags: Path, *, lockstep: bool = True) -> int:
     """
-    Run the demo.
+    Run the demo; return 0 if every check passed, else 1.
 
-    Parameters
-    ----------
-    output : Path
-        Folder for bags, logs, pictures and report. What an earlier demo left there is replaced.
-    bags : Path
-        Folder of the shipped recordings.
-    lockstep : bool
-        Whether the insertions run in lock-step: the same on any machine; else in real time.
-
-    Returns
-    -------
-    int
-        0 if every check passed, else 1.
-
-    Raises
-    ------
-    DemoError
-        If there are no shipped recordings, or the folder is not from a demo.
-    JobError
-        If a node fails.
-
+    An earlier demo in `output` is replaced. `bags` is the folder of the shipped recordings. In
+    lock-step the insertions are the same on any machine. Raises `DemoError` if there are no
+    shipped recordings or `output` is not from a demo, and `JobError` if a node fails.
     """
     shipped = {name: _shipped(bags, name) for name in PROTOCOLS}
     _clear(output)
@@ -123,7 +105,7 @@ def run(output: Path, bags: Path, *, lockstep: bool = True) -> int:
             logs = output / 'logs' / folder.name
             record_aimed(folder, logs, show, steered=steered, lockstep=lockstep)
     for name, protocol in PROTOCOLS.items():
-        # The same noise in each demo: the verdict does not depend on luck.
+        # The noise is the same in each demo, and so is the verdict.
         campaign = Campaign(protocol=protocol, repeats=1, seed=1, fixed=True)
         (parameters,) = campaign.runs.values()
         with Progress(f'{name} experiment') as show, rig(output, protocol) as running:
@@ -160,7 +142,7 @@ def run(output: Path, bags: Path, *, lockstep: bool = True) -> int:
             checks += _shipped_checks(f'{len(recorded)} shipped bags', recorded)
             checks += _fresh_checks(fresh)
         passed = sum(check.passed for check in checks)
-        # What needs attention comes first.
+        # Failed checks first.
         rows = [check.row for check in sorted(checks, key=lambda check: check.passed)]
         page = output / 'report.html'
         show('drawing')
@@ -170,11 +152,11 @@ def run(output: Path, bags: Path, *, lockstep: bool = True) -> int:
             title='Needle insertion: demo',
             introduction=_INTRODUCTION,
             cards=[
-                ('Checks', f'{passed} of {len(checks)} pass', 'true values beside what was found'),
+                ('Checks', f'{passed} of {len(checks)} pass', 'true values and results'),
                 (
                     'Steered',
                     f'{1e3 * read_aimed(aimed).miss:.2f} mm from its target',
-                    f'the tip is said to be at {read_aimed(aimed).said} (95 %)',
+                    f'expected tip at {read_aimed(aimed).said} (95 %)',
                 ),
             ],
             rows=rows,
@@ -196,7 +178,7 @@ def _shipped(bags: Path, name: str) -> list[Path]:
 
 
 def _clear(output: Path) -> None:
-    """Remove what an earlier demo left, and nothing else."""
+    """Remove the results of an earlier demo; reject any other folder."""
     if output.exists():
         if not (output / _MARKER).is_file():
             raise DemoError(f'{output} exists and is not from a demo; name another folder')
@@ -215,23 +197,23 @@ def _pictures(
     return [
         Picture(
             'bending',
-            'A needle that bends. On its way, about the path that it cuts, to scale: the bevel '
-            'pushes the tip along z until the needle is turned, and the guide has gone aside '
+            'Bending needle during the insertion, about the path that it cuts, to scale: the '
+            'bevel pushes the tip along z until the needle is rotated, and the guide is displaced '
             'along x.',
             draw_bending(bent),
         ),
         Picture(
             'steered',
-            'A needle that is steered to a target off the axis, in tissue that is softer than '
-            'believed, beside the same insertion with a guide at rest. To scale: the needle on '
-            'its way, about the path that it cuts, and its target.',
+            'Needle steered to a target off the axis, in tissue that is softer than the nominal '
+            'model, and the same insertion with a guide at rest. To scale: the needle during the '
+            'insertion, about the path that it cuts, and its target.',
             draw_aiming(*aimed),
         ),
         Picture(
             'insertion',
             'Insertion under both controllers. At the bottom, the tip sensor after the start: '
-            f'{START_DEFLECTION * 1e3:g} mm that ring at 2 kHz and fade. It averages over 1 ms, '
-            'which leaves little more than its noise.',
+            f'{START_DEFLECTION * 1e3:g} mm that ring at 2 kHz and decay. The sensor averages '
+            'over 1 ms, which leaves little more than its noise.',
             draw_insertions(insertions),
         ),
         Picture(
@@ -243,7 +225,7 @@ def _pictures(
         Picture(
             'presses',
             'Presses, fresh recording. Left: force against displacement of each press. Right: '
-            'where the end-effector came to rest, and where the fitted matrix puts it (ellipses).',
+            'rest positions of the end-effector, and those of the fitted matrix (ellipses).',
             stiffness_presses(stiffness),
         ),
         Picture(
@@ -256,7 +238,7 @@ def _pictures(
 
 
 def _known(bag: Path, comparisons: list[Comparison]) -> list[Comparison]:
-    """Require that the true values are known."""
+    """Require that the true values are available."""
     if any(one.truth is None for one in comparisons):
         raise DemoError(f'{bag} does not hold the configuration of its plant')
     return comparisons
@@ -270,7 +252,7 @@ def _by_symbol(comparisons: Sequence[Comparison]) -> Mapping[str, list[Compariso
 
 
 def _shipped_checks(source: str, bags: Sequence[Sequence[Comparison]]) -> list[Check]:
-    """Check how many of the 95 % intervals hold the true value of their own bag."""
+    """Check the number of 95 % intervals that contain the true value of their own bag."""
     checks = []
     for symbol, group in _by_symbol([one for bag in bags for one in bag]).items():
         found = Coverage.of(group)
@@ -286,7 +268,7 @@ def _shipped_checks(source: str, bags: Sequence[Sequence[Comparison]]) -> list[C
 
 
 def _fresh_checks(comparisons: Sequence[Comparison]) -> list[Check]:
-    """Check the distance from the truth in 95 % intervals, at the force where it is largest."""
+    """Check the error in half-widths of the 95 % interval, at the force of the largest error."""
     checks = []
     for symbol, group in _by_symbol(comparisons).items():
         worst = max(group, key=_distance)
@@ -308,7 +290,7 @@ def _half_width(one: Comparison) -> float:
 
 
 def _distance(one: Comparison) -> float:
-    """Return how many half intervals an estimate is from the truth."""
+    """Return the error of an estimate in half-widths of its 95 % interval."""
     if not one.estimate.determined or one.truth is None:
         return float('inf')
     return abs(one.estimate.value - one.truth) / _half_width(one)

@@ -1,4 +1,4 @@
-"""A controlled insertion of the simulated needle: recorded, read again, judged and drawn."""
+"""Record, read, check and draw a controlled insertion of the simulated needle."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from needle_ros.timing import NANOSECONDS, seconds
 import numpy as np
 from trajectory_msgs.msg import JointTrajectory
 
-#: The insertion: inserted length at the start and at the end [m], speed [m/s], sample rate [Hz].
+#: Insertion depth at the start and at the end [m], speed [m/s], sample rate [Hz].
 START_DEPTH, TARGET_DEPTH, SPEED, RATE = 0.02, 0.12, 0.010, 1000.0
 
 #: Tip deflection at the start [m], as in the paper's simulations.
@@ -30,35 +30,26 @@ START_DEFLECTION: Final = 5e-4
 COUNTED: Final = ('joint_states', 'base_wrench', 'tip_deflection', 'ground_truth')
 
 
-#: Time before the target is sent, in which all sensors report [s].
+#: Time before the target is sent, until all sensors have reported [s].
 WARM_UP: Final = 0.1
 
-#: Time that is recorded after the needle should have arrived: ramps, and the loop settles [s].
+#: Recorded time after the nominal arrival, for ramps and settling [s].
 SETTLING: Final = 1.6
 
 
 @dataclass(frozen=True, eq=False)
 class Insertion:
-    """
-    One recorded insertion.
-
-    Attributes
-    ----------
-    law : str
-        Name of the control law.
-    depth, reference, tip, force : ndarray, shape (2, n)
-        Times since the target was sent [s], and inserted length [m], its reference [m], tip
-        deflection [m] and commanded force [N] at these times.
-    completeness : dict
-        Messages in the bag over messages due, by topic of `COUNTED`.
-
-    """
+    """Curves of a recorded insertion, shape (2, n): times since the target [s], and values."""
 
     law: str
+    #: Insertion depth and its reference [m].
     depth: FloatArray
     reference: FloatArray
+    #: Tip deflection [m].
     tip: FloatArray
+    #: Commanded force [N].
     force: FloatArray
+    #: Recorded over expected number of messages, by topic of `COUNTED`.
     completeness: dict[str, float]
 
 
@@ -73,31 +64,11 @@ def record_insertion(
     lockstep: bool = True,
 ) -> None:
     """
-    Drive the simulated needle to the target under a law and record everything.
+    Insert the simulated needle to the target under a control law and record everything.
 
-    Parameters
-    ----------
-    law : str
-        Name of the control law.
-    bag : Path
-        Bag to write.
-    logs : Path
-        Folder for what the nodes print.
-    show : callable
-        Shows the progress.
-    plant : mapping of str to object, optional
-        Parameters of the plant, and of the controller as far as they are of the model; default
-        the needle of the paper, bent at the start.
-    course : JointTrajectory, optional
-        Motion of the guide of a steered needle, from the time of the target on.
-    lockstep : bool
-        As for `SimulatedRun`.
-
-    Raises
-    ------
-    GraphError
-        If a node fails.
-
+    `plant` holds parameters of the plant, of which ``model.*`` also go to the controller; default
+    is the needle of the paper, bent at the start. `course` moves the guide of a steered needle
+    from the time of the target on. Raises `GraphError` if a node fails.
     """
     with Graph(logs) as graph:
         run = SimulatedRun(graph, show, lockstep=lockstep)
@@ -126,22 +97,7 @@ def record_insertion(
 
 
 def target_message(stamp: int, point: tuple[float, float, float]) -> PointStamped:
-    """
-    Return a target.
-
-    Parameters
-    ----------
-    stamp : int
-        Its stamp [ns].
-    point : tuple of float
-        The target, x, y, z [m].
-
-    Returns
-    -------
-    PointStamped
-        The message.
-
-    """
+    """Return a target x, y, z [m] with a stamp [ns]."""
     message = PointStamped()
     message.header.frame_id = ENTRY
     message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp, NANOSECONDS)
@@ -150,27 +106,7 @@ def target_message(stamp: int, point: tuple[float, float, float]) -> PointStampe
 
 
 def read_insertion(law: str, bag: Path) -> Insertion:
-    """
-    Read what `record_insertion` recorded.
-
-    Parameters
-    ----------
-    law : str
-        Name of the control law.
-    bag : Path
-        The bag.
-
-    Returns
-    -------
-    Insertion
-        Times are since the target was sent.
-
-    Raises
-    ------
-    RecordingError
-        If the bag is not readable or lacks a topic.
-
-    """
+    """Read a recording of `record_insertion`."""
 
     def series(topic: str, value: Callable[[Any], float]) -> FloatArray:
         pairs = [(seconds(m.header.stamp), value(m)) for _, m in read_topic(bag, f'/{topic}')]
@@ -193,20 +129,7 @@ def read_insertion(law: str, bag: Path) -> Insertion:
 
 
 def insertion_checks(run: Insertion) -> list[Check]:
-    """
-    Check depth, overshoot, tracking error and number of messages of an insertion.
-
-    Parameters
-    ----------
-    run : Insertion
-        The insertion.
-
-    Returns
-    -------
-    list of Check
-        One for each.
-
-    """
+    """Check final depth, overshoot, tracking error and number of messages of an insertion."""
     law = run.law.replace('_', ' ')
     end, over = run.depth[1, -1] - TARGET_DEPTH, run.depth[1].max() - TARGET_DEPTH
     reference = np.interp(run.depth[0], *run.reference)
@@ -232,30 +155,17 @@ def insertion_checks(run: Insertion) -> list[Check]:
 
 
 def draw_insertions(runs: Sequence[Insertion]) -> Figure:
-    """
-    Draw depth, tracking error, force, and the tip deflection after the start.
-
-    Parameters
-    ----------
-    runs : sequence of Insertion
-        One for each of two control laws.
-
-    Returns
-    -------
-    Figure
-        Four plots.
-
-    """
+    """Draw depth, tracking error, force and tip deflection for two control laws."""
     figure = Figure(figsize=(9.0, 9.0), layout='constrained')
     axes = figure.subplots(4, 1)
-    labels = ('inserted length [mm]', 'tracking error [mm]', 'force [N]', 'tip deflection [mm]')
+    labels = ('insertion depth [mm]', 'tracking error [mm]', 'force [N]', 'tip deflection [mm]')
     for axis, label in zip(axes, labels, strict=True):
         axis.set_ylabel(label)
         axis.set_xlabel('time since the target was sent [s]')
         axis.grid(visible=True, alpha=0.3)
     time, reference = runs[0].reference
     axes[0].plot(time, reference * 1e3, 'k--', label='reference', zorder=3)
-    # The same values of both remain visible: the first line is broad, the second thin.
+    # A broad first line stays visible below an equal second line.
     for run, width in zip(runs, (3.0, 1.2), strict=True):
         time, reference = run.reference
         depth = np.interp(time, *run.depth)

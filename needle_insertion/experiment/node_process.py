@@ -1,4 +1,4 @@
-"""A node of the suite as a process."""
+"""Run a node of the suite as a process."""
 
 from __future__ import annotations
 
@@ -15,26 +15,15 @@ import yaml
 
 
 class GraphError(JobError):
-    """A node did not start, ended early, or did not do what was expected in time."""
+    """A node did not start, ended early, or timed out."""
 
 
 class NodeProcess:
     """
-    One node of the suite as a process.
+    One node of the suite, a key of `NODES`, as a process.
 
-    Parameters
-    ----------
-    name : str
-        A key of `NODES`.
-    parameters : Mapping[str, object]
-        Parameters by name.
-    environment : Mapping[str, str]
-        Environment with the domain.
-    log : file
-        Receives what the node prints.
-    file : Path, optional
-        ROS parameter file; what `parameters` says counts more.
-
+    `environment` selects the domain, `log` receives the output of the node, and `parameters`
+    override the ROS parameter file `file`.
     """
 
     def __init__(
@@ -61,15 +50,7 @@ class NodeProcess:
         )
 
     def check(self) -> None:
-        """
-        Require that the node runs.
-
-        Raises
-        ------
-        GraphError
-            With its last line of output, if it has ended.
-
-        """
+        """Raise `GraphError` with the last line of output if the node has ended."""
         status = self.process.poll()
         if status is not None:
             raise GraphError(
@@ -78,32 +59,19 @@ class NodeProcess:
 
     @property
     def last_line(self) -> str:
-        """The last line that the node has printed."""
+        """Last line of the node output."""
         self._log.flush()
         lines = Path(self._log.name).read_text(encoding='utf-8', errors='replace').splitlines()
         return lines[-1] if lines else ''
 
     def kill(self) -> None:
-        """End the node at once, as a crash does, and wait for it."""
+        """Kill the node, as in a crash, and wait for it."""
         self.killed = True
         self.process.kill()
         self.process.wait()
 
     def interrupt(self, timeout: float = 15.0) -> None:
-        """
-        End the node as Ctrl-C does, and wait for it.
-
-        Parameters
-        ----------
-        timeout : float
-            Longest time to wait [s].
-
-        Raises
-        ------
-        GraphError
-            If it does not end in time, or with an error.
-
-        """
+        """End the node with SIGINT; raise `GraphError` after a timeout [s] or an error."""
         self.process.send_signal(signal.SIGINT)
         try:
             status = self.process.wait(timeout)

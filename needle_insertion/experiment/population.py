@@ -1,5 +1,5 @@
 """
-True values of simulated needles and tissues, drawn so that they represent Tables 1 and 2.
+Sample true values of simulated needles and tissues that represent Tables 1 and 2.
 
 The tables give mean and standard deviation over 20 experiments. The values of the repeats form a
 Latin hypercube: with n repeats every quantity takes each of the quantiles (k + 1/2)/n once, in an
@@ -22,22 +22,7 @@ _POSITIVE: Final = ('k_xx', 'k_zz')
 
 
 def draw_friction(repeats: int, seed: int) -> list[dict[str, float]]:
-    """
-    Draw the friction of each repeat around Table 1.
-
-    Parameters
-    ----------
-    repeats : int
-        Number of repeats.
-    seed : int
-        The same seed gives the same values.
-
-    Returns
-    -------
-    list of dict
-        Values by the keys of `TABLE_1` [N], [N s/m].
-
-    """
+    """Sample the friction of each repeat around Table 1: values by its keys [N], [N s/m]."""
     quantiles = _hypercube(len(TABLE_1), repeats, np.random.default_rng(seed))
     drawn = [
         _positive(row, np.array(mean), np.array(deviation))
@@ -48,25 +33,12 @@ def draw_friction(repeats: int, seed: int) -> list[dict[str, float]]:
 
 def draw_stiffness(repeats: int, seed: int) -> list[dict[str, tuple[float, ...]]]:
     """
-    Draw the tissue stiffness of each place around Table 2.
+    Sample the tissue stiffness of each place around Table 2: values at `FORCE_LEVELS` [N/m].
 
     A place has one quantile per entry, used at all force levels: where the tissue is stiff, it is
     stiff under any force. At every level the symmetric part must be positive definite, or the
     tissue would release energy when it is pressed. A hypercube with a place that violates this is
     replaced by the next of the sequence of generators seeded (seed, 0), (seed, 1), ...
-
-    Parameters
-    ----------
-    repeats : int
-        Number of places.
-    seed : int
-        The same seed gives the same values.
-
-    Returns
-    -------
-    list of dict
-        Values at `FORCE_LEVELS` [N/m] by the keys of `TABLE_2`.
-
     """
     for attempt in count():
         quantiles = _hypercube(len(TABLE_2), repeats, np.random.default_rng((seed, attempt)))
@@ -95,5 +67,5 @@ def _normal(quantile: FloatArray, mean: FloatArray, deviation: FloatArray) -> Fl
 
 
 def _positive(quantile: FloatArray, mean: FloatArray, deviation: FloatArray) -> FloatArray:
-    """Return quantiles of the gamma distribution with that mean and standard deviation."""
+    """Return quantiles of the gamma distribution with this mean and standard deviation."""
     return np.asarray(gammaincinv((mean / deviation) ** 2, quantile) * deviation**2 / mean)

@@ -1,4 +1,4 @@
-"""Progress of a long job: its activity and the time since its start."""
+"""Show the progress of a long job: its activity and the elapsed time."""
 
 from __future__ import annotations
 
@@ -17,36 +17,18 @@ _CLEAR: Final = '\r\033[K'
 
 
 class Show(Protocol):
-    """Shows the activity of a job and the fraction of it that is done."""
+    """Callback that shows the activity of a job and the completed fraction."""
 
     def __call__(self, activity: str, fraction: float | None = None) -> None:
-        """
-        Show an activity.
-
-        Parameters
-        ----------
-        activity : str
-            In a few words.
-        fraction : float, optional
-            Fraction done.
-
-        """
+        """Show an activity in a few words, and the completed fraction."""
 
 
 class Progress:
     """
-    Writes the activity of a job with the elapsed time, also while its thread is busy.
+    Write the activity of a job with the elapsed time, also while its thread is busy.
 
     On a terminal it is one line that changes; elsewhere a line for each new activity, and one
-    every ten seconds.
-
-    Parameters
-    ----------
-    title : str
-        Name of the job.
-    stream : text file, optional
-        Where to write; the standard error by default.
-
+    every ten seconds. The default stream is stderr.
     """
 
     def __init__(self, title: str, stream: TextIO | None = None) -> None:
@@ -71,17 +53,9 @@ class Progress:
             self._stream.write('\n')
 
     def __call__(self, activity: str, fraction: float | None = None) -> None:
-        """
-        Take note of the activity; see `Show`.
-
-        Parameters
-        ----------
-        activity, fraction
-            As for `Show`.
-
-        """
+        """Set the activity, as `Show`."""
         self._text = activity if fraction is None else f'{activity} {100.0 * fraction:.0f} %'
-        # Numbers that change do not make it another activity.
+        # A changed number is not a new activity.
         before, self._kind = self._kind, re.sub(r'\d+', '', activity)
         if self._kind != before and not self._terminal:
             self._write()

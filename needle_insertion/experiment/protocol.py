@@ -1,4 +1,4 @@
-"""The experiments of sections 3.2.2.2 and 3.2.2.3: the commanded motion and force."""
+"""Commanded motion and force in the experiments of sections 3.2.2.2 and 3.2.2.3."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from needle_insertion.paper.tables import FORCE_LEVELS
 #: Recordings shipped with the source tree.
 SHIPPED_BAGS: Final = Path(__file__).parents[2] / 'bags'
 
-#: Inserted length at which the tip has passed the tissue, so that nothing is cut [m].
+#: Insertion depth at which the tip is past the tissue, so that nothing is cut [m].
 START_DEPTH: Final = 0.1
 
 #: Speeds of the strokes [m/s], in the range of manual insertion.
@@ -22,14 +22,14 @@ SPEEDS: Final = (0.002, 0.005, 0.010, 0.015, 0.020)
 #: Time of one stroke, and of a rest [s].
 STROKE_TIME, REST_TIME = 0.75, 0.15
 
-#: Time in which a stroke reaches its speed, and comes to rest [s], and the number of steps.
+#: Acceleration and deceleration time of a stroke [s], and its number of steps.
 EASE_TIME, _EASE_STEPS = 0.05, 5
 
-#: The push that finds the break-away force: its largest force [N], which moves every needle drawn,
-#: its duration, and the time to come back [s].
+#: Push that determines the break-away force: its largest force [N], which moves every sampled
+#: needle, its duration, and the return time [s].
 PUSH, PUSH_TIME, RETURN_TIME = 1.0, 1.5, 0.25
 
-#: Directions in which the tissue is pressed, evenly around the circle.
+#: Number of directions of the presses, evenly around the circle.
 DIRECTIONS: Final = 8
 
 #: Times of one press [s]: force up or down, force held, at rest.
@@ -41,7 +41,7 @@ FASTEST: Final = 100.0
 
 
 class Point(NamedTuple):
-    """A point of the commanded trajectory: motion where it has positions, else force."""
+    """Point of the commanded trajectory: motion if it has positions, else force."""
 
     time: float
     positions: tuple[float, ...] = ()
@@ -50,28 +50,17 @@ class Point(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Protocol:
-    """
-    One experiment on the simulated robot.
+    """One experiment on the simulated robot."""
 
-    Attributes
-    ----------
-    name : str
-        First part of the names of its bags.
-    joints : tuple of str
-        Joints that the points command.
-    points : tuple of Point
-        The trajectory: times [s], inserted length [m], force [N].
-    motion : str
-        Topic of the motion, sampled as often as ``/base_wrench``.
-    plant : mapping
-        Parameters of the plant, its mode among them.
-
-    """
-
+    #: First part of the names of its bags.
     name: str
+    #: Commanded joints.
     joints: tuple[str, ...]
+    #: Trajectory: times [s], insertion depths [m], forces [N].
     points: tuple[Point, ...]
+    #: Topic of the motion, sampled as often as ``/base_wrench``.
     motion: str
+    #: Parameters of the plant, with its mode.
     plant: Mapping[str, object]
 
     @property
@@ -86,13 +75,13 @@ class Protocol:
 
     @property
     def topics(self) -> tuple[str, ...]:
-        """Topics of a bag: what identification needs, the commands and the configuration."""
+        """Topics of a bag: inputs of the identification, commands and configuration."""
         return *self.sampled, '/joint_trajectory', '/plant/configuration'
 
 
 def _friction_points() -> tuple[Point, ...]:
     """
-    Return the protocol of section 3.2.2.2, the tip past the tissue.
+    Return the protocol of section 3.2.2.2, with the tip past the tissue.
 
     A force that rises from zero pushes the base until the needle has moved. Then the base moves
     back, and makes one stroke in and one out at each of `SPEEDS`, with rests. Strokes begin and
@@ -114,7 +103,7 @@ def _friction_points() -> tuple[Point, ...]:
 
 
 def _travel(time: float, speed: float) -> float:
-    """Return how far a stroke is [m] after a time [s]; its speed rises and falls linearly."""
+    """Return the distance in a stroke [m] after a time [s]; the speed rises and falls linearly."""
     begun, left = min(time, EASE_TIME), min(STROKE_TIME - time, EASE_TIME)
     steady = time - begun - (EASE_TIME - left)
     return speed * (steady + (begun**2 + EASE_TIME**2 - left**2) / (2.0 * EASE_TIME))
@@ -161,18 +150,5 @@ PROTOCOLS: Final[Mapping[str, Protocol]] = {
 
 
 def indenter_name(entry: str) -> str:
-    """
-    Return the name that the indenter has for an entry of the stiffness matrix.
-
-    Parameters
-    ----------
-    entry : str
-        Such as ``k_xx``.
-
-    Returns
-    -------
-    str
-        Such as ``stiffness_xx``.
-
-    """
+    """Return the indenter parameter of a stiffness entry: ``stiffness_xx`` for ``k_xx``."""
     return entry.replace('k_', 'stiffness_')

@@ -1,4 +1,4 @@
-"""Recording the runs of a campaign through real nodes, one bag each."""
+"""Record the runs of a campaign with real nodes, one bag each."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from rclpy.parameter_client import AsyncParameterClient
 from tqdm import tqdm
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-#: Longest time without a sample, on a busy machine, and time between two checks for the end [s].
+#: Timeout of a sample on a busy machine, and period of the checks for the end [s].
 _STALL, _CHECK = 60.0, 0.05
 
 
@@ -35,29 +35,11 @@ class ExperimentError(JobError):
 
 def record(campaign: Campaign, folder: Path, speed: float = SPEED) -> list[Path]:
     """
-    Record the runs of a campaign that a folder does not hold yet.
+    Record the missing runs of a campaign, and return all its bags in order.
 
-    Parameters
-    ----------
-    campaign : Campaign
-        What to record.
-    folder : Path
-        Folder of the bags. Other files in it are left alone.
-    speed : float
-        Multiple of real time.
-
-    Returns
-    -------
-    list of Path
-        All bags of the campaign, in order.
-
-    Raises
-    ------
-    ParameterError
-        If the folder holds something else under the name of a bag. Nothing is recorded then.
-    GraphError, ExperimentError
-        If a node fails, or samples are lost in real time too. Finished bags are kept.
-
+    `speed` is a multiple of real time. Raises `ParameterError`, before any recording, if the
+    folder holds other data under the name of a bag; `GraphError` or `ExperimentError` if a node
+    fails or samples are lost even in real time. Completed bags and other files are kept.
     """
     runs, protocol = campaign.runs, campaign.protocol
     missing = [
@@ -81,24 +63,9 @@ def record(campaign: Campaign, folder: Path, speed: float = SPEED) -> list[Path]
 
 @contextmanager
 def rig(folder: Path, protocol: Protocol) -> Iterator[Rig]:
-    """
-    Start a plant and a recorder for any number of runs of a protocol.
-
-    Parameters
-    ----------
-    folder : Path
-        Folder of the bags; unfinished ones are in a hidden folder beside them.
-    protocol : Protocol
-        What each run does.
-
-    Yields
-    ------
-    Rig
-        Ready to record.
-
-    """
+    """Start a plant and a recorder for runs of a protocol; drafts are in a hidden folder."""
     drafts = folder / f'.{protocol.name}.unfinished'
-    # An earlier call that was killed may have left it.
+    # Left by an earlier call that was killed.
     shutil.rmtree(drafts, ignore_errors=True)
     drafts.mkdir(parents=True)
     try:
@@ -112,15 +79,7 @@ class Rig:
     """
     The simulated robot and a recorder, which record one run after the other.
 
-    Parameters
-    ----------
-    graph : Graph
-        The graph in which they run.
-    draft : Path
-        Folder of the first bag during recording; that of bag k ends in ``_k``.
-    protocol : Protocol
-        What each run does.
-
+    `draft` is the folder of the first bag during recording; the name of bag k ends in ``_k``.
     """
 
     def __init__(self, graph: Graph, draft: Path, protocol: Protocol) -> None:
@@ -144,27 +103,12 @@ class Rig:
         progress: Callable[[float], None] = lambda _fraction: None,
     ) -> None:
         """
-        Run the protocol once; the bag appears when it is complete.
+        Run the protocol once, and move the complete bag to a folder that must not exist.
 
-        Parameters
-        ----------
-        bag : Path
-            Folder of the bag; must not exist.
-        parameters : mapping
-            Parameters of the plant by name.
-        speed : float
-            Multiple of real time. If samples are lost, the run is repeated at half of it, and so
-            on down to real time: a bag lacks no sample, and is the same on any machine.
-        progress : callable
-            Called with the fraction done.
-
-        Raises
-        ------
-        GraphError
-            If a node fails.
-        ExperimentError
-            If samples are lost in real time too.
-
+        `speed` is a multiple of real time. If samples are lost, the run is repeated at half the
+        speed, and so on down to real time: a bag lacks no sample, and is the same on any machine.
+        `progress` receives the completed fraction. Raises `ExperimentError` if samples are lost in
+        real time too.
         """
         factor = speed
         while True:
@@ -175,7 +119,7 @@ class Rig:
                 return
             said = f'{bag}: {lost} at {factor:g} times real time'
             if factor <= 1.0:
-                raise ExperimentError(f'{said}; ask for a lower --rate')
+                raise ExperimentError(f'{said}; choose a lower --rate')
             tqdm.write(said, file=sys.stderr)
             factor = max(1.0, factor / 2.0)
 
@@ -189,14 +133,14 @@ class Rig:
         graph.spin_until(answer.done, 'the answer of plant')
         for result in answer.result().results:
             if not result.successful:
-                raise ExperimentError(f'plant refused its parameters: {result.reason}')
+                raise ExperimentError(f'plant rejected its parameters: {result.reason}')
         graph.change(node, 'plant', CONFIGURE)
-        # Only the plant listens: the recorder has ended its earlier subscriptions.
+        # The plant is the only subscriber: the recorder has ended its earlier subscriptions.
         graph.spin_until(lambda: self._trajectory.get_subscription_count() == 1, 'the plant')
         graph.change(node, 'recorder', ACTIVATE)
         self._recordings += 1
-        # The plant starts when the recorder listens and the trajectory has arrived: then the bag
-        # holds every sample. This process listens to the wrench, too.
+        # The plant starts after the recorder has subscribed and the trajectory has arrived: the
+        # bag holds every sample. This process also subscribes to the wrench.
         graph.spin_until(
             lambda: (
                 self._trajectory.get_subscription_count() == 2
@@ -219,7 +163,7 @@ class Rig:
             progress(min(elapsed / protocol.duration, 1.0))
             return elapsed > protocol.duration
 
-        # The stamps decide, at any speed; simulated time may fall behind on a busy machine.
+        # The end is determined by stamps: simulated time may fall behind on a busy machine.
         graph.spin_until(
             done,
             'the next sample',
@@ -235,7 +179,7 @@ class Rig:
 
 
 def _move(draft: Path, bag: Path) -> None:
-    """Give a bag its final name, also in its metadata."""
+    """Rename a bag, also in its metadata."""
     old, new = f'{draft.name}_0.mcap', f'{bag.name}_0.mcap'
     (draft / old).rename(draft / new)
     metadata = draft / 'metadata.yaml'
@@ -256,7 +200,7 @@ def _trajectory(protocol: Protocol) -> JointTrajectory:
 
 
 def _lost(bag: Path, protocol: Protocol, rate: float) -> str:
-    """Say which samples a recorded run lacks, '' if none."""
+    """Return a description of the missing samples of a recorded run, '' if it is complete."""
     counts = message_counts(bag)
     for topic in protocol.topics:
         if not counts.get(topic):
@@ -273,7 +217,7 @@ def _lost(bag: Path, protocol: Protocol, rate: float) -> str:
 
 
 def _is_finished(bag: Path, protocol: Protocol, parameters: Mapping[str, Any]) -> bool:
-    """Tell whether a run is there; raise `ParameterError` if something else has its name."""
+    """Return whether a run is recorded; raise `ParameterError` if its name is taken."""
     if not bag.exists():
         return False
     try:
@@ -287,7 +231,7 @@ def _is_finished(bag: Path, protocol: Protocol, parameters: Mapping[str, Any]) -
     for name, value in parameters.items():
         if found.get(name) != value:
             raise ParameterError(
-                f'{bag} was recorded with {name} = {found.get(name)}, asked for is {value}; name '
+                f'{bag} was recorded with {name} = {found.get(name)}, requested is {value}; name '
                 'another folder'
             )
     if commanded != [_points(_trajectory(protocol))]:

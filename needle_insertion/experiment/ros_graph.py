@@ -1,4 +1,4 @@
-"""A private ROS graph: nodes as processes on a domain of their own, and nodes to watch them."""
+"""Run a private ROS graph: nodes as processes on their own domain, and nodes of this process."""
 
 from __future__ import annotations
 
@@ -32,31 +32,23 @@ ACTIVATE = Transition.TRANSITION_ACTIVATE
 DEACTIVATE = Transition.TRANSITION_DEACTIVATE
 CLEANUP = Transition.TRANSITION_CLEANUP
 
-#: Longest start of a node, with everything to compile on a busy machine [s].
+#: Timeout of the start of a node, with compilation on a busy machine [s].
 _START: Final = 180.0
 
-#: Time after which a node is asked for its state again [s].
+#: Period of the requests for the state of a node [s].
 _ASK: Final = 0.2
 
-#: Time in which the nodes may end by themselves at the end of a graph [s].
+#: Timeout of the clean end of the nodes, before they are killed [s].
 _PATIENCE: Final = 3.0
 
 
 class Graph:
     """
-    A ROS graph on a free domain, on this machine only; leaving it ends all its processes.
+    A ROS graph on a free domain of this machine; leaving the context ends all its processes.
 
-    Parameters
-    ----------
-    logs : Path
-        Folder for what the nodes print.
-    executor : type of executor
-        Runs the nodes of this process in the thread of the caller: an error in a callback is an
-        error of the caller.
-    shared : bool
-        Whether it is the domain of the user instead, with whoever else is on it, and open to
-        other machines if the environment says so.
-
+    `logs` is the folder of the node output. The executor runs the nodes of this process in the
+    thread of the caller, so that an error in a callback is an error of the caller. If `shared`,
+    the graph is on the domain of the user, open to other machines as set in the environment.
     """
 
     def __init__(
@@ -75,7 +67,7 @@ class Graph:
         self._life_cycles: dict[str, Client] = {}
 
     def __enter__(self) -> Graph:
-        # The context of this process reads the environment too.
+        # The context of this process also reads the environment.
         if self._shared:
             stay_local(os.environ)
             self._domain: AbstractContextManager[int] = nullcontext(domain_of(os.environ))
@@ -103,10 +95,10 @@ class Graph:
             self._nodes.clear()
             self._life_cycles.clear()
             del self.executor
-            # rclpy's nodes are in reference cycles. Until these are collected DDS keeps the nodes
-            # in the domain, where the next graph would find them.
+            # rclpy nodes are in reference cycles. Until the cycles are collected DDS keeps the
+            # nodes in the domain, where the next graph would discover them.
             gc.collect()
-            # Asked first: a recorder closes its bag.
+            # SIGTERM first: a recorder closes its bag.
             for started in self._processes:
                 if started.process.poll() is None:
                     started.process.terminate()
@@ -115,7 +107,7 @@ class Graph:
                 with suppress(subprocess.TimeoutExpired):
                     started.process.wait(max(0.0, deadline - time.monotonic()))
         finally:
-            # Kill all before waiting for any: a second interrupt may come while waiting.
+            # Kill all before waiting: a second interrupt may arrive during the wait.
             for started in self._processes:
                 if started.process.poll() is None:
                     started.process.kill()
@@ -126,66 +118,19 @@ class Graph:
             self._domain.__exit__(*raised)
 
     def add(self, kind: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
-        """
-        Make a node in this process.
-
-        Parameters
-        ----------
-        kind : callable
-            Its class.
-        *arguments, **options : object
-            Arguments of the class, besides the context.
-
-        Returns
-        -------
-        Node
-            Spun by `spin_until`.
-
-        """
+        """Create a node of a class in this process, spun by `spin_until`."""
         node = kind(*arguments, context=self.context, **options)
         self._nodes.append(node)
         self.executor.add_node(node)
         return node
 
     def node(self, name: str) -> Node:
-        """
-        Make a plain node in this process, to watch and to command.
-
-        Parameters
-        ----------
-        name : str
-            Its name.
-
-        Returns
-        -------
-        Node
-            Spun by `spin_until`.
-
-        """
+        """Create a plain node in this process, spun by `spin_until`."""
         node: Node = self.add(Node, name)
         return node
 
     def latest(self, node: Node, kind: type, topic: str, qos: QoSProfile) -> SimpleNamespace:
-        """
-        Watch a topic for its newest message.
-
-        Parameters
-        ----------
-        node : Node
-            Node of this process that subscribes.
-        kind : type
-            Message type.
-        topic : str
-            Name of the topic.
-        qos : QoSProfile
-            Quality of service.
-
-        Returns
-        -------
-        SimpleNamespace
-            Its ``message`` is the newest one; None before the first.
-
-        """
+        """Subscribe to a topic; the result has the newest message, or None, as ``message``."""
         latest = SimpleNamespace(message=None)
         node.create_subscription(kind, topic, partial(setattr, latest, 'message'), qos)
         return latest
@@ -196,24 +141,7 @@ class Graph:
         parameters: Mapping[str, object] | None = None,
         file: Path | None = None,
     ) -> NodeProcess:
-        """
-        Start a node of the suite as a process.
-
-        Parameters
-        ----------
-        name : str
-            A key of `NODES`.
-        parameters : Mapping[str, object], optional
-            Parameters by name.
-        file : Path, optional
-            ROS parameter file; what `parameters` says counts more.
-
-        Returns
-        -------
-        NodeProcess
-            The process.
-
-        """
+        """Start a node of `NODES` as a process; `parameters` override the ROS parameter file."""
         self._logs.mkdir(parents=True, exist_ok=True)
         # The process writes to it until the graph closes it.
         log = (self._logs / f'{name}.log').open('a', encoding='utf-8')
@@ -223,29 +151,14 @@ class Graph:
         return process
 
     def wait_for(self, node: Node, name: str) -> None:
-        """
-        Wait until a node of the suite answers a node of this process.
-
-        Parameters
-        ----------
-        node : Node
-            Node of this process, with all its clients.
-        name : str
-            Name of the other node.
-
-        Raises
-        ------
-        GraphError
-            If it does not.
-
-        """
+        """Wait until a node of the suite answers a node of this process with all its clients."""
         if name in self._life_cycles:
             return
         self._life_cycles[name] = node.create_client(ChangeState, f'{name}/change_state')
         probe = node.create_client(GetState, f'{name}/get_state')
         self.spin_until(probe.service_is_ready, f'the node {name}', _START)
-        # The answer to a client that the other side does not know yet is lost. Clients become
-        # known in the order in which they were made: once the last has an answer, all will.
+        # A response to a client that the server has not discovered is lost. Clients are discovered
+        # in the order of their creation: once the last has a response, all will.
         answers: list[Future] = []
         start = time.monotonic()
 
@@ -260,24 +173,7 @@ class Graph:
     def wait_active(
         self, node: Node, name: str, show: Callable[[str], object] = lambda _name: None
     ) -> None:
-        """
-        Wait until a node that starts by itself is active.
-
-        Parameters
-        ----------
-        node : Node
-            Node of this process.
-        name : str
-            Name of the other node.
-        show : callable
-            Called with the name while it is not active.
-
-        Raises
-        ------
-        GraphError
-            If it ends, or is not active in time.
-
-        """
+        """Wait until a node with automatic start is active; call `show` with its name."""
         show(name)
         self.wait_for(node, name)
         client = node.create_client(GetState, f'{name}/get_state')
@@ -298,24 +194,7 @@ class Graph:
         node.destroy_client(client)
 
     def change(self, node: Node, name: str, *transitions: int) -> None:
-        """
-        Change the life cycle state of a node that was started without ``autostart``.
-
-        Parameters
-        ----------
-        node : Node
-            Node of this process that asks for it.
-        name : str
-            Name of the other node.
-        *transitions : int
-            `CONFIGURE`, `ACTIVATE`, `DEACTIVATE` or `CLEANUP`, in order.
-
-        Raises
-        ------
-        GraphError
-            If a transition fails.
-
-        """
+        """Execute lifecycle transitions of a node that was started without ``autostart``."""
         self.wait_for(node, name)
         client = self._life_cycles[name]
         for transition in transitions:
@@ -323,7 +202,7 @@ class Graph:
             self.spin_until(answer.done, f'the answer of {name}', _START)
             if not answer.result().success:
                 said = [p.last_line for p in self._processes if p.name == name]
-                raise GraphError(f'{name} refused to start: {"".join(said[-1:])}')
+                raise GraphError(f'{name} failed to start: {"".join(said[-1:])}')
 
     def spin_until(
         self,
@@ -334,27 +213,11 @@ class Graph:
         period: float = 0.0,
     ) -> None:
         """
-        Run the nodes of this process until a condition holds.
+        Spin the nodes of this process until a condition holds.
 
-        Parameters
-        ----------
-        condition : callable
-            Returns whether it holds.
-        what : str
-            What is waited for, for the message.
-        timeout : float
-            Longest time to wait [s].
-        sign : callable
-            The time begins again whenever its result changes: a sign of progress.
-        period : float
-            Time between two checks of the condition [s]; 0 for one after each event, which costs
-            more.
-
-        Raises
-        ------
-        GraphError
-            If it does not hold in time, or a process of the graph has ended.
-
+        The timeout [s] restarts when the result of `sign` changes. With a `period` of 0 the
+        condition is checked after each event, which costs more CPU time. Raises `GraphError` with
+        the name `what` on a timeout, and if a process of the graph has ended.
         """
         deadline, seen = time.monotonic() + timeout, sign()
         while not condition():
@@ -365,7 +228,7 @@ class Graph:
                 if started.process.poll() not in (None, 0) and not started.killed:
                     started.check()
             if time.monotonic() > deadline:
-                raise GraphError(f'{what} did not come within {timeout:g} s')
+                raise GraphError(f'timeout after {timeout:g} s: waiting for {what}')
             if period:
                 self.executor.spin_until_future_complete(Future(), timeout_sec=period)
             else:

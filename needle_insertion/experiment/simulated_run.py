@@ -1,4 +1,4 @@
-"""A run of the simulated nodes whose course depends on simulated time only, on any machine."""
+"""Run simulated nodes in lock-step, so that the result depends on simulated time only."""
 
 from __future__ import annotations
 
@@ -21,62 +21,36 @@ from rclpy.publisher import Publisher
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
 
-#: Value of /diagnostics of a plant: number of nodes that it waits for.
+#: Key on /diagnostics of a plant: number of nodes in lock-step.
 IN_LOCKSTEP: Final = 'nodes in lock-step'
 
-#: Longest time in which a message arrives, on a busy machine [s].
+#: Timeout of the arrival of a message on a busy machine [s].
 _ARRIVAL: Final = Duration(seconds=30.0)
 
-#: Longest time without a sample, on a busy machine [s].
+#: Timeout of a sample on a busy machine [s].
 _STALL: Final = 60.0
 
-#: Time between two checks whether the run has ended [s].
+#: Period of the checks for the end of the run [s].
 _CHECK: Final = 0.05
 
 
 class Sample(NamedTuple):
-    """
-    A sample of the plant.
+    """A sample of the plant."""
 
-    Attributes
-    ----------
-    stamp : int
-        Its stamp [ns].
-    time : float
-        Time since the first one [s].
-    depth : float
-        Insertion depth [m].
-
-    """
-
+    #: [ns].
     stamp: int
+    #: Time since the first sample [s].
     time: float
+    #: Insertion depth [m].
     depth: float
 
 
 class Witness:
     """
-    Acts at samples of a plant.
+    Call a function at each sample of a plant, until it returns False.
 
-    A plant in lock-step waits at each sample until that has been done, and for good from the
-    sample on at which there is nothing more to do until `release`.
-
-    Parameters
-    ----------
-    node : Node
-        Node of this process.
-    act : callable
-        Called with each sample; returns whether time goes on.
-    lockstep : bool
-        Whether the plant runs in lock-step.
-
-    Attributes
-    ----------
-    stamp : int
-        Stamp of the newest sample [ns].
-    ended : bool
-        Whether there is nothing more to do.
-
+    A plant in lock-step waits at each sample until the call has returned, and without end after
+    the call that returned False, until `release`. `stamp` is the stamp of the newest sample [ns].
     """
 
     def __init__(self, node: Node, act: Callable[[Sample], bool], *, lockstep: bool) -> None:
@@ -95,13 +69,13 @@ class Witness:
 
     @property
     def is_matched(self) -> bool:
-        """Whether there is a plant."""
+        """Whether a plant publishes samples."""
         return bool(self._samples.get_publisher_count())
 
     def release(self) -> None:
-        """Let the plant go on alone."""
+        """End the subscription: the plant no longer waits for this process."""
         self._node.destroy_subscription(self._samples)
-        # A sample that was received before is still passed on.
+        # Samples in the queue are still delivered.
         processed, self._processed = self._processed, None
         if processed is not None:
             self._node.destroy_publisher(processed)
@@ -123,53 +97,21 @@ class Witness:
 
 class SimulatedRun:
     """
-    Starts nodes and a plant, acts at samples of the plant, and records everything.
+    Start nodes and a plant, act at samples of the plant, and record everything.
 
-    In lock-step the plant waits at each sample until it has been acted upon and all messages of
-    that have arrived: whatever is sent arrives at the same sample on any machine.
-
-    Parameters
-    ----------
-    graph : Graph
-        The graph.
-    show : callable
-        Shows the progress.
-    lockstep : bool
-        Whether the plant runs in lock-step; else in real time.
-
-    Attributes
-    ----------
-    node : Node
-        Node of this process.
-    values : dict
-        Values that each node published last on /diagnostics, by its name; its message is that
-        of the empty name.
-
+    In lock-step the plant waits at each sample until the action is complete and all its messages
+    have arrived: a message arrives at the same sample on any machine.
     """
 
     def __init__(self, graph: Graph, show: Show, *, lockstep: bool = True) -> None:
         self._graph, self._show, self._lockstep = graph, show, lockstep
         self.node = node = graph.node('demo')
+        #: Latest values of each node on /diagnostics by its name; key of its message: empty.
         self.values: dict[str, dict[str, str]] = {}
         node.create_subscription(DiagnosticArray, contract.DIAGNOSTICS.name, self._hear, 10)
 
     def publisher(self, kind: type, topic: str) -> Callable[[Any], None]:
-        """
-        Offer a topic.
-
-        Parameters
-        ----------
-        kind : type
-            Message type.
-        topic : str
-            Its name.
-
-        Returns
-        -------
-        callable
-            Publishes a message and waits until it has arrived everywhere.
-
-        """
+        """Create a publisher; return a function that publishes and waits for all subscribers."""
         publisher = self.node.create_publisher(kind, topic, COMMAND)
 
         def publish(message: Any) -> None:
@@ -185,24 +127,7 @@ class SimulatedRun:
         nodes: Mapping[str, Mapping[str, object]],
         act: Callable[[Sample], bool],
     ) -> None:
-        """
-        Run the nodes until there is nothing more to do.
-
-        Parameters
-        ----------
-        bag : Path
-            Bag to write.
-        nodes : mapping
-            Parameters of each node by its name, the plant last.
-        act : callable
-            Called with each sample; returns whether to go on.
-
-        Raises
-        ------
-        GraphError
-            If a node fails.
-
-        """
+        """Record the nodes, the plant last, until `act`, called at each sample, returns False."""
         graph, node = self._graph, self.node
         witness = Witness(node, act, lockstep=self._lockstep)
         started = [graph.start('recorder', {'path': str(bag)})]
@@ -214,7 +139,7 @@ class SimulatedRun:
             graph.wait_active(node, one.name, self._show_start)
         self._show('starting plant')
         graph.change(node, 'plant', CONFIGURE)
-        # The bag has every sample, and every sample is waited for.
+        # The bag must contain every sample, and lock-step must include all nodes.
         participants = str(self._lockstep * (2 + ('steering' in nodes)))
         graph.spin_until(
             lambda: (
@@ -236,7 +161,7 @@ class SimulatedRun:
             one.interrupt()
 
     def _show_start(self, name: str) -> None:
-        """Show that a node starts, and what it reports meanwhile."""
+        """Show the starting node and its status."""
         said = self.values.get(name, {}).get('', '')
         self._show(f'starting {name}' + (f': {said}' if said else ''))
 

@@ -1,5 +1,5 @@
 """
-Environments for reinforcement learning: `NeedleInsertion-v0` and `NeedleSteering-v0`.
+Register the reinforcement learning environments `NeedleInsertion-v0`, `NeedleSteering-v0`.
 
 Gymnasium finds them by ``needle_insertion.gym:NeedleSteering-v0`` (extra ``gym``).
 """

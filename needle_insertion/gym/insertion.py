@@ -1,4 +1,4 @@
-"""A needle that is pushed to a depth, as an environment of Gymnasium: one, or many at once."""
+"""Gymnasium environment of a needle that is pushed to a depth, single or vectorized."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from needle_insertion.gym.pushed import BOUND, observe, push, Pushed, Tissues, U
 from needle_ros.errors import ParameterError
 import numpy as np
 
-#: Depth at the start, and depths of targets [m].
+#: Depth at the start, and range of target depths [m].
 START: Final = 0.02
 TARGETS: Final = (0.03, 0.12)
 
-#: Part by which friction and tissue of a needle may differ from the preset, and what does.
+#: Largest relative deviation from the preset, and the constants that deviate.
 SPREAD: Final = 0.3
 DRAWN: Final = ('coulomb_friction', 'viscous_friction', 'tissue_stiffness')
 
-#: The needle of a single environment is pushed in each step.
+#: Mask of a single environment.
 _ONE: Final = np.ones(1, dtype=bool)
 
 
 class _Needles:
-    """The needles of some episodes, each with its target."""
+    """The needles of several episodes, each with its target."""
 
     def __init__(self, preset: str, number: int) -> None:
         self._preset = NeedleParameters.preset(preset)
@@ -46,7 +46,7 @@ class _Needles:
         self._held = Held(self._needles)
 
     def begin(self, k: int, rng: np.random.Generator) -> None:
-        """Draw another needle."""
+        """Sample a new needle and target for episode k."""
         factors = 1.0 + SPREAD * rng.uniform(-1.0, 1.0, len(DRAWN))
         changed: dict[str, Any] = {
             name: float(factor * getattr(self._preset, name))
@@ -60,30 +60,24 @@ class _Needles:
         all_of.targets[k] = rng.uniform(*TARGETS)
 
     def step(self, actions: FloatArray, which: Any) -> tuple[FloatArray, Any]:
-        """Push some for a period; return rewards, and which episodes have ended."""
+        """Push the selected needles for a period; return rewards and which episodes ended."""
         if not np.isfinite(actions).all():
             raise ParameterError(f'an action must be finite, got {actions!r}')
         return push(self._held, np.array(actions, dtype=np.float64), which)
 
     def observe(self) -> FloatArray:
-        """Return what is seen of them, shape (n, 4)."""
+        """Return the observations, shape (n, 4)."""
         return np.asarray(observe(self._held))
 
 
 class InsertionEnv(gymnasium.Env[FloatArray, FloatArray]):
     """
-    Push a needle to a depth; friction and tissue differ from episode to episode.
+    Push a needle to a depth; friction and tissue are sampled around a preset in each episode.
 
-    The action is the force over 10 ms, in parts of 15 N. The observation is the error of depth,
-    velocity and depth in dm and dm/s, and the deflection of the tip in mm. The reward is the
-    error with a minus [m], and a small price of force. The episode ends where the needle rests at
-    its target, or leaves its range, which is a reward of -1.
-
-    Parameters
-    ----------
-    preset : str
-        Needle and tissue in the middle.
-
+    The action is the force over 10 ms, as a fraction of 15 N. The observation is the error of
+    depth, velocity and depth in dm and dm/s, and the tip deflection in mm. The reward is the
+    negative error [m] minus a small price of force. The episode ends when the needle rests at its
+    target, or leaves its range, with a reward of -1.
     """
 
     metadata: ClassVar[dict[str, Any]] = {'render_modes': []}
@@ -96,52 +90,14 @@ class InsertionEnv(gymnasium.Env[FloatArray, FloatArray]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[FloatArray, dict[str, Any]]:
-        """
-        Begin an episode with another needle.
-
-        Parameters
-        ----------
-        seed : int, optional
-            Seed of all that follows.
-        options : dict, optional
-            Not used.
-
-        Returns
-        -------
-        observation : ndarray, shape (4,)
-            As the class says.
-        info : dict
-            Empty.
-
-        """
+        """Start an episode with a new needle; return the observation and an empty dict."""
         super().reset(seed=seed, options=options)
         self._needles.begin(0, self.np_random)
         self._begun = True
         return self._needles.observe()[0], {}
 
     def step(self, action: FloatArray) -> tuple[FloatArray, float, bool, bool, dict[str, Any]]:
-        """
-        Push for 10 ms.
-
-        Parameters
-        ----------
-        action : ndarray, shape (1,)
-            Force, in parts of 15 N; what is beyond is cut.
-
-        Returns
-        -------
-        observation : ndarray, shape (4,)
-            As the class says.
-        reward : float
-            As the class says.
-        terminated : bool
-            Whether the needle rests at its target, or has left its range.
-        truncated : bool
-            False.
-        info : dict
-            Empty.
-
-        """
+        """Push for 10 ms; the action is clipped to [-1, 1]."""
         if not self._begun:
             raise gymnasium.error.ResetNeeded('no episode has begun: call reset')
         [reward], [over] = self._needles.step(action, _ONE)
@@ -150,17 +106,9 @@ class InsertionEnv(gymnasium.Env[FloatArray, FloatArray]):
 
 class InsertionVectorEnv(VectorEnv[FloatArray, FloatArray, FloatArray]):
     """
-    Many needles at once, each as in `InsertionEnv` with a seed of its own.
+    Many needles at once, each as in `InsertionEnv` with its own seed.
 
-    Parameters
-    ----------
-    num_envs : int
-        How many.
-    preset : str
-        As in `InsertionEnv`.
-    max_episode_steps : int
-        Steps after which an episode is broken off.
-
+    An episode is truncated after `max_episode_steps`.
     """
 
     metadata: ClassVar[dict[str, Any]] = {
@@ -182,7 +130,6 @@ class InsertionVectorEnv(VectorEnv[FloatArray, FloatArray, FloatArray]):
         self._steps = np.zeros(num_envs, dtype=int)
 
     def _begin(self, k: int) -> None:
-        """Begin an episode."""
         self._needles.begin(k, self._rngs[k])
         self._begun[k], self._over[k], self._steps[k] = True, False, 0
 
@@ -193,23 +140,10 @@ class InsertionVectorEnv(VectorEnv[FloatArray, FloatArray, FloatArray]):
         options: dict[str, Any] | None = None,
     ) -> tuple[FloatArray, dict[str, Any]]:
         """
-        Begin an episode in each.
+        Start an episode in each environment, or in those of the option ``reset_mask``.
 
-        Parameters
-        ----------
-        seed : int or sequence of int, optional
-            Seed of the first, the next one of the second, and so on; or of each, where None goes
-            on as it was.
-        options : dict, optional
-            ``reset_mask``, a bool for each: where it is False the episode goes on.
-
-        Returns
-        -------
-        observations : ndarray, shape (n, 4)
-            As in `InsertionEnv`.
-        infos : dict
-            Empty.
-
+        An integer seed is the seed of the first environment, the next integer of the second, and
+        so on. In a sequence, None continues the random numbers of its environment.
         """
         super().reset(options=options)
         seeds: list[int | None] = [None] * self.num_envs
@@ -230,26 +164,7 @@ class InsertionVectorEnv(VectorEnv[FloatArray, FloatArray, FloatArray]):
         return self._needles.observe(), {}
 
     def step(self, actions: FloatArray) -> tuple[FloatArray, FloatArray, Any, Any, dict[str, Any]]:
-        """
-        Push all for 10 ms; where an episode is over, the next one begins instead.
-
-        Parameters
-        ----------
-        actions : ndarray, shape (n, 1)
-            Forces, in parts of 15 N.
-
-        Returns
-        -------
-        observations : ndarray, shape (n, 4)
-            As in `InsertionEnv`.
-        rewards : ndarray, shape (n,)
-            As there.
-        terminations, truncations : ndarray of bool, shape (n,)
-            Which episodes have ended, and which are broken off.
-        infos : dict
-            Empty.
-
-        """
+        """Push all needles for 10 ms; where an episode has ended, start the next one instead."""
         if not self._begun.all():
             raise gymnasium.error.ResetNeeded('no episode has begun: call reset')
         again = self._over

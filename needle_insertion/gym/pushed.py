@@ -1,4 +1,4 @@
-"""Needles that are pushed, all in one call of compiled code."""
+"""Simulate and observe many pushed needles in one call of compiled code."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ import numpy as np
 if TYPE_CHECKING:
     from needle_dynamics.compiled.held import Held
 
-#: Time of a step [s], longest step of the integrator [s], and largest force [N].
+#: Period of an action [s], longest step of the integrator [s], and largest force [N].
 PERIOD, STEP, FORCE = 0.01, 1e-3, 15.0
 
-#: A needle is there when it is nearer [m] and slower [m/s].
+#: Largest depth error [m] and speed [m/s] of a needle at rest at its target.
 NEAR, SLOW = 2e-4, 1e-3
 
 #: Price of force in the reward [1/N^2].
@@ -26,24 +26,12 @@ PRICE: Final = 1e-5
 #: Units of an observation: error [m], velocity [m/s], depth [m], deflection [m].
 UNITS: Final = (0.1, 0.1, 0.1, 1e-3)
 
-#: Observations are cut here, which nothing sane comes near.
+#: Limit of observations, far above any plausible value.
 BOUND: Final = 1e3
 
 
 class Tissues(NamedTuple):
-    """
-    Layers of tissue of several needles: the fields of `Layers`.
-
-    Attributes
-    ----------
-    starts, stiffnesses : ndarray, shape (n, layers)
-        As in `Layers`, as are the others.
-    gram : ndarray, shape (n, layers, modes, modes)
-        Of each needle.
-    area, moment : ndarray, shape (n, layers, modes)
-        Of each needle.
-
-    """
+    """Layers of tissue of n needles: the fields of `Layers`, each with a leading axis n."""
 
     starts: Matrix
     stiffnesses: Matrix
@@ -54,23 +42,22 @@ class Tissues(NamedTuple):
 
 class Pushed(NamedTuple):
     """
-    Some needles.
+    State of n needles.
 
     Attributes
     ----------
     common : Needle
-        What is the same for all.
+        Constants that are the same for all.
     friction : ndarray, shape (n, 2)
-        Coulomb friction [N] and viscous friction [N s/m] of each.
+        Coulomb friction [N] and viscous friction [N s/m].
     layers : Tissues
-        Layers of tissue of each.
+        Layers of tissue.
     times : ndarray, shape (n,)
-        Time of each [s].
+        [s].
     states : ndarray, shape (n, 2 (2 + modes))
-        State of each.
+        States.
     targets : ndarray, shape (n,)
-        Depth of the target of each [m].
-
+        Target depths [m].
     """
 
     common: Needle
@@ -84,24 +71,10 @@ class Pushed(NamedTuple):
 @kernel
 def push(held: Held[Pushed], actions: Vector, which: BoolVector) -> tuple[FloatArray, Any]:
     """
-    Push some needles for a period.
+    Push the needles of the mask `which` for a period; overwrite their times and states.
 
-    Parameters
-    ----------
-    held : Held of Pushed
-        The needles; times and states are overwritten.
-    actions : ndarray, shape (n,)
-        Insertion forces, in parts of `FORCE`; what is beyond is cut.
-    which : ndarray of bool, shape (n,)
-        Those that are pushed.
-
-    Returns
-    -------
-    rewards : ndarray, shape (n,)
-        Errors of depth and price of force, with a minus [m]; 0 where not pushed.
-    over : ndarray of bool, shape (n,)
-        Where the needle rests at its target, or would have left its range.
-
+    Actions, shape (n,), are forces as fractions of `FORCE`, clipped to [-1, 1]. Returns rewards
+    [m], 0 where not pushed, and where a needle rests at its target or would have left its range.
     """
     c, friction, layers, times, states, targets = held.value
     n, u = states.shape[0], states.shape[1] // 2
@@ -130,20 +103,7 @@ def push(held: Held[Pushed], actions: Vector, which: BoolVector) -> tuple[FloatA
 
 @kernel
 def observe(held: Held[Pushed]) -> Any:
-    """
-    Return what is seen of needles.
-
-    Parameters
-    ----------
-    held : Held of Pushed
-        The needles.
-
-    Returns
-    -------
-    ndarray of float32, shape (n, 4)
-        Error of depth, velocity, depth and deflection of the tip, in `UNITS`.
-
-    """
+    """Return depth error, velocity, depth and tip deflection, shape (n, 4), in `UNITS`."""
     c, _, _, _, states, targets = held.value
     tips, u = tip_deflections(c.modes, states), states.shape[1] // 2
     seen = np.empty((states.shape[0], 4), dtype=np.float32)

@@ -1,4 +1,4 @@
-"""A needle whose guide steers its tip, as an environment of Gymnasium."""
+"""Gymnasium environment of a needle whose guide steers its tip."""
 
 from __future__ import annotations
 
@@ -13,41 +13,35 @@ from needle_insertion.gym.pushed import BOUND
 from needle_ros.errors import ParameterError
 import numpy as np
 
-#: What nobody knows of a needle, by default.
+#: Default distribution of the unknown disturbances of a needle.
 BELIEF: Final = SteeringBelief(tilt=0.02, frame=0.03, bevel=0.1)
 
-#: Seeds of paths are below.
+#: Upper bound of the seeds of paths.
 _SEEDS: Final = 2**63
 
 
 class SteeringEnv(gymnasium.Env[FloatArray, FloatArray]):
     """
-    Bring the tip to a target: one step of the needle for each action.
+    Steer the tip to a target: one step of the needle for each action.
 
-    Each episode has a needle of its own in tissue of its own, and a target. The action is where
-    the guide goes before the needle goes on, in parts of its limit. The observation is what a
-    robot and a tracker know: depth over that of the target, and in parts of the guide's limit the
-    tip as it is seen, the target, and the guide, each x and z. The reward is the distance of the
-    tip from the target at the end, in mm, with a minus.
+    Needle, tissue and target are sampled in each episode. The action is the position of the guide
+    for the next step, as a fraction of its limit. The observation is the depth over the target
+    depth, and as fractions of the guide limit the measured tip, the target and the guide, each x
+    and z. The reward at the end is the negative distance of the tip from the target [mm], before
+    it is 0. Then the info has ``miss``, the distance [m].
 
     Parameters
     ----------
     needle : str
         A key of `STEERING_PRESETS`.
     depth, step : float
-        Depth of the target, and way of a step [m].
+        Depth of the target, and depth per step [m].
     guide_limit : float
-        Farthest position of the guide along x and z [m].
+        Largest displacement of the guide along x and z [m].
     aside : float
         Largest distance of the target from the axis, along x and z [m].
     belief : SteeringBelief
-        How needles differ.
-
-    Raises
-    ------
-    ParameterError
-        If a value is not valid.
-
+        Distribution of the needles.
     """
 
     metadata: ClassVar[dict[str, Any]] = {'render_modes': []}
@@ -84,22 +78,7 @@ class SteeringEnv(gymnasium.Env[FloatArray, FloatArray]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[FloatArray, dict[str, Any]]:
-        """
-        Begin an episode with another needle.
-
-        Parameters
-        ----------
-        seed, options
-            As in `InsertionEnv.reset`.
-
-        Returns
-        -------
-        observation : ndarray, shape (7,)
-            As the class says.
-        info : dict
-            Empty.
-
-        """
+        """Start an episode with a new needle; return the observation and an empty dict."""
         super().reset(seed=seed, options=options)
         rng = self.np_random
         self._truth = drawn(
@@ -110,28 +89,7 @@ class SteeringEnv(gymnasium.Env[FloatArray, FloatArray]):
         return self._observe(self._truth, self._one), {}
 
     def step(self, action: FloatArray) -> tuple[FloatArray, float, bool, bool, dict[str, Any]]:
-        """
-        Move the guide, then the needle.
-
-        Parameters
-        ----------
-        action : ndarray, shape (2,)
-            Where the guide goes, in parts of its limit; what is beyond is cut.
-
-        Returns
-        -------
-        observation : ndarray, shape (7,)
-            As the class says.
-        reward : float
-            0 before the end.
-        terminated : bool
-            Whether the needle is at the depth of the target.
-        truncated : bool
-            False.
-        info : dict
-            At the end ``miss``, the distance of the tip from the target [m].
-
-        """
+        """Move the guide, then the needle; the action is clipped to [-1, 1]."""
         truth = self._truth
         if truth is None or self._at == len(self._depths) - 1:
             raise gymnasium.error.ResetNeeded('the episode is over, or none has begun: call reset')

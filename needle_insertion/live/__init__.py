@@ -1,1 +1,1 @@
-"""A running graph: what a person may ask of it, and what its nodes say of themselves."""
+"""Operate a running graph: requests, statuses, measurements and the command terminal."""

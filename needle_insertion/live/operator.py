@@ -1,4 +1,4 @@
-"""Requests of a person to running nodes: a target, a pause, a retraction, a stop."""
+"""Send requests of a person to running nodes: target, pause, retraction, stop."""
 
 from __future__ import annotations
 
@@ -25,58 +25,36 @@ from rclpy.parameter import Parameter
 from rclpy.task import Future
 from std_srvs.srv import SetBool, Trigger
 
-#: Longest time to find a node at the first request [s].
+#: Timeout of the discovery of a node at the first request [s].
 _DISCOVERY: Final = 1.0
 
-#: Time between two checks for answers to a target [s].
+#: Period of the checks for answers to a target [s].
 _CHECK: Final = 0.1
 
 
 class State(NamedTuple):
-    """
-    The latest status of a node on /diagnostics.
+    """Latest status of a node on /diagnostics."""
 
-    Attributes
-    ----------
-    level : int
-        0 fine, 1 warning, 2 error.
-    message : str
-        Its state in one line.
-    values : dict of str to str
-        Values by name.
-    heard : float
-        Time of receipt, by `time.monotonic` [s].
-
-    """
-
+    #: 0 OK, 1 warning, 2 error.
     level: int
     message: str
     values: dict[str, str]
+    #: Time of receipt by `time.monotonic` [s].
     heard: float
 
     @property
     def age(self) -> float:
-        """Time since it was received [s]; a node publishes it every second."""
+        """Time since receipt [s]; the node publishes every second."""
         return monotonic() - self.heard
 
     @property
     def requests(self) -> RequestStatus:
-        """The requests that the node takes, and its answers."""
+        """Requests that the node accepts, and its answers."""
         return RequestStatus.from_values(self.values)
 
 
 class Outcome(NamedTuple):
-    """
-    The result of a request.
-
-    Attributes
-    ----------
-    success : bool
-        Whether it was executed.
-    message : str
-        Answers of the nodes.
-
-    """
+    """Result of a request: whether it was executed, and the answers of the nodes."""
 
     success: bool
     message: str
@@ -86,16 +64,8 @@ class Operator:
     """
     Send requests to nodes of the suite, repeat them until they are answered, collect statuses.
 
-    Parameters
-    ----------
-    node : Node
-        Node of this process that sends them; its owner spins it.
-
-    Attributes
-    ----------
-    states : dict of str to State
-        Latest status of each node, by its name without namespace.
-
+    The owner of `node` spins it. `states` has the latest status of each node by its name without
+    namespace.
     """
 
     def __init__(self, node: Node) -> None:
@@ -133,7 +103,7 @@ class Operator:
         for status in array.status:
             name = printable(status.name.rpartition('/')[2])
             self.states[name] = state = State(
-                # A byte, as rclpy has it.
+                # rclpy represents a byte as bytes.
                 int.from_bytes(status.level, 'little'),
                 printable(status.message),
                 {printable(one.key): printable(one.value) for one in status.values},
@@ -143,7 +113,7 @@ class Operator:
                 pending.hear(name, state.requests)
 
     def _repeat(self) -> None:
-        """Send targets without an answer again; use the simulated time if there is one."""
+        """Repeat targets without an answer; use simulated time if it is published."""
         # Before the first target: a node that has not received the time has no stamp.
         request_stamp(self._node)
         self._sending = [one for one in self._sending if not one[0].done]
@@ -158,19 +128,9 @@ class Operator:
 
     def target(self, x: float, y: float, z: float) -> PendingRequest:
         """
-        Send a target.
+        Send a target of the tip in ``needle_entry`` [m]; it is repeated until it has an answer.
 
-        Parameters
-        ----------
-        x, y, z : float
-            Target of the tip, in ``needle_entry`` [m]; without the node `steering` only the depth
-            y counts.
-
-        Returns
-        -------
-        PendingRequest
-            It is sent again until it has an answer.
-
+        Without the node `steering` only the depth y is used.
         """
         message = PointStamped()
         message.header.frame_id = contract.ENTRY
@@ -186,18 +146,9 @@ class Operator:
 
     def ask(self, word: str) -> Future:
         """
-        Call the services of a request without a value.
+        Call the services of a key of `REQUESTS`; the result of the future is an `Outcome`.
 
-        Parameters
-        ----------
-        word : str
-            A key of `REQUESTS`.
-
-        Returns
-        -------
-        Future
-            Its result is an `Outcome`. It is done at once if no node offers the service.
-
+        The future is done at once if no node offers the service.
         """
         ready = [
             (request, client)
@@ -221,22 +172,9 @@ class Operator:
 
     def set(self, node: str, name: str, value: Any) -> Future:
         """
-        Set a parameter of a node.
+        Set a parameter of a node; the result of the future is an `Outcome`.
 
-        Parameters
-        ----------
-        node : str
-            Name of the node.
-        name : str
-            Name of the parameter.
-        value : object
-            Its value.
-
-        Returns
-        -------
-        Future
-            Its result is an `Outcome`. It is done at once if there is no such node.
-
+        The future is done at once if there is no such node.
         """
         client = self._client(SetParameters, node, 'set_parameters')
         # A new client has not discovered the service yet.
@@ -264,7 +202,7 @@ def _done(outcome: Outcome) -> Future:
 
 
 def _gathered(answers: Mapping[str, Future], read: Callable[[Any], Outcome]) -> Future:
-    """Return one outcome of all calls, once the last is answered or has failed."""
+    """Return one outcome of all calls, when the last has an answer or has failed."""
     gathered = Future()
 
     def outcome(service: str) -> Outcome:

@@ -1,4 +1,4 @@
-"""The newest measurements of a running graph, read when somebody looks."""
+"""Read the newest measurements of a running graph on demand."""
 
 from __future__ import annotations
 
@@ -12,8 +12,7 @@ from needle_ros.timing import NANOSECONDS
 from needle_ros.wire import Reader, Reading
 from rclpy.node import Node
 
-#: A reference that is this near to its target has reached it [m]; one slower than this rests
-#: [m/s].
+#: Tolerance of the position [m] and the velocity [m/s] of a reference at rest at its target.
 _SAME: Final = 1e-9
 
 _TOPICS: Final = (
@@ -26,19 +25,14 @@ _TOPICS: Final = (
 
 class Readings:
     """
-    Keeps the newest message of each sensor and of the reference.
+    Newest message of each sensor and of the reference.
 
-    They come a thousand times a second: only those that are looked at are taken.
-
-    Parameters
-    ----------
-    node : Node
-        Node of this process that subscribes, and that nobody spins.
-
+    Messages arrive at 1 kHz: only a message that is requested is taken from the middleware. The
+    node subscribes and must not be spun.
     """
 
     def __init__(self, node: Node) -> None:
-        #: It must live as long as its subscriptions.
+        #: Kept alive for its subscriptions.
         self._node = node
         self._newest: dict[str, bytes] = {}
         self._readers = {topic.name: Reader(topic.type_name) for topic in _TOPICS}
@@ -47,44 +41,18 @@ class Readings:
         }
 
     def newest(self, topic: Topic) -> Reading | None:
-        """
-        Read the newest message of a topic.
-
-        Parameters
-        ----------
-        topic : Topic
-            `JOINT_STATES`, `BASE_WRENCH`, `TIP_DEFLECTION` or `REFERENCE` of the contract.
-
-        Returns
-        -------
-        Reading or None
-            What it holds; None before the first, and if it is none.
-
-        """
+        """Return the newest message of a topic; None before the first, or if unreadable."""
         for message in self._come[topic.name]():
             self._newest[topic.name] = message
         data = self._newest.get(topic.name)
         try:
             return None if data is None else self._readers[topic.name].read(data)
         except MessageError:
-            # Controller and recorder say so; here the needle is just not seen.
+            # Controller and recorder report invalid messages; they are ignored here.
             return None
 
     def insertion(self, topic: Topic = contract.JOINT_STATES) -> tuple[float, float] | None:
-        """
-        Return inserted length and velocity.
-
-        Parameters
-        ----------
-        topic : Topic
-            `JOINT_STATES` for what is measured, `REFERENCE` for what is wanted.
-
-        Returns
-        -------
-        tuple of float or None
-            Inserted length [m] and velocity [m/s]; None if they are not known.
-
-        """
+        """Return insertion depth [m] and velocity [m/s] of a topic; None if unknown."""
         reading = self.newest(topic)
         if reading is None or contract.INSERTION not in reading.names:
             return None
@@ -101,20 +69,7 @@ class Readings:
         return 0.0 if reading is None else reading.stamp / NANOSECONDS
 
     def reference_rests_at(self, target: tuple[float, ...]) -> bool:
-        """
-        Tell whether the reference has arrived.
-
-        Parameters
-        ----------
-        target : tuple of float
-            Inserted length to reach [m]; empty if there is none.
-
-        Returns
-        -------
-        bool
-            Whether it rests there.
-
-        """
+        """Return whether the reference rests at a target depth [m]; False without target."""
         reference = self.insertion(contract.REFERENCE)
         if reference is None or not target:
             return False
@@ -122,7 +77,7 @@ class Readings:
         return abs(depth - target[0]) < _SAME and abs(velocity) < _SAME
 
     def line(self) -> str:
-        """Return where the needle is, what it takes, and where its tip is, for people."""
+        """Return depth, velocity, force and tip deflection as one line of text."""
         words = []
         if (insertion := self.insertion()) is not None:
             words.append(f'depth {1e3 * insertion[0]:.2f} mm')
@@ -132,4 +87,4 @@ class Readings:
         if (tip := self.newest(contract.TIP_DEFLECTION)) is not None:
             x, _, z = tip.values[0]
             words.append(f'tip x {1e3 * x:+.2f} mm, z {1e3 * z:+.2f} mm')
-        return ', '.join(words) or 'nothing is measured'
+        return ', '.join(words) or 'no measurements'

@@ -1,4 +1,4 @@
-"""Services of the nodes by the word that calls them."""
+"""Services of the nodes by operator command."""
 
 from __future__ import annotations
 
@@ -10,24 +10,15 @@ STEERING: Final = 'steering'
 
 
 class Request(NamedTuple):
-    """
-    One service of a word.
-
-    Attributes
-    ----------
-    node, service : str
-        Names.
-    data : bool or None
-        Value of the request of a `SetBool`; None for a `Trigger`.
-
-    """
+    """One service of an operator command."""
 
     node: str
     service: str
+    #: Request of a `SetBool`; None for a `Trigger`.
     data: bool | None = None
 
 
-#: Services by word. A node that does not run is left out, if another node has a service.
+#: Services by command. Nodes that do not run are skipped, if another node offers a service.
 REQUESTS: Final[Mapping[str, tuple[Request, ...]]] = {
     'pause': (Request(CONTROLLER, 'pause', data=True),),
     'resume': (Request(CONTROLLER, 'pause', data=False),),

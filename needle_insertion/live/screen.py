@@ -1,4 +1,4 @@
-"""Lines that a person types or a script gives, and lines for the person."""
+"""Read lines from a terminal or a script, and write lines to it."""
 
 from __future__ import annotations
 
@@ -15,20 +15,12 @@ from needle_ros.errors import ParameterError
 
 _PROMPT: Final = 'needle> '
 
-#: Goes to the begin of a line and clears it.
+#: Moves to the start of a line and clears it.
 _CLEAR: Final = '\r\033[K'
 
 
 class Screen:
-    """
-    The terminal, or a script on the standard input.
-
-    Attributes
-    ----------
-    typed : bool
-        Whether a person types the lines.
-
-    """
+    """The terminal, or a script on the standard input; `typed` is True for a terminal."""
 
     def __init__(self) -> None:
         self.typed = bool(sys.stdin and sys.stdin.isatty() and sys.stdout.isatty())
@@ -38,28 +30,20 @@ class Screen:
 
     @contextmanager
     def reading(self) -> Iterator[None]:
-        """Read lines, in a thread of its own: nodes go on while a person types."""
+        """Read lines in a separate thread: nodes continue while a person types."""
         before = termios.tcgetattr(sys.stdin) if self.typed else None
         Thread(target=self._read, daemon=True).start()
         try:
             yield
         finally:
             if before is not None:
-                # The thread may still be waiting for a line, with a terminal set up for that.
+                # The thread may still wait for a line, with a terminal in its input mode.
                 termios.tcsetattr(sys.stdin, termios.TCSADRAIN, before)
                 if self._asked:
                     sys.stdout.write('\n')
 
     def complete(self, words: Sequence[str]) -> None:
-        """
-        Complete words with the tab key.
-
-        Parameters
-        ----------
-        words : sequence of str
-            The words.
-
-        """
+        """Complete words with the tab key."""
 
         def complete(begin: str, number: int) -> str | None:
             found = [word for word in words if word.startswith(begin)]
@@ -78,35 +62,22 @@ class Screen:
         except EOFError:
             return None
         except (OSError, ValueError, RuntimeError) as error:
-            # It cannot be read, is no text, or there is none at all.
+            # Unreadable input, invalid text, or no standard input.
             return error
 
     def ask(self) -> None:
-        """Let the next line come."""
+        """Request the next line."""
         self._clear()
         self._asked = True
         self._wanted.release()
 
     @property
     def answered(self) -> bool:
-        """Whether it has come."""
+        """Whether the requested line is available."""
         return not self._lines.empty()
 
     def take(self) -> str | None:
-        """
-        Return the line.
-
-        Returns
-        -------
-        str or None
-            The line; None at the end of all lines.
-
-        Raises
-        ------
-        ParameterError
-            If it is not text.
-
-        """
+        """Return the line, or None at the end; raise `ParameterError` if it is not text."""
         line = self._lines.get()
         if isinstance(line, Exception):
             raise ParameterError(f'the standard input is not readable as text: {line}')
@@ -119,15 +90,7 @@ class Screen:
         return line
 
     def say(self, line: str) -> None:
-        """
-        Write a line for the person.
-
-        Parameters
-        ----------
-        line : str
-            One line, or several.
-
-        """
+        """Write one or several lines above the prompt."""
         self._clear()
         sys.stdout.write(f'{line}\n')
         if self._asked and self.typed:
@@ -135,15 +98,7 @@ class Screen:
         sys.stdout.flush()
 
     def show(self, line: str) -> None:
-        """
-        Show a line that the next one replaces; nothing in a script.
-
-        Parameters
-        ----------
-        line : str
-            The line.
-
-        """
+        """Show a line that the next line replaces; no effect in a script."""
         if self.typed:
             sys.stdout.write(f'{_CLEAR}{line}')
             sys.stdout.flush()

@@ -1,4 +1,4 @@
-"""Nodes that are brought up for a person, and ended with the session."""
+"""Start nodes for a person or a script, and end them with the session."""
 
 from __future__ import annotations
 
@@ -24,40 +24,21 @@ from needle_ros.errors import NeedleError, ParameterError
 from needle_ros.network import DOMAIN
 from rclpy.node import Node
 
-#: Where the parameter files are: in a clone, beside what pip installed, and where colcon puts
-#: them.
+#: Folder of the parameter files, below the prefix of pip or colcon.
 _SHARE: Final = Path('share/needle_insertion/config')
 
-#: Longest start of the nodes, with everything to compile on a busy machine [s].
+#: Timeout of the start of the nodes, with compilation on a busy machine [s].
 _START: Final = 180.0
 
-#: Words of a script before which time does not go on; the first target arrives before, too.
+#: Commands of a script during which simulated time is paused, up to the first target.
 _AT_REST: Final = ('', 'target', 'law', 'set', 'status', 'help')
 
-#: The order in which nodes end.
+#: Order in which nodes end.
 _ENDING: Final = ('steering', 'controller', 'plant', 'recorder')
 
 
 def config_file(name: str) -> Path:
-    """
-    Return a parameter file of this package.
-
-    Parameters
-    ----------
-    name : str
-        Its name.
-
-    Returns
-    -------
-    Path
-        The file.
-
-    Raises
-    ------
-    ParameterError
-        If it is not installed.
-
-    """
+    """Return the path of a parameter file of the package, or raise `ParameterError`."""
     prefixes = [Path(one) for one in os.environ.get('AMENT_PREFIX_PATH', '').split(':') if one]
     folders = [
         Path(__file__).parents[2] / 'config',
@@ -73,28 +54,16 @@ def config_file(name: str) -> Path:
 
 @dataclass(frozen=True)
 class Session:
-    """
-    What to bring up.
+    """Nodes, parameters and folders of `needle run`."""
 
-    Attributes
-    ----------
-    nodes : dict
-        Parameters of each node by its name: `controller`, and `plant` and `steering` if wanted.
-    file : Path
-        ROS parameter file of all; what `nodes` says counts more.
-    folder : Path
-        For the recording, ``bag``, and what the nodes print, ``logs``.
-    records : bool
-        Whether everything is recorded.
-    lockstep : bool
-        Whether the plant runs in lock-step, and the nodes in its time.
-
-    """
-
+    #: Parameters by node: `controller`, and optionally `plant` and `steering`.
     nodes: Mapping[str, Mapping[str, Any]]
+    #: ROS parameter file of all nodes; `nodes` overrides it.
     file: Path
+    #: Folder of the recording, ``bag``, and of the node output, ``logs``.
     folder: Path
     records: bool
+    #: Whether the plant runs in lock-step, and the nodes in its time.
     lockstep: bool = False
 
     @property
@@ -104,30 +73,15 @@ class Session:
 
     @property
     def bag(self) -> Path:
-        """Where it is recorded to."""
+        """Folder of the recording."""
         return self.folder / 'bag'
 
 
 def run(session: Session) -> int:
     """
-    Bring the nodes up, do what a person or a script says, and end them.
+    Start the nodes, execute the commands of a person or a script, and end the nodes; return 0.
 
-    Parameters
-    ----------
-    session : Session
-        What to bring up.
-
-    Returns
-    -------
-    int
-        0.
-
-    Raises
-    ------
-    NeedleError
-        If a node fails; where the words are not typed but come from a script, also if one of
-        them cannot be done.
-
+    Raises `NeedleError` if a node fails, or a command of a script fails.
     """
     screen = Screen()
     with Graph(session.folder / 'logs', shared=True) as graph:
@@ -135,7 +89,7 @@ def run(session: Session) -> int:
         operator = Operator(node)
         readings = Readings(Node('readings', context=graph.context))
         screen.say(f'starting {", ".join(session.names)}')
-        # What a script asks for first is asked for at the same sample every time.
+        # The first commands of a script are always executed at the same sample.
         holds = session.lockstep and not screen.typed
         witness = Witness(node, _warms_up, lockstep=True) if holds else None
         processes = _bring_up(session, graph, node, operator, screen, holds=holds)
@@ -144,7 +98,7 @@ def run(session: Session) -> int:
         screen.say(f'on domain {graph.domain}; `help` lists the words')
         with screen.reading():
             _converse(terminal, screen, processes, witness)
-        # What moves the needle ends first, and the recorder last: the bag has the end.
+        # Nodes that move the needle end first, the recorder last: the bag is complete.
         for name in _ENDING:
             for process in processes:
                 if process.name == name:
@@ -155,7 +109,7 @@ def run(session: Session) -> int:
 
 
 def _warms_up(sample: Sample) -> bool:
-    """Let time go on until all sensors have reported."""
+    """Return whether time continues: until all sensors have reported."""
     return sample.time < WARM_UP
 
 
@@ -168,7 +122,7 @@ def _bring_up(
     *,
     holds: bool,
 ) -> list[NodeProcess]:
-    """Start the nodes; the plant begins when all others listen: the bag holds every sample."""
+    """Start the nodes; the plant starts after all others have subscribed, for a complete bag."""
     processes, begin = [], monotonic()
     for name in session.names:
         parameters = dict(session.nodes.get(name, {}))
@@ -194,11 +148,11 @@ def _bring_up(
         return node.count_subscribers(topic.name)
 
     def listen() -> bool:
-        # This process listens too.
+        # This process subscribes, too.
         hear = count(contract.JOINT_STATES) >= len(processes) + 1 + holds - own
         return hear and count(contract.TARGET) >= len(processes) - own
 
-    what = 'the nodes' if own else 'a robot that publishes joint_states, and the nodes,'
+    what = 'the nodes' if own else 'a robot that publishes joint_states, and for the nodes'
     graph.spin_until(listen, what, _START)
     _check_alone(graph, node)
     if own:
@@ -209,17 +163,20 @@ def _bring_up(
 
 
 def _check_alone(graph: Graph, node: Node) -> None:
-    """Refuse a second plant or controller."""
-    for topic, there in ((contract.JOINT_STATES, 'a plant'), (contract.WRENCH_COMMAND, 'one')):
+    """Reject a second plant or controller."""
+    for topic, there in (
+        (contract.JOINT_STATES, 'plant'),
+        (contract.WRENCH_COMMAND, 'controller'),
+    ):
         if (number := node.count_publishers(topic.name)) > 1:
             raise GraphError(
-                f'{number} nodes publish {topic.name} on domain {graph.domain}: there is {there} '
-                f'already. End it, or choose another {DOMAIN}'
+                f'{number} nodes publish {topic.name} on domain {graph.domain}: another {there} '
+                f'is running. End it, or choose another {DOMAIN}'
             )
 
 
 def _begin_plant(graph: Graph, node: Node, operator: Operator, number: int) -> None:
-    """Activate the plant once it has found the nodes that its samples wait for."""
+    """Activate the plant once it has discovered the nodes in lock-step."""
     graph.change(node, 'plant', CONFIGURE)
 
     def found() -> bool:
@@ -236,7 +193,7 @@ def _converse(
     processes: Sequence[NodeProcess],
     witness: Witness | None,
 ) -> None:
-    """Do one line after another, until `quit` or the end of the script."""
+    """Execute one line after another, until `quit` or the end of the script."""
     while (line := terminal.next_line()) is not None:
         word = (line.partition('#')[0].split() or [''])[0]
         if witness is not None and word not in _AT_REST:

@@ -1,4 +1,4 @@
-"""Commands of `needle run`, typed by a person or read from a script."""
+"""Execute the commands of `needle run`, typed by a person or read from a script."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ from needle_ros.errors import JobError, ParameterError
 from rclpy.task import Future
 import yaml
 
-#: Longest time until a node reports its state and its first measurements [s].
+#: Timeout of the first status and the first measurements of a node [s].
 _ANSWER: Final = 30.0
 
-#: Time for the needle to settle when the reference has arrived [s].
+#: Settling time of the needle after the end of the reference [s].
 _SETTLING: Final = 1.0
 
-#: Nodes publish their status every second: a node without one for this time is reported [s].
+#: Timeout of the status of a node, which is published every second [s].
 _SILENT: Final = 5.0
 
 #: Sensors without which a node rejects all targets.
@@ -39,7 +39,7 @@ _NEEDED: Final = (
     (STEERING, TIP_DEFLECTION.name),
 )
 
-#: A warning that appears again and again is printed once in this time [s].
+#: Shortest time between two prints of the same warning [s].
 _AGAIN: Final = 30.0
 
 #: Meters in a unit.
@@ -53,7 +53,7 @@ _AT_REST: Final = (Phase.IDLE.value, Phase.DONE.value)
 
 
 class _Word(NamedTuple):
-    """Arguments and meaning of a command."""
+    """Arguments and description of a command."""
 
     takes: str
     meaning: str
@@ -63,11 +63,11 @@ WORDS: Final = {
     'target': _Word(
         'DEPTH | X Y Z', 'insert to a depth, or steer the tip to a point: 0.05 or 50mm [m]'
     ),
-    'wait': _Word('[SECONDS]', 'until the needle has arrived'),
+    'wait': _Word('[SECONDS]', 'wait until the needle is at its target'),
     'pause': _Word('', 'brake to rest and hold'),
     'resume': _Word('', 'continue after a pause'),
     'retract': _Word('', 'withdraw to retract_depth'),
-    'stop': _Word('', 'no force at all, until `clear`'),
+    'stop': _Word('', 'stop and command zero force, until `clear`'),
     'clear': _Word('', 'clear a stop'),
     'law': _Word('NAME', f'change the control law: {", ".join(LAWS)}'),
     'set': _Word('NODE NAME VALUE', 'set a parameter, such as controller retract_depth 0.02'),
@@ -78,21 +78,7 @@ WORDS: Final = {
 
 
 class Terminal:
-    """
-    Execute commands, one line after another.
-
-    Parameters
-    ----------
-    graph : Graph
-        The graph; it is spun by the commands.
-    operator : Operator
-        Sends requests to the nodes.
-    readings : Readings
-        Measurements.
-    screen : Screen
-        Input of the commands and output of the answers.
-
-    """
+    """Execute commands, one line after another; the commands spin the graph."""
 
     def __init__(
         self, graph: Graph, operator: Operator, readings: Readings, screen: Screen
@@ -110,20 +96,9 @@ class Terminal:
 
     def begin(self, nodes: Sequence[str]) -> None:
         """
-        Wait until nodes report their state, and those that move the needle measure it.
+        Wait until all nodes report their state, and controller and steering have measurements.
 
-        Requests before that would be rejected.
-
-        Parameters
-        ----------
-        nodes : sequence of str
-            Their names.
-
-        Raises
-        ------
-        GraphError
-            If a node does not.
-
+        Earlier requests would be rejected. Raises `GraphError` on a timeout.
         """
         for name in nodes:
             self._state(name)
@@ -136,48 +111,20 @@ class Terminal:
         def sees() -> bool:
             return _sees(self._state(name), topic)
 
-        self._spin_until(sees, f'{topic}, which {name} needs,', _ANSWER)
+        self._spin_until(sees, f'{topic}, an input of {name}', _ANSWER)
 
     def next_line(self) -> str | None:
-        """
-        Wait for the next line.
-
-        Returns
-        -------
-        str or None
-            The line; None at the end of all lines.
-
-        Raises
-        ------
-        GraphError
-            If a node has ended meanwhile.
-
-        """
+        """Wait for the next line, None at the end; raise `GraphError` if a node ends."""
         self._screen.ask()
         self._spin_until(lambda: self._screen.answered, 'a line', inf)
         return self._screen.take()
 
     def do(self, line: str) -> bool:
         """
-        Execute a command.
+        Execute a command, where ``#`` begins a comment; return whether another may follow.
 
-        Parameters
-        ----------
-        line : str
-            The command and its arguments; ``#`` begins a comment.
-
-        Returns
-        -------
-        bool
-            Whether another command may follow.
-
-        Raises
-        ------
-        ParameterError
-            If the line is not understood.
-        JobError
-            If a node rejects it, or does not answer.
-
+        Raises `ParameterError` if the line is invalid, and `JobError` if a node rejects the
+        command or does not answer.
         """
         try:
             words = shlex.split(line, comments=True)
@@ -219,13 +166,13 @@ class Terminal:
     def _look(self) -> None:
         """Print new warnings and errors of the nodes."""
         if not self._begun:
-            # They wait for each other.
+            # During the start the nodes wait for each other.
             return
         for name, state in self._operator.states.items():
             level, message, now = state.level, state.message, monotonic()
             if state.age > _SILENT:
                 level, message = _ERROR, f'no status for {_SILENT:g} s'
-            # A count that grows is no new warning.
+            # A changed number is not a new warning.
             kind = re.sub(r'\d+', '', message)
             again = level >= _ERROR or now - self._told.get((name, kind), -inf) > _AGAIN
             if level and kind != self._last.get(name) and again:
@@ -264,7 +211,7 @@ class Terminal:
             longest = -inf
         if not longest >= 0.0:
             raise _unfit('wait', words)
-        # The time of the robot: a simulated one may be slower than this machine's.
+        # Time of the robot: simulated time may be slower than the time of this machine.
         begin, arrived = self._readings.time, inf
 
         def done() -> bool:
@@ -275,7 +222,7 @@ class Terminal:
             if state.level >= _ERROR:
                 raise JobError(state.message)
             if now - begin > longest:
-                raise JobError(f'not there after {longest:g} s: {self._readings.line()}')
+                raise JobError(f'target not reached after {longest:g} s: {self._readings.line()}')
             if self._steers:
                 return state.values.get('phase') in _AT_REST
             if not _aim(state):
@@ -284,7 +231,7 @@ class Terminal:
             arrived = min(arrived, now) if rests else inf
             return now > arrived + _SETTLING
 
-        # Its own limit is above, with the position of the needle in its error.
+        # The timeout is above, with the position of the needle in its error.
         self._spin_until(done, 'the needle', inf)
         self._say(self._readings.line())
 
@@ -314,13 +261,13 @@ class Terminal:
         self._say(f'{self._readings.line()}\n{table(rows, ("node", "level", "state"))}')
 
     def _state(self, node: str) -> State:
-        """Return the latest status of a node, once it has published its first."""
+        """Return the latest status of a node; wait for the first."""
         states = self._operator.states
         self._spin_until(lambda: node in states, f'the node {node}', _ANSWER)
         return states[node]
 
     def _answered(self, future: Future, what: str) -> None:
-        # Without an answer it is done, too.
+        # A call without an answer is done, too.
         self._spin_until(future.done, f'the answer to {what}', inf)
         outcome: Outcome = future.result()
         if not outcome.success:
@@ -334,7 +281,7 @@ def _unfit(word: str, given: Sequence[str]) -> ParameterError:
 
 
 def _length(word: str) -> float:
-    """Read a length in m, or with a unit."""
+    """Parse a length in m, or with a unit."""
     found = re.fullmatch(r'(.*?)\s*(mm|cm|m)?', word)
     try:
         value = float(found[1]) * _UNITS[found[2] or 'm'] if found else inf

@@ -1,4 +1,4 @@
-"""Messages that wait in the middleware until somebody looks."""
+"""Take messages from the queue of the middleware on demand."""
 
 from __future__ import annotations
 
@@ -14,27 +14,11 @@ def waiting(
     node: Node, topic: Topic, qos: Qos, *, raw: bool = True
 ) -> Callable[[], Iterator[Any]]:
     """
-    Subscribe to a topic, as best effort if it is a sensor, and take from it only when asked to.
+    Subscribe to a topic and return a function that yields the messages since its last call.
 
-    So a topic of 1 kHz costs no more of Python than one that is looked at 30 times a second.
-
-    Parameters
-    ----------
-    node : Node
-        Node that nobody spins.
-    topic : Topic
-        The topic.
-    qos : Qos
-        What is requested; as many messages as its depth wait.
-    raw : bool
-        Whether the messages are taken as bytes.
-
-    Returns
-    -------
-    callable
-        Yields what has come since the last call, and no more than may wait: what comes meanwhile
-        is for the next time.
-
+    A sensor is subscribed as best effort. The queue holds as many messages as the depth of `qos`.
+    Messages are taken on demand only: a topic of 1 kHz costs no more Python time than a topic that
+    is read 30 times a second. The node must not be spun. `raw` messages are bytes.
     """
     made = node.create_subscription(
         message_class(topic.type_name),

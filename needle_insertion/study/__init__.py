@@ -1,1 +1,1 @@
-"""Populations: many insertions that differ, and how often they do what they should."""
+"""Simulate populations of insertions and estimate the distribution of their metrics."""

@@ -1,4 +1,4 @@
-"""Distributions of one number, as a study file gives them."""
+"""Distributions of one variable, as defined in a study file."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from needle_ros.errors import ParameterError
 import numpy as np
 from scipy.special import gammainc, gammaincinv, ndtr, ndtri
 
-#: Kinds, and what the numbers of each are.
+#: Kinds, and the parameters of each.
 KINDS: Final[Mapping[str, tuple[str, ...]]] = {
     'uniform': ('low', 'high'),
     'normal': ('mean', 'standard deviation'),
@@ -20,7 +20,7 @@ KINDS: Final[Mapping[str, tuple[str, ...]]] = {
     'gamma': ('mean', 'standard deviation'),
 }
 
-#: Numbers beyond cannot be reckoned with.
+#: Largest valid magnitude of a parameter.
 _LARGEST: Final = 1e100
 
 #: Least and largest mean of a gamma distribution over its standard deviation.
@@ -32,39 +32,17 @@ _CHOICE: Final = 'choice'
 
 @dataclass(frozen=True, slots=True)
 class Distribution:
-    """
-    A distribution of one number.
+    """Distribution of one variable."""
 
-    Attributes
-    ----------
-    kind : str
-        One of `KINDS`, or ``choice``.
-    numbers : tuple of float
-        What `KINDS` says, or the values to choose from, equally often.
-    within : tuple of float
-        Low and high: what is outside does not occur.
-
-    """
-
+    #: One of `KINDS`, or ``choice``.
     kind: str
+    #: Parameters as in `KINDS`, or equally probable values.
     numbers: tuple[float, ...]
+    #: Low and high end of a truncated distribution.
     within: tuple[float, float] = (-np.inf, np.inf)
 
     def quantiles(self, parts: FloatArray) -> FloatArray:
-        """
-        Return the values below which a part of all are.
-
-        Parameters
-        ----------
-        parts : ndarray, shape (n,)
-            Parts in (0, 1).
-
-        Returns
-        -------
-        ndarray, shape (n,)
-            The values.
-
-        """
+        """Return the values of the quantile function at probabilities in (0, 1), shape (n,)."""
         if self.kind == _CHOICE:
             number = len(self.numbers)
             at = np.minimum((parts * number).astype(int), number - 1)
@@ -74,20 +52,7 @@ class Distribution:
         return np.asarray(np.clip(values, *self.within))
 
     def ends(self, least: float, most: float) -> tuple[float, float]:
-        """
-        Return between which values all are.
-
-        Parameters
-        ----------
-        least, most : float
-            Least and largest part that is asked for.
-
-        Returns
-        -------
-        low, high : float
-            The values; not finite if there are larger ones than a number can be.
-
-        """
+        """Return the values at two probabilities; not finite on overflow."""
         if self.kind == _CHOICE:
             return min(self.numbers), max(self.numbers)
         with np.errstate(over='ignore', invalid='ignore'):
@@ -107,7 +72,7 @@ class Distribution:
         return np.asarray(first / shape * gammaincinv(shape, parts))
 
     def _below(self, value: float) -> float:
-        """Return the part of all that is below a value."""
+        """Return the cumulative probability at a value."""
         first, second = self.numbers
         if not isfinite(value):
             return float(value > 0.0)
@@ -124,26 +89,10 @@ class Distribution:
 
 def distribution(name: str, given: Any) -> Distribution:
     """
-    Read a distribution.
+    Parse a distribution; `name` is for error messages.
 
-    Parameters
-    ----------
-    name : str
-        Of what, for messages.
-    given : object
-        A number, which stands for itself, or a mapping such as ``{normal: [0, 0.02]}``, with
-        ``within: [low, high]`` if it is cut off.
-
-    Returns
-    -------
-    Distribution
-        The distribution.
-
-    Raises
-    ------
-    ParameterError
-        If it is not valid.
-
+    `given` is a number, a constant, or a mapping such as ``{normal: [0, 0.02]}``, truncated by
+    ``within: [low, high]``. Raises `ParameterError` if it is not valid.
     """
     if _is_number(given):
         return Distribution(_CHOICE, (float(given),))

@@ -1,8 +1,8 @@
 """
-A study, computed on any executor: nothing twice, and nothing lost when it is broken off.
+Compute a study on any executor; it is resumed after an interruption.
 
-Chunks of samples are written as they come, each whole or not at all, in a folder of parts. What is
-there is not computed again. When all are there they become one table, in the order of the samples,
+Chunks of samples are written as they arrive, each atomically, in a folder of parts. Existing parts
+are not computed again. When all are complete they become one table, in the order of the samples,
 whose bytes depend neither on the chunks nor on the number of workers.
 """
 
@@ -29,19 +29,19 @@ from needle_ros.files import write_whole
 import pyarrow as pa
 from pyarrow import parquet
 
-#: Samples of the first chunk, by whose time the others are sized, and that time [s].
+#: Samples of the first chunk, and the target duration of the others [s].
 _FIRST, _WANTED = 16, 1.0
 _LARGEST: Final = 2**13
 
-#: Rows of the table that are written at once: its bytes depend on it.
+#: Rows per group of the table; the bytes of the table depend on it.
 _GROUP: Final = 2**13
 
-# The other pools keep what they are given back.
+# The other memory pools do not release freed memory.
 pa.set_memory_pool(pa.system_memory_pool())
 
 _PART: Final = re.compile(r'(\d{10})-(\d{10})\.parquet')
 
-#: Packages on whose versions the bits of a sample depend.
+#: Packages whose versions affect the bits of a sample.
 _PACKAGES: Final = ('needle_insertion', 'numba', 'numpy', 'scipy')
 
 TABLE: Final = 'samples.parquet'
@@ -49,20 +49,7 @@ STUDY: Final = 'study.json'
 
 
 def order(study: Study) -> str:
-    """
-    Return what a worker must know.
-
-    Parameters
-    ----------
-    study : Study
-        The study.
-
-    Returns
-    -------
-    str
-        The study, and the versions by which it is computed.
-
-    """
+    """Return the input of a worker as JSON: the study, and the versions of the packages."""
     return json.dumps(
         {'study': study.document, 'versions': _versions()}, sort_keys=True, default=str
     )
@@ -91,27 +78,10 @@ def _study(text: str) -> Study:
 
 def chunk(text: str, first: int, count: int) -> tuple[float, dict[str, FloatArray]]:
     """
-    Compute a chunk, in whatever process.
+    Compute `count` samples of the study `text` of `order`, from `first` on, in any process.
 
-    Parameters
-    ----------
-    text : str
-        Of `order`.
-    first, count : int
-        As in `Study.rows`.
-
-    Returns
-    -------
-    taken : float
-        Time that it took [s].
-    columns : dict of str to ndarray
-        The columns.
-
-    Raises
-    ------
-    JobError
-        If this process has other versions than the one that gives the order.
-
+    Returns the duration [s] and the columns. Raises `JobError` if the package versions of this
+    process differ.
     """
     study = _study(text)
     begin = monotonic()
@@ -121,22 +91,10 @@ def chunk(text: str, first: int, count: int) -> tuple[float, dict[str, FloatArra
 
 class Results:
     """
-    The folder of a study.
+    The folder of a study; a folder of the same study is resumed.
 
-    Parameters
-    ----------
-    folder : Path
-        May exist with the same study, which then goes on.
-    study : Study
-        The study.
-
-    Raises
-    ------
-    ParameterError
-        If there is another study in it, or anything else.
-    JobError
-        If its table is damaged.
-
+    Raises `ParameterError` if it has another study or other files, and `JobError` if its table is
+    damaged.
     """
 
     def __init__(self, folder: Path, study: Study) -> None:
@@ -145,38 +103,34 @@ class Results:
         self._file = folder / STUDY
         if self._file.is_file():
             if self._begun()['study'] != json.loads(order(study))['study']:
-                raise ParameterError(f'{folder} is of another study; name another folder')
-        # One that was killed at the begin leaves a draft, or nothing.
+                raise ParameterError(f'{folder} belongs to another study; name another folder')
+        # A process that was killed at the start leaves a draft, or nothing.
         elif folder.exists() and any(path.suffix != '.tmp' for path in folder.iterdir()):
-            raise ParameterError(f'{folder} exists and is not of a study; name another folder')
+            raise ParameterError(f'{folder} exists and is not a study; name another folder')
         else:
             folder.mkdir(parents=True, exist_ok=True)
             write_whole(self._file, order(study).encode())
         if self.table.exists():
             if _rows(self.table) != study.samples:
-                raise JobError(f'{self.table} is damaged; remove it, and it is computed again')
+                raise JobError(f'{self.table} is damaged; remove it to compute it again')
             self._clear()
         else:
             self._parts.mkdir(exist_ok=True)
 
     def _begun(self) -> dict[str, Any]:
-        """Return the study that was begun, and by which versions."""
+        """Return the study in the folder, and the package versions of its start."""
         try:
             given = json.loads(self._file.read_bytes())
             return {name: given[name] for name in ('study', 'versions')}
         except (ValueError, TypeError, KeyError) as error:
-            raise ParameterError(f'{self._file} is not of a study; name another folder') from error
+            raise ParameterError(f'{self._file} is not a study; name another folder') from error
 
     @contextmanager
     def alone(self) -> Iterator[None]:
         """
-        Keep other processes from computing here, and remove parts that are damaged.
+        Lock the folder against other processes, and remove damaged parts.
 
-        Raises
-        ------
-        JobError
-            If another one does, or the study was begun by other versions.
-
+        Raises `JobError` if another process computes here, or the package versions differ.
         """
         _check_versions(self._begun()['versions'], f'the study in {self.folder}')
         self._parts.mkdir(exist_ok=True)
@@ -195,11 +149,11 @@ class Results:
 
     @property
     def table(self) -> Path:
-        """The table of all samples."""
+        """File of all samples."""
         return self.folder / TABLE
 
     def missing(self) -> list[tuple[int, int]]:
-        """Return the samples that are still to be computed, as ranges of first and last + 1."""
+        """Return the samples to compute, as ranges of first and last + 1."""
         begin, gaps = 0, list[tuple[int, int]]()
         if self.table.exists():
             return gaps
@@ -216,39 +170,24 @@ class Results:
         return sorted((int(one[1]), int(one[2])) for one in found if one)
 
     def add(self, first: int, columns: Mapping[str, FloatArray]) -> int:
-        """
-        Write a chunk.
-
-        Parameters
-        ----------
-        first : int
-            Number of its first sample.
-        columns : dict of str to ndarray
-            The columns.
-
-        Returns
-        -------
-        int
-            Number of its samples.
-
-        """
+        """Write a chunk that starts at the sample `first`; return its number of samples."""
         count = len(columns['sample'])
         self._write(self._part(first, first + count), [pa.table(dict(columns))])
         return count
 
     def complete(self) -> None:
-        """Make one table of all parts, and remove them."""
+        """Merge all parts into one table, and remove the parts."""
         if not self.table.exists():
             self._write(self.table, self._groups())
         self._clear()
 
     def _clear(self) -> None:
-        """Remove the parts: all of it is in the table."""
+        """Remove the parts after they are merged."""
         shutil.rmtree(self._parts, ignore_errors=True)
         self.table.with_suffix('.tmp').unlink(missing_ok=True)
 
     def _groups(self) -> Iterator[Any]:
-        """Yield all samples in tables of the same number of rows."""
+        """Yield all samples in tables of equal size."""
         waiting: list[Any] = []
         for first, end in self._done():
             waiting.append(parquet.read_table(self._part(first, end), use_threads=False))
@@ -264,7 +203,7 @@ class Results:
 
     @staticmethod
     def _write(path: Path, tables: Iterable[Any]) -> None:
-        """Write a file that is there whole or not at all."""
+        """Write a file atomically."""
         draft = path.with_suffix('.tmp')
         try:
             with ExitStack() as stack:
@@ -278,7 +217,7 @@ class Results:
                         )
                     writer.write_table(one.combine_chunks(), row_group_size=_GROUP)
             if path.name == TABLE:
-                # The parts are removed then. A part that is lost is computed again.
+                # The parts are removed afterwards. A lost part is computed again.
                 with draft.open('rb') as file:
                     os.fsync(file.fileno())
             draft.replace(path)
@@ -295,24 +234,10 @@ def compute(
     progress: Callable[[int], object],
 ) -> None:
     """
-    Compute the missing samples.
+    Compute the missing samples; raise `JobError` if a sample cannot be computed or written.
 
-    Parameters
-    ----------
-    results : Results
-        Folder of the study.
-    executor : callable
-        Returns a context with the executor of the chunks. The executor replaces lost workers.
-    workers : int
-        Number of workers.
-    progress : callable
-        Called with the number of samples of each chunk that is written.
-
-    Raises
-    ------
-    JobError
-        If a sample cannot be computed or written.
-
+    `executor` returns a context with an executor that replaces lost workers. `progress` receives
+    the number of samples of each chunk that is written.
     """
     with results.alone():
         if todo := results.missing():
@@ -333,7 +258,7 @@ def _compute(
     try:
         while todo or running:
             while todo and len(running) < 2 * workers:
-                # Small ones at the end: no worker shall wait for another one's last.
+                # Small chunks at the end, so that all workers end at the same time.
                 left = sum(end - first for first, end in todo)
                 first, end = todo.pop(0)
                 count = min(size, end - first, max(_FIRST, left // (2 * workers)))
@@ -345,7 +270,7 @@ def _compute(
                 taken, columns = future.result()
                 count = results.add(first, columns)
                 written(count)
-                # The first one compiles, or loads what was compiled.
+                # The first chunk compiles the kernels, or loads them.
                 size = min(max(1, round(count * _WANTED / max(taken, 1e-6))), 4 * size, _LARGEST)
     finally:
         for future in running:
@@ -354,36 +279,18 @@ def _compute(
 
 @contextmanager
 def dask(client: Any) -> Iterator[Executor]:
-    """
-    Make an executor of a Dask cluster.
-
-    Parameters
-    ----------
-    client : distributed.Client
-        Its client.
-
-    Yields
-    ------
-    Executor
-        The cluster remains when the context ends.
-
-    Raises
-    ------
-    JobError
-        If the cluster loses a chunk for good.
-
-    """
-    # A sample is a pure function of its number, but the same chunk is not wanted twice.
+    """Yield an executor on a Dask cluster, which remains; raise `JobError` if a chunk is lost."""
+    # A sample is a pure function of its number, but the results need not be kept.
     pool = client.get_executor(pure=False)
     try:
         yield pool
     except (CancelledError, ImportError) as error:
-        reason = str(error) or 'the scheduler is gone'
-        raise JobError(f'the cluster has lost a part of the study: {reason}') from error
+        reason = str(error) or 'the scheduler is not available'
+        raise JobError(f'the cluster has lost a chunk of the study: {reason}') from error
     except Exception as error:
         if not type(error).__module__.startswith('distributed'):
             raise
-        raise JobError(f'the cluster has lost a part of the study: {error}') from error
+        raise JobError(f'the cluster has lost a chunk of the study: {error}') from error
     finally:
         if client.status == 'running':
             pool.shutdown(wait=False)

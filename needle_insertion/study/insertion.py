@@ -1,4 +1,4 @@
-"""Insertions of a flexible needle to a depth: under a law of the controller, or in open loop."""
+"""Insert sampled flexible needles to a depth, under a control law or in open loop."""
 
 from __future__ import annotations
 
@@ -42,10 +42,10 @@ from scipy.optimize import brentq
 
 OPEN_LOOP: Final = 'open loop'
 
-#: What pushes the needle.
+#: Control laws, and the open loop.
 CONTROLLERS: Final = (*LAWS, OPEN_LOOP)
 
-#: Slower than this a needle rests [m/s].
+#: Largest speed of a needle at rest [m/s].
 _REST: Final = 1e-5
 
 #: Limits of the guard of the node.
@@ -54,42 +54,34 @@ _LIMITS: Final = SafetyLimits()
 #: Most samples of an insertion.
 _MOST: Final = 1_000_000
 
-#: Insertions in open loop that are computed at once: all their samples are kept meanwhile.
+#: Open-loop insertions per batch, whose samples are all in memory.
 _AT_ONCE: Final = 16
 
-#: Parts of the settings that are mappings, or words.
+#: Settings that are mappings or words.
 _PARTS: Final = ('needle', 'constants', 'controller', 'gains', 'uncertainty', 'reference')
 
 FIGURES: Final[Mapping[str, Figure]] = {
     'error': Figure('m', 'distance of the needle from the target depth at the end'),
     'hit': Figure('', 'the needle ends within the tolerance of the target depth'),
-    'overshoot': Figure('m', 'farthest way beyond the target depth'),
-    'following': Figure('m', 'root mean square of the distance from the reference'),
+    'overshoot': Figure('m', 'largest overshoot of the target depth'),
+    'following': Figure('m', 'root mean square of the tracking error'),
     'force': Figure('N', 'largest force'),
-    'deflection': Figure('m', 'largest deflection of the tip'),
-    'rest': Figure('s', 'time until the needle rests for good'),
-    'reversals': Figure('1', 'how often it turns round in the time after the reference'),
-    'stopped': Figure('', 'it was stopped by the guard'),
-    'left': Figure('', 'it left its range of depths'),
+    'deflection': Figure('m', 'largest tip deflection'),
+    'rest': Figure('s', 'time until the needle remains at rest'),
+    'reversals': Figure('1', 'reversals of the velocity after the end of the reference'),
+    'stopped': Figure('', 'the guard stopped the needle'),
+    'left': Figure('', 'the needle left its range of depths'),
 }
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class InsertionStudy:
-    """
-    Numbers of the protocol that are the same for all samples.
-
-    Raises
-    ------
-    ParameterError
-        If a value is not a number or is outside its range.
-
-    """
+    """Settings of the scenario that are the same for all samples."""
 
     rate: float = constant(1000.0, 'Hz', 'samples of the loop', low=1.0, high=10_000.0)
     delay: float = constant(
-        1.0, 'periods', 'whole periods from a measurement to the effect of its command, as the '
-        'law believes', high=20.0,
+        1.0, 'periods', 'whole periods from a measurement to the effect of its command, in the '
+        'model of the law', high=20.0,
     )  # fmt: skip
     force_limit: float = constant(15.0, 'N', 'largest insertion force', open_low=True)
     speed: float = constant(0.01, 'm/s', 'highest speed of the reference', open_low=True)
@@ -98,7 +90,7 @@ class InsertionStudy:
     )
     wait: float = constant(1.0, 's', 'time after the end of the reference', open_low=True)
     push: float = constant(3.0, 'N', 'force of the open loop', open_low=True)
-    tolerance: float = constant(1e-4, 'm', 'error with which the target is hit', open_low=True)
+    tolerance: float = constant(1e-4, 'm', 'largest error of a hit', open_low=True)
     step: float = constant(2e-4, 's', 'longest step of the simulated needle', low=1e-7)
     speed_limit: float = constant(
         _LIMITS.speed, 'm/s', 'speed at which the guard stops', open_low=True
@@ -108,7 +100,7 @@ class InsertionStudy:
         open_low=True,
     )  # fmt: skip
     deflection_limit: float = constant(
-        _LIMITS.tip_deflection, 'm', 'deflection of the tip at which the guard stops',
+        _LIMITS.tip_deflection, 'm', 'tip deflection at which the guard stops',
         open_low=True,
     )  # fmt: skip
 
@@ -120,7 +112,7 @@ class InsertionStudy:
 
 class _Course(NamedTuple):
     """
-    One insertion up to where it ends or is stopped.
+    Trajectory of one insertion up to its end or stop.
 
     Attributes
     ----------
@@ -129,14 +121,13 @@ class _Course(NamedTuple):
     states : ndarray, shape (k + 1, 2 (2 + n))
         States at the samples.
     commands, forces : ndarray, shape (k,)
-        Command that answers each sample, and force that acts from it on [N].
+        Command of each sample, and the force that acts from that sample on [N].
     noise : ndarray, shape (k + 1, 2)
-        What the encoders say too much [m], [m/s].
+        Encoder errors of depth [m] and velocity [m/s].
     goal : ndarray, shape (k + 1,)
-        Reference [m]; NaN without one.
+        Reference [m]; NaN without a reference.
     stopped, left : float
         As in `FIGURES`.
-
     """
 
     model: NeedleModel
@@ -150,37 +141,28 @@ class _Course(NamedTuple):
 
     @property
     def depth(self) -> FloatArray:
-        """Inserted length [m], shape (k + 1,)."""
+        """Insertion depth [m], shape (k + 1,)."""
         return np.asarray(self.model.parameters.length - self.states[:, 0])
 
     @property
     def speed(self) -> FloatArray:
-        """Insertion speed [m/s], shape (k + 1,)."""
+        """Insertion velocity [m/s], shape (k + 1,)."""
         return np.asarray(-self.states[:, self.model.coordinates])
 
     @property
     def tip(self) -> FloatArray:
-        """Deflection of the tip [m], shape (k + 1,)."""
+        """Tip deflection [m], shape (k + 1,)."""
         return self.model.tip_deflections(self.states)
 
 
 class InsertionProtocol:
     """
-    Pushes needles that differ from what is believed of them to a depth.
+    Insert needles that differ from the nominal model to a depth.
 
-    Parameters
-    ----------
-    settings : dict
-        ``needle``, a preset; ``constants`` of it as they are believed; ``controller``, one of
-        `CONTROLLERS`, with its ``gains`` of insertion, which shall be stable for the
-        ``uncertainty``; ``reference``, a key of `REFERENCES`; and the numbers of
-        `InsertionStudy`.
-
-    Raises
-    ------
-    ParameterError
-        If a setting is not valid, or the gains are unstable.
-
+    `settings` holds ``needle``, a preset; nominal ``constants``; ``controller``, one of
+    `CONTROLLERS`, with its ``gains`` of insertion, which must be stable for the ``uncertainty``;
+    ``reference``, a key of `REFERENCES`; and the fields of `InsertionStudy`. Raises
+    `ParameterError` if a setting is not valid, or the gains are unstable.
     """
 
     figures = FIGURES
@@ -224,30 +206,31 @@ class InsertionProtocol:
         self.quantities: Mapping[str, Quantity] = {
             'target': Quantity(0.5 * p.length, 'm', 'target depth', p.minimum_depth, deepest),
             'depth': Quantity(
-                max(0.1 * p.length, p.minimum_depth), 'm', 'inserted length at the start',
+                max(0.1 * p.length, p.minimum_depth), 'm', 'insertion depth at the start',
                 p.minimum_depth, deepest,
             ),
-            'tip': Quantity(0.0, 'm', 'deflection of the tip at the start', -most, most),
-            'coulomb_friction': Quantity(1.0, '1', 'mu_s over the believed one', 0.0, 1e3),
-            'viscous_friction': Quantity(1.0, '1', 'mu_v over the believed one', 0.0, 1e3),
+            'tip': Quantity(0.0, 'm', 'tip deflection at the start', -most, most),
+            'coulomb_friction': Quantity(1.0, '1', 'mu_s over its nominal value', 0.0, 1e3),
+            'viscous_friction': Quantity(1.0, '1', 'mu_v over its nominal value', 0.0, 1e3),
             'carriage_mass': Quantity(
                 p.carriage_mass, 'kg', 'mass moved along with the needle', 0.0, 1e3
             ),
-            'tissue_stiffness': Quantity(1.0, '1', 'k_a over the believed one', 0.0, 1e3),
-            'tissue_damping': Quantity(1.0, '1', 'c_a over the believed one', 0.0, 1e3),
+            'tissue_stiffness': Quantity(1.0, '1', 'k_a over its nominal value', 0.0, 1e3),
+            'tissue_damping': Quantity(1.0, '1', 'c_a over its nominal value', 0.0, 1e3),
             'depth_noise': Quantity(0.0, 'm', 'standard deviation of a measured depth', 0.0),
-            'speed_noise': Quantity(0.0, 'm/s', 'standard deviation of a measured speed', 0.0),
+            'speed_noise': Quantity(0.0, 'm/s', 'standard deviation of a measured velocity', 0.0),
             'force_noise': Quantity(
-                0.0, 'N', 'standard deviation of the force that acts beyond a command', 0.0
+                0.0, 'N', 'standard deviation of the additional force on the needle', 0.0
             ),
             'late': Quantity(
-                0.0, 'periods', 'delay that the law does not know, to whole periods', 0.0, 100.0
+                0.0, 'periods', 'delay that is not in the model of the law, to whole periods',
+                0.0, 100.0,
             ),
         }  # fmt: skip
 
     @property
     def _longest(self) -> float:
-        """Time of the longest insertion [s]."""
+        """Upper bound of the duration of an insertion [s]."""
         p, numbers = self._needle, self._numbers
         if self._law is None:
             axis = Axis.insertion(p)
@@ -259,7 +242,7 @@ class InsertionProtocol:
     def _made(
         self, controller: str, gains: Mapping[str, Any], uncertainty: Uncertainty
     ) -> Law | None:
-        """Return the law of a controller, or none for the open loop."""
+        """Return the law of a controller, or None in open loop."""
         p = self._needle
         if controller == OPEN_LOOP:
             if gains:
@@ -283,20 +266,7 @@ class InsertionProtocol:
     def run(
         self, drawn: Mapping[str, FloatArray], streams: Sequence[np.random.Generator]
     ) -> dict[str, FloatArray]:
-        """
-        Insert some needles.
-
-        Parameters
-        ----------
-        drawn, streams
-            As in `Protocol.run`.
-
-        Returns
-        -------
-        dict of str to ndarray, shape (n,)
-            `FIGURES`.
-
-        """
+        """Compute the metrics of sampled needles, as `Protocol.run`."""
         rows = [
             self._row({name: float(values[k]) for name, values in drawn.items()})
             for k in range(len(streams))
@@ -311,25 +281,12 @@ class InsertionProtocol:
         return {name: np.array([one[name] for one in found]) for name in FIGURES}
 
     def replay(self, drawn: Mapping[str, float], rng: np.random.Generator) -> Iterator[Seen]:
-        """
-        Insert one needle again.
-
-        Parameters
-        ----------
-        drawn, rng
-            As in `Protocol.replay`.
-
-        Yields
-        ------
-        Seen
-            Joints, tip and commands at each sample of the loop, up to a stop, and the target.
-
-        """
+        """Yield joints, tip and commands at each sample up to a stop, and the target."""
         ((row, course),) = self._courses([self._row(drawn)], [rng])
         yield Seen(contract.TARGET, 0, (0.0, row['target'], 0.0))
         m = course.model.coordinates
         depths, speeds = course.depth + course.noise[:, 0], course.speed + course.noise[:, 1]
-        # The effort is what acted up to the sample.
+        # The effort acted up to the sample.
         acted = np.concatenate([[0.0], course.forces])
         for k, (state, tip) in enumerate(zip(course.states, course.tip, strict=True)):
             stamp = round(k * self._period * NANOSECONDS)
@@ -357,7 +314,7 @@ class InsertionProtocol:
     def _courses(
         self, rows: Sequence[Mapping[str, float]], streams: Sequence[np.random.Generator]
     ) -> Iterator[tuple[Mapping[str, float], _Course]]:
-        """Insert some needles."""
+        """Simulate the insertions."""
         if self._law is None:
             courses = self._open(rows, streams)
         else:
@@ -366,14 +323,14 @@ class InsertionProtocol:
         return zip(rows, courses, strict=True)
 
     def _noise(self, row: Mapping[str, float], rng: np.random.Generator, count: int) -> FloatArray:
-        """Return the noise of depth, speed and force for each period, shape (count, 3)."""
+        """Return the noise of depth, velocity and force for each period, shape (count, 3)."""
         sizes = [row[name] for name in ('depth_noise', 'speed_noise', 'force_noise')]
         return np.asarray(sizes * rng.standard_normal((count, 3)))
 
     def _closed(self, law: Law, row: Mapping[str, float], rng: np.random.Generator) -> _Course:
-        """Insert a needle under a law."""
+        """Simulate an insertion under a control law."""
         numbers, model = self._numbers, NeedleModel(self._truth(row))
-        # The reference begins where the needle is measured.
+        # The reference starts at the measured depth.
         begin = row['depth'] + row['depth_noise'] * float(rng.standard_normal())
         limits = ReferenceLimits(speed=numbers.speed, acceleration=numbers.acceleration)
         reference: Reference = self._kind(Setpoint(begin), row['target'], limits)
@@ -405,7 +362,7 @@ class InsertionProtocol:
         return course if end is None else _cut(course._replace(stopped=1.0, left=0.0), end)
 
     def _stop(self, course: _Course) -> int | None:
-        """Return the sample at which the guard stops, if it does."""
+        """Return the sample of the stop by the guard, or None."""
         p, n = course.model.parameters, self._numbers
         depth, speed = course.depth + course.noise[:, 0], course.speed + course.noise[:, 1]
         above, below = p.minimum_depth - depth, depth - p.length
@@ -415,14 +372,14 @@ class InsertionProtocol:
             np.abs(course.goal - depth) > n.error_limit,
             np.abs(course.tip) > n.deflection_limit,
         ]
-        # One reading alone may be a fault of the sensor.
+        # A single sample may be a fault of the sensor.
         twice = np.any([one[1:] & one[:-1] for one in beyond], axis=0)
         return 1 + int(np.argmax(twice)) if twice.any() else None
 
     def _open(
         self, rows: Sequence[Mapping[str, float]], streams: Sequence[np.random.Generator]
     ) -> Iterator[_Course]:
-        """Insert needles by a constant force, for as long as the believed needle would take."""
+        """Simulate insertions under a constant force, for the duration of the nominal needle."""
         numbers, believed = self._numbers, Axis.insertion(self._needle)
         models = [NeedleModel(self._truth(row)) for row in rows]
         commands, noise = [], []
@@ -458,7 +415,7 @@ class InsertionProtocol:
             yield _cut(course, done)
 
     def _judged(self, row: Mapping[str, float], course: _Course) -> dict[str, float]:
-        """Return the figures of merit of an insertion."""
+        """Return the metrics of an insertion."""
         depth, speed, target = course.depth, course.speed, row['target']
         error = abs(target - float(depth[-1]))
         beyond = copysign(1.0, target - row['depth']) * (depth - target)
@@ -482,12 +439,12 @@ class InsertionProtocol:
 
 
 def _said(noise: FloatArray) -> FloatArray:
-    """Return the noise of the encoders at each sample; nothing answers the last one."""
+    """Append zeros for the last sample, which no command follows, to the encoder noise."""
     return np.concatenate([noise[:, :2], np.zeros((1, 2))])
 
 
 def _cut(course: _Course, end: int) -> _Course:
-    """Return an insertion up to a sample."""
+    """Truncate an insertion at a sample."""
     return course._replace(
         states=course.states[: end + 1],
         commands=course.commands[:end],
@@ -498,7 +455,7 @@ def _cut(course: _Course, end: int) -> _Course:
 
 
 def _time(axis: Axis, force: float, way: float) -> float:
-    """Return the time in which a constant force moves an axis by a way, from rest [s]."""
+    """Return the time in which a constant force moves an axis by a distance, from rest [s]."""
     if way == 0.0:
         return 0.0
 

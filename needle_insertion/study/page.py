@@ -1,4 +1,4 @@
-"""The page of a study."""
+"""Write the page of a study."""
 
 from __future__ import annotations
 
@@ -27,41 +27,31 @@ from needle_insertion.study.summary import (
 import numpy as np
 import yaml
 
-#: Quantiles of each figure.
+#: Quantiles of each metric.
 _PARTS: Final = (0.5, 0.95, 0.99)
 
-#: Most bars of a distribution, and samples from which on its tail is cut off.
+#: Most bars of a histogram, and the number of samples from which its tail is cut off.
 _BARS, _TAILED = 80, 1000
 
-#: Most cells of a map along each axis, samples of one in the mean, and that it needs at least.
+#: Most cells of a map along each axis; mean and least number of samples of a cell.
 _CELLS, _MEAN, _FEWEST = 24, 25, 5
 
-#: How numbers in SI units are shown: unit and factor.
+#: Display unit and factor of SI units.
 _SHOWN: Final[Mapping[str, tuple[str, float]]] = {
     'm': ('mm', 1e3), 'rad': ('mrad', 1e3), '1': ('', 1.0), '%': ('%', 100.0),
 }  # fmt: skip
 
-#: Samples of which quantiles, shares and pictures are: the page needs no more memory for more.
+#: Most samples in quantiles, shares and pictures: bounds the memory of the page.
 _MOST: Final = 2**17
 
-_MISSING: Final = 'A sample in which a figure does not exist does not count for it.'
+_MISSING: Final = 'Samples without a value of a metric are excluded from it.'
 
-#: Worst samples that are listed.
+#: Number of worst samples in the list.
 _WORST: Final = 10
 
 
 def write(results: Results, path: Path) -> None:
-    """
-    Write the page.
-
-    Parameters
-    ----------
-    results : Results
-        A study whose table is complete.
-    path : Path
-        Page to write.
-
-    """
+    """Write the page of a study whose table is complete."""
     study, table = results.study, results.table
     figures, drawn = study.protocol.figures, list(study.population)
     main = next(iter(figures))
@@ -78,7 +68,7 @@ def write(results: Results, path: Path) -> None:
             quantiles.append((_head(name, one.unit), *words, str(there), one.meaning))
     shares = {name: share(values, column(table, name, _MOST)) for name in drawn}
     order = sorted(drawn, key=lambda name: -np.nan_to_num(shares[name]))
-    # The two that matter most are drawn.
+    # The two most influential variables are drawn.
     most = {name: column(table, name, _MOST) for name in order[:2]}
     bad, listed = worst(batches(table, main), _WORST), [main, *order[:4]]
     of_bad = {name: picked(table, name, bad) for name in listed}
@@ -87,12 +77,12 @@ def write(results: Results, path: Path) -> None:
     limited = (f'Of the first {_MOST} samples.',) if study.samples > _MOST else ()
     sections = [
         Section(
-            title='How often',
-            paragraphs=('Intervals are of 95 %, of Wilson.', _MISSING),
+            title='Probabilities',
+            paragraphs=('95 % intervals by the method of Wilson.', _MISSING),
             tables=(
                 Grid(
                     caption='Probabilities',
-                    heads=('figure', 'probability', '95 % interval', 'samples', 'what it is'),
+                    heads=('metric', 'probability', '95 % interval', 'samples', 'meaning'),
                     rows=tuple(
                         (name, *_rounded(one, '%'), str(one.samples), figures[name].meaning)
                         for name, one in chances.items()
@@ -103,12 +93,12 @@ def write(results: Results, path: Path) -> None:
             pictures=(),
         ),
         Section(
-            title='How far',
-            paragraphs=('With intervals of 95 %, whatever the distribution.', _MISSING, *limited),
+            title='Quantiles',
+            paragraphs=('With distribution-free 95 % intervals.', _MISSING, *limited),
             tables=(
                 Grid(
                     caption='Quantiles',
-                    heads=('figure', *(f'{part:.0%}' for part in _PARTS), 'samples', 'what it is'),
+                    heads=('metric', *(f'{part:.0%}' for part in _PARTS), 'samples', 'meaning'),
                     rows=tuple(quantiles),
                 ),
             ),
@@ -118,17 +108,17 @@ def write(results: Results, path: Path) -> None:
     if drawn:
         sections.append(
             Section(
-                title='What matters',
+                title='Sensitivity',
                 paragraphs=(
-                    f'Part of the variance of {main} that each quantity explains alone.',
-                    'What is missing to 100 % is noise, and quantities that act together.',
-                    'Quantities that are correlated have a part of the share of each other.',
+                    f'Fraction of the variance of {main} explained by each variable alone.',
+                    'The remainder to 100 % is noise, and interactions of variables.',
+                    'Correlated variables share a part of their fractions.',
                     *limited,
                 ),
                 tables=(
                     Grid(
                         caption='Shares of the variance',
-                        heads=('quantity', main, 'what it is'),
+                        heads=('variable', main, 'meaning'),
                         rows=tuple(
                             (name, _share(shares[name]), study.protocol.quantities[name].meaning)
                             for name in order
@@ -142,8 +132,8 @@ def write(results: Results, path: Path) -> None:
         )  # fmt: skip
     sections.append(
         Section(
-            title='The worst',
-            paragraphs=('One of them again, into a bag: needle study STUDY --replay NUMBER',),
+            title='Worst samples',
+            paragraphs=('Replay of a sample to a bag: needle study STUDY --replay NUMBER',),
             tables=(
                 Grid(
                     caption=f'Samples with the largest {main}',
@@ -172,7 +162,7 @@ def write(results: Results, path: Path) -> None:
         'study.html',
         pictures,
         title='Study',
-        introduction='Simulated insertions of a population of needles that nobody knows exactly.',
+        introduction='Simulated insertions of a population of needles with uncertain parameters.',
         cards=cards,
         sections=sections,
         study=yaml.safe_dump(dict(study.document), default_flow_style=None, sort_keys=False),
@@ -180,7 +170,7 @@ def write(results: Results, path: Path) -> None:
 
 
 def _shown(unit: str) -> tuple[str, float]:
-    """Return the unit in which numbers of a unit are shown, and the factor to it."""
+    """Return the display unit of an SI unit, and the factor to it."""
     return _SHOWN.get(unit, (unit, 1.0))
 
 
@@ -194,7 +184,7 @@ def _number(value: float, unit: str) -> str:
 
 
 def _rounded(one: Estimate, unit: str) -> tuple[str, str]:
-    """Return a number and its interval, with the digits that the interval leaves to it."""
+    """Format a value and its interval, with digits according to the width of the interval."""
     value, low, high = (_shown(unit)[1] * number for number in one[:3])
     wide = sum(end for end in (value - low, high - value) if isfinite(end))
     form = f'.{min(9, max(1, 1 - floor(log10(wide))))}f' if wide > 0.0 else '.4g'
@@ -222,7 +212,7 @@ def _distribution(name: str, figure: Figure, values: FloatArray) -> Picture:
     if len(seen):
         end = float(seen[-1])
         if len(seen) >= _TAILED:
-            # What is beyond would leave nothing to see of the rest.
+            # Outliers would compress the rest of the histogram.
             end = float(np.quantile(seen, 0.999))
             words += ' The largest thousandth is not shown.'
         bars = min(_BARS, ceil(2.0 * len(seen) ** (1.0 / 3.0)))
@@ -240,7 +230,7 @@ def _dashed() -> str:
 def _map(
     name: str, figure: Figure, values: FloatArray, over: dict[str, FloatArray], study: Study
 ) -> tuple[Picture, ...]:
-    """Draw the median of a figure over two quantities, if there is anything to see."""
+    """Draw the median of a metric over two variables, if both vary."""
     if len(over) < 2:
         return ()
     inside = np.isfinite(values)
@@ -251,7 +241,7 @@ def _map(
         if low == high or not inside.any():
             return ()
         at = np.linspace(low, high, count + 1)
-        # The last edge is that of the last cell.
+        # The last edge belongs to the last cell.
         place = np.minimum(np.digitize(of, at) - 1, count - 1).astype(np.int16)
         inside &= (of >= low) & (of <= high)
         cells = count * cells + place
@@ -268,5 +258,5 @@ def _map(
     mesh = axes.pcolormesh(*edges, shown.reshape(count, count).T, cmap='viridis')
     drawing.colorbar(mesh, label=_head(f'median {name}', figure.unit))
     axes.set(xlabel=heads[0], ylabel=heads[1])
-    words = f'Median {name} over the two quantities that matter most. White: too few.'
+    words = f'Median {name} over the two most influential variables. White: too few samples.'
     return (Picture('map', words, drawing),)

@@ -1,4 +1,4 @@
-"""What is done with each sample of a population."""
+"""Interface of a scenario: variables, metrics, and the simulation of samples."""
 
 from __future__ import annotations
 
@@ -13,122 +13,58 @@ import numpy as np
 
 
 class Quantity(NamedTuple):
-    """
-    A number that may differ from sample to sample.
+    """A variable that may differ from sample to sample."""
 
-    Attributes
-    ----------
-    default : float
-        Its value where the population does not say.
-    unit : str
-        SI unit.
-    meaning : str
-        What it is.
-    low, high : float
-        Valid range.
-
-    """
-
+    #: Value if it is not in the population.
     default: float
+    #: SI unit.
     unit: str
     meaning: str
+    #: Valid range.
     low: float = -inf
     high: float = inf
 
 
 class Figure(NamedTuple):
-    """
-    A figure of merit.
+    """A metric of a sample."""
 
-    Attributes
-    ----------
-    unit : str
-        SI unit; '' for yes or no.
-    meaning : str
-        What it is.
-
-    """
-
+    #: SI unit; '' for yes or no.
     unit: str
     meaning: str
 
 
 class Seen(NamedTuple):
-    """
-    What a robot or a sensor would have said in a sample.
-
-    Attributes
-    ----------
-    topic : Topic
-        Where.
-    stamp : int
-        When [ns].
-    values : sequence of float
-        Its numbers, see `Topic.quantities`.
-
-    """
+    """A message of a robot or a sensor in a replayed sample."""
 
     topic: Topic
+    #: [ns].
     stamp: int
+    #: Numbers of `Topic.quantities`.
     values: Sequence[float]
 
 
 class Protocol(Interface):
-    """
-    What is done with a sample.
+    """Interface of a scenario, which is simulated with each sample."""
 
-    Attributes
-    ----------
-    quantities : dict of str to Quantity
-        What may differ.
-    figures : dict of str to Figure
-        What comes out, the one that matters most first.
-
-    """
-
+    #: Variables of a sample.
     quantities: Mapping[str, Quantity]
+    #: Metrics, the primary metric first.
     figures: Mapping[str, Figure]
 
     def run(
         self, drawn: Mapping[str, FloatArray], streams: Sequence[np.random.Generator]
     ) -> dict[str, FloatArray]:
         """
-        Do it with some samples.
+        Simulate samples with the sampled values and the random generator of each.
 
-        Parameters
-        ----------
-        drawn : dict of str to ndarray, shape (n,)
-            What differs.
-        streams : sequence of Generator
-            Source of chance of each sample.
-
-        Returns
-        -------
-        dict of str to ndarray, shape (n,)
-            Figures of merit; yes is 1, and what does not exist nan.
-
+        Returns each metric, shape (n,): 1 for yes, NaN for a missing value.
         """
 
     def replay(self, drawn: Mapping[str, float], rng: np.random.Generator) -> Iterator[Seen]:
-        """
-        Do it with one sample again.
-
-        Parameters
-        ----------
-        drawn : dict of str to float
-            What differs.
-        rng : Generator
-            Its source of chance.
-
-        Yields
-        ------
-        Seen
-            What was measured and commanded, in the order of time within each topic.
-
-        """
+        """Simulate one sample again; yield measurements and commands in time order per topic."""
 
 
-# Imported when they are made: a study needs one of them.
+# Imported on demand: a study needs a single scenario.
 
 
 def _steering(settings: Mapping[str, Any]) -> Protocol:
@@ -143,7 +79,7 @@ def _insertion(settings: Mapping[str, Any]) -> Protocol:
     return InsertionProtocol(settings)
 
 
-#: Makes each protocol from the settings of a study.
+#: Constructor of each scenario from the settings of a study.
 PROTOCOLS: Final[Mapping[str, Callable[[Mapping[str, Any]], Protocol]]] = {
     'steering': _steering,
     'insertion': _insertion,

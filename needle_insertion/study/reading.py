@@ -1,4 +1,4 @@
-"""What is read of a study file."""
+"""Check the content of a study file."""
 
 from __future__ import annotations
 
@@ -10,24 +10,7 @@ from needle_ros.settings import unknown_name
 
 
 def check_names(where: str, given: Iterable[Any], valid: Iterable[str]) -> None:
-    """
-    Check that all names are known.
-
-    Parameters
-    ----------
-    where : str
-        What the message begins with.
-    given : iterable
-        Names of the file.
-    valid : iterable of str
-        Valid ones.
-
-    Raises
-    ------
-    ParameterError
-        If one is not.
-
-    """
+    """Raise `ParameterError`, with the prefix `where`, if a name is not valid."""
     known = list(valid)
     for name in given:
         if name not in known:
@@ -35,27 +18,7 @@ def check_names(where: str, given: Iterable[Any], valid: Iterable[str]) -> None:
 
 
 def mapping(name: str, value: Any) -> Mapping[str, Any]:
-    """
-    Return names with values.
-
-    Parameters
-    ----------
-    name : str
-        What it is, for the message.
-    value : object
-        What the file says; None for nothing.
-
-    Returns
-    -------
-    dict
-        The same.
-
-    Raises
-    ------
-    ParameterError
-        If it is something else.
-
-    """
+    """Return a mapping of the file, empty for None; raise `ParameterError` otherwise."""
     if value is None:
         return {}
     if not isinstance(value, Mapping):
@@ -64,29 +27,7 @@ def mapping(name: str, value: Any) -> Mapping[str, Any]:
 
 
 def one_of(name: str, value: Any, valid: Iterable[str]) -> str:
-    """
-    Return a word that is one of some.
-
-    Parameters
-    ----------
-    name : str
-        What it is, for the message.
-    value : object
-        What the file says.
-    valid : iterable of str
-        Valid words.
-
-    Returns
-    -------
-    str
-        The same.
-
-    Raises
-    ------
-    ParameterError
-        If it is something else.
-
-    """
+    """Return a word of the file; raise `ParameterError` if it is not valid."""
     words = tuple(valid)
     if value not in words:
         raise ParameterError(f'{name} must be one of {", ".join(words)}, got {value!r}')

@@ -1,4 +1,4 @@
-"""One sample of a study, computed again into a bag."""
+"""Compute one sample of a study again and record it to a bag."""
 
 from __future__ import annotations
 
@@ -14,29 +14,9 @@ import numpy as np
 
 def replay(results: Results, number: int, bag: Path) -> bool:
     """
-    Compute a sample again, and write what a robot and a tracker would have seen of it.
+    Record a sample to a bag; return whether there was a table to compare with.
 
-    Parameters
-    ----------
-    results : Results
-        The study; if its table is complete, the sample is compared with it.
-    number : int
-        Number of the sample.
-    bag : Path
-        Bag to write, with the topics that the protocol has.
-
-    Returns
-    -------
-    bool
-        Whether there was a table to compare with.
-
-    Raises
-    ------
-    ParameterError
-        If there is no such sample.
-    JobError
-        If the table has other numbers.
-
+    Raises `ParameterError` if there is no such sample, and `JobError` if the table differs.
     """
     study = results.study
     if not 0 <= number < study.samples:

@@ -1,4 +1,4 @@
-"""Insertions to a target: steered by a controller, or in open loop."""
+"""Insert sampled needles to a target, steered by a controller or in open loop."""
 
 from __future__ import annotations
 
@@ -38,71 +38,63 @@ OURS: Final = 'ours'
 BROYDEN: Final = 'Broyden'
 OPEN_LOOP: Final = 'open loop'
 
-#: Who moves the guide.
+#: Controllers of the guide.
 CONTROLLERS: Final = (OURS, 'springs', BROYDEN, 'roll towards the target', OPEN_LOOP)
 
-#: A tip that is no farther from its target has hit it [m].
+#: Largest miss of a hit [m].
 HIT: Final = 1e-3
 
-#: Squared distance within which 95 of 100 draws of two normal numbers are.
+#: Quantile 0.95 of the chi-squared distribution with two degrees of freedom.
 _ELLIPSE: Final = 5.991
 
-#: Velocity by which the depths of the looks of a replay become times [m/s].
+#: Insertion speed of a replay [m/s].
 _SPEED: Final = 0.01
 
-#: The joints of a guide, without forces.
+#: Joint states of a guide without efforts.
 _STATES: Final = contract.steered_states()
 _JOINTS: Final = replace(_STATES, joints=tuple(one._replace(effort='') for one in _STATES.joints))
 
-#: Seeds of paths are below.
+#: Upper bound of the seeds of paths.
 _SEEDS: Final = 2**63
 
 #: Most steps of an insertion.
 _MOST: Final = 1000
 
-#: Needles that are held at once.
+#: Needles per batch, which are in memory together.
 _TOGETHER: Final = 256
 
-#: Parts of the settings that are mappings, or words.
+#: Settings that are mappings or words.
 _PARTS: Final = ('needle', 'constants', 'belief', 'controller')
 
 FIGURES: Final[Mapping[str, Figure]] = {
     'miss': Figure('m', 'distance of the tip from the target at the end'),
     'hit': Figure('', f'the tip ends within {1e3 * HIT:g} mm of the target'),
-    'tip_x': Figure('m', 'where the tip ends, in the frame of the sensor'),
-    'tip_z': Figure('m', 'where the tip ends, in the frame of the sensor'),
-    'way': Figure('m', 'way of the guide'),
-    'turns': Figure('1', 'how often the needle was turned'),
-    'load': Figure('N', 'largest lateral force on the guide after a motion of it'),
-    'refused': Figure('', 'the target was refused as out of reach'),
-    'stopped': Figure('', 'the controller stopped short of the target'),
-    'warned': Figure('', 'it said on the way that the target is out of reach'),
-    'said_x': Figure('m', 'where the controller says that the tip ends'),
-    'said_z': Figure('m', 'where the controller says that the tip ends'),
-    'held': Figure('', 'the tip is in the ellipse of 95 % that the controller gives'),
+    'tip_x': Figure('m', 'final tip position, in the frame of the sensor'),
+    'tip_z': Figure('m', 'final tip position, in the frame of the sensor'),
+    'way': Figure('m', 'distance traveled by the guide'),
+    'turns': Figure('1', 'number of needle rotations'),
+    'load': Figure('N', 'largest lateral force on the guide after its motions'),
+    'refused': Figure('', 'the target was rejected as outside the reachable set'),
+    'stopped': Figure('', 'the controller stopped before the target depth'),
+    'warned': Figure('', 'a warning before the target depth: target outside the reachable set'),
+    'said_x': Figure('m', 'expected final tip position of the controller'),
+    'said_z': Figure('m', 'expected final tip position of the controller'),
+    'held': Figure('', 'the tip is in the 95 % ellipse of the controller'),
 }
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SteeringStudy:
-    """
-    Numbers of the protocol that are the same for all samples.
-
-    Raises
-    ------
-    ParameterError
-        If a value is not a number or is outside its range.
-
-    """
+    """Settings of the scenario that are the same for all samples."""
 
     depth: float = constant(0.1, 'm', 'depth of the target', open_low=True)
-    step: float = constant(5e-3, 'm', 'way between two looks', open_low=True)
-    guide_limit: float = constant(6e-3, 'm', 'farthest position of the guide')
-    guide_step: float = constant(1.0, 'm', 'farthest way of the guide in a step', open_low=True)
+    step: float = constant(5e-3, 'm', 'depth between two tip measurements', open_low=True)
+    guide_limit: float = constant(6e-3, 'm', 'largest displacement of the guide')
+    guide_step: float = constant(1.0, 'm', 'largest motion of the guide in a step', open_low=True)
     load_limit: float = constant(
-        1e3, 'N', 'largest lateral force of the guide that is planned', open_low=True
+        1e3, 'N', 'largest planned lateral force on the guide', open_low=True
     )
-    turns: float = constant(0.0, '1', 'how often the needle may be turned')
+    turns: float = constant(0.0, '1', 'largest number of needle rotations')
 
     def __post_init__(self) -> None:
         check_constants(self)
@@ -112,19 +104,11 @@ class SteeringStudy:
 
 class SteeringProtocol:
     """
-    Inserts needles that differ from what is believed of them.
+    Steer needles that differ from the nominal model to a target.
 
-    Parameters
-    ----------
-    settings : dict
-        ``needle``, a preset; ``constants`` of it as they are believed; ``belief``, how far they
-        may be wrong; ``controller``, one of `CONTROLLERS`; and the numbers of `SteeringStudy`.
-
-    Raises
-    ------
-    ParameterError
-        If a setting is not valid.
-
+    `settings` holds ``needle``, a preset; nominal ``constants``; ``belief``, the prior
+    uncertainty; ``controller``, one of `CONTROLLERS`; and the fields of `SteeringStudy`. Raises
+    `ParameterError` if a setting is not valid.
     """
 
     figures = FIGURES
@@ -160,50 +144,41 @@ class SteeringProtocol:
         moves = {OURS: numbers.guide_limit or numbers.turns, BROYDEN: numbers.guide_limit}
         if not moves.get(self._controller, True):
             raise ParameterError(
-                f'settings: controller {self._controller} with guide_limit 0 would move nothing'
+                f'settings: controller {self._controller} with guide_limit 0 has no actuation'
             )
         steps = max(1, round(ways))
         self._depths = np.linspace(0.0, numbers.depth, steps + 1)
         bevel = max(self._steering.bevel_load)
         noise = self._belief.path_noise
         self.quantities: Mapping[str, Quantity] = {
-            'target_x': Quantity(0.0, 'm', 'target, beside the axis'),
-            'target_z': Quantity(0.0, 'm', 'target, beside the axis'),
-            'bending_length': Quantity(1.0, '1', 'bending length over the believed one', 0.1, 10),
-            'skin': Quantity(1.0, '1', 'skin over tissue, over the believed one', 0.0, 1e3),
+            'target_x': Quantity(0.0, 'm', 'lateral position of the target'),
+            'target_z': Quantity(0.0, 'm', 'lateral position of the target'),
+            'bending_length': Quantity(1.0, '1', 'bending length over its nominal value', 0.1, 10),
+            'skin': Quantity(
+                1.0, '1', 'skin over tissue stiffness, relative to its nominal value', 0.0, 1e3
+            ),
             'tilt_x': Quantity(0.0, 'rad', 'tilt of the guide', -0.5, 0.5),
             'tilt_z': Quantity(0.0, 'rad', 'tilt of the guide', -0.5, 0.5),
             'bevel_x': Quantity(0.0, 'N', 'load of the bevel', -1e3, 1e3),
             'bevel_z': Quantity(bevel, 'N', 'load of the bevel', -1e3, 1e3),
-            'frame_x': Quantity(0.0, 'rad', 'turn of the frame of the sensor', -0.5, 0.5),
-            'frame_z': Quantity(0.0, 'rad', 'turn of the frame of the sensor', -0.5, 0.5),
+            'frame_x': Quantity(0.0, 'rad', 'rotation of the frame of the sensor', -0.5, 0.5),
+            'frame_z': Quantity(0.0, 'rad', 'rotation of the frame of the sensor', -0.5, 0.5),
             'path_noise': Quantity(noise, 'rad^2/m', 'variance of the direction of the path', 0.0),
-            'look_noise': Quantity(self._belief.noise, 'm', 'standard deviation of a look', 0.0),
-            'lost': Quantity(0.0, '1', 'part of the looks that are lost', 0.0, 1.0),
+            'look_noise': Quantity(
+                self._belief.noise, 'm', 'standard deviation of a tip measurement', 0.0
+            ),
+            'lost': Quantity(0.0, '1', 'fraction of lost tip measurements', 0.0, 1.0),
         }
 
     @cached_property
     def _model(self) -> SteeringModel:
-        """What may be true: it is the same for all samples."""
+        """Model of all hypotheses, the same for all samples."""
         return SteeringModel(self._needle, self._steering, self._depths, self._belief)
 
     def run(
         self, drawn: Mapping[str, FloatArray], streams: Sequence[np.random.Generator]
     ) -> dict[str, FloatArray]:
-        """
-        Insert some needles.
-
-        Parameters
-        ----------
-        drawn, streams
-            As in `Protocol.run`.
-
-        Returns
-        -------
-        dict of str to ndarray, shape (n,)
-            `FIGURES`.
-
-        """
+        """Compute the metrics of sampled needles, as `Protocol.run`."""
         count = len(streams)
         each = {
             name: drawn.get(name, np.full(count, one.default))
@@ -229,7 +204,7 @@ class SteeringProtocol:
         streams: Sequence[np.random.Generator],
         found: Mapping[str, FloatArray],
     ) -> None:
-        """Insert needles; each quantity and each figure has a number for each of them."""
+        """Simulate insertions; variables and metrics have one value per insertion."""
         rows = [
             dict(zip(each, values, strict=True))
             for values in zip(*(values.tolist() for values in each.values()), strict=True)
@@ -263,7 +238,7 @@ class SteeringProtocol:
         )
 
     def _open(self, truths: Sequence[Truth], found: Mapping[str, FloatArray]) -> None:
-        """Insert needles whose guide rests, all at once."""
+        """Simulate all insertions with a guide at rest in one batch."""
         depth = self._depths[-1]
         tilts = np.array([truth.tilt for truth in truths])[:, np.newaxis, :]
         rolls = np.array([np.arctan2(*truth.bevel) for truth in truths])[:, np.newaxis]
@@ -282,20 +257,7 @@ class SteeringProtocol:
             found[name][:] = 0.0
 
     def replay(self, drawn: Mapping[str, float], rng: np.random.Generator) -> Iterator[Seen]:
-        """
-        Insert one needle again, as if it had gone in at 1 cm/s.
-
-        Parameters
-        ----------
-        drawn, rng
-            As in `Protocol.replay`.
-
-        Yields
-        ------
-        Seen
-            The target, and joints and tip after each step.
-
-        """
+        """Yield the target, and joints and tip after each step; the insertion speed is 1 cm/s."""
         row = {name: drawn.get(name, one.default) for name, one in self.quantities.items()}
         tilt, frame = ([row[f'{name}_x'], row[f'{name}_z']] for name in ('tilt', 'frame'))
         still, seen = [0.0] * len(_JOINTS.joints), list[Seen]()
@@ -317,7 +279,7 @@ class SteeringProtocol:
         rng: np.random.Generator,
         watch: Callable[[SteeredNeedle], object] | None = None,
     ) -> dict[str, float]:
-        """Insert one needle under a controller."""
+        """Simulate one insertion under a controller."""
         target, said = (row['target_x'], row['target_z']), list[str]()
         try:
             controller = self._made(target)

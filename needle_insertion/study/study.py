@@ -1,4 +1,4 @@
-"""A study: a population, a protocol, and the numbers of each sample."""
+"""Define a study: a population, a scenario, and the columns of each sample."""
 
 from __future__ import annotations
 
@@ -19,75 +19,46 @@ from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 from scipy.stats import qmc
 
-#: What a study file may have.
+#: Keys of a study file.
 _KEYS: Final = ('protocol', 'samples', 'seed', 'design', 'settings', 'population', 'correlations')
 
-#: How samples are spread over the population.
+#: Sampling designs.
 DESIGNS: Final = ('sobol', 'random', 'latin')
 
-#: Largest study, which is that of the Sobol sequence, and its largest number of dimensions.
+#: Largest number of samples and of dimensions, as limited by the Sobol sequence.
 _MOST: Final = 2**30
 _DIMENSIONS: Final = 21201
 
-#: Rounds of a permutation.
+#: Rounds of the Feistel network.
 _ROUNDS: Final = 8
 
-#: Least and largest part of a distribution.
+#: Smallest and largest probability at which a quantile is evaluated.
 _INSIDE: Final = 2.0**-54
 _BELOW: Final = 1.0 - 2.0**-53
 
 
 @dataclass(frozen=True, eq=False)
 class Study:
-    """
-    A study.
-
-    Attributes
-    ----------
-    protocol : Protocol
-        What is done with a sample.
-    samples : int
-        Number of samples.
-    seed : int
-        The same seed gives the same samples.
-    design : str
-        One of `DESIGNS`.
-    population : dict of str to Distribution
-        What differs from sample to sample, by name; the rest is as the protocol has it.
-    factor : ndarray, shape (d, d)
-        Root of the correlations of the population's normal scores.
-    document : dict
-        All of it, as it was given.
-
-    """
+    """A study, as read from a file."""
 
     protocol: Protocol
     samples: int
     seed: int
+    #: One of `DESIGNS`.
     design: str
+    #: Distributions by variable; the other variables have their defaults.
     population: Mapping[str, Distribution]
+    #: Cholesky factor of the correlations of the normal scores, shape (d, d).
     factor: FloatArray
+    #: Content of the study file.
     document: Mapping[str, Any]
 
     def draw(self, numbers: FloatArray | Sequence[int]) -> dict[str, FloatArray]:
-        """
-        Return what differs in some samples.
-
-        Parameters
-        ----------
-        numbers : sequence of int
-            Numbers of consecutive samples.
-
-        Returns
-        -------
-        dict of str to ndarray
-            Values by name.
-
-        """
+        """Return the sampled values of consecutive sample numbers by variable."""
         parts = np.clip(self._parts(int(numbers[0]), len(numbers)), _INSIDE, _BELOW)
         if not np.array_equal(self.factor, np.eye(len(self.factor))):
             scores = ndtri(parts)
-            # Not as a product of matrices: its bits may depend on the number of rows.
+            # No matrix product: its bits may depend on the number of rows.
             parts = np.array(
                 [
                     ndtr(sum(f * one for f, one in zip(row, scores.T, strict=True)))
@@ -101,13 +72,13 @@ class Study:
         }
 
     def _parts(self, first: int, count: int) -> FloatArray:
-        """Return numbers that are even in (0, 1), shape (count, d)."""
+        """Return uniform numbers in (0, 1), shape (count, d)."""
         dimensions = len(self.population)
         if self.design == 'sobol' and dimensions:
             sequence = qmc.Sobol(dimensions, seed=np.random.default_rng(self.seed))
             if first:
                 sequence.fast_forward(first)
-            # One by itself at the begin: scipy warns of a first draw that is no power of 2.
+            # A single sample first: scipy warns of a first draw that is not a power of 2.
             return np.concatenate([sequence.random(1), sequence.random(count - 1)])
         chance = np.array(
             [self.rng(number, 0).random(dimensions) for number in range(first, first + count)]
@@ -122,41 +93,11 @@ class Study:
         return np.asarray((np.transpose(strata) + chance) / self.samples).reshape(chance.shape)
 
     def rng(self, number: int, stream: int) -> np.random.Generator:
-        """
-        Return the source of chance of a sample, whoever computes it.
-
-        Parameters
-        ----------
-        number : int
-            Number of the sample.
-        stream : int
-            0 for what differs, 1 for noise.
-
-        Returns
-        -------
-        Generator
-            The source.
-
-        """
+        """Return the random generator of a sample and stream; 0 for variables, 1 for noise."""
         return np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=(number, stream)))
 
     def rows(self, first: int, count: int) -> dict[str, FloatArray]:
-        """
-        Compute consecutive samples.
-
-        Parameters
-        ----------
-        first : int
-            Number of the first.
-        count : int
-            How many.
-
-        Returns
-        -------
-        dict of str to ndarray, shape (count,)
-            The columns of the table: number, what differs, and figures of merit.
-
-        """
+        """Compute `count` samples from number `first` on: number, sampled values and metrics."""
         numbers = range(first, first + count)
         drawn = self.draw(numbers)
         streams = [self.rng(number, 1) for number in numbers]
@@ -169,14 +110,14 @@ class Study:
 
 def _permuted(numbers: NDArray[np.uint64], count: int, key: tuple[int, int]) -> NDArray[np.uint64]:
     """
-    Return where a permutation of ``range(count)`` takes some numbers, without making all of it.
+    Return the images of numbers under a permutation of ``range(count)``, without storing it.
 
-    It is a network of Feistel on the least even number of bits, whose values beyond the range are
-    taken through it again until they are inside.
+    A Feistel network on the least even number of bits; values outside the range pass through the
+    network again until they are inside.
     """
     half = np.uint64(max(1, ((count - 1).bit_length() + 1) // 2))
     low = np.uint64((1 << int(half)) - 1)
-    # Streams of chance of samples have two numbers as their key, this one has three.
+    # Keys of the generators of samples have two numbers, this key has three.
     words = np.random.SeedSequence(key[0], spawn_key=(key[1], 0, 0)).generate_state(
         _ROUNDS, np.uint64
     )
@@ -195,25 +136,7 @@ def _permuted(numbers: NDArray[np.uint64], count: int, key: tuple[int, int]) -> 
 
 
 def read_study(path: Path) -> Study:
-    """
-    Read a study file.
-
-    Parameters
-    ----------
-    path : Path
-        YAML file.
-
-    Returns
-    -------
-    Study
-        The study.
-
-    Raises
-    ------
-    ParameterError
-        If it is not valid; the message names the file and what is wrong.
-
-    """
+    """Read a YAML study file; raise `ParameterError` with its name if it is not valid."""
     try:
         return made(read_document(path.read_text(encoding='utf-8')))
     except (DocumentError, ParameterError) as error:
@@ -224,25 +147,7 @@ def read_study(path: Path) -> Study:
 
 
 def made(document: Any) -> Study:
-    """
-    Make a study of what a file says.
-
-    Parameters
-    ----------
-    document : object
-        Its content.
-
-    Returns
-    -------
-    Study
-        The study.
-
-    Raises
-    ------
-    ParameterError
-        If it is not valid.
-
-    """
+    """Build a study from the content of a file; raise `ParameterError` if it is not valid."""
     if not isinstance(document, Mapping):
         raise ParameterError(f'a study has {", ".join(_KEYS)}, got {document!r}')
     check_names('', document, _KEYS)
@@ -253,7 +158,7 @@ def made(document: Any) -> Study:
     protocol = PROTOCOLS[kind](settings)
     known = protocol.quantities
     check_names('population: ', given, known)
-    # Which dimension a name has shall not depend on the order in a file: workers get it sorted.
+    # The dimension of a variable must not depend on its order in the file: workers sort it.
     population = {name: distribution(f'population: {name}', given[name]) for name in sorted(given)}
     for name, one in population.items():
         least, most = one.ends(_INSIDE, _BELOW)
@@ -261,7 +166,7 @@ def made(document: Any) -> Study:
         if not low <= least <= most <= high or not isfinite(least) or not isfinite(most):
             raise ParameterError(
                 f'population: {name} must be finite and in [{low:g}, {high:g}] {unit}, and would '
-                f'be from {least:g} to {most:g}; cut it off with within: [low, high]'
+                f'be from {least:g} to {most:g}; truncate it with within: [low, high]'
             )
     return Study(
         protocol=protocol,
@@ -282,7 +187,7 @@ def _whole(document: Mapping[str, Any], key: str, low: int) -> int:
 
 
 def _factor(given: Any, names: Sequence[str]) -> FloatArray:
-    """Return a root of the matrix of correlations, given as ``[[name, name, value], ...]``."""
+    """Return the Cholesky factor of correlations given as ``[[name, name, value], ...]``."""
     matrix = np.eye(len(names))
     form = 'correlations takes [[name, name, value between -1 and 1], ...] of the population'
     if not isinstance(given, Sequence) or isinstance(given, str):
@@ -302,5 +207,5 @@ def _factor(given: Any, names: Sequence[str]) -> FloatArray:
         return np.asarray(np.linalg.cholesky(matrix))
     except np.linalg.LinAlgError as error:
         raise ParameterError(
-            'correlations contradict each other: no numbers have all of them'
+            'correlations are inconsistent: the matrix is not positive definite'
         ) from error

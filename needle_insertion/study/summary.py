@@ -1,4 +1,4 @@
-"""What a table of samples says: probabilities, quantiles, and which quantity matters."""
+"""Evaluate a table of samples: probabilities, quantiles, and sensitivity to each variable."""
 
 from __future__ import annotations
 
@@ -12,28 +12,18 @@ import numpy as np
 from pyarrow import parquet
 from scipy.stats import binom
 
-#: Half of an interval of 95 % over the standard deviation.
+#: Half-width of a 95 % interval over the standard deviation.
 _NORMAL: Final = 1.96
 
-#: Part of all intervals that lie above the true value, and below it.
+#: Probability of an interval above the true value, and below it.
 _TAIL: Final = 0.025
 
-#: Groups of samples by which a share of the variance is found, and the fewest samples.
+#: Groups of samples in the estimate of a variance fraction, and the least number of samples.
 _GROUPS, _FEWEST = 32, 200
 
 
 class Estimate(NamedTuple):
-    """
-    A number with its interval of 95 %.
-
-    Attributes
-    ----------
-    value, low, high : float
-        The number, and the ends of the interval.
-    samples : int
-        Of how many samples it is.
-
-    """
+    """A value with its 95 % interval, from a number of samples."""
 
     value: float
     low: float
@@ -42,44 +32,14 @@ class Estimate(NamedTuple):
 
 
 def batches(table: Path, name: str) -> Iterator[FloatArray]:
-    """
-    Read one column of a table of samples, part by part.
-
-    Parameters
-    ----------
-    table : Path
-        Parquet file.
-    name : str
-        Its name.
-
-    Yields
-    ------
-    ndarray, shape (k,)
-        The next values, by number of the sample.
-
-    """
+    """Yield the values of one column of a table by sample number, in batches of shape (k,)."""
     with parquet.ParquetFile(table) as file:
         for batch in file.iter_batches(columns=[name], use_threads=False):
             yield batch.column(0).to_numpy(zero_copy_only=False)
 
 
 def column(table: Path, name: str, most: int | None = None) -> FloatArray:
-    """
-    Read one column of a table of samples.
-
-    Parameters
-    ----------
-    table, name
-        As for `batches`.
-    most : int, optional
-        How many values at most; all if not given.
-
-    Returns
-    -------
-    ndarray, shape (samples,) or (most,)
-        The first values, by number of the sample.
-
-    """
+    """Read one column of a table, up to `most` values."""
     found, size = list[FloatArray](), 0
     for values in batches(table, name):
         found.append(values)
@@ -90,22 +50,7 @@ def column(table: Path, name: str, most: int | None = None) -> FloatArray:
 
 
 def picked(table: Path, name: str, numbers: Sequence[int]) -> FloatArray:
-    """
-    Read some values of a column of a table of samples.
-
-    Parameters
-    ----------
-    table, name
-        As for `batches`.
-    numbers : sequence of int
-        Numbers of the samples.
-
-    Returns
-    -------
-    ndarray, shape (k,)
-        Their values.
-
-    """
+    """Read the values of one column for some sample numbers."""
     wanted, found, first = np.array(numbers, dtype=np.int64), np.empty(len(numbers)), 0
     for values in batches(table, name):
         here = (first <= wanted) & (wanted < first + len(values))
@@ -115,20 +60,7 @@ def picked(table: Path, name: str, numbers: Sequence[int]) -> FloatArray:
 
 
 def probability(parts: Iterable[FloatArray]) -> Estimate:
-    """
-    Return how often something is so.
-
-    Parameters
-    ----------
-    parts : iterable of ndarray, shape (k,)
-        Values: 1 where it is, 0 where it is not, nan where that does not exist.
-
-    Returns
-    -------
-    Estimate
-        With the interval of Wilson, which also holds near 0 and 1.
-
-    """
+    """Estimate a probability from values 1 and 0, with the interval of Wilson; NaN is ignored."""
     n, yes = 0, 0.0
     for values in parts:
         seen = values[np.isfinite(values)]
@@ -143,28 +75,17 @@ def probability(parts: Iterable[FloatArray]) -> Estimate:
 
 def quantile(values: FloatArray, part: float) -> Estimate:
     """
-    Return the value below which a part of all are.
+    Estimate a quantile at the probability `part`; NaN is ignored.
 
-    Parameters
-    ----------
-    values : ndarray, shape (n,)
-        Values; nan does not count.
-    part : float
-        The part.
-
-    Returns
-    -------
-    Estimate
-        With an interval between two of the values, whatever the distribution; an end is infinite
-        where there are too few of them.
-
+    The distribution-free interval lies between two of the values; an end is infinite with too few
+    values.
     """
     seen = np.sort(values[np.isfinite(values)])
     n = len(seen)
     if n == 0:
         return Estimate(np.nan, -np.inf, np.inf, 0)
-    # Ranks, from 1: the true value is below that of the first, and above that of the second, once
-    # in 40 studies each.
+    # Ranks, from 1: the true value is below the first, and above the second, in one of 40 studies
+    # each.
     low, high = (int(binom.ppf(tail, n, part)) for tail in (_TAIL, 1.0 - _TAIL))
     return Estimate(
         float(np.quantile(seen, part)),
@@ -176,21 +97,10 @@ def quantile(values: FloatArray, part: float) -> Estimate:
 
 def share(values: FloatArray, by: FloatArray) -> float:
     """
-    Return the part of a variance that one quantity alone explains.
+    Return the fraction of a variance that one variable alone explains; NaN is ignored.
 
-    Parameters
-    ----------
-    values : ndarray, shape (n,)
-        A figure; nan does not count.
-    by : ndarray, shape (n,)
-        The quantity.
-
-    Returns
-    -------
-    float
-        First-order index of Sobol, from means of equal groups, less what chance would give; nan
-        of fewer than 200 samples, where chance is most of it.
-
+    First-order Sobol index, from means of equal groups, corrected for its bias; NaN for fewer than
+    200 samples.
     """
     seen = np.isfinite(values)
     y = values[seen][np.argsort(by[seen], kind='stable')]
@@ -205,22 +115,7 @@ def share(values: FloatArray, by: FloatArray) -> float:
 
 
 def worst(parts: Iterable[FloatArray], number: int) -> list[int]:
-    """
-    Return the samples with the largest values.
-
-    Parameters
-    ----------
-    parts : iterable of ndarray, shape (k,)
-        Values, by number of the sample; nan does not count.
-    number : int
-        How many.
-
-    Returns
-    -------
-    list of int
-        Their numbers, the worst first.
-
-    """
+    """Return the sample numbers of the largest values, the largest first; NaN is ignored."""
     top, numbers, first = np.empty(0), np.empty(0, dtype=np.int64), 0
     for values in parts:
         top = np.concatenate([top, np.where(np.isfinite(values), values, -np.inf)])

@@ -177,7 +177,7 @@ def test_bags_of_something_else_are_left_alone(tmp_path: Path) -> None:
         record(campaign, tmp_path)
     place.rmdir()
     pretended(place, seed=7)
-    with pytest.raises(ParameterError, match='recorded with seed = 7, asked for is 2014'):
+    with pytest.raises(ParameterError, match='recorded with seed = 7, requested is 2014'):
         record(campaign, tmp_path)
     pretended(tmp_path / 'none' / 'friction_01', configuration='none')
     with pytest.raises(ParameterError, match='exists and is not a run of this experiment'):
@@ -294,7 +294,7 @@ def test_a_run_with_losses_is_repeated_more_slowly_and_given_up_in_real_time(
         return next(answers)
 
     monkeypatch.setattr(recorder, '_lost', lossy)
-    with pytest.raises(ExperimentError, match='fewest at 1 times real time; ask for a lower'):
+    with pytest.raises(ExperimentError, match='fewest at 1 times real time; choose a lower'):
         stand.record(tmp_path / 'a', place, 3.0)
     assert not (tmp_path / 'a').exists()
     stand.record(tmp_path / 'b', place, 50.0)

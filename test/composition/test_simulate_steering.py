@@ -67,7 +67,10 @@ def test_a_membrane_and_a_start_on_the_way(capsys: pytest.CaptureFixture[str]) -
 @pytest.mark.parametrize(
     ('words', 'complaint'),
     [
-        (['--model', 'steering', '--force', '3'], '--force is an option of --model modes, not of steering'),
+        (
+            ['--model', 'steering', '--force', '3'],
+            '--force is an option of --model modes, not of steering',
+        ),
         (['--to', '0.1'], '--to is an option of --model steering, not of modes'),
         (['--model', 'steering', '--to', '0.3'], 'the needle reached 160 mm, where its hub stops'),
         (['--model', 'steering', '--speed', '0'], '--speed must be positive and finite'),

@@ -403,7 +403,7 @@ def test_what_is_damaged_or_of_another_version_is_named(
     capsys.readouterr()
     table.write_bytes(whole[:-100])
     assert main(words) == 1
-    assert f'{table} is damaged; remove it, and it is computed' in capsys.readouterr().err
+    assert f'{table} is damaged; remove it to compute it again' in capsys.readouterr().err
     table.unlink()
     assert main(words) == 0
     assert table.read_bytes() == whole
@@ -422,7 +422,7 @@ def test_what_is_damaged_or_of_another_version_is_named(
     for content in (b'\xff', b'{}', b'3', b'[1'):
         (folder / 'study.json').write_bytes(content)
         assert main(words) == 2
-        assert 'study.json is not of a study; name another folder' in capsys.readouterr().err
+        assert 'study.json is not a study; name another folder' in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -453,12 +453,12 @@ def test_what_is_damaged_or_of_another_version_is_named(
         ({'settings': {'depth': 0.3}}, 'settings.depth must be <='),
         ({'settings': {'step': 1e-9}}, 'depth over step must be <= 1000 steps, got 1e+08'),
         ({'settings': {'turns': 0.7}}, 'settings.turns must be a whole number, got 0.7'),
-        ({'settings': {'guide_limit': 0}}, 'controller ours with guide_limit 0 would move noth'),
+        ({'settings': {'guide_limit': 0}}, 'controller ours with guide_limit 0 has no actuat'),
         ({'settings': {'guide_limit': 0, 'controller': 'Broyden'}}, 'controller Broyden with'),
         ({'correlations': [['skin', 'tilt', 0.5]]}, 'correlations takes [[name, name, value'),
         ({'correlations': [['skin', 'tilt_z', 2]]}, 'correlations takes [[name, name, value'),
         ({'correlations': [['skin', 'tilt_z', 0.9], ['tilt_z', 'target_x', 0.9],
-                           ['skin', 'target_x', -0.9]]}, 'correlations contradict each other'),
+                           ['skin', 'target_x', -0.9]]}, 'correlations are inconsistent'),
         ({'settings': {'deep': 1}}, "settings: unknown parameter 'deep'; did you mean 'depth'?"),
         ({'settings': {'depth': -1}}, 'settings.depth must be finite, > 0 m, got -1'),
         ({'settings': {'needle': 'bone'}}, 'settings: needle must be one of'),
@@ -491,10 +491,10 @@ def test_folders_and_files_that_cannot_be_used_are_named(
     assert 'none.yaml: No such file' in capsys.readouterr().err
     (tmp_path / 'other' / 'results').mkdir(parents=True)
     assert main(['study', str(file), '-o', str(tmp_path / 'other')]) == 2
-    assert 'exists and is not of a study; name another folder' in capsys.readouterr().err
+    assert 'exists and is not a study; name another folder' in capsys.readouterr().err
     Results(tmp_path / 'third', made({**SMALL, 'seed': 4}))
     assert main(['study', str(file), '-o', str(tmp_path / 'third')]) == 2
-    assert 'is of another study; name another folder' in capsys.readouterr().err
+    assert 'belongs to another study; name another folder' in capsys.readouterr().err
     assert main(['study', str(file), '-o', str(tmp_path / 'x'), '--workers', '0']) == 2
     assert '--workers must be >= 1' in capsys.readouterr().err
 
@@ -543,7 +543,7 @@ def test_a_scheduler_that_is_killed_ends_it_in_one_line(tmp_path: Path) -> None:
             )
         )
         client = stack.enter_context(Client(scheduler_file=str(file), timeout=60))
-        with pytest.raises(JobError, match='the cluster has lost a part of the study'):
+        with pytest.raises(JobError, match='the cluster has lost a chunk of the study'):
             compute(results, partial(dask, client), 1, lambda _: scheduler.kill())
     assert results.missing() != [(0, 400)]
     compute(results, here, 1, lambda _: None)

@@ -275,7 +275,7 @@ def test_the_page_and_the_example(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert main(again) == 0
     assert 'the same numbers as in the table' in capsys.readouterr().out
     page = (tmp_path / 'few' / 'study.html').read_text()
-    for words in ('Median error', 'viscous_friction', 'how often it turns round'):
+    for words in ('Median error', 'viscous_friction', 'reversals of the velocity'):
         assert words in page
 
 

@@ -152,7 +152,7 @@ def test_a_second_plant_is_refused(ros_graph: RosGraph, tmp_path: Path) -> None:
     status, said, complained = told(ros_graph, tmp_path / 'run', ['target 0.05'])
     assert status == 1
     assert 'error: 2 nodes publish joint_states on domain' in complained
-    assert 'there is a plant already. End it, or choose another ROS_DOMAIN_ID' in complained
+    assert 'another plant is running. End it, or choose another ROS_DOMAIN_ID' in complained
     assert 'needle> target' not in said
 
 
