@@ -241,7 +241,7 @@ def _run(options: argparse.Namespace) -> int:
         return 0
     sys.stdout.write(
         f'{options.needle}, seed {options.seed}: {len(depths) - 1} steps to '
-        f'{1e3 * target[1]:g} mm, the guide moved by {1e3 * done.way:.1f} mm in all '
+        f'{1e3 * target[1]:g} mm, the guide moved by {1e3 * done.way:.1f} mm in total '
         f'with {done.load:.1f} N at most, the needle turned {done.turns} times\n\n'
         f'{_text(found)}\n'
     )
@@ -257,7 +257,7 @@ def _text(found: Mapping[str, Any]) -> str:
         for name, (x, z), miss in (
             ('target', found['target [m]'], None),
             ('tip', found['tip [m]'], found['miss [m]']),
-            ('as it was expected', found['expected tip [m]'], None),
+            ('expected tip', found['expected tip [m]'], None),
             ('± (95 %)', found['its interval of 95 % [m]'], None),
             ('open loop', found['tip open loop [m]'], found['miss open loop [m]']),
         )

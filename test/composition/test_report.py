@@ -1,4 +1,4 @@
-"""Tables that line up, and pages that are complete and self-contained."""
+"""Alignment of text tables, and complete self-contained pages."""
 
 import asyncio
 from base64 import b64encode
@@ -36,14 +36,14 @@ PAGE = TEMPLATES.from_string(
 )
 
 cells = st.text(st.characters(categories=('L', 'N', 'P', 'S')), min_size=1, max_size=12)
-#: Whatever text there is, but for carriage returns, which HTML does not keep.
+#: Any text without carriage returns, which HTML does not preserve.
 texts = st.text(st.characters(exclude_categories=('Cs', 'Cc')), max_size=30)
 
 
 @settings(deadline=None)
 @given(st.lists(st.tuples(cells, cells, cells), max_size=6))
-def test_columns_of_a_table_line_up(rows: list[tuple[str, str, str]]) -> None:
-    """Every cell of a column starts at the same place, and every cell is there whole."""
+def test_table_columns_are_aligned(rows: list[tuple[str, str, str]]) -> None:
+    """All cells of a column start at the same position and are complete."""
     lines = table(rows, ('a', 'b', 'c')).splitlines()
     widths = [len(dashes) for dashes in lines[1].split('  ')]
     assert len(lines) == len(rows) + 2
@@ -59,7 +59,7 @@ WORDS = st.lists(st.text('ab-', min_size=1, max_size=12), min_size=1, max_size=1
 
 @given(st.lists(st.tuples(WORDS, WORDS, WORDS, WORDS), min_size=1, max_size=3))
 @settings(deadline=None)
-def test_a_table_fits_a_terminal(rows: list[tuple[str, ...]]) -> None:
+def test_tables_fit_a_terminal(rows: list[tuple[str, ...]]) -> None:
     """At most 100 columns, with every word in its column."""
     lines = table(rows, ('a', 'b', 'c', 'd')).splitlines()
     assert max(map(len, lines)) <= 100
@@ -72,14 +72,13 @@ def test_a_table_fits_a_terminal(rows: list[tuple[str, ...]]) -> None:
         assert column.split() == ' '.join(cells).split()
 
 
-def test_a_failure_is_printed_in_capitals() -> None:
-    """The verdict follows the check."""
+def test_failed_checks_are_printed_in_capitals() -> None:
     assert Check('x', '1', '2', passed=False).row == ('x', '1', '2', 'FAIL')
     assert Check('y', '1', '1', passed=True).row == ('y', '1', '1', 'pass')
 
 
 class Reader(HTMLParser):
-    """Reads a piece of HTML: its texts, and its tags, which must be closed in order."""
+    """HTML parser that collects texts and tags, and requires that tags are closed in order."""
 
     def __init__(self, piece: str) -> None:
         super().__init__()
@@ -103,8 +102,8 @@ class Reader(HTMLParser):
 
 @settings(deadline=None)
 @given(texts)
-def test_no_text_can_be_taken_for_a_tag(text: str) -> None:
-    """Each block holds what it was given, letter by letter, and only tags of its own."""
+def test_texts_are_escaped(text: str) -> None:
+    """Each block contains its text unchanged, and only its own tags."""
     for block in (
         BLOCKS.heading(text),
         BLOCKS.paragraph(text),
@@ -134,13 +133,13 @@ def test_no_text_can_be_taken_for_a_tag(text: str) -> None:
                 'sup',
             ),
         }
-        # Symbols are typeset; everything else is as it was given.
+        # Symbols are typeset; all other text is unchanged.
         if not re.search(r'[_^]|mu|phi|tau|theta|rho|omega|\d um', text):
             assert text in ''.join(reader.texts)
 
 
-def test_symbols_are_written_as_in_print() -> None:
-    """The name of a coefficient becomes a letter with a subscript, within words too."""
+def test_symbols_are_typeset() -> None:
+    """The name of a coefficient becomes a letter with a subscript, also within words."""
     paragraph = BLOCKS.paragraph
     assert '<i>μ</i><sub>s</sub> = 1' in paragraph('mu_s = 1')
     assert '<i>k</i><sub>zz</sub>' in paragraph('k_zz')
@@ -151,13 +150,12 @@ def test_symbols_are_written_as_in_print() -> None:
     assert 'm² M<sup>T</sup> m<sup>-1/2</sup>' in paragraph('m^2 M^T m^-1/2')
 
 
-def test_a_notice_of_nothing_is_nothing() -> None:
-    """No empty frame is drawn."""
+def test_empty_notices_are_omitted() -> None:
     assert BLOCKS.notice('Warnings', []).strip() == ''
 
 
-def test_a_table_says_what_its_cells_are() -> None:
-    """Heads of columns and of rows are marked as such, and the table has a caption."""
+def test_tables_mark_their_headers() -> None:
+    """Column and row headers have a scope, and the table has a caption."""
     reader = Reader(BLOCKS.grid([('mu_s', '0.56')], ('parameter', 'value'), 'Friction'))
     scopes = [given['scope'] for tag, given in reader.tags if tag == 'th']
     assert scopes == ['col', 'col', 'row']
@@ -165,7 +163,7 @@ def test_a_table_says_what_its_cells_are() -> None:
 
 
 def picture() -> Picture:
-    """Return a picture with something on it."""
+    """Return a picture with a curve."""
     figure = Figure()
     figure.subplots().plot([1.0, 2.0])
     return Picture('plot', 'caption "x"', figure, 'a line that "rises"')
@@ -176,8 +174,8 @@ def show(path: Path, blocks: list[Markup], pictures: Sequence[Picture] = ()) -> 
     write_page(path, PAGE, pictures, title='A page', introduction='of blocks', blocks=blocks)
 
 
-def test_the_page_needs_nothing_beside_it(tmp_path: Path) -> None:
-    """Pictures are inside, texts are escaped, and no draft is left."""
+def test_pages_are_self_contained(tmp_path: Path) -> None:
+    """Pictures are embedded, texts are escaped, and no draft remains."""
     path = tmp_path / 'report.html'
     checks = [Check('a < b', '<script>', '1 & 2', passed=True)]
     write_page(
@@ -200,10 +198,8 @@ def test_the_page_needs_nothing_beside_it(tmp_path: Path) -> None:
     assert {item.name for item in tmp_path.iterdir()} == {'report.html', 'plot.png'}
 
 
-def test_the_same_content_gives_the_same_bytes(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """No name of the folder gets into the page or its pictures, and the date that is asked for."""
+def test_pages_are_reproducible(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The bytes do not depend on the folder, and the date is SOURCE_DATE_EPOCH."""
     monkeypatch.setenv('SOURCE_DATE_EPOCH', '86400')
     pages = []
     for name in ('one', 'two'):
@@ -215,8 +211,8 @@ def test_the_same_content_gives_the_same_bytes(
     assert b'1970-01-02 00:00 UTC</footer>' in pages[0][0]
 
 
-def test_a_long_page_has_contents(tmp_path: Path) -> None:
-    """Each heading has a link that leads to it; a short page has none."""
+def test_long_pages_have_a_table_of_contents(tmp_path: Path) -> None:
+    """Each heading is linked on a page of four headings; a page of three has no links."""
     path = tmp_path / 'page.html'
     titles = ['mu_s & more', 'Data <fit>', 'Files', 'k_xx']
     for count in (3, 4):
@@ -228,8 +224,8 @@ def test_a_long_page_has_contents(tmp_path: Path) -> None:
     assert len(set(links)) == 4
 
 
-def test_a_page_says_how_it_was_made(tmp_path: Path) -> None:
-    """Version, the command as it was typed, and the date."""
+def test_pages_show_their_origin(tmp_path: Path) -> None:
+    """Version, command line and date."""
     token = COMMAND.set("needle identify friction 'a b'")
     show(tmp_path / 'page.html', [])
     COMMAND.reset(token)
@@ -241,8 +237,8 @@ def test_a_page_says_how_it_was_made(tmp_path: Path) -> None:
     )
 
 
-def test_a_page_fits_a_telephone(tmp_path: Path) -> None:
-    """Pictures have loaded with their texts, nothing outside is asked for, nothing sticks out."""
+def test_pages_fit_a_phone_screen(tmp_path: Path) -> None:
+    """All pictures load, no external requests are sent, and nothing overflows."""
     path = tmp_path / 'page.html'
     blocks = [
         BLOCKS.headline([('Friction mu_s', '0.5604 N', '95 % interval 0.5594 to 0.5614')]),
@@ -259,8 +255,8 @@ def test_a_page_fits_a_telephone(tmp_path: Path) -> None:
     assert seen.overflow == 0
 
 
-def test_what_a_page_would_load_from_outside_is_noticed(tmp_path: Path) -> None:
-    """The look at a page can fail: an image from elsewhere is seen as missing and as asked for."""
+def test_external_requests_are_detected(tmp_path: Path) -> None:
+    """An external image is reported as missing and as requested."""
     path = tmp_path / 'page.html'
     show(path, [Markup('<img src="http://127.0.0.1:9/outside.png">')])
     seen = look_at(path)
@@ -268,15 +264,15 @@ def test_what_a_page_would_load_from_outside_is_noticed(tmp_path: Path) -> None:
     assert seen.requests == ['http://127.0.0.1:9/outside.png']
 
 
-def test_a_page_that_cannot_be_written_is_named(tmp_path: Path) -> None:
-    """A folder that is not there ends in one line, and nothing is left."""
+def test_write_errors_name_the_page(tmp_path: Path) -> None:
+    """A missing folder gives a one-line error, and no file remains."""
     with pytest.raises(ParameterError, match=r'no/page.html cannot be written: No such file'):
         show(tmp_path / 'no' / 'page.html', [])
     assert not list(tmp_path.iterdir())
 
 
 def show_moving(folder: Path) -> Path:
-    """Write a page with a picture, and a needle that moves."""
+    """Write a page with a picture and an animated needle."""
     write_watched(folder / 'bag')
     path = folder / 'page.html'
     write_page(
@@ -286,8 +282,8 @@ def show_moving(folder: Path) -> Path:
     return path
 
 
-def test_a_needle_moves_by_its_own_script_only(tmp_path: Path) -> None:
-    """The page says which script may run: its own. The picture stays, and it is not too large."""
+def test_animations_run_only_their_own_script(tmp_path: Path) -> None:
+    """The content security policy allows the animation script only; the page stays small."""
     path = show_moving(tmp_path)
     text = path.read_text()
     (script,) = re.findall('<script>(.*?)</script>', text, re.DOTALL)
@@ -309,8 +305,8 @@ def test_a_needle_moves_by_its_own_script_only(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(BROWSER is None, reason='no Chromium on this machine')
-def test_a_needle_moves_in_a_browser(tmp_path: Path) -> None:
-    """It is drawn at its end, goes to a time, and plays to the end; in print it is left out."""
+def test_animations_play_in_a_browser(tmp_path: Path) -> None:
+    """The animation starts at its end, seeks, plays to its end, and is omitted in print."""
     path = show_moving(tmp_path)
 
     async def look() -> None:

@@ -1,4 +1,4 @@
-"""The tables anew from the shipped recordings, and verdicts that can fail."""
+"""Tables of the paper from the shipped recordings, and verdicts that can fail."""
 
 from functools import cache
 import json
@@ -28,25 +28,25 @@ from support.pages import look_at
 
 @pytest.fixture(scope='module')
 def tables() -> dict[str, IdentifiedTable]:
-    """Return what the shipped bags give."""
+    """Identify the tables from the shipped bags."""
     return {name: identify_table(name) for name in identified.TABLES}
 
 
 @pytest.fixture
 def once(monkeypatch: pytest.MonkeyPatch, tables: dict[str, IdentifiedTable]) -> None:
-    """Have the shipped bags identified once for all tests."""
+    """Use one identification of the shipped bags in all tests."""
     monkeypatch.setattr(results, 'identify_table', lambda name, _recorded: tables[name])
 
 
 @pytest.fixture
 def coarse(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Have the map of controllability with fewer points."""
+    """Use fewer points in the map of controllability."""
     monkeypatch.setattr(controllability, 'DEPTHS', 9)
     monkeypatch.setattr(controllability, 'DEFLECTIONS', 7)
 
 
 @pytest.mark.usefixtures('once')
-def test_table_1_comes_out_of_the_shipped_bags(capsys: pytest.CaptureFixture[str]) -> None:
+def test_shipped_bags_reproduce_table_1(capsys: pytest.CaptureFixture[str]) -> None:
     """Both means and both STDs of the paper are in their intervals, from 20 recordings."""
     assert main(['reproduce', 'table-1', '--json']) == 0
     found = json.loads(capsys.readouterr().out)
@@ -60,8 +60,8 @@ def test_table_1_comes_out_of_the_shipped_bags(capsys: pytest.CaptureFixture[str
 
 
 @pytest.mark.usefixtures('once')
-def test_table_2_comes_out_of_the_shipped_bags(capsys: pytest.CaptureFixture[str]) -> None:
-    """Every entry at every level is in its intervals, and k_a, from 20 places."""
+def test_shipped_bags_reproduce_table_2(capsys: pytest.CaptureFixture[str]) -> None:
+    """Every entry at every level, and k_a, is in its intervals, from 20 places."""
     assert main(['reproduce', 'table-2']) == 0
     text = capsys.readouterr().out
     assert 'DOES NOT HOLD' not in text
@@ -74,7 +74,7 @@ def test_table_2_comes_out_of_the_shipped_bags(capsys: pytest.CaptureFixture[str
 
 
 def line(mean: float, deviation: float | None, count: int = 20) -> Line:
-    """Return a made-up line: published are 10 ± 1."""
+    """Return a line with published values 10 ± 1."""
     reach = 2.1 * (deviation or 1.0) / np.sqrt(count)
     found = Statistic(
         name='a', symbol='a', unit='N', mean=mean, deviation=deviation, error=0.2,
@@ -89,23 +89,23 @@ def line(mean: float, deviation: float | None, count: int = 20) -> Line:
         (10.1, 1.0, True),
         (11.0, 1.0, False),
         (9.0, 1.0, False),
-        # Half and twice the STD are out of what chi-squared allows 20 to scatter.
+        # Half and twice the STD are outside the chi-squared interval of 20 samples.
         (10.0, 0.5, False),
         (10.0, 2.0, False),
         (10.0, None, True),
     ],
 )
-def test_a_line_holds_if_mean_and_std_are_in_their_intervals(
+def test_lines_hold_if_mean_and_std_are_in_their_intervals(
     mean: float, deviation: float | None, holds: bool
 ) -> None:
-    """Each of the two can break it; of a single recording the STD is not known."""
+    """Mean or STD alone can fail; the STD of a single recording is unknown."""
     judged = line(mean, deviation)
     assert judged.holds == holds
     assert ('DOES NOT HOLD' in judged.row) == (not holds)
 
 
-def test_the_interval_of_the_std_is_that_of_chi_squared() -> None:
-    """It holds the STD of the population in 95 of 100 samples of it."""
+def test_std_intervals_follow_the_chi_squared_distribution() -> None:
+    """The interval contains the STD of the population in 95 of 100 samples."""
     rng = np.random.default_rng(0)
     samples = rng.normal(size=(4000, 20)).std(axis=1, ddof=1)
     bounds = np.array([line(10.0, float(s)).deviation_interval for s in samples])
@@ -118,8 +118,8 @@ def test_the_interval_of_the_std_is_that_of_chi_squared() -> None:
 
 
 @pytest.mark.parametrize('trials', [1, 20, 40, 400])
-def test_fewer_intervals_than_the_least_are_improbable(trials: int) -> None:
-    """If each holds its truth in 95 %, fewer than `least` do so once in a hundred at most."""
+def test_least_coverage_is_the_one_percent_quantile(trials: int) -> None:
+    """With a coverage of 95 %, fewer intervals hold with a probability of 1 % at most."""
     least = Coverage(known=trials).least
     held = np.random.default_rng(trials).binomial(trials, 0.95, size=20000)
     # Three standard errors of a share of 0.01 in 20000.
@@ -127,8 +127,8 @@ def test_fewer_intervals_than_the_least_are_improbable(trials: int) -> None:
     assert np.mean(held <= least) >= 0.01 - 3.0 * np.sqrt(0.01 / 20000)
 
 
-def test_an_interval_counts_where_the_truth_is_known() -> None:
-    """Held, missed, not determined, not known."""
+def test_coverage_counts_intervals_with_a_true_value() -> None:
+    """Hit, miss, undetermined estimate, and unknown true value."""
     held = ParameterEstimate(
         name='a', symbol='a', unit='N', value=1.0, error=0.5, interval=(0.0, 2.0), determined=True
     )
@@ -138,18 +138,18 @@ def test_an_interval_counts_where_the_truth_is_known() -> None:
     assert Coverage.of(compared) == Coverage(held=1, known=3)
 
 
-def test_the_truth_of_a_place_is_that_of_the_level() -> None:
-    """The nearest level counts, not what lies between; without a configuration it is unknown."""
+def test_true_stiffness_is_taken_at_the_nearest_level() -> None:
+    """There is no interpolation; without a configuration the true value is unknown."""
     truth = {'indenter.force_levels': [1.1, 1.2], 'indenter.stiffness_zz': [900.0, 700.0]}
     assert _stiffness(truth, 'k_zz', 1.198) == 700.0
     assert _stiffness(truth, 'k_xx', 1.1) is None
     assert _stiffness(None, 'k_zz', 1.1) is None
 
 
-def test_without_recordings_there_is_one_line(
+def test_missing_recordings_are_a_one_line_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """What is missing, and where to get it, with exit status 2."""
+    """The error names the missing recordings, with exit status 2."""
     monkeypatch.setattr(identified, 'SHIPPED_BAGS', tmp_path)
     assert main(['reproduce', 'table-2']) == 2
     said = capsys.readouterr().err
@@ -157,10 +157,10 @@ def test_without_recordings_there_is_one_line(
     assert 'holds no stiffness_*' in said
 
 
-def test_a_table_that_does_not_hold_ends_in_status_1(
+def test_tables_that_do_not_hold_return_status_1(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Three recordings of one kind are not the population of the paper."""
+    """Two recordings of one kind do not represent the population of the paper."""
     for k, bag in enumerate(sorted(SHIPPED_BAGS.glob('friction_*'))[:2]):
         (tmp_path / f'friction_{k}').symlink_to(bag)
     monkeypatch.setitem(TABLE_1, 'coulomb_friction', (5.6, 0.0374))
@@ -169,7 +169,7 @@ def test_a_table_that_does_not_hold_ends_in_status_1(
     assert not json.loads(capsys.readouterr().out)['holds']
 
 
-def test_every_result_can_be_asked_for() -> None:
+def test_every_result_is_a_choice_of_the_command() -> None:
     """Figures 4 to 8, tables 1 to 3, analysis, claims, mismatch, or all of them."""
     tables = dict.fromkeys(identified.TABLES)
     assert {*RESULTS} == {*results._jobs(tables, '')} - {'figures'} | {'all'}
@@ -186,10 +186,10 @@ def test_every_result_can_be_asked_for() -> None:
     ],
 )
 @pytest.mark.usefixtures('once', 'coarse')
-def test_a_result_is_a_page_that_a_browser_shows(
+def test_results_are_pages_for_a_browser(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], what: str, pictures: int, words: list[str]
 ) -> None:
-    """It is whole, fits a telephone, asks for nothing outside, and says what the terminal says."""
+    """The page fits a phone, sends no external requests and matches the terminal output."""
     assert main(['reproduce', what, '-o', str(tmp_path)]) == 0
     assert f'wrote {tmp_path}/reproduce.html' in capsys.readouterr().out
     seen = look_at(tmp_path / 'reproduce.html')
@@ -202,7 +202,7 @@ def test_a_result_is_a_page_that_a_browser_shows(
 
 @pytest.fixture
 def cheap(monkeypatch: pytest.MonkeyPatch, once: Any, coarse: Any) -> None:
-    """Have all results, but few runs behind them."""
+    """Compute all results with few runs."""
     figure = figures.FIGURES['figure-4']
     study = cache(lambda: mismatch.study(8))
     monkeypatch.setattr(results, '_study', study)
@@ -218,10 +218,10 @@ def cheap(monkeypatch: pytest.MonkeyPatch, once: Any, coarse: Any) -> None:
 
 
 @pytest.mark.usefixtures('cheap')
-def test_all_is_one_page_with_every_part(
+def test_all_results_are_sections_of_one_page(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Parts in order, claims judged by what the bags gave, and the same bytes each time."""
+    """Sections are in order, claims use the results of the bags, bytes are reproducible."""
     monkeypatch.setenv('SOURCE_DATE_EPOCH', '86400')
     first, second = tmp_path / 'first', tmp_path / 'second'
     assert main(['reproduce', 'all', '-o', str(first)]) == 0
@@ -251,7 +251,7 @@ def test_all_is_one_page_with_every_part(
     assert found['results']['table-1']['lines'][0]['holds']
     one, other = (
         {
-            # The command differs, and is said at the end.
+            # The footer has the command, which differs.
             path.name: re.sub(b'<footer>.*</footer>', b'', path.read_bytes())
             for path in folder.iterdir()
         }
@@ -261,18 +261,16 @@ def test_all_is_one_page_with_every_part(
 
 
 @pytest.mark.usefixtures('cheap')
-def test_a_claim_that_does_not_hold_is_a_finding(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Only a table that does not come out is a failure."""
+def test_false_claims_are_not_failures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Only a table that does not hold is a failure."""
     assert main(['reproduce', 'claims', '-o', str(tmp_path)]) == 0
     assert 'does not hold' in capsys.readouterr().out
 
 
-def test_a_computed_result_cannot_be_recorded(
+def test_recording_of_computed_results_is_rejected(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A recording for a figure is rejected in one line."""
+    """--record with a figure gives a one-line error."""
     assert main(['reproduce', 'figure-6', '--record', str(tmp_path / 'bags')]) == 2
     assert 'nothing to --record' in capsys.readouterr().err
     assert not (tmp_path / 'bags').exists()

@@ -1,4 +1,4 @@
-"""`needle simulate`: the same run in a table, CSV, picture and bag."""
+"""`needle simulate`: the same run as table, CSV, picture and bag."""
 
 import csv
 import json
@@ -15,8 +15,8 @@ import pytest
 SHORT = ['simulate', '--preset', 'paper_si', '--duration', '0.005', '--interval', '1e-4']
 
 
-def test_csv_and_bag_hold_the_run(tmp_path: Path) -> None:
-    """Both hold the states of `simulate` at every sample, exactly."""
+def test_csv_and_bag_contain_the_run(tmp_path: Path) -> None:
+    """Both contain the states of `simulate` at every sample, exactly."""
     outputs = [str(tmp_path / name) for name in ('run.csv', 'run.png', 'bag')]
     words = [word for output in outputs for word in ('-o', output)]
     assert main([*SHORT, *words]) == 0
@@ -39,8 +39,8 @@ def test_csv_and_bag_hold_the_run(tmp_path: Path) -> None:
     assert (tmp_path / 'run.png').read_bytes().startswith(b'\x89PNG')
 
 
-def test_json_gives_the_summary(capsys: pytest.CaptureFixture[str]) -> None:
-    """The summary is machine-readable, and a changed constant changes it."""
+def test_json_contains_the_summary(capsys: pytest.CaptureFixture[str]) -> None:
+    """A changed constant changes the summary."""
     ends = []
     for change in (
         [],
@@ -64,20 +64,20 @@ def test_json_gives_the_summary(capsys: pytest.CaptureFixture[str]) -> None:
         (['--tolerance', '-1'], 'tolerance must be positive'),
     ],
 )
-def test_bad_input_ends_in_one_line(
+def test_invalid_input_is_a_one_line_error(
     words: list[str], complaint: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """What is wrong is named, with exit status 2."""
+    """The error names the invalid input, with exit status 2."""
     assert main([*SHORT, *words]) == 2
     captured = capsys.readouterr()
     assert complaint in captured.err
     assert captured.err.count('\n') == 1
 
 
-def test_the_run_is_named_and_so_are_its_files(
+def test_output_names_the_run_and_its_files(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Defaults that nobody typed are printed."""
+    """Default values are printed."""
     file = tmp_path / 'run.csv'
     assert main([*SHORT, '-o', str(file)]) == 0
     out = capsys.readouterr().out
@@ -85,8 +85,8 @@ def test_the_run_is_named_and_so_are_its_files(
     assert out.endswith(f'wrote {file}\n')
 
 
-def test_it_says_how_fast_and_how_exact_it_was(capsys: pytest.CaptureFixture[str]) -> None:
-    """On a line of its own, and in the table and JSON; a smaller tolerance is met."""
+def test_output_reports_speed_and_accuracy(capsys: pytest.CaptureFixture[str]) -> None:
+    """Speed is in the last line, accuracy in table and JSON; a smaller tolerance is met."""
     assert main(SHORT) == 0
     *_, last = capsys.readouterr().out.splitlines()
     pace = re.fullmatch(
@@ -95,14 +95,14 @@ def test_it_says_how_fast_and_how_exact_it_was(capsys: pytest.CaptureFixture[str
     assert pace is not None
     taken, times = float(pace[1]), float(pace[2])
     ratio = 0.005 / taken if pace[3] == 'faster' else taken / 0.005
-    # Both are said to two digits.
+    # Both are printed to two digits.
     assert times == pytest.approx(ratio, rel=0.1)
     for words, most in (([], 1e-3), (['--tolerance', '1e-6'], 1e-6)):
         assert main([*SHORT, '--json', *words]) == 0
         assert 0.0 < json.loads(capsys.readouterr().out)['change by twice the step [1]'] <= most
 
 
-def test_what_the_samples_cannot_show_is_said(capsys: pytest.CaptureFixture[str]) -> None:
+def test_limits_of_model_and_sampling_are_warned_of(capsys: pytest.CaptureFixture[str]) -> None:
     """A mode beyond half the sampling rate, and a deflection beyond a linear beam."""
     few = ['simulate', '--preset', 'paper_si', '--duration', '0.002', '--depth', '0.05']
     bent = ['--tip-deflection', '0.02']
@@ -114,23 +114,23 @@ def test_what_the_samples_cannot_show_is_said(capsys: pytest.CaptureFixture[str]
     assert capsys.readouterr().err == ''
 
 
-def test_the_contact_of_the_hub_is_named(capsys: pytest.CaptureFixture[str]) -> None:
-    """Only when the needle is in up to the hub."""
+def test_hub_contact_is_reported(capsys: pytest.CaptureFixture[str]) -> None:
+    """Only if the needle is inserted up to the hub."""
     name = 'hub at the skin after [s]'
     for preset, time in (('paper_si', 0.0287), ('phantom', 22.13)):
         assert main(['simulate', '--json', '--preset', preset]) == 0
         said = capsys.readouterr()
-        # A run takes 2000 samples by default; the modes that they cannot show have faded.
+        # The default is 2000 samples; modes above their Nyquist frequency have decayed.
         assert abs(json.loads(said.out)[name] - time) < 3e-3 * time
         assert said.err == ''
     assert main([*SHORT, '--json']) == 0
     assert name not in json.loads(capsys.readouterr().out)
 
 
-def test_a_run_may_start_from_modal_coordinates(
+def test_runs_can_start_from_modal_coordinates(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """q1 and q2 as given, instead of a deflection; not both, and not another number of them."""
+    """q1 and q2 replace a tip deflection; both, or a wrong number of values, are rejected."""
     assert main([*SHORT, '--modal', '1e-5', '-2e-6', '-o', str(tmp_path / 'run.csv')]) == 0
     with (tmp_path / 'run.csv').open() as file:
         first = list(csv.reader(file))[1]

@@ -1,4 +1,4 @@
-"""`needle simulate --model steering`: what it writes, and what it says of bad input."""
+"""`needle simulate --model steering`: outputs, and errors of invalid input."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ WAY = 'depth [mm],guide_z [mm],roll [deg]\n0,0,0\n20,4,0\n60,4,0\n61,4,180\n100,
 def said(
     capsys: pytest.CaptureFixture[str], *words: str, status: int = 0
 ) -> tuple[dict[str, float], str]:
-    """Run the command; return its JSON, if it succeeds, and what it complains of."""
+    """Run the command; return its JSON, if it succeeds, and stderr."""
     assert main(['simulate', *words]) == status
     found = capsys.readouterr()
     return (json.loads(found.out) if status == 0 else {}), found.err
 
 
-def test_what_it_writes_is_identified_again(
+def test_identification_recovers_the_constants(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The CSV has what friction and steering are identified from, and gives the constants back."""
+    """The CSV contains the inputs of the identification of friction and steering."""
     way, run, picture = (tmp_path / name for name in ('way.csv', 'run.csv', 'run.png'))
     way.write_text(WAY)
     steering = ['--model', 'steering', '--set', 'bevel_load=0.4', '--set', 'cutting_force=0.8']
@@ -38,13 +38,13 @@ def test_what_it_writes_is_identified_again(
         rows = list(csv.DictReader(stream))
     assert float(rows[-1]['tip_z [m]']) == found['tip at the end, z [m]']
     assert float(rows[-1]['guide_z [m]']) == pytest.approx(-2e-3)
-    # Friction of the preset, and what cuts; even within the interval, so that rounding is left.
+    # Friction of the preset plus cutting force, constant within the interval, up to rounding.
     assert float(rows[50]['force [N]']) == pytest.approx(0.56 + 300.0 * 5e-3 + 0.8, rel=1e-9)
     assert main(['identify', 'steering', str(run), '--terms', 'bevel', '--json']) == 0
     identified = json.loads(capsys.readouterr().out)
     [medium] = identified['media'].values()
-    # The preset bends over 35 mm, behind a free length of 40 mm. Samples are not at the corners
-    # of the way.
+    # The preset has a bending length of 35 mm and a free length of 40 mm. The samples are not at
+    # the corners of the guide motion.
     assert medium['parameters']['bending_length']['value'] == pytest.approx(0.035, rel=5e-3)
     assert identified['free_length']['value'] == pytest.approx(0.04, rel=5e-3)
     assert medium['parameters']['curvature_z']['value'] == pytest.approx(
@@ -52,7 +52,7 @@ def test_what_it_writes_is_identified_again(
     )
 
 
-def test_a_membrane_and_a_start_on_the_way(capsys: pytest.CaptureFixture[str]) -> None:
+def test_membranes_start_depth_and_seed_take_effect(capsys: pytest.CaptureFixture[str]) -> None:
     changes = ['membrane_depths=0.05', 'membrane_strengths=2', 'path_noise=1e-4']
     words = [word for change in changes for word in ('--set', change)]
     options = ['--model', 'steering', *words, '--depth', '0.03', '--to', '0.08', '--json']
@@ -82,7 +82,7 @@ def test_a_membrane_and_a_start_on_the_way(capsys: pytest.CaptureFixture[str]) -
         (['--model', 'steering', '--way', 'none.csv'], 'none.csv cannot be read'),
     ],
 )
-def test_bad_input_is_named(
+def test_invalid_input_is_named(
     words: list[str], complaint: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert complaint in said(capsys, *words, status=2)[1]
@@ -96,7 +96,7 @@ def test_bad_input_is_named(
         ('depth,roll\n0,0\n0.1,nan\n', 'has values that are not numbers'),
     ],
 )
-def test_bad_ways_are_named(
+def test_invalid_guide_tables_are_named(
     text: str, complaint: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     way = tmp_path / 'way.csv'

@@ -1,4 +1,4 @@
-"""`needle steer`: it hits, it says what it expects, and it names bad input."""
+"""`needle steer`: accuracy, expected tip, and errors of invalid input."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ import pytest
 
 
 def steered(capsys: pytest.CaptureFixture[str], *words: str, status: int = 0) -> tuple[Any, str]:
-    """Run the command; return its JSON, if it succeeds, and what it complains of."""
+    """Run the command; return its JSON, if it succeeds, and stderr."""
     assert main(['steer', '--json', *words]) == status
     said = capsys.readouterr()
     return (json.loads(said.out) if status == 0 else None), said.err
 
 
-def test_it_hits_where_open_loop_misses(
+def test_steering_hits_where_open_loop_misses(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """By millimeters, and says how far to trust that; twice the same."""
+    """Open loop misses by millimeters; the 95 % interval is valid, and runs are reproducible."""
     picture = tmp_path / 'steer.png'
     found, said = steered(capsys, '-o', str(picture))
     assert found['miss [m]'] < 4e-4 < 2e-3 < found['miss open loop [m]']
     assert said == ''
     off = np.array(found['tip [m]']) - found['expected tip [m]']
-    # One seed: within three times the half interval.
+    # Single seed: three half-widths of the interval.
     assert (np.abs(off) < 3.0 * np.array(found['its interval of 95 % [m]'])).all()
     assert picture.read_bytes().startswith(b'\x89PNG')
     assert steered(capsys)[0] == found
@@ -38,15 +38,15 @@ def test_it_hits_where_open_loop_misses(
     assert 'open loop' in capsys.readouterr().out
 
 
-def test_what_is_known_hits_nearer(capsys: pytest.CaptureFixture[str]) -> None:
-    """A path that does not stray and a sensor without noise leave next to nothing."""
+def test_miss_is_smaller_without_noise(capsys: pytest.CaptureFixture[str]) -> None:
+    """Without path noise and sensor noise the miss is below 0.06 mm."""
     exact = ['--belief', 'path_noise=1e-9', '--belief', 'noise=1e-7']
     found, _ = steered(capsys, *exact)
     assert found['miss [m]'] < 6e-5
 
 
-def test_roll_and_loads_are_counted(capsys: pytest.CaptureFixture[str]) -> None:
-    """A bevel is turned by roll alone; with the guide, whose load has a limit."""
+def test_roll_and_load_limits_take_effect(capsys: pytest.CaptureFixture[str]) -> None:
+    """Roll alone compensates a bevel; the guide respects its load limit."""
     bevel = ['--set', 'bevel_load=0.8', '--belief', 'tilt=0.01', '--belief', 'frame=0.01']
     near = '--target=0.001,0.1,0.003'
     rolled, _ = steered(capsys, near, *bevel, '--turns', '6', '--limit', '0')
@@ -59,12 +59,12 @@ def test_roll_and_loads_are_counted(capsys: pytest.CaptureFixture[str]) -> None:
     assert bound['miss [m]'] < 4e-4
 
 
-def test_out_of_reach_is_said_before_or_on_the_way(
+def test_unreachable_targets_are_rejected_or_warned_of(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     picture = tmp_path / 'reach.png'
     _, said = steered(capsys, '--target=0.05,0.1,0', '-o', str(picture), status=1)
-    # Beside the words a picture of what is within reach.
+    # The picture shows the reachable set.
     assert picture.read_bytes().startswith(b'\x89PNG')
     assert 'the target x = 50.00 mm, z = 0.00 mm is out of reach: from here a tip at x =' in said
     found, said = steered(capsys, '--target=-0.026,0.1,0')
@@ -95,7 +95,7 @@ def test_out_of_reach_is_said_before_or_on_the_way(
         (['-o', '/no/such/folder/x.png'], 'its folder does not exist'),
     ],
 )
-def test_bad_input_is_one_line(
+def test_invalid_input_is_a_one_line_error(
     capsys: pytest.CaptureFixture[str], words: list[str], complaint: str
 ) -> None:
     _, said = steered(capsys, *words, status=2)

@@ -1,4 +1,4 @@
-"""`needle study`: equal tables whoever computes them, and nothing lost."""
+"""`needle study`: reproducible tables, and recovery after interruptions."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from support.pages import look_at
 from support.studies import check_refused
 import yaml
 
-#: Few needles that go in by few steps.
+#: Small study: few needles, few steps.
 SMALL: dict[str, Any] = {
     'protocol': 'steering',
     'samples': 40,
@@ -54,28 +54,26 @@ SMALL: dict[str, Any] = {
 
 
 class Here(Executor):
-    """Computes at once in this process."""
+    """Executor that computes at once in this process."""
 
     def submit(self, function: Callable[..., Any], /, *words: Any, **options: Any) -> Future[Any]:
-        """Return what is done."""
         future: Future[Any] = Future()
         future.set_result(function(*words, **options))
         return future
 
 
 def here() -> AbstractContextManager[Executor]:
-    """Make such an executor."""
+    """Create an executor in this process."""
     return nullcontext(Here())
 
 
 def checksum(path: Path) -> str:
-    """Return the SHA-256 of a file."""
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 @pytest.mark.parametrize('design', DESIGNS)
-def test_a_sample_does_not_depend_on_its_chunk(design: str) -> None:
-    """To the bit, with correlations too."""
+def test_samples_are_independent_of_chunks(design: str) -> None:
+    """Bit-identical, also with correlations."""
     study = made({**SMALL, 'design': design})
     whole = study.rows(0, 13)
     for first, count in ((0, 1), (1, 5), (6, 7)):
@@ -86,8 +84,8 @@ def test_a_sample_does_not_depend_on_its_chunk(design: str) -> None:
 
 
 @pytest.mark.parametrize(('controller', 'count'), [('ours', 5), ('open loop', 300)])
-def test_a_sample_does_not_depend_on_its_neighbors(controller: str, count: int) -> None:
-    """To the bit; of those in open loop some hundreds are computed together."""
+def test_samples_are_independent_of_their_batch(controller: str, count: int) -> None:
+    """Bit-identical; open-loop samples are computed in batches of some hundreds."""
     study = made({**SMALL, 'settings': {**SMALL['settings'], 'controller': controller}})
     whole = study.rows(0, count)
     assert np.isfinite(whole['miss']).all()
@@ -97,7 +95,7 @@ def test_a_sample_does_not_depend_on_its_neighbors(controller: str, count: int) 
 
 
 @pytest.mark.parametrize('design', DESIGNS)
-def test_samples_have_the_distributions_and_correlations_of_the_file(design: str) -> None:
+def test_samples_follow_distributions_and_correlations(design: str) -> None:
     study = made({**SMALL, 'design': design, 'samples': 4096, 'population': {
         'tilt_x': {'normal': [0.01, 0.002], 'within': [-0.1, 0.1]},
         'tilt_z': {'uniform': [-0.02, 0.04]},
@@ -105,7 +103,7 @@ def test_samples_have_the_distributions_and_correlations_of_the_file(design: str
         'bending_length': {'lognormal': [1.2, 0.1], 'within': [0.2, 5.0]},
     }, 'correlations': [['tilt_x', 'tilt_z', 0.8]]})  # fmt: skip
     drawn = study.draw(range(4096))
-    # Five standard errors of 4096 independent draws; Sobol is nearer.
+    # Five standard errors of 4096 independent samples; the error of Sobol is smaller.
     near = 5.0 / sqrt(4096.0)
     assert drawn['tilt_x'].mean() == pytest.approx(0.01, abs=0.002 * near)
     assert drawn['tilt_x'].std() == pytest.approx(0.002, rel=near)
@@ -116,7 +114,7 @@ def test_samples_have_the_distributions_and_correlations_of_the_file(design: str
     # the root of the number.
     assert drawn['skin'].std() == pytest.approx(0.5, rel=0.77 * near)
     assert np.median(drawn['bending_length']) == pytest.approx(1.2, rel=0.125 * near)
-    # Of ranks, for a normal copula: 6 / pi asin(rho / 2).
+    # Rank correlation of a normal copula: 6 / pi asin(rho / 2).
     ranks = [np.argsort(np.argsort(drawn[name])) for name in ('tilt_x', 'tilt_z')]
     found = np.asarray(np.corrcoef(np.array(ranks)))
     assert found[0, 1] == pytest.approx(6 / np.pi * np.arcsin(0.4), abs=near)
@@ -124,8 +122,8 @@ def test_samples_have_the_distributions_and_correlations_of_the_file(design: str
 
 
 @pytest.mark.parametrize('design', DESIGNS)
-def test_a_worker_draws_what_the_file_says_in_whatever_order(design: str) -> None:
-    """A worker gets the study with sorted names; who replays reads the file."""
+def test_samples_are_independent_of_the_order_of_variables(design: str) -> None:
+    """A worker receives the study with sorted names; a replay reads the file."""
     given = SMALL['population']
     turned = {name: given[name] for name in reversed(given)}
     for names in (list(given), list(turned)):
@@ -141,8 +139,8 @@ def test_a_worker_draws_what_the_file_says_in_whatever_order(design: str) -> Non
 
 
 @pytest.mark.parametrize('samples', [1, 2, 5, 64, 1000, 1025])
-def test_each_stratum_of_a_latin_design_has_one_sample(samples: int) -> None:
-    """In every dimension; and what stratum that is in one says nothing of another."""
+def test_latin_design_has_one_sample_per_stratum(samples: int) -> None:
+    """In every dimension, and the strata of the dimensions are uncorrelated."""
     names = ('target_x', 'target_z', 'tilt_x')
     population = {name: {'uniform': [0.0, 0.5]} for name in names}
     drawn = made(
@@ -164,14 +162,14 @@ def test_each_stratum_of_a_latin_design_has_one_sample(samples: int) -> None:
     parts=st.lists(st.floats(1e-6, 1.0 - 1e-6), min_size=2, max_size=20),
     cut=st.tuples(st.floats(0.1, 0.45), st.floats(0.55, 0.9)),
 )
-def test_quantiles_grow_and_stay_within(
+def test_quantiles_are_monotone_and_within_the_range(
     kind: str, first: float, second: float, parts: list[float], cut: tuple[float, float]
 ) -> None:
-    """Of any distribution, also one that is cut off."""
+    """For all kinds of distributions, also truncated."""
     numbers = [first, first + second] if kind == 'uniform' else [first, second]
     free = distribution('x', {kind: numbers})
     values = free.quantiles(np.sort(parts))
-    # The inverse of the incomplete gamma function is monotone but for rounding.
+    # The inverse of the incomplete gamma function is monotone up to rounding.
     assert (np.diff(values) >= -1e-12 * np.abs(values[:-1])).all()
     low, high = free.quantiles(np.array(cut)).tolist()
     if not low < high:
@@ -179,13 +177,13 @@ def test_quantiles_grow_and_stay_within(
     within = distribution('x', {kind: numbers, 'within': [low, high]})
     some = within.quantiles(np.array(parts))
     assert ((some >= low) & (some <= high)).all()
-    # The middle of what is left is where the free one has it, but for rounding far out in a tail.
+    # The median of the truncated distribution, up to rounding in the far tail.
     (middle,) = within.quantiles(np.array([0.5]))
     assert middle == pytest.approx(free.quantiles(np.array([sum(cut) / 2]))[0], rel=1e-6)
 
 
-def test_the_table_is_the_same_for_any_workers_and_chunks(tmp_path: Path) -> None:
-    """Its bytes are; so it is after a part was lost, and when all was computed at once."""
+def test_table_is_independent_of_workers_and_chunks(tmp_path: Path) -> None:
+    """The bytes are equal in one process and with one or two workers."""
     study = made(SMALL)
     sums = set()
     for name, executor, workers in (
@@ -201,23 +199,23 @@ def test_the_table_is_the_same_for_any_workers_and_chunks(tmp_path: Path) -> Non
     assert np.array_equal(column(results.table, 'sample'), np.arange(study.samples))
 
 
-def test_killed_workers_change_nothing(tmp_path: Path) -> None:
-    """Six are killed at random times, most of them while they start; no process waits for them."""
+def test_killed_workers_do_not_change_the_table(tmp_path: Path) -> None:
+    """Six workers are killed at random times, most during their start; no process hangs."""
     document = {**SMALL, 'samples': 600}
     file, folder = tmp_path / 'study.yaml', tmp_path / 'killed'
     file.write_text(yaml.safe_dump(document))
     whole = Results(tmp_path / 'whole', made(document))
     compute(whole, here, 1, lambda _: None)
     words = [sys.executable, '-m', 'needle_insertion.cli', 'study', str(file), '--workers', '2']
-    # Up to 2 s between kills: a worker needs about that time to begin its first chunk.
+    # Up to 2 s between kills, about the time until a worker starts its first chunk.
     losses = kill_workers([*words, '-o', str(folder)], folder, 6, 2.0, np.random.default_rng(1))
     assert losses.killed >= 2
     assert (losses.errors, losses.hangs) == (0, 0)
     assert checksum(folder / 'samples.parquet') == checksum(whole.table)
 
 
-def test_killed_at_any_moment_it_goes_on(tmp_path: Path) -> None:
-    """Ten times, by kill -9; nothing is computed twice, and the table is the same."""
+def test_killed_studies_are_resumed(tmp_path: Path) -> None:
+    """Ten kills with SIGKILL; no chunk is computed twice, and the table is the same."""
     document = {**SMALL, 'samples': 1500, 'settings': {**SMALL['settings'], 'step': 0.005}}
     file = tmp_path / 'study.yaml'
     file.write_text(yaml.safe_dump(document))
@@ -234,8 +232,10 @@ def test_killed_at_any_moment_it_goes_on(tmp_path: Path) -> None:
     assert not (folder / 'parts').exists()
 
 
-def test_the_page_and_a_sample_again(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """What is shown is what the table holds; a bag of one sample ends at its tip."""
+def test_page_and_replay_match_the_table(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The page shows the values of the table; the bag of a sample ends at its tip."""
     file, folder = tmp_path / 'study.yaml', tmp_path / 'results'
     file.write_text(yaml.safe_dump(SMALL, sort_keys=False))
     words = ['study', str(file), '-o', str(folder), '--workers', '1']
@@ -253,7 +253,7 @@ def test_the_page_and_a_sample_again(tmp_path: Path, capsys: pytest.CaptureFixtu
     *_, (_, last) = read_topic(folder / 'sample_7', '/tip_deflection')
     assert last.point.x == column(table, 'tip_x')[7]
     assert last.point.z == column(table, 'tip_z')[7]
-    # Again is at once, and changes nothing.
+    # A repeated command does not change the table.
     before = checksum(table)
     assert main(words) == 0
     assert checksum(table) == before
@@ -261,10 +261,10 @@ def test_the_page_and_a_sample_again(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert '--replay must be from 0 to 39' in capsys.readouterr().err
 
 
-def test_a_page_keeps_the_first_samples_only(
+def test_pages_limit_the_number_of_samples(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Quantiles and pictures are of them, and it says so; probabilities and the worst of all."""
+    """Quantiles and pictures use the first samples, probabilities and worst samples use all."""
     results = Results(tmp_path / 'results', made(SMALL))
     compute(results, here, 1, lambda _: None)
     asked: set[int | None] = set()
@@ -284,39 +284,39 @@ def test_a_page_keeps_the_first_samples_only(
     assert f'>{last}<' in text
 
 
-def test_open_loop_is_that_of_a_guide_at_rest(tmp_path: Path) -> None:
-    """The batch says what single needles do."""
+def test_open_loop_equals_a_guide_at_rest(tmp_path: Path) -> None:
+    """The batch gives the same tips as single insertions."""
     free = {**SMALL, 'settings': {**SMALL['settings'], 'controller': 'open loop'}}
     rows = made(free).rows(0, 20)
     still = {**SMALL, 'settings': {**SMALL['settings'], 'guide_limit': 0.0}}
     same = made(still).rows(0, 20)
-    # A position of the guide and none differ by rounding.
+    # A guide at position 0 and a missing guide differ by rounding.
     np.testing.assert_allclose(rows['tip_x'], same['tip_x'], rtol=0.0, atol=1e-9)
     np.testing.assert_allclose(rows['tip_z'], same['tip_z'], rtol=0.0, atol=1e-9)
 
 
-def test_intervals_hold_as_often_as_they_say() -> None:
-    """Of probabilities near 0 and in the middle, and of quantiles, over draws with known truth."""
+def test_intervals_have_their_nominal_coverage() -> None:
+    """Probabilities near 0 and in the middle, and quantiles, with known true values."""
     rng = np.random.default_rng(5)
     for truth in (0.01, 0.3, 0.95):
         found = [probability([(rng.random(300) < truth).astype(float)]) for _ in range(1000)]
         held = np.mean([one.low <= truth <= one.high for one in found])
-        # Wilson's interval is within some percent of 95 for any probability.
+        # Coverage of the Wilson interval is within some percent of 95 for any probability.
         assert 0.925 < held < 0.99
     for part, exact in ((0.5, 0.0), (0.9, 1.2815515655446004), (0.99, 2.3263478740408408)):
         for n in (1, 5, 20, 200):
             near = [quantile(rng.standard_normal(n), part) for _ in range(1000)]
             held = np.mean([one.low <= exact <= one.high for one in near])
-            # Four standard errors below 95 %; of few samples only wide intervals hold so often.
+            # Four standard errors below 95 %; intervals of few samples are conservative.
             assert held > 0.95 - 4.0 * sqrt(0.95 * 0.05 / 1000)
         assert held < 0.99
-    # Without an order statistic that is large enough often enough there is no end.
+    # No upper end if no order statistic has the required probability.
     assert quantile(rng.standard_normal(367), 0.99).high == np.inf
     assert np.isfinite(quantile(rng.standard_normal(368), 0.99).high)
 
 
-def test_shares_are_those_of_a_sum() -> None:
-    """Of y = 2 a + b with equal variances: 0.8 and 0.2; a bystander has none."""
+def test_variance_fractions_of_a_sum_are_exact() -> None:
+    """For y = 2 a + b with equal variances: 0.8 and 0.2, and 0 for an independent variable."""
     rng = np.random.default_rng(2)
     a, b, other = rng.standard_normal((3, 20_000))
     y = 2.0 * a + b
@@ -324,15 +324,15 @@ def test_shares_are_those_of_a_sum() -> None:
     assert share(y, a) == pytest.approx(0.8, abs=0.01)
     assert share(y, b) == pytest.approx(0.2, abs=0.01)
     assert share(y, other) == pytest.approx(0.0, abs=0.005)
-    # Rounding of a mean is no variance.
+    # Rounding of a mean is not variance.
     assert share(np.full(1000, 1.23e-5), a[:1000]) == 0.0
     assert np.isnan(share(y[:199], a[:199]))
     found = list(np.argsort(np.where(np.isnan(y), np.inf, -y))[:2])
     assert worst([y], 2) == worst(np.array_split(y, 7), 2) == found
 
 
-def test_a_map_has_the_samples_at_its_edges() -> None:
-    """Of quantities with two values each, all are at an edge."""
+def test_maps_include_samples_at_their_edges() -> None:
+    """Two variables with two values each have all samples at an edge."""
     study, rng = made(SMALL), np.random.default_rng(3)
     over = {name: rng.integers(0, 2, 4000).astype(float) for name in ('tilt_z', 'skin')}
     values = over['tilt_z'] + 2.0 * over['skin']
@@ -342,8 +342,8 @@ def test_a_map_has_the_samples_at_its_edges() -> None:
     assert sorted(seen) == pytest.approx([0.0, 1e3, 2e3, 3e3])
 
 
-def test_a_part_at_the_end_of_its_range_is_a_number(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A scrambled Sobol sequence may have an exact 0, whose normal score is infinite."""
+def test_quantiles_at_zero_and_one_are_finite(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A scrambled Sobol sequence may contain an exact 0, whose normal score is infinite."""
     study = made(SMALL)
     for part in (0.0, 1.0):
         monkeypatch.setattr(Study, '_parts', lambda *_, at=part: np.full((3, 5), at))
@@ -352,7 +352,7 @@ def test_a_part_at_the_end_of_its_range_is_a_number(monkeypatch: pytest.MonkeyPa
             assert ((values >= quantity.low) & (values <= quantity.high)).all()
 
 
-def test_only_one_process_computes_a_study(
+def test_a_study_is_locked_by_one_process(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file, folder = tmp_path / 'study.yaml', tmp_path / 'results'
@@ -377,10 +377,10 @@ def test_only_one_process_computes_a_study(
     ],
     ids=['empty', 'cut', 'other number', 'twice'],
 )
-def test_a_damaged_part_is_computed_again(
+def test_damaged_parts_are_computed_again(
     tmp_path: Path, damage: Callable[[Path], object]
 ) -> None:
-    """Also one that has other samples than its name says, and one that is there twice."""
+    """Also a part with other samples than in its name, and overlapping parts."""
     study = made(SMALL)
     whole, broken = Results(tmp_path / 'whole', study), Results(tmp_path / 'broken', study)
     compute(whole, here, 1, lambda _: None)
@@ -391,7 +391,7 @@ def test_a_damaged_part_is_computed_again(
     assert checksum(broken.table) == checksum(whole.table)
 
 
-def test_what_is_damaged_or_of_another_version_is_named(
+def test_damaged_tables_and_other_versions_are_rejected(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file, folder = tmp_path / 'study.yaml', tmp_path / 'results'
@@ -407,7 +407,7 @@ def test_what_is_damaged_or_of_another_version_is_named(
     table.unlink()
     assert main(words) == 0
     assert table.read_bytes() == whole
-    # One that was begun by others must not go on: its samples would be of two kinds.
+    # A study of other versions must not be resumed: the versions change the samples.
     table.unlink()
     begun = json.loads((folder / 'study.json').read_text())
     begun['versions']['numpy'] = '1.26.4'
@@ -475,14 +475,14 @@ def test_what_is_damaged_or_of_another_version_is_named(
         ({'design': ['sobol']}, 'design must be one of sobol, random, latin, got'),
     ],
 )  # fmt: skip
-def test_what_a_study_cannot_have_is_named(
+def test_invalid_studies_are_rejected(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], change: Any, complaint: str
 ) -> None:
-    """In one line, with the file, and nothing is written."""
+    """A one-line error names the file, and nothing is written."""
     check_refused({**SMALL, **change}, complaint, tmp_path, capsys)
 
 
-def test_folders_and_files_that_cannot_be_used_are_named(
+def test_unusable_files_and_folders_are_rejected(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file = tmp_path / 'study.yaml'
@@ -499,8 +499,8 @@ def test_folders_and_files_that_cannot_be_used_are_named(
     assert '--workers must be >= 1' in capsys.readouterr().err
 
 
-def test_a_full_disk_ends_it_in_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What was written before is whole, and the study goes on when there is room."""
+def test_a_full_disk_is_a_one_line_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Completed parts remain, and the study is resumed when there is space."""
     study = made(SMALL)
     results = Results(tmp_path / 'results', study)
     room = resource_limit(2000)
@@ -513,7 +513,7 @@ def test_a_full_disk_ends_it_in_one_line(tmp_path: Path, monkeypatch: pytest.Mon
 
 @contextmanager
 def resource_limit(size: int) -> Any:
-    """Let no file of this process grow beyond a size [bytes]."""
+    """Limit the size of files of this process [bytes]."""
     import resource
 
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
@@ -526,8 +526,8 @@ def resource_limit(size: int) -> Any:
         signal.signal(signal.SIGXFSZ, handler)
 
 
-def test_a_scheduler_that_is_killed_ends_it_in_one_line(tmp_path: Path) -> None:
-    """In the middle; what was written is not lost."""
+def test_a_killed_scheduler_is_a_one_line_error(tmp_path: Path) -> None:
+    """Completed parts remain."""
     from distributed import Client
 
     study, file = made({**SMALL, 'samples': 400}), tmp_path / 'scheduler.json'
@@ -552,7 +552,6 @@ def test_a_scheduler_that_is_killed_ends_it_in_one_line(tmp_path: Path) -> None:
 
 @contextmanager
 def ended(process: subprocess.Popen[bytes]) -> Iterator[subprocess.Popen[bytes]]:
-    """Kill a process at the end."""
     try:
         yield process
     finally:
@@ -560,10 +559,10 @@ def ended(process: subprocess.Popen[bytes]) -> Iterator[subprocess.Popen[bytes]]
         process.wait()
 
 
-def test_a_dask_cluster_computes_the_same_though_a_worker_is_killed(
+def test_a_dask_cluster_survives_a_killed_worker(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """On this machine, with two processes; a scheduler that is not there is named."""
+    """The table is the same with two worker processes; a missing scheduler is reported."""
     from distributed import Client, LocalCluster
 
     study = made({**SMALL, 'samples': 200})

@@ -1,4 +1,4 @@
-"""`needle study` with the protocol `insertion`: a needle of eight states, pushed to a depth."""
+"""`needle study` with the scenario `insertion`: a flexible needle pushed to a depth."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ import yaml
 
 PHANTOM = NeedleParameters.preset('phantom')
 
-#: Short ways, from 2 cm.
+#: Short insertions, from 2 cm.
 POPULATION: dict[str, Any] = {
     'target': {'uniform': [0.025, 0.03]},
     'depth': {'uniform': [0.018, 0.02]},
@@ -56,7 +56,7 @@ SMALL: dict[str, Any] = {
 
 
 def one(settings: dict[str, Any] | None = None, **drawn: float) -> dict[str, float]:
-    """Return the figures of one sample with given values."""
+    """Return the metrics of one sample with given values."""
     protocol = made({**SMALL, 'settings': settings or {}, 'population': {}}).protocol
     rows = {name: np.array([value]) for name, value in drawn.items()}
     found = protocol.run(rows, [np.random.default_rng(1)])
@@ -66,8 +66,8 @@ def one(settings: dict[str, Any] | None = None, **drawn: float) -> dict[str, flo
 
 @pytest.mark.parametrize('controller', CONTROLLERS)
 @pytest.mark.parametrize('design', ['sobol', 'latin'])
-def test_a_sample_does_not_depend_on_its_chunk(controller: str, design: str) -> None:
-    """To the bit, whatever differs."""
+def test_samples_are_independent_of_chunks(controller: str, design: str) -> None:
+    """Bit-identical for all variables."""
     settings = {'wait': 0.2, 'controller': controller}
     study = made({**SMALL, 'settings': settings, 'design': design})
     whole = study.rows(0, 20)
@@ -79,8 +79,7 @@ def test_a_sample_does_not_depend_on_its_chunk(controller: str, design: str) -> 
             assert np.array_equal(values, whole[name][first : first + count], equal_nan=True)
 
 
-def test_the_table_is_the_same_for_any_workers(tmp_path: Path) -> None:
-    """Its bytes are."""
+def test_table_is_independent_of_the_workers(tmp_path: Path) -> None:
     study, tables = made({**SMALL, 'settings': {'wait': 0.2}}), []
     for workers in (1, 2):
         results = Results(tmp_path / str(workers), study)
@@ -90,21 +89,20 @@ def test_the_table_is_the_same_for_any_workers(tmp_path: Path) -> None:
 
 
 class Late:
-    """A controller whose commands take effect later than it believes."""
+    """Controller with an additional delay that is not in its model."""
 
     def __init__(self, controller: Controller, late: int) -> None:
         self._controller = controller
         self.period, self.delay = controller.period, controller.delay + late
 
     def command(self, measured: Measurement, load: float = 0.0) -> Command:
-        """Answer as the controller does."""
         return self._controller.command(measured, load)
 
 
 @pytest.mark.parametrize('law', ['adaptive', 'inverse_dynamics', 'pid'])
 @pytest.mark.parametrize('late', [0, 3])
-def test_it_is_the_controller_of_the_node(law: str, late: int) -> None:
-    """The same figures as from the object that the node runs, on the same needle."""
+def test_metrics_match_the_controller_of_the_node(law: str, late: int) -> None:
+    """The metrics equal those of the controller object of the node on the same needle."""
     settings = {'controller': law, 'step': 1e-5, 'reference': 'minimum_jerk', 'wait': 0.5}
     drawn = {'target': 0.025, 'depth': 0.02, 'tip': 3e-4, 'coulomb_friction': 1.3,
              'viscous_friction': 0.8, 'carriage_mass': 0.1, 'tissue_damping': 0.5}  # fmt: skip
@@ -120,13 +118,13 @@ def test_it_is_the_controller_of_the_node(law: str, late: int) -> None:
         PHANTOM, law, reference='minimum_jerk', settings=ControllerSettings(rotation=False)
     )
     controller.set_target(0.025)
-    # Rest of the run: the longer one of 15/8 D / v and of the acceleration, and the wait.
+    # Duration: 15/8 D / v, which exceeds the limit by the acceleration, plus the wait.
     duration = round(1e3 * (1.875 * 0.005 / 0.01 + 0.5)) * 1e-3
     run = run_controller(
         Late(controller, late), p, NeedleModel(p).state_at(0.02, 3e-4), duration=duration
     )
-    # The same steps, the controller compiled here and in Python there: rounding, which a closed
-    # loop with dry friction enlarges for a sample where it starts and stops.
+    # The same steps with the compiled and the Python controller: rounding, which a closed loop
+    # with dry friction amplifies for a sample at start and stop.
     assert found['error'] == pytest.approx(abs(0.025 - run.depth[-1]), abs=1e-11)
     assert found['overshoot'] == pytest.approx(max(0.0, run.depth.max() - 0.025), abs=1e-11)
     assert found['force'] == pytest.approx(np.abs(run.forces[:, 0]).max(), rel=1e-6)
@@ -134,8 +132,8 @@ def test_it_is_the_controller_of_the_node(law: str, late: int) -> None:
     assert found['stopped'] == found['left'] == 0.0
 
 
-def test_what_the_law_does_not_know_makes_it_worse() -> None:
-    """Exactly known it hits; with friction or delay that nobody told it, it follows less well."""
+def test_model_mismatch_increases_the_tracking_error() -> None:
+    """Exact parameters hit the target; unmodeled friction or delay degrades the tracking."""
     settings = {'controller': 'inverse_dynamics'}
     known = one(settings, target=0.03)
     assert known['hit'] == 1.0
@@ -144,12 +142,12 @@ def test_what_the_law_does_not_know_makes_it_worse() -> None:
     for name, value in (('viscous_friction', 1.5), ('coulomb_friction', 1.5), ('late', 30.0)):
         worse = one(settings, target=0.03, **{name: value})
         assert worse['following'] > 2.0 * known['following']
-    # Noise of the encoders lets it come to rest later.
+    # Encoder noise delays the rest of the needle.
     assert one(settings, target=0.03, depth_noise=2e-5)['rest'] > known['rest'] + 0.1
 
 
-def test_a_law_that_is_too_late_swings() -> None:
-    """Reversals at the end tell a limit cycle from a needle that comes to rest."""
+def test_unmodeled_delay_causes_a_limit_cycle() -> None:
+    """Reversals at the end distinguish a limit cycle from a needle at rest."""
     settings = {'controller': 'pid', 'wait': 2.0}
     calm = one(settings, target=0.03)
     assert calm['reversals'] <= 2.0
@@ -159,12 +157,12 @@ def test_a_law_that_is_too_late_swings() -> None:
     assert np.isnan(swings['rest'])
 
 
-def test_open_loop_goes_where_friction_lets_it() -> None:
-    """A straight needle as believed is within a period of its target; others by closed form."""
+def test_open_loop_error_follows_from_friction() -> None:
+    """The nominal needle hits within one period; the error of others has a closed form."""
     settings, p = {'controller': 'open loop', 'wait': 0.1}, PHANTOM
     speed = (3.0 - p.coulomb_friction) / p.viscous_friction
     known = one(settings, target=0.03, depth=0.02)
-    # M / mu_v is 7 us: it is at its speed at once.
+    # M / mu_v is 7 us: the acceleration time is negligible.
     assert known['error'] < speed * 1e-3
     assert np.isnan(known['following'])
     assert np.isnan(known['stopped'])
@@ -179,8 +177,8 @@ def test_open_loop_goes_where_friction_lets_it() -> None:
     assert out['error'] < speed * 1e-3
 
 
-def test_a_needle_that_leaves_its_range_is_said() -> None:
-    """Pulled out by a push for more friction than there is; before that, the guard stops a law."""
+def test_needles_outside_their_range_are_reported() -> None:
+    """In open loop the push is too strong; in closed loop the guard stops earlier."""
     found = one({'controller': 'open loop'}, target=0.001, depth=0.02, viscous_friction=0.5)
     assert found['left'] == 1.0
     assert found['hit'] == 0.0
@@ -201,10 +199,8 @@ def test_a_needle_that_leaves_its_range_is_said() -> None:
         ({}, {}),
     ],
 )
-def test_the_guard_stops_as_that_of_the_node(
-    settings: dict[str, Any], limits: dict[str, Any]
-) -> None:
-    """Fed with what was measured, it finds a violation at the last sample and at none before."""
+def test_guard_stops_as_in_the_node(settings: dict[str, Any], limits: dict[str, Any]) -> None:
+    """The guard of the node finds a violation at the last replayed sample, and not before."""
     study = made({**SMALL, 'settings': settings, 'population': {}})
     drawn = {'target': 0.03, 'depth': 0.02, 'tip': 3e-4, 'speed_noise': 2e-4}
     rows = {name: np.array([value]) for name, value in drawn.items()}
@@ -226,10 +222,10 @@ def test_the_guard_stops_as_that_of_the_node(
     assert found['hit'][0] == float(not settings)
 
 
-def test_a_bag_of_a_sample_has_what_the_table_has(
+def test_replayed_bag_matches_the_table(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Depth, force, deflection and target, bit for bit; the encoders beside their noise."""
+    """Depth, force, deflection and target are bit-identical; encoders differ by noise."""
     file, folder = tmp_path / 'insertion.yaml', tmp_path / 'results'
     file.write_text(yaml.safe_dump(SMALL))
     words = ['study', str(file), '-o', str(folder), '--workers', '1']
@@ -255,15 +251,15 @@ def test_a_bag_of_a_sample_has_what_the_table_has(
     assert np.abs(acted).max() == row['force']
     commands = [m.wrench.force.y for _, m in read_topic(bag, '/wrench_command')]
     late = int(column(table, 'late')[number])
-    # A command takes effect one period, and those that nobody knows, after its sample.
+    # A command takes effect after one period plus the unmodeled delay.
     assert acted[2 + late :] == commands[: len(commands) - 1 - late]
     off = np.array([m.position[0] for _, m in read_topic(bag, '/joint_states')]) - tips[:, 0]
-    # Five standard errors of a standard deviation; nothing answers the last sample.
+    # Five standard errors of a standard deviation; the last sample has no command.
     assert off[:-1].std() == pytest.approx(2e-6, rel=5.0 / np.sqrt(2.0 * len(off)))
 
 
-def test_the_page_and_the_example(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """The study that is shipped, with few samples: it goes through, and most needles hit."""
+def test_shipped_example_runs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The shipped study with few samples completes, and most needles hit."""
     example = Path(__file__).parents[2] / 'examples' / 'studies' / 'insertion.yaml'
     document = {**yaml.safe_load(example.read_text()), 'samples': 20}
     file = tmp_path / 'few.yaml'
@@ -279,8 +275,8 @@ def test_the_page_and_the_example(tmp_path: Path, capsys: pytest.CaptureFixture[
         assert words in page
 
 
-def test_steps_of_the_simulation_do_not_matter_at_the_default() -> None:
-    """Figures are those of steps 20 times as short, to a thousandth of what they are for."""
+def test_default_step_is_converged() -> None:
+    """Metrics agree with a step shorter by a factor of 20, to a thousandth of the tolerance."""
     drawn = {'target': 0.04, 'tip': 5e-4, 'coulomb_friction': 1.2, 'carriage_mass': 0.1}
     found, fine = (one(settings, **drawn) for settings in ({}, {'step': 1e-5}))
     for name in ('error', 'overshoot', 'following'):
@@ -324,8 +320,8 @@ def test_steps_of_the_simulation_do_not_matter_at_the_default() -> None:
         ),
     ],
 )
-def test_what_is_wrong_is_named_before_anything_is_computed(
+def test_invalid_studies_are_rejected(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], change: Any, complaint: str
 ) -> None:
-    """In one line, with the file, and nothing is written."""
+    """A one-line error names the file, and nothing is written."""
     check_refused({**SMALL, **change}, complaint, tmp_path, capsys)

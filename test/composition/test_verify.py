@@ -1,4 +1,4 @@
-"""A recorded run computed again is the run; a difference is named: where, what, and why."""
+"""Replay of recorded runs: identical results, and the location and reason of differences."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ TIP = TipParameters(rate=50.0, noise=1e-5, delay=0.012)
 
 
 def configuration(**changes: object) -> dict[str, Any]:
-    """Return the parameters as the node says them."""
+    """Return the parameters as published by the node."""
     values = dict(NODE)
     for prefix, constants in (
         ('model.', MODEL),
@@ -92,7 +92,7 @@ def configuration(**changes: object) -> dict[str, Any]:
 
 
 def needle(mode: str = 'simulation', parameters: NeedleParameters = MODEL) -> Plant:
-    """Make the plant as the node does."""
+    """Create the plant as in the node."""
     state = NeedleModel(parameters).state_at(NODE['depth'], NODE['tip_deflection'])
     reach = parameters.minimum_depth, parameters.length
     return Plant(
@@ -105,7 +105,7 @@ def needle(mode: str = 'simulation', parameters: NeedleParameters = MODEL) -> Pl
 
 
 def stamp(k: int) -> int:
-    """Return the time of a sample, counted from 1 [ns]."""
+    """Return the stamp of a sample, counted from 1 [ns]."""
     return BEGIN + k * PERIOD
 
 
@@ -145,7 +145,7 @@ def text(values: Mapping[str, Any]) -> bytes:
 
 
 def event(at: int, number: int, kind: str, **content: object) -> Message:
-    """Return what the plant says of an event that counts from a sample on."""
+    """Return the message of an event that takes effect at a sample."""
     pairs = [
         message_type('diagnostic_msgs/msg/KeyValue')(key, json.dumps(value))
         for key, value in {'sample': number, **content}.items()
@@ -156,7 +156,7 @@ def event(at: int, number: int, kind: str, **content: object) -> Message:
 
 
 def beginning(**changes: object) -> list[Message]:
-    """Return what the plant says when it is configured, and with its first sample."""
+    """Return the messages of the configuration, and the events of the first sample."""
     values = configuration(**changes)
     return [
         Message('/plant/configuration', BEGIN - 1, 0, text(values)),
@@ -166,12 +166,12 @@ def beginning(**changes: object) -> list[Message]:
 
 
 def as_if(messages: list[Message], **changes: object) -> list[Message]:
-    """Return a recording of which the plant says that it had other parameters."""
+    """Return a recording with other published parameters."""
     return [*beginning(**changes), *messages[len(beginning()) :]]
 
 
 def without_events(messages: list[Message]) -> list[Message]:
-    """Return the recording of a plant that did not say what was done to it."""
+    """Return a recording of a plant without events."""
     return [message for message in messages if message.topic != '/plant/events']
 
 
@@ -192,7 +192,7 @@ def trajectory(
 
 @dataclass
 class Message:
-    """What goes into a bag."""
+    """A message of a bag."""
 
     topic: str
     received: int
@@ -201,7 +201,7 @@ class Message:
 
 
 def measured(sample: Sample, k: int, torque: float, acting: float | None = None) -> list[Message]:
-    """Return what the node publishes of a sample; ``acting`` is the force in mode simulation."""
+    """Return the messages of a sample; ``acting`` is the force in mode simulation [N]."""
     state, at = sample.state, stamp(k)
     m = len(state) // 2
     names = ['d', 'theta', 'q1', 'q2']
@@ -222,7 +222,7 @@ def measured(sample: Sample, k: int, torque: float, acting: float | None = None)
 
 
 def force(k: int) -> float:
-    """Return what answers a sample [N]: no two are alike."""
+    """Return the command for a sample [N], different for each sample."""
     return 2.0 + 1.5 * sin(0.3 * k)
 
 
@@ -232,9 +232,9 @@ def simulated(
     before: Callable[..., Any] | None = None,
 ) -> list[Message]:
     """
-    Run under commands, each an answer to a sample, which act one period later.
+    Simulate a run under commands, each for a sample, which act one period later.
 
-    Those to the samples ``late`` arrive a period too late, those ``lost`` at the recorder only.
+    Commands for the samples ``late`` arrive a period late, the samples ``lost`` are not recorded.
     ``before`` is called before each sample.
     """
     plant = needle()
@@ -261,12 +261,12 @@ def simulated(
     return messages
 
 
-#: Times [s] and inserted lengths [m] of a trajectory.
+#: Times [s] and insertion depths [m] of a trajectory.
 POINTS = ((0.1, 0.032), (0.2, 0.031), (0.25, 0.031))
 
 
 def carried(comes: int, recorded: int) -> list[Message]:
-    """Run with a base that takes a trajectory before a sample; it is recorded near another."""
+    """Simulate a base that accepts a trajectory before a sample; it is recorded near another."""
     plant = needle('robot')
     times, depths = zip(*POINTS, strict=True)
     content: dict[str, Any] = {
@@ -288,7 +288,7 @@ def carried(comes: int, recorded: int) -> list[Message]:
 
 
 def written(path: Path, messages: Iterable[Message]) -> Path:
-    """Write messages into a bag, in the order in which they were received."""
+    """Write messages to a bag, in the order of receipt."""
     with BagWriter(path) as bag:
         for topic, kind in KINDS.items():
             bag.add_topic(topic, kind)
@@ -303,32 +303,31 @@ def only(path: Path) -> Rerun:
 
 
 def exact(result: Rerun) -> None:
-    """Every number of every topic is the same to the last bit."""
+    """Require that all numbers of all topics are bit-identical."""
     assert result.verdict == 'identical', result
     assert {topic.verdict for topic in result.topics.values()} == {'identical'}
     assert all(topic.compared for topic in result.topics.values())
 
 
-# What is the same.
+# Identical runs.
 
 
-def test_a_run_under_commands_is_the_same(tmp_path: Path) -> None:
-    """All numbers are identical."""
+def test_replay_of_a_run_under_commands_is_identical(tmp_path: Path) -> None:
     result = only(written(tmp_path / 'bag', simulated()))
     exact(result)
     assert result.recorded.numbers == list(range(1, SAMPLES + 1))
     assert {name: topic.compared for name, topic in result.topics.items()} == {
         '/joint_states': SAMPLES,
         '/base_wrench': SAMPLES,
-        # Every fourth sample; three samples of delay hold the last one back.
+        # Every fourth sample; a delay of three samples excludes the last measurement.
         '/tip_deflection': SAMPLES // 4 - 1,
         '/ground_truth': SAMPLES,
     }
     assert result.notes == []
 
 
-def test_commands_may_act_at_any_time_or_be_missing(tmp_path: Path) -> None:
-    """The ground truth says which force acted."""
+def test_acting_force_is_taken_from_the_ground_truth(tmp_path: Path) -> None:
+    """Commands may be late or missing."""
     messages = simulated(late=(20, 21, 60), lost=(40,))
     exact(only(written(tmp_path / 'bag', messages)))
     messages = [message for message in messages if message.topic != '/wrench_command']
@@ -338,10 +337,10 @@ def test_commands_may_act_at_any_time_or_be_missing(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize('late', [(), (20,)])
-def test_without_the_ground_truth_commands_act_a_period_later(
+def test_without_ground_truth_commands_act_after_a_period(
     tmp_path: Path, late: tuple[int, ...]
 ) -> None:
-    """That is what a prompt controller does; where it was not so the run differs, and why."""
+    """A late command causes a difference, with its reason."""
     messages = [m for m in simulated(late=late) if m.topic != '/ground_truth']
     result = only(written(tmp_path / 'bag', messages))
     assert result.notes == [
@@ -356,14 +355,14 @@ def test_without_the_ground_truth_commands_act_a_period_later(
     else:
         assert result.verdict == 'differs'
         assert result.reason == 'which command acted is not in the bag'
-        # The answer to sample 20 was to act from sample 21 on.
+        # The command for sample 20 should act from sample 21 on.
         assert result.first is not None
         assert result.first['sample'] == 22
 
 
 @pytest.mark.parametrize('shift', [-4, 0, 3])
-def test_a_trajectory_begins_where_the_plant_says(tmp_path: Path, shift: int) -> None:
-    """Whenever the recorder saw it, and if it did not."""
+def test_trajectories_start_at_the_sample_of_their_event(tmp_path: Path, shift: int) -> None:
+    """At any time of recording, and without a recording of the trajectory."""
     messages = carried(40, 40 + shift)
     for name in ('bag', 'without'):
         result = only(written(tmp_path / name, messages))
@@ -373,10 +372,10 @@ def test_a_trajectory_begins_where_the_plant_says(tmp_path: Path, shift: int) ->
 
 
 @pytest.mark.parametrize(('shift', 'verdict'), [(0, 'identical'), (2, 'differs')])
-def test_without_events_a_trajectory_begins_after_it_was_recorded(
+def test_without_events_trajectories_start_after_their_recording(
     tmp_path: Path, shift: int, verdict: str
 ) -> None:
-    """With the next sample; the bag does not say whether that is right."""
+    """They start with the next sample, which may be wrong."""
     messages = without_events(carried(40, 40 + shift))
     result = only(written(tmp_path / 'bag', messages))
     assert result.verdict == verdict
@@ -385,8 +384,8 @@ def test_without_events_a_trajectory_begins_after_it_was_recorded(
     assert begins == f'joint_trajectory from sample {40 + shift} on'
 
 
-def test_a_recording_that_begins_late_is_numbered_by_the_events(tmp_path: Path) -> None:
-    """They are latched: who records late gets those of before."""
+def test_events_number_the_samples_of_late_recordings(tmp_path: Path) -> None:
+    """Events are latched: a late recorder receives earlier events."""
     messages = [m for m in carried(40, 40) if m.stamp == 0 or m.stamp >= stamp(48)]
     result = only(written(tmp_path / 'bag', messages))
     exact(result)
@@ -394,8 +393,8 @@ def test_a_recording_that_begins_late_is_numbered_by_the_events(tmp_path: Path) 
     assert result.notes == ['joint_trajectory from sample 40 on']
 
 
-def test_samples_lost_on_the_way_are_computed(tmp_path: Path) -> None:
-    """A best-effort reader loses some: commands in the bag say what acted."""
+def test_lost_samples_are_computed(tmp_path: Path) -> None:
+    """A best-effort subscription loses samples; the commands in the bag give the acting force."""
     gone = {stamp(k) for k in (30, 31, 32, 77)}
     measures = {'/joint_states', '/base_wrench', '/ground_truth'}
     messages = [m for m in simulated() if m.topic not in measures or m.stamp not in gone]
@@ -406,14 +405,14 @@ def test_samples_lost_on_the_way_are_computed(tmp_path: Path) -> None:
     assert note.startswith('which command acted before 4 samples is not in the bag')
 
 
-def test_a_pause_is_not_taken_for_samples_lost(tmp_path: Path) -> None:
-    """After a pause or a stall the plant goes on where it was, though stamps have gone on."""
+def test_pauses_are_distinguished_from_lost_samples(tmp_path: Path) -> None:
+    """After a pause the plant continues from its state, but the stamps have advanced."""
     shifted = [event(stamp(81) + 50 * PERIOD, 81, 'time')]
     for message in carried(40, 40):
         pause = 50 * PERIOD if message.received > stamp(81) else 0
         data, at = message.data, message.stamp + pause
         if message.stamp:
-            # The stamp stands behind the encapsulation.
+            # The stamp follows the encapsulation header.
             seconds, rest = divmod(at, 10**9)
             data = (
                 data[:4] + seconds.to_bytes(4, 'little') + rest.to_bytes(4, 'little') + data[12:]
@@ -425,8 +424,8 @@ def test_a_pause_is_not_taken_for_samples_lost(tmp_path: Path) -> None:
     assert result.notes[-1] == 'time was paused, or samples were given up, before sample 81'
 
 
-def test_tare_and_reset_are_done_again(tmp_path: Path) -> None:
-    """Where the plant says that it did them."""
+def test_tare_and_reset_are_replayed(tmp_path: Path) -> None:
+    """At the samples of their events."""
     plant = needle('robot')
     messages = beginning(mode='robot')
     for k in range(1, SAMPLES + 1):
@@ -446,8 +445,8 @@ def test_tare_and_reset_are_done_again(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize('told', [True, False])
-def test_friction_that_changed_in_the_run_is_followed(tmp_path: Path, told: bool) -> None:
-    """By the event, or without it by the configuration, which is recorded before the sample."""
+def test_parameter_changes_are_replayed(tmp_path: Path, told: bool) -> None:
+    """By the event, or without events by the configuration recorded before the sample."""
     other = replace(MODEL, coulomb_friction=0.8)
 
     def changed(plant: Plant, k: int) -> None:
@@ -466,8 +465,8 @@ def test_friction_that_changed_in_the_run_is_followed(tmp_path: Path, told: bool
     assert result.notes[-1] == 'model.coulomb_friction changed before sample 50'
 
 
-def test_a_plant_that_is_configured_again_begins_anew(tmp_path: Path) -> None:
-    """Numbers of samples go on; the parameters are those of the event."""
+def test_reconfiguration_restarts_the_plant(tmp_path: Path) -> None:
+    """Sample numbers continue; the parameters are in the event."""
     first, second = needle('robot'), needle('robot', replace(MODEL, coulomb_friction=0.8))
     values = configuration(mode='robot', **{'model.coulomb_friction': 0.8})
     messages = [*beginning(mode='robot'), event(stamp(60), 60, 'configured', **values)]
@@ -478,7 +477,7 @@ def test_a_plant_that_is_configured_again_begins_anew(tmp_path: Path) -> None:
     assert result.notes == ['the plant was configured again before sample 60']
 
 
-# What is not.
+# Runs that differ.
 
 
 @pytest.mark.parametrize(
@@ -489,10 +488,10 @@ def test_a_plant_that_is_configured_again_begins_anew(tmp_path: Path) -> None:
         ('/ground_truth', 76, 'position of theta'),
     ],
 )
-def test_a_single_changed_sample_is_named(
+def test_a_single_changed_sample_is_located(
     tmp_path: Path, topic: str, offset: int, quantity: str
 ) -> None:
-    """Stamp, topic and number are those of the message that was altered, and nothing else is."""
+    """Stamp, topic and value of the changed message are reported, and no other difference."""
     messages = simulated()
     message = next(m for m in messages if m.topic == topic and m.stamp == stamp(70))
     data = bytearray(message.data)
@@ -507,7 +506,7 @@ def test_a_single_changed_sample_is_named(
     first = result.first
     found = first['stamp'], first['sample'], first['topic'], first['quantity'], first['recorded']
     assert found == (stamp(70), 70, topic, quantity, recorded)
-    # 1e-12: the sum above is rounded.
+    # Tolerance for the rounding of the sum above.
     assert first['computed'] == pytest.approx(recorded - 0.125, abs=1e-12)
     assert 'this one was altered' in result.reason
 
@@ -523,35 +522,35 @@ def test_a_single_changed_sample_is_named(
     ],
     ids=['friction', 'fault'],
 )
-def test_another_plant_differs_and_the_reason_is_told(
+def test_changed_parameters_differ_with_a_reason(
     tmp_path: Path, changes: dict[str, Any], reason: str
 ) -> None:
-    """Parameters that are not those of the run do not give its samples."""
+    """Parameters that differ from the run do not reproduce its samples."""
     changes = {'model.viscous_friction': 250.0, **changes}
     result = only(written(tmp_path / 'bag', as_if(simulated(), **changes)))
     assert result.verdict == 'differs'
     assert reason in result.reason
-    # The needle moves as soon as the first command acts: it answers sample 1.
+    # The needle moves when the command for sample 1 acts.
     assert result.first is not None
     assert result.first['sample'] <= 5
 
 
-def test_another_seed_is_told_from_another_motion(tmp_path: Path) -> None:
-    """Encoders have no noise: only the force sensor and that of the tip differ."""
+def test_changed_seeds_are_distinguished_from_changed_motion(tmp_path: Path) -> None:
+    """Encoders have no noise: only force sensor and tip sensor differ."""
     result = only(written(tmp_path / 'bag', as_if(simulated(), seed=8)))
     assert result.verdict == 'differs'
     assert result.topics['/joint_states'].verdict == 'identical'
     assert result.reason.startswith('the motion is as computed: the seed or the constants')
 
 
-def test_constants_of_another_version_are_named(tmp_path: Path) -> None:
-    """They are left out, which may be why a run differs."""
+def test_unknown_constants_are_reported(tmp_path: Path) -> None:
+    """Constants of another version are ignored, a possible reason for a difference."""
     result = only(written(tmp_path / 'bag', as_if(simulated(), **{'model.tissue_density': 3.0})))
     assert result.notes == ['recorded by another version, with model.tissue_density']
 
 
-def test_a_bag_without_commands_says_what_to_record(tmp_path: Path) -> None:
-    """The motion has no cause in the bag."""
+def test_missing_commands_are_reported(tmp_path: Path) -> None:
+    """The reason names the topics to record."""
     silent = [m for m in simulated() if m.topic not in ('/wrench_command', '/ground_truth')]
     result = only(written(tmp_path / 'bag', silent))
     assert result.verdict == 'differs'
@@ -561,13 +560,13 @@ def test_a_bag_without_commands_says_what_to_record(tmp_path: Path) -> None:
     still = [m for m in without_events(carried(40, 40)) if m.topic != '/joint_trajectory']
     result = only(written(tmp_path / 'still', still))
     assert result.reason == 'the bag holds no joint_trajectory: record it with the rest'
-    # It was to be there from sample 40 on.
+    # The trajectory starts at sample 40.
     assert result.first is not None
     assert result.first['sample'] == 40
 
 
-def test_differences_within_the_tolerance_are_no_difference(tmp_path: Path) -> None:
-    """A tolerance takes what is smaller, and says how large it was."""
+def test_differences_within_the_tolerance_are_accepted(tmp_path: Path) -> None:
+    """The size of the difference is reported."""
     changes = {'model.viscous_friction': MODEL.viscous_friction * (1.0 + 1e-9)}
     path = written(tmp_path / 'bag', as_if(simulated(), **changes))
     (result,) = verify(path)
@@ -579,7 +578,7 @@ def test_differences_within_the_tolerance_are_no_difference(tmp_path: Path) -> N
     assert result.verdict == 'differs'
 
 
-# What cannot be verified.
+# Unusable recordings.
 
 
 @pytest.mark.parametrize(
@@ -600,14 +599,14 @@ def test_differences_within_the_tolerance_are_no_difference(tmp_path: Path) -> N
     ],
     ids=['parameters', 'measurements', 'value', 'mode'],
 )
-def test_bad_input_is_named(
+def test_unusable_bags_are_a_one_line_error(
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
     kept: Callable[..., Any] | type,
     changes: dict[str, Any],
     complaint: str,
 ) -> None:
-    """One line names the bag and what it lacks; the exit status is 2."""
+    """The error names the bag and the missing content; the exit status is 2."""
     messages = as_if(simulated(), **changes)
     if changes.get('mode'):
         messages = [m for m in messages if m.topic != '/base_wrench']
@@ -619,10 +618,8 @@ def test_bad_input_is_named(
     assert said.count('\n') == 1
 
 
-def test_the_others_are_verified_all_the_same(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """A bag that is not there, and one that is damaged, are named; the good one has its row."""
+def test_unusable_bags_are_skipped(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Missing and damaged bags are reported; the usable bag has its row."""
     (tmp_path / 'bad.mcap').write_bytes(b'nothing of the kind')
     good = written(tmp_path / 'good', simulated())
     bags = [str(tmp_path / 'none'), str(tmp_path / 'bad.mcap'), str(good)]
@@ -633,8 +630,7 @@ def test_the_others_are_verified_all_the_same(
     assert '1 runs: 1 identical' in captured.out
 
 
-def test_a_parameter_that_is_missing_is_named(tmp_path: Path) -> None:
-    """Without the rate there is no time."""
+def test_missing_parameters_are_named(tmp_path: Path) -> None:
     messages = without_events(simulated())
     values = configuration()
     del values['rate']
@@ -643,10 +639,10 @@ def test_a_parameter_that_is_missing_is_named(tmp_path: Path) -> None:
         verify(written(tmp_path / 'bag', messages))
 
 
-def test_the_command_line_tells_people_and_machines(
+def test_command_prints_tables_and_json(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Exit status 0 for what is the same, 1 for what is not; JSON has the first difference."""
+    """Exit status 0 for identical runs, 1 for differences; JSON has the first difference."""
     same = written(tmp_path / 'same', simulated())
     other = written(tmp_path / 'other', as_if(simulated(), seed=8))
     assert main(['verify', str(same)]) == 0
@@ -667,12 +663,12 @@ def test_the_command_line_tells_people_and_machines(
     assert '--tolerance must be in [0, 1), got 2' in capsys.readouterr().err
 
 
-# What real nodes recorded.
+# Recordings of real nodes.
 
 
 @pytest.mark.parametrize('name', ['friction', 'stiffness'])
-def test_the_shipped_bags_are_what_the_plant_computes(name: str) -> None:
-    """All of them, but for how another machine may round."""
+def test_shipped_bags_are_reproduced(name: str) -> None:
+    """All shipped bags are identical, up to the rounding of another machine."""
     for path in sorted(SHIPPED_BAGS.glob(f'{name}_*')):
         (result,) = verify(path)
         assert result.verdict in ('identical', 'within tolerance'), result
@@ -682,10 +678,10 @@ def test_the_shipped_bags_are_what_the_plant_computes(name: str) -> None:
 @pytest.mark.parametrize(
     ('name', 'rate', 'speed'), [('friction', 100.0, 20.0), ('stiffness', 40.0, 40.0)]
 )
-def test_an_experiment_over_dds_is_computed_anew(
+def test_experiments_over_dds_are_reproduced(
     tmp_path: Path, name: str, rate: float, speed: float
 ) -> None:
-    """What nodes have recorded a moment ago on this machine is the same to the last bit."""
+    """A fresh recording of nodes on this machine is bit-identical."""
     campaign = Campaign(protocol=PROTOCOLS[name], repeats=1, rate=rate)
     (path,) = record(campaign, tmp_path, speed)
     result = only(path)
@@ -693,8 +689,8 @@ def test_an_experiment_over_dds_is_computed_anew(
     assert 'joint_trajectory from sample 1 on' in result.notes
 
 
-def test_a_run_under_commands_over_dds_is_computed_anew(tmp_path: Path) -> None:
-    """Whenever a command arrived at the plant, on however busy a machine: the run is the same."""
+def test_runs_under_commands_over_dds_are_reproduced(tmp_path: Path) -> None:
+    """The replay is independent of the arrival of commands, also on a busy machine."""
     path = tmp_path / 'bag'
     with Graph(tmp_path / 'logs') as graph:
         node = graph.node('commander')
@@ -731,8 +727,8 @@ def test_a_run_under_commands_over_dds_is_computed_anew(tmp_path: Path) -> None:
     assert result.topics['/joint_states'].compared > 250
 
 
-def test_all_that_is_done_to_a_plant_is_done_again(tmp_path: Path) -> None:
-    """Also what was done before the recorder came: events are latched."""
+def test_all_plant_inputs_are_replayed(tmp_path: Path) -> None:
+    """Also inputs before the start of the recorder: events are latched."""
     path = tmp_path / 'bag'
     with Graph(tmp_path / 'logs') as graph:
         node = graph.node('operator')
@@ -770,7 +766,7 @@ def test_all_that_is_done_to_a_plant_is_done_again(tmp_path: Path) -> None:
         assert changed.results[0].successful
         further(40)
         assert call(SetBool, 'pause', SetBool.Request(data=True)).success
-        # Time goes on meanwhile, some periods.
+        # A pause of some periods.
         time.sleep(0.05)
         assert call(SetBool, 'pause', SetBool.Request(data=False)).success
         further(40)
@@ -783,7 +779,7 @@ def test_all_that_is_done_to_a_plant_is_done_again(tmp_path: Path) -> None:
     exact(result)
     assert result.recorded.numbers[0] > 100
     said = [re.sub(r' (before|from) sample \d+.*', '', note) for note in result.notes]
-    # A stall of a busy machine is a pause too.
+    # A stall of a busy machine also counts as a pause.
     pause = 'time was paused, or samples were given up,'
     assert [note for note in said if note != pause] == [
         'the sensor was zeroed (~/tare)',
@@ -808,10 +804,10 @@ def test_all_that_is_done_to_a_plant_is_done_again(tmp_path: Path) -> None:
         ('mode', {}, 'mode must be one of '),
     ],
 )
-def test_a_parameter_that_no_plant_can_have_is_named(
+def test_invalid_plant_parameters_are_named(
     tmp_path: Path, name: str, value: object, reason: str
 ) -> None:
-    """As a plant would refuse it; nothing is computed."""
+    """The plant would reject them; nothing is computed."""
     messages = without_events(simulated())
     messages[0].data = text(configuration(**{name: value}))
     with pytest.raises(RecordingError, match=re.escape(f'the parameters of /plant: {reason}')):
