@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from hypothesis import given, strategies as st
+from hypothesis import given
+from hypothesis import strategies as st
 import pytest
 from tools.commit_message import faults, LONGEST
 from tools.language import idioms, texts_of_code
@@ -28,13 +29,15 @@ def test_idioms_are_found_and_plain_sentences_pass(idiom: str, plain: str) -> No
 
 def test_each_kind_of_text_in_code_is_read() -> None:
     """Docstrings, comments and messages, each with its line; short strings are keys."""
-    source = '"""Page."""\n# A comment.\ndef f():\n    """Doc."""\n    return "three word text", "key"\n'
+    source = (
+        '"""Page."""\n# A comment.\ndef f():\n    """Doc."""\n    return "a longer text", "key"\n'
+    )
     found = {(text.kind, text.line, text.content) for text in texts_of_code('a.py', source)}
     assert found == {
         ('docstring', 1, 'Page.'),
         ('comment', 2, '# A comment.'),
         ('docstring', 4, 'Doc.'),
-        ('message', 5, 'three word text'),
+        ('message', 5, 'a longer text'),
     }
 
 
