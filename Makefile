@@ -2,7 +2,7 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-SOURCES := needle_ros needle_dynamics needle_controller needle_identification needle_insertion benchmarks examples test description launch docs setup.py
+SOURCES := needle_ros needle_dynamics needle_controller needle_identification needle_insertion benchmarks examples test description launch docs tools setup.py
 
 .PHONY: demo test check docs format setup compiled lock bags results bench clean
 
@@ -16,6 +16,7 @@ check: $(VENV)/.dev
 	$(BIN)/ruff format --check $(SOURCES)
 	$(BIN)/ruff check $(SOURCES)
 	$(BIN)/mypy
+	$(BIN)/python -m tools.language
 
 # The site, without the network; what Sphinx warns of is an error.
 docs: $(VENV)/.docs
