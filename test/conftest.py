@@ -48,6 +48,9 @@ os.environ['PYTHONFAULTHANDLER'] = '1'
 
 def pytest_configure(config: pytest.Config) -> None:
     config.stash[STDERR] = os.dup(2)
+    # A shell starts background jobs with SIGINT ignored, and all child processes inherit that.
+    if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.hookimpl(wrapper=True)

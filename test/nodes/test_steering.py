@@ -298,7 +298,6 @@ def test_a_plan_does_not_block_the_node(ros_graph: RosGraph) -> None:
     answer = bench.stop.call_async(Trigger.Request())
     bench.until(answer.done, 'the answer')
     assert answer.result().message == 'planning cancelled'
-    assert not job.done
     assert bench.said == 'waits for a target'
     assert not bench.moves
     # The thread ends before the test does.
