@@ -114,9 +114,7 @@ class Search:
         return np.concatenate([self._left(k, free, *own) for k, own in enumerate(lengths)])
 
     def _search(self, first: FloatArray, free: Sequence[int]) -> tuple[FloatArray, float]:
-        """
-        Search over the variables ``free`` (indices); return all variables and the cost [m^2].
-        """
+        """Search over variables with these indices; return all variables and the cost [m^2]."""
         at = list(free)
         x = first.copy()
 

@@ -75,7 +75,7 @@ class LevelEstimate(Named[ParameterEstimate]):
 
     @property
     def matrix(self) -> FloatArray:
-        """K [N/m], shape (2, 2), rows of force and columns of displacement; nan if undetermined."""
+        """K [N/m], shape (2, 2), rows of force, columns of displacement; nan if undetermined."""
         return np.array([p.value for p in self.parameters]).reshape(2, 2)
 
 

@@ -441,7 +441,7 @@ def test_tare_and_reset_are_done_again(tmp_path: Path) -> None:
     exact(result)
     assert result.notes == [
         'the sensor was zeroed (~/tare) before sample 50',
-        'the plant was put back (~/reset) before sample 90',
+        'the plant was reset (~/reset) before sample 90',
     ]
 
 
@@ -593,7 +593,7 @@ def test_differences_within_the_tolerance_are_no_difference(tmp_path: Path) -> N
         (
             lambda m: m.stamp == 0 or m.topic == '/wrench_command',
             {},
-            'holds nothing that was measured; record /base_wrench, /ground_truth, /joint_states',
+            'holds no measurements; record /base_wrench, /ground_truth, /joint_states',
         ),
         (bool, {'depth': 5.0}, 'the parameters of /plant: inserted length'),
         (bool, {'mode': 'indenter'}, 'holds nothing'),
@@ -789,7 +789,7 @@ def test_all_that_is_done_to_a_plant_is_done_again(tmp_path: Path) -> None:
         'the sensor was zeroed (~/tare)',
         'joint_trajectory',
         'model.coulomb_friction changed',
-        'the plant was put back (~/reset)',
+        'the plant was reset (~/reset)',
     ]
     assert said.count(pause) >= 2
 

@@ -106,7 +106,7 @@ def test_what_makes_it_drift_is_not_told_apart_where_it_cannot_be() -> None:
     [words] = tilted.warnings
     assert 'these explain the drift equally well (rms: tilt 0.1' in words
     assert 'frame 0.1' in words
-    assert 'A motion of the guide in air would tell the frame' in words
+    assert 'A motion of the guide in air identifies the frame' in words
     bent = identify_steering(
         [
             insertion(k, Truth(tilt=(0.0, 0.0), curvature=0.8), lambda depth: pi * (depth > 0.05))
