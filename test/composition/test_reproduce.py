@@ -182,7 +182,7 @@ def test_every_result_can_be_asked_for() -> None:
         ('table-1', 0, ['Table 1', 'holds', '2 quantities', '299.9 ± 44.4', 'no unit']),
         ('table-3', 0, ['Table 3', 'kg/m³', 'round wire of 1.27 mm']),
         ('figure-4', 1, ['Figure 4', 'metrics of each run', '0.3 N s/mm, as_printed']),
-        ('controllability', 1, ['steer 4 of 8 states', 'q1, q2, q\u03071, q\u03072']),
+        ('controllability', 1, ['control 4 of 8 states', 'q1, q2, q\u03071, q\u03072']),
     ],
 )
 @pytest.mark.usefixtures('once', 'coarse')

@@ -347,8 +347,8 @@ def test_without_the_ground_truth_commands_act_a_period_later(
     assert result.notes == [
         'not in the bag: /ground_truth',
         (
-            f'which command acted before {SAMPLES} samples is not in the bag: each is taken to '
-            'act one period after the sample that it answers'
+            f'which command acted before {SAMPLES} samples is not in the bag: each is assumed '
+            'to act one period after the sample that it responds to'
         ),
     ]
     if not late:
@@ -596,7 +596,7 @@ def test_differences_within_the_tolerance_are_no_difference(tmp_path: Path) -> N
             'holds no measurements; record /base_wrench, /ground_truth, /joint_states',
         ),
         (bool, {'depth': 5.0}, 'the parameters of /plant: inserted length'),
-        (bool, {'mode': 'indenter'}, 'holds nothing'),
+        (bool, {'mode': 'indenter'}, 'holds no measurements'),
     ],
     ids=['parameters', 'measurements', 'value', 'mode'],
 )
