@@ -1,1 +1,1 @@
-"""Friction of a needle from the force and the motion of its base."""
+"""Friction identification from the force and the motion of the needle base."""

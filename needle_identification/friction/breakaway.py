@@ -1,8 +1,8 @@
 """
-The force at which the needle breaks away, section 3.2.2.2 of the paper.
+Estimate the breakaway force of the needle, section 3.2.2.2 of the paper.
 
-The base pushes with a rising force until the needle moves. A straight line through the force of
-the last 0.3 s of the rest is read at the time at which the motion begins.
+The base pushes with a rising force until the needle moves. A straight line is fitted to the force
+of the last 0.3 s at rest and evaluated at the onset of motion.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from scipy.special import stdtrit
 #: Time before the motion in which the rise of the force is measured [s].
 _RISING: Final = 0.3
 
-#: Part of the force, and of mu_s, by which it must rise in that time.
+#: Smallest rise of the force in that time, as a fraction of the force and of mu_s.
 _SMALLEST_RISE: Final = 0.05
 
-#: Smallest rate of the rise [standard errors].
+#: Smallest slope of the rise [standard errors].
 _CLEAR_RISE: Final = 5.0
 
-#: Length of the correlation here, as a part of that elsewhere: the rise of the force is short.
+#: Fraction of the usual correlation length used here, because the rise of the force is short.
 _WINDOW_PART: Final = 0.4
 
 _UNKNOWN: Final = ParameterEstimate(name='breakaway_force', symbol='f_b', unit='N')
@@ -38,22 +38,7 @@ _UNKNOWN: Final = ParameterEstimate(name='breakaway_force', symbol='f_b', unit='
 def breakaway_force(
     design: Design, parameters: Sequence[ParameterEstimate]
 ) -> ParameterEstimate | None:
-    """
-    Return the mean force at which the needle left a rest with a rising force.
-
-    Parameters
-    ----------
-    design : Design
-        Filtered force, and regimes of the motion.
-    parameters : sequence of ParameterEstimate
-        Fitted parameters: mu_s, and the offset to subtract if there is one.
-
-    Returns
-    -------
-    ParameterEstimate or None
-        The force [N]; None if there is no such rest.
-
-    """
+    """Return the mean force [N] at which the needle left a rest with a rising force, if any."""
     starts = np.flatnonzero((design.regime[1:] != 0.0) & (design.regime[:-1] == 0.0)) + 1
     changes = np.flatnonzero(np.diff(design.stroke)) + 1
     found, signs = [], []
@@ -85,10 +70,10 @@ def _push(
     design: Design, span: tuple[int, int, int], least: float
 ) -> tuple[float, float, float] | None:
     """
-    Return the size of the force when the motion began, its error and half its interval [N].
+    Return breakaway force, standard error and half width of the interval [N] for one rest.
 
-    ``span`` holds the samples at which the rest begins, the motion begins, and the motion ends;
-    ``least`` is the smallest rise of the force [N].
+    ``span`` holds the sample indices at which the rest begins, the motion begins and the motion
+    ends; ``least`` is the smallest rise of the force [N].
     """
     signals = design.signals
     cutoff = signals.settings.cutoff
@@ -126,7 +111,7 @@ def _push(
 
 
 def _onset(design: Design, span: tuple[int, int, int]) -> tuple[float, float]:
-    """Return the time at which a step and a ramp of the speed fit best, and its error [s]."""
+    """Return the onset of motion [s], fitted as a step and a ramp of velocity, and its error."""
     signals = design.signals
     first, start, end = span
     time, speed = signals.time[first:end], design.speed[first:end]
@@ -139,12 +124,12 @@ def _onset(design: Design, span: tuple[int, int, int]) -> tuple[float, float]:
     independent = max(len(time) / (2 * signals.half_filter + 1) - 3.0, 1.0)
     close = misfits <= misfits[best] * (1.0 + 4.0 / independent)
     error = signals.period * max(np.count_nonzero(close) / 4.0, 1.0 / sqrt(12.0))
-    # The motion began after the sample before.
+    # The onset lies between this sample and the previous sample.
     return float(candidates[best]) - 0.5 * signals.period, float(error)
 
 
 def _misfit(time: FloatArray, values: FloatArray) -> float:
-    """Return the sum of squares that a straight line leaves."""
+    """Return the residual sum of squares of a straight line fit."""
     centered, rest = time - time.mean(), values - values.mean()
     total = float(centered @ centered)
     explained = float(centered @ rest) ** 2 / total if total else 0.0

@@ -1,4 +1,4 @@
-"""What speaks against an estimate of friction: errors, and warnings in words."""
+"""Plausibility checks of a friction estimate: errors and warnings."""
 
 from __future__ import annotations
 
@@ -13,33 +13,20 @@ from needle_identification.friction.design import Design
 from needle_identification.friction.terms import columns_of
 import numpy as np
 
-#: Lag beyond that of usual sensor filters [s].
+#: Largest lag of usual sensor filters [s].
 _UNUSUAL_LAG: Final = 0.01
 
-#: Growth of the errors by the memory of the noise that is worth a word.
+#: Growth of the standard errors by autocorrelated noise above which a warning is given.
 _MUCH_LARGER: Final = 1.5
 
-#: Noise that is correlated for more than this part of the recording has no time of its own.
+#: Noise correlated over more than this fraction of the recording has no finite correlation time.
 _WANDERS: Final = 0.25
 
 _FRICTION: Final = ('coulomb_friction', 'viscous_friction')
 
 
 def check_friction(parameters: Sequence[ParameterEstimate]) -> None:
-    """
-    Reject friction that is negative or absent.
-
-    Parameters
-    ----------
-    parameters : sequence of ParameterEstimate
-        Fitted parameters.
-
-    Raises
-    ------
-    IdentificationError
-        If a coefficient is clearly negative, or none is clearly different from zero.
-
-    """
+    """Raise `IdentificationError` if friction is clearly negative or not significant."""
     friction = [parameter for parameter in parameters if parameter.name in _FRICTION]
     for parameter in friction:
         if parameter.determined and parameter.value + 2.0 * parameter.error < 0.0:
@@ -61,28 +48,7 @@ def fit_warnings(
     lag: ParameterEstimate,
     coarse: float,
 ) -> Iterator[str]:
-    """
-    Warn of what limits the use of the parameters.
-
-    Parameters
-    ----------
-    design : Design
-        The regression.
-    fit : Regression
-        Its solution.
-    parameters : sequence of ParameterEstimate
-        Its parameters.
-    lag : ParameterEstimate
-        Lag of the force [s].
-    coarse : float
-        Lag that was corrected if that one is not determined [s].
-
-    Yields
-    ------
-    str
-        A warning.
-
-    """
+    """Yield warnings; ``coarse`` is the corrected lag [s] if ``lag`` is not determined."""
     unknown = [parameter.name for parameter in parameters if not parameter.determined]
     if unknown:
         yield f'the data do not determine {", ".join(unknown)}: use more speeds, or fewer terms'
@@ -124,7 +90,7 @@ def fit_warnings(
 
 
 def _of_lag(lag: ParameterEstimate, coarse: float, period: float) -> Iterator[str]:
-    """Warn of a lag that no usual filter explains, or that points to a mass."""
+    """Warn of a lag that exceeds usual filters, or that indicates a mass."""
     if not lag.determined:
         if coarse:
             way = 'behind' if coarse > 0.0 else 'ahead of'
@@ -139,22 +105,7 @@ def _of_lag(lag: ParameterEstimate, coarse: float, period: float) -> Iterator[st
 
 
 def noise_bias(design: Design, fit: Regression) -> float:
-    """
-    Return how much noise of the speed reduces mu_v, if that counts.
-
-    Parameters
-    ----------
-    design : Design
-        The regression.
-    fit : Regression
-        Its solution.
-
-    Returns
-    -------
-    float
-        Bias [N s/m]; 0 if it is less than half the standard error, or is corrected.
-
-    """
+    """Return the bias of mu_v by velocity noise [N s/m]; 0 if negligible or corrected."""
     settings, noise = design.signals.settings, design.signals.speed_noise
     columns = columns_of(settings.terms, settings)
     names = [column.name for column in columns]
@@ -169,28 +120,13 @@ def noise_bias(design: Design, fit: Regression) -> float:
 
 
 def noise_words(design: Design, bias: float) -> str:
-    """
-    Say what noise of the speed does.
-
-    Parameters
-    ----------
-    design : Design
-        The regression.
-    bias : float
-        How much it reduces mu_v [N s/m].
-
-    Returns
-    -------
-    str
-        Words.
-
-    """
+    """Describe the bias of mu_v [N s/m] by velocity noise."""
     noise = design.signals.speed_noise
     return f'noise of {noise:.2g} m/s in the speed reduces mu_v by {bias:.2g} N s/m'
 
 
 def _of_memory(design: Design, fit: Regression) -> Iterator[str]:
-    """Warn if the memory of the noise makes the errors much larger."""
+    """Warn if autocorrelated noise increases the standard errors clearly."""
     if fit.memory is None or not fit.memory.length or fit.is_exact:
         return
     growth = float(fit.memory.inflation[fit.determined].max(initial=1.0))
@@ -203,26 +139,11 @@ def _of_memory(design: Design, fit: Regression) -> Iterator[str]:
         if time < _WANDERS * lasts
         else 'wanders for as long as the recording'
     )
-    yield f'the noise of the force {how}: the errors are {growth:.2g} times those of white noise'
+    yield f'the noise of the force {how}: the errors grow by {growth:.2g} against white noise'
 
 
 def missing_term(chosen: Sequence[str], comparisons: Sequence[Comparison]) -> str:
-    """
-    Name the best term that is missing.
-
-    Parameters
-    ----------
-    chosen : sequence of str
-        The chosen terms.
-    comparisons : sequence of Comparison
-        Other sets of terms.
-
-    Returns
-    -------
-    str
-        A warning; '' if the data support no further term.
-
-    """
+    """Return a warning that names the best missing term, or an empty string."""
     missing = [c for c in comparisons if c.supported and len(c.terms) > len(chosen)]
     if not missing:
         return ''

@@ -1,4 +1,4 @@
-"""Comparison with other sets of terms: one term more or less, or two more."""
+"""Comparison with sets that have one term more or less, or two more."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ import numpy as np
 SIGNIFICANCE: Final = 0.02
 
 
-#: Growth of the errors by a memory of the noise that two missing terms may explain.
+#: Growth of the standard errors by autocorrelation that two missing terms may explain.
 _LIKE_MEMORY: Final = 1.5
 
-#: Parts of the strokes that are held out in turn.
+#: Folds of the cross-validation over strokes.
 _FOLDS: Final = 5
 
 #: Terms whose coefficient cannot be negative.
@@ -35,25 +35,25 @@ _POSITIVE: Final = ('inertia', 'stribeck', 'cutting')
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Comparison:
     """
-    Another set of terms beside the chosen one.
+    Comparison of an alternative set of terms with the chosen set.
 
     Attributes
     ----------
     terms : tuple of str
-        The other set: one term more or one less, or two more.
+        Alternative set: one term more or less, or two more.
     criterion : str
         Criterion of the comparison: BIC, with the effective number of samples.
     difference : float
-        BIC of the other set minus that of the chosen one; negative if the other set is better,
-        nan if it is not determined.
+        BIC of the alternative set minus BIC of the chosen set; negative if the alternative is
+        better, nan if it is not determined.
     p_value : float
-        p-value of the Wald test that the terms which differ are zero, with errors that respect
-        autocorrelation. It is corrected for the number of terms tried (Holm).
+        p-value of the Wald test that the differing terms are zero, with standard errors that
+        account for autocorrelation, corrected for the number of terms tried (Holm).
     supported : bool
-        Whether the data support the other set; a further term must also predict samples better
-        that were held out.
+        Whether the data support the alternative set; an additional term must also improve the
+        prediction of held-out samples.
     words : str
-        The result in words.
+        Result as a sentence.
 
     """
 
@@ -67,22 +67,9 @@ class Comparison:
 
 def compare_terms(design: Design, fit: Regression, among: int = 1) -> tuple[Comparison, ...]:
     """
-    Try each term that was not chosen, and leave out each chosen one.
+    Fit each unused term in addition, and leave out each chosen term.
 
-    Parameters
-    ----------
-    design : Design
-        Samples to use, and the chosen terms.
-    fit : Regression
-        The fit of the chosen terms.
-    among : int
-        Number of recordings over which the probability of a false alarm is kept.
-
-    Returns
-    -------
-    tuple of Comparison
-        One per set of terms that could be fitted.
-
+    ``among`` is the number of recordings over which the probability of a false alarm is kept.
     """
     settings = design.signals.settings
     chosen = settings.terms
@@ -98,7 +85,7 @@ def compare_terms(design: Design, fit: Regression, among: int = 1) -> tuple[Comp
     found = _added(design, screening, singles, samples, level)
     growth = 1.0 if fit.memory is None else float(fit.memory.inflation.max())
     if growth > _LIKE_MEMORY and not any(one.supported for one in found):
-        # Two terms that are both missing leave what looks like noise with a memory.
+        # Two missing terms leave residuals that resemble autocorrelated noise.
         pairs = [(first, second) for (first,), (second,) in combinations(singles, 2)]
         both = _added(design, screening, pairs, samples, level)
         found += [one for one in both if one.supported]
@@ -117,7 +104,7 @@ def _candidates(design: Design) -> list[str]:
     """Return the terms that could be added."""
     settings = design.signals.settings
     chosen = set(settings.terms)
-    # Where layers begin must be said.
+    # The user must give the boundaries of layers.
     excluded = chosen | {'layers'}
     if design.estimates_lag:
         excluded.add('inertia')
@@ -135,7 +122,7 @@ def _added(
     samples: float,
     level: float,
 ) -> list[Comparison]:
-    """Try further terms; none is supported unless it predicts better too."""
+    """Fit additional terms; a supported term must also improve the prediction."""
     tried = [_tried(design, screening, more) for more in candidates]
     p_values = _holm([trial.p_value for trial in tried])
     return [
@@ -145,15 +132,15 @@ def _added(
 
 
 def _tried(design: Design, screening: Screening, more: tuple[str, ...]) -> Trial:
-    """Fit further terms; those that seem to matter with errors that allow for a memory."""
+    """Fit additional terms, with errors for autocorrelated noise if they are significant."""
     settings = design.signals.settings
     trial = screening.tried(design.columns(more)[design.used])
     if not trial.determined or trial.p_value >= SIGNIFICANCE:
         return trial
     start = len(columns_of(settings.terms, settings))
     which = list(range(start, start + len(trial.values)))
-    # Noise with a memory looks like many a term. Too few samples for one more parameter are no
-    # fault of the chosen terms.
+    # Autocorrelated noise resembles many terms. The chosen terms remain valid if the samples do
+    # not suffice for an additional parameter.
     with suppress(IdentificationError):
         other = design.solve((*settings.terms, *more), settings.estimator)
         if other.determined[which].all():
@@ -181,7 +168,7 @@ def _judged(
     columns = columns_of(more, settings)
     difference = samples * log(trial.misfit / misfit) + len(columns) * log(samples)
     firsts = {columns_of([term], settings)[0].name for term in more if term in _POSITIVE}
-    # Neither a mass nor what breaks away is less than nothing.
+    # A mass, breakaway friction or cutting force cannot be negative.
     impossible = any(
         column.name in firsts and value < 0.0
         for value, column in zip(trial.values, columns, strict=True)
@@ -207,10 +194,10 @@ def _judged(
 
 def _predicts_better(design: Design, more: tuple[str, ...]) -> bool:
     """
-    Tell whether further terms lower the error of predictions of samples that were held out.
+    Test whether additional terms lower the prediction error of held-out samples.
 
-    The samples are held out in turn by strokes and rests that follow each other, so that what a
-    term learns of noise with a memory does not help it.
+    Folds consist of consecutive strokes and rests, so that fitting autocorrelated noise gives a
+    term no advantage.
     """
     used = design.used
     settings = design.signals.settings
@@ -229,7 +216,7 @@ def _predicts_better(design: Design, more: tuple[str, ...]) -> bool:
 
 
 def _holm(p_values: Sequence[float]) -> list[float]:
-    """Correct p-values for their number (Holm): the probability of any false alarm is kept."""
+    """Correct p-values for multiple tests (Holm): controls the probability of any false alarm."""
     corrected = np.ones(len(p_values))
     largest = 0.0
     for rank, k in enumerate(np.argsort(p_values)):

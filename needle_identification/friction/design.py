@@ -1,8 +1,9 @@
 """
-The regression of friction: which samples it uses, and with which regressors.
+Select samples and regressors for the friction regression.
 
-The terms with a sign are not linear. Samples whose filter reaches a start, a stop or a reversal
-are therefore left out. One more regressor takes up what is left of the lag of the force.
+The terms with a sign are not linear. Samples whose filter window reaches a start, a stop or a
+reversal are therefore left out. An additional regressor accounts for the remaining lag of the
+force.
 """
 
 from __future__ import annotations
@@ -20,43 +21,44 @@ from needle_identification.friction.terms import columns_of, Motion, regressors
 import numpy as np
 from scipy.ndimage import maximum_filter1d
 
-#: Independent samples of motion that a meaningful standard error needs.
+#: Smallest number of independent samples in motion for a meaningful standard error.
 FEWEST_SAMPLES: Final = 10.0
 
-#: Time after a change at which the filters of the sensor have settled too [lags of the force].
+#: Settling time of the sensor filters after a change [lags of the force].
 _SETTLING: Final = 3.0
 
-#: What is less deep than the deepest by no more is as deep [m]: counts, noise, play.
+#: Tolerance within which the needle is at its largest insertion depth [m]: encoder counts,
+#: noise, backlash.
 _SAME_DEPTH: Final = 5e-5
 
-#: Part of a term's full size that is felt.
+#: Smallest fraction of the full size of a term that counts as an effect.
 _FELT: Final = 0.05
 
-#: A longer settling time than this is the lag of a clock [s].
+#: Largest settling time [s]; a longer lag is a clock offset.
 _LONGEST_SETTLING: Final = 0.1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Design:
     """
-    Motion as the force shows it, and the samples that are used.
+    Motion delayed by the lag of the force, and the samples of the regression.
 
     Attributes
     ----------
     signals : FilteredSignals
         Filtered force and motion.
     speed, acceleration, depth : ndarray, shape (n,)
-        Speed [m/s], acceleration [m/s^2] and inserted length [m], delayed by the lag of the force.
+        Velocity [m/s], acceleration [m/s^2] and insertion depth [m], delayed by the lag.
     fresh : ndarray of bool, shape (n,)
-        Whether the needle is as deep as it ever was.
+        Whether the needle is at its largest insertion depth so far.
     regime : ndarray, shape (n,)
-        Sign of the speed; 0 at rest.
+        Sign of the velocity; 0 at rest.
     change, used : ndarray of bool, shape (n,)
         Where the regime changes or samples are lost, and samples to use.
     stroke : ndarray of int, shape (n,)
-        Number of the stroke or rest of each sample.
+        Index of the stroke or rest of each sample.
     lag_column : ndarray, shape (n, 1) or (n, 0)
-        Change of the force with a further lag [N/s]; no column if the lag is not estimated.
+        Derivative of the force by the lag [N/s]; no column if the lag is not estimated.
 
     """
 
@@ -73,7 +75,7 @@ class Design:
 
     @property
     def estimates_lag(self) -> bool:
-        """Whether the regression has a column for the lag."""
+        """Whether the regression includes the lag."""
         return self.lag_column.size > 0
 
     @property
@@ -83,39 +85,11 @@ class Design:
         return bool(np.count_nonzero(self.used) >= needed)
 
     def regressors(self, terms: Sequence[str]) -> FloatArray:
-        """
-        Return the regressors of terms and, if it is estimated, of the lag.
-
-        Parameters
-        ----------
-        terms : sequence of str
-            Terms, of `TERMS`.
-
-        Returns
-        -------
-        ndarray, shape (n, k)
-            One column per coefficient.
-
-        """
+        """Return the regressors of terms and of an estimated lag, shape (n, k)."""
         return np.column_stack([self.columns(terms), self.lag_column])
 
     def columns(self, terms: Sequence[str], later: float = 0.0) -> FloatArray:
-        """
-        Return the regressors of terms.
-
-        Parameters
-        ----------
-        terms : sequence of str
-            Terms, of `TERMS`.
-        later : float
-            Further lag of the force [s].
-
-        Returns
-        -------
-        ndarray, shape (n, k)
-            One column per coefficient.
-
-        """
+        """Return the regressors of terms at an additional lag ``later`` [s], shape (n, k)."""
         signals = self.signals
         motion = Motion(
             self.speed - later * self.acceleration,
@@ -128,22 +102,11 @@ class Design:
 
     def reaches(self, term: str) -> bool:
         """
-        Tell whether there are enough samples at which a term would be felt for one to count.
+        Test whether enough samples lie where a term has an effect.
 
-        Two terms have a place. ``stribeck`` is near rest; beyond, the term is nearly zero, and
-        what speaks for it is the noise of the speed. ``cutting`` is in new tissue; without
-        motion into old tissue it is an offset.
-
-        Parameters
-        ----------
-        term : str
-            Term, of `TERMS`.
-
-        Returns
-        -------
-        bool
-            Whether there are.
-
+        ``stribeck`` acts near rest; at higher speeds it is nearly zero, and only velocity noise
+        would support it. ``cutting`` acts in new tissue; without motion into old tissue it is an
+        offset.
         """
         if term == 'cutting':
             inward = self.used & (self.speed > 0.0)
@@ -158,34 +121,13 @@ class Design:
         return bool(felt >= self.signals.correlation)
 
     def far_from_changes(self, distance: float) -> Design:
-        """
-        Leave out what is near a change of regime.
-
-        Parameters
-        ----------
-        distance : float
-            Time beyond the reach of the filter within which samples are left out [s].
-
-        Returns
-        -------
-        Design
-            With fewer samples.
-
-        """
+        """Leave out samples within ``distance`` [s] plus the filter of a change of regime."""
         size = 2 * (self.signals.margin + ceil(distance / self.signals.period)) + 1
         near = maximum_filter1d(self.change.astype(np.uint8), size) > 0
         return replace(self, used=self.used & ~near)
 
     def with_lag_column(self) -> Design:
-        """
-        Add the change of the fitted force with a further lag.
-
-        Returns
-        -------
-        Design
-            With a column for the lag.
-
-        """
+        """Add the derivative of the fitted force by the lag as a regressor."""
         settings, step = self.signals.settings, 0.5 * self.signals.period
         early, now, late = (self.columns(settings.terms, shift) for shift in (-step, 0.0, step))
         used = self.used
@@ -195,25 +137,9 @@ class Design:
 
     def solve(self, terms: Sequence[str], estimator: str) -> Regression:
         """
-        Fit terms to the force.
+        Fit terms to the force; the last coefficient is the remaining lag [s] if it is estimated.
 
-        Parameters
-        ----------
-        terms : sequence of str
-            Terms, of `TERMS`.
-        estimator : str
-            One of `ESTIMATORS`.
-
-        Returns
-        -------
-        Regression
-            Coefficients of the terms, then what is left of the lag [s] if it is estimated.
-
-        Raises
-        ------
-        IdentificationError
-            If there are too few samples, or the noise of the speed exceeds its variation.
-
+        Raises `IdentificationError` for too few samples, or velocity noise above its variation.
         """
         signals = self.signals
         noise_of = {
@@ -237,15 +163,7 @@ class Design:
         )
 
     def check(self) -> None:
-        """
-        Reject a recording with too little motion or without force.
-
-        Raises
-        ------
-        IdentificationError
-            If the motion is too short, or the force is constant.
-
-        """
+        """Raise `IdentificationError` if the motion is too short or the force is constant."""
         signals = self.signals
         if not self.is_enough:
             needed = FEWEST_SAMPLES * independent_span(signals.correlation) * signals.period
@@ -264,22 +182,10 @@ class Design:
 
 def select_samples(signals: FilteredSignals, lag: float, settling_lag: float) -> Design:
     """
-    Select samples in steady regimes, farther from changes than the filters reach.
+    Select samples in steady regimes, outside the filter windows around changes.
 
-    Parameters
-    ----------
-    signals : FilteredSignals
-        Filtered force and motion.
-    lag : float
-        Lag of the force [s].
-    settling_lag : float
-        Lag of the filters of the sensor [s], for which more samples are left out.
-
-    Returns
-    -------
-    Design
-        Without a column for the lag.
-
+    ``lag`` is the lag of the force [s]; ``settling_lag`` [s] is the lag of the sensor filters, for
+    which additional samples are left out.
     """
     settings, time = signals.settings, signals.time
     then = np.clip(time - lag, time[0], time[-1])
@@ -291,7 +197,7 @@ def select_samples(signals: FilteredSignals, lag: float, settling_lag: float) ->
     fresh = depth >= np.maximum.accumulate(depth) - _SAME_DEPTH
     if 'cutting' in settings.terms:
         change[1:-1] |= (fresh[1:-1] != fresh[:-2]) & (speed[1:-1] > 0.0)
-    # The sensor settles while the filter does, whose outer third weighs little.
+    # Sensor and filter settle at the same time; the outer third of the window has little weight.
     settling = min(_SETTLING * settling_lag, _LONGEST_SETTLING)
     settling -= HALF_LENGTH / settings.cutoff / 1.5
     more = max(0, ceil(settling / signals.period))

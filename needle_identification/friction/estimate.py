@@ -1,4 +1,4 @@
-"""Friction of one recording."""
+"""Friction estimate of a recording."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ class Fit:
     Attributes
     ----------
     time : ndarray
-        Even time on the clock of the recording [s].
+        Evenly spaced time on the clock of the recording [s].
     speed : ndarray
-        Filtered speed [m/s], delayed by the lag of the force.
+        Filtered velocity [m/s], delayed by the lag of the force.
     force, model : ndarray
-        Filtered and fitted force [N]; the fitted one is nan where the sample was not used.
+        Filtered and fitted force [N]; the fitted force is nan for samples that were not used.
     used : ndarray of bool
         Whether the sample was used.
 
@@ -43,29 +43,29 @@ class Fit:
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
 class FrictionEstimate(Named[ParameterEstimate]):
     """
-    Friction of one recording.
+    Friction estimate of a recording.
 
     Attributes
     ----------
     name : str
-        The recording.
+        Name of the recording.
     terms : tuple of str
         Terms of the force.
     estimator : str
-        Estimator.
+        Estimator, one of `ESTIMATORS`.
     parameters : tuple of ParameterEstimate
-        Coefficients of the terms, then ratios that follow from them: ``withdrawal_friction``
+        Coefficients of the terms, then derived ratios: ``withdrawal_friction``
         (friction on withdrawal over friction on insertion, at the mean speed) and
-        ``breakaway_friction`` (friction at rest over mu_s). ``estimate[name]`` gives one.
+        ``breakaway_friction`` (friction at rest over mu_s). ``estimate[name]`` is a parameter.
     breakaway : ParameterEstimate or None
         Force at which the needle began to move after rests with a rising force [N], without the
         offset if that is a term; None if there is no such rest.
     lag : ParameterEstimate or None
-        Lag of the force behind the motion [s]; it was corrected. Not determined where the speed
-        only jumps. A mass m beside viscous friction reduces it by m / mu_v. None if inertia is a
-        term, which looks like a lag, or if only positions were recorded.
+        Corrected lag of the force behind the motion [s]. Not determined if the velocity changes
+        only in steps. An unmodeled mass m reduces it by m / mu_v. None if inertia is a term,
+        which resembles a lag, or if only positions were recorded.
     punctures : tuple of Puncture
-        Where the force dropped while the needle went into new tissue.
+        Drops of the force while the needle enters new tissue.
     samples : int
         Number of samples used.
     residual : float
@@ -77,9 +77,9 @@ class FrictionEstimate(Named[ParameterEstimate]):
     tests : tuple of ResidualTest
         Tests of the residuals.
     comparison : tuple of Comparison
-        Whether the data support one term more, or one less.
+        Comparisons with alternative sets of terms.
     warnings : tuple of str
-        What to know before using the numbers, in words.
+        Warnings about the validity of the estimate.
     fit : Fit
         Signals for plots.
 

@@ -1,8 +1,8 @@
 """
-Force and motion of a recording on an even time base, passed through one zero-phase filter.
+Resample force and motion of a recording and apply a zero-phase low-pass filter.
 
-Force and speed pass the same low-pass filter of finite length (Hann window). A linear relation
-between them stays what it is. The filter mixes what lies before and after a change, so samples
+Force and velocity pass the same low-pass filter of finite length (Hann window), which preserves
+linear relations between them. The filter mixes samples from before and after a change, so samples
 near a start, a stop or a reversal are left out later; see `design`.
 """
 
@@ -31,22 +31,22 @@ HALF_LENGTH: Final = 0.36
 #: Length over which filtered noise is correlated [periods of the cutoff].
 CORRELATION_LENGTH: Final = 3.0
 
-#: A longer step between samples is a gap [sampling periods].
+#: Longest step between samples that is not a gap [sampling periods].
 GAP: Final = 3.5
 
-#: The needle moves if its speed is at least this many standard deviations of the noise.
+#: Speed above which the needle moves [standard deviations of the noise].
 _CLEARLY: Final = 5.0
 
 #: Samples per period of the cutoff that are kept after the filter.
 _KEPT: Final = 8.0
 
-#: How much longer a force is held at a limit of its sensor than anywhere else.
+#: Ratio of the hold time at a limit of the sensor to the longest hold time at other values.
 _LONGER: Final = 3
 
-#: Largest share of the samples that is taken for cut off.
+#: Largest fraction of samples that may count as saturated.
 _MOST_CUT_OFF: Final = 0.5
 
-#: Largest number of points of the even time base per sample; beyond, it would be mostly gaps.
+#: Largest number of resampled points per sample; with more, most of the time base is gaps.
 _LARGEST_GRID: Final = 10.0
 
 
@@ -60,20 +60,20 @@ class FilteredSignals:
     settings : FrictionSettings
         Settings of the identification.
     time, force, depth : ndarray, shape (n,)
-        Even time [s], filtered force [N], and inserted length [m].
+        Evenly spaced time [s], filtered force [N], and insertion depth [m].
     period : float
-        Step of the time [s].
+        Sampling period after resampling [s].
     motion : BSpline
-        Filtered speed [m/s] as a function of time [s].
+        Filtered velocity [m/s] as a function of time [s].
     lost : ndarray of bool, shape (n,)
-        Samples within a gap of the recording, or where the force is cut off.
+        Samples within a gap of the recording, or with a saturated force.
     half_filter, margin : int
-        Half the length of the filter, and distance from a change of the filtered speed at which
-        the filtered force may still be affected by it [samples].
+        Half the length of the filter, and distance from a change of the filtered velocity within
+        which the change may affect the filtered force [samples].
     speed_noise, acceleration_noise : float
-        Standard deviations of the noise of filtered speed [m/s] and acceleration [m/s^2].
+        Standard deviations of the noise of filtered velocity [m/s] and acceleration [m/s^2].
     cut_off : float
-        Share of the samples of the force at the limits of its sensor; they count as lost.
+        Fraction of samples with a saturated force; these samples count as lost.
 
     """
 
@@ -92,7 +92,7 @@ class FilteredSignals:
 
     @property
     def correlation(self) -> int:
-        """Length over which the filtered noise is correlated [samples]."""
+        """Correlation length of the filtered noise [samples]."""
         return ceil(CORRELATION_LENGTH / self.settings.cutoff / self.period)
 
     @property
@@ -105,23 +105,8 @@ def filter_signals(recording: Recording, settings: FrictionSettings) -> Filtered
     """
     Filter force and motion of a recording.
 
-    Parameters
-    ----------
-    recording : Recording
-        Without speeds, the inserted length is differentiated by the same filter.
-    settings : FrictionSettings
-        Its cutoff is used.
-
-    Returns
-    -------
-    FilteredSignals
-        Signals on an even time base.
-
-    Raises
-    ------
-    IdentificationError
-        If the recording is too short or its stamps are too uneven.
-
+    Without recorded velocity, the insertion depth is differentiated by the same filter. Raises
+    `IdentificationError` if the recording is too short or its stamps are too uneven.
     """
     time = recording.time
     if len(time) < 3:
@@ -137,7 +122,7 @@ def filter_signals(recording: Recording, settings: FrictionSettings) -> Filtered
     lost = steps[np.clip(np.searchsorted(time, grid), 1, len(steps)) - 1] > GAP * period
     cut = cut_off(recording.force)
     lost |= np.interp(grid, time, cut.astype(np.float64)) > 0.0
-    # A filter longer than the recording may not even fit into memory.
+    # A filter longer than the recording may exceed the memory.
     half = ceil(min(HALF_LENGTH / settings.cutoff / period, len(grid)))
     if len(grid) <= 4 * half:
         raise IdentificationError(
@@ -174,20 +159,9 @@ def filter_signals(recording: Recording, settings: FrictionSettings) -> Filtered
 
 def cut_off(force: FloatArray) -> BoolArray:
     """
-    Mark samples at the limits of a sensor, where it says the same whatever the force.
+    Mark samples at which the force sensor is saturated, shape (n,).
 
     The largest or smallest value is a limit if it is held for much longer than any other value.
-
-    Parameters
-    ----------
-    force : ndarray, shape (n,)
-        Measured force [N].
-
-    Returns
-    -------
-    ndarray of bool, shape (n,)
-        Samples that are cut off.
-
     """
     limits = force.max(), force.min()
     found = np.zeros(force.shape, dtype=np.bool_)
@@ -201,34 +175,19 @@ def cut_off(force: FloatArray) -> BoolArray:
     for limit in limits:
         if int(lengths[values == limit].max()) > longest:
             found |= force == limit
-    # A force that hardly ever varies is as constant at its largest.
+    # A nearly constant force is also constant at its extreme values.
     return found if found.mean() < _MOST_CUT_OFF else np.zeros_like(found)
 
 
 def filter_taps(cutoff: float, period: float) -> FloatArray:
-    """
-    Return the filter of force and motion.
-
-    Parameters
-    ----------
-    cutoff : float
-        Frequency at which the filter halves the power [Hz].
-    period : float
-        Sampling period [s].
-
-    Returns
-    -------
-    ndarray, shape (2 h + 1,)
-        A Hann window with unit sum.
-
-    """
+    """Return a Hann window, shape (2 h + 1,), that halves the power at ``cutoff`` [Hz]."""
     half = ceil(HALF_LENGTH / cutoff / period)
     taps = 0.5 + 0.5 * np.cos(np.linspace(-np.pi, np.pi, 2 * half + 1))
     return np.asarray(taps / taps.sum(), dtype=np.float64)
 
 
 def _smooth(signal: FloatArray, taps: FloatArray) -> FloatArray:
-    """Filter a signal that is held constant beyond its ends, by FFT of overlapping blocks."""
+    """Filter a signal by FFT of overlapping blocks, with constant extension at both ends."""
     padded = np.pad(signal, len(taps) // 2, mode='edge')
     overlap = len(taps) - 1
     # The size with the fewest operations per sample.
@@ -246,7 +205,7 @@ def _smooth(signal: FloatArray, taps: FloatArray) -> FloatArray:
 def _filtered_speed(
     time: FloatArray, raw: FloatArray, taps: FloatArray, step: int, derivative: int
 ) -> BSpline:
-    """Return the filtered speed as a function of time, from speeds or (derivative 1) depths."""
+    """Return the filtered velocity as a spline of time, from velocity or (derivative 1) depth."""
     from scipy.interpolate import make_interp_spline
 
     start = raw[0] if derivative else 0.0
@@ -260,14 +219,14 @@ def _filtered_speed(
 
 
 def _white_noise(raw: FloatArray, speed: FloatArray, acceleration: FloatArray) -> float:
-    """Estimate the standard deviation of white noise from fourth differences, robustly."""
+    """Return a robust estimate of the white noise standard deviation from fourth differences."""
     size = np.abs(acceleration)
-    # Where the noise is large, it is all of the acceleration most of the time.
+    # Large noise dominates the acceleration most of the time.
     unsteady = size > max(0.1 * float(size.max()), 3.0 * float(np.median(size)))
     steady = maximum_filter1d(unsteady.astype(np.uint8), 9) == 0
     steady &= np.abs(speed) > 0.1 * np.max(np.abs(speed))
     differences = np.abs(np.diff(raw, 4))[steady[2:-2]]
-    # The 80th percentile: counts of a constant speed may show no noise in half the strokes. The
-    # variance of the fourth difference of white noise is 70 times its own.
+    # 80th percentile: encoder counts at constant velocity may show no noise in half the strokes.
+    # The fourth difference of white noise has 70 times its variance.
     usual = float(np.quantile(differences, 0.8)) if len(differences) else 0.0
     return usual / (1.2816 * sqrt(70.0))

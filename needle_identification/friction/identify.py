@@ -1,21 +1,21 @@
 r"""
-Friction of a needle from force and motion of its base, by linear regression.
+Identify friction from force and motion of the needle base by linear regression.
 
 With the tip past the tissue, the axial row of equation (16) of the paper is friction (15),
 with optional further terms:
 
 .. math:: f_y(t + \tau) = \mu_s \operatorname{sgn}(\dot s) + \mu_v \dot s + ...
 
-The steps, each in a file of its own:
+Modules:
 
 ================  =================================================================================
 `filtering`       force and motion through one zero-phase filter, on an even time base
 `lag`             the lag tau of the force
 `design`          samples in steady motion, regressors (`terms`), and the regression
 `intervals`       parameters with standard errors and confidence intervals
-`breakaway`       the force at which the needle begins to move
-`punctures`       where the force drops on the way into new tissue
-`comparison`      other sets of terms
+`breakaway`       breakaway force
+`punctures`       drops of the force on entering new tissue
+`comparison`      alternative sets of terms
 `checks`          errors and warnings
 ================  =================================================================================
 """
@@ -56,18 +56,18 @@ from needle_identification.friction.terms import columns_of
 from needle_identification.recordings.recording import Recording
 import numpy as np
 
-#: Part of the usual speed below which motion must be seen.
+#: Largest velocity noise threshold, as a fraction of the median speed.
 _HIDDEN: Final = 0.2
 
-#: Positions tell the speed better if it has less than this part of the noise.
+#: Positions replace velocities if their velocity noise is below this fraction.
 _CLEANER: Final = 0.5
 
-#: Time from a change within which the force may not follow the terms yet [s], and the p-value
-#: below which the samples within it are left out because they say something else.
+#: Time after a change within which the force may deviate from the terms [s], and the p-value
+#: of the deviation below which these samples are left out.
 _TRANSITION: Final = 0.1
 _TRANSITIONS_DIFFER: Final = 0.001
 
-#: Parameters that differ by fewer standard errors of white noise agree.
+#: Largest difference of parameters that agree [standard errors for white noise].
 _CLOSE: Final = 3.0
 
 
@@ -80,19 +80,19 @@ def identify_friction(
     Parameters
     ----------
     recording : Recording
-        Force and motion with the needle tip past the tissue, so that nothing is cut. Without
-        speeds the inserted length is differentiated, by the same zero-phase filter.
+        Force and motion with the needle tip beyond the tissue, without cutting. Without recorded
+        velocity, the insertion depth is differentiated by the same zero-phase filter.
     settings : FrictionSettings, optional
         Terms, filter and estimator.
     among : int
-        Number of recordings that are identified together: all of them have one chance in fifty
-        that any is advised a term that it does not need.
+        Number of recordings identified together. The probability that an unneeded term is
+        suggested for any of them is 2 %.
 
     Returns
     -------
     FrictionEstimate
-        Estimates with standard errors that respect the correlation which filter and sensor leave
-        in the residuals, and warnings.
+        Estimates with standard errors that account for the autocorrelation of the residuals by
+        filter and sensor, and warnings.
 
     Raises
     ------
@@ -101,7 +101,7 @@ def identify_friction(
 
     Examples
     --------
-    From NumPy arrays: strokes in and out with 20 s of motion at 250 samples/s.
+    Synthetic strokes, 20 s at 250 samples/s:
 
     >>> import numpy as np
     >>> time = np.arange(0.0, 20.0, 0.004)
@@ -153,7 +153,7 @@ def _identify(recording: Recording, settings: FrictionSettings, among: int) -> F
         estimator=settings.estimator,
         parameters=parameters,
         breakaway=breakaway_force(design, parameters),
-        # The resolution of positions and a mass make errors of the lag that its interval lacks.
+        # The interval of the lag omits errors by the position resolution and by a mass.
         lag=None if choice.from_positions or has_inertia else lag,
         punctures=find_punctures(design, fit),
         samples=fit.samples,
@@ -178,7 +178,7 @@ def _identify(recording: Recording, settings: FrictionSettings, among: int) -> F
 
 
 class _Choice(NamedTuple):
-    """What was chosen by the data, and the lag of the force [s] as `find_lag` gives it."""
+    """Signals, samples and fit selected by the data; lag of the force [s] from `find_lag`."""
 
     signals: FilteredSignals
     design: Design
@@ -190,7 +190,7 @@ class _Choice(NamedTuple):
 
 
 def _chosen(recording: Recording, settings: FrictionSettings) -> _Choice:
-    """Choose the source of the speed, the estimator and the samples; say what is unusual."""
+    """Select velocity source, estimator and samples; remarks describe unusual choices."""
     simple = replace(settings, estimator='ordinary') if settings.estimator == AUTO else settings
     choice = _first_choice(filter_signals(recording, simple), recording.speed is None)
     if settings.estimator != AUTO:
@@ -214,7 +214,7 @@ def _chosen(recording: Recording, settings: FrictionSettings) -> _Choice:
 
 
 def _noise_remark(choice: _Choice) -> str:
-    """Say what noise of the speed does, if it does something."""
+    """Describe the effect of velocity noise if it is relevant."""
     if bias := noise_bias(choice.design, choice.fit):
         return noise_words(choice.design, bias)
     design = choice.design
@@ -228,27 +228,27 @@ def _noise_remark(choice: _Choice) -> str:
 
 
 def _is_cleaner(positions: FilteredSignals, speeds: FilteredSignals) -> bool:
-    """Whether positions tell the speed better; those that are integrated speeds do not."""
+    """Whether positions give less velocity noise and are not integrated velocities."""
     apart = float(np.std(positions.motion(speeds.time) - speeds.motion(speeds.time)))
     noise = speeds.speed_noise
     return positions.speed_noise < _CLEANER * noise and apart > _CLEANER * noise
 
 
 def _first_choice(signals: FilteredSignals, from_positions: bool) -> _Choice:
-    """Fit with the lag that the motion determines, if it does."""
+    """Fit at the lag that the motion determines, if any."""
     coarse, fine = 0.0, None
     if 'inertia' not in signals.settings.terms:
         coarse, fine = find_lag(signals)
     design, fit = _fitted(signals, coarse, fine)
     if design.estimates_lag and not fit.errors[-1] < HALF_LENGTH / signals.settings.cutoff:
-        # Beyond the length of the filter the force is not linear in the lag.
+        # The force is not linear in a lag above the filter length.
         fine = None
         design, fit = _fitted(signals, coarse, fine)
     return _Choice(signals, design, fit, coarse, fine, from_positions)
 
 
 def _without_transitions(choice: _Choice) -> _Choice:
-    """Leave out more around each change, if the force does not follow the terms there."""
+    """Leave out more samples around each change if the force deviates from the terms there."""
     settings = choice.signals.settings
     count = len(columns_of(settings.terms, settings))
     design = choice.design.far_from_changes(_TRANSITION)
@@ -259,7 +259,7 @@ def _without_transitions(choice: _Choice) -> _Choice:
             design = design.with_lag_column()
         fit = design.solve(settings.terms, settings.estimator)
     except IdentificationError:
-        # Little is left without them.
+        # Too few samples remain.
         return choice
     if fit.differs(choice.fit, count) >= _TRANSITIONS_DIFFER:
         return choice
@@ -271,7 +271,7 @@ def _without_transitions(choice: _Choice) -> _Choice:
 
 
 def _agree(design: Design, whole: Regression, count: int) -> bool:
-    """Whether fewer samples give the same as all, by errors that are small for their noise."""
+    """Whether a subset of samples gives the same parameters within small standard errors."""
     used = design.used
     few = Screening(
         design.regressors(design.signals.settings.terms)[used],
@@ -285,10 +285,10 @@ def _agree(design: Design, whole: Regression, count: int) -> bool:
 def _fitted(
     signals: FilteredSignals, coarse: float, fine: float | None
 ) -> tuple[Design, Regression]:
-    """Fit with a further lag as one more unknown, or at the coarse lag if there is no fine one."""
+    """Fit with the remaining lag as an unknown, or at the coarse lag if ``fine`` is None."""
     settings = signals.settings
     lag = coarse if fine is None else fine
-    # A coarse lag is wrong by up to half a step.
+    # The error of a coarse lag is up to half a step.
     error = 0.5 * signals.half_filter * signals.period if fine is None else 0.0
     design = select_samples(signals, lag, abs(lag) + error)
     design.check()

@@ -1,9 +1,8 @@
 """
-Friction parameters with their standard errors and confidence intervals.
+Compute friction parameters with standard errors and confidence intervals.
 
-The interval of mu_s, like that of every coefficient, is that of the regression: its standard
-error, from `score_covariance`, times the quantile of Student's t. Ratios have intervals by the
-delta method.
+The interval of a coefficient is its standard error from `score_covariance` times the quantile of
+Student's t. Ratios have intervals by the delta method.
 """
 
 from __future__ import annotations
@@ -24,24 +23,11 @@ def parameter_estimates(
     fit: Regression, settings: FrictionSettings, mean_speed: float, period: float
 ) -> tuple[ParameterEstimate, ...]:
     """
-    Return the coefficients of the terms, then the ratios that follow from them.
+    Return the coefficients of the terms, then derived ratios.
 
-    Parameters
-    ----------
-    fit : Regression
-        Its first columns are those of the terms.
-    settings : FrictionSettings
-        The terms.
-    mean_speed : float
-        Mean speed [m/s] at which withdrawal is compared with insertion.
-    period : float
-        Sampling period [s]. The stamps of force and motion may differ by up to this.
-
-    Returns
-    -------
-    tuple of ParameterEstimate
-        The parameters.
-
+    The first columns of ``fit`` are the columns of the terms. ``mean_speed`` [m/s] is the speed
+    for the ratio of withdrawal to insertion; ``period`` [s] is the sampling period, the largest
+    difference between the stamps of force and motion.
     """
     columns = columns_of(settings.terms, settings)
     at = {column.name: k for k, column in enumerate(columns)}
@@ -76,11 +62,7 @@ def parameter_estimates(
 
 
 def _widened(mass: ParameterEstimate, largest: float) -> ParameterEstimate:
-    """
-    Add the error by a lag that looks like a mass.
-
-    That error is uniform up to ``largest`` [kg] on either side.
-    """
+    """Add the error by a lag that resembles a mass, uniform within +- ``largest`` [kg]."""
     low, high = mass.interval
     return mass.with_value(
         mass.value,

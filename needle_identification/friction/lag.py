@@ -1,9 +1,9 @@
 """
-The lag of the force behind the motion, by filters of the sensor or by clocks that differ.
+Estimate the lag of the force behind the motion by sensor filters or clock offsets.
 
-A lag of 2 ms changes the force of a needle that accelerates by more than the error of its
-friction. The lag is therefore estimated: first coarsely, in steps of half the filter, then by
-Gauss-Newton steps; the regression of friction itself takes the last step.
+A lag of 2 ms changes the force of an accelerating needle by more than the error of its friction.
+The lag is estimated coarsely in steps of half the filter, then by Gauss-Newton steps; the last
+step is part of the friction regression.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from needle_identification.friction.terms import Motion, regressors
 import numpy as np
 from scipy.special import ndtri
 
-#: Largest lag that is searched for [s].
+#: Largest lag of the coarse search [s].
 _LARGEST_LAG: Final = 0.25
 
-#: Part of the misfit that a coarse lag must leave at most.
+#: Largest fraction of the misfit that remains with an accepted coarse lag.
 _BETTER: Final = 0.5
 
 #: Largest number of samples for the coarse search.
@@ -30,16 +30,16 @@ _MAX_SAMPLES: Final = 1000
 
 _MAX_ITERATIONS: Final = 10
 
-#: Part of the power of the acceleration that may be noise where the lag is estimated.
+#: Largest fraction of noise in the power of the acceleration for an estimate of the lag.
 _LARGEST_NOISE: Final = 0.1
 
-#: The lag is reported if the acceleration (root mean square) exceeds this part of its largest
-#: value. A smaller one may be left by filter and spline of jumps of the speed.
+#: Smallest ratio of root mean square and largest acceleration at which the lag is reported.
+#: Filter and spline produce smaller accelerations from velocity steps.
 _SMALLEST_ACCELERATION: Final = 0.01
 
-#: Error of a lag by the cubic spline between samples, for one sample per period of the cutoff
-#: [sampling periods]; of fourth order. Found with the simulated plant, whose speed has corners at
-#: the samples.
+#: Error of a lag by the cubic spline between samples at one sample per period of the cutoff
+#: [sampling periods]; of fourth order. Found with the simulated plant, whose velocity is
+#: piecewise linear between samples.
 _SPLINE_ERROR: Final = 10.0
 
 _UNKNOWN: Final = ParameterEstimate(name='lag', symbol='tau', unit='s')
@@ -47,20 +47,10 @@ _UNKNOWN: Final = ParameterEstimate(name='lag', symbol='tau', unit='s')
 
 def find_lag(signals: FilteredSignals) -> tuple[float, float | None]:
     """
-    Search for the lag of the force.
+    Search for the lag of the force, without the term inertia, which resembles a lag.
 
-    Parameters
-    ----------
-    signals : FilteredSignals
-        Filtered force and motion; without the term inertia, which looks like a lag.
-
-    Returns
-    -------
-    coarse : float
-        Lag to half the length of the filter [s]; 0 if no lag fits much better.
-    fine : float or None
-        Lag of least misfit [s]; None if the motion does not determine it.
-
+    Returns the coarse lag, within half the filter length [s], or 0 if no lag fits much better; and
+    the lag of least misfit [s], or None if the motion does not determine it.
     """
     terms = signals.settings.terms
     lag = coarse = _coarse_lag(signals)
@@ -74,14 +64,14 @@ def find_lag(signals: FilteredSignals) -> tuple[float, float | None]:
         lag += change
         if abs(lag) > 2.0 * _LARGEST_LAG:
             return coarse, None
-        # The fit itself takes the last step.
+        # The last step is part of the final regression.
         if abs(change) < 0.05 * signals.period:
             break
     return coarse, lag
 
 
 def _coarse_lag(signals: FilteredSignals) -> float:
-    """Return the lag, in steps of half the filter, that fits far better than none, else zero."""
+    """Return the best lag in steps of half the filter [s]; 0 if zero lag fits nearly as well."""
     every = max(1, len(signals.time) // _MAX_SAMPLES)
     step = signals.half_filter * signals.period
     count = int(_LARGEST_LAG / step)
@@ -90,13 +80,13 @@ def _coarse_lag(signals: FilteredSignals) -> float:
     best = int(np.argmin(misfits))
     if not misfits[best] < _BETTER * misfits[count]:
         return 0.0
-    # Few samples may have missed what speaks against it: the edges of the strokes.
+    # The subsampled search may miss contradicting samples at the edges of strokes.
     lag = float(lags[best])
     return lag if _misfit(signals, lag, 1) < _BETTER * _misfit(signals, 0.0, 1) else 0.0
 
 
 def _misfit(signals: FilteredSignals, lag: float, every: int) -> float:
-    """Return the mean squared misfit of some of the samples at a lag; nan if too few move."""
+    """Return the mean squared misfit at a lag of every n-th sample; nan if too few move."""
     settings, time, force = signals.settings, signals.time[::every], signals.force[::every]
     then = np.clip(time - lag, time[0], time[-1])
     speed, acceleration = signals.motion(then), signals.motion(then, 1)
@@ -122,23 +112,10 @@ def _acceleration_is_noise(design: Design) -> bool:
 
 def lag_estimate(lag: float | None, design: Design, fit: Regression) -> ParameterEstimate:
     """
-    Return the lag with its error, to which the spline between samples adds.
+    Return the lag [s] and its error, including the error of the spline.
 
-    Parameters
-    ----------
-    lag : float or None
-        Lag at which the force was fitted [s].
-    design : Design
-        The regression.
-    fit : Regression
-        Its solution; the last parameter is what is left of the lag.
-
-    Returns
-    -------
-    ParameterEstimate
-        The lag [s]; not determined if it was not estimated, or the samples accelerate by no more
-        than the filter leaves of jumps of the speed.
-
+    The last coefficient of ``fit`` is the remaining lag. The lag is undetermined if it was not
+    estimated, or if the acceleration is within the filter error of velocity steps.
     """
     used = float(np.sqrt(np.mean(design.acceleration[design.used] ** 2)))
     accelerates = used > _SMALLEST_ACCELERATION * float(np.max(np.abs(design.acceleration)))

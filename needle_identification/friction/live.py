@@ -1,4 +1,4 @@
-"""Friction from running topics: pairs force and motion by stamp and keeps estimating."""
+"""Online friction identification from running topics: synchronizes force and motion by stamp."""
 
 from __future__ import annotations
 
@@ -13,52 +13,35 @@ from needle_identification.estimation.estimate import ParameterEstimate
 from needle_identification.friction.recursive import RecursiveFriction
 from needle_identification.friction.settings import FrictionSettings
 
-#: Pairs from which the sampling rate is determined.
+#: Number of pairs that determine the sampling rate.
 _FIRST: Final = 50
 
-#: Motion is not interpolated over a longer step [s].
+#: Largest step for interpolation of the motion [s].
 _LARGEST_STEP: Final = 0.1
 
-#: A stamp that goes back by more means that the clock was set back; by less, that a message
-#: arrived late [s].
+#: Backward step of a stamp above which the clock was set back [s]; after a smaller step, the
+#: message arrived late.
 _SET_BACK: Final = 1.0
 
-#: What no recording holds: forces [N], and depths [m] or speeds [m/s].
+#: Largest plausible values: forces [N]; depths [m] or velocities [m/s].
 _LARGEST: Final = {'force': 1e4, 'motion': 100.0}
 
-#: Samples that may wait for the other topic.
+#: Largest number of samples that wait for the other topic.
 _MAX_WAITING: Final = 20_000
 
 
 class LiveFriction:
     """
-    Estimates friction from messages as they arrive.
+    Estimate friction from messages as they arrive.
 
-    Motion is interpolated to the stamps of the force. A sample that is not finite, out of order,
-    or within a gap of the motion is dropped and counted. When the clock is set back, estimation
-    starts again.
-
-    Parameters
-    ----------
-    settings : FrictionSettings
-        Terms and filter.
-    forgetting : float
-        Time of steady motion in which the weight of a sample falls to 1 / e [s].
-
-    Attributes
-    ----------
-    samples : int
-        Number of samples of the force that were paired with the motion.
-
-    Raises
-    ------
-    ParameterError
-        If `RecursiveFriction` rejects the settings or the time.
-
+    Motion is interpolated to the stamps of the force. Samples that are not finite, out of order,
+    or within a gap of the motion are discarded and counted. Estimation restarts when the clock is
+    set back. ``forgetting`` is the time of steady motion after which the weight of a sample is 1 /
+    e [s]; ``samples`` counts the paired force samples.
     """
 
     def __init__(self, settings: FrictionSettings, forgetting: float) -> None:
-        # The rate is not known yet; the other arguments are checked now.
+        # Checks the arguments except the sampling rate, which is determined later.
         RecursiveFriction(settings, 1.0, forgetting)
         self._settings, self._forgetting = settings, forgetting
         self._dropped: Counter[str] = Counter()
@@ -76,23 +59,11 @@ class LiveFriction:
 
     @property
     def dropped(self) -> Mapping[str, int]:
-        """Number of dropped samples by reason."""
+        """Number of discarded samples by reason."""
         return dict(self._dropped)
 
     def take_motion(self, stamp: int, depth: float, speed: float | None) -> None:
-        """
-        Add a sample of the motion.
-
-        Parameters
-        ----------
-        stamp : int
-            Time [ns].
-        depth : float
-            Inserted length [m].
-        speed : float or None
-            Insertion speed [m/s]; None to differentiate the depth.
-
-        """
+        """Add depth [m] and velocity [m/s], or depth to differentiate, at a stamp [ns]."""
         time = self._time('motion', stamp, depth if speed is None else speed)
         if time is None:
             return
@@ -100,43 +71,25 @@ class LiveFriction:
             before, self._last_depth = self._last_depth, (time, depth)
             if before is None:
                 return
-            # The slope between two samples is the speed in their middle.
+            # The difference quotient is the velocity at the midpoint.
             speed = (depth - before[1]) / (time - before[0])
             time = (time + before[0]) / 2.0
         self._motion.append((time, speed))
         self._pair()
 
     def take_force(self, stamp: int, force: float) -> None:
-        """
-        Add a sample of the force.
-
-        Parameters
-        ----------
-        stamp : int
-            Time [ns].
-        force : float
-            Force of the base on the needle [N], positive into the tissue.
-
-        """
+        """Add the base force on the needle [N], positive into the tissue, at a stamp [ns]."""
         time = self._time('force', stamp, force)
         if time is not None:
             self._force.append((time, force))
             self._pair()
 
     def estimate(self) -> tuple[ParameterEstimate, ...]:
-        """
-        Return the present friction.
-
-        Returns
-        -------
-        tuple of ParameterEstimate
-            As `RecursiveFriction.estimate`; empty before the sampling rate is known.
-
-        """
+        """Return the current friction parameters; empty until the sampling rate is determined."""
         return () if self._estimator is None else self._estimator.estimate()
 
     def _time(self, topic: str, stamp: int, value: float) -> float | None:
-        """Return the time from the start [s], or None if the sample is dropped."""
+        """Return the time since the start [s], or None if the sample is discarded."""
         if not abs(value) <= _LARGEST[topic]:
             self._dropped['absurd' if isfinite(value) else 'not finite'] += 1
             return None
@@ -154,7 +107,7 @@ class LiveFriction:
         return time
 
     def _pair(self) -> None:
-        """Pass on the samples of the force that the motion has reached."""
+        """Process force samples up to the latest motion sample."""
         motion = self._motion
         while self._force and motion and motion[-1][0] >= self._force[0][0]:
             time, force = self._force.popleft()

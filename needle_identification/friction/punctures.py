@@ -1,9 +1,9 @@
 """
-Punctures: where the force drops while the needle goes into new tissue.
+Detect punctures: drops of the force while the needle enters new tissue.
 
-A membrane or a skin yields at once: the force falls within a few milliseconds by what it bore. The
-mean force before and after each moment is compared over as long as the filter correlates noise,
-less what friction explains; a drop stands out from what noise and tissue do elsewhere.
+A membrane or skin yields at once: the force falls within a few milliseconds. The mean forces
+before and after each sample, over one correlation length of the filter and without the fitted
+friction, are compared; a puncture is a drop clearly above the usual changes by noise and tissue.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from needle_identification.friction.design import Design
 import numpy as np
 from scipy.special import ndtri
 
-#: A puncture drops the force by this many standard deviations of other changes of it.
+#: Smallest drop of a puncture [standard deviations of other changes of the force].
 _CLEAR: Final = 8.0
 
-#: Part of a change of the friction that the terms may have wrong.
+#: Model error of a change of friction, as a fraction.
 _UNKNOWN_FRICTION: Final = 0.5
 
 #: Standard deviation of normal noise over its median absolute deviation.
@@ -36,14 +36,14 @@ _DROP: Final = ParameterEstimate(name='puncture_force', symbol='f_p', unit='N')
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Puncture:
     """
-    A puncture.
+    Puncture of a tissue boundary.
 
     Attributes
     ----------
     time : float
-        When it was, on the clock of the recording [s].
+        Time on the clock of the recording [s].
     depth, drop : ParameterEstimate
-        Inserted length [m] and drop of the force [N].
+        Insertion depth [m] and drop of the force [N].
 
     """
 
@@ -53,22 +53,7 @@ class Puncture:
 
 
 def find_punctures(design: Design, fit: Regression) -> tuple[Puncture, ...]:
-    """
-    Find punctures.
-
-    Parameters
-    ----------
-    design : Design
-        The samples, and the terms of the friction.
-    fit : Regression
-        Their solution.
-
-    Returns
-    -------
-    tuple of Puncture
-        In order of time; none where the needle does not go into new tissue.
-
-    """
+    """Return punctures in order of time."""
     signals = design.signals
     inward = design.fresh & (design.regime > 0.0) & ~signals.lost
     width, reach = signals.correlation, signals.half_filter
@@ -97,7 +82,7 @@ def find_punctures(design: Design, fit: Regression) -> tuple[Puncture, ...]:
     usual = float(np.median(drops[known]))
     noise = _DEVIATION_OVER_MEDIAN * float(np.median(np.abs(drops[known] - usual)))
     found = []
-    # Where the speed changes, friction does, and is hardly known better than by a part.
+    # The threshold includes the model error of friction at velocity changes.
     clear = np.maximum(usual + _CLEAR * noise, _UNKNOWN_FRICTION * np.abs(others))
     left = np.where(known & (drops > np.maximum(clear, 0.0)), drops, 0.0)
     while noise > 0.0 and left.any():
@@ -108,18 +93,18 @@ def find_punctures(design: Design, fit: Regression) -> tuple[Puncture, ...]:
 
 
 def _puncture(design: Design, force: FloatArray, peak: int, noise: float) -> Puncture:
-    """Locate the steepest fall near a moment, and measure the drop across it."""
+    """Locate the steepest drop near a sample and measure its size."""
     signals = design.signals
     width, reach = signals.correlation, signals.half_filter
     around = slice(peak - width // 2 - reach, peak + width // 2 + reach)
     at = around.start + int(np.argmin(np.gradient(force[around])))
     before, after = force[at - reach - width : at - reach], force[at + reach : at + reach + width]
-    # The tissue may load the needle up to the puncture: the straight line before it is continued.
+    # The tissue may load the needle up to the puncture: extrapolate the line before it.
     time = np.arange(-width, 0) - reach
     level = np.polyfit(time, before, 1)[1]
     drop = float(level - after.mean())
     half_width = float(ndtri(0.975))
-    # Two means, one of them continued by half its length and half the filter.
+    # Variance of two means, with extrapolation by half a window and half the filter.
     error = noise * sqrt(1.0 + 1.5 * (1.0 + 2.0 * reach / width) ** 2)
     place = hypot(reach * signals.period * float(design.speed[at]), 1e-6) / sqrt(3.0)
     return Puncture(

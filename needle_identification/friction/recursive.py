@@ -1,11 +1,11 @@
 r"""
-Friction while the needle moves: recursive least squares with exponential forgetting.
+Estimate friction online by recursive least squares with exponential forgetting.
 
 The information :math:`A = \sum \lambda^{age} x x^T`, :math:`b = \sum \lambda^{age} x f` of the
-samples in steady motion is kept. The estimate is at any time that of weighted least squares over
-all of them. Force and speed pass the filter of `identify_friction`, half its length late, and the
-same samples are left out. The acceleration is one more regressor, which takes up a lag of the
-force.
+samples in steady motion is updated; the estimate is the weighted least squares solution over all
+of them. Force and velocity pass the filter of `identify_friction`, delayed by half its length,
+with the same sample selection. The acceleration is an additional regressor that accounts for a lag
+of the force.
 """
 
 from __future__ import annotations
@@ -24,40 +24,40 @@ from needle_identification.friction.terms import columns_of, Motion, regressors
 from needle_ros.errors import ParameterError
 import numpy as np
 
-#: Terms of the time since the start, or of the inserted length.
+#: Terms that depend on the time since the start or on the insertion depth.
 _OF_THE_WHOLE: Final = {'drift', 'length', 'layers', 'cutting'}
 
-#: Independent parts of the remembered motion that a meaningful standard error needs.
+#: Smallest number of independent blocks for a meaningful standard error.
 _FEWEST_PARTS: Final = 10.0
 
-#: Length of these parts [correlation windows of filtered noise].
+#: Length of a block [correlation lengths of filtered noise].
 _PART_LENGTH: Final = 2.0
 
-#: Time after which a part is dropped [forgetting times]; its weight is then below 4e-4.
+#: Age at which a block is discarded [forgetting times]; its weight is then below 4e-4.
 _REMEMBERED: Final = 8.0
 
-#: Singular values of the information below this part of the largest are rounding.
+#: Relative threshold below which singular values of the information are rounding errors.
 _ROUNDING: Final = 1e-7
 
 
 class RecursiveFriction:
     """
-    Friction estimated sample by sample, in constant time and memory per sample.
+    Recursive friction estimator with constant time and memory per sample.
 
     Parameters
     ----------
     settings : FrictionSettings
-        Terms, filter and what counts as steady motion; the estimator is ordinary.
+        Terms, filter and thresholds of steady motion; the estimator is ordinary.
     rate : float
-        Sampling rate [Hz]; the samples are even.
+        Constant sampling rate [Hz].
     forgetting : float
-        Time of steady motion in which the weight of a sample falls to 1 / e [s]. At rest nothing
-        is learned and nothing is forgotten.
+        Time of steady motion after which the weight of a sample is 1 / e [s]. Samples at rest
+        change neither the estimate nor the weights.
 
     Raises
     ------
     ParameterError
-        If rate or forgetting time are not positive, or the estimator is another.
+        If rate or forgetting time is not positive, or the estimator is not ordinary.
 
     Examples
     --------
@@ -85,7 +85,7 @@ class RecursiveFriction:
         self._settings = settings
         self._period = 1.0 / rate
         self._taps = filter_taps(settings.cutoff, self._period)
-        # The filtered acceleration needs a neighbor on either side, the lag one more.
+        # The filtered acceleration needs a neighbor on either side, the lag another neighbor.
         self._margin = len(self._taps) // 2 + 2
         self._decay = exp(-self._period / forgetting)
         self._length = ceil(_PART_LENGTH * CORRELATION_LENGTH / settings.cutoff * rate)
@@ -97,7 +97,7 @@ class RecursiveFriction:
         self._pending: deque[tuple[float, float, float]] = deque()
         self._estimates_lag = 'inertia' not in settings.terms
         k = len(columns_of(settings.terms, settings)) + self._estimates_lag
-        #: Information A and, in the last column, b: of all samples, and of the part in progress.
+        #: Information A and, in the last column, b: of all samples, and of the current block.
         self._known, self._part = np.zeros((k, k + 1)), np.zeros((k, k + 1))
         self._count = 0
         self._speed_sum = self._weight = 0.0
@@ -112,10 +112,10 @@ class RecursiveFriction:
         Parameters
         ----------
         time : float
-            Time [s]. After a gap, or a step back, the filter starts again.
+            Time [s]. After a gap or a backward step, the filter restarts.
         speed, force : float
-            Insertion speed [m/s] and force of the base on the needle [N], positive into the
-            tissue. A sample that is not finite is a gap.
+            Insertion velocity [m/s] and force of the base on the needle [N], positive into the
+            tissue. A sample that is not finite counts as a gap.
 
         """
         if not abs(speed) + abs(force) < inf:
@@ -136,12 +136,12 @@ class RecursiveFriction:
             self._select(now, 0.5 * (after - before) / self._period, filtered)
 
     def _drop_pending(self) -> None:
-        """Drop the samples that a change of regime affects, before and after it."""
+        """Discard samples before and after a change of regime."""
         self._pending.clear()
         self._since_change = 0
 
     def _select(self, speed: float, acceleration: float, force: float) -> None:
-        """Pass on samples in steady motion, once the motion has stayed steady after them."""
+        """Use samples in steady motion, after the motion has remained steady for the margin."""
         settings = self._settings
         regime = float(np.sign(speed)) if abs(speed) > settings.moving_speed else 0.0
         if self._estimates_lag and abs(acceleration) > settings.largest_acceleration:
@@ -174,20 +174,19 @@ class RecursiveFriction:
 
     def estimate(self) -> tuple[ParameterEstimate, ...]:
         """
-        Return the present parameters of the terms.
+        Return the current parameters of the terms.
 
         Returns
         -------
         tuple of ParameterEstimate
-            With the names of `identify_friction`; not determined until the motion determines
-            them.
+            Parameters named as by `identify_friction`; undetermined until the motion suffices.
 
         """
         mean_speed = self._speed_sum / max(self._weight, 1.0)
         return parameter_estimates(self._regression(), self._settings, mean_speed, self._period)
 
     def _regression(self) -> Regression:
-        """Solve; errors come from the scores of parts longer than the correlation of the noise."""
+        """Solve; standard errors use the scores of blocks longer than the noise correlation."""
         known, moment = self._known[:, :-1], self._known[:, -1]
         k = len(moment)
         norms = np.sqrt(np.diag(known))
@@ -222,14 +221,14 @@ class RecursiveFriction:
     def _scores(
         self, values: FloatArray, inverse: FloatArray
     ) -> tuple[FloatArray, FloatArray, float]:
-        """Return the covariance of the summed scores, and the parts behind each value and all."""
+        """Return score covariance, effective blocks per parameter, and their total number."""
         now = self._count
         parts = [*self._parts, (self._part, now)]
         ages = np.array([self._decay ** (now - count) for _, count in parts])
         weighed = ages[:, np.newaxis, np.newaxis] * np.array([part for part, _ in parts])
         information = weighed[:, :, :-1]
         scores = weighed[:, :, -1] - information @ values
-        # Share of each part in the variance of each parameter, for even noise.
+        # Contribution of each block to the variance of each parameter, for white noise.
         even = ages * np.einsum('ki,pij,jk->kp', inverse, information, inverse)
         total = even.sum(axis=1)
         behind = np.divide(

@@ -1,4 +1,4 @@
-"""Settings of the identification of friction."""
+"""Settings of friction identification."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ TERMS: Final = (
     'layers', 'cutting',
 )  # fmt: skip
 
-#: Name of the choice of an estimator by the data.
+#: Automatic choice of the estimator.
 AUTO: Final = 'auto'
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FrictionSettings:
     """
-    Settings of `identify_friction` and `RecursiveFriction`; each field says its meaning and unit.
+    Settings of `identify_friction` and `RecursiveFriction`; fields describe meaning and unit.
 
     Attributes
     ----------
     terms : tuple of str
         Terms of the friction force, of `TERMS`; the default is equation (15).
     estimator : str
-        ``auto`` or one of `ESTIMATORS`. ``weighted`` measures the noise in each stroke, ``total``
-        takes the noise of the speed into account; ``auto`` is ``total`` where that noise counts,
+        ``auto`` or one of `ESTIMATORS`. ``weighted`` estimates the noise in each stroke, ``total``
+        accounts for velocity noise; ``auto`` is ``total`` if velocity noise is relevant,
         otherwise ``ordinary``.
 
     Raises
@@ -57,7 +57,7 @@ class FrictionSettings:
     layers: tuple[float, ...] = field(
         default=(),
         metadata={
-            'description': 'inserted lengths at which layers begin, for the term layers [m]'
+            'description': 'insertion depths at which layers begin, for the term layers [m]'
         },
     )
     terms: tuple[str, ...] = field(
@@ -69,7 +69,7 @@ class FrictionSettings:
 
     @property
     def allows_total(self) -> bool:
-        """Whether the noise of the speed is that of one column, as the estimator total needs."""
+        """Whether velocity noise affects a single column, as the estimator total requires."""
         return 'viscous' in self.terms and 'direction' not in self.terms
 
     def __post_init__(self) -> None:
@@ -98,5 +98,5 @@ class FrictionSettings:
         if self.estimator == 'total' and not self.allows_total:
             raise ParameterError(
                 'the estimator total needs the term viscous and does not work with direction: '
-                'the noise of the speed is that of one column'
+                'velocity noise must affect a single column'
             )

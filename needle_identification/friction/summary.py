@@ -1,4 +1,4 @@
-"""Friction over several recordings, as in Table 1."""
+"""Summary of friction over several recordings, as in Table 1."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ class FrictionSummary(Named[Statistic]):
     Attributes
     ----------
     statistics : tuple of Statistic
-        One per parameter; ``summary[name]`` gives one.
+        One per parameter; ``summary[name]`` returns a statistic.
     estimates : tuple of FrictionEstimate
         One per recording.
     warnings : tuple of str
-        What all recordings together say and none of them alone, in words.
+        Warnings that only all recordings together support.
 
     """
 
@@ -55,8 +55,7 @@ def summarize(estimates: Sequence[FrictionEstimate]) -> FrictionSummary:
     Returns
     -------
     FrictionSummary
-        One `statistic` per parameter, then those of the breakaway force and the lag if any
-        recording has them.
+        One `statistic` per parameter, then breakaway force and lag if any recording has them.
 
     Raises
     ------
@@ -79,7 +78,7 @@ def summarize(estimates: Sequence[FrictionEstimate]) -> FrictionSummary:
 
 
 def _together(estimates: Sequence[FrictionEstimate]) -> Iterator[str]:
-    """Name terms that all recordings support together, by Fisher's test, though none alone."""
+    """Warn of a term that the recordings support only together, by Fisher's test."""
     tried: dict[str, list[Comparison]] = {}
     for estimate in estimates:
         for one in estimate.comparison:

@@ -1,7 +1,7 @@
 r"""
 Terms of the friction force and their regressors.
 
-Equation (15) of the paper has the first two; the others are optional:
+Equation (15) of the paper contains the first two terms; the others are optional:
 
 .. math::
 
@@ -10,8 +10,8 @@ Equation (15) of the paper has the first two; the others are optional:
    + (\mu_b - \mu_s) \operatorname{sgn}(\dot s) \, e^{-(\dot s / v_s)^2}
    + \operatorname{sgn}(\dot s) \sum_i c_i \ell_i(s) + f_c \, [\text{the tip is in new tissue}]
 
-with :math:`\ell_i` the length of the needle in layer i, and the whole inserted length for the term
-``length``. To add a friction law, add a term to `TERMS` and its columns here.
+with :math:`\ell_i` the length of the needle in layer i; for the term ``length``, the insertion
+depth. To add a friction law, add a term to `TERMS` and its columns here.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ class Motion(NamedTuple):
     Attributes
     ----------
     speed, acceleration : ndarray
-        Insertion speed [m/s] and acceleration [m/s^2], positive into the tissue.
+        Insertion velocity [m/s] and acceleration [m/s^2], positive into the tissue.
     time : ndarray
-        Time since the recording began [s].
+        Time since the start of the recording [s].
     depth : ndarray
-        Inserted length [m].
+        Insertion depth [m].
     fresh : ndarray of bool
-        Whether the needle is as deep as it ever was.
+        Whether the needle is at its largest insertion depth so far.
 
     """
 
@@ -53,17 +53,7 @@ class Motion(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """
-    A regressor and its coefficient.
-
-    Attributes
-    ----------
-    name, symbol, unit : str
-        Coefficient: name, symbol in text and unit.
-    of : callable
-        Regressor from the motion and the settings, shape (n,).
-
-    """
+    """Regressor ``of`` the motion and the settings, shape (n,), and its coefficient."""
 
     name: str
     symbol: str
@@ -75,17 +65,17 @@ _COLUMNS: Final[Mapping[str, tuple[Column, ...]]] = {
     'coulomb': (Column('coulomb_friction', 'mu_s', 'N', lambda x, _: np.sign(x.speed)),),
     'viscous': (Column('viscous_friction', 'mu_v', 'N s/m', lambda x, _: x.speed),),
     'offset': (Column('offset', 'b', 'N', lambda x, _: np.ones_like(x.speed)),),
-    # Of the sensor, or of the tissue: since the recording began.
+    # Drift of sensor or tissue since the start of the recording.
     'drift': (Column('force_drift', 'c', 'N/s', lambda x, _: x.time),),
     'inertia': (Column('moving_mass', 'm', 'kg', lambda x, _: x.acceleration),),
-    # What Coulomb and viscous friction are more on withdrawal than on insertion.
+    # Additional Coulomb and viscous friction on withdrawal.
     'direction': (
         Column(
             'withdrawal_coulomb', 'd mu_s', 'N', lambda x, _: np.minimum(np.sign(x.speed), 0)
         ),
         Column('withdrawal_viscous', 'd mu_v', 'N s/m', lambda x, _: np.minimum(x.speed, 0.0)),
     ),
-    # What the breakaway friction is more than mu_s.
+    # Excess of the breakaway friction over mu_s.
     'stribeck': (
         Column(
             'stribeck_friction',
@@ -107,7 +97,7 @@ _COLUMNS: Final[Mapping[str, tuple[Column, ...]]] = {
 
 
 def _layers(boundaries: Sequence[float]) -> list[Column]:
-    """Return a column for each layer: the last one ends nowhere."""
+    """Return a column per layer; the last layer is unbounded."""
     ends = [*boundaries[1:], inf]
     return [
         Column(f'layer_{k + 1}_friction', f'c_{k + 1}', 'N/m', partial(_in_layer, low, end - low))
@@ -121,22 +111,7 @@ def _in_layer(begin: float, thickness: float, motion: Motion, _: FrictionSetting
 
 
 def columns_of(terms: Sequence[str], settings: FrictionSettings) -> list[Column]:
-    """
-    Return the columns of terms.
-
-    Parameters
-    ----------
-    terms : sequence of str
-        Terms, of `TERMS`.
-    settings : FrictionSettings
-        Constants of the terms.
-
-    Returns
-    -------
-    list of Column
-        Their columns, in order.
-
-    """
+    """Return the columns of terms, in order."""
     return [
         column
         for term in terms
@@ -145,22 +120,5 @@ def columns_of(terms: Sequence[str], settings: FrictionSettings) -> list[Column]
 
 
 def regressors(motion: Motion, terms: Sequence[str], settings: FrictionSettings) -> FloatArray:
-    """
-    Return the regressors of terms.
-
-    Parameters
-    ----------
-    motion : Motion
-        Motion of the needle.
-    terms : sequence of str
-        Terms, of `TERMS`.
-    settings : FrictionSettings
-        Constants of the terms.
-
-    Returns
-    -------
-    ndarray, shape (n, k)
-        One column per coefficient, as in `columns_of`.
-
-    """
+    """Return the regressors of terms, shape (n, k), with the columns of `columns_of`."""
     return np.column_stack([c.of(motion, settings) for c in columns_of(terms, settings)])

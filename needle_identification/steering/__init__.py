@@ -1,1 +1,1 @@
-"""How a needle bends in tissue, from its depth, its guide, its roll and its tip."""
+"""Steering identification: needle bending from depth, guide, roll and tip positions."""

@@ -1,4 +1,4 @@
-"""Result of a fit of steered insertions."""
+"""Steering estimate: constants of needle and medium from steered insertions."""
 
 from __future__ import annotations
 
@@ -27,16 +27,16 @@ CONSTANTS: Mapping[str, tuple[str, str]] = {
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class MediumEstimate(Named[ParameterEstimate]):
     """
-    Constants of a needle in one medium.
+    Constants of the needle in a medium.
 
     Attributes
     ----------
     medium : str
         Name of the medium.
     parameters : tuple of ParameterEstimate
-        Bending length, skin, and what makes the needle drift.
+        Bending length, skin, and drift constants.
     rms : float
-        What the fit leaves, per axis [m].
+        Root mean square of the residuals, per axis [m].
     samples, recordings : int
         Number of samples and of recordings.
 
@@ -55,25 +55,25 @@ class MediumEstimate(Named[ParameterEstimate]):
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class SteeringEstimate:
     """
-    Result of a fit of several recordings.
+    Joint fit of several recordings.
 
     Attributes
     ----------
     free_length : ParameterEstimate
-        Free length, which they share.
+        Free length, common to all recordings.
     media : tuple of MediumEstimate
-        Constants by medium; ``estimate[name]`` is that of one.
+        Constants by medium; ``estimate[name]`` returns a medium.
     terms : tuple of str
         Terms of the fit.
     order : str
-        How guide and needle move between samples.
+        Order of guide motion and insertion between samples.
     alternatives : mapping of tuple of str to float
-        What fits with these terms leave, per axis [m].
+        Root mean square of the residuals by set of terms, per axis [m].
     residuals : tuple of ndarray
-        Measured minus fitted positions of the tip, of each recording, where the tip is
-        known, shape (samples, 2) [m].
+        Measured minus fitted tip positions of each recording, without missing measurements,
+        shape (samples, 2) [m].
     warnings : tuple of str
-        What to know before using the values.
+        Warnings about the validity of the values.
 
     """
 
@@ -93,5 +93,5 @@ class SteeringEstimate:
 
     @property
     def rms(self) -> float:
-        """What the fit leaves, per axis [m]."""
+        """Root mean square of the residuals, per axis [m]."""
         return float(np.sqrt(np.mean(np.concatenate(self.residuals) ** 2)))

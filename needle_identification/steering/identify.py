@@ -1,20 +1,20 @@
 r"""
-The bending of a needle in tissue, from where its guide went and where its tip did.
+Identify the bending of a needle in tissue from guide and tip positions.
 
-With the free length L0, and for each medium the bending length lambda and the skin, the tip is
-linear in everything else: in the known motion of the guide, in an offset of each recording, and in
-what makes a needle drift, which are these terms:
+For a given free length L0, and bending length lambda and skin of each medium, the tip position is
+linear in the motion of the guide, an offset of each recording, and the constants of these drift
+terms:
 
 ============  =================================================================================
 ``tilt``      tilt of the guide, in x and z
-``frame``     turn between the frames of robot and tracker: the tip seems to drift with its depth
+``frame``     rotation between robot and tracker frames: an apparent drift with depth
 ``bevel``     lateral load of the bevel, as the curvature of a long needle, along z and x at zero
               roll
 ============  =================================================================================
 
-The linear ones are solved for at each step of a search over the lengths [Golub2003]_. Intervals of
-the lengths end where all the other constants together cannot make up for another value: with few
-samples they are far from symmetric.
+The lengths are estimated by variable projection: the linear constants are solved for at each step
+[Golub2003]_. Intervals of the lengths are profile likelihood intervals, which are far from
+symmetric with few samples.
 
 References
 ----------
@@ -41,30 +41,30 @@ from needle_ros.errors import ParameterError
 import numpy as np
 from scipy.special import stdtrit
 
-#: Recordings of one medium from which on their spread tells the errors.
+#: Smallest number of recordings of a medium whose spread determines the errors.
 _SEVERAL: Final = 8
 
-#: A fit that leaves more than the best one by less than this part is as good.
+#: Relative difference of residuals below which fits are equivalent.
 _AS_GOOD: Final = 0.02
 
-#: Constants of a medium that are not linear.
+#: Number of nonlinear constants of a medium.
 _LENGTHS: Final = 2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SteeringSettings:
     """
-    How steered insertions are fitted.
+    Settings of the steering identification.
 
     Attributes
     ----------
     terms : tuple of str or None
-        What makes the needle drift, of `TERMS`; None for the one that explains the most.
+        Drift terms, of `TERMS`; None selects the term with the smallest residual.
     order : str or None
         Whether guide and needle move ``together`` between samples, or the ``guide first``; None
-        for what explains more.
+        selects the order with the smaller residual.
     free_length : float or None
-        Free length if it is known [m].
+        Known free length [m]; None to estimate it.
 
     Raises
     ------
@@ -96,22 +96,22 @@ def identify_steering(
     progress: Callable[[], object] | None = None,
 ) -> SteeringEstimate:
     """
-    Fit recorded insertions together.
+    Identify free length, bending length, skin and drift from recorded insertions.
 
     Parameters
     ----------
     recordings : sequence of SteeringRecording
-        Recordings. All share the free length; those of one medium the bending length, the skin
-        and what makes the needle drift; each has an offset of its own.
+        Recordings. All share the free length; recordings of the same medium share bending
+        length, skin and drift constants; each recording has a separate offset.
     settings : SteeringSettings, optional
-        How to fit them.
+        Drift terms, order and free length.
     progress : callable, optional
         Called after each fit.
 
     Returns
     -------
     SteeringEstimate
-        Constants with intervals, and what the recordings cannot tell apart.
+        Constants with intervals, and warnings about equivalent drift terms.
 
     Raises
     ------
@@ -129,7 +129,7 @@ def identify_steering(
         for order in orders:
             search = Search(recordings, terms, order, settings.free_length)
             _check(search)
-            # What makes it drift hardly changes how it bends.
+            # The lengths hardly depend on the drift terms.
             fits.append(_Fit(search, *search.best(fits[0].x if fits else None)))
             if progress is not None:
                 progress()
@@ -144,7 +144,7 @@ def identify_steering(
 
 
 class _Fit(NamedTuple):
-    """A search, the best variables, and what they leave."""
+    """Search, best variables, and cost."""
 
     search: Search
     x: FloatArray
@@ -154,7 +154,7 @@ class _Fit(NamedTuple):
 def _check(search: Search) -> None:
     for one in search.recordings:
         if not one.samples:
-            raise IdentificationError(f'{one.name}: no sample of the tip counts')
+            raise IdentificationError(f'{one.name}: no valid sample of the tip')
     for medium, members in search.members.items():
         samples = 2 * sum(search.recordings[k].samples for k in members)
         unknown = _LENGTHS + 1 + 2 * len(members) + sum(len(TERMS[term]) for term in search.terms)
@@ -167,20 +167,20 @@ def _check(search: Search) -> None:
 
 class _Errors(NamedTuple):
     """
-    Errors of all constants: those of the search, then the linear ones of each medium.
+    Errors of all constants: search variables, then the linear constants of each medium.
 
     Attributes
     ----------
     errors : ndarray, shape (k,)
         Standard errors.
     units : ndarray, shape (k,)
-        What they would be if each sample had a variance of one.
+        Standard errors for unit variance of the samples.
     freedom : list of int
         Degrees of freedom of each medium.
     values : list of ndarray
         Linear constants of each medium.
     left : list of ndarray
-        What is left of the samples of each medium [m].
+        Residuals of each medium [m].
 
     """
 
@@ -192,7 +192,7 @@ class _Errors(NamedTuple):
 
 
 def _errors(search: Search, x: FloatArray) -> _Errors:
-    """Return the errors of the fit; recordings are independent, and their noise may be even."""
+    """Return the errors of the fit, with independent recordings or white noise."""
     parts = search.design(x)
     slopes = search.slopes(x)
     total = len(x) + sum(a.shape[1] for a, _ in parts)
@@ -210,7 +210,7 @@ def _errors(search: Search, x: FloatArray) -> _Errors:
         free = len(rest) - len(own) - _LENGTHS
         even += squares * float(rest @ rest) / free
         if len(members) >= _SEVERAL:
-            # What differs from insertion to insertion is not of one sample alone.
+            # Differences between insertions are correlated within each insertion.
             starts = np.cumsum([0, *(2 * search.recordings[k].samples for k in members[:-1])])
             scores = np.add.reduceat(jacobian * rest[:, np.newaxis], starts, axis=0)
             middle += scores.T @ scores * len(scores) / (len(scores) - 1)
@@ -225,20 +225,20 @@ def _errors(search: Search, x: FloatArray) -> _Errors:
     scale[scale == 0.0] = 1.0
     inverse = np.linalg.pinv(normal / np.outer(scale, scale), rcond=1e-13, hermitian=True)
     inverse = inverse / np.outer(scale, scale)
-    # The spread of a few recordings may be small by chance.
+    # The spread of few recordings may be small by chance.
     both = [np.diag(inverse @ one @ inverse) for one in (even, middle)]
     errors = np.asarray(np.sqrt(np.maximum(*both)))
     return _Errors(errors, np.sqrt(np.diag(inverse)), freedom, values, left)
 
 
 def _estimate(fit: _Fit, alternatives: Mapping[tuple[str, ...], float]) -> SteeringEstimate:
-    """Add errors, and put the result in words."""
+    """Compute errors and intervals, and assemble the result."""
     search, x, cost = fit
     e = _errors(search, x)
     quantiles = stdtrit(np.array(e.freedom), 0.975).tolist()
 
     def length(name: str, at: int, quantile: float) -> ParameterEstimate:
-        """Return a constant of the search, whose interval need not be symmetric."""
+        """Return a search variable as a constant with a profile interval."""
         width = quantile * float(e.errors[at])
         rise = quantile * float(e.errors[at] / e.units[at]) if e.units[at] > 0.0 else inf
         if not isfinite(rise):
@@ -247,7 +247,7 @@ def _estimate(fit: _Fit, alternatives: Mapping[tuple[str, ...], float]) -> Steer
         value, error = float(x[at]), float(e.errors[at])
         if name == 'skin':
             low, value, high = (SKIN_SCALE * one for one in (low, value, high))
-            # Without any skin it ends at zero.
+            # The lower bound of the skin is zero.
             return _constant(name, value, SKIN_SCALE * error, (max(0.0, low), high))
         if not (isfinite(low) and isfinite(high)):
             return _constant(name)
@@ -292,7 +292,7 @@ def _estimate(fit: _Fit, alternatives: Mapping[tuple[str, ...], float]) -> Steer
 
 
 def _residuals(search: Search, left: Sequence[FloatArray]) -> list[FloatArray]:
-    """Return what is left of each recording, in the order in which they came."""
+    """Return the residuals of each recording, in input order."""
     found = {}
     for members, rest in zip(search.members.values(), left, strict=True):
         begin = 0
@@ -309,7 +309,7 @@ def _constant(
     error: float = inf,
     interval: tuple[float, float] = (-inf, inf),
 ) -> ParameterEstimate:
-    """Return a constant; one whose interval has no end is not determined."""
+    """Return a constant; it is undetermined if its interval is unbounded."""
     symbol, unit = CONSTANTS[name]
     if value is None or not all(map(isfinite, interval)):
         return ParameterEstimate(name=name, symbol=symbol, unit=unit)
@@ -325,13 +325,13 @@ def _constant(
 
 
 def _warnings(search: Search, alternatives: Mapping[tuple[str, ...], float]) -> Iterator[str]:
-    """Say what the recordings cannot tell apart, and what would."""
+    """Warn of drift terms that the recordings cannot distinguish."""
     best = min(alternatives.values())
     equal = [terms for terms, rms in alternatives.items() if rms <= (1.0 + _AS_GOOD) * best]
     if len(equal) > 1:
         each = ', '.join(f'{terms[0]} {1e3 * alternatives[terms]:.3f} mm' for terms in equal)
         yield (
-            f'these explain the drift equally well (rms: {each}); all of it is taken for '
-            f'{search.terms[0]}. A motion of the guide in air would tell the frame, and a turn of '
-            'the needle half way in the bevel'
+            f'these explain the drift equally well (rms: {each}); all of it is attributed to '
+            f'{search.terms[0]}. A motion of the guide in air identifies the frame, a rotation of '
+            'the needle at half the depth identifies the bevel'
         )

@@ -1,4 +1,4 @@
-"""Steered insertions from bags, and from tables: `tables`."""
+"""Read steered insertions from bags, and from tables by `tables`."""
 
 from __future__ import annotations
 
@@ -44,11 +44,11 @@ _JOINTS: Final = {'depth': INSERTION, 'guide_x': GUIDE_X, 'guide_z': GUIDE_Z, 'r
 _TIPS: Final = {'tip_x': 'x', 'tip_z': 'z'}
 _TILTS: Final = (TILT_X, TILT_Z)
 
-#: A tilt that changes by more has moved [rad].
+#: Largest change of a constant tilt [rad].
 _MOVED: Final = 1e-4
 
-#: Readings of the tip that are kept: of more, neighbors are averaged. A path of a hundred
-#: millimeters then has one each fifth of a millimeter.
+#: Largest number of tip samples; denser samples are averaged. The spacing over a path of 100 mm
+#: is then 0.2 mm.
 _MOST: Final = 500
 
 
@@ -62,7 +62,7 @@ def read_steering_recording(
     columns: Mapping[str, str] | None = None,
 ) -> SteeringRecording:
     """
-    Read an insertion in which the guide moved, or the needle was turned.
+    Read an insertion with guide motion or needle rotation.
 
     Parameters
     ----------
@@ -71,21 +71,21 @@ def read_steering_recording(
     medium : str
         Name of the tissue.
     tip_topic : str, optional
-        Topic of the tip, PointStamped or PoseStamped; default the only one, or else that with the
-        last name tip_deflection.
+        Topic of the tip, PointStamped or PoseStamped; default the only topic of these types, or
+        the topic with the last name tip_deflection.
     motion_topic : str, optional
-        Topic of the joints, a JointState; default the only one, or that with the last name
-        joint_states.
+        Topic of the joints, a JointState; default the only topic of this type, or the topic with
+        the last name joint_states.
     time : str
         Stamps to use, one of `TIMES`.
     columns : mapping of str to str, optional
-        By role, of `STEERING_ROLES`: columns of a table, see `tables`; of a bag the joints of
-        depth, guide and roll, and the axes x, y or z of the tip, each perhaps after ``-``.
+        By role, of `STEERING_ROLES`: columns of a table, see `tables`; for a bag, the joints of
+        depth, guide and roll, and the axes x, y or z of the tip, optionally with a prefix ``-``.
 
     Returns
     -------
     SteeringRecording
-        The insertion; its ``losses`` say what was left out or repaired.
+        The insertion; its ``losses`` list discarded and corrected data.
 
     Raises
     ------
@@ -110,7 +110,7 @@ def read_steering_recording(
     if missing := {name for _, name in joints.values()} - seen:
         raise RecordingError(
             f'{path}: {motion.name} has no joint {" nor ".join(sorted(missing))}, it has '
-            f'{", ".join(sorted(seen)) or "none"}: say --columns guide_x=JOINT,...'
+            f'{", ".join(sorted(seen)) or "none"}: use --columns guide_x=JOINT,...'
         )
     axes = {role: signed_axis(columns.get(role, axis), role) for role, axis in _TIPS.items()}
     tilts = [name for name in _TILTS if name in seen]
@@ -123,7 +123,7 @@ def read_steering_recording(
     losses = list(bag.losses)
     for name, column in zip(tilts, moved[:, len(joints) :].T, strict=True):
         if (change := float(np.ptp(column))) > _MOVED:
-            losses.append(f'{name} moves by {change:.3g} rad, which is not taken into account')
+            losses.append(f'{name} moves by {change:.3g} rad, which is ignored')
     both = np.hstack([tips, moved[:, : len(joints)]])
     signs = [sign for sign, _ in (*axes.values(), *joints.values())]
     values = dict(zip([*axes, *joints], (both * signs).T, strict=True))
@@ -131,12 +131,12 @@ def read_steering_recording(
 
 
 def _thinned(values: Mapping[str, FloatArray], losses: list[str]) -> dict[str, FloatArray]:
-    """Average neighbors where there are more samples than a fit needs."""
+    """Average neighboring samples down to the largest number for a fit."""
     count = len(values['depth'])
     group = ceil(count / _MOST)
     if group == 1:
         return dict(values)
-    losses.append(f'of {count} readings of the tip each {group} are averaged')
+    losses.append(f'{count} samples of the tip averaged in groups of {group}')
     whole = count - count % group
     return {
         role: column[:whole].reshape(-1, group).mean(axis=1) for role, column in values.items()

@@ -1,4 +1,4 @@
-"""Recordings of steered insertions."""
+"""Recording of a steered insertion."""
 
 from __future__ import annotations
 
@@ -12,26 +12,26 @@ from needle_identification.errors import RecordingError
 from needle_ros.errors import ShapeError, shown
 import numpy as np
 
-#: Equal readings in a row of a tip that goes deeper from which on its sensor has frozen.
+#: Number of equal consecutive tip measurements that indicate a frozen sensor.
 _FROZEN: Final = 3
 
-#: Depth that the tip must go in that time [m]: more than the noise of any robot.
+#: Change of depth over these measurements [m]; above the position noise of robots.
 _GONE: Final = 5e-4
 
-#: A first depth beyond this is that of another origin than the skin [m].
+#: Largest first depth that is measured from the skin [m].
 _AT_THE_SKIN: Final = 0.03
 
-#: A robot at rest on the skin may be so far above it [m].
+#: Largest height above the skin of a robot at rest on it [m].
 _JITTER: Final = 1e-3
 
-#: A tip this much further aside than the guide and half of its depth is not that of this needle.
+#: Largest plausible lateral tip position, in addition to the guide and half the depth [m].
 _ASIDE: Final = 0.03
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
 class SteeringRecording:
     """
-    An insertion: what moved the needle, and where its tip went.
+    Recorded insertion: depth, guide, roll and tip position.
 
     Attributes
     ----------
@@ -40,15 +40,15 @@ class SteeringRecording:
     medium : str
         Name of the tissue; recordings in one tissue share its constants.
     depth : ndarray, shape (n,)
-        Depth of the tip below the skin [m]; the first one has been reached straight.
+        Depth of the tip below the skin [m]; the path up to the first depth is straight.
     guide : ndarray, shape (n, 2)
-        Position of the guide in x and z [m], from any origin.
+        Position of the guide in x and z [m], with any origin.
     roll : ndarray, shape (n,)
         Roll of the base, right-handed about y [rad].
     tip : ndarray, shape (n, 2)
-        Position of the tip in x and z [m], from any origin; NaN where it is not known.
+        Position of the tip in x and z [m], with any origin; NaN if missing.
     losses : tuple of str
-        What was left out or repaired.
+        Discarded and corrected data.
 
     Raises
     ------
@@ -89,39 +89,27 @@ class SteeringRecording:
 
     @property
     def known(self) -> BoolArray:
-        """Where the tip is known, shape (n,)."""
+        """Whether a tip position is present, shape (n,)."""
         return np.asarray(np.isfinite(self.tip).all(axis=1))
 
     @property
     def samples(self) -> int:
-        """Number of samples where the tip is known."""
+        """Number of samples with a tip position."""
         return int(np.count_nonzero(self.known))
 
 
 def credible(depth: FloatArray, guide: FloatArray, tip: FloatArray) -> tuple[BoolArray, list[str]]:
     """
-    Find the samples of a tip whose sensor neither froze nor says what cannot be.
+    Return a mask of plausible tip samples, shape (n,), and messages about the others.
 
-    Parameters
-    ----------
-    depth : ndarray, shape (n,)
-        Depth of the tip by the robot [m].
-    guide, tip : ndarray, shape (n, 2)
-        Positions in x and z, each from its value at the start [m]; NaN where there is none.
-
-    Returns
-    -------
-    good : ndarray of bool, shape (n,)
-        Samples that count.
-    losses : list of str
-        What does not, and why.
-
+    ``depth`` (n,) is from the robot; ``guide`` and ``tip`` (n, 2) are x and z [m] relative to
+    their start, NaN if missing. Frozen and implausible measurements are rejected.
     """
     there = np.isfinite(tip).all(axis=1)
     same = np.zeros(len(depth), dtype=np.bool_)
     same[1:] = (tip[1:] == tip[:-1]).all(axis=1)
     frozen = np.zeros(len(depth), dtype=np.bool_)
-    # Stretches of equal readings; the first of them was still one.
+    # Runs of equal values; the first value of a run is valid.
     starts = np.flatnonzero(~same)
     for begin, end in zip(starts, [*starts[1:], len(depth)], strict=True):
         if end - begin >= _FROZEN and np.ptp(depth[begin:end]) > _GONE:
@@ -131,9 +119,9 @@ def credible(depth: FloatArray, guide: FloatArray, tip: FloatArray) -> tuple[Boo
     losses = [
         f'{count} samples of the tip {why}, left out'
         for count, why in (
-            (np.count_nonzero(frozen), 'that repeat one while the needle goes on (frozen sensor)'),
-            (np.count_nonzero(wild), 'where this needle cannot be'),
-            (np.count_nonzero(~there), 'that are no numbers'),
+            (np.count_nonzero(frozen), 'repeated during the insertion (frozen sensor)'),
+            (np.count_nonzero(wild), 'at implausible positions'),
+            (np.count_nonzero(~there), 'that are not numbers'),
         )
         if count
     ]
@@ -144,39 +132,20 @@ def recorded_insertion(
     path: Path, medium: str, values: Mapping[str, FloatArray], losses: Sequence[str]
 ) -> SteeringRecording:
     """
-    Make an insertion of what a file says, and leave out what cannot be.
+    Create a recording from values of a file, without implausible samples.
 
-    Parameters
-    ----------
-    path : Path
-        The file.
-    medium : str
-        Name of the tissue.
-    values : mapping of str to ndarray, shape (n,)
-        ``depth``, ``guide_x``, ``guide_z``, ``tip_x`` and ``tip_z`` [m], and perhaps ``roll``
-        [rad]; finite but for the tip.
-    losses : sequence of str
-        What was left out or repaired before.
-
-    Returns
-    -------
-    SteeringRecording
-        The insertion.
-
-    Raises
-    ------
-    RecordingError
-        If the depth counts out of the tissue, or the tip is never known.
-
+    ``values`` has shape (n,) each: ``depth``, ``guide_x``, ``guide_z``, ``tip_x`` and ``tip_z``
+    [m], optionally ``roll`` [rad]; finite except for the tip. Raises `RecordingError` if the depth
+    is positive out of the tissue, or no tip position is present.
     """
     losses, depth = list(losses), values['depth']
     if not 0.0 <= depth[0] <= _AT_THE_SKIN or depth.min() < 0.0:
-        losses.append(f'depths from the first, {1e3 * depth[0]:.4g} mm, which is at the skin')
+        losses.append(f'depths relative to the first depth, {1e3 * depth[0]:.4g} mm, at the skin')
         depth = depth - depth[0]
     if depth.min() < -_JITTER:
         raise RecordingError(
             f'{path}: depth goes from the first row to {1e3 * depth.min():.4g} mm, out of the '
-            f'skin: if it counts out of the tissue, say --columns depth=-NAME'
+            f'skin: if it is positive out of the tissue, use --columns depth=-NAME'
         )
     guide = np.column_stack([values['guide_x'], values['guide_z']])
     tip = np.column_stack([values['tip_x'], values['tip_z']])

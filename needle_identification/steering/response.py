@@ -1,4 +1,4 @@
-"""What the tip of a steered needle does along the way of a recording, by cause."""
+"""Simulate the tip response of a recorded insertion to guide, tilt and bevel."""
 
 from __future__ import annotations
 
@@ -11,24 +11,24 @@ from needle_dynamics.steering.needle import empty_cut
 from needle_identification.steering.recording import SteeringRecording
 import numpy as np
 
-#: How guide and depth change between samples.
+#: Order of guide motion and insertion between samples.
 ORDERS: Final = ('together', 'guide first')
 
-#: What makes a needle drift, each with its constants.
+#: Drift terms and their constants.
 TERMS: Final = {
     'tilt': ('tilt_x', 'tilt_z'),
     'frame': ('frame_x', 'frame_z', 'frame_y'),
     'bevel': ('curvature_z', 'curvature_x'),
 }
 
-#: Longest element [m]: good to a micrometer, and the same for all bending lengths, so that the
-#: responses change smoothly with them.
+#: Longest element [m]: accurate to a micrometer, and equal for all bending lengths, so that the
+#: responses are smooth functions of them.
 _ELEMENT: Final = 1.5e-3
 
 
 class Responses(NamedTuple):
     """
-    Motions of the tip at the samples, each for one cause.
+    Tip motion at the samples by cause.
 
     Attributes
     ----------
@@ -37,7 +37,7 @@ class Responses(NamedTuple):
     tilt : ndarray, shape (n,)
         Per tilt of the guide, in its plane [m].
     bevel : ndarray, shape (n, 2)
-        In x and z, by a bevel that turns a long needle with 1/m [m^2].
+        In x and z, per curvature of a long needle by the bevel [m^2].
 
     """
 
@@ -50,26 +50,10 @@ def responses(
     recording: SteeringRecording, free: float, length: float, skin: float, order: str
 ) -> Responses:
     """
-    Simulate a recorded insertion, once for each cause.
+    Simulate a recorded insertion for each cause.
 
-    Parameters
-    ----------
-    recording : SteeringRecording
-        The recording.
-    free : float
-        Free length between guide and skin [m].
-    length : float
-        Bending length lambda [m].
-    skin : float
-        Stiffness of the skin over that of the tissue per length [m].
-    order : str
-        One of `ORDERS`.
-
-    Returns
-    -------
-    Responses
-        Motions of the tip.
-
+    ``free`` and ``length`` are the free and the bending length [m]; ``skin`` is the stiffness of
+    the skin over tissue stiffness per length [m]; ``order`` is from `ORDERS`.
     """
     depth, guide = recording.depth, recording.guide - recording.guide[0]
     poses = np.zeros((3, len(depth), 6))
@@ -78,12 +62,12 @@ def responses(
     poses[1, :, 4] = 1.0
     poses[2, :, 5] = recording.roll
     if order == 'guide first':
-        # At each depth but the last one the guide moves on before the needle does.
+        # The guide moves to its next position before the needle, except at the last depth.
         poses = np.repeat(poses, 2, axis=1)[:, 1:]
         poses[:, 1::2, 0] = depth[:-1]
-    # All of it depends on lengths alone: of unit bending stiffness.
+    # The response depends only on lengths: unit bending stiffness.
     reach = float(depth.max()) + free
-    # Nodes where the guide changes its way, if the steps are even.
+    # Nodes at the depths of guide motions, for equal steps.
     steps = np.diff(depth)
     step = float(np.median(steps[steps > _ELEMENT])) if (steps > _ELEMENT).any() else _ELEMENT
     element = step / ceil(step / _ELEMENT - 1e-6)
@@ -110,31 +94,14 @@ def responses(
 
 
 def drift(term: str, recording: SteeringRecording, r: Responses) -> FloatArray:
-    """
-    Return what the tip does per unit of the constants of a term.
-
-    Parameters
-    ----------
-    term : str
-        One of `TERMS`.
-    recording : SteeringRecording
-        The recording.
-    r : Responses
-        Its responses.
-
-    Returns
-    -------
-    ndarray, shape (2 n, k)
-        Motions of the tip in x, then in z, by the constants of the term [m per unit].
-
-    """
+    """Return tip motion in x, then z, per unit of the constants of a term, shape (2 n, k)."""
     zero, depth = np.zeros(len(r.tilt)), recording.depth
     (guide_x, guide_z), (bevel_x, bevel_z) = r.guide.T, r.bevel.T
     pairs = {
         'tilt': [(r.tilt, zero), (zero, r.tilt)],
-        # Turns about z and x let the tip seem to drift with depth; one about y mixes x and z.
+        # Rotations about z and x appear as a drift with depth; a rotation about y mixes x and z.
         'frame': [(depth, zero), (zero, depth), (guide_z, -guide_x)],
-        # As it pushes along z at zero roll, and a quarter of a turn further on.
+        # Load along z at zero roll, and rotated by a quarter turn.
         'bevel': [(bevel_x, bevel_z), (bevel_z, -bevel_x)],
     }[term]
     return np.array([np.concatenate(pair) for pair in pairs]).T

@@ -1,4 +1,4 @@
-"""An identified needle that bends as a ROS parameter file."""
+"""ROS parameter file of an identified steered needle."""
 
 from __future__ import annotations
 
@@ -12,35 +12,20 @@ from needle_identification.estimation.formatting import UNKNOWN
 from needle_identification.steering.estimate import SteeringEstimate
 import yaml
 
-#: Digits that are written: more than any experiment gives.
+#: Written digits, above the accuracy of experiments.
 _DIGITS: Final = '.7g'
 
 
 def steering_yaml(found: SteeringEstimate) -> str:
     """
-    Return a ROS parameter file for a plant that is steered, its controller and what aims it.
+    Return a ROS parameter file for plant, controller and steering node, errors as comments.
 
-    Motion tells lengths, not forces: the bending stiffness is that of the default needle.
-
-    Parameters
-    ----------
-    found : SteeringEstimate
-        Result of insertions into one medium.
-
-    Returns
-    -------
-    str
-        YAML, with the errors in comments.
-
-    Raises
-    ------
-    IdentificationError
-        If there are several media, or the bending length is not determined.
-
+    The data determine lengths, not forces: the bending stiffness is the default. Raises
+    `IdentificationError` for several media or an undetermined bending length.
     """
     if len(found.media) > 1:
         raise IdentificationError(
-            'a parameter file is of one medium, these are '
+            'a parameter file describes a single medium, got '
             f'{", ".join(medium.medium for medium in found.media)}'
         )
     (medium,) = found.media
@@ -49,12 +34,12 @@ def steering_yaml(found: SteeringEstimate) -> str:
         raise IdentificationError('the data do not determine the bending length')
     stiffness = NeedleParameters.preset(DEFAULT_PRESET).bending_stiffness
     tissue = tissue_of(stiffness, length.value)
-    lines = ['# A needle that bends, identified by needle_identification.']
+    lines = ['# Steered needle, identified by needle_identification.']
     for one in (found.free_length, *medium.parameters):
         unit = '' if one.unit == '1' else f' {one.unit}'
         value = f'{one.value:.6g}{unit}, SE {one.error:.2g}' if one.determined else UNKNOWN
         lines.append(f'# {one.symbol} ({one.name}) = {value}')
-    lines.append(f'# E I = {stiffness:g} N m^2 is that of the preset {DEFAULT_PRESET}')
+    lines.append(f'# E I = {stiffness:g} N m^2 of the preset {DEFAULT_PRESET}')
     lengths: dict[str, object] = {}
     if found.free_length.determined and isfinite(found.free_length.value):
         lengths['steering.free_length'] = _short(found.free_length.value)

@@ -1,4 +1,4 @@
-"""The lengths that explain recorded insertions best, and how far they may be wrong."""
+"""Nonlinear least squares search for the lengths, and their profile intervals."""
 
 from __future__ import annotations
 
@@ -18,51 +18,33 @@ FREE: Final = (1e-3, 0.3)
 LENGTH: Final = (4e-3, 0.5)
 SKIN: Final = (0.0, 0.5)
 
-#: Where the search starts: bending lengths, free length [m] and scaled skin.
+#: Start values of the search: bending lengths, free length [m] and scaled skin.
 _STARTS: Final = (0.018, 0.035, 0.07)
 _START_FREE, _START_SKIN = 0.03, 0.1
 
 #: The scale of the skin in the search [m].
 SKIN_SCALE: Final = 0.02
 
-#: What is left is searched in this unit [m]: of the size of one, as the search expects.
+#: Unit of the residuals in the search [m], for values of order 1.
 _UNIT: Final = 1e-4
 
-#: Step of the differences: the responses are exact to rounding [search variables].
+#: Finite difference step [search variables]; the responses are exact to rounding.
 _STEP: Final = 1e-5
 
-#: Trials for an end of an interval, and how near to it is there.
+#: Largest number of iterations for an end of an interval, and relative tolerance.
 _TRIALS, _NEAR = 12, 0.01
 
-#: Media at lengths that are remembered.
+#: Size of the cache of media at given lengths.
 _KEPT: Final = 256
 
 
 class Search:
     """
-    Recorded insertions as a function of their lengths: all else is linear, and solved for.
+    Tip residuals of recorded insertions as a function of the lengths (variable projection).
 
-    The variables are the logarithm of the free length, unless it is known, and for each medium the
-    logarithm of the bending length, and the skin over its scale.
-
-    Parameters
-    ----------
-    recordings : sequence of SteeringRecording
-        Recordings.
-    terms : tuple of str
-        What makes the needle drift.
-    order : str
-        One of `ORDERS`.
-    free : float or None
-        Free length if it is known [m].
-
-    Attributes
-    ----------
-    media : tuple of str
-        Media in the order in which they first come.
-    members : dict
-        Places of the recordings by medium.
-
+    The variables are the logarithm of the free length, unless ``free`` [m] is given, and for each
+    medium the logarithm of the bending length, and the skin over its scale. ``media`` are in order
+    of appearance; ``members`` are the indices of recordings by medium.
     """
 
     def __init__(
@@ -84,27 +66,12 @@ class Search:
         if free is None:
             low, high = [log(FREE[0]), *low], [log(FREE[1]), *high]
         self._bounds = np.array([low, high])
-        # A change of one medium leaves the others as they were.
+        # The columns of a medium depend on its lengths only.
         self._part = lru_cache(maxsize=_KEPT)(self._columns)
         self._left = lru_cache(maxsize=_KEPT)(self._rest)
 
     def lengths(self, x: FloatArray) -> tuple[float, list[tuple[float, float]]]:
-        """
-        Return what the variables stand for.
-
-        Parameters
-        ----------
-        x : ndarray, shape (k,)
-            The variables.
-
-        Returns
-        -------
-        free : float
-            Free length [m].
-        media : list of tuple of float
-            Bending length and skin of each medium [m].
-
-        """
+        """Return the free length [m], and bending length and skin of each medium [m]."""
         own = x.tolist()
         free = self.known if self.known is not None else exp(own.pop(0))
         pairs = zip(own[::2], own[1::2], strict=True)
@@ -112,19 +79,9 @@ class Search:
 
     def design(self, x: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
         """
-        Return the linear columns of each medium, and what its guide does not explain.
+        Return linear columns (2 n, c) and the tip without guide response (2 n,) by medium.
 
-        Parameters
-        ----------
-        x : ndarray, shape (k,)
-            The variables.
-
-        Returns
-        -------
-        list of tuple of ndarray
-            Shapes (2 n, columns) and (2 n,), for the n samples of the medium: of each recording
-            x, then z. The last columns are the offsets of each recording.
-
+        Rows are x, then z, of each recording; the last columns are offsets of the recordings.
         """
         free, lengths = self.lengths(x)
         return [self._part(k, free, *own) for k, own in enumerate(lengths)]
@@ -132,7 +89,7 @@ class Search:
     def _columns(
         self, medium: int, free: float, length: float, skin: float
     ) -> tuple[FloatArray, FloatArray]:
-        """Return the linear columns of a medium, and what its guide does not explain."""
+        """Return linear columns of a medium, and the tip without guide response."""
         rows, left = [], []
         members = self.members[self.media[medium]]
         for k, at in enumerate(members):
@@ -147,30 +104,17 @@ class Search:
         return np.vstack(rows), np.concatenate(left)
 
     def _rest(self, medium: int, free: float, length: float, skin: float) -> FloatArray:
-        """Return what is left of a medium at the best linear parameters."""
+        """Return the residuals of a medium at the best linear constants."""
         columns, left = self._part(medium, free, length, skin)
         return np.asarray(left - columns @ np.linalg.lstsq(columns, left)[0])
 
     def residual(self, x: FloatArray) -> FloatArray:
-        """
-        Return what is left at the best linear parameters.
-
-        Parameters
-        ----------
-        x : ndarray, shape (k,)
-            The variables.
-
-        Returns
-        -------
-        ndarray
-            Of all media [m].
-
-        """
+        """Return the residuals of all media at the best linear constants [m]."""
         free, lengths = self.lengths(x)
         return np.concatenate([self._left(k, free, *own) for k, own in enumerate(lengths)])
 
     def _search(self, first: FloatArray, free: Sequence[int]) -> tuple[FloatArray, float]:
-        """Search over some of the variables from a start; return all, and the cost [m^2]."""
+        """Search over variables with these indices; return all variables and the cost [m^2]."""
         at = list(free)
         x = first.copy()
 
@@ -185,22 +129,7 @@ class Search:
         return x, _UNIT**2 * float(found.cost)
 
     def best(self, near: FloatArray | None = None) -> tuple[FloatArray, float]:
-        """
-        Return the best lengths.
-
-        Parameters
-        ----------
-        near : ndarray, shape (k,), optional
-            Variables from which to search; otherwise from several starts.
-
-        Returns
-        -------
-        x : ndarray, shape (k,)
-            The variables.
-        cost : float
-            Half the sum of squares that they leave [m^2].
-
-        """
+        """Return the best variables (k,) and half their sum of squares [m^2]."""
         if near is not None:
             return self._search(near, range(len(near)))
         found = []
@@ -212,20 +141,7 @@ class Search:
         return min(found, key=lambda one: one[1])
 
     def slopes(self, x: FloatArray) -> FloatArray:
-        """
-        Differentiate the fitted tip by the variables, at fixed linear parameters.
-
-        Parameters
-        ----------
-        x : ndarray, shape (k,)
-            The variables.
-
-        Returns
-        -------
-        ndarray, shape (samples, k)
-            Derivatives [m].
-
-        """
+        """Return derivatives of the fitted tip by the variables at fixed linear constants [m]."""
         values = [np.linalg.lstsq(a, y)[0] for a, y in self.design(x)]
 
         def fitted(at: FloatArray) -> FloatArray:
@@ -239,26 +155,10 @@ class Search:
         self, x: FloatArray, cost: float, k: int, width: float, rise: float
     ) -> tuple[float, float]:
         """
-        Find how far a variable may be off: until the others cannot make up for it.
+        Return the profile likelihood interval of variable k; infinite at a bound of the search.
 
-        Parameters
-        ----------
-        x : ndarray, shape (k,)
-            The best variables.
-        cost : float
-            What they leave [m^2].
-        k : int
-            Which variable.
-        width : float
-            Half the width of its interval if the fit were linear.
-        rise : float
-            The root of twice the rise of the cost at the ends of the interval [m].
-
-        Returns
-        -------
-        low, high : float
-            Ends of the interval; infinite where the search ends before.
-
+        ``cost`` is the minimum [m^2]; ``width`` is half the interval for a linear fit; ``rise`` is
+        the root of twice the rise of the cost at the ends of the interval [m].
         """
         return (
             float(x[k]) - self._end(x, cost, k, -width, rise),
@@ -266,7 +166,7 @@ class Search:
         )
 
     def _end(self, x: FloatArray, cost: float, k: int, first: float, rise: float) -> float:
-        """Return how far from the best value an interval ends on one side."""
+        """Return the distance from the best value to an end of the interval."""
         others = [i for i in range(len(x)) if i != k]
         bound = float(self._bounds[int(first > 0.0), k])
         reach = abs(bound - float(x[k]))
@@ -288,7 +188,7 @@ class Search:
                 return inf
             else:
                 near, near_rise = trial, now
-            # Nearly a straight line: follow its chords.
+            # The root of the rise is nearly linear: secant steps.
             if far < inf:
                 trial = near + (far - near) * (rise - near_rise) / (far_rise - near_rise)
             else:

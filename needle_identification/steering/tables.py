@@ -1,9 +1,9 @@
 """
-Steered insertions in tables with named columns.
+Read steered insertions from tables with named columns.
 
-The roles are ``depth``, ``guide_x``, ``guide_z``, ``tip_x`` and ``tip_z``, and ``roll`` if the
-needle was turned. Signs, units and factors are those of all tables; ``@1`` behind a column takes
-its value from one row before: ``guide_x=base.x[mm]@1``.
+The roles are ``depth``, ``guide_x``, ``guide_z``, ``tip_x`` and ``tip_z``, and ``roll`` for a
+rotated needle. Signs, units and factors are written as in other tables; the suffix ``@1`` takes
+values from the previous row: ``guide_x=base.x[mm]@1``.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from needle_identification.recordings.tables import column_values, guessed, read
 from needle_identification.steering.recording import recorded_insertion, SteeringRecording
 import numpy as np
 
-#: Roles of the columns; without a roll the needle was not turned.
+#: Roles of the columns; without a roll column the roll is zero.
 STEERING_ROLES: Final = ('depth', 'guide_x', 'guide_z', 'tip_x', 'tip_z', 'roll')
 
-#: Usual names of columns by role, in small letters and without signs.
+#: Usual column names by role, in lower case without separators.
 _USUAL: Final = {
     'depth': ('depth', 'insertion', 'insertiondepth', 'tipy', 'robot'),
     'guide_x': ('guidex', 'basex', 'xguide', 'xbase'),
@@ -38,29 +38,7 @@ _SHIFTED: Final = re.compile(r'^(.*?)\s*@\s*(\d{1,6})$')
 def read_steering_table(
     path: Path | str, columns: Mapping[str, str], medium: str = ''
 ) -> SteeringRecording:
-    """
-    Read an insertion from a table.
-
-    Parameters
-    ----------
-    path : Path or str
-        The file.
-    columns : mapping of str to str
-        Columns by role, of `STEERING_ROLES`; what is not given is found by the usual names.
-    medium : str
-        Name of the tissue.
-
-    Returns
-    -------
-    SteeringRecording
-        The insertion; its ``losses`` say what was taken, left out or repaired.
-
-    Raises
-    ------
-    RecordingError
-        If a column is missing or not usable.
-
-    """
+    """Read an insertion from a table; roles missing in ``columns`` are found by usual names."""
     path = Path(path)
     table = read_table(path)
     specs = {**guessed(table, _USUAL), **columns}
@@ -68,8 +46,8 @@ def read_steering_table(
     missing = [role for role in STEERING_ROLES if role not in specs and role != 'roll']
     if missing:
         raise RecordingError(
-            f'{path}: which column is {" and ".join(missing)}? It has '
-            f'{", ".join(table.columns)}: say --columns {missing[0]}=NAME,...'
+            f'{path}: no column found for {" and ".join(missing)}, it has '
+            f'{", ".join(table.columns)}: use --columns {missing[0]}=NAME,...'
         )
     losses = list(table.losses)
     if words := ', '.join(f'{role}={spec}' for role, spec in specs.items() if role not in columns):
@@ -78,7 +56,7 @@ def read_steering_table(
     moved = np.column_stack([values[role] for role in specs if not role.startswith('tip')])
     usable = np.isfinite(moved).all(axis=1)
     if lost := int(np.count_nonzero(~usable)):
-        losses.append(f'{lost} rows with a value that is no number, left out')
+        losses.append(f'{lost} rows with a value that is not a number, left out')
     if np.count_nonzero(usable) < 2:
         raise RecordingError('; '.join([f'{path} has fewer than 2 usable rows', *losses]))
     values = {role: column[usable] for role, column in values.items()}
@@ -86,7 +64,7 @@ def read_steering_table(
 
 
 def _shifted(table: Table, role: str, spec: str, losses: list[str]) -> FloatArray:
-    """Return the values of a column, perhaps from rows before; the first then counts again."""
+    """Return the values of a column, shifted by rows; the first value is repeated."""
     rows = 0
     if spec not in table.columns and (match := _SHIFTED.match(spec)):
         spec, rows = match[1], int(match[2])

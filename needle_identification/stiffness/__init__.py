@@ -1,1 +1,1 @@
-"""Stiffness of the tissue in the plane of deflection, from presses with an end-effector."""
+"""Identification of the tissue stiffness in the plane of deflection from indentation presses."""

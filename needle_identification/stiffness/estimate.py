@@ -1,4 +1,4 @@
-"""Stiffness at one place of the tissue, by force level."""
+"""Tissue stiffness at a place, by force level."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy as np
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
 class LevelEstimate(Named[ParameterEstimate]):
     """
-    Stiffness at one force level.
+    Stiffness at a force level.
 
     Attributes
     ----------
@@ -24,28 +24,28 @@ class LevelEstimate(Named[ParameterEstimate]):
     curl : ParameterEstimate
         k_zx - k_xz [N/m], the curl of the force of the tissue -K d.
     spring : ParameterEstimate
-        Frobenius norm of the antisymmetric part of K over that of the symmetric part [1]. It is
-        never negative and, near zero, too large on average. Its interval is right there too: it
-        holds zero where that of the curl does.
+        Frobenius norm of the antisymmetric part of K over the norm of the symmetric part [1]. It
+        is nonnegative and biased upward near zero. Its interval has the nominal coverage and
+        contains zero if the interval of the curl does.
     is_spring : bool
-        Whether all of the interval of ``spring`` is within the setting ``largest_asymmetry``.
+        Whether the whole interval of ``spring`` is within the setting ``largest_asymmetry``.
     words : str
         Whether the tissue is a spring, and why.
     principal : (ParameterEstimate, ParameterEstimate)
         Larger and smaller principal stiffness, of the symmetric part [N/m].
     angle : ParameterEstimate
-        Direction of the larger one, from x toward z, in (-pi/2, pi/2] [rad]; not determined
-        where the two agree within their errors.
+        Direction of the larger stiffness, from x toward z, in (-pi/2, pi/2] [rad]; not
+        determined if the two agree within their errors.
     tissue_stiffness : ParameterEstimate
         k_a = k_zz / contact length [N/m^2].
     presses, directions : int
-        Number of presses used, and of their directions.
+        Number of used presses and of directions.
     residual : float
         Root mean square of force minus K d [N].
     determination : float
         Coefficient of determination R^2.
     condition : float
-        Condition number of the displacements; large where they have one direction only.
+        Condition number of the displacements; large for a single direction.
 
     """
 
@@ -75,27 +75,27 @@ class LevelEstimate(Named[ParameterEstimate]):
 
     @property
     def matrix(self) -> FloatArray:
-        """K [N/m], shape (2, 2), rows of force and columns of displacement; nan if unknown."""
+        """K [N/m], shape (2, 2), rows of force, columns of displacement; nan if undetermined."""
         return np.array([p.value for p in self.parameters]).reshape(2, 2)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
 class StiffnessEstimate:
     """
-    Stiffness at one place of the tissue.
+    Tissue stiffness at a place.
 
     Attributes
     ----------
     name : str
-        The recording.
+        Name of the recording.
     levels : tuple of LevelEstimate
-        By force, from the smallest.
+        By force, in ascending order.
     off_plane : float
-        Largest ratio of the displacement out of the plane to that in the plane.
+        Largest ratio of displacement out of the plane to displacement in the plane.
     warnings : tuple of str
-        What to know before using the numbers, in words.
+        Warnings about the validity of the estimate.
     presses : Presses
-        What was fitted.
+        Fitted presses.
 
     """
 

@@ -1,13 +1,12 @@
 r"""
-Stiffness of the tissue in the plane of deflection, section 3.2.2.3 of the paper.
+Identify the tissue stiffness in the plane of deflection, section 3.2.2.3 of the paper.
 
-The end-effector presses the tissue with force F and moves it by d. The tissue answers with -F.
-For each force level the stiffness matrix K of F = K d is fitted to the presses of that level.
-The steps, each in a file of its own:
+The end-effector presses the tissue with force F and displaces it by d; the reaction is -F. For
+each force level the stiffness matrix K of F = K d is fitted to the presses. Modules:
 
 ============  =====================================================================================
-`plateaus`    holds and rests: the times in which force and position are steady
-`presses`     displacement and force of each hold, with the zeros between the rests
+`plateaus`    holds and rests: intervals of steady force and position
+`presses`     displacement and force of each hold relative to the rests
 `matrix`      the stiffness matrix with its errors
 `spring`      whether the tissue is a spring
 `principal`   principal stiffnesses
@@ -33,16 +32,16 @@ from needle_identification.stiffness.settings import StiffnessSettings
 from needle_identification.stiffness.spring import spring_estimates
 import numpy as np
 
-#: What is worth a warning, as a part of what was measured.
+#: Relative deviation above which a warning is given.
 _WORTH_WARNING: Final = 0.1
 
-#: Scatter over noise beyond which the presses do not follow one matrix.
+#: Largest ratio of scatter to noise for presses that follow a matrix.
 _LARGEST_SCATTER: Final = 2.0
 
-#: A clear change [standard errors].
+#: Significant change [standard errors].
 _CLEARLY: Final = 3.0
 
-#: Fewest directions without a warning.
+#: Smallest number of directions without a warning.
 _FEWEST_DIRECTIONS: Final = 4
 
 
@@ -50,24 +49,24 @@ def identify_stiffness(
     recording: IndentationRecording, settings: StiffnessSettings | None = None
 ) -> StiffnessEstimate:
     """
-    Estimate the stiffness matrix at each force level of one recording.
+    Estimate the stiffness matrix at each force level of a recording.
 
-    A hold is the longest time in which force and position stay steady. Rests are the steady times
-    whose force is visited most often. The zeros of force and position are followed from rest to
-    rest, which removes slow drift and the bias of the sensor. Standard errors come from the
-    scatter of the presses about the matrix, intervals from Student's t.
+    A hold is the longest interval of steady force and position. Rests are the steady intervals at
+    the most frequent force. The zeros of force and position are tracked over the rests, which
+    removes slow drift and the sensor bias. Standard errors are computed from the scatter of the
+    presses about the matrix, intervals from Student's t.
 
     Parameters
     ----------
     recording : IndentationRecording
-        Presses in any number of directions and levels, with rests between.
+        Presses in any number of directions and levels, with rests in between.
     settings : StiffnessSettings, optional
-        What is steady, what is a rest, and the estimator.
+        Thresholds of holds and rests, and the estimator.
 
     Returns
     -------
     StiffnessEstimate
-        One matrix per level. What the presses do not determine is marked.
+        Matrix of each level; undetermined parameters are marked.
 
     Raises
     ------
@@ -76,7 +75,7 @@ def identify_stiffness(
 
     Examples
     --------
-    From NumPy arrays: presses of 1.2 N in eight directions on a tissue of 800 N/m.
+    Presses of 1.2 N in eight directions on a tissue of 800 N/m:
 
     >>> import numpy as np
     >>> angles = np.repeat(np.arange(8) * np.pi / 4, 2)
@@ -129,7 +128,7 @@ def _identify(recording: IndentationRecording, settings: StiffnessSettings) -> S
 def _level(
     presses: Presses, chosen: BoolArray, fit: MatrixFit, settings: StiffnessSettings
 ) -> LevelEstimate:
-    """Collect the results of one level."""
+    """Collect the results of a level."""
     k_zz = float(fit.matrix[1, 1])
     curl, spring, is_spring, words = spring_estimates(fit, settings.largest_asymmetry)
     first, second, angle = principal_estimates(fit)
@@ -165,14 +164,14 @@ def _level(
 
 
 def _unit(row: int, column: int) -> FloatArray:
-    """Return the gradient of one entry of the matrix."""
+    """Return the gradient of an entry of the matrix."""
     gradient = np.zeros((2, 2))
     gradient[row, column] = 1.0
     return gradient
 
 
 def _doubts(level: LevelEstimate, fit: MatrixFit) -> Iterator[tuple[str, str]]:
-    """Yield what makes the matrix of a level doubtful, each with a detail of this level."""
+    """Yield warnings about the matrix of a level, each with a detail of this level."""
     if not fit.known.all():
         lacking = ', '.join(p.symbol for p in level.parameters if not p.determined)
         yield (
@@ -197,7 +196,7 @@ def _doubts(level: LevelEstimate, fit: MatrixFit) -> Iterator[tuple[str, str]]:
 
 
 def _falling(presses: Presses, levels: Sequence[LevelEstimate]) -> list[str]:
-    """Warn where more force gave less displacement along it."""
+    """Warn of displacements that decrease with increasing force."""
     along = (presses.force * presses.displacement).sum(axis=1) / np.hypot(*presses.force.T)
     error = np.hypot(*presses.displacement_error.T)
     falls: dict[tuple[int, int], int] = {}

@@ -1,5 +1,5 @@
 r"""
-The stiffness matrix of one force level, by least squares over its presses.
+Fit the stiffness matrix of a force level by least squares over its presses.
 
 .. math:: F = K d, \qquad K = \begin{bmatrix} k_{xx} & k_{xz} \\ k_{zx} & k_{zz} \end{bmatrix}
 
@@ -24,33 +24,33 @@ from scipy.special import stdtrit
 #: Entries of the matrix, by row.
 ENTRIES: Final = ('k_xx', 'k_xz', 'k_zx', 'k_zz')
 
-#: Fewest presses of a level.
+#: Smallest number of presses of a level.
 _FEWEST_PRESSES: Final = 3
 
-#: Scatter of the displacements in both directions, over their error, that determines the matrix:
+#: Smallest ratio of scatter and error of the displacements that determines the matrix:
 #: attenuation by the noise of the displacements is then below 1 %.
 _SMALLEST_SPREAD: Final = 10.0
 
-#: A column that is not this much larger than its error is only noise.
+#: Ratio of column norm to error below which a column contains only noise.
 _LARGEST_NOISE: Final = 3.0
 
 
 class MatrixFit(NamedTuple):
     """
-    A stiffness matrix with its errors.
+    Stiffness matrix with errors.
 
     Attributes
     ----------
     matrix : ndarray, shape (2, 2)
-        Stiffness matrix K [N/m]; columns that are not known are nan.
+        Stiffness matrix K [N/m]; undetermined columns are nan.
     known : ndarray of bool, shape (2,)
         Columns that the presses determine.
     factors : ndarray, shape (2, 2, 2)
-        Factors A of the covariance: that of rows r and s of K is R_rs A_r A_s^T.
+        Factors A of the covariance R_rs A_r A_s^T of rows r and s of K.
     correlation : ndarray, shape (2, 2)
         Correlation R of the residuals of the rows.
     degrees_of_freedom : float
-        Of each row.
+        Degrees of freedom of each row.
     residual : ndarray, shape (m, 2)
         Force minus K d [N].
     scatter : float
@@ -73,22 +73,10 @@ class MatrixFit(NamedTuple):
         self, name: str, symbol: str, unit: str, value: float, gradient: FloatArray
     ) -> ParameterEstimate:
         """
-        Return a quantity that depends on the matrix, with propagated errors.
+        Return a quantity derived from the matrix, with propagated errors.
 
-        Parameters
-        ----------
-        name, symbol, unit : str
-            The quantity.
-        value : float
-            Its value.
-        gradient : ndarray, shape (2, 2)
-            Its derivatives with respect to the entries of the matrix.
-
-        Returns
-        -------
-        ParameterEstimate
-            The quantity; not determined if an entry that it depends on is not.
-
+        ``gradient`` (2, 2) are its derivatives by the entries of the matrix. The quantity is
+        undetermined if a required entry is.
         """
         parameter = ParameterEstimate(name=name, symbol=symbol, unit=unit)
         if not self.known[np.any(gradient != 0.0, axis=0)].all() or not isfinite(value):
@@ -98,20 +86,7 @@ class MatrixFit(NamedTuple):
         return parameter.with_value(value, error, error * float(stdtrit(freedom, 0.975)))
 
     def variance_of(self, gradient: FloatArray) -> tuple[float, float]:
-        """
-        Return the variance of a quantity that depends on the matrix.
-
-        Parameters
-        ----------
-        gradient : ndarray, shape (2, 2)
-            Its derivatives with respect to the entries of the matrix.
-
-        Returns
-        -------
-        variance, degrees_of_freedom : float
-            Variance and its degrees of freedom (Satterthwaite).
-
-        """
+        """Return variance and degrees of freedom (Satterthwaite) of a quantity by its gradient."""
         along = np.einsum('rij,ri->rj', self.factors, gradient)
         parts = along @ along.T @ self.correlation
         variance = max(float(np.trace(parts)), 0.0)
@@ -134,27 +109,11 @@ _UNKNOWN: Final = MatrixFit(
 
 def fit_matrix(presses: Presses, noise: PressNoise, chosen: IntArray, estimator: str) -> MatrixFit:
     """
-    Solve F = K d over presses, as far as they determine K.
+    Solve F = K d over the presses with indices ``chosen`` (m,).
 
-    The rows of K are solved one by one, with the noise of force and displacement and of their
-    zeros. The errors come from the scatter of the presses about K.
-
-    Parameters
-    ----------
-    presses : Presses
-        All presses.
-    noise : PressNoise
-        Their noise.
-    chosen : ndarray of int, shape (m,)
-        Presses to use.
-    estimator : str
-        One of `ESTIMATORS`; ``weighted`` takes the noise of each press for its own.
-
-    Returns
-    -------
-    MatrixFit
-        The matrix.
-
+    The rows of K are solved separately, with the noise of force and displacement and of their
+    zeros. Standard errors are computed from the scatter of the presses about K. The estimator
+    ``weighted`` uses the noise of each press.
     """
     displacement, force = presses.displacement[chosen], presses.force[chosen]
     error = sqrt(float(np.mean(presses.displacement_error[chosen] ** 2)) * len(chosen))
@@ -212,11 +171,11 @@ def _deviation(
     residual: FloatArray, freedom: float, estimator: str
 ) -> tuple[float, float, FloatArray]:
     """
-    Return the standard deviation of residuals, its degrees of freedom, and the residuals used.
+    Return standard deviation, degrees of freedom, and used values of residuals.
 
-    With few presses the scatter of all is better known than that of each. For ``huber`` it is
-    that of the clipped residuals, P. J. Huber, "Robust Statistics", 1981, section 7.6; one degree
-    of freedom is lost for each clipped residual.
+    The scatter of all presses is more accurate than the noise of each of a few presses. For
+    ``huber`` it is computed from the clipped residuals, P. J. Huber, "Robust Statistics", 1981,
+    section 7.6; each clipped residual reduces the degrees of freedom by 1.
     """
     if estimator != 'huber':
         return sqrt(float(residual @ residual) / freedom), freedom, residual

@@ -1,8 +1,8 @@
 """
-Plateaus: the times in which force and position are steady, as holds of presses and as rests.
+Find plateaus of force and position: holds of presses, and rests.
 
-A plateau is the longest time in which force and position stay steady. Plateaus near the force
-that is visited most often are rests, the others are holds.
+A plateau is the longest interval of steady force and position. Plateaus near the most frequent
+force are rests, the others are holds.
 """
 
 from __future__ import annotations
@@ -18,46 +18,48 @@ from needle_identification.stiffness.settings import StiffnessSettings
 import numpy as np
 from numpy.linalg import norm
 
-#: Bins in the shortest plateau; steadiness is judged by their means.
+#: Number of bins in the shortest plateau; steadiness is tested on bin means.
 _BINS: Final = 10.0
 
-#: A longer step between bins ends a plateau [bins].
+#: Largest step between bins within a plateau [bins].
 _GAP: Final = 4
 
-#: Steady: positions stay within this part of their whole range.
+#: Largest range of positions in a plateau, as a fraction of their whole range.
 _STEADY_MOTION: Final = 0.05
 
-#: Steady: the force changes from begin to end by at most this part of its tolerance. A ramp,
-#: however slow, uses all of the tolerance.
+#: Largest trend of the force over a plateau, as a fraction of its tolerance. Even a slow ramp
+#: extends over the whole tolerance.
 _STEADY_TREND: Final = 1.0 / 3.0
 
-#: Noise does not leave a band this much wider by chance [standard deviations].
+#: Width of the band that contains noise [standard deviations].
 _BAND: Final = 12.0
 
-#: Bins this far from the middle half of a plateau belong to a ramp [standard deviations].
+#: Deviation from the middle half of a plateau that indicates a ramp [standard deviations].
 _RAMP: Final = 3.0
 
-#: Fewest samples of a plateau.
+#: Smallest number of samples of a plateau.
 _FEWEST_SAMPLES: Final = 4
 
-#: Noise below this part of the largest value is rounding.
+#: Relative noise below which values differ by rounding.
 ROUNDING: Final = 1e-8
 
 
 class Plateaus(NamedTuple):
     """
-    Steady times of a recording. Channels are force x, z, displacement x, z, and off-plane.
+    Steady intervals of a recording.
+
+    Channels are force x, z, displacement x, z, and off-plane displacement.
 
     Attributes
     ----------
     time : ndarray, shape (p,)
-        Middle of each plateau [s].
+        Center of each plateau [s].
     mean, variance : ndarray, shape (p, 5)
-        Mean of each channel, and the variance of that mean.
+        Mean of each channel, and the variance of the mean.
     rest : ndarray of bool, shape (p,)
-        Whether it is a rest.
+        Whether the plateau is a rest.
     missed : int
-        Number of times in which the end-effector pressed without a plateau.
+        Number of presses without a plateau.
 
     """
 
@@ -69,27 +71,7 @@ class Plateaus(NamedTuple):
 
 
 def find_plateaus(recording: IndentationRecording, settings: StiffnessSettings) -> Plateaus:
-    """
-    Find the holds and rests of a recording.
-
-    Parameters
-    ----------
-    recording : IndentationRecording
-        Presses with rests between.
-    settings : StiffnessSettings
-        What is steady, and what is a rest.
-
-    Returns
-    -------
-    Plateaus
-        In order of time.
-
-    Raises
-    ------
-    IdentificationError
-        If nothing is steady.
-
-    """
+    """Return holds and rests in order; raise `IdentificationError` if nothing is steady."""
     time = recording.time
     channels = np.column_stack([recording.force, recording.position, recording.off_plane])
     if len(time) < _FEWEST_SAMPLES:
@@ -121,7 +103,7 @@ def find_plateaus(recording: IndentationRecording, settings: StiffnessSettings) 
     for (start, length), is_rest in zip(runs, rest, strict=True):
         held[start : start + length] = not is_rest
     edges = np.flatnonzero(np.diff(np.pad(pressed.astype(np.int8), 1))).reshape(-1, 2)
-    # Noise crosses the limit of a rest more than once, but not twice that limit.
+    # Noise may cross the limit of a rest repeatedly, but not twice the limit.
     high = size > 2.0 * settings.rest_force
     missed = sum(high[up:down].any() and not held[up:down].any() for up, down in edges)
     return Plateaus(middle, mean, _variances(channels, parts), rest, missed)
@@ -130,10 +112,10 @@ def find_plateaus(recording: IndentationRecording, settings: StiffnessSettings) 
 def _steady_runs(
     number: IntArray, means: FloatArray, tolerance: float, shortest: int
 ) -> list[tuple[int, int]]:
-    """Return (start, length) of the longest steady runs of bins that do not overlap."""
+    """Return (start, length) of the longest steady runs of bins without overlap."""
     if len(means) < shortest:
         return []
-    # Ramps have no second differences; their scatter is that of the noise times root 6.
+    # Second differences of ramps vanish; noise scatters by its standard deviation times root 6.
     noise = np.median(np.abs(np.diff(means[:, :2], n=2, axis=0, prepend=means[:1, :2])))
     band = max(tolerance, _BAND * float(noise) / (0.6745 * sqrt(6.0)))
     motion = float(np.ptp(means[:, 2:], axis=0).max()) * _STEADY_MOTION
@@ -149,7 +131,7 @@ def _steady_runs(
         if taken[start] or taken[start + length - 1]:
             continue
         taken[start : start + length] = True
-        # The ends of ramps may give a trend to a run that is a hold in its middle.
+        # Ends of ramps may add a trend to a hold.
         begin, end = _trimmed(scaled[start : start + length])
         if _trend(scaled[start + begin : start + end, :2]) <= _STEADY_TREND:
             found.append((int(start) + begin, end - begin))
@@ -157,13 +139,13 @@ def _steady_runs(
 
 
 def _trend(values: FloatArray) -> float:
-    """Return the change from the first to the last row of the line through them."""
+    """Return the change of a fitted line from the first to the last row."""
     abscissa = np.linspace(-0.5, 0.5, len(values))
     return float(norm(abscissa @ values / (abscissa @ abscissa)))
 
 
 def _trimmed(values: FloatArray) -> tuple[int, int]:
-    """Leave out at both ends, up to a quarter each, what differs from the middle half."""
+    """Leave out up to a quarter at both ends that deviates from the middle half."""
     quarter = len(values) // 4
     middle = values[quarter : len(values) - quarter]
     limit = _RAMP * middle.std(axis=0) + ROUNDING
@@ -173,7 +155,7 @@ def _trimmed(values: FloatArray) -> tuple[int, int]:
 
 
 def _steady_lengths(values: FloatArray) -> IntArray:
-    """For each row, count the rows from it on over which no column varies by more than 1."""
+    """Return for each row the number of following rows within a range of 1 in all columns."""
     count = len(values)
     # Smallest and largest values over 1, 2, 4, ... rows.
     lows, highs = [values], [values]
@@ -195,7 +177,7 @@ def _steady_lengths(values: FloatArray) -> IntArray:
 
 
 def _rests(force: FloatArray, rest_force: float) -> BoolArray:
-    """Mark the rests: near the force that is visited most often, followed as it drifts."""
+    """Mark the plateaus near the most frequent force, tracked as it drifts."""
     apart = np.hypot(*(force[:, np.newaxis] - force).transpose(2, 0, 1))
     visits = np.count_nonzero(apart <= rest_force, axis=1)
     start = min(range(len(force)), key=lambda i: (-visits[i], hypot(*force[i])))
@@ -210,10 +192,10 @@ def _rests(force: FloatArray, rest_force: float) -> BoolArray:
 
 def _variances(channels: FloatArray, parts: list[tuple[int, int]]) -> FloatArray:
     """
-    Return the variance of the mean of each part; all parts share their autocorrelation.
+    Return the variance of the mean of each part, with a common autocorrelation.
 
-    A steady trend within a part is drift or creep, not noise. The sum of autocorrelations ends
-    where it is a fifth of the lag, which balances its bias and its noise (A. Sokal, "Monte Carlo
+    A steady trend within a part is drift or creep, not noise. The sum of autocorrelations ends at
+    a lag of five correlation times, which balances its bias and its noise (A. Sokal, "Monte Carlo
     methods in statistical mechanics", 1997).
     """
     rows, shapes = [], []
@@ -225,7 +207,7 @@ def _variances(channels: FloatArray, parts: list[tuple[int, int]]) -> FloatArray
     counts = np.array([[len(row)] for row in rows])
     products = _autocorrelations(rows, int(counts.max()) // 4 + 1)
     lags = np.arange(len(products))
-    # Mean and trend that were subtracted took their share of the noise at each lag.
+    # Subtracting mean and trend removed a fraction of the noise at each lag.
     taken = _autocorrelations(shapes, len(lags)).sum(axis=1)
     free = np.maximum(counts.sum() - (2.0 * np.cumsum(taken) - taken[0]), 1.0)
     sums = 2.0 * np.cumsum(products, axis=0) - products[0]
@@ -239,7 +221,7 @@ def _variances(channels: FloatArray, parts: list[tuple[int, int]]) -> FloatArray
 
 
 def _autocorrelations(rows: Sequence[FloatArray], lags: int) -> FloatArray:
-    """Sum the products of samples by lag over all rows of shape (n, c), shape (lags, c)."""
+    """Sum products of samples by lag over all rows of shape (n, c); shape (lags, c)."""
     products = np.zeros((lags, rows[0].shape[1]))
     for row in rows:
         spectrum = np.fft.rfft(row, 2 * len(row), axis=0)

@@ -1,4 +1,4 @@
-"""Presses: displacement and force of each hold, relative to the rests around it."""
+"""Compute displacement and force of each hold relative to the rests."""
 
 from __future__ import annotations
 
@@ -15,26 +15,26 @@ import numpy as np
 from scipy.linalg import cho_solve_banded, cholesky_banded
 from scipy.optimize import minimize_scalar
 
-#: Forces within this angle press in the same direction [rad].
+#: Largest angle between forces of the same direction [rad].
 _SAME_DIRECTION: Final = pi / 18.0
 
-#: Drift of the zero that is worth a warning, as a part of what was measured.
+#: Relative drift of the zero above which a warning is given.
 _WORTH_WARNING: Final = 0.1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
 class Presses:
     """
-    Presses of a recording, relative to the rests around them.
+    Presses of a recording, relative to the adjacent rests.
 
     Attributes
     ----------
     time : ndarray, shape (m,)
-        Middle of the hold [s].
+        Center of the hold [s].
     displacement, force : ndarray, shape (m, 2)
         Mean displacement [m] and force on the tissue [N] along x and z.
     displacement_error, force_error : ndarray, shape (m, 2)
-        Their standard errors, which respect the autocorrelation of the samples.
+        Their standard errors, which account for the autocorrelation of the samples.
     off_plane : ndarray, shape (m,)
         Displacement out of the plane [m].
     level, direction : ndarray of int, shape (m,)
@@ -76,22 +76,10 @@ class PressNoise(NamedTuple):
 
     def covariance(self, matrix: FloatArray, chosen: IntArray, *, pooled: bool) -> FloatArray:
         """
-        Return the covariance of F - K d.
+        Return the covariance of F - K d for each row of K [N^2], shape (2, m, m).
 
-        Parameters
-        ----------
-        matrix : ndarray, shape (2, 2)
-            Stiffness matrix K [N/m].
-        chosen : ndarray of int, shape (m,)
-            Presses.
-        pooled : bool
-            Whether all holds have the same noise, their mean.
-
-        Returns
-        -------
-        ndarray, shape (2, m, m)
-            One covariance among the presses for each row of K [N^2].
-
+        ``matrix`` is K [N/m]; ``chosen`` (m,) are indices of presses; ``pooled`` uses the mean
+        noise of the holds.
         """
         force, displacement = self.force[chosen], self.displacement[chosen]
         squares: FloatArray = matrix**2
@@ -113,7 +101,7 @@ class PressNoise(NamedTuple):
 
 
 def _bounded(variance: FloatArray) -> FloatArray:
-    """Bound variances from below: rounding may make a hold look quiet by chance."""
+    """Bound variances from below: rounding may give a hold too small a variance."""
     return np.asarray(np.maximum(variance, 0.1 * variance.mean(axis=0)))
 
 
@@ -121,31 +109,9 @@ def find_presses(
     recording: IndentationRecording, plateaus: Plateaus, settings: StiffnessSettings
 ) -> tuple[Presses, PressNoise, list[str]]:
     """
-    Take the holds relative to the rests.
+    Compute the holds relative to the rests; return presses, their noise, and warnings.
 
-    Parameters
-    ----------
-    recording : IndentationRecording
-        The recording.
-    plateaus : Plateaus
-        Its holds and rests.
-    settings : StiffnessSettings
-        What one force level is.
-
-    Returns
-    -------
-    presses : Presses
-        One per hold.
-    noise : PressNoise
-        Their noise.
-    warnings : list of str
-        What drifted and what was left out.
-
-    Raises
-    ------
-    IdentificationError
-        If there is no hold.
-
+    Raises `IdentificationError` if there is no hold.
     """
     rest, hold = plateaus.rest, ~plateaus.rest
     if not hold.any():
@@ -205,22 +171,7 @@ def _warnings(presses: Presses, plateaus: Plateaus, settings: StiffnessSettings)
 
 
 def grouped(sizes: FloatArray, tolerance: float) -> IntArray:
-    """
-    Put values that are close into groups.
-
-    Parameters
-    ----------
-    sizes : ndarray, shape (m,)
-        Values.
-    tolerance : float
-        A value farther than this above the mean of its group so far begins a new group.
-
-    Returns
-    -------
-    ndarray of int, shape (m,)
-        Group of each value, numbered from the smallest.
-
-    """
+    """Group values (m,) within ``tolerance`` of the group mean; return ascending group numbers."""
     group = np.zeros(len(sizes), dtype=np.int64)
     members: list[float] = []
     number = -1
@@ -233,7 +184,7 @@ def grouped(sizes: FloatArray, tolerance: float) -> IntArray:
 
 
 def _directions(force: FloatArray) -> IntArray:
-    """Group forces by direction, beginning after the widest gap between directions."""
+    """Group forces by direction, starting after the widest gap between directions."""
     angle = np.arctan2(force[:, 1], force[:, 0])
     order = np.sort(angle)
     gaps = np.diff(order, append=order[0] + 2.0 * pi)
@@ -245,12 +196,12 @@ def _follow_zero(
     times: FloatArray, rests: FloatArray, variance: FloatArray, at: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """
-    Estimate the zero between the rests as a random walk, measured with noise of known variance.
+    Estimate the zero between rests as a random walk with measurement noise.
 
-    Rests of shape (r, c) at ``times`` have this ``variance`` (r,). Returned are the zeros ``at``
-    other times, (m, c), and their covariance in each channel, (m, m). The variance of the walk
-    is that of maximum likelihood: without drift every rest counts for every hold; where the
-    drift exceeds the noise, the zero is interpolated between neighbors.
+    Rests of shape (r, c) at ``times`` have this ``variance`` (r,). Returns the zeros ``at`` other
+    times, (m, c), and their covariance in each channel, (m, m). The variance of the walk is the
+    maximum likelihood estimate: without drift the zero is the mean of all rests; if the drift
+    exceeds the noise, it is interpolated between neighbors.
     """
     mean: FloatArray = rests.mean(axis=0)
     knots, place = np.unique(np.concatenate([times, at]), return_inverse=True)
@@ -268,7 +219,7 @@ def _follow_zero(
 
 
 def _drift_rate(times: FloatArray, rests: FloatArray, variance: FloatArray) -> float:
-    """Return the variance per second of the random walk with the largest likelihood."""
+    """Return the maximum likelihood variance of the random walk per second."""
     step, change = np.diff(times), np.diff(rests, axis=0)
     slow = 0.01 * float(np.median(variance)) / float(step.sum())
     fast = 100.0 * max(slow, float((change**2).max() / step.min()))

@@ -1,4 +1,4 @@
-"""Principal stiffnesses and their directions, of the symmetric part of the stiffness matrix."""
+"""Principal stiffnesses and directions of the symmetric part of the stiffness matrix."""
 
 from __future__ import annotations
 
@@ -17,23 +17,11 @@ def principal_estimates(
     fit: MatrixFit,
 ) -> tuple[ParameterEstimate, ParameterEstimate, ParameterEstimate]:
     """
-    Return the principal stiffnesses and the direction of the larger one.
+    Return larger and smaller principal stiffness [N/m], and direction of the larger [rad].
 
-    Where the two agree within their errors, the larger one is too large by chance and the
-    smaller one too small. Their intervals then include that of their mean.
-
-    Parameters
-    ----------
-    fit : MatrixFit
-        Stiffness matrix with errors.
-
-    Returns
-    -------
-    larger, smaller : ParameterEstimate
-        Principal stiffnesses [N/m].
-    angle : ParameterEstimate
-        Direction of the larger one, from x toward z [rad]; not determined where the two agree.
-
+    If both agree within their errors, the larger is biased upward and the smaller downward: their
+    intervals then include the interval of their mean, and the direction (from x toward z) is
+    undetermined.
     """
     k = fit.matrix
     half, shear = (k[0, 0] - k[1, 1]) / 2.0, (k[0, 1] + k[1, 0]) / 2.0

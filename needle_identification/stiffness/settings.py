@@ -1,4 +1,4 @@
-"""Settings of the identification of stiffness."""
+"""Settings of stiffness identification."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from needle_ros.settings import check_constants, constant
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StiffnessSettings:
     """
-    Settings of `identify_stiffness`; each field says its meaning and unit.
+    Settings of `identify_stiffness`; fields describe meaning and unit.
 
     The mean matrices of Table 2 have an asymmetry of up to 0.086, and the paper calls their
     tissue a spring; ``largest_asymmetry`` is the next round number.

@@ -1,13 +1,13 @@
 r"""
-Whether the tissue is a spring, section 3.2.2.3 of the paper.
+Test whether the tissue is a spring, section 3.2.2.3 of the paper.
 
-The force of the tissue is -K d. It is that of a spring where its curl
+The force of the tissue is -K d. The tissue is a spring if the curl
 
 .. math:: \frac{\partial F_x}{\partial z} - \frac{\partial F_z}{\partial x} = k_{zx} - k_{xz}
 
-is zero, that is, where K is symmetric. The measure used here has no unit: the Frobenius norm of
-the antisymmetric part of K over that of its symmetric part. The largest value that still counts
-as a spring is `StiffnessSettings.largest_asymmetry`.
+is zero, that is, if K is symmetric. The dimensionless measure is the Frobenius norm of the
+antisymmetric part of K over the norm of its symmetric part. Its largest value for a spring is
+`StiffnessSettings.largest_asymmetry`.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _CURL: Final = np.array([[0.0, -1.0], [1.0, 0.0]])
 
 def asymmetry(matrix: ArrayLike) -> float:
     """
-    Compare the antisymmetric part of a stiffness matrix with its symmetric part.
+    Return the ratio of the antisymmetric to the symmetric part of a stiffness matrix.
 
     Parameters
     ----------
@@ -40,8 +40,7 @@ def asymmetry(matrix: ArrayLike) -> float:
     Returns
     -------
     float
-        Frobenius norm of the antisymmetric part over that of the symmetric part [1]; nan if the
-        symmetric part is zero.
+        Ratio of the Frobenius norms [1]; nan if the symmetric part is zero.
 
     """
     k = np.asarray(matrix, dtype=np.float64)
@@ -53,26 +52,10 @@ def spring_estimates(
     fit: MatrixFit, limit: float
 ) -> tuple[ParameterEstimate, ParameterEstimate, bool, str]:
     """
-    Judge whether the tissue is a spring.
+    Return curl, asymmetry, whether the tissue is a spring, and the result as a sentence.
 
-    Parameters
-    ----------
-    fit : MatrixFit
-        Stiffness matrix with errors.
-    limit : float
-        Largest asymmetry of a spring [1].
-
-    Returns
-    -------
-    curl : ParameterEstimate
-        Curl of the force of the tissue, k_zx - k_xz [N/m].
-    spring : ParameterEstimate
-        Asymmetry of the matrix [1], which is ``|curl| / (sqrt(2) |K_s|)``.
-    is_spring : bool
-        Whether the whole interval of the asymmetry is within the limit.
-    words : str
-        The result in words: a spring, not a spring, or undecided.
-
+    The curl is k_zx - k_xz [N/m], the asymmetry ``|curl| / (sqrt(2) |K_s|)`` [1]. The tissue is a
+    spring if the whole interval of the asymmetry is within ``limit`` [1].
     """
     k = fit.matrix
     curl = fit.derived('curl', 'curl F', 'N/m', float(k[1, 0] - k[0, 1]), _CURL)
@@ -98,10 +81,10 @@ def spring_estimates(
 
 def _unsigned_interval(value: float, error: float, freedom: float) -> tuple[float, float]:
     """
-    Return the 95 % interval of the size of a quantity with an arbitrary sign.
+    Return the 95 % interval of the magnitude of a signed quantity.
 
-    It holds each size for which the measured value is among the nearest 95 % of possible values,
-    so zero where the interval of Student's t of the signed quantity holds zero.
+    It contains each magnitude for which the measured value is among the nearest 95 % of possible
+    values, hence zero if the Student's t interval of the signed quantity contains zero.
     """
     if error <= ROUNDING * value:
         return value, value
@@ -109,7 +92,7 @@ def _unsigned_interval(value: float, error: float, freedom: float) -> tuple[floa
     farthest = float(stdtrit(freedom, 0.975))
 
     def excess(size: float) -> float:
-        """Probability that a value is nearer to this size than the measured one, minus 95 %."""
+        """Probability that a value is nearer to this size than the measurement, minus 95 %."""
         off = abs(size - found)
         near = [off, max(-off, -size), min(-size, off - 2.0 * size), -off - 2.0 * size]
         above, below, mirrored, lowest = stdtr(freedom, near)

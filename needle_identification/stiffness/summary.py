@@ -1,4 +1,4 @@
-"""Stiffness over several places, as in Table 2."""
+"""Summary of stiffness over several places, as in Table 2."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ import numpy as np
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LevelSummary(Named[Statistic]):
     """
-    One force level over several places: a column of Table 2.
+    Force level over several places: a column of Table 2.
 
     Attributes
     ----------
     force : float
         Mean magnitude of the force [N].
     statistics : tuple of Statistic
-        k_xx, k_xz, k_zx, k_zz, curl and tissue_stiffness; ``level[name]`` gives one.
+        k_xx, k_xz, k_zx, k_zz, curl and tissue_stiffness; ``level[name]`` returns a statistic.
 
     """
 
@@ -43,13 +43,13 @@ class StiffnessSummary:
     Attributes
     ----------
     levels : tuple of LevelSummary
-        By force, from the smallest.
+        By force, in ascending order.
     tissue_stiffness : Statistic
         k_a [N/m^2] at the chosen level.
     estimates : tuple of StiffnessEstimate
         One per place.
     warnings : tuple of str
-        What all places together say, in words.
+        Warnings about all places.
 
     """
 
@@ -71,11 +71,11 @@ def summarize_stiffness(
     Parameters
     ----------
     estimates : sequence of StiffnessEstimate
-        One per place. A level that a place lacks is the mean of the other places.
+        One per place. A missing level of a place is replaced by the mean of the other places.
     force : float, optional
         Force level of the resulting tissue stiffness [N]; default the largest, as in the paper.
     level_tolerance : float, optional
-        Levels of different places this close are one level [N].
+        Tolerance within which levels of different places are grouped [N].
 
     Returns
     -------
@@ -85,7 +85,7 @@ def summarize_stiffness(
     Raises
     ------
     IdentificationError
-        If there are no estimates, or none at the chosen force.
+        If there are no estimates at all, or at the chosen force.
 
     """
     levels = [level for estimate in estimates for level in estimate.levels]

@@ -1,1 +1,1 @@
-"""The paper: its figures, tables and claims."""
+"""Reproduction of the figures, tables and claims of the paper."""

@@ -1,4 +1,4 @@
-"""The whole needle as a beam, to judge what the model assumes of the part outside."""
+"""Finite element beam of the whole needle, to test the model assumption about the outer part."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from needle_dynamics import FloatArray, NeedleParameters
 import numpy as np
 from scipy.linalg import eigh
 
-#: What holds the needle where it enters the tissue, with the coordinates of that point it fixes.
+#: Support of the needle at its entry into the tissue, and the fixed coordinates of that point.
 ENTRIES: Final = {'free': (), 'pinned': (0,), 'clamped': (0, 1)}
 
-#: Elements outside and inside: first frequency and compliance have converged to six digits.
+#: Number of elements outside and inside: frequency and compliance converge to six digits.
 _ELEMENTS: Final = 24
 
 #: Matrices of a cubic element of unit length, bending stiffness and mass; coordinates are value
@@ -39,16 +39,16 @@ _GRAM: Final = (
 
 class WholeNeedle(NamedTuple):
     """
-    What a beam clamped at its base does.
+    Response of a beam that is clamped at its base.
 
     Attributes
     ----------
     frequency : float
         First natural frequency [Hz].
     compliance : float
-        Deflection of the tip per lateral force there [m/N].
+        Deflection of the tip per lateral force at the tip [m/N].
     force : float
-        Modulus of the lateral force at the base under 1 N at the tip [N].
+        Magnitude of the lateral force at the base for 1 N at the tip [N].
 
     """
 
@@ -59,29 +59,17 @@ class WholeNeedle(NamedTuple):
 
 def whole_needle(parameters: NeedleParameters, depth: float, entry: str) -> WholeNeedle:
     """
-    Solve the needle from base to tip, on its elastic foundation inside of the tissue.
+    Solve the needle from base to tip, on an elastic foundation inside the tissue.
 
-    Parameters
-    ----------
-    parameters : NeedleParameters
-        Needle and tissue of one layer.
-    depth : float
-        Inserted length [m], less than the length of the needle.
-    entry : str
-        A key of `ENTRIES`: what holds the needle at the entry.
-
-    Returns
-    -------
-    WholeNeedle
-        Frequency, compliance and what the base feels.
-
+    ``depth`` is the insertion depth [m], less than the length of the needle; ``entry`` is a key of
+    `ENTRIES`.
     """
     p, n = parameters, _ELEMENTS
     lengths = np.repeat([(p.length - depth) / n, depth / n], n)
     stiffness, mass = np.zeros((2, 4 * n + 2, 4 * n + 2))
     for k, h in enumerate(lengths):
         part = slice(2 * k, 2 * k + 4)
-        # Slopes count by the length of the element.
+        # Slopes are scaled by the length of the element.
         scale = np.array([1.0, h, 1.0, h])
         gram = _GRAM * np.outer(scale, scale) * h
         stiffness[part, part] += p.bending_stiffness / h**3 * _BENDING * np.outer(scale, scale)

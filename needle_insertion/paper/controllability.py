@@ -8,22 +8,14 @@ from needle_dynamics import NeedleModel, NeedleParameters
 from needle_insertion.report import controllability as report
 from needle_insertion.report.content import Grid, Picture, Section
 
-#: Operating points: inserted lengths [m], tip deflections [m], speed [m/s].
+#: Operating points: insertion depths [m], tip deflections [m], velocity [m/s].
 DEPTHS: Final = (0.02, 0.1, 0.2)
 DEFLECTIONS: Final = (0.0, 5e-4)
 SPEED: Final = 5e-3
 
 
 def section() -> Section:
-    """
-    Return a table of the operating points and a map.
-
-    Returns
-    -------
-    Section
-        For the page of results.
-
-    """
+    """Return the section of the results page: table of operating points, and map."""
     parameters = NeedleParameters.preset('paper_si')
     model = NeedleModel(parameters)
     straight, bent = (
@@ -35,17 +27,17 @@ def section() -> Section:
         title='Controllability and observability',
         paragraphs=(
             (
-                'Linearized about a straight needle, f_y and tau steer '
-                f'{first.state.rank} of {first.state.order} states, and the tip shows '
-                f'{first.observed.rank}. With a deflection of {1e3 * DEFLECTIONS[-1]:g} mm they '
-                f'steer {last.state.rank}, and it shows {last.observed.rank}. Ranks are taken in '
+                'Linearized about a straight needle, f_y and tau control '
+                f'{first.state.rank} of {first.state.order} states, and {first.observed.rank} are '
+                f'observable from the tip. With a deflection of {1e3 * DEFLECTIONS[-1]:g} mm '
+                f'{last.state.rank} and {last.observed.rank}. Ranks are computed in '
                 'natural units: in SI units the columns of [B, AB, ...] span more decades than '
                 'doubles have digits. The margin is the change of the pair that removes a rank.'
             ),
         ),
         tables=(
             Grid(
-                caption='States steered by f_y and tau, and seen in the tip deflection '
+                caption='States controlled by f_y and tau, and observable from the tip deflection '
                 '(0.3 N s/m, complete equations)',
                 heads=report.POINT_HEADS,
                 rows=tuple(point.row for point in (*straight, *bent)),
@@ -55,7 +47,7 @@ def section() -> Section:
             Picture(
                 'controllability',
                 'Distance of the linearized needle from losing controllability and observability, '
-                'and how far the base moves the tip, by inserted length and deflection.',
+                'and tip motion per base motion, by insertion depth and deflection.',
                 figure,
             ),
         ),

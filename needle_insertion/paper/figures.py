@@ -1,4 +1,4 @@
-"""Figures 4 to 8 of the paper, drawn from the runs of `runs`."""
+"""Draw figures 4 to 8 of the paper from the runs of `runs`."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _COLORS: Final = dict(zip(CASES, ('#1f5fa8', '#c25a00', '#2a9d5c', '#7b3fa0'), s
 _DASHES: Final = dict(zip(CASES, ('-', '--', '-.', ':'), strict=True))
 _HUB: Final = {False: 'without a hub', True: 'the hub stops the needle'}
 
-#: State variables that are drawn: index and axis label.
+#: Drawn state variables: index and axis label.
 _STATES: Final = (
     (0, 'd [mm]'),
     (2, r'$q_1$ [$10^{-3}$ m$^{3/2}$]'),
@@ -41,7 +41,7 @@ _STATES: Final = (
 #: Column heads of `_cells`.
 _HEADS: Final = (
     *('peak of the tip [mm]', 'at [s]', 'tip at the end [mm]', 'd at the end [mm]'),
-    *('most inserted [mm]', 'end [s]'),
+    *('largest depth [mm]', 'end [s]'),
 )
 
 
@@ -57,7 +57,7 @@ def _cells(found: Outcome) -> tuple[str, ...]:
 
 
 def _millimeters(value: float) -> str:
-    """Write a length; less than a nanometer is rounding of the solver."""
+    """Format a length [m] in mm; values below a nanometer are rounding errors."""
     return f'{1e3 * value:.3g}' if abs(value) >= 1e-9 else '< 1e-6'
 
 
@@ -69,14 +69,14 @@ def _label(case: tuple[str, ...]) -> str:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PaperFigure:
     """
-    One figure of the paper.
+    Figure of the paper.
 
     Attributes
     ----------
     picture : Picture
         Figure and caption.
     outcomes : Mapping[tuple of str, Outcome]
-        Numbers of each run, by reading and formulation, and for a closed loop 'hub' or 'no hub'.
+        Metrics of each run, by reading and formulation, and for a closed loop 'hub' or 'no hub'.
 
     """
 
@@ -84,29 +84,14 @@ class PaperFigure:
     outcomes: Mapping[tuple[str, ...], Outcome]
 
     def table(self, title: str = '') -> Grid:
-        """
-        Return the numbers as a table.
-
-        Parameters
-        ----------
-        title : str
-            What it is of; the figure if empty.
-
-        Returns
-        -------
-        Grid
-            One row for each run.
-
-        """
+        """Return the metrics as a table with a row per run; default title is the figure."""
         title = title or self.picture.caption.partition(',')[0]
         rows = tuple((_label(case), *_cells(found)) for case, found in self.outcomes.items())
-        return Grid(
-            caption=f'{title}: what came out of each run', heads=('run', *_HEADS), rows=rows
-        )
+        return Grid(caption=f'{title}: metrics of each run', heads=('run', *_HEADS), rows=rows)
 
 
 def _draw_open(axes: Axes, case: tuple[str, str], values: FloatArray) -> float:
-    """Draw what an open-loop run gives [mm]; return the factor of its time axis."""
+    """Draw values of an open-loop run [mm]; return the factor of the time axis."""
     is_fast = case[0] == 'paper_si'
     factor, unit = (1e3, 'ms') if is_fast else (1.0, 's')
     _draw_band(axes, factor * open_loop(*case).time, 1e3 * values, _COLORS[case])
@@ -116,7 +101,7 @@ def _draw_open(axes: Axes, case: tuple[str, str], values: FloatArray) -> float:
 
 
 def _draw_band(axes: Axes, time: FloatArray, values: FloatArray, color: str) -> None:
-    """Draw a line, or the band that it fills if it has more turns than there are pixels."""
+    """Draw a line, or its envelope if it oscillates faster than the pixels resolve."""
     bins = 800
     width = len(time) // bins
     if width < 8:
@@ -150,10 +135,10 @@ def _figure_4() -> PaperFigure:
     caption = (
         f'Figure 4, tip deflection under {FORCE:g} N. With mu_v = 0.3 N s/m the needle is at its '
         f'hub after {1e3 * hub_time(open_loop(*CASES[0])):.1f} ms (dotted), with 0.3 N s/mm after '
-        f'{hub_time(open_loop(*CASES[2])):.1f} s. The tip does not keep its 0.5 mm. It rings, at '
-        f'kilohertz first, with up to {fast:.3g} mm and {slow:.3g} mm by the complete equations '
-        f'and {fast_printed:.3g} mm and {slow_printed:.3g} mm by those as printed. Nothing damps '
-        'it. Bands are vibration too fast to be drawn.'
+        f'{hub_time(open_loop(*CASES[2])):.1f} s. The deflection is not constant: it rings, at '
+        f'kilohertz at first, with up to {fast:.3g} mm and {slow:.3g} mm by the complete and '
+        f'{fast_printed:.3g} mm and {slow_printed:.3g} mm by the printed equations. The model has '
+        'no damping. Bands are the envelope of fast vibration.'
     )
     return PaperFigure(picture=Picture('figure_4', caption, figure), outcomes=found)
 
@@ -175,11 +160,11 @@ def _figure_5() -> PaperFigure:
         for pair in (CASES[:2], CASES[2:])
     )
     caption = (
-        'Figure 5, state variables under 3 N. d falls to the hub and stays there. By the complete '
-        'equations q1 and q2 shrink as the needle goes in, since the same deflection of a longer '
-        'needle takes less of them; by those as printed they do not. The two differ in d by at '
-        f'most {fast:.2g} mm (0.3 N s/m) and {slow:.2g} mm (0.3 N s/mm): the printed ones have no '
-        'force of the deflection on d.'
+        'Figure 5, state variables under 3 N. d decreases to the hub and stays there. By the '
+        'complete equations q1 and q2 decrease during the insertion, since the same deflection of '
+        'a longer needle requires smaller values; by the printed equations they do not. The two '
+        f'differ in d by at most {fast:.2g} mm (0.3 N s/m) and {slow:.2g} mm (0.3 N s/mm): the '
+        'printed equations have no force of the deflection on d.'
     )
     return PaperFigure(picture=Picture('figure_5', caption, figure), outcomes=_open_outcomes())
 
@@ -189,7 +174,7 @@ def _closed_outcomes(law: str) -> dict[tuple[str, ...], Outcome]:
         (*case, 'hub' if hub_stop else 'no hub'): Outcome.of(
             closed_loop(law, *case, hub_stop=hub_stop)
         )
-        # PID comes to rest before the hub.
+        # PID stops before the hub.
         for hub_stop in ((True,) if law == 'pid' else (False, True))
         for case in CASES
     }
@@ -228,12 +213,12 @@ def _figure_6() -> PaperFigure:
     free = found['paper_si', 'complete', 'no hub']
     caption = (
         'Figure 6, state variables under inverse dynamics with the gains of the paper. All four '
-        'cases lie on one another: a law that knows its needle exactly cancels friction, '
-        'stiffness and formulation alike and leaves e_ddot + k_v e_dot + k_p e = 0, with a '
+        'cases coincide: with an exact model the law cancels friction, stiffness and formulation, '
+        'and the error obeys e_ddot + k_v e_dot + k_p e = 0, with a '
         'damping ratio of 0.05 in d and 0.16 in q1 and q2. d overshoots to '
         f'{1e3 * (NeedleParameters().length - free.deepest):.0f} mm, {1e3 * free.deepest:.0f} mm '
-        'of a 200 mm needle inserted, which only an equation without a hub can do. On the hub the '
-        'needle stops where it should.'
+        'of a 200 mm needle inserted, which is possible only in a model without a hub. With the '
+        'hub the needle stops at the target.'
     )
     return PaperFigure(picture=Picture('figure_6', caption, figure), outcomes=found)
 
@@ -249,17 +234,17 @@ def _figure_7() -> PaperFigure:
     found = _closed_outcomes('inverse_dynamics')
     free, held = (found['paper_si', 'complete', word] for word in ('no hub', 'hub'))
     caption = (
-        'Figure 7, tip deflection under inverse dynamics. It goes to zero after a detour: q1 and '
-        'q2 are slow (3.2 rad/s) and the needle is pushed in while they last, so that the tip '
-        f'swings to {1e3 * free.peak:.0f} mm at {free.peak_time:.1f} s without a hub and to '
+        'Figure 7, tip deflection under inverse dynamics. It converges to zero after a peak: q1 '
+        'and q2 are slow (3.2 rad/s) and the needle is inserted before they decay, so that the '
+        f'tip swings to {1e3 * free.peak:.0f} mm at {free.peak_time:.1f} s without a hub and to '
         f'{1e3 * held.peak:.0f} mm at {held.peak_time:.1f} s with it, from 0.5 mm at the start. '
-        'So large a deflection is outside a linear beam model.'
+        'Such a deflection is outside the validity of a linear beam model.'
     )
     return PaperFigure(picture=Picture('figure_7', caption, figure), outcomes=found)
 
 
 def _figure_8() -> PaperFigure:
-    """Draw the tip deflection under PID, and the position error that it leaves."""
+    """Draw the tip deflection under PID, and the remaining position error."""
     figure = Figure(figsize=(11.0, 4.2), layout='constrained')
     left, right = figure.subplots(1, 2)
     _draw_closed(left, 'pid', hub_stop=True)
@@ -278,10 +263,10 @@ def _figure_8() -> PaperFigure:
     caption = (
         'Figure 8, PID with the gains of the paper. Left: the tip deflection grows to '
         f'{1e3 * abs(fast.peak):.1f} mm (0.3 N s/m) or {1e3 * abs(slow.peak):.1f} mm '
-        f'(0.3 N s/mm) at {slow.peak_time:.0f} s and then goes to zero, as under inverse '
-        'dynamics: the gains on q1 and q2 act on errors that friction does not hold. Right '
+        f'(0.3 N s/mm) at {slow.peak_time:.0f} s and then converges to zero, as under inverse '
+        'dynamics: friction does not act on q1 and q2. Right '
         f'(0.3 N s/mm, complete): d stops at {1e3 * slow.error:.2f} mm = mu_s / k_p, where '
-        'friction holds the proportional force and nothing integrates. The error of inverse '
+        'friction balances the proportional force without an integral. The error of inverse '
         'dynamics, without a hub, falls as exp(-0.05 t).'
     )
     return PaperFigure(picture=Picture('figure_8', caption, figure), outcomes=found)
@@ -298,7 +283,7 @@ FIGURES: Final[Mapping[str, Callable[[], PaperFigure]]] = {
 
 
 def _comparison() -> Grid:
-    """Compare what each law leaves of the deflection and of the position error."""
+    """Compare the remaining deflection and position error of the laws."""
     rows = []
     for reading in READINGS:
         for law in LAWS:
@@ -311,22 +296,14 @@ def _comparison() -> Grid:
                 for how, run in runs.items()
             ]
     return Grid(
-        caption='What each controller leaves, by what it can push on (hub on, complete equations)',
+        caption='Metrics of each controller by actuated coordinates (hub on, complete equations)',
         heads=('controller', *_HEADS),
         rows=tuple(rows),
     )
 
 
 def section() -> Section:
-    """
-    Return figures 4 to 8 and the comparison of the controllers.
-
-    Returns
-    -------
-    Section
-        For the page of results.
-
-    """
+    """Return the section of the results page: figures 4 to 8, and a comparison of the laws."""
     figures = [draw() for draw in FIGURES.values()]
     pid = Outcome.of(closed_loop('pid', 'paper_mm', 'complete', hub_stop=True))
     inverse, proportional = (1e3 * Outcome.of(base_alone(law, 'paper_mm')).final for law in LAWS)
@@ -334,23 +311,23 @@ def section() -> Section:
         title='Figures 4 to 8',
         paragraphs=(
             (
-                'Start of all runs: 2 cm inserted, tip deflected by 0.5 mm in the shape that a '
-                'force at the tip would hold (the paper gives the tip alone). Gains: inverse '
+                'Start of all runs: 2 cm inserted, tip deflected by 0.5 mm in the static shape '
+                'for a force at the tip (the paper gives only the tip deflection). Gains: inverse '
                 'dynamics k_p = diag(1, 10, 10), k_v = 0.1 k_p; PID k_p = 1000, k_v = 10 k_p on '
-                'each of d, q1 and q2, no integral. The wanted state is zero.'
+                'each of d, q1 and q2, no integral. The target state is zero.'
             ),
             (
-                'Final deflection: both controllers bring it to zero, each with generalized '
-                'forces on q1 and q2 that no motor of a needle robot applies. With f_y alone '
-                'neither does: the needle is at its depth and its tip rings on, with up to '
+                'Final deflection: both controllers reduce it to zero, with generalized forces on '
+                'q1 and q2 that no motor of a needle robot applies. With f_y alone the deflection '
+                'remains: the needle is at its depth and its tip vibrates, with up to '
                 f'{inverse:.2g} mm under inverse dynamics and {proportional:.2g} mm under PID '
                 '(0.3 N s/mm), as the model has no damping.'
             ),
             (
                 'Final position error: inverse dynamics none, since it compensates Coulomb '
                 f'friction exactly; PID {1e3 * pid.error:.2f} mm = mu_s / k_p, since it has no '
-                'integral. Either an integral or knowledge of mu_s removes this error; knowledge '
-                'of the rest of the model has no part in it.'
+                'integral. Either an integral or compensation of mu_s removes this error; the '
+                'other parameters of the model do not affect it.'
             ),
         ),
         tables=(

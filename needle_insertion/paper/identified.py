@@ -35,7 +35,7 @@ _HEADS: Final = (
     *('95 % of the STD', 'true value inside', 'verdict'),
 )
 
-#: The unit that each table does not print.
+#: Unit of each table, which the paper does not print.
 _UNITS: Final[Mapping[str, str]] = {
     'table-1': (
         'The paper prints no unit of mu_v. Here 0.3 is read as N s/mm, 300 N s/m, as on the rig '
@@ -48,18 +48,18 @@ _UNITS: Final[Mapping[str, str]] = {
 }
 
 
-#: Verdict on a table by whether it comes out as the paper has it.
+#: Verdict on a table by agreement with the paper.
 VERDICTS: Final = {True: 'holds', False: 'DOES NOT HOLD'}
 
 
 class ReproduceError(NeedleError):
-    """There is nothing to reproduce a result from."""
+    """No recordings to reproduce a result from."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Line:
     """
-    One published quantity beside what the recordings give.
+    Published quantity and its statistics over the recordings.
 
     Attributes
     ----------
@@ -68,9 +68,9 @@ class Line:
     paper : (float, float)
         Published mean and standard deviation, SI.
     found : Statistic
-        The same over the recordings.
+        Mean and standard deviation over the recordings.
     truth : Coverage
-        Recordings whose 95 % interval holds their own true value.
+        Number of recordings whose 95 % interval contains the ground truth.
 
     """
 
@@ -93,7 +93,7 @@ class Line:
 
     @property
     def holds(self) -> bool:
-        """Whether both intervals hold what is published."""
+        """Whether both intervals contain the published values."""
         return all(
             low <= value <= high
             for value, (low, high) in zip(
@@ -116,7 +116,7 @@ class Line:
 
     @property
     def document(self) -> dict[str, Any]:
-        """For JSON."""
+        """Document for JSON."""
         mean, deviation = self.paper
         return {
             'quantity': self.quantity,
@@ -138,19 +138,7 @@ def _interval(interval: tuple[float, float]) -> str:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class IdentifiedTable:
-    """
-    A table of the paper, identified from recordings.
-
-    Attributes
-    ----------
-    name : str
-        One of `TABLES`.
-    bags : tuple of Path
-        The recordings.
-    lines : tuple of Line
-        What they give.
-
-    """
+    """Table ``name``, of `TABLES`, of the paper, identified from recordings."""
 
     name: str
     bags: tuple[Path, ...]
@@ -158,23 +146,23 @@ class IdentifiedTable:
 
     @property
     def title(self) -> str:
-        """Such as ``Table 1``."""
+        """Title such as ``Table 1``."""
         return self.name.replace('-', ' ').capitalize()
 
     @property
     def truth(self) -> Coverage:
-        """How many intervals of all lines hold their own true value."""
+        """Coverage of the ground truth over all lines."""
         found = [line.truth for line in self.lines]
         return Coverage(sum(one.held for one in found), sum(one.known for one in found))
 
     @property
     def holds(self) -> bool:
-        """Whether the recordings agree with the paper and with their true values."""
+        """Whether the recordings agree with the paper and with their ground truth."""
         return self.truth.is_enough and all(line.holds for line in self.lines)
 
     @property
     def words(self) -> str:
-        """How many intervals contain their true value."""
+        """Number of intervals that contain their ground truth, as a sentence."""
         truth = self.truth
         return (
             f'{truth.held} of {truth.known} intervals (95 %) contain the true value of their bag; '
@@ -184,7 +172,7 @@ class IdentifiedTable:
 
     @property
     def document(self) -> dict[str, Any]:
-        """For JSON."""
+        """Document for JSON."""
         truth = self.truth
         return {
             'unit': 'SI',
@@ -201,16 +189,16 @@ class IdentifiedTable:
 
     @property
     def section(self) -> Section:
-        """For the page."""
+        """Section of the results page."""
         return Section(
             title=self.title,
             paragraphs=(
                 _UNITS[self.name],
                 (
                     'The paper prints mean and STD over repeated experiments. Both are compared '
-                    'with the 95 % intervals that the recordings give. The recordings are of a '
-                    "simulated rig whose constants are drawn around the paper's: they show that "
-                    'the method finds the true values, not that the paper measured well. '
+                    'with the 95 % intervals from the recordings. The recordings are of a '
+                    "simulated rig whose constants are sampled around the paper's: they validate "
+                    'the method, not the measurements of the paper. '
                     f'{self.words}.'
                 ),
             ),
@@ -239,7 +227,7 @@ def _table_1(bags: Sequence[Path]) -> list[Line]:
 
 
 def _table_2(bags: Sequence[Path]) -> list[Line]:
-    """Return each entry of the stiffness matrix at each level over several places, and k_a."""
+    """Return the entries of the stiffness matrix by level over several places, and k_a."""
     recordings = [read_indentation_recording(bag) for bag in _shown(bags, 'reading')]
     estimates = [identify_stiffness(recording) for recording in _shown(recordings, 'fits')]
     for estimate in estimates:
@@ -263,12 +251,12 @@ def _table_2(bags: Sequence[Path]) -> list[Line]:
             )
     tissue, (means, deviations) = summary.tissue_stiffness, TABLE_2['k_zz']
     quantity = f'{tissue.symbol} at {FORCE_LEVELS[-1]:g} N [{tissue.unit}]'
-    # The paper takes k_zz for it, as a contact length of 1 m does.
+    # The paper equates k_a and k_zz, which implies a contact length of 1 m.
     lines.append(Line(quantity=quantity, paper=(means[-1], deviations[-1]), found=tissue))
     return lines
 
 
-#: Tables by name: the experiment behind each, and what is made of its bags.
+#: Tables by name: experiment, and function that identifies the table from bags.
 TABLES: Final[Mapping[str, tuple[str, Callable[[Sequence[Path]], list[Line]]]]] = {
     'table-1': ('friction', _table_1),
     'table-2': ('stiffness', _table_2),
@@ -278,34 +266,14 @@ TABLES: Final[Mapping[str, tuple[str, Callable[[Sequence[Path]], list[Line]]]]] 
 def identify_table(
     name: str, recorded: Mapping[str, Sequence[Path]] | None = None
 ) -> IdentifiedTable:
-    """
-    Identify a table of the paper from recordings.
-
-    Parameters
-    ----------
-    name : str
-        One of `TABLES`.
-    recorded : Mapping[str, sequence of Path], optional
-        Recordings by experiment; the shipped ones if not given.
-
-    Returns
-    -------
-    IdentifiedTable
-        What they give.
-
-    Raises
-    ------
-    ReproduceError
-        If there are no recordings, or they have other force levels than Table 2.
-
-    """
+    """Identify a table, of `TABLES`, from recordings by experiment; default: shipped bags."""
     experiment, result = TABLES[name]
     bags = (recorded or {}).get(experiment) or sorted(
         path for path in SHIPPED_BAGS.glob(f'{experiment}_*') if path.is_dir()
     )
     if not bags:
         raise ReproduceError(
-            f'{SHIPPED_BAGS} holds no {experiment}_*; run from a clone, or give --record DIR'
+            f'{SHIPPED_BAGS} holds no {experiment}_*; run from a clone, or use --record DIR'
         )
     return IdentifiedTable(name=name, bags=tuple(bags), lines=tuple(result(bags)))
 

@@ -1,9 +1,9 @@
 """
-The control laws on needles with other friction and stiffness than they believe: 30 % off.
+Simulate the control laws with 30 % mismatch of friction and stiffness.
 
-The sampled laws of the node with their default gains, and as they are in the paper: inverse
-dynamics without feedback, PID without integral. At 1 kHz they drive the base (`physical`). They
-believe in the preset; each run has a needle of its own.
+The sampled laws of the controller node run at 1 kHz with default gains, and as in the paper:
+inverse dynamics without feedback, PID without integral. They actuate the base (`physical`). The
+nominal model is the preset; the plant parameters are sampled for each run.
 """
 
 from __future__ import annotations
@@ -33,23 +33,23 @@ from needle_insertion.paper.runs import LAWS
 from needle_insertion.report.content import Grid, Picture, Section
 import numpy as np
 
-#: Largest relative deviation of the uniform distributions, and the constants that are drawn.
+#: Largest relative deviation of the uniform distributions, and the sampled constants.
 WIDTH: Final = 0.3
 DRAWN: Final = ('coulomb_friction', 'viscous_friction', 'tissue_stiffness')
 
-#: The insertion: from, to [m], and duration of the run [s]; the reference takes 9.4 s.
+#: Insertion: start and target depth [m], and duration of the run [s]; the reference takes 9.4 s.
 START: Final = 0.02
 TARGET: Final = 0.07
 DURATION: Final = 11.5
 DEFLECTION: Final = 5e-4
 
-#: Longest step [s]: the modal flow is exact; a hundredth of it changes no error by a nanometer.
+#: Longest step [s]: the modal flow is exact; a step of 1/100 changes no error by a nanometer.
 STEP: Final = 1e-3
 
-#: Preset that the laws believe in, and the middle of the true needles.
+#: Preset of the nominal model, and mean of the plants.
 PRESET: Final = DEFAULT_PRESET
 
-#: What is studied, in words, and its delay [periods].
+#: Cases: description and delay [periods].
 CASES: Final[Mapping[str, tuple[str, int]]] = {
     'inverse_dynamics': ('inverse dynamics', 1),
     'pid': ('PID', 1),
@@ -69,16 +69,16 @@ _MEASURES: Final = {
 @dataclass(frozen=True, slots=True, eq=False)
 class Mismatch:
     """
-    The study.
+    Results of the mismatch study.
 
     Attributes
     ----------
     factors : ndarray, shape (runs, 3)
-        True over believed value of mu_s, mu_v and k_a.
+        Ratio of true to nominal mu_s, mu_v and k_a.
     batches : Mapping[str, LoopBatch]
         Runs of each of `CASES`.
     nominal : Mapping[str, LoopBatch]
-        The one run of each on the needle that it believes in.
+        Run of each case without mismatch.
 
     """
 
@@ -88,18 +88,9 @@ class Mismatch:
 
     def shares(self, law: str) -> FloatArray:
         """
-        Return the share of each factor in the variance of the final error.
+        Return the fraction of each factor in the variance of the final error, shape (3,).
 
-        Parameters
-        ----------
-        law : str
-            One of `CASES`.
-
-        Returns
-        -------
-        ndarray, shape (3,)
-            Variance of the means within 20 equal bins of a factor, over the whole variance.
-
+        It is the variance of the means within 20 equal bins of a factor, over the whole variance.
         """
         final = self.batches[law].final
         shares = np.zeros(len(DRAWN))
@@ -117,26 +108,7 @@ def study(
     step: float = STEP,
     progress: Callable[[], object] | None = None,
 ) -> Mismatch:
-    """
-    Run all `CASES` on the same needles.
-
-    Parameters
-    ----------
-    runs : int
-        Runs of each.
-    seed : int
-        Seed of the needles.
-    step : float
-        Longest step of the integrator [s].
-    progress : callable, optional
-        Called after each run.
-
-    Returns
-    -------
-    Mismatch
-        Results.
-
-    """
+    """Run all `CASES` on the same plants; ``step`` is the longest integrator step [s]."""
     believed = NeedleParameters.preset(PRESET)
     factors = np.random.default_rng(seed).uniform(1.0 - WIDTH, 1.0 + WIDTH, (runs, len(DRAWN)))
     means = np.array([getattr(believed, name) for name in DRAWN])
@@ -170,22 +142,7 @@ def study(
 
 
 def sampled_laws(parameters: NeedleParameters, period: float) -> dict[str, Law]:
-    """
-    Return the laws of insertion with their default gains, and as they are in the paper.
-
-    Parameters
-    ----------
-    parameters : NeedleParameters
-        Needle that the laws believe in.
-    period : float
-        Sample period [s].
-
-    Returns
-    -------
-    dict
-        Laws by name.
-
-    """
+    """Return the insertion laws for a nominal model, default and paper gains; period in s."""
     axis = Axis.insertion(parameters)
 
     def inverse(gains: InverseDynamicsGains) -> InverseDynamics:
@@ -200,7 +157,7 @@ def sampled_laws(parameters: NeedleParameters, period: float) -> dict[str, Law]:
 
 
 def _table(found: Mismatch) -> Grid:
-    """Return median, 95 % and largest of each error, beside the run without mismatch."""
+    """Return median, 95 % quantile and maximum of each error, and the error without mismatch."""
     rows = []
     for law, batch in found.batches.items():
         for name, words in _MEASURES.items():
@@ -218,7 +175,7 @@ def _table(found: Mismatch) -> Grid:
 
 
 def _figure(found: Mismatch) -> Figure:
-    """Draw the distribution of each error, and the final error against that of mu_s."""
+    """Draw the distribution of each error, and the final error against the mismatch of mu_s."""
     figure = Figure(figsize=(12.0, 4.2), layout='constrained')
     axes = figure.subplots(1, 4)
     drawn = {law: found.batches[law] for law in LAWS}
@@ -230,68 +187,52 @@ def _figure(found: Mismatch) -> Figure:
             known = 1e3 * abs(float(getattr(found.nominal[law], name)[0]))
             panel.axvline(known, color=LAW_COLORS[law], linestyle=':', linewidth=1.0)
         panel.set(xscale='log', xlabel=f'{words} [mm]', ylim=(0.0, 1.0))
-    axes[0].set_ylabel('share of the runs')
+    axes[0].set_ylabel('fraction of the runs')
     axes[0].legend(fontsize='small')
     friction = 100.0 * (found.factors[:, 0] - 1.0)
     for law, batch in drawn.items():
         axes[3].plot(friction, 1e3 * batch.final, '.', markersize=2.5, color=LAW_COLORS[law])
-    axes[3].set(
-        xlabel=r'true $\mu_s$ over believed - 1 [%]', ylabel='signed error at the end [mm]'
-    )
+    axes[3].set(xlabel=r'true $\mu_s$ over nominal - 1 [%]', ylabel='signed error at the end [mm]')
     for panel in axes:
         panel.grid(visible=True, alpha=0.3)
     return figure
 
 
 def section(found: Mismatch) -> Section:
-    """
-    Return the study for the page.
-
-    Parameters
-    ----------
-    found : Mismatch
-        The study.
-
-    Returns
-    -------
-    Section
-        For the page of results.
-
-    """
+    """Return the section of the results page."""
     final = {name: 1e6 * np.median(np.abs(b.final)) for name, b in found.batches.items()}
     rms = {name: 1e6 * np.median(b.rms) for name, b in found.batches.items()}
     stiffness = 100.0 * found.shares('inverse_dynamics')[2]
     caption = (
-        'Distribution of the errors over the runs (dotted: the needle is known exactly), and the '
-        'final error against the error in mu_s. The integral of each law continues until the '
+        'Distribution of the errors over the runs (dotted: exact model), and the final error '
+        'against the error in mu_s. The integral of each law continues until the '
         'error is within its tolerance.'
     )
     return Section(
-        title='Needles that the controller does not know',
+        title='Mismatch between needle and model',
         paragraphs=(
             (
                 f'{len(found.factors)} insertions from {100.0 * START:g} to {100.0 * TARGET:g} cm '
                 'in 9.4 s with each law, at 1 kHz, default gains, f_y alone. mu_s, mu_v, k_a of '
-                'the needle are each uniform within 30 % of what the law believes (preset '
+                'the needle are each uniform within 30 % of the nominal values (preset '
                 f'{PRESET}; the same needles for all laws). No observer: the laws do not '
-                'know the force of the bent needle, which starts with 0.5 mm of deflection that '
-                'rings out within tens of milliseconds.'
+                'compensate the force of the bent needle, whose initial deflection of 0.5 mm '
+                'decays within tens of milliseconds.'
             ),
             (
                 f'Inverse dynamics with its feedback ends {final["inverse_dynamics"]:.2g} um from '
                 f'the goal in the median, with an rms error of {rms["inverse_dynamics"]:.2g} um; '
                 f'PID {final["pid"]:.2g} um and {rms["pid"]:.2g} um. The integral of both removes '
-                'what is not modeled, and the feed-forward of inverse dynamics leaves less of it. '
+                'unmodeled forces, and the feed-forward of inverse dynamics reduces them. '
                 f'k_a explains {stiffness:.0f} % of the variance of its final error: the '
-                'stiffness of the tissue does not matter to the base of a needle that is nearly '
-                'straight.'
+                'stiffness of the tissue does not affect the base of a nearly straight needle.'
             ),
             (
-                'As in the paper, inverse dynamics has no feedback of what differs from the '
-                'model, and compensates friction with the measured velocity. With a delay of one '
+                'As in the paper, inverse dynamics has no feedback of the mismatch, '
+                'and compensates friction with the measured velocity. With a delay of one '
                 f'period it ends {final["paper_inverse_dynamics"]:.2g} um from the goal (PID '
-                f'without integral: {final["paper_pid"]:.2g} um). Without delay it compensates '
-                'more friction than there is, and moves back and forth: '
+                f'without integral: {final["paper_pid"]:.2g} um). Without delay it '
+                'overcompensates friction and oscillates: '
                 f'{final["paper_inverse_dynamics_at_once"]:.2g} um '
                 f'({final["paper_pid_at_once"]:.2g} um).'
             ),

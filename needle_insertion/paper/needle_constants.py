@@ -1,4 +1,4 @@
-"""The constants of the needle, Table 3, beside those of a round wire."""
+"""Constants of the needle, Table 3, compared with a round wire."""
 
 from __future__ import annotations
 
@@ -13,15 +13,7 @@ DIAMETER: Final = 1.27e-3
 
 
 def section() -> Section:
-    """
-    Return Table 3.
-
-    Returns
-    -------
-    Section
-        For the page of results.
-
-    """
+    """Return Table 3 for the results page."""
     p = NeedleParameters()
     rows = (
         ('l [m]', p.length, None),
@@ -35,10 +27,10 @@ def section() -> Section:
         title='Table 3',
         paragraphs=(
             (
-                'A and I_y are those of a round needle of 1.27 mm. I_x is not its polar moment of '
-                'area. The equations need a mass moment of inertia and get the same number in '
+                'A and I_y match a round needle of 1.27 mm. I_x is not its polar moment of '
+                'area. The equations require a mass moment of inertia and use the same number in '
                 'kg m^2; only the rotation depends on it. g (9.89 m/s^2 in the paper) is in no '
-                'equation: the plane of motion is level.'
+                'equation: the plane of motion is horizontal.'
             ),
         ),
         tables=(

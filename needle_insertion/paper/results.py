@@ -1,4 +1,4 @@
-"""The results of the paper, computed again: each as text, as JSON and on one page."""
+"""Reproduce the results of the paper as text, as JSON, and as a page."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from needle_insertion.report.page import write_page
 from needle_insertion.report.text import filled, table
 from tqdm import tqdm
 
-#: Tables that a result is judged by.
+#: Tables that decide about a result.
 _JUDGED_BY: Final[Mapping[str, tuple[str, ...]]] = {
     **{name: (name,) for name in TABLES},
     'claims': tuple(TABLES),
@@ -39,20 +39,20 @@ VERDICT_HEADS: Final = ('where', 'what', 'verdict')
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Result:
     """
-    One result, for the page, for the terminal and for JSON.
+    Result for the page, the terminal and JSON.
 
     Attributes
     ----------
     section : Section
-        For the page.
+        Section of the page.
     text : str
-        For the terminal.
+        Text for the terminal.
     verdicts : tuple of (str, str, str)
-        Where, what, and the verdict on it.
+        Place in the paper, statement, and verdict.
     document : Mapping[str, object]
-        For JSON.
+        Document for JSON.
     holds : bool
-        False if a table does not come out as the paper has it.
+        False if a table differs from the paper.
 
     """
 
@@ -64,25 +64,7 @@ class Result:
 
 
 def campaigns(what: str) -> dict[str, Campaign]:
-    """
-    Return the experiments behind a result.
-
-    Parameters
-    ----------
-    what : str
-        Such as ``figure-4``, ``table-1``, ``claims`` or ``all``.
-
-    Returns
-    -------
-    dict
-        Campaigns by the name of the experiment.
-
-    Raises
-    ------
-    ReproduceError
-        If no recordings are behind it.
-
-    """
+    """Return the campaigns of a result (``table-1``, ``claims``, ``all``), by experiment."""
     if what not in _JUDGED_BY:
         raise ReproduceError(f'{what} is computed: there is nothing to --record')
     names = [TABLES[name][0] for name in _JUDGED_BY[what]]
@@ -91,20 +73,9 @@ def campaigns(what: str) -> dict[str, Campaign]:
 
 def results(what: str, recorded: Mapping[str, Sequence[Path]] | None = None) -> dict[str, Result]:
     """
-    Compute a result of the paper again, or all of them.
+    Compute a result (``figure-4``, ``table-1``, ``claims``) or ``all``, in page order.
 
-    Parameters
-    ----------
-    what : str
-        Such as ``figure-4``, ``table-1``, ``claims`` or ``all``.
-    recorded : Mapping[str, sequence of Path], optional
-        Recordings by experiment; the shipped ones if not given.
-
-    Returns
-    -------
-    dict[str, Result]
-        By name, in the order of the page.
-
+    ``recorded`` are recordings by experiment, by default the shipped recordings.
     """
     tables = {name: identify_table(name, recorded) for name in _JUDGED_BY.get(what, ())}
     source = f'the {"shipped" if recorded is None else "new"} simulated recordings'
@@ -114,7 +85,7 @@ def results(what: str, recorded: Mapping[str, Sequence[Path]] | None = None) -> 
 
 
 def _jobs(tables: Mapping[str, IdentifiedTable], source: str) -> dict[str, Callable[[], Result]]:
-    """Return what computes each result; ``figures`` are all of them on one page."""
+    """Return the functions that compute each result; ``figures`` combines all figures."""
     return {
         'claims': lambda: _of_claims(_judged(tables, source)),
         **{name: partial(_of_table, one) for name, one in tables.items()},
@@ -132,7 +103,7 @@ def _of_table(found: IdentifiedTable) -> Result:
     return Result(
         section=section,
         text=f'{table(grid.rows, grid.heads)}\n\n{found.words}',
-        verdicts=((found.title, 'means and STD are those printed', VERDICTS[found.holds]),),
+        verdicts=((found.title, 'means and STD agree with the paper', VERDICTS[found.holds]),),
         document=found.document,
         holds=found.holds,
     )
@@ -190,7 +161,7 @@ def _judged(tables: Mapping[str, IdentifiedTable], source: str) -> list[claims.C
 
 
 def _statistics(tables: Mapping[str, IdentifiedTable], source: str) -> claims.Tables:
-    """Return identified tables as claims are judged by them."""
+    """Return identified tables as statistics for the claims."""
     found: dict[str, list[tuple[float, float]]] = {}
     for line in (line for one in tables.values() for line in one.lines):
         mean, deviation = line.found.mean, line.found.deviation
@@ -210,27 +181,7 @@ def _bar(what: str) -> dict[str, Any]:
 
 
 def write_results(folder: Path, found: Mapping[str, Result]) -> Path:
-    """
-    Write results on one page, with a short overview at the top.
-
-    Parameters
-    ----------
-    folder : Path
-        Where to write.
-    found : Mapping[str, Result]
-        Results by name.
-
-    Returns
-    -------
-    Path
-        The page, ``reproduce.html``.
-
-    Raises
-    ------
-    ParameterError
-        If a file cannot be written.
-
-    """
+    """Write results as a page ``reproduce.html`` with an overview; return its path."""
     cards = []
     if 'claims' in found:
         said = [verdict for _where, _what, verdict in found['claims'].verdicts]
@@ -239,7 +190,7 @@ def write_results(folder: Path, found: Mapping[str, Result]) -> Path:
             (
                 'Claims of the paper',
                 f'{said.count(claims.HOLDS)} of {len(said)} hold',
-                f'{conditional} more under a condition, {failed} do not',
+                f'{conditional} hold only under a condition, {failed} do not hold',
             )
         )
     for one in (found[name] for name in TABLES if name in found):
@@ -253,8 +204,8 @@ def write_results(folder: Path, found: Mapping[str, Result]) -> Path:
         'sections.html',
         title='The paper, reproduced',
         introduction='A. Boroomand, M. Tavakoli, R. Sloboda, N. Usmani, Dynamical modeling and '
-        'controllability analysis of a flexible needle in soft tissue (2014): its figures, tables '
-        'and claims, computed again.',
+        'controllability analysis of a flexible needle in soft tissue (2014): reproduced figures, '
+        'tables and claims.',
         pictures=[picture for section in sections for picture in section.pictures],
         cards=cards,
         sections=sections,

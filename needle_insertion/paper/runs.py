@@ -1,10 +1,10 @@
 """
-The runs behind figures 4 to 8: both readings of Table 1 and both formulations.
+Runs for figures 4 to 8: both readings of Table 1 and both formulations.
 
-The paper does not say how its figures were computed. Here the integrator of the simulated plant
-solves the open loop, and `run_continuous` the closed loops in continuous time, with a generalized
-force on every coordinate, as the paper's gain matrices ask for (`modal`). For comparison the same
-laws run with f_y alone, which is all that a robot at the needle base can apply.
+The paper does not describe the computation of its figures. Here the integrator of the simulated
+plant solves the open loop, and `run_continuous` the closed loops in continuous time, with a
+generalized force on every coordinate, as the gain matrices of the paper require (`modal`). For
+comparison the same laws run with f_y alone, the only force of a robot at the needle base.
 """
 
 from __future__ import annotations
@@ -32,19 +32,19 @@ from needle_dynamics import (
 )
 import numpy as np
 
-#: Both readings of Table 1, and these with both formulations.
+#: Readings of Table 1, and their combinations with both formulations.
 READINGS: Final = ('paper_si', 'paper_mm')
 CASES: Final = tuple(product(READINGS, FORMULATIONS))
 
-#: Laws of section 3.2.7, with the words for them.
+#: Laws of section 3.2.7 and their names in text.
 LAWS: Final[Mapping[str, str]] = {'inverse_dynamics': 'inverse dynamics', 'pid': 'PID'}
 
-#: Section 3.2.8: inserted length [m], tip deflection [m], and the force in the open loop [N].
+#: Section 3.2.8: insertion depth [m], tip deflection [m], and open-loop force [N].
 DEPTH: Final = 0.02
 DEFLECTION: Final = 5e-4
 FORCE: Final = 3.0
 
-#: Gains of section 3.2.8. The paper has none for theta; here it gets those of d.
+#: Gains of section 3.2.8. The paper gives no gains for theta; here they equal the gains of d.
 INVERSE_DYNAMICS_KP: Final = (1.0, 1.0, 10.0, 10.0)
 INVERSE_DYNAMICS_KV: Final = tuple(0.1 * gain for gain in INVERSE_DYNAMICS_KP)
 PID_KP: Final = 1e3
@@ -54,27 +54,27 @@ PID_KV: Final = 1e4
 OPEN_LOOP: Final[Mapping[str, float]] = {'paper_si': 0.035, 'paper_mm': 24.0}
 CLOSED_LOOP: Final = {'inverse_dynamics': 150.0, 'pid': 150.0}
 
-#: Part of a closed loop that is drawn, and that has denser samples [s].
+#: Drawn part of a closed loop, with denser samples [s].
 SHOWN: Final = 40.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Outcome:
     """
-    The main numbers of a run.
+    Metrics of a run.
 
     Attributes
     ----------
     peak, peak_time : float
-        Largest tip deflection, with its sign [m], and its time [s].
+        Signed tip deflection of largest magnitude [m], and its time [s].
     final : float
-        Largest modulus of the tip deflection [m] over the last tenth of the run.
+        Largest magnitude of the tip deflection [m] over the last tenth of the run.
     error : float
-        d at the end [m]: the position error, as q_d = 0.
+        Final d [m]: the position error, as q_d = 0.
     deepest : float
-        Largest inserted length [m].
+        Largest insertion depth [m].
     end : float
-        Time at the end [s].
+        Final time [s].
 
     """
 
@@ -88,20 +88,7 @@ class Outcome:
     @classmethod
     @cache
     def of(cls, run: LoopRun) -> Outcome:
-        """
-        Take the numbers from a run.
-
-        Parameters
-        ----------
-        run : LoopRun
-            The run.
-
-        Returns
-        -------
-        Outcome
-            Its numbers.
-
-        """
+        """Compute the metrics of a run."""
         tip = run.tip_deflection
         k = int(np.abs(tip).argmax())
         late = run.time >= run.time[0] + 0.9 * (run.time[-1] - run.time[0])
@@ -116,22 +103,7 @@ class Outcome:
 
 
 def needle(reading: str, formulation: str, *, hub_stop: bool = True) -> NeedleModel:
-    """
-    Return the needle of the paper's figures.
-
-    Parameters
-    ----------
-    reading, formulation : str
-        Preset and formulation.
-    hub_stop : bool
-        Whether the hub stops the needle.
-
-    Returns
-    -------
-    NeedleModel
-        The needle.
-
-    """
+    """Return the model of the paper's figures for a reading (preset) and a formulation."""
     return NeedleModel(
         NeedleParameters.preset(reading, formulation=formulation, hub_stop=hub_stop)
     )
@@ -142,18 +114,8 @@ def open_loop(reading: str, formulation: str, deflection: float = DEFLECTION) ->
     """
     Run the open loop of figures 4 and 5: 3 N from the start, up to the hub and beyond.
 
-    Parameters
-    ----------
-    reading, formulation : str
-        Preset and formulation.
-    deflection : float
-        Initial deflection of the tip [m].
-
-    Returns
-    -------
-    LoopRun
-        At least 3500 samples; some modes are faster than that.
-
+    ``deflection`` is the initial tip deflection [m]. The run has at least 3500 samples; some modes
+    are faster.
     """
     model = needle(reading, formulation)
     duration = OPEN_LOOP[reading]
@@ -173,24 +135,7 @@ def open_loop(reading: str, formulation: str, deflection: float = DEFLECTION) ->
 def paper_law(
     name: str, model: NeedleModel, factors: tuple[float, float] = (1.0, 1.0)
 ) -> ContinuousLaw:
-    """
-    Return a law of section 3.2.7 with the paper's gains, in continuous time, `modal`.
-
-    Parameters
-    ----------
-    name : str
-        One of `LAWS`.
-    model : NeedleModel
-        Needle that the law believes in.
-    factors : tuple of float
-        Factors on k_p and k_v.
-
-    Returns
-    -------
-    ContinuousLaw
-        The law.
-
-    """
+    """Return a continuous law with the paper's gains times ``factors`` on k_p and k_v, `modal`."""
     kp, kv = factors
     if name == 'pid':
         ones = np.ones(model.coordinates)
@@ -217,27 +162,13 @@ def closed_loop(
     """
     Run a closed loop of figures 6 to 8, with a generalized force on every coordinate.
 
-    Parameters
-    ----------
-    law : str
-        One of `LAWS`.
-    reading, formulation : str
-        Preset and formulation, of the needle and of the law.
-    hub_stop : bool
-        Whether the hub stops the needle.
-    factors : tuple of float
-        Factors on k_p and k_v.
-
-    Returns
-    -------
-    LoopRun
-        Samples every 25 ms up to 40 s, and every 100 ms up to 150 s if the hub does not stop the
-        needle before and the factors are 1.
-
+    Reading and formulation apply to plant and law; ``factors`` scale k_p and k_v. Samples are 25
+    ms apart up to 40 s, and 100 ms up to 150 s unless the hub stops the needle before or the
+    factors are not 1.
     """
     model = needle(reading, formulation, hub_stop=hub_stop)
-    # With the hub, inverse dynamics reaches its goal within two seconds and stays there. Of runs
-    # with other gains only the peaks within 20 s are used, to a thousandth.
+    # With the hub, inverse dynamics reaches its target within two seconds and stays there. Runs
+    # with other gains are used for their peaks within 20 s, with relative accuracy 1e-3.
     brief = factors != (1.0, 1.0) or (hub_stop and law == 'inverse_dynamics')
     times = np.linspace(0.0, SHOWN, round(40.0 * SHOWN) + 1)
     if not brief:
@@ -260,21 +191,9 @@ def base_alone(law: str, reading: str) -> LoopRun:
     """
     Run a closed loop with the paper's gains on d and no force on q1 and q2, `complete`.
 
-    Inverse dynamics gives d exactly the motion of its error equation, so the base is moved by it.
-    Under PID with the goal at rest, k_v e_dot is a viscous friction, so the needle gets it as one.
-
-    Parameters
-    ----------
-    law : str
-        One of `LAWS`.
-    reading : str
-        Preset.
-
-    Returns
-    -------
-    LoopRun
-        Samples every 5 ms, up to 10 s (inverse dynamics; the hub stops it) or 120 s (PID).
-
+    Inverse dynamics imposes the motion of its error equation on d, so the base is moved by it.
+    Under PID with a constant target, k_v e_dot is added to the viscous friction of the plant.
+    Samples are 5 ms apart, up to 10 s (inverse dynamics, stopped by the hub) or 120 s (PID).
     """
     model = needle(reading, 'complete')
     parameters, state = model.parameters, model.state_at(DEPTH, DEFLECTION)
@@ -288,7 +207,7 @@ def base_alone(law: str, reading: str) -> LoopRun:
     forces = np.zeros((count + 1, model.coordinates))
     for k in range(count):
         if law == 'pid':
-            # Held over 5 ms: 5e-4 of the time constant k_v / k_p.
+            # Constant over 5 ms, 5e-4 of the time constant k_v / k_p.
             force = PID_KP * float(states[-1][0])
             integrator.advance(period, force)
             forces[k, 0] = force - PID_KV * integrator.velocity
@@ -301,7 +220,7 @@ def base_alone(law: str, reading: str) -> LoopRun:
 
 
 def _error_speed(time: float) -> float:
-    """Return the insertion speed that e_ddot + k_v e_dot + k_p e = 0 gives d, from rest."""
+    """Return the insertion velocity of e_ddot + k_v e_dot + k_p e = 0 from rest [m/s]."""
     damping, square = 0.5 * INVERSE_DYNAMICS_KV[0], INVERSE_DYNAMICS_KP[0]
     frequency = sqrt(square - damping**2)
     start = NeedleParameters().length - DEPTH
@@ -310,19 +229,6 @@ def _error_speed(time: float) -> float:
 
 
 def hub_time(run: LoopRun) -> float:
-    """
-    Return when a run reached the hub.
-
-    Parameters
-    ----------
-    run : LoopRun
-        The run.
-
-    Returns
-    -------
-    float
-        Time [s]; nan if it did not reach the hub.
-
-    """
+    """Return the time at which a run reached the hub [s]; nan if it did not."""
     there = np.flatnonzero(run.states[:, 0] <= 0.0)
     return float(run.time[there[0]]) if len(there) else float('nan')

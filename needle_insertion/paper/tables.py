@@ -1,8 +1,8 @@
 """
-The numbers of the paper's Tables 1 and 2, in SI units.
+Values of the paper's Tables 1 and 2, in SI units.
 
-The paper prints no units. In Table 1 mu_v = 0.3 is read as N s/mm, which makes an insertion under
-3 N last seconds; Table 2 is read as kN/m, which makes its last k_zz the 0.52 of the text. The
+The paper prints no units. In Table 1 mu_v = 0.3 is read as N s/mm, for which an insertion under 3
+N takes seconds; Table 2 is read as kN/m, for which its last k_zz is the 0.52 of the text. The
 constants of Table 3 are the defaults of `needle_dynamics.NeedleParameters`.
 """
 
@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Final
 
-#: Number of experiments behind each mean and standard deviation.
+#: Number of experiments of each mean and standard deviation.
 EXPERIMENTS: Final = 20
 
 #: Table 1: mean and standard deviation of mu_s [N] and mu_v [N s/m].

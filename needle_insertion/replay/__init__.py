@@ -1,1 +1,1 @@
-"""A recorded run of a plant, computed again."""
+"""Recomputation of recorded plant runs."""

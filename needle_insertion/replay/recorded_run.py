@@ -1,4 +1,4 @@
-"""What a bag says of a plant: what was done to it and what it measured, by number of sample."""
+"""Read a recorded plant run from a bag: events, commands and measurements by sample number."""
 
 from __future__ import annotations
 
@@ -28,39 +28,21 @@ from numpy.typing import NDArray
 #: Message types by the last part of the name of a topic.
 _TYPES: Final = {topic.name.rpartition('/')[2]: topic.type_name for topic in TOPICS}
 
-#: What is read beside measurements and commands.
+#: Topics that are read in addition to measurements and commands.
 _OTHERS: Final = ('configuration', 'events', 'joint_trajectory')
 
-#: Parameters without which a plant cannot be made again.
+#: Parameters that are required to recreate a plant.
 _NEEDED: Final = ('mode', 'seed', 'rate', 'step', 'depth', 'force_limit', 'command_timeout')
 
-#: Limits that older plants did not have.
+#: Limits that older versions of the plant did not have.
 _UNLIMITED: Final = {'force_rate_limit': 1e12, 'power_limit': 1e12}
 
-#: Messages of a topic, each with the time at which it was recorded [ns].
+#: Messages of a topic with their recording time [ns].
 _Messages = list[tuple[int, Any]]
 
 
 def recorded_runs(path: Path) -> list[RecordedRun]:
-    """
-    Read the runs of all plants in a bag.
-
-    Parameters
-    ----------
-    path : Path
-        The bag.
-
-    Returns
-    -------
-    list of RecordedRun
-        One for each plant.
-
-    Raises
-    ------
-    RecordingError
-        If the bag is not readable or has no plant, or lacks what is needed.
-
-    """
+    """Read the runs of all plants in a bag; raise `RecordingError` without a plant."""
     bag, invalid = Bag(path), Counter[str]()
     messages: dict[str, _Messages] = defaultdict(list)
     readers: dict[str, Reader] = {}
@@ -96,10 +78,10 @@ def recorded_runs(path: Path) -> list[RecordedRun]:
 
 
 def _configurations(messages: _Messages) -> list[tuple[int, dict[str, Any]]]:
-    """Read the parameters of a plant, and when they were recorded [ns]."""
+    """Read the parameters of a plant with their recording times [ns]."""
     found = []
     for received, message in messages:
-        # Some other text, or another node.
+        # Skip other texts, and other nodes.
         with suppress(DocumentError, AttributeError, KeyError, TypeError):
             for node in read_document(message.data).values():
                 values = node['ros__parameters']
@@ -109,11 +91,11 @@ def _configurations(messages: _Messages) -> list[tuple[int, dict[str, Any]]]:
 
 
 def _events(messages: _Messages) -> list[tuple[int, int, Event]]:
-    """Read events, with stamp [ns] and number of the sample from which each counts."""
+    """Read events with stamp [ns] and number of the first affected sample."""
     found = []
     for _, message in messages:
         for status in message.status:
-            # Some other diagnostics.
+            # Skip other diagnostics.
             with suppress(ValueError, KeyError):
                 content = {item.key: json.loads(item.value) for item in status.values}
                 number = int(content.pop('sample'))
@@ -135,14 +117,14 @@ def _trajectory(message: Any) -> Event:
 
 class Rows(NamedTuple):
     """
-    Messages of a topic, in the order of the samples.
+    Messages of a topic, sorted by sample number.
 
     Attributes
     ----------
     numbers, stamps : ndarray, shape (n,)
-        Numbers of the samples, from 1, and stamps [ns].
+        Sample numbers, from 1, and stamps [ns].
     values : ndarray, shape (n, k)
-        Numbers of the messages, nan for those that an older plant did not publish.
+        Values of the messages, nan for values that an older version did not publish.
 
     """
 
@@ -153,18 +135,9 @@ class Rows(NamedTuple):
 
 class RecordedRun:
     """
-    A run of a plant as a bag has it.
+    Run of a plant as recorded in a bag.
 
-    Parameters
-    ----------
-    path : Path
-        The bag.
-    name : str
-        Full name of the plant.
-    messages : mapping
-        Messages of the bag by topic, each with the time at which it was recorded [ns].
-    losses : list of str
-        What is broken in the bag.
+    Raises `RecordingError` if a parameter is missing or not valid, or measurements are missing.
 
     Attributes
     ----------
@@ -175,23 +148,18 @@ class RecordedRun:
     topics : dict
         Topics of the plant by full name.
     rows : dict
-        Messages of each topic that has any.
+        Recorded messages by topic.
     numbers : list of int
-        Numbers of the samples of which something is in the bag.
+        Numbers of the samples with recorded messages.
     events : dict
-        What was done, by the number of the sample from which it counts.
+        Events by the number of the first affected sample.
     commands : dict
-        Stamp [ns], frame, force [N] and torque [N m] of the commands, by the number of the
-        sample after which they came.
+        Stamp [ns], frame, force [N] and torque [N m] of commands, by the number of the last
+        sample before their arrival.
     notes : list of str
-        What is broken in the bag, and what it does not say.
+        Faults of the bag, and missing topics.
     faults : str
-        Faults that were switched on, '' for none.
-
-    Raises
-    ------
-    RecordingError
-        If a parameter is missing or not valid, or nothing was measured.
+        Enabled faults, '' for none.
 
     """
 
@@ -214,9 +182,9 @@ class RecordedRun:
         self.constants = plant.constants
         self.topics = {f'{space}/{topic.name}': topic for topic in plant.topics.values()}
         self._period = NANOSECONDS / self.constants.own.rate
-        #: Stamps [ns] and numbers of samples, from which those of others follow.
+        #: Known pairs of stamp [ns] and sample number, from which the others are interpolated.
         self._anchors = [(stamp, number) for stamp, number, _ in said]
-        #: When samples were recorded [ns], and their numbers.
+        #: Recording times [ns] and sample numbers.
         self._arrivals: list[tuple[int, int]] = []
         self.rows = self._measured(messages)
         self.numbers = sorted({number for _, number in self._arrivals})
@@ -240,13 +208,11 @@ class RecordedRun:
         self.notes = [*losses, *self._unsaid(has_events=bool(said))]
 
     def _measured(self, messages: Mapping[str, _Messages]) -> dict[str, Rows]:
-        """Put the measurements in the order of the samples."""
+        """Sort the measurements by sample number."""
         sampled = [name for name in self.topics if not name.endswith(TIP_DEFLECTION.name)]
         stamps = [reading.stamp for name in sampled for _, reading in messages.get(name, [])]
         if not stamps:
-            raise RecordingError(
-                f'{self.path} holds nothing that was measured; record {", ".join(sampled)}'
-            )
+            raise RecordingError(f'{self.path} holds no measurements; record {", ".join(sampled)}')
         self._anchors = self._anchors or [(min(stamps), 1)]
         rows = {}
         for name, topic in self.topics.items():
@@ -256,7 +222,7 @@ class RecordedRun:
                 if len(values) not in (width, 2 * len(topic.joints)):
                     raise RecordingError(
                         f'{self.path}: {name} holds {len(values)} numbers, a plant in mode '
-                        f'{self.constants.mode} says {width}'
+                        f'{self.constants.mode} publishes {width}'
                     )
                 number = self._number(reading.stamp)
                 if name in sampled:
@@ -270,15 +236,15 @@ class RecordedRun:
         return rows
 
     def _number(self, stamp: int) -> int:
-        """Return the number of the sample of a stamp [ns]."""
+        """Return the sample number of a stamp [ns]."""
         begin, number = self._anchors[max(bisect_right(self._anchors, (stamp, inf)) - 1, 0)]
         return number + round((stamp - begin) / self._period)
 
     def _efforts(self, messages: _Messages) -> Iterator[tuple[int, float, float]]:
-        """Yield stamp [ns], force and torque of messages of `joint_commands`."""
+        """Yield stamp [ns], force [N] and torque [N m] of `joint_commands`."""
         reader = self.constants.joint_commands()
         for received, reading in messages:
-            # One that a plant refuses is no force.
+            # Commands that the plant rejects have no force.
             force = torque = nan
             stamp = reading.stamp or self.stamp(self._newest(received))
             with suppress(ParameterError):
@@ -288,33 +254,20 @@ class RecordedRun:
             yield stamp, force, torque
 
     def stamp(self, number: int) -> int:
-        """
-        Return the time of a sample.
-
-        Parameters
-        ----------
-        number : int
-            Number of the sample.
-
-        Returns
-        -------
-        int
-            Its stamp [ns], to a nanosecond.
-
-        """
+        """Return the stamp [ns] of a sample number."""
         after = bisect_right(self._anchors, number, key=lambda anchor: anchor[1])
         begin, known = self._anchors[max(after - 1, 0)]
         return begin + round((number - known) * self._period)
 
     def _newest(self, received: int) -> int:
-        """Return the number of the newest sample when a message was recorded, 0 for none."""
+        """Return the newest sample number at a recording time [ns], 0 for none."""
         before = self._arrivals[: bisect_left(self._arrivals, (received, 0))]
         return max((number for _, number in before), default=0)
 
     def _guessed(
         self, configurations: list[tuple[int, dict[str, Any]]], trajectories: _Messages
     ) -> Iterator[tuple[int, Event]]:
-        """Yield what was done to a plant that did not say so, with the sample after it came."""
+        """Yield events of a plant without recorded events, with the next sample number."""
         found = [(received, _trajectory(message)) for received, message in trajectories]
         if self.constants.mode == 'simulation':
             found.clear()
@@ -325,11 +278,11 @@ class RecordedRun:
             yield self._newest(received) + 1, event
 
     def _unsaid(self, *, has_events: bool) -> Iterator[str]:
-        """Say what the bag does not say."""
+        """Yield notes about missing information."""
         if not has_events:
             yield (
                 f'{self.name}/events is not in the bag: trajectories and changes of parameters '
-                'are taken to count from the sample after they were recorded'
+                'are assumed to apply from the sample after they were recorded'
             )
         missing = [topic for topic in self.topics if topic not in self.rows]
         if missing:

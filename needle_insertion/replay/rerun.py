@@ -1,4 +1,4 @@
-"""A recorded run computed again, sample by sample, and compared with what was recorded."""
+"""Recompute a recorded run sample by sample, and compare it with the recording."""
 
 from __future__ import annotations
 
@@ -30,17 +30,17 @@ from needle_ros.contract import (
 )
 import numpy as np
 
-#: Part of the largest value of a topic and unit that a difference may be: far above what another
-#: processor or library rounds otherwise, far below what any sensor resolves.
+#: Largest accepted difference relative to the largest value of a topic and unit: far above
+#: rounding differences between processors or libraries, far below the resolution of sensors.
 TOLERANCE: Final = 1e-6
 
-#: What is said of events, by kind.
+#: Descriptions of events, by kind.
 _WORDS: Final = {
     MOTION: 'joint_commands from sample {number} on',
     TRAJECTORY: 'joint_trajectory from sample {number} on',
     PARAMETERS: '{names} changed before sample {number}',
     TARE: 'the sensor was zeroed (~/tare) before sample {number}',
-    RESET: 'the plant was put back (~/reset) before sample {number}',
+    RESET: 'the plant was reset (~/reset) before sample {number}',
     TIME: 'time was paused, or samples were given up, before sample {number}',
     CONFIGURED: 'the plant was configured again before sample {number}',
 }
@@ -49,18 +49,18 @@ _WORDS: Final = {
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Comparison:
     """
-    What the comparison of a topic has given.
+    Comparison of a recorded topic with the recomputed topic.
 
     Attributes
     ----------
     compared, differing : int
-        Number of messages compared, and of those beyond the tolerance.
+        Number of compared messages, and of messages beyond the tolerance.
     largest : float
-        Largest difference, relative to what is allowed.
+        Largest difference, relative to the accepted difference.
     difference : float
-        The same in its unit.
+        Largest difference in its unit.
     quantity, unit : str
-        The number that has it, '' if there is no difference.
+        Quantity of the largest difference, '' if there is no difference.
     first : dict or None
         First difference beyond the tolerance.
 
@@ -76,7 +76,7 @@ class Comparison:
 
     @property
     def verdict(self) -> str:
-        """Identical, within tolerance or differs."""
+        """Verdict: identical, within tolerance or differs."""
         if self.differing:
             return 'differs'
         return 'within tolerance' if self.largest else 'identical'
@@ -84,47 +84,40 @@ class Comparison:
 
 class Rerun:
     """
-    A recorded run, computed again.
-
-    Parameters
-    ----------
-    recorded : RecordedRun
-        The run.
-    tolerance : float
-        Part of the largest value of a topic and unit that a difference may be.
+    Recomputation of a recorded run.
 
     Attributes
     ----------
     recorded : RecordedRun
-        The run as the bag has it.
+        Recorded run.
     topics : dict
         `Comparison` of each topic.
     first : dict or None
         First difference beyond the tolerance.
     reason : str
-        Why it may be there, '' if there is none.
+        Probable reason of a difference, '' without difference.
     notes : list of str
-        What was done to the plant, what is broken in the bag, and what it does not say.
+        Events, faults of the bag, and missing information.
 
     """
 
     def __init__(self, recorded: RecordedRun, tolerance: float) -> None:
         self.recorded = recorded
         self.notes = [*recorded.notes]
-        #: Why the computed plant gives no more samples.
+        #: Reason for which the recomputed plant stopped.
         self._halted = ''
-        #: Whether a motion of `joint_commands` has been noted.
+        #: Whether a motion by `joint_commands` has been noted.
         self._driven = False
         self._told = self._commands()
         numbers = recorded.numbers
-        #: Samples before which it is not known which command acted.
+        #: Number of samples without a recorded active command.
         self._untold = 0
         if recorded.constants.mode == 'simulation':
             self._untold = numbers[-1] - numbers[0] + 1 - len(self._told)
         if self._untold:
             self.notes.append(
                 f'which command acted before {self._untold} samples is not in the bag: each is '
-                'taken to act one period after the sample that it answers'
+                'assumed to act one period after the sample that it responds to'
             )
         computed = self._compute()
         self.topics = {
@@ -138,13 +131,13 @@ class Rerun:
 
     @property
     def verdict(self) -> str:
-        """The worst verdict of the topics: identical, within tolerance or differs."""
+        """Worst verdict of the topics: identical, within tolerance or differs."""
         verdicts = {topic.verdict for topic in self.topics.values()}
         return next((v for v in ('differs', 'within tolerance') if v in verdicts), 'identical')
 
     @property
     def document(self) -> dict[str, Any]:
-        """Everything for JSON, by name."""
+        """Document for JSON."""
         recorded = self.recorded
         return {
             'bag': str(recorded.path),
@@ -170,21 +163,21 @@ class Rerun:
         }
 
     def _commands(self) -> dict[int, Command]:
-        """Return the commands that acted before samples, as far as the bag says."""
+        """Return the active commands by sample number, if recorded."""
         for name, rows in self.recorded.rows.items():
             topic = self.recorded.topics[name]
             efforts = [k for k, q in enumerate(topic.quantities) if q.name.startswith('effort')]
             if topic.name == GROUND_TRUTH.name and efforts:
                 told = zip(rows.numbers.tolist(), rows.values[:, efforts].tolist(), strict=True)
-                # Insertion makes d smaller.
+                # Insertion reduces d.
                 return {n: Command(0, -d, torque) for n, (d, torque, *_) in told if not isnan(d)}
         return {}
 
     def _compute(self) -> dict[str, FloatArray]:
-        """Return the numbers of each topic by number of the sample, nan where there are none."""
+        """Return values of each topic by sample number, nan for missing values."""
         recorded = self.recorded
         tip = recorded.constants.tip
-        # A measurement of the tip leaves with a later sample.
+        # Tip measurements are published with a later sample.
         end = recorded.numbers[-1] + ceil(tip.delay * recorded.constants.own.rate)
         computed = {
             topic.name: np.full((end + 1, len(topic.quantities)), np.nan)
@@ -207,11 +200,11 @@ class Rerun:
         return computed
 
     def _perform(self, plant: PlantRun, event: Event, number: int) -> PlantRun:
-        """Do again what was done to the plant, and note it."""
+        """Apply an event to the plant, and note it."""
         if event.kind in (CONFIGURED, TIME) and number == 1:
             return plant
         names = ', '.join(sorted(event.content))
-        # A driver says where to go many times a second.
+        # A driver sends motion commands many times a second.
         if event.kind != MOTION or not self._driven:
             self.notes.append(_WORDS[event.kind].format(number=number, names=names))
         self._driven |= event.kind == MOTION
@@ -221,10 +214,10 @@ class Rerun:
         return plant
 
     def _compare(self, name: str, computed: FloatArray, tolerance: float) -> Comparison:
-        """Compare the messages of a topic with what was computed."""
+        """Compare the recorded messages of a topic with the computed values."""
         rows, quantities = self.recorded.rows[name], self.recorded.topics[name].quantities
         found = computed[rows.numbers]
-        # An older plant did not publish some numbers.
+        # Older versions of the plant did not publish all values.
         efforts = np.array([quantity.name.startswith('effort') for quantity in quantities])
         missing = efforts & np.isnan(rows.values).all(axis=0)
         difference = np.where(missing, 0.0, np.abs(found - rows.values))
@@ -257,7 +250,7 @@ class Rerun:
         )
 
     def _limits(self, name: str, tolerance: float) -> FloatArray:
-        """Return the largest difference allowed of each number of a topic."""
+        """Return the largest accepted difference for each quantity of a topic."""
         topic, constants = self.recorded.topics[name], self.recorded.constants
         sizes = np.abs(self.recorded.rows[name].values)
         sizes = np.where(np.isfinite(sizes), sizes, 0.0).max(axis=0, initial=0.0)
@@ -270,20 +263,20 @@ class Rerun:
             resolution[:3] = constants.indenter.encoder_resolution
         elif topic.name == JOINT_STATES.name and constants.mode == 'robot':
             resolution[0] = constants.base.encoder_resolution
-        # A count is the difference of two rounded numbers.
+        # Rounded values may differ by a count.
         return np.asarray(tolerance * largest + (1.0 + 1e-6) * resolution)
 
     def _reason(self) -> str:
-        """Say why the run may differ, as far as the bag tells."""
+        """Return the most probable reason of a difference."""
         recorded, start = self.recorded, self.recorded.numbers[0]
         simulated = recorded.constants.mode == 'simulation'
         differing = {name: topic.differing for name, topic in self.topics.items()}
         wrong = {recorded.topics[name].name for name, number in differing.items() if number}
         kinds = {event.kind for events in recorded.events.values() for event in events}
         reasons = {
-            f'the computed plant stands still: {self._halted}': self._halted,
-            f'{recorded.faults} altered what was measured': recorded.faults,
-            'the rest is as computed: this one was altered on its way or in the bag': (
+            f'the recomputed plant stopped: {self._halted}': self._halted,
+            f'{recorded.faults} altered the measurements': recorded.faults,
+            'all other messages are as computed: one was altered in transit or in the bag': (
                 sum(differing.values()) == 1
             ),
             'the bag holds no wrench_command and no joint_commands: record them with the rest': (
@@ -292,39 +285,19 @@ class Rerun:
             'the bag holds no joint_trajectory: record it with the rest': (
                 not simulated and not kinds & {MOTION, TRAJECTORY}
             ),
-            f'the bag begins with sample {start}: the commands before it are not known': (
+            f'the bag begins with sample {start}: earlier commands are missing': (
                 simulated and start > 1
             ),
             'which command acted is not in the bag': self._untold,
-            'the motion is as computed: the seed or the constants of a sensor were others': (
+            'the motion is as computed: the seed or the constants of a sensor differ': (
                 len(wrong - {BASE_WRENCH.name, TIP_DEFLECTION.name}) == 0
                 and len(differing) > len(wrong)
             ),
         }
         given = (words for words, holds in reasons.items() if holds)
-        return next(given, 'the plant was of another version, or its parameters were others')
+        return next(given, 'the plant was of another version, or its parameters differ')
 
 
 def verify(path: Path, tolerance: float = TOLERANCE) -> list[Rerun]:
-    """
-    Compute the runs in a bag again and compare.
-
-    Parameters
-    ----------
-    path : Path
-        The bag.
-    tolerance : float
-        Part of the largest value of a topic and unit that a difference may be.
-
-    Returns
-    -------
-    list of Rerun
-        One for each plant in the bag.
-
-    Raises
-    ------
-    RecordingError
-        If the bag is not readable, or lacks the parameters of a plant or all measurements.
-
-    """
+    """Recompute and compare the runs of all plants in a bag."""
     return [Rerun(recorded, tolerance) for recorded in recorded_runs(path)]

@@ -1,1 +1,1 @@
-"""Tables, pictures and pages."""
+"""Report pages, tables and figures."""

@@ -1,4 +1,4 @@
-"""A needle on its way, that a reader of a page may play."""
+"""Interactive animation of a needle for report pages."""
 
 from __future__ import annotations
 
@@ -13,29 +13,29 @@ from typing import Any, Final
 from markupsafe import Markup
 import numpy as np
 
-#: The drawing, which `needle watch` has too, and what plays it.
+#: Scripts: drawing (also used by `needle watch`), and player.
 _SCRIPTS: Final = ('needle.js', 'animation.js')
 
-#: Most points of a needle.
+#: Largest number of points of a needle.
 _POINTS: Final = 40
 
-#: Of a frame, what is drawn.
+#: Keys of a frame that are drawn.
 _DRAWN: Final = ('time', 'needle', 'shape', 'target', 'expected', 'tip', 'depth')
 
 
 @dataclass(frozen=True, eq=False)
 class Animation:
     """
-    Frames of a needle, and the script that draws them.
+    Animation of a needle from frames.
 
     Attributes
     ----------
     caption : str
-        Text below it.
+        Text below the animation.
     scene : mapping
-        Tissue and limits, as `needle_insertion.watch.scene.scene` returns them.
+        Tissue and limits, from `needle_insertion.watch.scene.scene`.
     frames : sequence of mapping
-        As `needle_insertion.watch.view.View.frame` returns them; each with a needle.
+        Frames of `needle_insertion.watch.view.View.frame`, each with a needle.
 
     """
 
@@ -45,12 +45,12 @@ class Animation:
 
     @property
     def data(self) -> Markup:
-        """What the script reads, as JSON; no text in it can end its element."""
+        """JSON data of the script, escaped so that it cannot close its HTML element."""
         frames = [{key: frame[key] for key in _DRAWN} for frame in self.frames]
         for frame in frames:
             frame['needle'] = _thinned(frame['needle'])
         paths = [frame['path'] for frame in self.frames if frame['path']]
-        # What is cut only grows.
+        # The last cut path contains all earlier paths.
         path = paths[-1] if paths else [[], [], []]
         content = {'scene': self.scene, 'frames': frames, 'path': path}
         text = json.dumps(content, separators=(',', ':'), allow_nan=False)
@@ -58,21 +58,21 @@ class Animation:
 
     @property
     def script(self) -> Markup:
-        """What draws it."""
+        """Script of the animation."""
         folder = Path(__file__).with_name('templates')
         parts = [(folder / name).read_text(encoding='utf-8') for name in _SCRIPTS]
-        # Of this package.
+        # Trusted: the scripts are part of this package.
         return Markup('\n'.join(parts))  # noqa: S704
 
     @property
     def digest(self) -> str:
-        """By which the browser knows the script: it runs no other."""
+        """SHA-256 source expression of the script for the content security policy."""
         made = sha256(self.script.encode()).digest()
         return f'sha256-{base64.b64encode(made).decode("ascii")}'
 
 
 def _thinned(line: Sequence[Sequence[float]]) -> list[list[float]]:
-    """Return a line with fewer points, the first and the last among them."""
+    """Reduce the points of a line, keeping the first and the last."""
     count = len(line[0])
     chosen = np.unique(np.linspace(0, count - 1, min(count, _POINTS)).round().astype(int))
     return [[round(column[k], 5) for k in chosen.tolist()] for column in line]

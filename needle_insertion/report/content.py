@@ -1,4 +1,4 @@
-"""What pages are made of, as plain data: pictures, tables and sections."""
+"""Content of pages as plain data: pictures, tables and sections."""
 
 from __future__ import annotations
 
@@ -9,25 +9,12 @@ from io import BytesIO
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    # Takes half a second to import; tables do without.
+    # Takes half a second to import; only pictures need it.
     from matplotlib.figure import Figure
 
 
 def png(figure: Figure) -> bytes:
-    """
-    Return a figure as a PNG.
-
-    Parameters
-    ----------
-    figure : Figure
-        The figure.
-
-    Returns
-    -------
-    bytes
-        The same bytes for the same figure.
-
-    """
+    """Return a figure as PNG; equal figures give equal bytes."""
     buffer = BytesIO()
     figure.savefig(buffer, format='png', dpi=120)
     return buffer.getvalue()
@@ -36,18 +23,18 @@ def png(figure: Figure) -> bytes:
 @dataclass(frozen=True, eq=False)
 class Picture:
     """
-    A figure with its caption.
+    Figure with caption.
 
     Attributes
     ----------
     name : str
-        Name of the PNG beside the page, without its ending.
+        File name of the PNG next to the page, without extension.
     caption : str
-        Text below it.
+        Text below the figure.
     figure : Figure
         The figure.
     description : str
-        Text for readers who cannot see it; the caption if empty.
+        Alternative text for screen readers; default: the caption.
 
     """
 
@@ -58,12 +45,12 @@ class Picture:
 
     @cached_property
     def image(self) -> bytes:
-        """The PNG."""
+        """PNG data."""
         return png(self.figure)
 
     @property
     def source(self) -> str:
-        """The PNG as a URL that holds all of it."""
+        """PNG as a data URL."""
         return f'data:image/png;base64,{base64.b64encode(self.image).decode("ascii")}'
 
     @property
@@ -79,19 +66,7 @@ class Picture:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Grid:
-    """
-    A table.
-
-    Attributes
-    ----------
-    caption : str
-        What it shows.
-    heads : tuple of str
-        Column heads.
-    rows : tuple of tuple of str
-        Cells; the first of a row names it.
-
-    """
+    """Table; the first cell of a row is its name."""
 
     caption: str
     heads: tuple[str, ...]
@@ -100,21 +75,7 @@ class Grid:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Section:
-    """
-    A heading and what stands below it.
-
-    Attributes
-    ----------
-    title : str
-        The heading.
-    paragraphs : tuple of str
-        Plain text.
-    tables : tuple of Grid
-        Tables.
-    pictures : tuple of Picture
-        Pictures with their captions.
-
-    """
+    """Heading with paragraphs of plain text, tables and pictures."""
 
     title: str
     paragraphs: tuple[str, ...]

@@ -1,4 +1,4 @@
-"""Controllability and observability at operating points, as tables, JSON and a map."""
+"""Report controllability and observability at operating points as tables, JSON and a map."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     # Takes half a second to import; only the map needs it.
     from matplotlib.figure import Figure
 
-#: The map starts at this share of the needle's length, with this many depths and deflections.
+#: Smallest depth of the map as a fraction of the needle length; numbers of depths and deflections.
 SHALLOWEST, DEPTHS, DEFLECTIONS = 0.05, 41, 31
 
 #: Largest tip deflection of the map if none is given [m].
@@ -36,8 +36,8 @@ LARGEST_DEFLECTION: Final = 2e-3
 #: Column heads of `Point.row`.
 POINT_HEADS: Final = (
     'depth, tip, speed',
-    *('steered', 'not steered', 'margin', 'next to lose'),
-    *('seen', 'not seen', 'margin', 'next to lose'),
+    *('controllable', 'not controllable', 'margin', 'weakest'),
+    *('observable', 'not observable', 'margin', 'weakest'),
     'tip / base travel',
 )
 
@@ -48,7 +48,7 @@ _PANELS: Final = (
     ('output_gain', 'tip deflection per base travel', 'm per m'),
     (
         'observed_margin',
-        'distance from seeing less of the state',
+        'distance from losing observability',
         'change of A, C (natural units)',
     ),
 )
@@ -57,16 +57,16 @@ _PANELS: Final = (
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Point:
     """
-    An operating point with what was found there.
+    Analysis at an operating point.
 
     Attributes
     ----------
     depth, deflection, speed, force : float
-        Inserted length [m], tip deflection [m], insertion speed [m/s] and force [N].
+        Insertion depth [m], tip deflection [m], insertion velocity [m/s] and force [N].
     system : LinearSystem
-        The linearized model.
+        Linearized model.
     result : Analysis
-        Its controllability and observability.
+        Controllability and observability.
 
     """
 
@@ -90,7 +90,7 @@ class Point:
 
     @property
     def document(self) -> dict[str, Any]:
-        """Everything for JSON, in SI units."""
+        """Document for JSON, in SI units."""
         system, found = self.system, self.result
         return {
             'depth': self.depth,
@@ -135,31 +135,11 @@ def analyze_points(
     sliding: str | None = None,
 ) -> list[Point]:
     """
-    Analyze every combination of a depth, a deflection and a speed.
+    Analyze every combination of depth [m], deflection [m] and velocity [m/s].
 
-    Parameters
-    ----------
-    model : NeedleModel
-        The needle.
-    depths, deflections : sequence of float
-        Inserted lengths and tip deflections [m].
-    speeds : sequence of float
-        Insertion speeds [m/s].
-    force : float
-        Insertion force [N].
-    sliding : str, optional
-        Branch of dry friction at speed 0, a key of `needle_dynamics.linearization.SLIDING`.
-
-    Returns
-    -------
-    list of Point
-        In the order of the values; speeds change fastest.
-
-    Raises
-    ------
-    NeedleError
-        If a point is not valid, or the needle sticks there.
-
+    ``force`` is the insertion force [N]; ``sliding`` is the branch of dry friction at rest, a key
+    of `needle_dynamics.linearization.SLIDING`. Velocities vary fastest in the result. Raises
+    `NeedleError` if a point is not valid, or the needle sticks there.
     """
     points = []
     for depth, deflection, speed in product(depths, deflections, speeds):
@@ -185,28 +165,7 @@ def map_needle(
     force: float = 0.0,
     sliding: str | None = None,
 ) -> ControllabilityMap:
-    """
-    Analyze a grid of inserted lengths and deflections.
-
-    Parameters
-    ----------
-    parameters : NeedleParameters
-        The needle.
-    speed : float
-        Insertion speed [m/s].
-    largest : float
-        Largest tip deflection [m].
-    force : float
-        Insertion force [N].
-    sliding : str, optional
-        Branch of dry friction at speed 0.
-
-    Returns
-    -------
-    ControllabilityMap
-        `DEPTHS` times `DEFLECTIONS` points.
-
-    """
+    """Analyze a grid of insertion depths and deflections up to ``largest`` [m]."""
     length = parameters.length
     deflections = np.linspace(0.0, largest, DEFLECTIONS)
     depths = np.linspace(max(SHALLOWEST * length, parameters.minimum_depth), length, DEPTHS)
@@ -217,20 +176,7 @@ def map_needle(
 
 
 def draw_map(found: ControllabilityMap) -> Figure:
-    """
-    Draw a map.
-
-    Parameters
-    ----------
-    found : ControllabilityMap
-        The map.
-
-    Returns
-    -------
-    Figure
-        Three panels, gray where the inputs do not move all of the state.
-
-    """
+    """Draw a map in three panels, gray where the state is not controllable."""
     from matplotlib.colors import LogNorm
     from matplotlib.figure import Figure
 
@@ -250,38 +196,18 @@ def draw_map(found: ControllabilityMap) -> Figure:
             shading='nearest',
         )
         figure.colorbar(mesh, ax=axes, location='bottom', label=unit)
-        axes.set(title=title, xlabel='inserted length [cm]')
+        axes.set(title=title, xlabel='insertion depth [cm]')
         axes.title.set_fontsize('medium')
     figure.axes[0].set_ylabel('tip deflection [mm]')
     figure.suptitle(
         f'{parameters.formulation}, {parameters.modes} modes, {1e3 * found.velocity:g} mm/s; '
-        'dimensionless; gray: the inputs do not move all of the state'
+        'dimensionless; gray: not fully controllable'
     )
     return figure
 
 
 def write_map(folder: Path, found: ControllabilityMap) -> list[Path]:
-    """
-    Write a map as a CSV and a PNG.
-
-    Parameters
-    ----------
-    folder : Path
-        Where to write.
-    found : ControllabilityMap
-        The map.
-
-    Returns
-    -------
-    list of Path
-        The files.
-
-    Raises
-    ------
-    ParameterError
-        If a file cannot be written.
-
-    """
+    """Write a map as CSV and PNG to a folder; return the files."""
     depths, deflections = np.meshgrid(found.depths, found.deflections, indexing='ij')
     columns = (depths, deflections, *(getattr(found, name) for name in _MAPPED))
     lines = [','.join(('depth_m', 'tip_deflection_m', *_MAPPED))]

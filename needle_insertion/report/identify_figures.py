@@ -23,13 +23,13 @@ from needle_insertion.paper.tables import FORCE_LEVELS, TABLE_2
 from needle_insertion.report.identify_text import label_of
 import numpy as np
 
-#: Colors: motion into the tissue and results, motion out of it, data, pale data, fits.
+#: Colors: insertion and results, withdrawal, data, pale data, fits.
 _IN, _OUT, _DATA, _LIGHT, _FIT = '#1f5fa8', '#c25a00', '#8b95a1', '#c3cad2', '#111111'
 
-#: Directions of motion: sign, words, color and marker.
-_SIDES: Final = ((1.0, 'into the tissue', _IN, 'o'), (-1.0, 'out of it', _OUT, '^'))
+#: Directions of motion: sign, label, color and marker.
+_SIDES: Final = ((1.0, 'insertion', _IN, 'o'), (-1.0, 'withdrawal', _OUT, '^'))
 
-#: Points of a line; more cannot be seen.
+#: Largest number of drawn points of a line, in large and small plots.
 _MOST_POINTS: Final = 8000
 _MOST_SMALL: Final = 300
 
@@ -38,20 +38,7 @@ _GREEK: Final = {'mu': r'\mu'}
 
 
 def friction_data(estimate: FrictionEstimate) -> Figure:
-    """
-    Draw the filtered force over time and against speed, with the fit.
-
-    Parameters
-    ----------
-    estimate : FrictionEstimate
-        What a recording gave.
-
-    Returns
-    -------
-    Figure
-        Two plots.
-
-    """
+    """Draw the filtered force over time and against velocity, with the fit."""
     fit = estimate.fit
     figure = _new_figure(9.0, 7.5)
     above, below = figure.subplots(2, 1)
@@ -70,26 +57,13 @@ def friction_data(estimate: FrictionEstimate) -> Figure:
         below.plot(*line, color=_FIT, linewidth=1.2, label='fit' if sign < 0.0 else None)
     below.axhline(0.0, color=_FIT, linewidth=0.6)
     below.axvline(0.0, color=_FIT, linewidth=0.6)
-    _label(below, 'insertion speed [mm/s]', 'force on the needle [N]')
+    _label(below, 'insertion velocity [mm/s]', 'force on the needle [N]')
     _legend_above(below, markerscale=2.0)
     return figure
 
 
 def friction_residuals(estimate: FrictionEstimate) -> Figure:
-    """
-    Draw what the fit leaves, over time, against speed, and as a histogram.
-
-    Parameters
-    ----------
-    estimate : FrictionEstimate
-        What a recording gave.
-
-    Returns
-    -------
-    Figure
-        Three plots.
-
-    """
+    """Draw the residual over time, against velocity, and as a histogram."""
     fit = estimate.fit
     figure = _new_figure(9.0, 6.5)
     over, against, often = figure.subplot_mosaic([['time', 'time'], ['speed', 'size']]).values()
@@ -111,30 +85,17 @@ def friction_residuals(estimate: FrictionEstimate) -> Figure:
     for axes in (over, against):
         axes.axhline(0.0, color=_FIT, linewidth=0.8)
     _label(over, 'time [s]', 'residual [mN]')
-    _label(against, 'insertion speed [mm/s]', 'residual [mN]')
+    _label(against, 'insertion velocity [mm/s]', 'residual [mN]')
     _label(often, 'residual [mN]', 'samples')
     _legend_above(over, markerscale=3.0)
     return figure
 
 
 def friction_each(estimates: Sequence[FrictionEstimate], names: Sequence[str]) -> Figure:
-    """
-    Draw force against speed of every recording, with the fit.
-
-    Parameters
-    ----------
-    estimates : sequence of FrictionEstimate
-        What each recording gave.
-    names : sequence of str
-        Their names.
-
-    Returns
-    -------
-    Figure
-        A small plot of each, all with the same axes.
-
-    """
-    figure, panels = _small_multiples(names, 'insertion speed [mm/s]', 'force on the needle [N]')
+    """Draw force against velocity of each recording, with the fit."""
+    figure, panels = _small_multiples(
+        names, 'insertion velocity [mm/s]', 'force on the needle [N]'
+    )
     for axes, estimate in zip(panels, estimates, strict=True):
         fit = estimate.fit
         for sign, words, color, mark in _SIDES:
@@ -150,22 +111,7 @@ def friction_each(estimates: Sequence[FrictionEstimate], names: Sequence[str]) -
 
 
 def stiffness_each(estimates: Sequence[StiffnessEstimate], names: Sequence[str]) -> Figure:
-    """
-    Draw where the end-effector came to rest in every recording, with the fitted ellipses.
-
-    Parameters
-    ----------
-    estimates : sequence of StiffnessEstimate
-        What each recording gave.
-    names : sequence of str
-        Their names.
-
-    Returns
-    -------
-    Figure
-        A small plot of each, all with the same axes.
-
-    """
+    """Draw the rest positions of the end-effector in each recording, with fitted ellipses."""
     figure, panels = _small_multiples(names, 'displacement x [mm]', 'displacement z [mm]')
     for axes, estimate in zip(panels, estimates, strict=True):
         _ellipses(axes, estimate)
@@ -191,7 +137,7 @@ def _small_multiples(names: Sequence[str], xlabel: str, ylabel: str) -> tuple[Fi
 
 
 def _ellipses(axes: Axes, estimate: StiffnessEstimate) -> None:
-    """Draw where each level of force ends according to its matrix."""
+    """Draw the displacements at each force level according to its matrix."""
     turn = np.linspace(0.0, 2.0 * np.pi, 181)
     circle = np.array([np.cos(turn), np.sin(turn)])
     for level in estimate.levels:
@@ -201,20 +147,7 @@ def _ellipses(axes: Axes, estimate: StiffnessEstimate) -> None:
 
 
 def stiffness_levels(summary: StiffnessSummary) -> Figure:
-    """
-    Draw each entry of the matrix against the force, beside Table 2.
-
-    Parameters
-    ----------
-    summary : StiffnessSummary
-        All recordings.
-
-    Returns
-    -------
-    Figure
-        Four plots.
-
-    """
+    """Draw each entry of the matrix against the force, with Table 2."""
     figure = _new_figure(9.0, 6.5)
     for axes, (name, (means, deviations)) in zip(
         figure.subplots(2, 2, sharex=True).flat, TABLE_2.items(), strict=True
@@ -223,7 +156,7 @@ def stiffness_levels(summary: StiffnessSummary) -> Figure:
             FORCE_LEVELS, means, deviations, fmt='D', color=_DATA, capsize=4.0, markersize=5.0,
             label='Table 2, mean and STD', zorder=1,
         )  # fmt: skip
-        # Beside one another, not on top.
+        # Offset horizontally to avoid overlap.
         for estimate in summary.estimates:
             places = [(one.force - 0.012, one[name].value) for one in estimate.levels]
             axes.plot(*np.transpose(places), '.', color=_IN, alpha=0.35, markersize=4.0)
@@ -247,20 +180,7 @@ def stiffness_levels(summary: StiffnessSummary) -> Figure:
 
 
 def stiffness_presses(estimate: StiffnessEstimate) -> Figure:
-    """
-    Draw the presses of one recording with the fitted matrices.
-
-    Parameters
-    ----------
-    estimate : StiffnessEstimate
-        What the recording gave.
-
-    Returns
-    -------
-    Figure
-        Force against displacement, and the displacements in the plane.
-
-    """
+    """Draw force against displacement, and the displacements in the plane, with the fit."""
     presses = estimate.presses
     figure = _new_figure(9.0, 4.8)
     left, right = figure.subplots(1, 2)
@@ -288,7 +208,7 @@ def stiffness_presses(estimate: StiffnessEstimate) -> Figure:
 
 
 def _principal_axes(axes: Axes, level: LevelEstimate) -> None:
-    """Draw the principal axes of the largest force, each as long as that force moves it."""
+    """Draw the principal axes at the largest force, scaled to its displacement."""
     if not level.angle.determined:
         return
     for one, name, turned, style in zip(
@@ -306,22 +226,7 @@ def _principal_axes(axes: Axes, level: LevelEstimate) -> None:
 def spread_figure(
     means: Sequence[Statistic], rows: Sequence[tuple[str, Mapping[str, ParameterEstimate]]]
 ) -> Figure:
-    """
-    Draw each parameter of each recording with its interval, and the mean with its own.
-
-    Parameters
-    ----------
-    means : sequence of Statistic
-        Parameters to draw, a plot each.
-    rows : sequence of (str, Mapping[str, ParameterEstimate])
-        Recordings, and what each gave by the name of the parameter.
-
-    Returns
-    -------
-    Figure
-        The figure.
-
-    """
+    """Draw each parameter of each recording with its interval, and the mean with its interval."""
     columns = min(len(means), 4)
     lines = -(-len(means) // columns)
     figure = _new_figure(9.0, lines * (1.2 + 0.24 * len(rows)))
@@ -351,7 +256,7 @@ def _new_figure(width: float, height: float) -> Figure:
 
 
 def _label(axes: Axes, xlabel: str, ylabel: str) -> None:
-    """Label a plot, with symbols typeset, and give it a grid."""
+    """Label the axes with typeset symbols, and add a grid."""
     axes.set(xlabel=_typeset(xlabel), ylabel=_typeset(ylabel))
     axes.grid(visible=True, alpha=0.25)
     axes.spines[['top', 'right']].set_visible(False)
@@ -363,7 +268,7 @@ def _typeset(words: str) -> str:
 
 
 def _legend_above(axes: Axes, **options: Any) -> None:
-    """Put the legend above the plot, where no data are."""
+    """Put the legend above the plot."""
     axes.legend(
         loc='lower left', bbox_to_anchor=(0.0, 1.0), ncols=4, frameon=False,
         borderaxespad=0.2, handletextpad=0.5, **options,
@@ -371,6 +276,6 @@ def _legend_above(axes: Axes, **options: Any) -> None:
 
 
 def _thinned(*signals: FloatArray, most: int = _MOST_POINTS) -> list[FloatArray]:
-    """Leave out samples that cannot be seen."""
+    """Reduce the number of samples for drawing."""
     step = max(1, len(signals[0]) // most)
     return [signal[::step] for signal in signals]

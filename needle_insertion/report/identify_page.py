@@ -1,4 +1,4 @@
-"""The pages about identified friction and stiffness: result, data behind it, what to doubt."""
+"""Report pages of identified friction and stiffness: results, data and warnings."""
 
 from __future__ import annotations
 
@@ -39,10 +39,10 @@ from needle_insertion.report.origin import Origin
 from needle_insertion.report.page import write_page
 import numpy as np
 
-#: Parameters that a plant takes while it runs.
+#: Parameters that can be set on a running plant.
 _LIVE: Final = ('model.coulomb_friction', 'model.viscous_friction')
 
-#: Recordings that have a small plot each.
+#: Largest number of recordings with a small plot.
 _MOST_EACH: Final = 60
 
 _ENTRY_HEADS: Final = tuple(f'{entry} [N/m]' for entry in TABLE_2)
@@ -52,29 +52,7 @@ _QUALITY_HEADS: Final = ('residual [mN]', 'R²', 'condition')
 def write_identified_page(
     folder: Path, summary: FrictionSummary | StiffnessSummary, origin: Origin
 ) -> Path:
-    """
-    Write ``friction.html`` or ``stiffness.html``, and its pictures.
-
-    Parameters
-    ----------
-    folder : Path
-        Where to write.
-    summary : FrictionSummary or StiffnessSummary
-        What was identified.
-    origin : Origin
-        What it was identified from, and how.
-
-    Returns
-    -------
-    Path
-        The page.
-
-    Raises
-    ------
-    ParameterError
-        If a file cannot be written.
-
-    """
+    """Write ``friction.html`` or ``stiffness.html`` and its pictures; return the page."""
     estimates = summary.estimates
     label = short_names([estimate.name for estimate in estimates])
     short, full = warned(summary, origin)
@@ -133,7 +111,7 @@ def _published(one: Statistic) -> str:
 def _term_rows(
     shown: FrictionEstimate, estimates: Sequence[FrictionEstimate]
 ) -> list[tuple[str, ...]]:
-    """Return the other sets of terms, each with the support that it has."""
+    """Return the alternative sets of terms with the number of supporting recordings."""
     supported = Counter(
         one.terms for estimate in estimates for one in estimate.comparison if one.supported
     )
@@ -159,17 +137,17 @@ def _friction_pictures(
     return [
         Picture(
             'friction_data',
-            f'{name}, whose mu_s is nearest to the median: force over time and against speed '
+            f'{name}, with mu_s nearest to the median: force over time and against velocity '
             f'after the low-pass filter, and the fit of {", ".join(shown.terms)} to the samples '
             'in steady motion.',
             figures.friction_data(shown),
             f'Two plots of {name}. The force over time follows the strokes of the needle, with '
-            'the fitted force on top of it. Against speed the force jumps at zero by twice mu_s '
+            'the fitted force superimposed. Against velocity the force jumps at zero by 2 mu_s '
             'and rises with slope mu_v.',
         ),
         Picture(
             'friction_residuals',
-            f'{name}: measured minus fitted force, over time, against speed, and as a histogram, '
+            f'{name}: measured minus fitted force, over time, against velocity, as histogram, '
             'separately for both directions.',
             figures.friction_residuals(shown),
             f'Three plots of the residual force of {name}, which has a root mean square of '
@@ -177,12 +155,12 @@ def _friction_pictures(
         ),
         Picture(
             'friction_each',
-            'Force against speed of each recording, and its fit.',
+            'Force against velocity of each recording, and its fit.',
             figures.friction_each(
                 estimates[:_MOST_EACH], [label[one.name] for one in estimates[:_MOST_EACH]]
             ),
-            f'Small plots of {_shown_of(len(estimates))}: the force jumps at zero speed and rises '
-            'on a straight line.',
+            f'Small plots of {_shown_of(len(estimates))}: the force jumps at zero velocity and '
+            'rises linearly.',
         ),
         Picture(
             'friction_spread',
@@ -242,13 +220,13 @@ def _stiffness_content(summary: StiffnessSummary, label: Mapping[str, str]) -> d
             for level in one.levels
         ],
         'values': model_parameters([result]),
-        # A running plant takes no stiffness.
+        # The stiffness of a running plant cannot be set.
         'live': [],
     }
 
 
 def _tissue_stiffness(estimate: StiffnessEstimate, force: float) -> ParameterEstimate:
-    """Return k_a of one recording at the level nearest to a force."""
+    """Return k_a of a recording at the level nearest to a force."""
     return min(estimate.levels, key=lambda one: abs(one.force - force)).tissue_stiffness
 
 
@@ -274,13 +252,13 @@ def _stiffness_pictures(
             'Entries of the matrix against the force, with 95 % intervals of the mean. Small dots '
             'are places. Gray is Table 2, mean and STD.',
             figures.stiffness_levels(summary),
-            'Four plots of the entries of the stiffness matrix against force, beside Table 2.',
+            'Four plots of the entries of the stiffness matrix against force, with Table 2.',
         ),
         Picture(
             'stiffness_presses',
-            f'{name}, whose k_a is nearest to the median. Left: force against displacement along '
-            'each direction. Right: where the end-effector came to rest, the ellipse on which '
-            'each level of force ends according to the fitted matrix, and the principal axes at '
+            f'{name}, with k_a nearest to the median. Left: force against displacement along '
+            'each direction. Right: rest positions of the end-effector, the fitted ellipse of '
+            'each force level, and the principal axes at '
             'the largest force.',
             figures.stiffness_presses(shown),
             f'Two plots of {name}. Force grows with displacement in each direction. The rest '
@@ -288,7 +266,7 @@ def _stiffness_pictures(
         ),
         Picture(
             'stiffness_each',
-            'Where the end-effector came to rest at each place, and the ellipses of its matrices.',
+            'Rest positions of the end-effector at each place, and the fitted ellipses.',
             figures.stiffness_each(
                 summary.estimates[:_MOST_EACH],
                 [label for label, _ in rows][:_MOST_EACH],
@@ -305,7 +283,7 @@ def _stiffness_pictures(
     ]
 
 
-# What both pages share.
+# Functions of both pages.
 
 
 def _cell(one: ParameterEstimate) -> str:
@@ -317,7 +295,7 @@ def _quality(one: FrictionEstimate | LevelEstimate) -> tuple[str, ...]:
 
 
 def _card(one: Statistic) -> tuple[str, str, str]:
-    """Return a main result: what it is, its value, its interval and scatter."""
+    """Return a main result: name, value, and interval with scatter."""
     what = f'{one.name.replace("_", " ").capitalize()} {one.symbol}'
     if not isfinite(one.mean):
         return what, 'not determined', 'by these recordings'

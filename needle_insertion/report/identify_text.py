@@ -1,4 +1,4 @@
-"""Identified parameters as text: how they are written, tables for the terminal, and JSON."""
+"""Format identified parameters as text, tables for the terminal, and JSON."""
 
 from __future__ import annotations
 
@@ -35,38 +35,12 @@ PUNCTURE_HEADS: Final = ('bag', 'puncture at [s]', 'depth [mm] ± SE', 'drop [N]
 
 
 def label_of(one: ParameterEstimate | Statistic) -> str:
-    """
-    Return symbol and unit.
-
-    Parameters
-    ----------
-    one : ParameterEstimate or Statistic
-        A parameter.
-
-    Returns
-    -------
-    str
-        Such as ``mu_s [N]``.
-
-    """
+    """Return symbol and unit, such as ``mu_s [N]``."""
     return one.symbol if one.unit == '1' else f'{one.symbol} [{one.unit}]'
 
 
 def mean_row(one: Statistic) -> tuple[str, ...]:
-    """
-    Return a row of a table of means, with the heads `MEAN_HEADS`.
-
-    Parameters
-    ----------
-    one : Statistic
-        A parameter over the recordings.
-
-    Returns
-    -------
-    tuple of str
-        Table cells.
-
-    """
+    """Return a row of a table of means, with the heads `MEAN_HEADS`."""
     return (
         f'{one.name.replace("_", " ").capitalize()} {label_of(one)}',
         measured(one.mean, one.error),
@@ -77,39 +51,13 @@ def mean_row(one: Statistic) -> tuple[str, ...]:
 
 
 def with_deviation(one: Statistic) -> str:
-    """
-    Return mean ± standard error, and the standard deviation in brackets if there is one.
-
-    Parameters
-    ----------
-    one : Statistic
-        A parameter over the recordings.
-
-    Returns
-    -------
-    str
-        A table cell.
-
-    """
+    """Return mean ± standard error, and the standard deviation in brackets if available."""
     scatter = '' if one.deviation is None else f' ({spread(one.deviation)})'
     return f'{measured(one.mean, one.error)}{scatter}'
 
 
 def friction_parameters(estimate: FrictionEstimate) -> dict[str, ParameterEstimate]:
-    """
-    Return all parameters of a recording, also the break-away force and the lag.
-
-    Parameters
-    ----------
-    estimate : FrictionEstimate
-        What the recording gave.
-
-    Returns
-    -------
-    dict
-        Parameters by name, times in milliseconds.
-
-    """
+    """Return all parameters of a recording by name, with breakaway force and lag [ms]."""
     first, *others = estimate.parameters
     found = [first, estimate.breakaway, *others, estimate.lag]
     return {one.name: _in_milliseconds(one) for one in found if one is not None}
@@ -125,63 +73,21 @@ def _in_milliseconds(one: ParameterEstimate) -> ParameterEstimate:
 
 
 def friction_statistics(summary: FrictionSummary) -> list[Statistic]:
-    """
-    Return statistics of `friction_parameters`, each over the recordings that have it.
-
-    Parameters
-    ----------
-    summary : FrictionSummary
-        All recordings.
-
-    Returns
-    -------
-    list of Statistic
-        One for each parameter.
-
-    """
+    """Return statistics of `friction_parameters` over the recordings with each parameter."""
     rows = [friction_parameters(estimate) for estimate in summary.estimates]
     names = dict.fromkeys(name for row in rows for name in row)
     return [statistic([row[name] for row in rows if name in row]) for name in names]
 
 
 def parameter_cells(estimate: FrictionEstimate, means: Sequence[Statistic]) -> list[str]:
-    """
-    Return the parameters of one recording.
-
-    Parameters
-    ----------
-    estimate : FrictionEstimate
-        What the recording gave.
-    means : sequence of Statistic
-        Parameters to show, in order.
-
-    Returns
-    -------
-    list of str
-        Table cells, '' where the recording does not have the parameter.
-
-    """
+    """Return table cells of a recording's parameters; '' for missing parameters."""
     given = friction_parameters(estimate)
     found = [given.get(one.name) for one in means]
     return ['' if one is None else measured(one.value, one.error) for one in found]
 
 
 def identified_text(summary: FrictionSummary | StiffnessSummary) -> str:
-    """
-    Return what was identified for the terminal.
-
-    Parameters
-    ----------
-    summary : FrictionSummary or StiffnessSummary
-        All recordings.
-
-    Returns
-    -------
-    str
-        Friction: a table of the means, and one of the recordings. Stiffness: Table 2 with a row
-        for each entry and a column for each force, the intervals, and k_a.
-
-    """
+    """Return tables of identified parameters for the terminal."""
     if isinstance(summary, FrictionSummary):
         return _friction_text(summary)
     return _stiffness_text(summary)
@@ -201,20 +107,7 @@ def _friction_text(summary: FrictionSummary) -> str:
 
 
 def puncture_rows(summary: FrictionSummary) -> list[tuple[str, ...]]:
-    """
-    Return the punctures of all recordings.
-
-    Parameters
-    ----------
-    summary : FrictionSummary
-        All recordings.
-
-    Returns
-    -------
-    list of tuple of str
-        Table rows with the heads `PUNCTURE_HEADS`.
-
-    """
+    """Return the punctures of all recordings as rows with the heads `PUNCTURE_HEADS`."""
     return [
         (
             estimate.name,
@@ -255,21 +148,10 @@ def warned(
     summary: FrictionSummary | StiffnessSummary, origin: Origin
 ) -> tuple[list[str], list[str]]:
     """
-    Return what to know before using the numbers.
+    Return the warnings about a result, grouped and in full.
 
-    Parameters
-    ----------
-    summary : FrictionSummary or StiffnessSummary
-        All recordings.
-    origin : Origin
-        What it was identified from.
-
-    Returns
-    -------
-    short, full : list of str
-        One of each group of warnings that differ in numbers only, and how many more there are;
-        and all of them.
-
+    The first list has a warning of each group that differs in numbers only, with the number of
+    others; the second list has all warnings.
     """
     names = short_names([one.name for one in summary.estimates])
     found = [('', words) for words in summary.warnings]
@@ -288,41 +170,13 @@ def warned(
 
 
 def short_names(names: Sequence[str]) -> dict[str, str]:
-    """
-    Return names of recordings without their folders, unless two would be the same.
-
-    Parameters
-    ----------
-    names : sequence of str
-        Names.
-
-    Returns
-    -------
-    dict
-        Short names by name.
-
-    """
+    """Return names of recordings without their folders, unless they are ambiguous."""
     short = [Path(name).name or name for name in names]
     return dict(zip(names, short if len(set(short)) == len(names) else names, strict=True))
 
 
 def identified_document(summary: object, origin: Origin) -> dict[str, Any]:
-    """
-    Return everything that was identified for JSON; what is not finite is null.
-
-    Parameters
-    ----------
-    summary : FrictionSummary or StiffnessSummary
-        All recordings.
-    origin : Origin
-        What it was identified from, and how.
-
-    Returns
-    -------
-    dict
-        Plain values.
-
-    """
+    """Return the result and its origin as plain values for JSON."""
     return {
         **plain(summary),
         'settings': plain(origin.settings),
@@ -334,29 +188,20 @@ def identified_document(summary: object, origin: Origin) -> dict[str, Any]:
 
 def plain(value: Any) -> Any:
     """
-    Return a result as plain values for JSON.
+    Convert dataclasses, sequences, mappings and numbers to plain values for JSON.
 
-    Parameters
-    ----------
-    value : object
-        Dataclasses, sequences, mappings and numbers.
-
-    Returns
-    -------
-    object
-        The same without arrays as long as a recording; what is not finite is None.
-
+    Numbers that are not finite become None; arrays as long as a recording are left out.
     """
     if is_dataclass(value):
         named = {item.name: getattr(value, item.name) for item in fields(value)}
-        # Arrays as long as the recording are for figures.
+        # Arrays as long as the recording are only for figures.
         return {
             name: plain(one) for name, one in named.items() if not isinstance(one, (Fit, Presses))
         }
     if isinstance(value, dict):
         return {str(key): plain(one) for key, one in value.items()}
     if isinstance(value, (list, tuple)):
-        # Parameters and statistics are found by their names.
+        # Parameters and statistics become mappings by name.
         if value and all(isinstance(one, (ParameterEstimate, Statistic)) for one in value):
             return {one.name: plain(one) for one in value}
         return [plain(one) for one in value]

@@ -1,4 +1,4 @@
-"""A simulated insertion of a steered needle as a summary, a CSV and a figure."""
+"""Report a simulated steered insertion as summary, CSV and figures."""
 
 from __future__ import annotations
 
@@ -14,37 +14,29 @@ from needle_ros.files import write_whole
 import numpy as np
 
 if TYPE_CHECKING:
-    # Take half a second each to import; only the picture needs one of them.
+    # Take half a second each to import; only pictures need them.
     from matplotlib.figure import Figure
     from needle_controller.steering.controller import Reach
 
-#: Columns of the CSV, as identification of friction and steering finds them.
+#: Columns of the CSV, with the names that friction and steering identification expect.
 COLUMNS: Final = (
     'time [s]', 'depth [m]', 'speed [m/s]', 'force [N]', 'guide_x [m]', 'guide_z [m]',
     'roll [rad]', 'tip_x [m]', 'tip_z [m]', 'tip_roll [rad]', 'force_x [N]', 'force_z [N]',
     'torque_x [N m]', 'torque_y [N m]', 'torque_z [N m]',
 )  # fmt: skip
 
-#: Needles drawn on the way.
+#: Number of drawn needle shapes.
 _DRAWN: Final = 4
 
 #: Width of the picture [in].
 _WIDTH: Final = 9.0
 
-#: What is shown around a needle [mm].
+#: Margin around a needle [mm].
 _MARGIN: Final = 4.0
 
 
 class InsertionRecord:
-    """
-    Samples of an insertion, and the needle at some of them.
-
-    Parameters
-    ----------
-    one : Insertion
-        The needle, at its start.
-
-    """
+    """Samples of an insertion, with needle shapes."""
 
     def __init__(self, one: Insertion) -> None:
         self._one = one
@@ -53,15 +45,7 @@ class InsertionRecord:
         self.take(0.0)
 
     def take(self, force: float) -> None:
-        """
-        Take a sample.
-
-        Parameters
-        ----------
-        force : float
-            Mean axial force since the one before [N].
-
-        """
+        """Record a sample; ``force`` is the mean axial force since the previous sample [N]."""
         one = self._one
         (guide_x, guide_z), (tip_x, _, tip_z) = one.needle.guide, one.needle.tip
         force_x, force_z, *torques = one.wrench
@@ -75,41 +59,28 @@ class InsertionRecord:
 
     @property
     def table(self) -> FloatArray:
-        """The samples, shape (n, columns) in the order of `COLUMNS`."""
+        """Samples, shape (n, columns) in the order of `COLUMNS`."""
         return np.array(self._rows)
 
     @property
     def path(self) -> NeedlePath:
-        """The path that the tip cut."""
+        """Path cut by the tip."""
         return self._one.needle.path
 
     @property
     def shapes(self) -> list[NeedleShape]:
-        """The needle at evenly spaced samples, the last one included."""
+        """Needle shapes at evenly spaced samples, including the last."""
         at = np.linspace(0, len(self._shapes) - 1, _DRAWN + 1).round().astype(int)
         return [self._shapes[k] for k in at[1:]]
 
     @property
     def punctured(self) -> int:
-        """Number of membranes that are punctured."""
+        """Number of punctured membranes."""
         return sum(self._one.punctured)
 
 
 def summary(record: InsertionRecord) -> dict[str, float]:
-    """
-    Return the main numbers of an insertion.
-
-    Parameters
-    ----------
-    record : InsertionRecord
-        The insertion.
-
-    Returns
-    -------
-    dict
-        Values by what they are, with their units.
-
-    """
+    """Return the main metrics of an insertion, by name with unit."""
     rows = record.table
     column = dict(zip(COLUMNS, rows.T, strict=True))
     return {
@@ -127,22 +98,7 @@ def summary(record: InsertionRecord) -> dict[str, float]:
 
 
 def write(path: Path, record: InsertionRecord) -> None:
-    """
-    Write an insertion in the format that the name of the file asks for.
-
-    Parameters
-    ----------
-    path : Path
-        A ``.csv`` or ``.png`` file.
-    record : InsertionRecord
-        The insertion.
-
-    Raises
-    ------
-    NeedleError
-        If it cannot be written.
-
-    """
+    """Write an insertion to a ``.csv`` or ``.png`` file."""
     if path.suffix == '.csv':
         text = StringIO(newline='')
         writer = csv.writer(text)
@@ -162,24 +118,9 @@ def draw_needle(
     beside: FloatArray | None = None,
 ) -> Figure:
     """
-    Draw a needle on its way in both planes, to scale, with the path that it cut.
+    Draw needle shapes (k, 3), cut path (m, 3) and target (3,) to scale in both planes [m].
 
-    Parameters
-    ----------
-    needles : sequence of ndarray, shape (k, 3)
-        Points x, y, z along the needle [m], now and then; the last one is drawn bold.
-    path : ndarray, shape (m, 3)
-        Points of the path [m].
-    target : ndarray, shape (3,), optional
-        A target [m].
-    beside : ndarray, shape (k, 3), optional
-        The needle that nobody steered [m].
-
-    Returns
-    -------
-    Figure
-        The picture.
-
+    The last needle is drawn bold. ``beside`` (k, 3) is the needle of an open-loop insertion.
     """
     from matplotlib.figure import Figure
 
@@ -189,7 +130,7 @@ def draw_needle(
     whole = 1e3 * np.vstack([*needles, path, *others])[:, [0, 2]]
     limits = np.array([whole.min(axis=0) - _MARGIN, whole.max(axis=0) + _MARGIN]).T
     spans = np.diff(limits)[:, 0]
-    # As high as the scale asks for, with room for the words.
+    # Height from the scale, plus space for labels.
     height = _WIDTH * float(spans.sum()) / (end - begin)
     figure = Figure(figsize=(_WIDTH, height + 1.5), layout='constrained')
     planes = figure.subplots(2, 1, sharex=True, height_ratios=spans.tolist())
@@ -206,7 +147,7 @@ def draw_needle(
                 alpha=1.0 if last else 0.5,
                 label='needle' if last else None,
             )
-        axes.plot(1e3 * path[:, 1], 1e3 * path[:, k], 'k--', lw=0.8, label='path it cut')
+        axes.plot(1e3 * path[:, 1], 1e3 * path[:, k], 'k--', lw=0.8, label='cut path')
         if beside is not None:
             axes.plot(1e3 * beside[:, 1], 1e3 * beside[:, k], color='gray', label='open loop')
         if target is not None:
@@ -224,22 +165,7 @@ def draw_needle(
 
 
 def draw_reach(reach: Reach, target: FloatArray) -> Figure:
-    """
-    Draw where the tip can be brought, at the depth of a target that is out of reach.
-
-    Parameters
-    ----------
-    reach : Reach
-        What is within reach, by what may be true: the more probable, the darker.
-    target : ndarray, shape (2,)
-        The target, x and z [m].
-
-    Returns
-    -------
-    Figure
-        The picture.
-
-    """
+    """Draw the reachable set at the depth of an unreachable target, x and z [m]."""
     from matplotlib.figure import Figure
     from matplotlib.patches import Rectangle
 
@@ -259,9 +185,7 @@ def draw_reach(reach: Reach, target: FloatArray) -> Figure:
         )
     axes.plot(*(1e3 * target), 'rx', ms=10.0, mew=2.0, label='target')
     axes.plot(0.0, 0.0, 'k+', ms=10.0, label='axis of the guide')
-    axes.set(
-        xlabel='x [mm]', ylabel='z [mm]', title='Where the tip can be brought', aspect='equal'
-    )
+    axes.set(xlabel='x [mm]', ylabel='z [mm]', title='Reachable tip positions', aspect='equal')
     axes.margins(0.1)
     axes.legend()
     return figure

@@ -1,4 +1,4 @@
-"""What every page says of itself: version, command and date."""
+"""Version, command and date of a report page."""
 
 from __future__ import annotations
 
@@ -9,20 +9,15 @@ import os
 import time
 from typing import Final
 
-#: The command line that is being run, as it was typed; `needle_insertion.cli` sets it.
+#: Command line of this process, set by `needle_insertion.cli`.
 COMMAND: Final[ContextVar[str]] = ContextVar('COMMAND', default='')
 
 
 def made() -> str:
     """
-    Say with what, how and when a page was made.
+    Return version, command and date of a page in a line.
 
-    Returns
-    -------
-    str
-        One line. With SOURCE_DATE_EPOCH in the environment the date is that, so that the same
-        content gives the same bytes.
-
+    The environment variable SOURCE_DATE_EPOCH fixes the date, for reproducible pages.
     """
     at = float(os.environ.get('SOURCE_DATE_EPOCH', time.time()))
     date = datetime.fromtimestamp(at, timezone.utc).strftime('%Y-%m-%d %H:%M UTC')

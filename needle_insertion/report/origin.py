@@ -1,4 +1,4 @@
-"""What a result was identified from: recordings, files, settings, and what was lost."""
+"""Provenance of an identified result: recordings, files, settings and losses."""
 
 from __future__ import annotations
 
@@ -11,27 +11,27 @@ from typing import Any, Final
 from needle_ros.errors import NeedleError
 from tqdm import tqdm
 
-#: Bytes of a file that are read at once.
+#: Block size for reading a file [bytes].
 _PIECE: Final = 1 << 20
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Source:
     """
-    One recording.
+    Recording of a result.
 
     Attributes
     ----------
     name : str
-        The recording.
+        Name of the recording.
     losses : tuple of str
-        What was lost, left out or repaired in reading, in words.
+        Lost, discarded or corrected data.
     clock_offset : float
-        Stamps of the force minus those of the motion [s], already corrected.
+        Stamps of the force minus stamps of the motion [s], already corrected.
     samples : int
-        Samples of force and motion.
+        Number of samples of force and motion.
     files : tuple of (str, str)
-        Paths and SHA-256 of its files.
+        Paths and SHA-256 of the files.
 
     """
 
@@ -45,22 +45,22 @@ class Source:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Origin:
     """
-    Recordings and settings behind a result.
+    Recordings and settings of a result.
 
     Attributes
     ----------
     settings : object
-        The dataclass with the settings.
+        Dataclass of settings.
     reading : Mapping[str, Any]
-        Options of reading; None stands for what is found by type.
+        Options of the reader; None for automatic selection by type.
     result : Path or None
-        The parameter file, if one is written.
+        Written parameter file, if any.
     sources : sequence of Source
-        The recordings.
+        Recordings.
     failures : sequence of (str, str)
-        Recordings that could not be used, and why.
+        Unusable recordings with reason.
     copies : sequence of (str, str)
-        Recordings with the samples of another, and that other; they count once.
+        Recordings with the same samples as another, with its name; used once.
 
     """
 
@@ -73,19 +73,19 @@ class Origin:
 
     @property
     def failed(self) -> list[str]:
-        """Recordings that could not be used, in words."""
+        """Unusable recordings with reasons."""
         return [
             reason if name in reason else f'{name}: {reason}' for name, reason in self.failures
         ]
 
     @property
     def losses(self) -> list[str]:
-        """What was lost or corrected in reading, in words."""
+        """Lost or corrected data, as sentences."""
         return [f'{name}: {words}' for name, words in self.lost]
 
     @property
     def lost(self) -> list[tuple[str, str]]:
-        """Recordings, and what was lost or corrected in reading each, in words."""
+        """Recordings with a message for each loss or correction."""
         return [
             *((name, f'the same samples as {other}: counts once') for name, other in self.copies),
             *((one.name, words) for one in self.sources for words in one.losses),
@@ -139,26 +139,11 @@ def identify_all(
     digest: bool,
 ) -> tuple[list[Any], Origin]:
     """
-    Identify recordings one by one; those that cannot be used, and copies, are left out.
+    Identify recordings, and skip copies and unusable recordings.
 
-    Parameters
-    ----------
-    bags : sequence of Path
-        The recordings.
-    read : callable
-        Reads one of them.
-    identify : callable
-        Identifies parameters from what was read.
-    origin : Origin
-        Settings, options and result.
-    digest : bool
-        Whether to take the checksums of the files, which reads them once more.
-
-    Returns
-    -------
-    (list, Origin)
-        Estimates, and the origin with sources and failures.
-
+    ``read`` and ``identify`` handle a single recording; ``digest`` enables the checksums of the
+    files, for which they are read again. Returns the estimates, and the origin with sources and
+    failures.
     """
     estimates, sources, failures, copies = [], [], [], []
     seen: dict[bytes, str] = {}

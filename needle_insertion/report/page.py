@@ -1,8 +1,8 @@
 """
-Self-contained HTML pages from the templates of this folder.
+Write self-contained HTML pages from the templates of this folder.
 
-A page needs no other file and loads nothing, and its own policy tells the browser so. The same
-content gives the same bytes, but for the date. Templates escape all text that they are given.
+Pages load no other files, and their content security policy forbids it. The same content gives the
+same bytes, except for the date. Templates escape all inserted text.
 """
 
 from __future__ import annotations
@@ -21,18 +21,18 @@ from needle_insertion.report.made import made
 from needle_insertion.report.symbols import symbols
 from needle_ros.files import write_whole
 
-#: A text that starts with a number and is longer, such as a checksum, is not a number.
+#: Largest length of a cell with a number; longer text is for example a checksum.
 _LONGEST_NUMBER: Final = 40
 
-#: A longer cell has words for reading.
+#: Largest length of a cell without sentences.
 _SENTENCE: Final = 30
-#: Headings, and how many of them are worth a table of contents.
+#: Headings, and smallest number of headings for a table of contents.
 _HEADING: Final = re.compile('<h2 id="([^"]*)">(.*?)</h2>')
 _FEWEST_HEADINGS: Final = 4
 
 _NUMBER: Final = re.compile(r'[-+]?\d')
 
-#: Style classes of cells that hold a verdict.
+#: Style classes of cells with a verdict.
 _VERDICTS: Final = {
     'pass': 'pass',
     'holds': 'pass',
@@ -43,32 +43,32 @@ _VERDICTS: Final = {
 
 
 def _kind(cell: str) -> str:
-    """Return the style class of a table cell, '' if it needs none."""
+    """Return the style class of a table cell, or ''."""
     is_number = _NUMBER.match(cell) and len(cell) < _LONGEST_NUMBER
     return _VERDICTS.get(cell, 'number' if is_number else '')
 
 
 def _has_sentences(rows: Sequence[Sequence[str]]) -> bool:
-    """Return whether the cells of a table are for reading rather than comparing."""
+    """Whether cells of a table contain sentences."""
     return any(len(cell) > _SENTENCE for row in rows for cell in row[1:])
 
 
 def _anchor(words: str) -> str:
-    """Return the name of a heading in an address."""
+    """Return the anchor of a heading."""
     return re.sub(r'\W+', '-', words.lower()).strip('-')
 
 
 def _contents(content: str) -> Markup:
-    """Return the table of contents of a page, nothing for a short one."""
+    """Return the table of contents of a page, empty for a short page."""
     found = _HEADING.findall(content)
     if len(found) < _FEWEST_HEADINGS:
         return Markup()
-    # Both are from the page itself, where they have been escaped.
+    # Both are from the page itself, where they are already escaped.
     links = ''.join(f'<a href="#{anchor}">{words}</a>\n' for anchor, words in found)
     return Markup(f'<nav aria-label="Contents">\n{links}</nav>')  # noqa: S704
 
 
-#: Where the templates are, and what else pages are made of.
+#: Folder of templates, style and scripts.
 TEMPLATE_FOLDER: Final = Path(__file__).with_name('templates')
 
 #: Templates of this folder.
@@ -97,26 +97,11 @@ def write_page(
     **content: Any,
 ) -> None:
     """
-    Write one page, and each of its pictures as a PNG beside it.
+    Write a page atomically, and each of its pictures as a PNG in the same folder.
 
-    Parameters
-    ----------
-    path : Path
-        Page to write; it appears completely or not at all.
-    template : str or Template
-        The template, or the name of its file.
-    pictures : iterable of Picture
-        Pictures of the page; the template gets them by name as ``pictures``.
-    animation : Animation, optional
-        A needle that moves; the only script that the browser then runs on the page is its own.
-    **content : object
-        What else the template shows; a ``title`` and an ``introduction`` at least.
-
-    Raises
-    ------
-    ParameterError
-        If a file cannot be written.
-
+    ``template`` is a template or its file name; it receives the pictures by name as ``pictures``,
+    the ``animation``, whose script is the only script that the policy permits, and ``content``
+    with at least ``title`` and ``introduction``.
     """
     shown = {one.name: one for one in pictures}
     page = TEMPLATES.get_template(template).render(

@@ -1,4 +1,4 @@
-"""Symbols in plain text, such as mu_s or q1_dot, typeset for HTML."""
+"""Typeset symbols in plain text, such as mu_s or q1_dot, for HTML."""
 
 from __future__ import annotations
 
@@ -11,28 +11,15 @@ _GREEK: Final = {'mu': 'μ', 'phi': 'φ', 'tau': 'τ', 'theta': 'θ', 'rho': 'ρ
 _SYMBOL: Final = re.compile(
     rf'\b({"|".join(_GREEK)}|q(?=\d)|[kfIqcde](?=_))(\d?)(?:_(d?dot))?(?:_(\w{{1,3}}))?\b'
 )
-#: Combining dots, which stand behind their letter.
+#: Combining dots, which follow their letter.
 _DOTS: Final = {None: '', 'dot': '\u0307', 'ddot': '\u0308'}
 _POWER: Final = re.compile(r'\^(?:([2-4])(?![\d/])|(-?\d+(?:/\d+)?|T\b))')
 _MICROMETERS: Final = re.compile(r'(?<=\d )um\b')
 
 
 def symbols(words: str) -> Markup:
-    """
-    Escape a text and typeset its symbols, powers and micrometers.
-
-    Parameters
-    ----------
-    words : str
-        Plain text.
-
-    Returns
-    -------
-    Markup
-        HTML.
-
-    """
-    # Only `escape` makes the text safe: what is put in below are tags, letters and digits.
+    """Escape a text and typeset its symbols, powers and micrometers."""
+    # `escape` makes the text safe: the substitutions insert only tags, letters and digits.
     text = _POWER.sub(_power, _SYMBOL.sub(_symbol, str(escape(words))))
     return Markup(_MICROMETERS.sub('μm', text))  # noqa: S704
 

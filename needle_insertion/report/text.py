@@ -1,4 +1,4 @@
-"""Tables and checks as text for the terminal."""
+"""Format tables and checks as text for the terminal."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ import re
 from textwrap import fill, wrap
 from typing import Final
 
-#: Widest line of a table, unless its words are too long.
+#: Largest width of a table, unless words are longer.
 _WIDTH: Final = 100
 
-#: A number stays in one line with its unit and error, and an interval with its ends.
+#: Spaces without line break: between number, unit and error, and within an interval.
 _TOGETHER: Final = re.compile(r' (±|to) (?=[-\d])|(?<=\d) (?=[A-Za-z%])')
 
 _SPACE: Final = re.compile(' ')
@@ -20,23 +20,8 @@ _NEVER: Final = re.compile('(?!)')
 
 
 def table(rows: Sequence[Sequence[str]], heads: Sequence[str]) -> str:
-    """
-    Return rows as aligned text; cells of a table wider than 100 columns go over several lines.
-
-    Parameters
-    ----------
-    rows : sequence of sequence of str
-        Cells.
-    heads : sequence of str
-        Column heads.
-
-    Returns
-    -------
-    str
-        Lines without a final newline.
-
-    """
-    # Without breaks in numbers and in the first column, which names the row, if there is room.
+    """Return rows as aligned text; cells of tables wider than 100 columns are wrapped."""
+    # Avoid breaks in numbers and in the first column if the width permits.
     for first, inside in ((_SPACE, _TOGETHER), (_SPACE, _NEVER), (_NEVER, _NEVER)):
         cells = [
             [first.sub(_joined, name), *(inside.sub(_joined, cell) for cell in others)]
@@ -60,20 +45,7 @@ def table(rows: Sequence[Sequence[str]], heads: Sequence[str]) -> str:
 
 
 def filled(text: str) -> str:
-    """
-    Return a paragraph in lines that are no wider than a table.
-
-    Parameters
-    ----------
-    text : str
-        Words.
-
-    Returns
-    -------
-    str
-        Lines without a final newline.
-
-    """
+    """Wrap a paragraph to the width of a table."""
     return fill(text, _WIDTH, break_long_words=False, break_on_hyphens=False)
 
 
@@ -82,7 +54,7 @@ def _joined(found: re.Match[str]) -> str:
 
 
 def _widths(cells: Sequence[Sequence[str]]) -> list[int]:
-    """Return the widths of the columns, the widest narrowed as far as their words allow."""
+    """Return column widths; the widest columns are narrowed down to their longest words."""
     columns = list(zip(*cells, strict=True))
     widths = [max(map(len, column)) for column in columns]
     least = [max(map(len, ' '.join(column).split(' '))) for column in columns]
@@ -105,24 +77,12 @@ def _total(widths: Sequence[int]) -> int:
 
 
 #: Heads of the rows of `Check.row`.
-CHECK_HEADS: Final = ('what', 'true or wanted', 'found', 'verdict')
+CHECK_HEADS: Final = ('check', 'expected', 'found', 'verdict')
 
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """
-    One line of a result: what was wanted, what was found, and whether that is good enough.
-
-    Attributes
-    ----------
-    what : str
-        Quantity that was checked.
-    wanted, found : str
-        With units.
-    passed : bool
-        The verdict.
-
-    """
+    """Check of a quantity: expected and actual value with units, and verdict."""
 
     what: str
     wanted: str
@@ -131,5 +91,5 @@ class Check:
 
     @property
     def row(self) -> tuple[str, str, str, str]:
-        """Cells of a table, the verdict as a word."""
+        """Cells of a table, with the verdict 'pass' or 'FAIL'."""
         return self.what, self.wanted, self.found, 'pass' if self.passed else 'FAIL'

@@ -1,4 +1,4 @@
-"""A simulated trajectory as a summary, a CSV, a figure and a bag."""
+"""Report a simulated trajectory as summary, CSV, figure and bag."""
 
 from __future__ import annotations
 
@@ -20,29 +20,16 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from needle_identification import BagWriter
 
-#: Deflection up to which a linear beam is valid, as a part of the inserted length.
+#: Largest deflection of a linear beam, as a fraction of the insertion depth.
 _LINEAR: Final = 0.1
 
-#: A mode that has faded by a factor of e to this power within this part of a run is not missed.
+#: Modes that decay by exp(-_FADED) within this fraction of a run are negligible.
 _FADED: Final = 7.0
 _SOON: Final = 0.02
 
 
 def summary(trajectory: Trajectory) -> dict[str, float]:
-    """
-    Return the main numbers of a trajectory.
-
-    Parameters
-    ----------
-    trajectory : Trajectory
-        The trajectory.
-
-    Returns
-    -------
-    dict
-        Values by what they are, with their units.
-
-    """
+    """Return the main metrics of a trajectory, by name with unit."""
     model = NeedleModel(trajectory.parameters)
     states, tips = trajectory.states, trajectory.tip_deflection
     at_hub = trajectory.time[trajectory.depth >= trajectory.parameters.length]
@@ -61,33 +48,20 @@ def summary(trajectory: Trajectory) -> dict[str, float]:
 
 
 def warnings(trajectory: Trajectory) -> Iterator[str]:
-    """
-    Warn of what the trajectory cannot show.
-
-    Parameters
-    ----------
-    trajectory : Trajectory
-        The trajectory.
-
-    Yields
-    ------
-    str
-        A warning.
-
-    """
+    """Yield warnings about the validity and resolution of a trajectory."""
     model = NeedleModel(trajectory.parameters)
     tips, depths = np.abs(trajectory.tip_deflection), trajectory.depth
     worst = int(np.argmax(tips - _LINEAR * depths))
     if tips[worst] > _LINEAR * depths[worst]:
         yield (
             f'the tip deflects {1e3 * tips[worst]:.3g} mm at {1e3 * depths[worst]:.3g} mm '
-            'inserted: a linear beam is valid up to about a tenth of the inserted length'
+            'inserted: a linear beam is valid up to about a tenth of the insertion depth'
         )
     p, duration = trajectory.parameters, float(trajectory.time[-1])
     fade = p.tissue_damping / (2.0 * p.linear_density)
     if fade * _SOON * duration > _FADED:
         return
-    # The frequencies depend on the inserted length.
+    # The frequencies depend on the insertion depth.
     ends = [
         linearize(model, trajectory.states[k], time=float(trajectory.time[k]), sliding='insertion')
         for k in (0, -1)
@@ -97,28 +71,13 @@ def warnings(trajectory: Trajectory) -> Iterator[str]:
     if fastest > 0.5 / interval:
         yield (
             f'the fastest mode, {1e-3 * fastest:.3g} kHz, is beyond half the sampling rate, '
-            f'{0.5e-3 / interval:.3g} kHz: samples show it at a wrong frequency; '
-            f'an interval below {0.5 / fastest:.2g} s shows it'
+            f'{0.5e-3 / interval:.3g} kHz: samples alias it; '
+            f'an interval below {0.5 / fastest:.2g} s resolves it'
         )
 
 
 def write(path: Path, trajectory: Trajectory) -> None:
-    """
-    Write a trajectory in the format that the name of the file asks for.
-
-    Parameters
-    ----------
-    path : Path
-        A ``.csv`` or ``.png`` file, or a folder for a bag, which must not exist.
-    trajectory : Trajectory
-        The trajectory.
-
-    Raises
-    ------
-    NeedleError
-        If the file or the bag cannot be written.
-
-    """
+    """Write a trajectory to a ``.csv`` or ``.png`` file, or as a bag to a new folder."""
     if path.suffix == '.csv':
         write_whole(path, _csv(trajectory).encode())
     elif path.suffix == '.png':
@@ -143,14 +102,14 @@ def _csv(trajectory: Trajectory) -> str:
 
 
 def _figure(trajectory: Trajectory) -> Figure:
-    """Draw inserted length, modal coordinates and tip deflection over time."""
+    """Draw insertion depth, modal coordinates and tip deflection over time."""
     from matplotlib.figure import Figure
 
     result = Figure(figsize=(9.0, 7.0), layout='constrained')
     above, middle, below = result.subplots(3, 1, sharex=True)
     time = trajectory.time * 1e3
     above.plot(time, trajectory.depth * 1e3)
-    above.set_ylabel('inserted length [mm]')
+    above.set_ylabel('insertion depth [mm]')
     for i in range(trajectory.parameters.modes):
         middle.plot(time, trajectory.states[:, 2 + i] * 1e3, label=f'q{i + 1}')
     middle.set_ylabel('modal coordinates [1e-3 m^3/2]')

@@ -1,4 +1,4 @@
-"""`needle analyze`: what it prints and writes, and what it rejects."""
+"""Output, written files and error messages of `needle analyze`."""
 
 from __future__ import annotations
 
@@ -38,8 +38,8 @@ def found_by(capsys: pytest.CaptureFixture[str], *words: str) -> dict[str, Any]:
     return found
 
 
-def test_json_holds_the_analysis_of_each_point(capsys: pytest.CaptureFixture[str]) -> None:
-    """Every combination of the values is there, with the matrices and figures of the library."""
+def test_json_contains_the_analysis_of_each_point(capsys: pytest.CaptureFixture[str]) -> None:
+    """Every combination of the values has the matrices and metrics of the library."""
     words = ('--preset', 'paper_si', '--formulation', 'as_printed', '--modes', '1')
     points = ('--depth', '0.05', '0.1', '--tip-deflection', '0', '1e-3', '--speed', '0.01')
     found = found_by(capsys, *words, *points, '--force', '2')
@@ -67,8 +67,10 @@ def test_json_holds_the_analysis_of_each_point(capsys: pytest.CaptureFixture[str
         }
 
 
-def test_the_table_names_lost_states(capsys: pytest.CaptureFixture[str]) -> None:
-    """A straight and a deflected needle, out of the box; long cells go over several lines."""
+def test_table_lists_uncontrollable_and_unobservable_states(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """A straight and a deflected needle with defaults; long cells are wrapped."""
     assert run() == 0
     lines = capsys.readouterr().out.splitlines()
     first, second = (k for k, line in enumerate(lines) if line.startswith('10 cm'))
@@ -82,18 +84,18 @@ def test_the_table_names_lost_states(capsys: pytest.CaptureFixture[str]) -> None
 
 
 def test_constants_can_be_set(capsys: pytest.CaptureFixture[str]) -> None:
-    """Numbers, lists and words of any constant."""
+    """Numeric, list and string constants."""
     words = ('--set', 'friction_law=tanh', '--set', 'layer_depths=[0.05]')
     more = ('--set', 'layer_stiffnesses=[900]', '--set', 'minimum_depth=0.05', '--modes', '4')
-    # At rest only a smooth law of friction has a derivative.
+    # Only a smooth friction law has a derivative at rest.
     found = found_by(capsys, *words, *more, '--speed', '0')
     assert found['points'][0]['states'][:6] == ['d', 'theta', 'q1', 'q2', 'q3', 'q4']
 
 
-def test_map_is_a_table_and_a_picture(
+def test_map_is_written_as_csv_and_png(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The map covers the needle and goes up to the deflection given; its picture has content."""
+    """The map covers the needle length and deflections up to the option; the PNG is not empty."""
     monkeypatch.setattr(controllability, 'DEPTHS', 13)
     monkeypatch.setattr(controllability, 'DEFLECTIONS', 11)
     folder = tmp_path / 'new' / 'folder'
@@ -135,10 +137,10 @@ def test_map_is_a_table_and_a_picture(
         (('--map', '-o', '.', '--speed', '1', '2'), 'single --speed'),
     ],
 )
-def test_bad_input_ends_in_one_line(
+def test_invalid_input_is_reported_in_one_line(
     words: tuple[str, ...], complaint: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """What is wrong is named before anything is printed."""
+    """The error is reported before any output."""
     with pytest.raises(NeedleError) as caught:
         run(*words)
     assert complaint in str(caught.value)
@@ -146,8 +148,8 @@ def test_bad_input_ends_in_one_line(
     assert capsys.readouterr().out == ''
 
 
-def test_a_folder_that_cannot_be_made_is_named(tmp_path: Path) -> None:
-    """A file in the way is one line, too."""
+def test_folder_that_cannot_be_created_is_reported(tmp_path: Path) -> None:
+    """A file with the same name is reported in one line."""
     (tmp_path / 'taken').write_text('')
     with pytest.raises(NeedleError, match=r'taken.*cannot be written'):
         run('--map', '-o', str(tmp_path / 'taken'))

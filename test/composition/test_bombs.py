@@ -1,4 +1,4 @@
-"""Small files that stand for more than a machine holds, or never end: one line, little memory."""
+"""Decompression bombs and malicious documents are rejected in one line with little memory."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ WRENCH = 'geometry_msgs/msg/WrenchStamped'
 JOINTS = 'sensor_msgs/msg/JointState'
 MEGABYTE = 2**20
 
-#: Most memory that a file may take that is small [kB], and time after which it hangs [s].
+#: Memory limit for reading a small file [kB], and timeout [s].
 MEMORY, PATIENCE = 1_000_000, 120.0
 
-#: A quadratic, or worse, number of things behind a few lines.
+#: Documents of a few lines that expand quadratically or worse.
 LAUGHS = 'a0: &a0 [lol, lol, lol, lol, lol, lol, lol, lol, lol, lol]\n' + ''.join(
     f'a{k}: &a{k} [{", ".join([f"*a{k - 1}"] * 10)}]\n' for k in range(1, 12)
 )
@@ -44,7 +44,7 @@ MERGES = 'a0: &a0 {k: 0}\n' + ''.join(
 
 
 def mcap(file: Path, messages: Iterable[bytes], compression: CompressionType) -> None:
-    """Write messages on both topics that an identification wants."""
+    """Write messages on both topics of an identification."""
     with file.open('wb') as stream:
         writer = McapWriter(stream, compression=compression)
         writer.start(profile='ros2')
@@ -59,7 +59,7 @@ def mcap(file: Path, messages: Iterable[bytes], compression: CompressionType) ->
 
 
 def zeros(size: int) -> bytes:
-    """Compress zeros in pieces: they do not fit in the memory of every machine."""
+    """Compress zeros in blocks, to limit the memory."""
     stream = BytesIO()
     with zstandard.ZstdCompressor(level=19).stream_writer(stream, closefd=False) as packer:
         for _ in range(size // MEGABYTE):
@@ -68,21 +68,21 @@ def zeros(size: int) -> bytes:
 
 
 def zstd_messages(folder: Path) -> Path:
-    """64 messages of 60 MB each, in a few kB, and those in a chunk that is compressed too."""
+    """Write 64 messages of 60 MB in a few kB, and the same in a compressed chunk."""
     file = folder / 'messages.mcap'
     mcap(file, [zeros(60 * MEGABYTE)] * 64, CompressionType.ZSTD)
     return file
 
 
 def lz4_messages(folder: Path) -> Path:
-    """60 MB are 250 kB."""
+    """Write 60 MB in 250 kB."""
     file = folder / 'messages.mcap'
     mcap(file, [lz4.frame.compress(bytes(60 * MEGABYTE))] * 64, CompressionType.ZSTD)
     return file
 
 
 def zstd_file(folder: Path) -> Path:
-    """Let 3 GB of zeros follow the first bytes."""
+    """Append 3 GB of zeros to the first bytes."""
     file = folder / 'whole.mcap.zst'
     head = b'\x89MCAP0\r\n' + struct.pack('<BQ', 0x0F, 2**62)
     file.write_bytes(zstandard.ZstdCompressor().compress(head) + zeros(3072 * MEGABYTE))
@@ -90,7 +90,7 @@ def zstd_file(folder: Path) -> Path:
 
 
 def chunks(folder: Path) -> Path:
-    """Chunks that are 1 GB each, of 32 kB."""
+    """Write chunks of 1 GB each in 32 kB."""
     file, name = folder / 'chunks.mcap', b'zstd'
     for size, claims in ((100, 100), (1024, 1024)):
         packed = zeros(size * MEGABYTE)
@@ -113,7 +113,7 @@ def bag_with(metadata: str) -> Callable[[Path], Path]:
 
 
 def database(*statements: str) -> Callable[[Path], Path]:
-    """Return what makes a database of two topics, with what is here as its messages."""
+    """Return the SQL statements of a database of two topics with the given messages."""
 
     def make(folder: Path) -> Path:
         file = folder / 'bag.db3'
@@ -139,7 +139,7 @@ COMPUTED = (
 
 
 def zstd_database(folder: Path) -> Path:
-    """Let 3 GB of zeros follow a database."""
+    """Append 3 GB of zeros to a database."""
     plain = database('CREATE TABLE messages (topic_id, timestamp, data)')(folder)
     packed = zstandard.ZstdCompressor().compress(plain.read_bytes()) + zeros(3072 * MEGABYTE)
     plain.unlink()
@@ -149,7 +149,7 @@ def zstd_database(folder: Path) -> Path:
 
 
 def ros1_chunk(folder: Path) -> Path:
-    """Let a chunk of a recording of ROS 1 be 3 GB of zeros."""
+    """Replace a chunk of a ROS 1 recording by 3 GB of zeros."""
     store = get_typestore(Stores.ROS1_NOETIC)
     file = folder / 'run.bag'
     writer = Ros1Writer(file)
@@ -163,7 +163,7 @@ def ros1_chunk(folder: Path) -> Path:
     packer = bz2.BZ2Compressor()
     packed = b''.join(packer.compress(bytes(MEGABYTE)) for _ in range(3072)) + packer.flush()
     size = struct.unpack('<I', content[begin - 4 : begin])[0]
-    # The index that follows is found by its place.
+    # The index after the chunk is located by its position.
     spread = packed + content[begin + size :]
     place = struct.unpack('<Q', field(content, b'index_pos='))[0] + len(packed) - size
     head = content[: begin - 4].replace(
@@ -179,13 +179,13 @@ def field(content: bytes, name: bytes) -> bytes:
 
 
 def matlab(folder: Path) -> Path:
-    """Let a variable of 3 GB say that it has one number."""
+    """Write a variable of 3 GB with a declared size of one number."""
     file = folder / 'run.mat'
     savemat(file, {'time': 1.0}, do_compression=False)
     content = file.read_bytes()
     inner = bytearray(content[128:])
     packer = zlib.compressobj(9)
-    # The last element is the number, of 8 bytes: let it be of 3 GB.
+    # The last element is the number of 8 bytes: declare 3 GB.
     inner[-12:-8] = struct.pack('<I', 3072 * MEGABYTE)
     inner[4:8] = struct.pack('<I', 3072 * MEGABYTE + len(inner) - 16)
     packed = packer.compress(bytes(inner))
@@ -195,7 +195,7 @@ def matlab(folder: Path) -> Path:
 
 
 def one_line(folder: Path) -> Path:
-    """Write a table of one line."""
+    """Write a table with a single long line."""
     file = folder / 'run.csv'
     file.write_text('1,' * 15_000_000, encoding='utf-8')
     return file
@@ -220,13 +220,13 @@ def one_line(folder: Path) -> Path:
         pytest.param(zstd_database, 'NEEDLE_BAG_FACTOR=10 raises', id='zstd database'),
     ],
 )
-def test_a_bomb_ends_in_one_line(
+def test_decompression_bomb_is_rejected_in_one_line(
     make: Callable[[Path], Path], reason: str, tmp_path: Path
 ) -> None:
-    """It names the limit; a file of some kB takes no more memory than any recording."""
+    """The message names the limit; the memory is not above an ordinary recording."""
     bomb = make(tmp_path)
     files = [bomb] if bomb.is_file() else [*bomb.iterdir()]
-    # The chunks of 100 MB are honest enough for the limit of a record, but not all together.
+    # Chunks of 100 MB are within the limit of a record, but exceed the total limit.
     assert sum(file.stat().st_size for file in files) < 32 * MEGABYTE
     command = [sys.executable, '-m', 'needle_insertion', 'identify', 'friction', str(bomb)]
     run = subprocess.Popen(
@@ -243,8 +243,8 @@ def test_a_bomb_ends_in_one_line(
 
 
 @pytest.mark.parametrize('bomb', [LAUGHS, MERGES])
-def test_recorded_parameters_that_are_a_bomb_are_none(bomb: str, tmp_path: Path) -> None:
-    """As any other text."""
+def test_recorded_parameters_with_a_yaml_bomb_are_ignored(bomb: str, tmp_path: Path) -> None:
+    """They are ignored like other invalid text."""
     with BagWriter(tmp_path / 'bag') as bag:
         bag.add_topic('/plant/configuration', TEXT)
         bag.write('/plant/configuration', text(bomb), EPOCH)
@@ -258,8 +258,8 @@ def test_recorded_parameters_that_are_a_bomb_are_none(bomb: str, tmp_path: Path)
 
 
 def peak(command: list[str]) -> int:
-    """Run a command once more and return the most memory that it had [kB]."""
-    # By a small process: what one begins as has the size of the process that begins it.
+    """Run a command again and return its peak memory [kB]."""
+    # From a small process, since a child starts with the size of its parent.
     script = (
         'import resource, subprocess, sys\n'
         'subprocess.run(sys.argv[1:], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)\n'
@@ -276,8 +276,8 @@ def peak(command: list[str]) -> int:
     return int(run.stdout)
 
 
-def test_a_limit_can_be_raised(tmp_path: Path) -> None:
-    """By one factor for all; one that is no number is refused."""
+def test_limits_can_be_raised(tmp_path: Path) -> None:
+    """A common factor scales all limits; an invalid factor is rejected."""
     file = tmp_path / 'bag.mcap'
     mcap(file, [zeros(50 * MEGABYTE)] * 4, CompressionType.ZSTD)
     command = [sys.executable, '-m', 'needle_insertion', 'info', str(file)]
@@ -303,7 +303,7 @@ def test_a_limit_can_be_raised(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     'text', ['a: &x 1\nb: *x', '{' * 40, '"' + 'a' * 2**20 + '"', 'a: [', '\0']
 )
-def test_a_document_that_stands_for_more_is_refused(text: str) -> None:
-    """Aliases, depth and length; what is not YAML at all too."""
+def test_documents_that_expand_are_rejected(text: str) -> None:
+    """Aliases, nesting depth, length, and invalid YAML."""
     with pytest.raises(DocumentError):
         read_document(text)

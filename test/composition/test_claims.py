@@ -1,4 +1,4 @@
-"""Claims: each verdict, and each number of the evidence beside one that is computed otherwise."""
+"""Claims: each verdict, and each number of the evidence against an independent computation."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from scipy.optimize import brentq, minimize_scalar
 
 ROOT = Path(__file__).parents[2]
 
-#: Its verdicts are those of a thousand needles: what they rest on differs by factors.
+#: Number of plants; the verdicts equal the verdicts for 1000, as their margins are large.
 NEEDLES = 8
 
 VERDICTS = {
@@ -90,12 +90,12 @@ def found(study: mismatch.Mismatch) -> dict[str, Claim]:
     return {one.name: one for one in claims.judge_claims(Tables(), study)}
 
 
-def test_verdicts_are_those_that_the_equations_give(found: dict[str, Claim]) -> None:
+def test_verdicts_agree_with_the_equations(found: dict[str, Claim]) -> None:
     assert {name: one.verdict for name, one in found.items()} == VERDICTS
     assert len({one.claim for one in found.values()}) == len(found)
 
 
-def test_a_claim_is_either_computed_or_proved_by_a_test_that_exists(
+def test_claims_are_computed_or_proved_by_an_existing_test(
     found: dict[str, Claim],
 ) -> None:
     for one in found.values():
@@ -108,15 +108,15 @@ def test_a_claim_is_either_computed_or_proved_by_a_test_that_exists(
             assert test in {n.name for n in ast.walk(tree) if isinstance(n, ast.FunctionDef)}
 
 
-def test_the_evidence_says_every_number(found: dict[str, Claim]) -> None:
-    """Every number of a claim has its place in the words, and every place its number."""
+def test_evidence_text_contains_every_number(found: dict[str, Claim]) -> None:
+    """Placeholders of the text and numbers of the claim match."""
     for entry in judge._entries():
         words = entry['evidence'] + entry.get('condition', '')
         places = set(re.findall(r'\{(\w+)', words)) - {'source'}
         assert places == set(found[entry['name']].numbers), entry['name']
 
 
-# --- the same numbers by other ways ----------------------------------------------------------
+# --- independent computation of the numbers --------------------------------------------------
 #
 # Constants of Table 3, and the readings of Table 1, as printed in the paper.
 LENGTH, DENSITY, AREA, YOUNG = 0.2, 8000.0, 1.27e-6, 200e9
@@ -138,7 +138,7 @@ def start() -> FloatArray:
 
 
 def hub_time(damping: float) -> float:
-    """Return when a straight needle is at its hub under 3 N, by the closed form."""
+    """Return the time to the hub of a straight needle under 3 N, in closed form [s]."""
     tau, speed = MASS / damping, (FORCE - MU_S) / damping
     return float(
         brentq(lambda t: speed * (t - tau * (1.0 - exp(-t / tau))) - WAY, 1e-6, 100.0, xtol=1e-12)
@@ -149,7 +149,7 @@ def hub_time(damping: float) -> float:
 def run(
     modes: int = 2, tip: float = 5e-4, formulation: str = 'complete'
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return time, d and tip of the open loop (0.3 N s/m), by steps of controlled error."""
+    """Return time, d and tip of the open loop (0.3 N s/m), with error control."""
     p = NeedleParameters(
         modes=modes, formulation=formulation, minimum_depth=0.01 if modes < 3 else 0.0195
     )
@@ -160,14 +160,14 @@ def run(
 
 
 def apart(modes: int, duration: float) -> float:
-    """Return how far the deflection moves d [m] within a time [s]."""
+    """Return the change of d by the deflection [m] within a time [s]."""
     time, bent, _ = run(modes)
     _, straight, _ = run(modes, 0.0)
     return float(np.abs(bent - straight)[time <= duration + 1e-9].max())
 
 
 def bias_terms() -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return row d of N, and the parts of row q1, along the open loop by the equations."""
+    """Return row d of N, and the parts of row q1, along the open loop, from the equations."""
     p = NeedleParameters()
     of = NeedleModel(p)
     trajectory = simulate(
@@ -187,14 +187,14 @@ def bias_terms() -> tuple[FloatArray, FloatArray, FloatArray]:
 
 
 def normal_modes(depth: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return frequencies [rad/s], shapes of unit mass, and what each has at the tip."""
+    """Return frequencies [rad/s], shapes of unit mass, and their values at the tip."""
     at = model().modes.integrals(depth)
     squares, shapes = eigh(BENDING * at.curvature_gram + K_A * at.gram, LINEAR * at.gram)
     return np.sqrt(squares), shapes, at.value @ shapes
 
 
 def rings() -> float:
-    """Return the tip's amplitude at the hub: a slow insertion keeps energy over frequency."""
+    """Return the tip amplitude at the hub: energy over frequency is an adiabatic invariant."""
     before, shapes, _ = normal_modes(0.02)
     after, _, tips = normal_modes(LENGTH)
     amplitude = np.linalg.inv(shapes) @ start()
@@ -211,7 +211,7 @@ def error(time: FloatArray, gain: float, first: float) -> FloatArray:
 
 @cache
 def inverse_dynamics_on_the_hub() -> tuple[FloatArray, FloatArray]:
-    """Return time and tip of figure 7: all errors follow their equation, d up to the hub."""
+    """Return time and tip of figure 7 from the error equations, d up to the hub."""
     time = np.linspace(0.0, 40.0, 40001)
     d = error(time, 1.0, WAY)
     d[np.argmax(d <= 0.0) :] = 0.0
@@ -221,7 +221,7 @@ def inverse_dynamics_on_the_hub() -> tuple[FloatArray, FloatArray]:
 
 @cache
 def pid(kp: float, kv: float, end: float = 60.0) -> tuple[FloatArray, FloatArray]:
-    """Return time and tip of figure 8 (0.3 N s/mm) where the inertia does not count."""
+    """Return time and tip of figure 8 (0.3 N s/mm), without inertia."""
     kp, kv, bound = 1e3 * kp, 1e4 * kv, MU_S / (1e3 * kp)
 
     def depth(time: FloatArray | float) -> FloatArray:
@@ -268,7 +268,7 @@ def beam(
     Return matrix and basis roots of a beam of parts (length [m], foundation [N/m^2]).
 
     Unknowns are the weights of exponentials in each part; rows are the conditions at the base
-    (clamped), at the joints (a pivot at the first if asked for) and at the tip, force last.
+    (clamped), at the joints (optionally a pivot at the first) and at the tip, force last.
     """
     inertia = LINEAR * (2 * pi * frequency) ** 2
     roots = np.array(
@@ -294,7 +294,7 @@ def beam(
 
 def beam_tip(parts: list[tuple[float, float]], *, pivot: bool = False) -> tuple[float, float]:
     """Return deflection at the tip [m] and force at the base [N] under 1 N at the tip."""
-    # Free parts have polynomials; a foundation of 1e-3 N/m^2 is as good as none.
+    # Free parts have polynomials; a foundation of 1e-3 N/m^2 is negligible.
     parts = [(length, max(k, 1e-3)) for length, k in parts]
     matrix, roots = beam(parts, pivot=pivot)
     right = np.zeros(len(matrix))
@@ -305,7 +305,7 @@ def beam_tip(parts: list[tuple[float, float]], *, pivot: bool = False) -> tuple[
 
 
 def beam_frequency(parts: list[tuple[float, float]], near: float, *, pivot: bool) -> float:
-    """Return the natural frequency [Hz] near a value: there the determinant vanishes."""
+    """Return the natural frequency [Hz] near a value, a root of the determinant."""
 
     def size(frequency: float) -> float:
         return float(abs(np.linalg.det(beam(parts, pivot=pivot, frequency=frequency)[0])))
@@ -316,7 +316,7 @@ def beam_frequency(parts: list[tuple[float, float]], near: float, *, pivot: bool
 
 
 def lost_to_the_way() -> tuple[float, float]:
-    """Return how much earlier a bent needle is at the hub [s], fast and slow."""
+    """Return by how much a bent needle reaches the hub earlier [s], fast and slow."""
     time, bent, _ = run()
     _, straight, _ = run(tip=0.0)
 
@@ -324,7 +324,7 @@ def lost_to_the_way() -> tuple[float, float]:
         k = int(np.flatnonzero(d > 1e-6)[-1])
         return float(time[k] + (time[k] - time[k - 1]) * d[k] / (d[k - 1] - d[k]))
 
-    # Slow: each mode keeps its energy over its frequency, so that it pulls by E (-w' / w).
+    # Slow: energy over frequency of each mode is constant, so that it pulls by E (-w' / w).
     depths = np.linspace(0.02, LENGTH, 801)
     modes = [normal_modes(float(s)) for s in depths]
     frequencies = np.array([mode[0] for mode in modes])
@@ -336,7 +336,7 @@ def lost_to_the_way() -> tuple[float, float]:
 
 
 def tip_spring() -> float:
-    """Return what a spring at the tip stores in the second shape over the first, by quadrature."""
+    """Return the energy ratio of second and first shape for a tip spring, by quadrature."""
     y, weights = np.polynomial.legendre.leggauss(40)
     points = 0.01 * (y + 1.0)
     _, shapes, tips = normal_modes(0.02)
@@ -345,7 +345,7 @@ def tip_spring() -> float:
 
 
 def table_2() -> dict[str, dict[str, tuple[float | str, float]]]:
-    """Return what Table 2, as printed in kN/m, gives."""
+    """Return the numbers from Table 2, printed in kN/m."""
     xx = np.array([1.26, 0.82, 1.10, 1.03, 0.96])
     zz = np.array([1.01, 0.81, 0.69, 0.60, 0.52])
     xz = np.array([0.04, 0.04, 0.01, 0.001, -0.005])
@@ -382,10 +382,10 @@ def table_2() -> dict[str, dict[str, tuple[float | str, float]]]:
 
 @pytest.fixture(scope='module')
 def expected(study: mismatch.Mismatch) -> dict[str, dict[str, tuple[float | str, float]]]:
-    """Return every number of every claim, with the relative tolerance of the other way."""
+    """Return independent values of all numbers of all claims, with relative tolerances."""
     si_tip, printed_tip = run()[2], run(formulation='as_printed')[2]
     row_d, stiff, rate = bias_terms()
-    # Samples of the claims are 1e-5 s apart at 0.3 N s/m; a row of them for the largest.
+    # Samples of the claims are 1e-5 s apart at 0.3 N s/m.
     fast, slow = hub_time(MU_V['si']), hub_time(MU_V['mm'])
     hub, hub_tip = inverse_dynamics_on_the_hub()
     late = hub >= 36.0
@@ -400,7 +400,7 @@ def expected(study: mismatch.Mismatch) -> dict[str, dict[str, tuple[float | str,
     earlier = lost_to_the_way()
     beam = exact_beam()
     first_frequency = normal_modes(LENGTH)[0][0]
-    # Depth rises evenly in the slow run, so that its mean is that over the depths.
+    # The velocity of the slow run is constant, so that time and depth averages are equal.
     depths = np.linspace(0.02, LENGTH, 2001)
     mean_frequency = np.mean([normal_modes(float(s))[0][0] for s in depths])
     at = model().modes.integrals(0.02)
@@ -410,11 +410,11 @@ def expected(study: mismatch.Mismatch) -> dict[str, dict[str, tuple[float | str,
     known = {law: 1e6 * float(batch.rms[0]) for law, batch in study.nominal.items()}
     times = {'si_ms': (1e3 * fast, 1e-3), 'mm_s': (slow, 1e-4)}
     return {
-        # At rest and straight at its free end, row d is k_a w^2 / 2.
+        # At rest and without curvature at the free end, row d is k_a w^2 / 2.
         'three_dimensions': {'one': (K_A * 5e-4**2 / 2, 0.02), 'both': (K_A * 5e-4**2, 0.02)},
         'bending_outside': {
             'model_hz': (normal_modes(0.02)[0][0] / (2 * pi), 1e-6),
-            # Two modes are a little stiffer than the beam.
+            # Two modes are slightly stiffer than the beam.
             'model_mm': (1e3 * beam_tip([(0.02, K_A)])[0], 0.03),
             'free_hz': (beam_frequency(whole, 30.6, pivot=False), 1e-3),
             'free_mm': (1e3 * free[0], 1e-3),
@@ -442,7 +442,7 @@ def expected(study: mismatch.Mismatch) -> dict[str, dict[str, tuple[float | str,
             ),
         },
         'no_cutting': {'cutting': (1.0, 0.0), 'dry': (MU_S, 0.0), 'both': (1.0 + MU_S, 1e-12)},
-        # So short a needle is nearly a cantilever: its frequency falls with the length squared.
+        # A short needle is nearly a cantilever: its frequency falls with the length squared.
         'linearization': {'way_mm': (20 * (sqrt(1.1) - 1), 0.01), 'insertion_mm': (180, 1e-9)},
         'zero_rows': {
             'largest': (np.abs(row_d).max(), 0.01),
@@ -455,7 +455,7 @@ def expected(study: mismatch.Mismatch) -> dict[str, dict[str, tuple[float | str,
         'independence': {
             'printed': (0.0, 0.0),
             'si_mm': (1e3 * apart(2, 0.035), 0.02),
-            # The energy of the deflection is given to friction, at the steady speed.
+            # The energy of the deflection is dissipated by friction at the steady velocity.
             'mm_mm': (1e3 * model().energy(model().state_at(0.02, 5e-4)) / (FORCE - MU_S), 0.1),
             'percent': (100 * apart(2, 0.035) / WAY, 0.02),
         },
@@ -484,7 +484,7 @@ def expected(study: mismatch.Mismatch) -> dict[str, dict[str, tuple[float | str,
             'of_along': (I_X / (MASS * AREA / (2 * pi)), 1e-9),
         },
         'friction_matters': {'none_ms': (1e3 * sqrt(2 * WAY * MASS / FORCE), 1e-9), **times},
-        # Two modes with a phase of their own: both at their largest within the last two seconds.
+        # Two modes with different phases: both reach their maximum within the last two seconds.
         'transients': {'rings_mm': (1e3 * rings(), 0.03), 'fade_ms': (12.7, 1e-9)},
         'reading_of_table_1': {**times, 'mean': (0.3, 1e-9), 'deviation': (0.0447, 1e-9)},
         'identifiable': {
@@ -494,7 +494,7 @@ def expected(study: mismatch.Mismatch) -> dict[str, dict[str, tuple[float | str,
             'apart': (0.0, 0.0),
         },
         **table_2(),
-        # docs/analysis.md, to its digits.
+        # Values of docs/analysis.md, rounded.
         'controllability': {
             'bent': (8, 0.0),
             'straight': (4, 0.0),
@@ -504,7 +504,7 @@ def expected(study: mismatch.Mismatch) -> dict[str, dict[str, tuple[float | str,
         'inadequate': {'least': (0.0041, 0.01), 'most': (1.5 * 5e-4 / 0.02, 0.01)},
         'modes_observable': {'margin': (0.20, 0.02)},
         'error_equation': {
-            # The tolerance of the solver; its size is of no matter.
+            # The tolerance of the solver; only its order matters.
             'error': (3e-6, 1.0),
             'pushed_mn': (1e3 * MASS * WAY, 1e-9),
             'friction': (MU_S, 1e-9),
@@ -512,7 +512,7 @@ def expected(study: mismatch.Mismatch) -> dict[str, dict[str, tuple[float | str,
         'positive_definite': {
             # The slow pole of d in the implicit form, over one period of 1 ms.
             'at_1_khz': (1.0 - 1e-3 * 1e3 / (1e4 + MU_V['mm']), 1e-6),
-            # No closed form: as found; it is for `test_stability` to say that it is right.
+            # No closed form: observed value; `test_stability` verifies the computation.
             'at_1_mhz': (1.0241, 1e-4),
             'textbook': (-1e4 / MU_V['mm'], 1e-9),
         },
@@ -528,7 +528,7 @@ def expected(study: mismatch.Mismatch) -> dict[str, dict[str, tuple[float | str,
             'peak_ms': (1e3 * run()[0][np.abs(si_tip).argmax()], 0.03),
         },
         'smoother': {
-            # Two changes of side in a period of the first mode, on the way and at the hub.
+            # Two sign changes in a period of the first mode, during the insertion and at the hub.
             'free': ((mean_frequency / pi * slow + first_frequency / pi * (24 - slow)) / 24, 0.1),
             'controlled': (turns(hub_tip) / 40.0, 0.05),
             'alone': (first_frequency / pi, 0.1),
@@ -577,7 +577,7 @@ def expected(study: mismatch.Mismatch) -> dict[str, dict[str, tuple[float | str,
 
 
 def wrong(one: Claim, wanted: dict[str, tuple[float | str, float]]) -> list[str]:
-    """Name the numbers of a claim that differ by more than their tolerance."""
+    """Return names of the numbers of a claim beyond their tolerance."""
     assert set(one.numbers) == set(wanted), one.name
 
     def is_right(number: float | str, value: float | str, tolerance: float) -> bool:
@@ -588,7 +588,7 @@ def wrong(one: Claim, wanted: dict[str, tuple[float | str, float]]) -> list[str]
     return [name for name, entry in wanted.items() if not is_right(one.numbers[name], *entry)]
 
 
-def test_every_number_of_the_evidence_is_right(
+def test_every_number_of_the_evidence_is_correct(
     found: dict[str, Claim], expected: dict[str, dict[str, tuple[float | str, float]]]
 ) -> None:
     computed = {name: one for name, one in found.items() if not one.test}
@@ -598,10 +598,10 @@ def test_every_number_of_the_evidence_is_right(
     }
 
 
-def test_a_wrong_number_is_found(
+def test_wrong_numbers_are_detected(
     found: dict[str, Claim], expected: dict[str, dict[str, tuple[float | str, float]]]
 ) -> None:
-    """The test above can fail on each number: tripled, or one instead of none."""
+    """The previous test fails for each number if tripled, or changed from 0 to 1."""
     for name, wanted in expected.items():
         for key, number in found[name].numbers.items():
             other = 'none' if isinstance(number, str) else 3.0 * number or 1.0
@@ -613,8 +613,8 @@ def test_a_wrong_number_is_found(
 
 
 @pytest.mark.parametrize('judged', [judges._consistency, judges._spring, judges._linear])
-def test_an_ideal_tissue_makes_the_claims_of_table_2_hold(judged: Callable[..., object]) -> None:
-    """A linear spring with little scatter; the printed table is not one."""
+def test_claims_of_table_2_hold_for_an_ideal_tissue(judged: Callable[..., object]) -> None:
+    """A linear spring with little scatter, unlike the printed table."""
     even, none = ((1e3,) * 5, (50.0,) * 5), ((0.0,) * 5, (50.0,) * 5)
     ideal = Tables(stiffness={'k_xx': even, 'k_xz': none, 'k_zx': none, 'k_zz': even})
     assert judged(ideal)[0] == HOLDS  # type: ignore[index]
@@ -622,7 +622,7 @@ def test_an_ideal_tissue_makes_the_claims_of_table_2_hold(judged: Callable[..., 
     assert judges._off_plane(ideal).verdict == FAILS
 
 
-def test_scatter_and_distance_from_the_tables_count() -> None:
+def test_claims_depend_on_scatter_and_deviation_from_the_tables() -> None:
     """A scatter of 16 % is not small; 0.02 N are 2.4 standard errors of 0.0374 N in 20."""
     means, scatter = (1e3,) * 5, (160.0,) * 5
     loose = Tables(stiffness={'k_xx': (means, scatter), 'k_zz': (means, scatter)})
@@ -632,7 +632,7 @@ def test_scatter_and_distance_from_the_tables_count() -> None:
     assert apart == pytest.approx(0.02 / 0.0374 * sqrt(20))
 
 
-def test_verdicts_on_friction_follow_the_tables(study: mismatch.Mismatch) -> None:
+def test_friction_verdicts_depend_on_the_tables(study: mismatch.Mismatch) -> None:
     far = Tables(
         source='another needle',
         friction={'coulomb_friction': (0.8, 0.03), 'viscous_friction': (900.0, 40.0)},
@@ -643,7 +643,7 @@ def test_verdicts_on_friction_follow_the_tables(study: mismatch.Mismatch) -> Non
     assert 'From another needle: 0.9 with an STD of 0.04 N s/mm' in said.evidence
 
 
-def test_the_section_lists_all(found: dict[str, Claim]) -> None:
+def test_section_lists_all_claims(found: dict[str, Claim]) -> None:
     page = claims.section(list(found.values()))
     rows = page.tables[0].rows
     assert len(rows) == len(found) == 51

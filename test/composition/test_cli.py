@@ -1,4 +1,4 @@
-"""The command line: what it accepts and rejects, and how it ends."""
+"""Command line: accepted and rejected arguments, exit status and messages."""
 
 from hashlib import sha256
 import os
@@ -20,8 +20,8 @@ import yaml
 BAGS = [str(path) for path in sorted(SHIPPED_BAGS.glob('friction_*'))]
 
 
-def test_shipped_bags_give_the_friction_they_were_made_with() -> None:
-    """Each recording holds its truth; the errors of all are as large as they claim to be."""
+def test_shipped_bags_give_their_true_friction() -> None:
+    """Each recording contains its ground truth; the errors match their standard errors."""
     scores = []
     for bag in BAGS:
         recording = read_friction_recording(Path(bag))
@@ -29,15 +29,15 @@ def test_shipped_bags_give_the_friction_they_were_made_with() -> None:
         for name in ('coulomb_friction', 'viscous_friction'):
             found, truth = estimate[name], recording.truth[f'model.{name}']
             scores.append((found.value - truth) / found.error)
-            # A tight number: two percent of the truth.
+            # Accuracy: 2 % of the ground truth.
             assert found.error < 0.02 * truth
     assert len(scores) >= 8
-    # 4.5: with 40 scores of 10 or more degrees of freedom each, beyond it once in 50 sets.
+    # 4.5: exceeded in 1 of 50 sets of 40 scores with 10 or more degrees of freedom.
     assert max(map(abs, scores)) < 4.5
 
 
-def test_the_result_runs_the_plant(tmp_path: Path) -> None:
-    """The plant takes the file with --params-file and holds the identified values."""
+def test_result_file_configures_the_plant(tmp_path: Path) -> None:
+    """The plant loads the file with --params-file and has the identified values."""
     file = tmp_path / 'friction.yaml'
     assert main(['identify', 'friction', *BAGS[:2], '-o', str(file)]) == 0
     given = yaml.safe_load(file.read_text())['/**/plant']['ros__parameters']
@@ -63,14 +63,14 @@ def test_the_result_runs_the_plant(tmp_path: Path) -> None:
     ],
     ids=['missing', 'corrupt', 'empty'],
 )
-def test_bad_bags_end_in_one_line(
+def test_unreadable_bags_are_reported_in_one_line(
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
     what: str,
     content: bytes | None,
     complaint: str,
 ) -> None:
-    """A bag that cannot be read is named in one line, exit status 2, and nothing is written."""
+    """An unreadable bag is named in one line, exit status 2, without output files."""
     bag, file = tmp_path / 'bag.mcap', tmp_path / 'result.yaml'
     if content is not None:
         bag.write_bytes(content)
@@ -96,7 +96,9 @@ def test_bad_bags_end_in_one_line(
         ['experiment', 'luck'],
     ],
 )
-def test_bad_usage_ends_with_2(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+def test_invalid_usage_exits_with_status_2(
+    words: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
     """Unknown commands and options are rejected with the usage."""
     with pytest.raises(SystemExit) as refused:
         main(words)
@@ -104,8 +106,8 @@ def test_bad_usage_ends_with_2(words: list[str], capsys: pytest.CaptureFixture[s
     assert 'usage: needle' in capsys.readouterr().err
 
 
-def test_the_checksums_of_the_shipped_bags_hold() -> None:
-    """Each file of the shipped recordings is the one that SHA256SUMS names."""
+def test_shipped_bags_match_their_checksums() -> None:
+    """Each file of the shipped recordings matches SHA256SUMS."""
     lines = (SHIPPED_BAGS / 'SHA256SUMS').read_text().splitlines()
     listed = {name: digest for digest, name in (line.split() for line in lines)}
     files = [path for path in SHIPPED_BAGS.glob('*_*/*') if path.is_file()]
@@ -127,30 +129,28 @@ def test_the_checksums_of_the_shipped_bags_hold() -> None:
         (['--speed', 'nan'], '--speed must be in'),
     ],
 )
-def test_an_invalid_experiment_is_rejected_before_anything_is_written(
+def test_invalid_experiments_are_rejected_before_writing(
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
     which: str,
     words: list[str],
     complaint: str,
 ) -> None:
-    """Bad numbers are named, with exit status 2, and leave no folder behind."""
+    """Invalid numbers are reported with exit status 2, and no folder is created."""
     assert main(['experiment', which, str(tmp_path / 'out'), *words]) == 2
     assert complaint in capsys.readouterr().err
     assert not (tmp_path / 'out').exists()
 
 
 @pytest.mark.parametrize('output', ['.', '/', ''])
-def test_a_result_needs_the_name_of_a_file(
-    output: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_output_must_be_a_file_name(output: str, capsys: pytest.CaptureFixture[str]) -> None:
     """A folder as output is rejected in one line."""
     assert main(['identify', 'friction', BAGS[0], '-o', output]) == 2
     assert 'it is not the name of a file' in capsys.readouterr().err
 
 
-def test_a_copy_of_a_bag_counts_once(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    """The same recording twice would make the error look smaller, whatever its name."""
+def test_copies_of_a_bag_are_used_once(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    """A duplicate recording under any name would underestimate the error."""
     copy = tmp_path / 'copy'
     shutil.copytree(BAGS[0], copy)
     words = ['identify', 'friction', *[BAGS[0]] * 2, BAGS[0] + '/', str(copy), '--all-warnings']
@@ -160,7 +160,7 @@ def test_a_copy_of_a_bag_counts_once(capsys: pytest.CaptureFixture[str], tmp_pat
     assert len([line for line in out.splitlines() if 'friction_01' in line or 'copy' in line]) == 1
 
 
-def test_a_place_that_cannot_be_written_ends_in_one_line(
+def test_unwritable_outputs_are_reported_in_one_line(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     """An error of the operating system is reported in one line."""
@@ -168,8 +168,8 @@ def test_a_place_that_cannot_be_written_ends_in_one_line(
     assert capsys.readouterr().err.count('\n') == 1
 
 
-def test_a_signal_while_the_command_loads_ends_it_without_a_traceback() -> None:
-    """Imports take long enough for a user to press Ctrl-C."""
+def test_signal_during_import_exits_without_traceback() -> None:
+    """A user may press Ctrl-C during the imports."""
     code = """
 import os, signal, sys
 from needle_insertion.cli import main
@@ -189,14 +189,16 @@ main(['identify', 'friction', 'nowhere'])
 
 
 @pytest.mark.parametrize('speed', ['-5e-3', '-0.005', '-.5E-2'])
-def test_a_negative_number_is_a_value(speed: str, capsys: pytest.CaptureFixture[str]) -> None:
-    """Also in scientific notation, which argparse takes for an option."""
+def test_negative_numbers_are_option_values(
+    speed: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Also in scientific notation, which argparse parses as an option."""
     assert main(['analyze', '--speed', speed]) == 0
     assert '-5 mm/s' in capsys.readouterr().out
 
 
 def run(*words: str, **environment: str) -> subprocess.CompletedProcess[str]:
-    """Run the command as a user does."""
+    """Run the command in a subprocess."""
     return subprocess.run(
         [sys.executable, '-m', 'needle_insertion.cli', *words],
         capture_output=True,
@@ -207,10 +209,10 @@ def run(*words: str, **environment: str) -> subprocess.CompletedProcess[str]:
     )
 
 
-def test_negative_numbers_may_be_in_scientific_notation(
+def test_negative_numbers_in_scientific_notation_are_accepted(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """They are values, not options; also several of them."""
+    """Single and multiple values."""
     assert main(['analyze', '--speed', '-5e-3', '-1e-2', '--tip-deflection', '-5e-4']) == 0
     out = capsys.readouterr().out
     assert '10 cm, -0.5 mm, -5 mm/s' in out
@@ -233,17 +235,17 @@ def test_negative_numbers_may_be_in_scientific_notation(
 def test_numbers_must_be_finite(
     words: list[str], value: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """NaN and infinity end in one line."""
+    """NaN and infinity are rejected in one line."""
     assert main([*words, value]) == 2
     captured = capsys.readouterr()
     assert captured.out == ''
     assert captured.err.count('\n') == 1
 
 
-def test_a_cutoff_that_the_recording_cannot_have_is_named(
+def test_cutoff_outside_the_range_of_the_recording_is_reported(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """Too low for its length is rejected; too high for its rate is no filter, and said."""
+    """Too low for the duration is rejected; above the Nyquist rate gives a warning."""
     for cutoff in ('1e-9', '1e-310'):
         assert main(['identify', 'friction', BAGS[0], '--cutoff', cutoff]) == 2
         err = capsys.readouterr().err
@@ -261,7 +263,7 @@ def test_a_cutoff_that_the_recording_cannot_have_is_named(
         ('needle identify friction --estimator h', ['huber']),
     ],
 )
-def test_the_shell_completes_commands_options_and_values(line: str, offered: list[str]) -> None:
+def test_shell_completes_commands_options_and_values(line: str, offered: list[str]) -> None:
     """As after ``eval "$(register-python-argcomplete needle)"``: answers go to descriptor 8."""
     asked = subprocess.run(
         ['/bin/bash', '-c', f'exec {sys.executable} -m needle_insertion 8>&1 >/dev/null'],
@@ -279,14 +281,14 @@ def test_the_shell_completes_commands_options_and_values(line: str, offered: lis
     assert asked.stdout.split() == offered
 
 
-def test_a_terminal_without_unicode_gets_a_result() -> None:
-    """Characters that it does not know are replaced."""
+def test_terminal_without_unicode_shows_a_result() -> None:
+    """Unsupported characters are replaced."""
     done = run('identify', 'friction', BAGS[0], PYTHONIOENCODING='ascii')
     assert (done.returncode, done.stderr) == (0, '')
     assert 'mean +- SE' in done.stdout
 
 
-def test_the_wrong_kind_of_recording_names_the_right_subcommand(
+def test_wrong_kind_of_recording_suggests_the_correct_subcommand(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     """Friction from presses, and stiffness from strokes."""
@@ -308,10 +310,10 @@ def test_the_wrong_kind_of_recording_names_the_right_subcommand(
         (['analyze', '--preset', 'phantm'], 'phantom'),
     ],
 )
-def test_a_mistyped_word_names_the_nearest(
+def test_misspelled_words_suggest_the_nearest(
     words: list[str], meant: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Of subcommands, options and choices."""
+    """Subcommands, options and choices."""
     with pytest.raises(SystemExit):
         main(words)
     assert capsys.readouterr().err.endswith(f'did you mean {meant}?\n')
@@ -330,17 +332,17 @@ def test_a_mistyped_word_names_the_nearest(
         ['experiment', 'friction', 'locked/bags'],
     ],
 )
-def test_places_are_checked_before_the_work_starts(
+def test_output_paths_are_checked_before_the_computation(
     words: list[str],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """A folder that is missing, is a file, or may not be written to."""
+    """The folder is missing, is a file, or is not writable."""
     monkeypatch.chdir(tmp_path)
     Path('file').touch()
     Path('locked').mkdir()
-    # Nobody can lock out the user root.
+    # Permissions do not apply to root.
     monkeypatch.setattr(os, 'access', lambda path, _mode: Path(path).name != 'locked')
     assert main(words) == 2
     err = capsys.readouterr().err

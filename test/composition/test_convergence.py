@@ -1,4 +1,4 @@
-"""The picture of the documentation on the number of modes shows what it says."""
+"""Figure of the convergence with the number of modes."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import numpy as np
 SCRIPT = Path(__file__).parents[2] / 'docs' / 'images' / 'convergence.py'
 
 
-def test_the_errors_in_the_picture_fall_with_every_mode() -> None:
-    """Every line falls with the number of modes, down to where it can be seen."""
+def test_errors_decrease_with_every_mode() -> None:
+    """Every line decreases with the number of modes, down to the visible range."""
     left, right = runpy.run_path(str(SCRIPT))['draw']().axes
     lines = [*left.get_lines(), *right.get_lines()]
     assert len(lines) == 7

@@ -1,4 +1,4 @@
-"""The checks of the demo: each can fail."""
+"""Checks of the demo, each of which can fail."""
 
 from dataclasses import replace
 from math import inf, nan
@@ -29,7 +29,7 @@ import pytest
 def insertion(
     end: float = TARGET_DEPTH, peak: float = TARGET_DEPTH, lag: float = 0.0, complete: float = 1.0
 ) -> Insertion:
-    """Return a made-up insertion."""
+    """Return a synthetic insertion."""
     time = np.linspace(0.0, 10.0, 1001)
     reference = np.linspace(0.02, TARGET_DEPTH, 1001)
     depth = reference - lag
@@ -55,15 +55,15 @@ def insertion(
         ({'complete': 1.01}, [True, True, True, False]),
     ],
 )
-def test_an_insertion_is_checked_for_depth_overshoot_tracking_and_messages(
+def test_insertion_checks_depth_overshoot_tracking_and_messages(
     changes: dict[str, float], verdicts: list[bool]
 ) -> None:
-    """Each check fails for its own reason and for no other."""
+    """Each check fails for its specific fault only."""
     assert [check.passed for check in insertion_checks(insertion(**changes))] == verdicts
 
 
 def comparison(value: float, symbol: str = 'k_zz', **changes: Any) -> Comparison:
-    """Return a made-up estimate: the truth is 100, the interval reaches 10 to both sides."""
+    """Return a synthetic estimate: ground truth 100, half width of the interval 10."""
     estimate: dict[str, Any] = {
         'name': symbol, 'symbol': symbol, 'unit': 'N/m', 'value': value, 'error': 4.0,
         'interval': (value - 10.0, value + 10.0), 'determined': True,
@@ -72,10 +72,8 @@ def comparison(value: float, symbol: str = 'k_zz', **changes: Any) -> Comparison
 
 
 @pytest.mark.parametrize(('missed', 'passed'), [(0, True), (4, True), (5, False), (20, False)])
-def test_shipped_bags_are_checked_by_how_many_intervals_hold_the_truth(
-    missed: int, passed: bool
-) -> None:
-    """Of 20 at least 16 must, for each parameter on its own."""
+def test_shipped_bags_are_checked_by_interval_coverage(missed: int, passed: bool) -> None:
+    """At least 16 of 20 intervals contain the ground truth, for each parameter separately."""
     bags = [
         [comparison(111.0 if k < missed else 109.0), comparison(100.0, symbol='k_xx')]
         for k in range(20)
@@ -87,7 +85,7 @@ def test_shipped_bags_are_checked_by_how_many_intervals_hold_the_truth(
 
 
 @pytest.mark.parametrize(('value', 'passed'), [(119.0, True), (81.0, True), (121.0, False)])
-def test_a_fresh_recording_is_checked_at_its_worst_force(value: float, passed: bool) -> None:
+def test_new_recording_is_checked_at_the_worst_force(value: float, passed: bool) -> None:
     """The limit is twice the interval; an undetermined parameter fails."""
     (check,) = demo._fresh_checks([comparison(100.0), comparison(value), comparison(101.0)])
     assert check.passed == passed
@@ -96,8 +94,8 @@ def test_a_fresh_recording_is_checked_at_its_worst_force(value: float, passed: b
     assert not check.passed
 
 
-def test_estimates_are_compared_with_the_true_values_of_their_own_bag() -> None:
-    """Of the first shipped bags every parameter, at every level, is within a few intervals."""
+def test_estimates_are_compared_with_the_ground_truth_of_the_same_bag() -> None:
+    """All parameters at all levels of the first shipped bags are within a few intervals."""
     friction = read_friction_recording(SHIPPED_BAGS / 'friction_01')
     found = compare_friction(friction, identify_friction(friction))
     assert [one.truth for one in found] == [
@@ -113,7 +111,7 @@ def test_estimates_are_compared_with_the_true_values_of_their_own_bag() -> None:
         assert abs(one.estimate.value - one.truth) < 2.0 * (high - low)
 
 
-def test_a_recording_without_true_values_cannot_be_checked() -> None:
+def test_recording_without_ground_truth_is_rejected() -> None:
     """A bag without the configuration of its plant is rejected."""
     recording = read_friction_recording(SHIPPED_BAGS / 'friction_01')
     estimate = identify_friction(recording)
@@ -122,8 +120,8 @@ def test_a_recording_without_true_values_cannot_be_checked() -> None:
         demo._known(SHIPPED_BAGS / 'friction_01', compared)
 
 
-def test_the_demo_removes_only_its_own_files(tmp_path: Path) -> None:
-    """A folder that no demo has made is left alone."""
+def test_demo_removes_only_its_own_files(tmp_path: Path) -> None:
+    """Folders of other origin are not modified."""
     bags, output = tmp_path / 'bags', tmp_path / 'thesis'
     (bags / 'friction_1').mkdir(parents=True)
     (bags / 'stiffness_1').mkdir()

@@ -1,4 +1,4 @@
-"""The experiments: what they command and record, and how they continue after an interruption."""
+"""Experiments: commands, recordings, and resumption after an interruption."""
 
 from collections.abc import Callable, Iterator
 from contextlib import suppress
@@ -43,21 +43,21 @@ import pytest
 
 FRICTION, STIFFNESS = PROTOCOLS['friction'], PROTOCOLS['stiffness']
 
-#: Enough to identify from, as the shipped bags are recorded; slow enough for a busy machine.
+#: Rate for identification, as in the shipped bags, slow enough for a busy machine.
 RATE, SPEED = 100.0, 10.0
 
 
-# What is commanded.
+# Commands.
 
 
 @pytest.mark.parametrize('protocol', PROTOCOLS.values(), ids=PROTOCOLS)
 def test_times_increase(protocol: Protocol) -> None:
-    """No point is before or at the one before it."""
+    """Times of points are strictly increasing."""
     assert (np.diff([0.0, *(point.time for point in protocol.points)]) > 0.0).all()
 
 
-def test_strokes_go_both_ways_at_each_speed_and_the_base_can_follow() -> None:
-    """The speed of each stroke is held for most of its time, in and out, and ends at the start."""
+def test_strokes_insert_and_withdraw_at_each_speed_within_base_limits() -> None:
+    """Strokes are mostly at constant speed, in both directions, and end at the start."""
     moved = [point for point in FRICTION.points if point.positions]
     times = np.array([point.time for point in moved])
     depths = np.array([point.positions[0] for point in moved])
@@ -68,23 +68,23 @@ def test_strokes_go_both_ways_at_each_speed_and_the_base_can_follow() -> None:
             held = spans[np.isclose(speeds, direction * speed, rtol=0.0, atol=1e-9)]
             assert held.sum() > 0.5
     assert depths[-1] == pytest.approx(START_DEPTH, abs=1e-12)
-    # Between the middles of two lines the speed changes by their difference.
+    # The velocity changes between the midpoints of two segments.
     accelerations = np.diff(speeds) / ((spans[1:] + spans[:-1]) / 2.0)
     base = BaseParameters()
     assert np.abs(accelerations).max() < base.acceleration_limit
     assert np.abs(speeds).max() < base.speed_limit
 
 
-def test_the_push_moves_any_needle_that_is_drawn() -> None:
-    """Its force rises from zero to a third more than the largest mu_s of a thousand draws."""
+def test_push_exceeds_the_friction_of_sampled_needles() -> None:
+    """The force rises from zero to 4/3 of the largest mu_s of 1000 samples."""
     first, last = (point.effort for point in FRICTION.points if point.effort)
     assert first == (0.0,)
     assert last == (PUSH,)
     assert max(drawn['coulomb_friction'] for drawn in draw_friction(1000, 1)) < 0.75 * PUSH
 
 
-def test_each_level_is_pressed_in_eight_directions_from_rest() -> None:
-    """Forces held have the five magnitudes, evenly around; before and after is no force."""
+def test_each_force_level_has_presses_in_eight_directions() -> None:
+    """Holds have five magnitudes in evenly spaced directions, with zero force in between."""
     forces = np.array([point.effort for point in STIFFNESS.points])
     held = np.flatnonzero((forces[1:] == forces[:-1]).all(axis=1) & forces[1:].any(axis=1))
     assert len(held) == DIRECTIONS * len(FORCE_LEVELS)
@@ -97,8 +97,8 @@ def test_each_level_is_pressed_in_eight_directions_from_rest() -> None:
     assert np.diff(np.unwrap(angles)) == pytest.approx(2.0 * np.pi / DIRECTIONS, abs=1e-12)
 
 
-def test_a_campaign_draws_around_the_tables_or_takes_their_means() -> None:
-    """Runs have the drawn values and a seed each; ``fixed`` gives every run the means."""
+def test_campaign_samples_around_the_tables_or_uses_their_means() -> None:
+    """Each run has sampled values and a seed; ``fixed`` uses the means."""
     runs = Campaign(protocol=FRICTION, repeats=3, seed=5).runs
     assert list(runs) == ['friction_01', 'friction_02', 'friction_03']
     assert [run['seed'] for run in runs.values()] == [5, 6, 7]
@@ -116,8 +116,8 @@ def test_a_campaign_draws_around_the_tables_or_takes_their_means() -> None:
 
 
 @pytest.mark.parametrize('seed', [0, 2014])
-def test_the_indenter_takes_every_place_that_is_drawn(seed: int) -> None:
-    """The simulated indenter rejects no draw."""
+def test_indenter_accepts_every_sampled_place(seed: int) -> None:
+    """The simulated indenter rejects no sample."""
     for run in Campaign(protocol=STIFFNESS, repeats=40, seed=seed).runs.values():
         drawn: dict[str, Any] = {
             name.removeprefix('indenter.'): tuple(value)
@@ -128,19 +128,19 @@ def test_the_indenter_takes_every_place_that_is_drawn(seed: int) -> None:
 
 
 @pytest.mark.parametrize('rate', [40.0, 100.0, 333.0, 5000.0])
-def test_the_sensor_suits_any_rate(rate: float) -> None:
-    """The sensor's own rate is a whole multiple of that of the samples."""
+def test_sensor_rate_is_a_multiple_of_the_sampling_rate(rate: float) -> None:
+    """The internal rate of the sensor is an integer multiple of the sampling rate."""
     (run,) = Campaign(protocol=FRICTION, repeats=1, rate=rate).runs.values()
     own = float(str(run['sensor.rate']))
     assert own % rate == 0.0
     assert rate <= own <= 8000.0
 
 
-# What is rejected.
+# Rejected recordings.
 
 
 def pretended(folder: Path, configuration: str = '', **changes: object) -> None:
-    """Write a bag that claims to be the only run of the friction experiment, with changes."""
+    """Write a bag that resembles the only run of the friction experiment, with changes."""
     (parameters,) = Campaign(protocol=FRICTION, repeats=1).runs.values()
     text = message_type('std_msgs/msg/String')
     kinds = {
@@ -164,8 +164,8 @@ def pretended(folder: Path, configuration: str = '', **changes: object) -> None:
         bag.write('/joint_trajectory', encode(empty), 2)
 
 
-def test_bags_of_something_else_are_left_alone(tmp_path: Path) -> None:
-    """A file, a folder, other parameters, another trajectory: named, and nothing is recorded."""
+def test_other_bags_are_not_overwritten(tmp_path: Path) -> None:
+    """A file, a folder, other parameters, another trajectory are reported; nothing is recorded."""
     campaign = Campaign(protocol=FRICTION, repeats=1)
     place = tmp_path / 'friction_01'
     place.write_text('notes')
@@ -188,14 +188,14 @@ def test_bags_of_something_else_are_left_alone(tmp_path: Path) -> None:
     assert sorted(path.name for path in tmp_path.iterdir()) == ['friction_01', 'none', 'other']
 
 
-# What is recorded.
+# Recordings.
 
 
 @pytest.mark.parametrize(('protocol', 'rate'), [(FRICTION, 100.0), (STIFFNESS, 40.0)])
-def test_the_shipped_bags_are_those_of_the_command_that_makes_them(
+def test_shipped_bags_match_the_command_that_records_them(
     protocol: Protocol, rate: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Parameters and trajectory are as today: the command would record nothing."""
+    """Parameters and trajectory are current: the command has nothing to record."""
     monkeypatch.delattr(recorder, 'rig')
     bags = record(Campaign(protocol=protocol, rate=rate), SHIPPED_BAGS)
     assert bags == sorted(SHIPPED_BAGS.glob(f'{protocol.name}_*'))
@@ -206,18 +206,18 @@ def digests(folder: Path) -> dict[str, str]:
     return {path.name: sha256(path.read_bytes()).hexdigest() for path in folder.iterdir()}
 
 
-def test_an_interrupted_experiment_continues_where_it_stopped(tmp_path: Path) -> None:
-    """Ctrl-C leaves whole bags only; the same call keeps them and records the others."""
+def test_interrupted_experiment_is_resumed(tmp_path: Path) -> None:
+    """Ctrl-C leaves complete bags only; the same call keeps them and records the others."""
     words = ['experiment', 'friction', str(tmp_path), '--repeats', '3']
     words += ['--rate', f'{RATE:g}', '--speed', f'{SPEED:g}']
     foreign = tmp_path / 'notes.txt'
     foreign.write_text('keep me')
-    # What a call that was killed leaves.
+    # Remains of a killed call.
     (tmp_path / '.friction.unfinished' / 'run').mkdir(parents=True)
     first, last = tmp_path / 'friction_01', tmp_path / 'friction_03'
     command = [sys.executable, '-m', 'needle_insertion.cli', *words]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
-        # Until then it hangs: the first start compiles for a minute.
+        # Timeout: the first start compiles for a minute.
         deadline = time.monotonic() + 300.0
         while not first.exists():
             with suppress(subprocess.TimeoutExpired):
@@ -242,11 +242,11 @@ def test_an_interrupted_experiment_continues_where_it_stopped(tmp_path: Path) ->
         assert recording.losses == ()
         assert recording.truth['model.coulomb_friction'] == drawn['coulomb_friction']
         estimate = identify_friction(recording)
-        # 1 %: some ten standard errors; what matters here is that each has its own friction.
+        # 1 %: about ten standard errors; each run must have its own friction.
         for coefficient, value in drawn.items():
             assert estimate[coefficient].value == pytest.approx(value, rel=0.01)
 
-    # All is there: nothing is started.
+    # Complete: no run is started.
     assert main(words) == 0
 
 
@@ -265,28 +265,28 @@ def place() -> dict[str, Any]:
     return parameters
 
 
-def test_stiffness_is_recorded_press_by_press(
+def test_stiffness_recording_gives_the_sampled_matrix(
     tmp_path: Path, stand: Rig, place: dict[str, Any]
 ) -> None:
-    """The bag of a place gives the matrix that was drawn, at each level."""
+    """The bag of a place gives the sampled matrix at each level."""
     stand.record(tmp_path / 'bag', place, 2.0 * SPEED)
     (drawn,) = draw_stiffness(1, place['seed'])
     estimate = identify_stiffness(read_indentation_recording(tmp_path / 'bag'))
     assert [level.force for level in estimate.levels] == pytest.approx(FORCE_LEVELS, abs=0.01)
     for k, level in enumerate(estimate.levels):
         for entry, values in drawn.items():
-            # 15 N/m: some ten standard errors.
+            # 15 N/m: about ten standard errors.
             assert level[entry].value == pytest.approx(values[k], abs=15.0)
 
 
-def test_a_run_with_losses_is_repeated_more_slowly_and_given_up_in_real_time(
+def test_run_with_lost_samples_is_repeated_slower_and_fails_in_real_time(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capfd: pytest.CaptureFixture[str],
     stand: Rig,
     place: dict[str, Any],
 ) -> None:
-    """A run without all samples never becomes a bag; a slower attempt may."""
+    """A run with lost samples gives no bag; a slower attempt may."""
     judged, answers = [], iter(['few messages', 'fewer', 'fewest', 'few messages', ''])
 
     def lossy(bag: Path, *_rest: object) -> str:
@@ -316,8 +316,10 @@ def test_a_run_with_losses_is_repeated_more_slowly_and_given_up_in_real_time(
     ],
     ids=['whole', 'gaps', 'cut', 'none'],
 )
-def test_losses_are_seen(tmp_path: Path, kept: Callable[..., Any], complaint: str) -> None:
-    """A bag is whole if the stamps of the sampled topics leave no gaps and reach to the end."""
+def test_lost_samples_are_detected(
+    tmp_path: Path, kept: Callable[..., Any], complaint: str
+) -> None:
+    """A bag is complete if the stamps of the sampled topics have no gaps up to the end."""
     header, stamp = (
         message_type('std_msgs/msg/Header'),
         message_type('builtin_interfaces/msg/Time'),

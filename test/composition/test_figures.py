@@ -1,4 +1,4 @@
-"""What figures 4 to 8 show must come out of the runs."""
+"""Statements of figures 4 to 8 hold in the runs."""
 
 from math import exp, sqrt
 
@@ -30,7 +30,7 @@ BOUND = NeedleParameters().coulomb_friction / PID_KP
 
 
 @pytest.mark.parametrize('case', CASES)
-def test_all_runs_begin_where_the_paper_says(case: tuple[str, ...]) -> None:
+def test_all_runs_start_at_the_initial_state_of_the_paper(case: tuple[str, ...]) -> None:
     for run in (open_loop(*case), closed_loop('pid', *case, hub_stop=True)):
         assert_allclose(run.depth[0], DEPTH)
         assert_allclose(run.tip_deflection[0], DEFLECTION)
@@ -38,7 +38,7 @@ def test_all_runs_begin_where_the_paper_says(case: tuple[str, ...]) -> None:
 
 
 def test_the_open_loop_distinguishes_readings_and_formulations() -> None:
-    # 2 %: the way to the terminal speed and the force of the deflection.
+    # 2 %: acceleration to the terminal velocity, and force of the deflection.
     assert_allclose(hub_time(open_loop('paper_mm', 'complete')), 0.18 * 300.0 / 2.44, rtol=0.02)
     assert 0.028 < hub_time(open_loop('paper_si', 'complete')) < 0.029
     for reading in READINGS:
@@ -50,7 +50,7 @@ def test_the_open_loop_distinguishes_readings_and_formulations() -> None:
 
 
 def test_the_open_loop_has_converged() -> None:
-    """The slow runs turn many thousand times; their peaks must not be those of the step."""
+    """The slow runs oscillate thousands of times; their peaks must not depend on the step."""
     for formulation in ('complete', 'as_printed'):
         run = open_loop('paper_mm', formulation)
         fine = Integrator(run.model.parameters, run.states[0], 5e-6)
@@ -59,13 +59,13 @@ def test_the_open_loop_has_converged() -> None:
             for _ in range(50):
                 integrator.advance(0.1, 3.0)
         energies = [run.model.energy(one.state) for one in (fine, coarse)]
-        # 1e-3: a second-order step a quarter as wrong; the phase is not looked at.
+        # 1e-3: halving a second-order step reduces the error by 4; the phase is not compared.
         assert_allclose(energies[1], energies[0], rtol=1e-3)
 
 
 @pytest.mark.parametrize('hub_stop', [False, True])
 def test_inverse_dynamics_cancels_reading_and_formulation(hub_stop: bool) -> None:
-    # Of a peak of 100 mm and 30 mm; where the hub is touched differs by the solver's tolerance.
+    # Peaks are 100 mm and 30 mm; the time of the hub contact differs by the solver tolerance.
     tips = [
         closed_loop('inverse_dynamics', *case, hub_stop=hub_stop).tip_deflection for case in CASES
     ]
@@ -89,8 +89,8 @@ def test_pid_leaves_coulomb_friction_over_its_gain(case: tuple[str, ...]) -> Non
     assert found.deepest < 0.2
 
 
-def test_another_solver_agrees_on_the_pid_run() -> None:
-    """BDF on the smooth right-hand side: before the end the friction never changes its sign."""
+def test_pid_run_agrees_with_another_solver() -> None:
+    """BDF on the smooth right-hand side: friction does not change sign before the end."""
     model = needle('paper_mm', 'complete')
     law = paper_law('pid', model)
     assert isinstance(law, ContinuousPid)
@@ -106,12 +106,12 @@ def test_another_solver_agrees_on_the_pid_run() -> None:
 
 
 @pytest.mark.parametrize('law', LAWS)
-def test_with_f_y_alone_the_tip_rings_on(law: str) -> None:
+def test_tip_keeps_ringing_with_f_y_alone(law: str) -> None:
     for reading in READINGS:
         run = base_alone(law, reading)
         found = Outcome.of(run)
         assert found.final > DEFLECTION
-        # The base does what it does under the modal law.
+        # The base moves as under the modal law.
         modal = Outcome.of(closed_loop(law, reading, 'complete', hub_stop=True))
         assert_allclose(found.error, modal.error, atol=5e-6)
 
@@ -122,11 +122,11 @@ def test_the_moved_base_follows_the_error_equation() -> None:
     w = sqrt(1.0 - 0.05**2)
     t = run.time[before]
     exact = 0.18 * np.exp(-0.05 * t) * (np.cos(w * t) + 0.05 / w * np.sin(w * t))
-    # The speed is even within 5 ms.
+    # The velocity is constant within 5 ms.
     assert_allclose(run.states[before, 0], exact, atol=1e-5)
 
 
-def test_every_figure_is_drawn_and_says_what_is_seen() -> None:
+def test_every_figure_is_drawn_with_a_caption() -> None:
     for name, draw in FIGURES.items():
         found = draw()
         assert isinstance(found.picture.figure, Figure)
@@ -135,7 +135,7 @@ def test_every_figure_is_drawn_and_says_what_is_seen() -> None:
     assert png(FIGURES['figure-8']().picture.figure) == png(FIGURES['figure-8']().picture.figure)
 
 
-def test_the_section_compares_the_controllers() -> None:
+def test_section_compares_the_controllers() -> None:
     found = section()
     assert len(found.pictures) == 5
     rows = found.tables[0].rows
@@ -145,8 +145,8 @@ def test_the_section_compares_the_controllers() -> None:
 
 
 @pytest.mark.parametrize(('law', 'peak'), [('inverse_dynamics', 16.0), ('pid', 4.87)])
-def test_peaks_depend_on_the_shape_at_the_start(law: str, peak: float) -> None:
-    """From mode 1 alone, with the same deflection, they are less than half as large."""
+def test_peaks_depend_on_the_initial_shape(law: str, peak: float) -> None:
+    """With mode 1 alone and the same deflection the peaks are less than half as large."""
     model = needle('paper_mm', 'complete', hub_stop=False)
     first = DEFLECTION / model.modes.integrals(DEPTH).value[0]
     run = run_continuous(

@@ -1,4 +1,4 @@
-"""The environments of Gymnasium: its own checks, seeds, and many at once."""
+"""Gymnasium environments: checker, seeds, and vector environments."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ import pytest
 
 @pytest.mark.filterwarnings('error')
 @pytest.mark.parametrize('name', ['NeedleInsertion-v0', 'NeedleSteering-v0'])
-def test_gymnasium_has_nothing_to_complain_of(name: str) -> None:
-    """It finds them by module and name; the same seed gives the same episode."""
+def test_environments_pass_the_gymnasium_checker(name: str) -> None:
+    """Environments are registered by module and name; the same seed gives the same episode."""
     with gymnasium.make(f'needle_insertion.gym:{name}') as environment:
         check_env(environment.unwrapped, skip_render_check=True)
 
 
-def test_a_vector_is_single_environments_with_seeds_of_their_own() -> None:
-    """Step by step, to the bit, over the end of episodes that are broken off."""
+def test_vector_equals_single_environments_with_separate_seeds() -> None:
+    """Bitwise equal at each step, also across truncated episodes."""
     many = InsertionVectorEnv(3, max_episode_steps=20)
     single = [gymnasium.wrappers.TimeLimit(InsertionEnv(), 20) for _ in range(3)]
     observations, _ = many.reset(seed=5)
@@ -53,8 +53,8 @@ def test_a_vector_is_single_environments_with_seeds_of_their_own() -> None:
     many.close()
 
 
-def test_seeds_and_masks_of_a_vector() -> None:
-    """None goes on, a mask leaves the others alone, and what does not fit is named."""
+def test_vector_seeds_and_masks() -> None:
+    """A seed of None continues, a mask resets a subset, and invalid shapes are rejected."""
     many, other = InsertionVectorEnv(3), InsertionVectorEnv(3)
     with pytest.raises(gymnasium.error.ResetNeeded, match='call reset'):
         many.step(np.zeros((3, 1)))
@@ -75,8 +75,8 @@ def test_seeds_and_masks_of_a_vector() -> None:
             many.reset(**options)
 
 
-def test_a_needle_is_that_of_the_integrator() -> None:
-    """To the bit, until it leaves its range."""
+def test_environment_equals_the_integrator() -> None:
+    """Bitwise equal, until the needle leaves its range."""
     environment = InsertionEnv('phantom')
     seen, _ = environment.reset(seed=3)
     rng, _ = gymnasium.utils.seeding.np_random(3)
@@ -87,7 +87,7 @@ def test_a_needle_is_that_of_the_integrator() -> None:
     )
     target = rng.uniform(*TARGETS)
     one = Integrator(parameters, NeedleModel(parameters).state_at(START), STEP)
-    # In for a while, then out, and beyond the range.
+    # Insert, withdraw, and leave the range.
     for force in [FORCE] * 20 + [-FORCE] * 200:
         seen, reward, over, _, _ = environment.step(np.array([force / FORCE]))
         try:
@@ -106,15 +106,15 @@ def test_a_needle_is_that_of_the_integrator() -> None:
         pytest.fail('the needle did not come out')
 
 
-def test_a_force_that_is_no_number_is_named() -> None:
+def test_force_that_is_not_finite_is_rejected() -> None:
     environment = InsertionEnv()
     environment.reset(seed=1)
     with pytest.raises(ParameterError, match='an action must be finite'):
         environment.step(np.array([np.nan]))
 
 
-def test_a_push_towards_the_target_earns_more_than_none() -> None:
-    """So there is something to learn."""
+def test_push_toward_the_target_has_a_higher_reward_than_no_push() -> None:
+    """The reward distinguishes policies."""
 
     def earned(law: float) -> float:
         environment = InsertionEnv()
@@ -130,8 +130,8 @@ def test_a_push_towards_the_target_earns_more_than_none() -> None:
     assert earned(3.0) > 0.5 * earned(0.0)
 
 
-def test_a_guide_that_is_moved_reaches_what_one_at_rest_does_not() -> None:
-    """On a mean of needles; the miss is told at the end, and then a reset is needed."""
+def test_moving_guide_reduces_the_mean_miss() -> None:
+    """Mean over needles; the miss is reported at the end, and then a reset is required."""
     environment = SteeringEnv()
 
     def missed(seed: int) -> float:
@@ -146,8 +146,8 @@ def test_a_guide_that_is_moved_reaches_what_one_at_rest_does_not() -> None:
         environment.step(np.zeros(2))
 
 
-def test_a_position_that_is_no_number_moves_nothing() -> None:
-    """The next one goes on from there."""
+def test_position_that_is_not_finite_does_not_move_the_guide() -> None:
+    """The next position continues from there."""
     environment = SteeringEnv()
     seen, _ = environment.reset(seed=1)
     with pytest.raises(ParameterError):
@@ -165,6 +165,6 @@ def test_a_position_that_is_no_number_moves_nothing() -> None:
         ({'depth': 1.0}, 'depth must be <='),
     ],
 )
-def test_what_cannot_be_is_named(options: dict[str, object], complaint: str) -> None:
+def test_invalid_options_are_rejected(options: dict[str, object], complaint: str) -> None:
     with pytest.raises(ParameterError, match=complaint):
         SteeringEnv(**options)  # type: ignore[arg-type]

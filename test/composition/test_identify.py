@@ -1,4 +1,4 @@
-"""`needle identify`: what it prints, warns of, writes, and how it ends."""
+"""Output, warnings, written files and exit status of `needle identify`."""
 
 import json
 from pathlib import Path
@@ -28,14 +28,14 @@ def places(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
 
 
 def identify(capsys: pytest.CaptureFixture[str], *words: str, status: int = 0) -> tuple[str, ...]:
-    """Run the command; return what it printed and what it warned of."""
+    """Run the command; return its output and warnings."""
     assert main(['identify', *words]) == status
     said = capsys.readouterr()
     return said.out, said.err
 
 
 def as_json(capsys: pytest.CaptureFixture[str], *words: str, status: int = 0) -> dict[str, Any]:
-    """Run the command for machines; nothing in its answer is other than standard JSON."""
+    """Run the command with JSON output; the output must be standard JSON."""
 
     def refuse(word: Any) -> None:
         raise AssertionError(f'{word} is no JSON')
@@ -47,10 +47,10 @@ def as_json(capsys: pytest.CaptureFixture[str], *words: str, status: int = 0) ->
 # Friction.
 
 
-def test_the_tables_hold_every_parameter_with_error_and_interval(
+def test_tables_contain_every_parameter_with_error_and_interval(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """Over the bags with 95 % interval and STD, and bag by bag; break-away stands beside mu_s."""
+    """Means over the bags with 95 % interval and STD, and each bag; breakaway follows mu_s."""
     out, _ = identify(capsys, 'friction', *BAGS)
     whole, each = out.split('\n\n')
     heads = whole.splitlines()[0]
@@ -68,7 +68,7 @@ def test_the_tables_hold_every_parameter_with_error_and_interval(
     assert all(bag in each for bag in BAGS)
 
 
-def test_json_names_everything_and_has_no_nan(capsys: pytest.CaptureFixture[str]) -> None:
+def test_json_is_complete_and_has_no_nan(capsys: pytest.CaptureFixture[str]) -> None:
     """Statistics and parameters by name, with settings, files and checksums."""
     found = as_json(capsys, 'friction', *BAGS, '--terms', 'coulomb,viscous,offset')
     assert {'coulomb_friction', 'viscous_friction', 'offset'} <= set(found['statistics'])
@@ -87,7 +87,7 @@ def test_json_names_everything_and_has_no_nan(capsys: pytest.CaptureFixture[str]
 
 
 def test_terms_are_a_list_or_repeated(capsys: pytest.CaptureFixture[str]) -> None:
-    """Both ways of writing them mean the same."""
+    """Both notations are equivalent."""
     one = as_json(capsys, 'friction', BAGS[0], '--terms', 'coulomb,viscous,offset')
     two = as_json(capsys, 'friction', BAGS[0], '--terms', 'coulomb', '--terms', 'viscous, offset')
     assert one == two
@@ -103,10 +103,10 @@ def test_terms_are_a_list_or_repeated(capsys: pytest.CaptureFixture[str]) -> Non
         (['--motion-axis', '-slide'], 'slide'),
     ],
 )
-def test_invalid_options_are_named_in_one_line(
+def test_invalid_options_are_reported_in_one_line(
     capsys: pytest.CaptureFixture[str], words: list[str], complaint: str
 ) -> None:
-    """Exit status 2; the line says what was found and what would be valid."""
+    """Exit status 2; the message names the invalid and the valid values."""
     out, err = identify(capsys, 'friction', BAGS[0], *words, status=2)
     assert out == ''
     assert err.count('\n') == 1
@@ -123,25 +123,25 @@ def test_invalid_options_are_named_in_one_line(
 def test_signed_axes_are_accepted_in_both_forms(
     capsys: pytest.CaptureFixture[str], words: list[str]
 ) -> None:
-    """Force and motion both turned around leave friction what it is."""
+    """Reversing force and motion does not change friction."""
     turned = as_json(capsys, 'friction', BAGS[0], *words)['statistics']
     straight = as_json(capsys, 'friction', BAGS[0])['statistics']
     for name in ('coulomb_friction', 'viscous_friction'):
-        # The search for the lag stops at 1 % of its error, on one side of it or the other.
+        # The search for the lag stops within 1 % of its error.
         tolerance = 0.1 * straight[name]['error']
         assert turned[name]['mean'] == pytest.approx(straight[name]['mean'], abs=tolerance)
 
 
-def test_a_force_of_the_wrong_sign_is_rejected(capsys: pytest.CaptureFixture[str]) -> None:
-    """Friction cannot drive the needle."""
+def test_force_of_the_wrong_sign_is_rejected(capsys: pytest.CaptureFixture[str]) -> None:
+    """Friction must be positive."""
     _, err = identify(capsys, 'friction', BAGS[0], '--force-axis', '-y', status=2)
     assert 'must not be negative' in err
 
 
-def test_a_bad_bag_is_named_and_the_others_are_used(
+def test_invalid_bag_is_reported_and_the_others_are_used(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    """The result is that of the others; exit status 2 tells a script that it is not of all."""
+    """The result is from the other bags; exit status 2 indicates that bags are missing."""
     bad, file = str(tmp_path / 'bad.mcap'), tmp_path / 'result.yaml'
     Path(bad).write_bytes(b'not a bag')
     found = as_json(capsys, 'friction', BAGS[0], bad, BAGS[1], '-o', str(file), status=2)
@@ -154,10 +154,10 @@ def test_a_bad_bag_is_named_and_the_others_are_used(
     assert [bad in line for line in err.splitlines() if line.startswith('error: ')] == [True]
 
 
-def test_nothing_is_written_if_no_bag_can_be_used(
+def test_nothing_is_written_without_a_usable_bag(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    """Neither file nor folder, and nothing is printed but the reasons."""
+    """No file, no folder, and only the reasons are printed."""
     bad = [str(tmp_path / name) for name in ('one', 'two')]
     file, page = tmp_path / 'result.yaml', tmp_path / 'report'
     out, err = identify(capsys, 'friction', *bad, '-o', str(file), '--report', str(page), status=2)
@@ -169,7 +169,7 @@ def test_nothing_is_written_if_no_bag_can_be_used(
 def test_undetermined_parameters_are_reported(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    """A single term too many for one speed is no tight number, and not in the file."""
+    """An unidentifiable term for a single speed is undetermined, and not in the file."""
     file = tmp_path / 'result.yaml'
     words = ('friction', BAGS[0], '-o', str(file), '--terms', 'coulomb,viscous,stribeck')
     out, _ = identify(capsys, *words, '--stribeck-speed', '10')
@@ -180,10 +180,10 @@ def test_undetermined_parameters_are_reported(
     assert all(one['interval'] == [None, None] and one['error'] is None for one in unknown)
 
 
-def test_the_friction_page_shows_what_was_found(
+def test_friction_page_shows_the_results(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    """A person sees figures, pictures and what was read; the page loads nothing from outside."""
+    """The page shows numbers, pictures and recordings, and loads no other files."""
     file, folder = tmp_path / 'result.yaml', tmp_path / 'new' / 'report'
     bags = [*BAGS, str(tmp_path / 'missing')]
     out, _ = identify(
@@ -210,10 +210,10 @@ def test_the_friction_page_shows_what_was_found(
     }  # fmt: skip
 
 
-def test_the_same_recordings_give_the_same_page(
+def test_same_recordings_give_the_same_page(
     capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Byte by byte: pages can be compared, and kept under version control."""
+    """Bytes are equal, for comparison and version control."""
     monkeypatch.setenv('SOURCE_DATE_EPOCH', '1700000000')
     pages = []
     for _ in range(2):
@@ -223,10 +223,10 @@ def test_the_same_recordings_give_the_same_page(
     assert pages[0] == pages[1]
 
 
-def test_where_nothing_is_determined_table_and_page_are_made(
+def test_table_and_page_are_written_without_determined_parameters(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    """Of one speed nothing is; only the parameter file would be empty, and is not written."""
+    """A single speed determines no parameter; the parameter file is not written."""
     time = np.arange(0.0, 20.0, 0.01)
     depth = 0.1 + 0.01 * np.abs((time / 4.0) % 2.0 - 1.0)
     force = np.sign(np.gradient(depth)) + 0.01 * np.sin(37.0 * time)
@@ -244,8 +244,8 @@ def test_where_nothing_is_determined_table_and_page_are_made(
     assert not (tmp_path / 'x.yaml').exists()
 
 
-def test_warnings_of_a_kind_are_one_line(capsys: pytest.CaptureFixture[str]) -> None:
-    """With the number of those like it; all of them on request."""
+def test_similar_warnings_are_grouped(capsys: pytest.CaptureFixture[str]) -> None:
+    """A line has the number of similar warnings; an option lists all."""
     bags = sorted(str(path) for path in SHIPPED_BAGS.glob('stiffness_0*'))
     _, short = identify(capsys, 'stiffness', *bags)
     _, full = identify(capsys, 'stiffness', *bags, '--all-warnings')
@@ -254,8 +254,10 @@ def test_warnings_of_a_kind_are_one_line(capsys: pytest.CaptureFixture[str]) -> 
     assert '--all-warnings' in short.splitlines()[-1]
 
 
-def test_a_folder_that_cannot_be_made_ends_in_one_line(capsys: pytest.CaptureFixture[str]) -> None:
-    """The reason of the operating system, exit status 2."""
+def test_folder_that_cannot_be_created_is_reported_in_one_line(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """The message has the reason of the operating system; exit status 2."""
     _, err = identify(capsys, 'friction', BAGS[0], '--report', '/dev/null/report', status=2)
     assert '/dev/null/report cannot be written' in err.splitlines()[-1]
 
@@ -263,10 +265,10 @@ def test_a_folder_that_cannot_be_made_ends_in_one_line(capsys: pytest.CaptureFix
 # Stiffness.
 
 
-def test_stiffness_is_printed_by_force_as_in_table_2(
+def test_stiffness_table_has_a_column_per_force_as_table_2(
     capsys: pytest.CaptureFixture[str], places: list[str]
 ) -> None:
-    """Each entry of the matrix at each force, and k_a at the largest."""
+    """Each entry of the matrix at each force, and k_a at the largest force."""
     out, _ = identify(capsys, 'stiffness', *places)
     matrices, intervals, result = out.strip().split('\n\n')
     assert re.split(r' {2,}', matrices.splitlines()[0])[1:] == ['1.10 N', '1.50 N']
@@ -275,15 +277,15 @@ def test_stiffness_is_printed_by_force_as_in_table_2(
         (line,) = [line for line in matrices.splitlines() if line.startswith(f'{entry} ')]
         told = [float(cell.split(' ±')[0]) for cell in re.split(r' {2,}', line)[1:]]
         truth = [stiffness.flat[i] for stiffness in STIFFNESS.values()]
-        # Noise of 1 um and 2 mN over 30 samples and 8 presses: some N/m at most.
+        # Noise of 1 um and 2 mN over 30 samples and 8 presses: a few N/m.
         assert told == pytest.approx(truth, abs=5.0)
     assert result.startswith('k_a = 5')
 
 
-def test_the_level_of_the_result_can_be_chosen(
+def test_force_level_of_the_result_can_be_selected(
     capsys: pytest.CaptureFixture[str], places: list[str], tmp_path: Path
 ) -> None:
-    """The parameter file holds k_a at that force, over the contact length."""
+    """The parameter file has k_a at this force, over the contact length."""
     file = tmp_path / 'result.yaml'
     words = ('--level', '1.1', '--contact-length', '2', '-o', str(file))
     found = as_json(capsys, 'stiffness', *places, *words)
@@ -298,10 +300,10 @@ def test_the_level_of_the_result_can_be_chosen(
     assert 'no level at 3 N' in err
 
 
-def test_the_plane_of_the_presses_can_be_named(
+def test_plane_of_the_presses_can_be_selected(
     capsys: pytest.CaptureFixture[str], places: list[str]
 ) -> None:
-    """Axes in the other order and with a sign turn the matrix accordingly."""
+    """Swapped and reversed axes transform the matrix."""
     found = as_json(capsys, 'stiffness', *places, '--axes', '-z,x')['levels'][0]['statistics']
     k = STIFFNESS[1.1]
     assert found['k_xx']['mean'] == pytest.approx(k[1, 1], abs=5.0)
@@ -310,10 +312,10 @@ def test_the_plane_of_the_presses_can_be_named(
     assert '--axes must name two axes' in err
 
 
-def test_the_stiffness_page_shows_what_was_found(
+def test_stiffness_page_shows_the_results(
     capsys: pytest.CaptureFixture[str], places: list[str], tmp_path: Path
 ) -> None:
-    """A person sees the matrices beside Table 2, whether it is a spring, and the pictures."""
+    """The page shows matrices, Table 2, the test for a spring, and the pictures."""
     folder = tmp_path / 'report'
     identify(capsys, 'stiffness', *places, '--report', str(folder))
     seen = look_at(folder / 'stiffness.html')

@@ -1,4 +1,4 @@
-"""The example of inference: what it simulates and sums up; what learns is not installed here."""
+"""Example of inference: simulation and summary statistics, without the optional package sbi."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ EXAMPLE = runpy.run_path(str(Path(__file__).parents[2] / 'examples/inference.py'
 
 
 def drawn(count: int, **values: float) -> dict[str, FloatArray]:
-    """Return needles of the population with some values set."""
+    """Return plants of the population with some values fixed."""
     found: dict[str, FloatArray] = EXAMPLE['population'](count, seed=1)
     return {**found, **{name: np.full(count, value) for name, value in values.items()}}
 
 
-def test_looks_are_those_of_single_needles() -> None:
-    """Of a needle without noise of its path; what is left is the noise of the looks."""
+def test_tip_measurements_equal_single_needles() -> None:
+    """Without path noise, the difference is the noise of the averaged tip measurements."""
     quiet = {'path_noise': 0.0, 'bending_length': 1.0, 'skin': 1.0, 'bevel_x': 0.0, 'bevel_z': 0.3}
     seen = EXAMPLE['looks'](
         drawn(20, **quiet, tilt_x=0.0, tilt_z=0.01, frame_x=0.0, frame_z=0.02), 2
@@ -37,19 +37,19 @@ def test_looks_are_those_of_single_needles() -> None:
     for depth, guide, found in zip(depths, EXAMPLE['guides'](), seen.swapaxes(0, 1), strict=True):
         one.move(depth=float(depth), guide=guide)
         expected = one.tip[[0, 2]] + np.array([0.0, 0.02]) * depth
-        # The mean of 20 looks: five standard errors.
+        # Mean of 20 averaged tip measurements: five standard errors.
         near = 5.0 * EXAMPLE['NOISE'] / np.sqrt(20.0)
         assert np.abs(found.mean(axis=0) - expected).max() < near
 
 
-def test_the_same_seeds_give_the_same_looks() -> None:
+def test_same_seeds_give_the_same_tip_measurements() -> None:
     needles = drawn(5)
     assert np.array_equal(EXAMPLE['looks'](needles, 2), EXAMPLE['looks'](needles, 2))
     assert not np.array_equal(EXAMPLE['looks'](needles, 2), EXAMPLE['looks'](needles, 3))
 
 
-def test_a_path_that_wanders_more_turns_more() -> None:
-    """Over long ways: the last numbers of the summary grow with the noise of the path."""
+def test_path_noise_increases_the_summary_of_curvature() -> None:
+    """Over long distances the last values of the summary grow with the path noise."""
     still = {'tilt_x': 0.0, 'tilt_z': 0.0, 'frame_x': 0.0, 'frame_z': 0.0}
     summaries = [
         EXAMPLE['summary'](EXAMPLE['looks'](drawn(50, path_noise=noise, **still), 2))
@@ -59,19 +59,19 @@ def test_a_path_that_wanders_more_turns_more() -> None:
     assert (summaries[1][:, -2:].mean(axis=0) > summaries[0][:, -2:].mean(axis=0) + 0.2).all()
 
 
-def test_what_is_inferred() -> None:
+def test_inferred_parameters() -> None:
     needles = drawn(4, bending_length=1.0, path_noise=1e-3)
     assert np.array_equal(EXAMPLE['unknown'](needles), np.tile([0.0, -3.0], (4, 1)))
 
 
-def test_without_sbi_it_says_how_to_install_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_sbi_gives_installation_instructions(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, 'sbi', None)
     with pytest.raises(SystemExit, match='this example needs sbi: pip install sbi'):
         EXAMPLE['learn'](np.zeros((4, 2)), np.zeros((4, 24)))
 
 
-def test_the_picture_shows_how_often_intervals_hold() -> None:
-    """For draws that are those of the truth, the curve is near the diagonal."""
+def test_figure_shows_the_coverage_of_intervals() -> None:
+    """For posterior samples from the ground truth the curve is near the diagonal."""
     rng = np.random.default_rng(1)
     truths, draws = rng.standard_normal((500, 2)), rng.standard_normal((200, 500, 2))
     ranks = np.mean(draws < truths, axis=0)

@@ -1,4 +1,4 @@
-"""Draws represent the tables they are drawn from."""
+"""Samples of the population represent the tables."""
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -12,13 +12,13 @@ SEEDS = st.integers(0, 2**32)
 
 
 @pytest.mark.parametrize('seed', [0, 1, 2014])
-def test_twenty_draws_have_the_mean_and_std_of_the_tables(seed: int) -> None:
+def test_twenty_samples_have_the_mean_and_std_of_the_tables(seed: int) -> None:
     """
-    The midpoints of 20 strata stand for the whole distribution.
+    The midpoints of 20 strata represent the whole distribution.
 
-    They leave out the outer half of the outermost strata: of a normal distribution that is
-    0.6 % of the STD, of the most skewed entry (k_xx at 1.2 N, an STD of two thirds of its mean)
-    2.7 %, and 1.3 % of an STD from the mean, whatever the seed. 3 % and 1.5 % bound them.
+    They omit the outer half of the outermost strata: for a normal distribution this reduces the
+    STD by 0.6 %, for the most skewed entry (k_xx at 1.2 N, an STD of two thirds of its mean) by
+    2.7 %, with a mean error of 1.3 % of an STD, for any seed. The bounds are 3 % and 1.5 %.
     """
     friction, stiffness = draw_friction(20, seed), draw_stiffness(20, seed)
     drawn = {name: np.array([d[name] for d in friction])[:, None] for name in TABLE_1}
@@ -32,8 +32,8 @@ def test_twenty_draws_have_the_mean_and_std_of_the_tables(seed: int) -> None:
 
 @settings(max_examples=30, deadline=None)
 @given(repeats=st.integers(1, 60), seed=SEEDS)
-def test_every_draw_is_a_possible_tissue(repeats: int, seed: int) -> None:
-    """Friction is positive, and pressing the tissue costs energy at every level, anywhere."""
+def test_every_sample_is_a_physical_tissue(repeats: int, seed: int) -> None:
+    """Friction is positive, and the stiffness is positive definite at every level and place."""
     assert all(value > 0.0 for drawn in draw_friction(repeats, seed) for value in drawn.values())
     places = draw_stiffness(repeats, seed)
     assert len(places) == repeats
@@ -45,8 +45,8 @@ def test_every_draw_is_a_possible_tissue(repeats: int, seed: int) -> None:
 
 @settings(max_examples=20, deadline=None)
 @given(seed=SEEDS)
-def test_a_place_has_one_quantile_per_entry(seed: int) -> None:
-    """The order of the places by an entry is the same at every force level."""
+def test_quantile_of_a_place_is_equal_at_all_force_levels(seed: int) -> None:
+    """The ranking of places by an entry is equal at every force level."""
     places = draw_stiffness(20, seed)
     for entry in TABLE_2:
         values = np.array([place[entry] for place in places])
@@ -55,16 +55,16 @@ def test_a_place_has_one_quantile_per_entry(seed: int) -> None:
         assert (orders == orders[:, :1]).all()
 
 
-def test_a_seed_gives_the_same_draw() -> None:
-    """The same seed gives the same draw, another seed another."""
+def test_seed_determines_the_sample() -> None:
+    """The same seed gives the same sample, another seed another sample."""
     for draw in (draw_friction, draw_stiffness):
         assert draw(20, 7) == draw(20, 7)
         assert draw(20, 7) != draw(20, 8)
 
 
-def test_a_single_repeat_is_typical() -> None:
-    """One repeat takes the medians, which the tables' means are close to."""
+def test_single_repeat_uses_the_medians() -> None:
+    """The medians are close to the means of the tables."""
     (friction,) = draw_friction(1, 3)
-    # A gamma distribution's median is below its mean by a third of variance over mean.
+    # The median of a gamma distribution is below its mean by a third of variance / mean.
     for name, (mean, deviation) in TABLE_1.items():
         assert abs(friction[name] - mean) < 0.4 * deviation**2 / mean

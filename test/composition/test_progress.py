@@ -1,4 +1,4 @@
-"""What a long job shows: its activity and the time since its start."""
+"""Progress display of long jobs: activity and elapsed time."""
 
 import io
 from threading import Event
@@ -9,24 +9,24 @@ import pytest
 
 
 class Terminal(io.StringIO):
-    """A terminal that tells when something was written to it."""
+    """Terminal that records the times of writes."""
 
     def __init__(self) -> None:
         super().__init__()
         self.written = Event()
 
     def isatty(self) -> bool:
-        """Tell that it is one."""
+        """Return True."""
         return True
 
     def write(self, text: str) -> int:
-        """Write."""
+        """Write and record the time."""
         self.written.set()
         return super().write(text)
 
 
-def test_where_there_is_no_terminal_each_activity_is_a_line() -> None:
-    """Numbers that change within an activity are none; the last line says how it ended."""
+def test_each_activity_is_a_line_without_a_terminal() -> None:
+    """Changing numbers within an activity add no lines; the last line reports the end."""
     stream = io.StringIO()
     with Progress('insertion', stream) as show:
         show('starting plant: compiling 1 of 9')
@@ -41,17 +41,17 @@ def test_where_there_is_no_terminal_each_activity_is_a_line() -> None:
     ]
 
 
-def test_a_job_that_fails_says_so() -> None:
+def test_failed_job_is_reported() -> None:
     stream = io.StringIO()
     with pytest.raises(KeyError), Progress('insertion', stream):
         raise KeyError
     assert stream.getvalue().splitlines()[-1] == 'insertion: failed, 0 s'
 
 
-def test_on_a_terminal_it_is_one_line_that_goes_on_by_itself(
+def test_terminal_line_is_updated_during_the_job(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """It is written again while the job is busy with something else."""
+    """The line is rewritten while the job is busy."""
     monkeypatch.setattr(progress, '_UPDATE', 0.01)
     stream = Terminal()
     with Progress('insertion', stream) as show:

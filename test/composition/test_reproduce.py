@@ -181,8 +181,8 @@ def test_every_result_is_a_choice_of_the_command() -> None:
     [
         ('table-1', 0, ['Table 1', 'holds', '2 quantities', '299.9 ± 44.4', 'no unit']),
         ('table-3', 0, ['Table 3', 'kg/m³', 'round wire of 1.27 mm']),
-        ('figure-4', 1, ['Figure 4', 'what came out of each run', '0.3 N s/mm, as_printed']),
-        ('controllability', 1, ['steer 4 of 8 states', 'q1, q2, q\u03071, q\u03072']),
+        ('figure-4', 1, ['Figure 4', 'metrics of each run', '0.3 N s/mm, as_printed']),
+        ('controllability', 1, ['control 4 of 8 states', 'q1, q2, q\u03071, q\u03072']),
     ],
 )
 @pytest.mark.usefixtures('once', 'coarse')
@@ -230,8 +230,8 @@ def test_all_results_are_sections_of_one_page(
     assert said.count('does not hold') == 1
     seen = look_at(first / 'reproduce.html')
     titles = [
-        *('What the paper claims', 'Table 1', 'Table 2', 'Table 3', 'Figures 4 to 8'),
-        *('Controllability and observability', 'Needles that the controller does not know'),
+        *('Claims of the paper', 'Table 1', 'Table 2', 'Table 3', 'Figures 4 to 8'),
+        *('Controllability and observability', 'Mismatch between needle and model'),
     ]
     places = [seen.text.index(f'\n{title}\n') for title in titles[1:]]
     assert places == sorted(places)

@@ -346,8 +346,8 @@ def test_without_ground_truth_commands_act_after_a_period(
     assert result.notes == [
         'not in the bag: /ground_truth',
         (
-            f'which command acted before {SAMPLES} samples is not in the bag: each is taken to '
-            'act one period after the sample that it answers'
+            f'which command acted before {SAMPLES} samples is not in the bag: each is assumed '
+            'to act one period after the sample that it responds to'
         ),
     ]
     if not late:
@@ -440,7 +440,7 @@ def test_tare_and_reset_are_replayed(tmp_path: Path) -> None:
     exact(result)
     assert result.notes == [
         'the sensor was zeroed (~/tare) before sample 50',
-        'the plant was put back (~/reset) before sample 90',
+        'the plant was reset (~/reset) before sample 90',
     ]
 
 
@@ -592,10 +592,10 @@ def test_differences_within_the_tolerance_are_accepted(tmp_path: Path) -> None:
         (
             lambda m: m.stamp == 0 or m.topic == '/wrench_command',
             {},
-            'holds nothing that was measured; record /base_wrench, /ground_truth, /joint_states',
+            'holds no measurements; record /base_wrench, /ground_truth, /joint_states',
         ),
         (bool, {'depth': 5.0}, 'the parameters of /plant: inserted length'),
-        (bool, {'mode': 'indenter'}, 'holds nothing'),
+        (bool, {'mode': 'indenter'}, 'holds no measurements'),
     ],
     ids=['parameters', 'measurements', 'value', 'mode'],
 )
@@ -785,7 +785,7 @@ def test_all_plant_inputs_are_replayed(tmp_path: Path) -> None:
         'the sensor was zeroed (~/tare)',
         'joint_trajectory',
         'model.coulomb_friction changed',
-        'the plant was put back (~/reset)',
+        'the plant was reset (~/reset)',
     ]
     assert said.count(pause) >= 2
 

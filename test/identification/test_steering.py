@@ -106,7 +106,7 @@ def test_what_makes_it_drift_is_not_told_apart_where_it_cannot_be() -> None:
     [words] = tilted.warnings
     assert 'these explain the drift equally well (rms: tilt 0.1' in words
     assert 'frame 0.1' in words
-    assert 'A motion of the guide in air would tell the frame' in words
+    assert 'A motion of the guide in air identifies the frame' in words
     bent = identify_steering(
         [
             insertion(k, Truth(tilt=(0.0, 0.0), curvature=0.8), lambda depth: pi * (depth > 0.05))
@@ -162,8 +162,8 @@ def test_a_table_of_another_laboratory_reads_with_options(
     assert main(['identify', 'steering', *paths, *options, '--json']) == 0
     said = capsys.readouterr()
     found = json.loads(said.out)
-    assert 'run_2.csv: 8 samples of the tip that repeat one while the needle goes on' in said.err
-    assert 'depths from the first, 200 mm, which is at the skin' in said.err
+    assert 'run_2.csv: 8 samples of the tip repeated during the insertion' in said.err
+    assert 'depths relative to the first depth, 200 mm, at the skin' in said.err
     [medium] = found['media'].values()
     assert medium['samples'] == 4 * 22 - 8
     low, high = medium['parameters']['bending_length']['interval']
@@ -231,7 +231,7 @@ def test_bad_input_is_named() -> None:
     with pytest.raises(IdentificationError, match=r'7 constants of these recordings need more'):
         identify_steering([short], TILTED)
     blind = replace(short, name='run 7', tip=np.full((3, 2), np.nan))
-    with pytest.raises(IdentificationError, match='run 7: no sample of the tip counts'):
+    with pytest.raises(IdentificationError, match='run 7: no valid sample of the tip'):
         identify_steering([blind])
     with pytest.raises(ShapeError, match=r"guide must have shape \('n', 2\)"):
         replace(short, guide=np.zeros((2, 2)))
@@ -337,7 +337,7 @@ def test_a_parameter_file_is_of_one_medium(
     tables = [str(tmp_path / name / 'run.csv') for name in ('gel', 'liver')]
     words = ['identify', 'steering', *tables, '--columns', COLUMNS, '--terms', 'tilt']
     assert main([*words, '-o', str(tmp_path / 'both.yaml')]) == 2
-    assert 'a parameter file is of one medium, these are gel, liver' in capsys.readouterr().err
+    assert 'a parameter file describes a single medium, got gel, liver' in capsys.readouterr().err
     assert not (tmp_path / 'both.yaml').exists()
 
 

@@ -1,4 +1,4 @@
-"""The claims of the paper, judged by what a run gives, with verdict and evidence."""
+"""Claims of the paper with computed verdict and evidence."""
 
 from needle_insertion.paper.claims.claim import Claim, FAILS, HOLDS, ONLY_IF, Tables
 from needle_insertion.paper.claims.judge import judge_claims, section

@@ -1,4 +1,4 @@
-"""Claims about controllability and observability, sections 3.2.3 to 3.2.6."""
+"""Verdicts on claims about controllability and observability, sections 3.2.3 to 3.2.6."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from needle_insertion.report.controllability import analyze_points
 
 @cache
 def _analyses(deflection: float) -> tuple[Analysis, ...]:
-    """Analyze the moving needle at three depths, in both readings and formulations."""
+    """Analyze the moving needle at three depths, for both readings and formulations."""
     return tuple(
         point.result
         for case in CASES
@@ -22,7 +22,7 @@ def _analyses(deflection: float) -> tuple[Analysis, ...]:
 
 
 def _controllability() -> Finding:
-    """Judge state controllability by the ranks."""
+    """Test state controllability by the ranks."""
     straight, bent = map(_analyses, DEFLECTIONS)
     least, most = (
         {one.state.rank for one in bent},
@@ -40,13 +40,13 @@ def _controllability() -> Finding:
 
 
 def _inadequate() -> Finding:
-    """Judge the inputs by how far they move the tip sideways."""
+    """Test the inputs by the lateral tip motion per base motion."""
     gains = [one.output_gain for one in _analyses(DEFLECTIONS[-1])]
     return finding({'least': min(gains), 'most': max(gains)}, always=max(gains) < 0.1)
 
 
 def _modes_observable() -> Finding:
-    """Judge whether q1, q2 and their rates show in the tip."""
+    """Test whether q1, q2 and their rates are observable from the tip."""
     straight, bent = map(_analyses, DEFLECTIONS)
     found = [one.observed for one in (*straight, *bent)]
     hidden = {name for one in found for name in (*one.lost, *one.combined)}

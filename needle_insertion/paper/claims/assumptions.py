@@ -1,4 +1,4 @@
-"""Claims about what the model assumes, sections 3.2.1 to 3.2.4 and 3.2.8."""
+"""Verdicts on claims about model assumptions, sections 3.2.1 to 3.2.4 and 3.2.8."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ import numpy as np
 from scipy.linalg import eigh
 from scipy.optimize import brentq
 
-#: Least bore of an 18 gauge tube of regular wall [m], and its outer diameter: ISO 9626.
+#: Smallest bore of an 18 gauge tube with regular wall [m], and outer diameter: ISO 9626.
 _BORE, _OUTER = 0.79e-3, 1.27e-3
 
-#: Depth of a second layer [m]: beyond the length over which the tissue takes up a deflection.
+#: Depth of a second layer [m], larger than the decay length of a deflection in the tissue.
 _LAYER = 0.15
 
 
@@ -29,13 +29,13 @@ def _first_frequency(model: NeedleModel, depth: float) -> float:
 
 
 def _compliance(model: NeedleModel, depth: float) -> float:
-    """Return the deflection of the tip per lateral force there [m/N]."""
+    """Return the deflection of the tip per lateral force at the tip [m/N]."""
     value = model.modes.integrals(depth).value
     return float(value @ np.linalg.solve(model.stiffness_matrix(depth), value))
 
 
 def _bending_outside() -> Finding:
-    """Judge the clamp at the entry by a beam that bends outside, too."""
+    """Test the clamp at the entry against a beam that also bends outside."""
     model = needle('paper_si', 'complete')
     p = model.parameters
     free, pinned, guided = (whole_needle(p, DEPTH, entry) for entry in ENTRIES)
@@ -58,10 +58,10 @@ def _bending_outside() -> Finding:
 
 
 def _three_dimensions() -> Finding:
-    """Judge a second plane of bending: row d of N has the sum of both, for it is quadratic."""
+    """Test bending in a second plane: row d of N adds both planes, as it is quadratic."""
     model = needle('paper_si', 'complete')
     one = model.bias_forces(model.state_at(DEPTH, DEFLECTION))
-    # A round needle bent by w in both planes stores what one bent by sqrt(2) w stores.
+    # Deflections w in both planes store the same energy as sqrt(2) w in a single plane.
     both = model.bias_forces(model.state_at(DEPTH, np.sqrt(2.0) * DEFLECTION))
     return finding(
         {'one': abs(float(one[0])), 'both': abs(float(both[0]))},
@@ -71,7 +71,7 @@ def _three_dimensions() -> Finding:
 
 
 def _linearization() -> Finding:
-    """Judge the linearized system by how far it may go before its first frequency is another."""
+    """Test the linearized system by the insertion that changes its first frequency by 10 %."""
     model = needle('paper_si', 'complete')
     there = _first_frequency(model, DEPTH)
 
@@ -87,7 +87,7 @@ def _linearization() -> Finding:
 
 
 def _friction_length() -> Finding:
-    """Judge friction that does not depend on the inserted length, by one that does."""
+    """Compare constant friction with friction proportional to the insertion depth."""
     p = NeedleParameters.preset('paper_mm')
     # F = (mu_s + mu_v v) s / l without inertia; the integral of ds / v with a = F l / mu_s.
     a = FORCE * p.length / p.coulomb_friction
@@ -102,7 +102,7 @@ def _friction_length() -> Finding:
 
 
 def _no_cutting() -> Finding:
-    """Judge friction without the cutting force, which a tip in tissue has as well."""
+    """Test friction without the cutting force of a tip in tissue."""
     dry = NeedleParameters().coulomb_friction
     cutting = 1.0
     return finding(
@@ -111,7 +111,7 @@ def _no_cutting() -> Finding:
 
 
 def _cannula() -> Finding:
-    """Judge the cross-section by that of a tube, through which seeds can pass."""
+    """Compare the cross-section with a tube for seeds."""
     p = NeedleParameters()
     bore, tube = _BORE / _OUTER, pi * _OUTER**2 / 4.0
     area = 1.0 - bore**2
@@ -128,7 +128,7 @@ def _cannula() -> Finding:
 
 
 def _stiffness_along() -> Finding:
-    """Judge k(d, t) where the tip has just entered a second layer that is twice as stiff."""
+    """Test k(d, t) with the tip just inside a second layer of twice the stiffness."""
     p = NeedleParameters()
     depth, stiff = _LAYER + 0.01, 2.0 * p.tissue_stiffness
     layered = replace(p, layer_depths=(_LAYER,), layer_stiffnesses=(stiff,))

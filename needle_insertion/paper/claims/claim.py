@@ -1,4 +1,4 @@
-"""What a claim is, and what it is judged by."""
+"""Claim of the paper, and the statistics for its verdict."""
 
 from __future__ import annotations
 
@@ -16,67 +16,40 @@ Numbers: TypeAlias = Mapping[str, float | str]
 
 
 class Finding(NamedTuple):
-    """
-    What a computation says of a claim.
-
-    Attributes
-    ----------
-    verdict : str
-        `HOLDS`, `ONLY_IF` or `FAILS`.
-    numbers : Numbers
-        Numbers of the evidence by name, in the units of its words.
-
-    """
+    """Verdict (`HOLDS`, `ONLY_IF`, `FAILS`), and numbers in the units of the evidence."""
 
     verdict: str
     numbers: Numbers
 
 
 def finding(numbers: Numbers, *, always: bool, sometimes: bool = False) -> Finding:
-    """
-    Derive a verdict.
-
-    Parameters
-    ----------
-    numbers : Numbers
-        Numbers of the evidence.
-    always : bool
-        Whether the claim holds.
-    sometimes : bool
-        Whether it holds under its condition.
-
-    Returns
-    -------
-    Finding
-        Verdict and numbers.
-
-    """
+    """Return a finding for a claim that holds ``always``, or ``sometimes``: under a condition."""
     return Finding(HOLDS if always else ONLY_IF if sometimes else FAILS, numbers)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Claim:
     """
-    One claim of the paper with its verdict.
+    Claim of the paper with its verdict.
 
     Attributes
     ----------
     name : str
-        Short name, that of the function that judges it.
+        Short name, equal to the name of the function that computes the verdict.
     section : str
-        Where the paper makes it.
+        Section of the paper.
     claim : str
-        What it says.
+        Statement of the paper.
     verdict : str
         `HOLDS`, `ONLY_IF` or `FAILS`.
     condition : str
-        The condition of `ONLY_IF`.
+        Condition of `ONLY_IF`.
     evidence : str
-        What the verdict rests on, in words with numbers.
+        Evidence as text with numbers.
     numbers : Numbers
-        The numbers, by name.
+        Numbers of the evidence, by name.
     test : str
-        The test that proves it, where one does.
+        Test that proves the verdict, if any.
 
     """
 
@@ -98,18 +71,18 @@ class Claim:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Tables:
     """
-    Statistics that claims about Tables 1 and 2 are judged by.
+    Statistics for claims about Tables 1 and 2.
 
     Attributes
     ----------
     source : str
-        Where they come from, in words.
+        Source as text.
     friction : Mapping[str, tuple of float]
         Mean and standard deviation by the keys of `TABLE_1`, SI.
     stiffness : Mapping[str, tuple of tuple of float]
         Means and standard deviations at each force level by the keys of `TABLE_2`, SI.
     experiments : int
-        Number of experiments behind each.
+        Number of experiments of each statistic.
 
     """
 

@@ -1,4 +1,4 @@
-"""Claims about the controllers and their figures, sections 3.2.7 and 3.2.8."""
+"""Verdicts on claims about the controllers and their figures, sections 3.2.7 and 3.2.8."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def _with_hub(law: str, factors: tuple[float, float] = (1.0, 1.0)) -> LoopRun:
 
 
 def _error_equation() -> Finding:
-    """Judge the error of inverse dynamics by the exact solution of its equation."""
+    """Compare the error of inverse dynamics with the exact solution of its equation."""
     run = closed_loop('inverse_dynamics', 'paper_si', 'complete')
     early = run.time <= 20.0
     times, start = run.time[early], run.model.state_at(DEPTH, DEFLECTION)
@@ -55,7 +55,7 @@ def _error_equation() -> Finding:
 
 
 def _positive_definite() -> Finding:
-    """Judge stability by the poles of the sampled loop."""
+    """Test stability by the poles of the sampled loop."""
     p = NeedleParameters.preset('paper_mm')
     gains = PidGains(kp=PID_KP, ki=0.0, kd=PID_KV, tolerance=0.0)
     slow, fast = (
@@ -74,7 +74,7 @@ def _positive_definite() -> Finding:
 
 
 def _same_inputs() -> Finding:
-    """Judge the inputs by the forces at the start of figures 6 to 8."""
+    """Test the inputs by the forces at the start of figures 6 to 8."""
     inverse, pid = (
         closed_loop(law, 'paper_si', 'complete', hub_stop=True).forces[0, 2:] for law in LAWS
     )
@@ -91,14 +91,14 @@ def _same_inputs() -> Finding:
 
 
 def _turns(run: LoopRun) -> int:
-    """Return how often the tip changes sides by more than rounding."""
+    """Count sign changes of the tip deflection above rounding."""
     tip = run.tip_deflection
     tip = tip[np.abs(tip) > 1e-9]
     return int(np.count_nonzero(np.diff(np.sign(tip))))
 
 
 def _tip_varies() -> Finding:
-    """Judge figure 4 by the peak of the tip."""
+    """Test figure 4 by the peak of the tip deflection."""
     found = [Outcome.of(open_loop(*case)) for case in CASES]
     return finding(
         {
@@ -111,7 +111,7 @@ def _tip_varies() -> Finding:
 
 
 def _smoother() -> Finding:
-    """Judge smoothness by how often the tip changes sides in a second."""
+    """Compare sign changes of the tip deflection per second."""
 
     def rate(run: LoopRun) -> float:
         return _turns(run) / float(run.time[-1])
@@ -133,7 +133,7 @@ def _smoother() -> Finding:
 
 
 def _zero_deflection() -> Finding:
-    """Judge the deflection that inverse dynamics leaves."""
+    """Test the remaining deflection under inverse dynamics."""
     modal = max(
         Outcome.of(closed_loop('inverse_dynamics', *case, hub_stop=hub)).final
         for case in CASES
@@ -149,7 +149,7 @@ def _zero_deflection() -> Finding:
 
 
 def _fully_inserted() -> Finding:
-    """Judge the wanted state by the length that is inserted."""
+    """Test the target state by the insertion depth."""
     free, held = (
         closed_loop('inverse_dynamics', 'paper_si', 'complete', hub_stop=hub)
         for hub in (False, True)
@@ -163,7 +163,7 @@ def _fully_inserted() -> Finding:
 
 
 def _minimum_deflection() -> Finding:
-    """Judge the gains of PID by the peaks of four other pairs of gains."""
+    """Compare the PID gains with four other pairs of gains by the peak deflection."""
     pairs = (1.0, 1.0), (2.0, 1.0), (0.5, 1.0), (1.0, 2.0), (1.0, 0.5)
     peaks = {pair: 1e3 * abs(Outcome.of(_with_hub('pid', pair)).peak) for pair in pairs}
     best = min(peaks, key=lambda pair: peaks[pair])

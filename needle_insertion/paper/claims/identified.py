@@ -1,4 +1,4 @@
-"""Claims about Tables 1 and 2, section 3.2.2."""
+"""Verdicts on claims about Tables 1 and 2, section 3.2.2."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _THOUSAND: Final = 1e3
 
 
 def _reading_of_table_1(tables: Tables) -> Finding:
-    """Judge the unit of mu_v by the time of an insertion."""
+    """Test the unit of mu_v by the duration of an insertion."""
     si, mm = (hub_time(open_loop(reading, 'complete', 0.0)) for reading in READINGS)
     mean, deviation = tables.friction['viscous_friction']
     published, scatter = TABLE_1['viscous_friction']
@@ -34,7 +34,7 @@ def _reading_of_table_1(tables: Tables) -> Finding:
 
 
 def _identifiable(tables: Tables) -> Finding:
-    """Judge the method by the mean of mu_s that it finds."""
+    """Test the method by the identified mean of mu_s."""
     mean, deviation = tables.friction['coulomb_friction']
     error = deviation / sqrt(tables.experiments)
     apart = abs(mean - TABLE_1['coulomb_friction'][0]) / error
@@ -55,7 +55,7 @@ def _means(tables: Tables) -> dict[str, FloatArray]:
 
 
 def _consistency(tables: Tables) -> Finding:
-    """Judge the scatter of k_xx and k_zz over the places."""
+    """Test the scatter of k_xx and k_zz over the places."""
     xx, zz = (
         100.0 * np.array(deviations) / np.abs(means)
         for means, deviations in (tables.stiffness[entry] for entry in ('k_xx', 'k_zz'))
@@ -77,7 +77,7 @@ def _consistency(tables: Tables) -> Finding:
 
 
 def _spring(tables: Tables) -> Finding:
-    """Judge whether the tissue is a spring by the curl of the force."""
+    """Test whether the tissue is a spring by the curl of the force."""
     mean = _means(tables)
     matrices = np.stack([mean[entry] for entry in TABLE_2], axis=-1).reshape(-1, 2, 2)
     parts = np.array([asymmetry(matrix) for matrix in matrices])
@@ -98,14 +98,14 @@ def _spring(tables: Tables) -> Finding:
 
 
 def _linear(tables: Tables) -> Finding:
-    """Judge linearity by how k_zz changes with the force."""
+    """Test linearity by the change of k_zz with the force."""
     ratio = float(_means(tables)['k_zz'][0] / _means(tables)['k_zz'][-1])
     fall = 1.0 - 1.0 / ratio
     return finding({'fall': 100.0 * fall, 'ratio': ratio}, always=abs(fall) < 0.1)
 
 
 def _off_plane(tables: Tables) -> Finding:
-    """Judge the difference of k_xx and k_zz under larger forces."""
+    """Test the difference of k_xx and k_zz under larger forces."""
     xx, zz = (_means(tables)[entry] for entry in ('k_xx', 'k_zz'))
     apart = np.abs(xx - zz) / (0.5 * (xx + zz))
     return finding(
@@ -116,7 +116,7 @@ def _off_plane(tables: Tables) -> Finding:
 
 
 def _tissue_stiffness(tables: Tables) -> Finding:
-    """Judge the unit of k_a."""
+    """Test the unit of k_a."""
     k = float(_means(tables)['k_zz'][-1])
     means, deviations = TABLE_2['k_zz']
     return finding(

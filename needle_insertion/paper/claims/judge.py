@@ -1,4 +1,4 @@
-"""All claims of ``claims.yaml``, judged in the order of the paper."""
+"""Compute the verdicts on all claims of ``claims.yaml`` in the order of the paper."""
 
 from __future__ import annotations
 
@@ -25,22 +25,10 @@ def judge_claims(
     tables: Tables, study: Mismatch, progress: Callable[[], object] | None = None
 ) -> list[Claim]:
     """
-    Judge every claim. The same arguments give the same claims.
+    Compute the verdict on every claim, in the order of the paper; deterministic.
 
-    Parameters
-    ----------
-    tables : Tables
-        Statistics behind Tables 1 and 2.
-    study : Mismatch
-        Insertions of needles that the controllers do not know.
-    progress : callable, optional
-        Called after each claim.
-
-    Returns
-    -------
-    list of Claim
-        In the order of the paper.
-
+    ``tables`` are the statistics of Tables 1 and 2; ``study`` is the mismatch study; ``progress``
+    is called after each claim.
     """
     found = []
     for entry in _entries():
@@ -57,7 +45,7 @@ def _entries() -> list[dict[str, Any]]:
 
 
 def _judged(entry: dict[str, Any], tables: Tables, study: Mismatch) -> Claim:
-    """Judge a claim by the function of its name, which is private to its module."""
+    """Compute a verdict by the private function of the same name in its module."""
     name = f'_{entry["name"]}'
     modules: tuple[tuple[ModuleType, tuple[Any, ...]], ...] = (
         *((needle, ()), (assumptions, ()), (identified, (tables,)), (analysis, ()), (control, ())),
@@ -76,32 +64,19 @@ def _judged(entry: dict[str, Any], tables: Tables, study: Mismatch) -> Claim:
 
 
 def section(found: list[Claim]) -> Section:
-    """
-    Return the claims for the page.
-
-    Parameters
-    ----------
-    found : list of Claim
-        From `judge_claims`.
-
-    Returns
-    -------
-    Section
-        A count of the verdicts, and a table.
-
-    """
+    """Return the section of the results page: number of verdicts, and table of claims."""
     verdicts = [one.verdict for one in found]
     return Section(
-        title='What the paper claims',
+        title='Claims of the paper',
         paragraphs=(
             (
                 f'{len(found)} claims: {verdicts.count(HOLDS)} hold, {verdicts.count(ONLY_IF)} '
                 f'hold only if a condition is met, {verdicts.count(FAILS)} do not hold. The '
-                'numbers beside most of them are computed in this run, and decide. The others '
-                'are proved by the test of the package that stands beside them. Where a claim '
-                'turns on a unit, on a cause that data cannot tell or on what it leaves unsaid, '
+                'verdict on most of them is computed in this run from the listed numbers. The '
+                'others are proved by the listed test of the package. If a claim depends on a '
+                'unit, on a cause that the data do not identify or on an unstated assumption, '
                 'numbers can refute it, but the condition is our judgment. Statements on the '
-                'literature and on clinical practice are not among them.'
+                'literature and on clinical practice are not included.'
             ),
         ),
         tables=(

@@ -1,4 +1,4 @@
-"""Claims about needles that the controllers do not know, section 3.2.8."""
+"""Verdicts on claims about mismatch between needle and model, section 3.2.8."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ import numpy as np
 
 def _informed(study: Mismatch) -> Finding:
     """
-    Judge whether knowledge of the model helps, where it is exact and where it is not.
+    Test whether a model-based law performs better with and without mismatch.
 
-    Like is compared with like: both laws as in the paper, without integral.
+    Both laws are as in the paper, without integral.
     """
     model = needle('paper_mm', 'complete')
     friction = 0.99 * model.parameters.coulomb_friction
@@ -64,7 +64,7 @@ def _informed(study: Mismatch) -> Finding:
 
 
 def _not_zero(study: Mismatch) -> Finding:
-    """Judge the error on needles that the laws do not know."""
+    """Test the final error with mismatch."""
     inverse, pid = (1e6 * float(np.abs(study.batches[law].final).min()) for law in LAWS)
     return finding(
         {'needles': len(study.factors), 'inverse_um': inverse, 'pid_um': pid},

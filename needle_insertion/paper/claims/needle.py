@@ -1,4 +1,4 @@
-"""Claims about the model of the needle, section 3.2.1."""
+"""Verdicts on claims about the model of the needle, section 3.2.1."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from scipy.linalg import eigh
 
 @cache
 def _bias(formulation: str) -> tuple[FloatArray, FloatArray]:
-    """Return N along the open loop (0.3 N s/m), as it is and with all rates set to zero."""
+    """Return N along the open loop (0.3 N s/m), with the rates and with zero rates."""
     run = open_loop('paper_si', formulation)
     moving = run.states[run.states[:, 0] > 0.0][::5]
     still = moving.copy()
@@ -34,7 +34,7 @@ def _bias(formulation: str) -> tuple[FloatArray, FloatArray]:
 
 
 def _zero_rows() -> Finding:
-    """Judge the rows of N for d and theta."""
+    """Test the rows of N for d and theta."""
     model = needle('paper_si', 'complete')
     straight = model.state_at(DEPTH)
     straight[4:6] = -1.0, 1.0
@@ -48,7 +48,7 @@ def _zero_rows() -> Finding:
 
 
 def _rates_in_bias() -> Finding:
-    """Judge the part of the rates in the row of q1 of N."""
+    """Test the contribution of the rates to row q1 of N."""
     complete, printed = (
         100.0 * float(np.abs(whole - rest)[:, 2].max() / np.abs(whole[:, 2]).max())
         for whole, rest in (_bias('complete'), _bias('as_printed'))
@@ -61,7 +61,7 @@ def _rates_in_bias() -> Finding:
 
 
 def _independence() -> Finding:
-    """Judge by how much d depends on an initial deflection."""
+    """Test the effect of an initial deflection on d."""
 
     def apart(reading: str, formulation: str) -> float:
         bent, straight = (open_loop(reading, formulation, w) for w in (DEFLECTION, 0.0))
@@ -78,7 +78,7 @@ def _independence() -> Finding:
 
 
 def _two_modes_cause() -> Finding:
-    """Judge whether that dependence vanishes with more modes, over the first 20 ms."""
+    """Test whether this effect vanishes with more modes, over the first 20 ms."""
 
     def path(modes: int, deflection: float) -> FloatArray:
         p = NeedleParameters(modes=modes, minimum_depth=0.0195)
@@ -103,7 +103,7 @@ def _two_modes_cause() -> Finding:
 
 
 def _deflection_changes() -> Finding:
-    """Judge whether a deflection grows during insertion, and only if there is one."""
+    """Test whether only an initial deflection grows during insertion."""
     peaks = {case: abs(Outcome.of(open_loop(*case)).peak) for case in CASES}
     straight = max(
         float(np.abs(open_loop(reading, 'complete', 0.0).tip_deflection).max())
@@ -121,7 +121,7 @@ def _deflection_changes() -> Finding:
 
 
 def _spring_at_the_tip() -> Finding:
-    """Judge one spring at the tip, which stores what the tissue does in the first shape."""
+    """Compare a spring at the tip with the tissue by the energy in the mode shapes."""
     model = needle('paper_si', 'complete')
     at = model.modes.integrals(DEPTH)
     shapes = eigh(model.stiffness_matrix(DEPTH), model.parameters.linear_density * at.gram)[1].T
@@ -132,7 +132,7 @@ def _spring_at_the_tip() -> Finding:
 
 
 def _two_modes() -> Finding:
-    """Judge two modes by the exact clamped beam on an elastic foundation."""
+    """Compare two modes with the exact clamped beam on an elastic foundation."""
     model = needle('paper_si', 'complete')
     p = model.parameters
     decay = (p.tissue_stiffness / (4.0 * p.bending_stiffness)) ** 0.25
@@ -158,7 +158,7 @@ def _two_modes() -> Finding:
 
 
 def _axis_of_rotation() -> Finding:
-    """Judge the axis that theta turns about by the moments of inertia of a round wire."""
+    """Identify the axis of theta by the moments of inertia of a round wire."""
     p = NeedleParameters()
     mass = p.linear_density * p.length
     across, along = mass * p.length**2 / 12.0, 0.5 * mass * p.area / pi
@@ -170,7 +170,7 @@ def _axis_of_rotation() -> Finding:
 
 
 def _friction_matters() -> Finding:
-    """Judge friction by the time of an insertion with and without it."""
+    """Compare the duration of an insertion with and without friction."""
     p = NeedleParameters()
     free = sqrt(2.0 * (p.length - DEPTH) * p.moving_mass / FORCE)
     si, mm = (hub_time(open_loop(reading, 'complete', 0.0)) for reading in READINGS)
@@ -180,7 +180,7 @@ def _friction_matters() -> Finding:
 
 
 def _transients() -> Finding:
-    """Judge static models by how long a deflection rings."""
+    """Test static models by the decay time of a deflection."""
     p = NeedleParameters.preset('phantom')
     fade = p.linear_density * 2.0 / p.tissue_damping
     rings = Outcome.of(open_loop('paper_mm', 'complete')).final

@@ -1,6 +1,6 @@
 'use strict';
 
-/* Plays the frames of a report: at once as many of them as there are, and as fast as it was. */
+/* Plays the frames of a report in real time. */
 (() => {
   const box = document.querySelector('.animation');
   const {scene, frames, path} = JSON.parse(document.getElementById('frames').textContent);
@@ -10,12 +10,12 @@
 
   box.hidden = false;
   const drawing = new needleDrawing.Drawing(box.querySelector('canvas'));
-  /* Room for all that comes, from the first. */
+  /* Reserve the range of all frames from the start. */
   frames.forEach((frame) => drawing.room({...frame, path}, scene));
 
   function draw() {
     const frame = frames.reduce((found, one) => (one.time <= time ? one : found));
-    /* What is cut only grows: so much of it was there. */
+    /* The cut path only grows: length at this frame. */
     const deepest = Math.max(...frames.filter((one) => one.time <= frame.time)
       .map((one) => Math.max(...one.needle[1])));
     const count = path[1].filter((y) => y <= deepest).length;

@@ -16,7 +16,7 @@ const needleDrawing = (() => {
   };
   const FONT = '12px system-ui, sans-serif';
 
-  /* Shown of the needle outside, at least across it, and beyond what is deepest [mm]. */
+  /* Shown length outside, smallest width, and margin below the deepest point [mm]. */
   const OUTSIDE = 45, LEAST = 10, BEYOND = 12;
   const MARGIN = {left: 44, right: 10, top: 6, between: 12, bottom: 34};
 
@@ -50,7 +50,7 @@ const needleDrawing = (() => {
     pen.setLineDash([]);
   }
 
-  /* Text that stays legible on whatever is below it. */
+  /* Text that is legible on any background. */
   function label(pen, words, x, y, color, align = 'left') {
     pen.textAlign = align;
     pen.lineWidth = 3;
@@ -80,18 +80,18 @@ const needleDrawing = (() => {
   class Drawing {
     constructor(canvas) {
       this.canvas = canvas;
-      /* They only grow, so that the picture does not jump. */
+      /* Limits only grow, so that the picture does not jump. */
       this.end = 60;
       this.side = LEAST;
     }
 
-    /* Forget what was seen: another recording, or another time of it. */
+    /* Reset the limits for another recording or time. */
     reset() {
       this.end = 60;
       this.side = LEAST;
     }
 
-    /* Make room for what will be drawn. */
+    /* Extend the limits for later drawings. */
     room(frame, scene) {
       const depths = [0], sides = [LEAST - 3];
       const line = (points) => {
@@ -141,7 +141,7 @@ const needleDrawing = (() => {
       pen.rect(left, top, right - left, 2 * half);
       pen.clip();
       this.tissue(pen, plane, scene, right);
-      /* A grid in steps that leave room for their numbers. */
+      /* A grid with steps wide enough for the labels. */
       const step = scale * 5 > 14 ? 5 : 10;
       pen.strokeStyle = COLORS.grid;
       pen.lineWidth = 1;
@@ -221,7 +221,7 @@ const needleDrawing = (() => {
         stroke(pen, COLORS.paper, 5.5, [], line);
         stroke(pen, COLORS.needle, 3.5, frame.shape === 'straight' ? [10, 5] : [], line);
       }
-      /* Over the needle, which hides most of it. */
+      /* Drawn over the needle, which would hide it. */
       if (frame.path) {
         stroke(pen, COLORS.paper, 1.6, [], points(frame.path));
         stroke(pen, COLORS.path, 1.6, [5, 4], points(frame.path));
@@ -234,7 +234,7 @@ const needleDrawing = (() => {
         cross(pen, across(target[1]), up(target[axis]), 5);
       }
       if (expected) {
-        /* Beside the target, which would hide it. */
+        /* Next to the target, which would hide it. */
         const x = across(expected.at[1]) + 12, wide = expected.half[axis ? 1 : 0] || 0;
         const low = up(expected.at[axis] - wide), high = up(expected.at[axis] + wide);
         for (const [color, width] of [[COLORS.paper, 4.5], [COLORS.expected, 2.2]]) {
@@ -280,7 +280,7 @@ const needleDrawing = (() => {
     label(pen, 'z', x(0) + 6, y(reach) + 12, COLORS.ink);
     if (expected) {
       const [right, up] = from(expected.at);
-      /* 95 % of draws of two numbers are within 2.45 standard deviations, of one within 1.96. */
+      /* 95 % of normal samples are within 2.45 standard deviations in 2D, within 1.96 in 1D. */
       const [a, b] = expected.half.map((half) => mm(half) * 2.4477 / 1.96);
       const c = expected.correlation || 0, turned = Math.sqrt(Math.max(0, 1 - c * c));
       const edge = [...Array(65).keys()].map((k) => {
