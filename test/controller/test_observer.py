@@ -1147,7 +1147,7 @@ def test_an_observer_that_does_not_explain_its_measurements_is_not_used() -> Non
     assert bending.warning is None
     assert bending.load != 0.0
     watch(300, 0.2)
-    assert 'does not explain what is measured: NIS is' in str(bending.warning)
+    assert 'inconsistent with the measurements: NIS is' in str(bending.warning)
     assert bending.load == 0.0
     watch(1000, 0.0)
     assert bending.warning is None

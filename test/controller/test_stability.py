@@ -238,7 +238,7 @@ def test_gains_that_cannot_be_stable_are_named() -> None:
     law = InverseDynamics(axis=PHANTOM, gains=InverseDynamicsGains(kv=3000.0), period=PERIOD)
     words = (
         r'my gains are unstable at 1000 Hz with a delay of 1 period: spectral radius .* '
-        r'must be <= 1 - 1e-06; all of them times ([\d.]+) would be stable'
+        r'must be <= 1 - 1e-06; all gains times ([\d.]+) would be stable'
     )
     with pytest.raises(ParameterError, match=words) as refusal:
         check_stability(law, 1, 'my gains')
