@@ -111,15 +111,15 @@ def test_the_joint_is_found_by_name(names: list[str]) -> None:
 def test_what_is_missing_is_said() -> None:
     """With the joints that there are."""
     with pytest.raises(
-        ParameterError, match="no position of the joint 'slide'; it has those of 'a', 'b' "
+        ParameterError, match="no position of the joint 'slide'; positions found: 'a', 'b' "
     ):
         forces(joint='slide').measurement(state(['a', 'b'], [0.0, 1.0], [0.0, 0.0]))
-    with pytest.raises(ParameterError, match='it has those of none'):
+    with pytest.raises(ParameterError, match='positions found: none'):
         forces(joint='slide').measurement(state(['slide'], []))
     for velocities in ([], [nan]):
         with pytest.raises(ParameterError, match="no velocity of 'slide': efforts need it"):
             forces(joint='slide').measurement(state(['slide'], [0.0], velocities))
-    with pytest.raises(ParameterError, match="joint 'b'; it has those of 'slide', 'a' "):
+    with pytest.raises(ParameterError, match="joint 'b'; positions found: 'slide', 'a' "):
         moves(joint='slide', command_joints=('slide', 'b')).measurement(
             state(['slide', 'a', 'b'], [0.0, 1.0, nan])
         )
@@ -271,7 +271,7 @@ def test_a_known_load_does_not_move_the_base() -> None:
         ({'command': 'velocity'}, 'hardware.command must be one of effort, position, got'),
         ({'command_type': 'twist'}, 'hardware.command_type must be one of wrench, float64'),
         ({'command': 'position'}, 'hardware.command_type must be one of float64_multi'),
-        (PUSHES | {'command_topic': ''}, 'hardware.command_topic must be that of the driver'),
+        (PUSHES | {'command_topic': ''}, "hardware.command_topic must be the driver's topic"),
         ({'state_type': 'x'}, 'hardware.state_type must be one of joint_state, dynamic'),
         ({'stamps': 'now'}, "hardware.stamps must be one of header, receive, got 'now'"),
         ({'command_joints': ['a']}, "hardware.command_joints must have the joint 'insertion'"),

@@ -327,7 +327,7 @@ def test_the_load_of_a_true_state_is_compensated() -> None:
     wild = Reading(bent.now, '', (), ((0.18, 0.0, 1e308, 0.0), rest, ()))
     bent.supervisor.truth(wild, bent.now)
     assert bent.supervisor.bending.load == 0.0
-    assert 'not taken in' in bent.said()[-1]
+    assert 'ignored' in bent.said()[-1]
 
 
 def test_the_wrench_of_a_measurement_waits_for_it() -> None:
@@ -410,7 +410,7 @@ def test_a_push_beyond_eulers_load_is_warned_of() -> None:
         loop.measure()
         said += loop.said()
     (line,) = (one for one in said if 'Euler' in one)
-    assert "is more than Euler's load 13.2 N of the part outside" in line
+    assert "exceeds Euler's load 13.2 N of the part outside" in line
 
 
 @pytest.mark.parametrize('what', ['target', 'trajectory'])

@@ -407,7 +407,7 @@ def test_pauses_goes_on_and_retracts(ros_graph: RosGraph) -> None:
     assert loop.said('paused') is True
     assert loop.call(SetBool, 'pause', SetBool.Request(data=False)).success
     loop.until(lambda: loop.speed() > 0.0, 'motion')
-    assert loop.call(Trigger, 'retract', Trigger.Request()).message == 'goes to 0.019 m'
+    assert loop.call(Trigger, 'retract', Trigger.Request()).message == 'retracting to 0.019 m'
     loop.until(lambda: loop.aims[-1].position[0] == 0.019, 'the way back')
     loop.until(lambda: abs(loop.states[-1].position[0] - 0.019) < 1e-4, 'the needle')
     # No jump in all of it: one period at the limits, and rounding.
