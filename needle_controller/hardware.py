@@ -88,14 +88,14 @@ class HardwareSettings:
         'y', 'axis of the force sensor that points into the tissue; may be signed: -z'
     )
     lateral_axis: str = _text(
-        '', 'axis of the force sensor along which the tip deflects; may be signed; empty: the axis '
-        'after force_axis',
+        '', 'axis of the force sensor along which the tip deflects; may be signed; empty: the '
+        'axis after force_axis',
     )  # fmt: skip
     reaction: bool = field(
         default=False,
         metadata={
-            'description': 'the sensor reports the force of the needle on the sensor, not the force '
-            'on the needle'
+            'description': 'the sensor reports the force of the needle on the sensor, not the '
+            'force on the needle'
         },
     )
     command: str = _text(EFFORT, f'one of {", ".join(COMMANDS)}: kind of joint command')
@@ -342,8 +342,8 @@ class Robot:
         Returns
         -------
         Measurement
-            Depth, velocity, angle and force; the force is NaN if it is not reported, or with position
-            commands.
+            Depth, velocity, angle and force; the force is NaN if it is not reported, or with
+            position commands.
 
         Raises
         ------

@@ -20,7 +20,7 @@ def test_more_than_one_late_answer_in_twenty_is_said(rate: int, late: int, said:
         # Two periods are in time; a little more is not.
         lateness.add(now, 2.0 * period if k % rate >= late else 2.1 * period)
     warning = lateness.warning(now)
-    share = f'{late / rate:.0%} of the answers come too late for delay 1: raise it'
+    share = f'{late / rate:.0%} of the commands are too late for delay 1: raise it'
     assert (warning is not None and warning.startswith(share)) == said
     values = lateness.describe()
     assert values['measurements answered'] == 2 * rate + 1

@@ -37,7 +37,7 @@ def test_another_rate_is_said(rate: float, true: float) -> None:
     for jitter in (0.0, 0.02):
         said = judged(rate, true, rng, jitter=jitter)
         assert said is not None
-        found = float(said.partition(' comes at ')[2].partition(' Hz')[0])
+        found = float(said.partition(' is received at ')[2].partition(' Hz')[0])
         assert found == pytest.approx(true, rel=0.03)
         assert f'rate is {rate:g} Hz: set rate to {found:.3g}' in said
 
@@ -64,5 +64,5 @@ def test_it_takes_a_second_of_samples() -> None:
     assert pace.warning() is None
     pace.add(2 * 10**10, 20_000_000)
     assert pace.warning() == (
-        'joint_states comes at 50 Hz, rate is 100 Hz: set rate to 50, or the robot to 100 Hz'
+        'joint_states is received at 50 Hz, rate is 100 Hz: set rate to 50, or the robot to 100 Hz'
     )

@@ -140,8 +140,8 @@ GUARD = [
     ),
     ('encoders', (encoded(0.05, -0.11),), 'insertion speed -0.11 m/s'),
     ('encoders', (encoded(0.0025, nan),), 'insertion speed nan m/s'),
-    ('encoders', (encoded(0.103, 0.0),), 'inserted length 0.103 m is outside [-0.001, 0.102] m'),
-    ('encoders', (encoded(-0.002, 0.0),), 'inserted length -0.002 m'),
+    ('encoders', (encoded(0.103, 0.0),), 'insertion depth 0.103 m is outside [-0.001, 0.102] m'),
+    ('encoders', (encoded(-0.002, 0.0),), 'insertion depth -0.002 m'),
     ('encoders', (encoded(0.05, 0.0, 1001.0),), 'angle 1001 rad'),
     ('encoders', (encoded(0.05, 0.0, 0.0, -101.0),), 'angular speed -101 rad/s'),
     ('tracking', (0.011,), 'tracking error 0.011 m is beyond the limit of 0.01 m'),
@@ -236,8 +236,8 @@ def test_sensors_are_missed_while_the_encoders_speak() -> None:
         if i < 1000:
             wrench.check(now, now, 'needle_base', [0.0, 0.0])
         said += whole.news(now)
-    assert said == ['base_wrench is stale: none that counts for 0.5 s']
-    assert whole.warning(now) == 'base_wrench is stale: none that counts for 1.0 s'
+    assert said == ['base_wrench is stale: no valid message for 0.5 s']
+    assert whole.warning(now) == 'base_wrench is stale: no valid message for 1.0 s'
     now += MILLISECOND
     wrench.check(now, now, 'needle_base', [0.0, 0.0])
     assert whole.warning(now) is None
@@ -325,7 +325,7 @@ def test_encoders_of_two_clocks_stop_the_motion() -> None:
             stream.check(now if k % (late + 1) == 0 else now - SECOND // 50, now)
         share = late / (late + 1)
         assert (stream.window.share(now) > 0.5) == (share > 0.5)
-        said = f'joint_states has {stream.window.share(now):.0%} of its messages after later ones'
+        said = f'joint_states has {stream.window.share(now):.0%} of its messages out of order'
         assert whole.warning(now) == (said if warned or share > 0.5 else None)
         assert whole.muddled(now) == (said if stopped else None)
 

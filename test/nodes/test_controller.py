@@ -543,7 +543,7 @@ def test_the_integral_is_frozen_while_it_is_stopped(ros_graph: RosGraph) -> None
 #: Beyond each limit, and what is well within it.
 BEYOND = {
     'speed': (lambda b: b.measure(0.02, 0.15), 'insertion speed 0.15 m/s is beyond'),
-    'depth': (lambda b: b.measure(0.204), 'inserted length 0.204 m is outside'),
+    'depth': (lambda b: b.measure(0.204), 'insertion depth 0.204 m is outside'),
     'axial': (lambda b: b.wrench(axial=-40.0), 'axial force -40 N is beyond the limit of 30 N'),
     'lateral': (lambda b: b.wrench(lateral=12.0), 'lateral force 12 N is beyond'),
     'moment': (lambda b: b.wrench(moment=1.5), 'moment 1.5 N m is beyond'),

@@ -499,7 +499,7 @@ def test_another_rate_is_said(ros_graph: RosGraph) -> None:
     """Both numbers and what to set; nothing at the true rate."""
     bench = Bench(ros_graph, rate=1000.0)
     bench.until(lambda: ' Hz, rate is 1000 Hz: set rate to ' in bench.said, 'the rate')
-    assert bench.said.startswith('joint_states comes at ')
+    assert bench.said.startswith('joint_states is received at ')
 
 
 @pytest.mark.parametrize(
