@@ -66,7 +66,7 @@ def test_out_of_reach_is_said_before_or_on_the_way(
     _, said = steered(capsys, '--target=0.05,0.1,0', '-o', str(picture), status=1)
     # Beside the words a picture of what is within reach.
     assert picture.read_bytes().startswith(b'\x89PNG')
-    assert 'the target x = 50.00 mm, z = 0.00 mm is out of reach: from here a tip at x =' in said
+    assert 'the target x = 50.00 mm, z = 0.00 mm is out of reach: reachable are x =' in said
     found, said = steered(capsys, '--target=-0.026,0.1,0')
     assert found['miss [m]'] > 1e-3
     assert found['warnings']

@@ -185,7 +185,7 @@ def test_a_look_that_is_noisier_says_less() -> None:
 
 def test_a_target_out_of_reach_is_refused_with_what_is_within_it() -> None:
     with pytest.raises(
-        OutOfReachError, match=r'x = 40\.00 mm, z = 0\.00 mm is out of reach: from'
+        OutOfReachError, match=r'x = 40\.00 mm, z = 0\.00 mm is out of reach: reachable'
     ):
         SteeringController(MODEL, (0.04, 0.0))
     with pytest.raises(OutOfReachError, match=r'a tip at x = 0\.00 ± \d'):
@@ -252,11 +252,14 @@ def test_a_fault_that_passes_does_no_harm(change: dict[int, Any]) -> None:
 @pytest.mark.parametrize(
     ('change', 'complaint'),
     [
-        (dict.fromkeys(range(8, 21), 'same'), 'the sensor of the tip is frozen: 3 looks are'),
-        (dict.fromkeys(range(8, 21), 'lost'), 'the tip was not seen in 7 looks'),
+        (
+            dict.fromkeys(range(8, 21), 'same'),
+            'the tip sensor is frozen: 3 identical measurements',
+        ),
+        (dict.fromkeys(range(8, 21), 'lost'), '7 tip measurements are missing'),
         (
             dict.fromkeys(range(8, 21), 0.02),
-            r'the tip is \+\d+\.\d\d mm in x and .* from where any',
+            r'the tip is \+\d+\.\d\d mm in x and .* from its expected',
         ),
     ],
 )
@@ -286,7 +289,7 @@ def test_a_frame_that_is_wrong_by_ten_degrees_hits_or_is_said(seed: int) -> None
             said = str(error)
             break
     if said:
-        assert 'from where any needle of the belief can be' in said
+        assert 'outside the model uncertainty' in said
         assert depth <= 0.05
     else:
         assert np.hypot(*(tip - target)) < 5e-4
@@ -317,7 +320,7 @@ def test_bad_input_is_named() -> None:
     with pytest.raises(ParameterError, match='spread must be finite'):
         SteeringBelief(spread=-0.1)
     controller = SteeringController(MODEL, (0.0, 0.0))
-    with pytest.raises(ShapeError, match='a look must be x and z'):
+    with pytest.raises(ShapeError, match='a tip measurement must be x and z'):
         controller.next([0.0, 0.0, 0.0])
     done = SteeringController(MODEL, (0.0, 0.0))
     steer(done, SteeredNeedle(*other(1.0)))
