@@ -123,7 +123,7 @@ class Admittance:
         Returns
         -------
         float or None
-            Insertion depth to hold [m]: the last commanded one; None if there is none.
+            Insertion depth to hold [m]: the last commanded depth, or None.
 
         """
         self.velocity, self.answered = 0.0, None

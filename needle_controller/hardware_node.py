@@ -250,7 +250,7 @@ class Driver:
         self._period = Duration(sec=whole, nanosec=part)
 
     def message(self, answer: Answer, load: float, *, stopped: bool) -> Any:
-        """Return the message for a command, see `Robot.command`; None if there is none."""
+        """Return the message for a command, see `Robot.command`, or None."""
         settings, stamp = self._settings, answer.stamp
         kind, joints = settings.command_type, list(settings.joints)
         if kind == 'wrench':

@@ -42,7 +42,7 @@ MARGIN: Final = 1e-6
 #: Periods of unmodeled delay in reserve.
 RESERVE: Final = 1
 
-#: Largest factors on gains and rate in the search for stable ones.
+#: Largest factors on gains and rate in the search for stable gains.
 _MOST_GAIN: Final = 1e6
 _MOST_RATE: Final = 1e3
 
@@ -63,7 +63,7 @@ class Limit:
     plant : Axis
         The true axis.
     cycle : float
-        Amplitude of a limit cycle of dry friction [m] or [rad]; 0 if there is none.
+        Amplitude of a limit cycle of dry friction [m] or [rad]; 0 without a cycle.
 
     """
 
@@ -86,7 +86,7 @@ def transition_matrix(
     Compute the transition matrix of the closed loop over one period, exact for its linear part.
 
     The state is position, velocity, the memory of the law (integral, filtered rate and modeled
-    motion, if its gains use them) and the pending commands; the last ones are known to the law.
+    motion, if its gains use them) and the pending commands; the latest are known to the law.
     The matrix is computed by running the implemented loop on unit states, so that analysis and
     implementation agree.
 

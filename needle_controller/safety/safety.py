@@ -51,7 +51,7 @@ class Safety:
     stops : int
         Number of stops so far.
     rivals : str or None
-        Topics with duplicate publishers of commands or measurements; None if there are none.
+        Topics with duplicate publishers of commands or measurements, or None.
     streams : dict of str to Stream
         Inputs by topic.
     saturation : RateCounter
@@ -140,7 +140,7 @@ class Safety:
 
     def latch(self, reason: str | None) -> bool:
         """
-        Latch a stop for a reason, if there is one; return whether the stop begins now.
+        Latch a stop for a reason, if not None; return whether the stop begins now.
 
         Parameters
         ----------

@@ -85,7 +85,7 @@ class Broyden(OpenLoop):
 
     Each step minimizes the distance of the tip from the target, as predicted by the matrix. The
     source has a horizon of four steps; without a cost of motion its first step is the same for any
-    horizon. Two changes against the source: the first matrix comes from a simulated insertion of
+    horizon. Two changes against the source: the first matrix is from a simulated insertion of
     the nominal needle, and the guide is fixed until tissue holds the needle. Near the skin the tip
     moves with the guide, deeper against it, and a wrong sign drives the guide to its limit,
     without any further correction.

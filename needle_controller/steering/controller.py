@@ -179,10 +179,10 @@ class SteeringController:
     >>> from needle_controller.steering.controller import SteeringController
     >>> from needle_controller.steering.responses import SteeringModel
     >>> from needle_dynamics import SteeredNeedle, STEERING_PRESETS
-    >>> believed, steering, _ = STEERING_PRESETS['bending_35mm']
+    >>> nominal, steering, _ = STEERING_PRESETS['bending_35mm']
     >>> depths = np.linspace(0.0, 0.1, 21)
-    >>> control = SteeringController(SteeringModel(believed, steering, depths), (2e-3, -1e-3))
-    >>> softer = replace(believed, tissue_stiffness=0.8 * believed.tissue_stiffness)
+    >>> control = SteeringController(SteeringModel(nominal, steering, depths), (2e-3, -1e-3))
+    >>> softer = replace(nominal, tissue_stiffness=0.8 * nominal.tissue_stiffness)
     >>> needle = SteeredNeedle(softer, steering, tilt=(0.02, 0.01))
     >>> for depth in depths[1:]:
     ...     x, z, _ = control.next(needle.tip[[0, 2]])

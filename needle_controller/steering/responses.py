@@ -92,7 +92,7 @@ class SteeringModel:
     belief : SteeringBelief
         As given.
     lengths, skins : ndarray, shape (h,)
-        Bending length and skin stiffness of each hypothesis, relative to the nominal ones.
+        Bending length and skin stiffness of each hypothesis, relative to the nominal values.
     guide : ndarray, shape (h, n + 1, n)
         Shift of the tip at each depth per position of the guide in each step.
     causes : ndarray, shape (h, n + 1, 5 + n)

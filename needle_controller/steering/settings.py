@@ -51,8 +51,8 @@ class OuterLoopSettings:
     continuous: bool = field(
         default=False,
         metadata={
-            'description': 'the needle is inserted without rests, and the guide follows its depth; '
-            'else it rests at the end of each step'
+            'description': 'the needle is inserted without rests, and the guide follows its '
+            'depth; else it rests at the end of each step'
         },
     )
     rate: float = constant(20.0, 'Hz', 'continuous: rate of guide commands', low=1.0, high=50.0)
