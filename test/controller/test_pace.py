@@ -1,4 +1,4 @@
-"""Whether another rate is found, and the true one never is."""
+"""The rate monitor detects a wrong rate, without false alarms."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def judged(
     look, newest = 0, (0, 0)
     for before, stamp in pairwise(times):
         if stamp >= look:
-            # What came last before the look.
+            # The last sample before the check.
             pace.add(*newest)
             look = stamp + NANOSECONDS // 20
         newest = stamp, stamp - before
@@ -31,8 +31,8 @@ def judged(
 
 
 @pytest.mark.parametrize(('rate', 'true'), [(1000.0, 500.0), (500.0, 1000.0), (100.0, 125.0)])
-def test_another_rate_is_said(rate: float, true: float) -> None:
-    """With both numbers and what to set, with jitter too."""
+def test_wrong_rate_gives_a_warning(rate: float, true: float) -> None:
+    """The warning has both rates and the correction, with jitter too."""
     rng = np.random.default_rng(1)
     for jitter in (0.0, 0.02):
         said = judged(rate, true, rng, jitter=jitter)
@@ -43,8 +43,8 @@ def test_another_rate_is_said(rate: float, true: float) -> None:
 
 
 @pytest.mark.parametrize('rate', [50.0, 200.0, 1000.0])
-def test_the_true_rate_never_is(rate: float) -> None:
-    """Whatever jitter, lost samples and small differences of clocks there are."""
+def test_correct_rate_gives_no_warning(rate: float) -> None:
+    """For any jitter, lost samples and small clock differences."""
     rng = np.random.default_rng(2)
     for jitter in (0.0, 0.1, 0.45):
         for lost in (0.0, 0.2, 0.4):
@@ -53,8 +53,8 @@ def test_the_true_rate_never_is(rate: float) -> None:
                 assert said is None, (jitter, lost, drift, said)
 
 
-def test_it_takes_a_second_of_samples() -> None:
-    """A few steps say nothing, nor do gaps, nor the same sample seen again."""
+def test_rate_monitor_needs_a_second_of_samples() -> None:
+    """A few steps give no warning, nor do gaps or repeated samples."""
     pace = Pace(100.0, 0.1)
     for k in range(19):
         pace.add(k * 20_000_000, 20_000_000)
