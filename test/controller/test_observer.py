@@ -59,7 +59,7 @@ def phantom(modes: int = 2, **changes: Any) -> NeedleParameters:
 
 class Reference:
     """
-    The linear model that the observer stands on, written densely with matrix exponentials.
+    The linear model of the observer, in dense form with matrix exponentials.
 
     The state is q, p = rho A G q_dot, the impulses of lateral force and moment, the integral of
     the tip deflection, and a lateral force at the tip; depth is frozen at its mean over a sample.
@@ -175,7 +175,7 @@ class Reference:
         return first, np.array(loads)
 
     def remembered(self, loads: FloatArray) -> FloatArray:
-        """Return what loads, shape (3, cases), have left in the memories of the low-pass."""
+        """Return the contribution of loads, shape (3, cases), to the memories of the low-pass."""
         arms = 1.0, self.model.parameters.length
         parts = []
         for c in range(2):
@@ -198,8 +198,8 @@ class Reference:
         """
         Return states (q, p) on the grid, readings of the wrench, and means over windows.
 
-        The last axis of all inputs and results numbers cases, which are run side by side.
-        ``kicks`` has shape (samples, 2, n, cases): the noise at both ends of each sample.
+        The last axis of all inputs and results is the case. ``kicks`` is the noise at both ends of
+        each sample, shape (samples, 2, n, cases).
         """
         n, count, cases = self.n, len(depths) - 1, start.shape[-1]
         x = start.copy()
@@ -465,10 +465,11 @@ def under_tip_force(
     force: float, tip_period: int, late: int, beliefs: ObserverSettings, cases: int, count: int
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """
-    Watch needles at 10 cm that begin to bend under a constant force at the tip.
+    Observe needles at 10 cm that begin to bend under a constant force at the tip.
 
-    The tip comes every ``tip_period`` samples, ``late`` samples after its exposure. Returns error
-    and standard deviation of the tip at the end, NEES, and NIS with its degrees, by case.
+    A tip sample is received every ``tip_period`` samples, ``late`` samples after its exposure.
+    Returns error and standard deviation of the tip at the end, NEES, and NIS with its degrees, by
+    case.
     """
     parameters = phantom()
     reference = Reference(parameters, beliefs)
@@ -571,7 +572,7 @@ def test_tip_latency_corrects_receive_stamps() -> None:
 
 
 class Irregular(Integrator):
-    """The simulated needle with the distributed noise force that the observer believes in."""
+    """The simulated needle with the distributed noise force of the observer model."""
 
     def __init__(
         self, parameters: NeedleParameters, state: FloatArray, size: float, seed: int
@@ -609,7 +610,7 @@ def plant(
     beliefs: ObserverSettings,
     irregularity: float = 0.0,
 ) -> tuple[Plant, float]:
-    """Return the plant with default sensors, as bent as is believed, and a force to move it."""
+    """Return the plant with default sensors, bent by the prior, and a force to move it."""
     rng = np.random.default_rng(seed)
     root, model, n = prior(parameters, beliefs, depth), NeedleModel(parameters), parameters.modes
     start = root @ rng.normal(size=2 * n)
@@ -628,7 +629,7 @@ def plant(
 
 
 def watch_plant(observer: Observer, simulated: Plant, force: float, count: int) -> list[Sample]:
-    """Let the observer see what the plant's sensors report."""
+    """Update the observer by the plant's sensors."""
     needle = simulated.integrator
     observer.reset()
     observer.update(0.0, needle.depth, needle.velocity)
@@ -666,10 +667,10 @@ def test_defaults_of_plant_and_observer_agree() -> None:
 )
 def test_observer_is_consistent_on_the_plant_over_200_runs(name: str, irregularity: float) -> None:
     """
-    NEES, error of the tip and NIS within their bands of 95 % where the needle is as believed.
+    NEES, error of the tip and NIS within their bands of 95 % for the nominal needle.
 
-    The plant moves under a force and has its sensors as they are by default; the observer has
-    its defaults, also where the tissue is as irregular as these say, or not at all.
+    The plant moves under a force with its default sensors; the observer has its defaults, with
+    tissue as irregular as configured, or regular.
     """
     parameters = preset(name)
     # The initial state of the low-pass is a guess: NIS is computed from later samples.
@@ -719,12 +720,12 @@ def simulate(
     **options: Any,
 ) -> tuple[Observer, FloatArray]:
     """
-    Watch the plant with its default force sensor; the tip at 50 Hz, 20 ms late.
+    Observe the plant with its default force sensor; the tip at 50 Hz, 20 ms late.
 
-    Against its friction the bent needle's pull is nothing: the speed is the same all the time.
+    The pull of the bent needle is small against friction: the speed is constant.
 
     Returns the observer, and for every sample NEES, true tip deflection, its estimate, the
-    standard deviation of that, and the last tip sample that has come.
+    standard deviation of the estimate, and the last received tip sample.
     """
     beliefs = ObserverSettings(**options)
     rng = np.random.default_rng([seed, 3])
@@ -768,12 +769,12 @@ def test_low_pass_is_part_of_the_state() -> None:
         assert (error < 5.0 * rows[40:, 3].max()) == consistent
 
 
-def test_fast_modes_keep_their_action_while_the_depth_changes() -> None:
+def test_action_of_fast_modes_is_conserved_while_the_depth_changes() -> None:
     """
-    At 2 cm, where a sample is 2 and 22 turns of the modes, without any noise believed.
+    At 2 cm, where a sample is 2 and 22 periods of the modes, without configured irregularity.
 
-    A change of basis all at once, in whatever phase the modes are, is wrong by a thousandth each
-    time: after 150 samples errors would be ten times as large as said.
+    An abrupt change of basis, at any phase of the modes, has an error of a thousandth each time:
+    after 150 samples the errors would be ten times the predicted ones.
     """
     nees = np.zeros(150)
     for seed in range(10):
@@ -852,7 +853,7 @@ def test_deflection_is_observable(name: str, depth: float, modes: int) -> None:
 
 
 def exact(depth: float, modes: int, **changes: Any) -> tuple[Observer, Integrator]:
-    """Watch the simulated needle with sensors that hardly err."""
+    """Observe the simulated needle with very accurate sensors."""
     parameters = phantom(modes, **changes)
     needle = Integrator(parameters, NeedleModel(parameters).state_at(depth, 1e-3), 2e-6)
     beliefs = ObserverSettings(
@@ -935,7 +936,7 @@ def watch(
     origin: float = 0.0,
     at_once: bool = True,
 ) -> Observer:
-    """Forty samples with a made-up wrench; tips when their time has come, or at the end."""
+    """Forty samples with an artificial wrench; tips at their time, or at the end."""
     observer = Observer(phantom(), ObserverSettings(), PERIOD)
     waiting = list(tips)
     for k in range(41):
