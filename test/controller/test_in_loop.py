@@ -282,7 +282,7 @@ def test_user_defined_law_runs_in_the_loop() -> None:
 
 
 class Blurred:
-    """A controller whose measurements have noise, and whose commands another force besides."""
+    """A controller with measurement noise and an additional force on its commands."""
 
     def __init__(self, controller: Controller, noise: FloatArray) -> None:
         self._controller, self._noise = controller, iter(noise)

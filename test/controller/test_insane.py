@@ -21,7 +21,7 @@ TOPICS = ('joint_states', 'base_wrench', 'tip_deflection', 'target')
 
 
 class Insane(Fault):
-    """Says these numbers in place of the first ones."""
+    """Replaces the first values by these numbers."""
 
     def __init__(self, values: Sequence[float]) -> None:
         self._values = values

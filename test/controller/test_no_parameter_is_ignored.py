@@ -63,7 +63,7 @@ def test_every_parameter_is_read(settings: Any) -> None:
 
 
 def forces(law: str, gains: dict[str, Any], **changes: Any) -> list[float]:
-    """Return what a law commands to a needle that moves in, rests, and is to move out."""
+    """Return the commands of a law to a needle that moves in, rests, and has a goal outside."""
     parameters = NeedleParameters.preset('phantom', **changes)
     controller = Controller(parameters, law, gains=gains)
     controller.set_target(0.05)

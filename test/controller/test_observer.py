@@ -39,7 +39,7 @@ preset = NeedleParameters.preset
 
 PERIOD = 1e-3
 
-#: Longest step of the plant by default [s], and speed at which its needle goes in [m/s].
+#: Longest step of the plant by default [s], and insertion speed [m/s].
 STEP, SPEED = 2e-5, 0.008
 
 #: Needle without a lateral force at the tip, and sensor without offset, as in the plant.
@@ -585,7 +585,7 @@ class Irregular(Integrator):
     def advance(self, duration: float, *inputs: Any, **options: Any) -> Interval:
         n = self.model.modes.count
         if abs(self.depth - self._known) > 1e-3 * self.depth:
-            # G goes with the fifth power of the depth at most: good to half a percent.
+            # G grows at most with the fifth power of the depth: accurate to half a percent.
             self._known = self.depth
             root = cholesky(self.model.modes.integrals(self.depth).gram, lower=True)
             self._root = self._size * np.linalg.inv(root.T)
@@ -774,7 +774,7 @@ def test_action_of_fast_modes_is_conserved_while_the_depth_changes() -> None:
     At 2 cm, where a sample is 2 and 22 periods of the modes, without configured irregularity.
 
     An abrupt change of basis, at any phase of the modes, has an error of a thousandth each time:
-    after 150 samples the errors would be ten times the predicted ones.
+    after 150 samples the errors would be ten times the prediction.
     """
     nees = np.zeros(150)
     for seed in range(10):

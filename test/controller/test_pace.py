@@ -14,7 +14,7 @@ import pytest
 def judged(
     rate: float, true: float, rng: Generator, *, jitter: float = 0.0, lost: float = 0.0
 ) -> str | None:
-    """Return what is said of five seconds of samples, looked at every 50 ms."""
+    """Return the warning after five seconds of samples, checked every 50 ms."""
     pace = Pace(rate, 0.1)
     stamps = np.arange(int(5.0 * true)) / true
     stamps += jitter / true * rng.uniform(-1.0, 1.0, stamps.shape)

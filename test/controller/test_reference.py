@@ -113,7 +113,7 @@ def samples(motion: Callable[..., Any], end: float, count: int = 801) -> tuple[F
 def check_smooth(
     motion: Callable[..., Any], end: float, extra_speed: float = 0.0, extra_ramp: float = 0.0
 ) -> None:
-    """Check that position and speed do not jump and keep the limits, and what a start exceeds."""
+    """Check continuity and limits of position and velocity, with the excess of the start."""
     times, position, speed, _ = samples(motion, end)
     step = times[1]
     top = max(LIMITS.speed, abs(extra_speed))

@@ -13,7 +13,7 @@ from numpy.testing import assert_allclose
 import pytest
 
 NEEDLE, _STEERING, _ = STEERING_PRESETS['bending_35mm']
-#: Two layers, and elements of the same length as those of the model.
+#: Two layers, and elements of the same length as in the model.
 NEEDLE = replace(NEEDLE, layer_depths=(0.03125,), layer_stiffnesses=(4e4,))
 STEERING = replace(_STEERING, skin_stiffness=400.0, bevel_load=(1.0, 0.5), element=1.25e-3)
 DEPTHS = np.linspace(0.005, 0.08, 16)
