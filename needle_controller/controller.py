@@ -99,11 +99,6 @@ class ControllerSettings:
         parameters : NeedleParameters
             The needle.
 
-        Returns
-        -------
-        tuple of float
-            Both depths [m].
-
         Raises
         ------
         ParameterError

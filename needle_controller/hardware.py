@@ -305,11 +305,6 @@ class Robot:
         position : float
             Position of the joint, in its unit.
 
-        Returns
-        -------
-        float
-            Insertion depth [m].
-
         """
         return self._gain * (position - self.settings.zero)
 

@@ -138,11 +138,6 @@ def spectral_radius(law: Law, delay: int, unmodeled: int = 0, plant: Axis | None
     law, delay, unmodeled, plant
         As for `transition_matrix`.
 
-    Returns
-    -------
-    float
-        Spectral radius.
-
     """
     matrix = transition_matrix(law, delay, unmodeled, plant)
     return float(np.abs(np.linalg.eigvals(matrix)).max())

@@ -214,11 +214,6 @@ class Supervisor:
         now : int
             Time [ns].
 
-        Returns
-        -------
-        Answer
-            Zero force.
-
         """
         if self.controller is not None:
             self.controller.forget()
@@ -387,11 +382,6 @@ class Supervisor:
         ----------
         now : int
             Time [ns].
-
-        Returns
-        -------
-        Reply
-            Success, and zero force.
 
         """
         self.requests.supersede(now)
@@ -758,15 +748,6 @@ class Supervisor:
         ----------
         now : int
             Time [ns].
-
-        Returns
-        -------
-        severity : Severity
-            Severity of the state.
-        held : str or None
-            The fault.
-        values : dict
-            Values by name.
 
         """
         values: dict[str, object] = {}

@@ -54,11 +54,6 @@ class Uncertainty:
         carriage : bool
             Whether the axis may carry the carriage.
 
-        Returns
-        -------
-        list of Axis
-            The axes.
-
         """
         extra = [part * self.carriage for part in _PARTS if carriage and self.carriage > 0.0]
         inertias = [*_bounds(axis.inertia, self.inertia)]

@@ -58,11 +58,6 @@ class Guard:
         topic : str
             The topic.
 
-        Returns
-        -------
-        bool
-            Whether it is.
-
         """
         return topic in self._beyond
 

@@ -129,11 +129,6 @@ class Safety:
         now : int
             Time now [ns].
 
-        Returns
-        -------
-        float
-            Step back [s].
-
         """
         back, self._seen = self._seen - now, now
         return back / NANOSECONDS if back > self._back else 0.0
@@ -146,11 +141,6 @@ class Safety:
         ----------
         reason : str or None
             The reason.
-
-        Returns
-        -------
-        bool
-            Whether the stop begins now.
 
         """
         if reason is None or self.stop is not None:
@@ -253,11 +243,6 @@ class Safety:
         now : int
             Time [ns].
 
-        Returns
-        -------
-        list of str
-            The lines.
-
         """
         silent = self._silent(now)
         lines = [line for name, line in silent.items() if name not in self._stale]
@@ -304,11 +289,6 @@ class Safety:
         ----------
         now : int
             Time [ns].
-
-        Returns
-        -------
-        dict
-            Values by name.
 
         """
         return {

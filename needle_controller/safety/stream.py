@@ -187,11 +187,6 @@ class Stream:
         now : int
             Time [ns].
 
-        Returns
-        -------
-        float
-            Silence [s].
-
         """
         return (now - self.counted) / NANOSECONDS if self.counted is not None else 0.0
 
@@ -203,11 +198,6 @@ class Stream:
         ----------
         now : int
             Time [ns].
-
-        Returns
-        -------
-        str
-            The line.
 
         """
         refused = {

@@ -929,15 +929,6 @@ class OuterLoop:
         now : int
             Time [ns].
 
-        Returns
-        -------
-        severity : Severity
-            Severity of the state.
-        state : str
-            Description for the user.
-        values : dict
-            Values by name.
-
         """
         values, warning = self._describe_control()
         if self._seen is not None:

@@ -115,17 +115,12 @@ class OuterLoopSettings:
 
     def farthest(self, step: float) -> float:
         """
-        Return the largest change of the guide from one step to the next along each axis.
+        Return the largest change of the guide per step along each axis [m].
 
         Parameters
         ----------
         step : float
             Insertion distance of a step [m].
-
-        Returns
-        -------
-        float
-            The change [m].
 
         """
         if not self.continuous:
