@@ -1,7 +1,7 @@
 """
 Control of a flexible needle: laws, references, observer, stability, safety, and closed loops.
 
-Units are SI throughout; signs and frames are those of docs/architecture.md.
+Units are SI throughout; signs and frames follow docs/architecture.md.
 """
 
 from needle_controller.admittance import Admittance

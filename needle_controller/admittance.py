@@ -1,4 +1,4 @@
-"""Admittance: turns the force of a law into positions, for a robot that takes nothing else."""
+"""Admittance: converts the force of a law to positions, for a position-controlled robot."""
 
 from __future__ import annotations
 
@@ -7,22 +7,22 @@ from typing import Final
 from needle_controller.laws.axis import Axis
 from needle_ros.timing import NANOSECONDS
 
-#: Longest time of one step, in periods: time that samples were missing is not made up.
+#: Longest time of one step, in periods: missing samples are not made up for.
 _LONGEST: Final = 2.0
 
 
 class Admittance:
     r"""
-    A virtual needle base, driven by the force of a law; where it goes, the robot is sent.
+    Virtual needle base that is driven by the force of a law and commands the robot's position.
 
-    The base has the inertia and the friction that the law believes in, so that the law sees the
-    plant that it was made for:
+    The base has the inertia and the friction of the nominal model, so that the law controls its
+    nominal plant:
 
     .. math:: M \dot{v} = f - \mu_v v - \mu_s(v)
 
     Each step is the exact flow under a constant force, in which Coulomb friction is set-valued: a
-    force below friction holds the position, and a constant one leads to the speed
-    :math:`(f - \mu_s) / \mu_v`. The base never gives more energy than it was given.
+    force below friction holds the position, and a constant larger one leads to the velocity
+    :math:`(f - \mu_s) / \mu_v`. The base is passive.
 
     Parameters
     ----------
@@ -33,16 +33,16 @@ class Admittance:
     speed : float
         Largest speed of the base [m/s].
     lead : float
-        Farthest that the command may be from the measurement [m].
+        Largest distance of the command from the measurement [m].
     depths : tuple of float
-        Least and largest inserted length to command [m].
+        Least and largest insertion depth to command [m].
 
     Attributes
     ----------
     axis : Axis
         As given; it may be exchanged between steps.
     position : float or None
-        Inserted length that the robot is sent to [m]; None before the first step.
+        Commanded insertion depth [m]; None before the first step.
     velocity : float
         Velocity of the base [m/s].
     answered : int or None
@@ -76,27 +76,27 @@ class Admittance:
         self._low, self._high = depths
         self.position: float | None = None
         self.velocity = 0.0
-        #: What the robot was last measured at [m].
+        #: Last measured insertion depth [m].
         self._measured = 0.0
         self.answered: int | None = None
 
     def step(self, force: float, measured: float, stamp: int) -> float:
         """
-        Move under a force until the next sample; a stamp that was answered changes nothing.
+        Move under a force until the next sample; a repeated stamp changes nothing.
 
         Parameters
         ----------
         force : float
             Force on the base, less known loads [N].
         measured : float
-            Inserted length at which the robot is [m].
+            Measured insertion depth of the robot [m].
         stamp : int
             Time of the measurement [ns].
 
         Returns
         -------
         float
-            Inserted length to send the robot to [m].
+            Insertion depth to command [m].
 
         """
         before = measured if self.position is None else self.position
@@ -109,7 +109,7 @@ class Admittance:
         aim, velocity = self.axis.propagate(before, self.velocity, force, elapsed)
         velocity = min(max(velocity, -most), most)
         aim = min(max(aim, before - most * elapsed), before + most * elapsed)
-        # It goes no farther out of the range, wherever it is.
+        # A base outside the range does not move further out.
         within = min(max(aim, min(self._low, before)), max(self._high, before))
         within = min(max(within, measured - self._lead), measured + self._lead)
         self.velocity = velocity if within == aim else 0.0
@@ -118,12 +118,12 @@ class Admittance:
 
     def hold(self) -> float | None:
         """
-        Come to rest at once.
+        Stop the base at once.
 
         Returns
         -------
         float or None
-            Inserted length at which the robot shall stay [m]: the last one; None if there is none.
+            Insertion depth to hold [m]: the last commanded depth, or None.
 
         """
         self.velocity, self.answered = 0.0, None
@@ -131,7 +131,7 @@ class Admittance:
 
     def give_way(self) -> float | None:
         """
-        Come to rest where the robot was last measured, so that it no longer pushes.
+        Stop the base at the last measured position of the robot, so that it no longer pushes.
 
         Returns
         -------

@@ -1,4 +1,4 @@
-"""What a supervisor says to command, and how it answers a service."""
+"""Force command of the axial supervisor, and the result of a service call."""
 
 from __future__ import annotations
 
@@ -7,18 +7,18 @@ from typing import NamedTuple
 
 class Answer(NamedTuple):
     """
-    What to command now.
+    Force command in response to a measurement.
 
     Attributes
     ----------
     stamp : int
-        Stamp of the measurement that it answers; the time now if it answers none [ns].
+        Stamp of the measurement that it answers; the present time if it answers none [ns].
     force, torque : float
         Insertion force [N] and torque [N m].
     reference : tuple of float
-        Inserted length [m] and velocity [m/s] that it aims at; empty without a motion.
+        Reference of insertion depth [m] and velocity [m/s]; empty without a motion.
     error : tuple of float
-        The reference less the measurement; empty without a motion.
+        Reference minus measurement; empty without a motion.
 
     """
 
@@ -30,7 +30,7 @@ class Answer(NamedTuple):
 
 
 class Reply(NamedTuple):
-    """The answer of a service, and what to command now, if anything."""
+    """Result of a service call, with a force command to publish or None."""
 
     success: bool
     message: str

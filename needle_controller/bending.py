@@ -1,4 +1,4 @@
-"""What is known of the bending of the needle, and the load that it adds to the insertion."""
+"""Load of the bent needle on the insertion axis, from an observer or from the simulation."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from needle_ros.errors import ParameterError
 from needle_ros.timing import NANOSECONDS
 import numpy as np
 
-#: Samples between two looks at the consistency of the observer.
+#: Samples between two consistency checks of the observer.
 _LOOK: Final = 25
 
 
 class Bending:
     """
-    The load of the bent needle: from an observer, from the simulation, or zero.
+    Load of the bent needle: estimated by an observer, from the simulation, or zero.
 
     Stamps are integers in ns.
 
@@ -29,14 +29,14 @@ class Bending:
     observer : Observer, optional
         Estimates the bending from tip and wrench.
     largest : float
-        Load that no needle has [N]; an observer that says so is started anew.
+        Largest plausible load [N]; the observer is restarted above it.
 
     Attributes
     ----------
     load : float
-        Force against insertion [N]; zero where it is not known, or the observer is doubtful.
+        Force against insertion [N]; zero if it is unknown or the observer is inconsistent.
     warning : str or None
-        Why the observer is doubtful.
+        Why the observer is inconsistent.
     model : NeedleModel
         The needle, for the load of a true state.
     observer : Observer or None
@@ -55,43 +55,26 @@ class Bending:
         self.forget()
 
     def forget(self) -> None:
-        """Know nothing of what was measured."""
+        """Discard all measurements."""
         self.load = 0.0
         self.warning: str | None = None
         self._updates = 0
-        #: Stamp, lateral force and moment of the last wrench that no measurement has taken.
+        #: Stamp, lateral force and moment of the last wrench that waits for the encoders.
         self._waiting: tuple[int, float, float] | None = None
         if self.observer is not None:
             self.observer.reset()
 
     def take_tip(self, stamp: int, deflection: float) -> None:
-        """
-        Take in the deflection of the tip [m].
-
-        Parameters
-        ----------
-        stamp : int
-            Its stamp [ns].
-        deflection : float
-            Deflection of the tip [m].
-
-        """
+        """Add a deflection of the tip [m] with its stamp [ns]."""
         if self.observer is not None:
             self.observer.add_tip(stamp / NANOSECONDS, deflection)
 
     def take_wrench(self, stamp: int, lateral: float, moment: float, measured: int) -> None:
         """
-        Take in force [N] and moment [N m]; one newer than the encoders waits for them.
+        Add lateral force along z [N] and moment about x at the base without the torque [N m].
 
-        Parameters
-        ----------
-        stamp : int
-            Its stamp [ns].
-        lateral, moment : float
-            Force along z [N], and moment about x at the base [N m] without the torque.
-        measured : int
-            Stamp of the newest encoder sample [ns].
-
+        A wrench newer than the latest encoder sample, at ``measured`` [ns], waits for the
+        encoders.
         """
         if self.observer is None:
             return
@@ -102,43 +85,23 @@ class Bending:
 
     def take_truth(self, state: Sequence[float]) -> None:
         """
-        Take the load from a true state, or raise NeedleError if it has none.
+        Set the load from a true state, shape (2 (2 + n),), SI units.
 
-        Parameters
-        ----------
-        state : sequence of float, shape (2 (2 + n),)
-            State of the simulation, SI units.
-
-        Raises
-        ------
-        NeedleError
-            If the state has no load.
-
+        Raises NeedleError if the state has no valid load.
         """
         self.load = 0.0
-        # What is finite may be too large all the same.
+        # Finite states may overflow.
         with np.errstate(over='ignore', invalid='ignore'):
             load = -float(self.model.bias_forces(state)[0])
         if not abs(load) <= self._largest:
-            raise ParameterError(f'such a needle has a load of {load:.3g} N')
+            raise ParameterError(f'implausible load of {load:.3g} N')
         self.load = load
 
     def update(self, stamp: int, measured: Measurement) -> None:
         """
-        Take in the encoders and the wrench of the same stamp, or raise NeedleError.
+        Update the observer with an encoder sample and the wrench of the same stamp [ns].
 
-        Parameters
-        ----------
-        stamp : int
-            Stamp of the encoder sample [ns].
-        measured : Measurement
-            The encoders.
-
-        Raises
-        ------
-        NeedleError
-            If the observer cannot take it.
-
+        Raises NeedleError if the observer rejects the sample.
         """
         observer, wrench = self.observer, self._waiting
         if observer is None:
@@ -154,24 +117,24 @@ class Bending:
         if not abs(observer.load) <= self._largest:
             load = observer.load
             self.forget()
-            raise ParameterError(f'a load of {load:.3g} N is absurd; the observer started anew')
+            raise ParameterError(f'implausible load estimate of {load:.3g} N; observer restarted')
         if self.warning is None:
             self.load = observer.load
 
     def _judge(self, observer: Observer) -> None:
-        """See whether the errors of the observer are as large as it says."""
-        # What it begins with is a guess, and counts as long as the history has it.
+        """Check the consistency of the observer (NIS)."""
+        # The initial state is a guess, and affects the NIS while the history contains it.
         known = self._updates * observer.period > 1.2 * observer.settings.history
         nis = observer.nis
         self.warning = None
         if known and nis.doubtful:
             self.warning = (
-                f'the observer does not explain what is measured: NIS is {nis.ratio:.2f} '
+                f'the observer is inconsistent with the measurements: NIS is {nis.ratio:.2f} '
                 f'instead of 1; the load of the bent needle is not used'
             )
 
     def describe(self) -> dict[str, object]:
-        """Return what diagnostics say of the observer, if there is one that has begun."""
+        """Return the diagnostics of the observer; empty before its first estimate."""
         observer = self.observer
         if observer is None or not observer.ready:
             return {}

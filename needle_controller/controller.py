@@ -1,4 +1,4 @@
-"""The controller as an object: reference, laws and limits, one command per measurement."""
+"""Axial controller: reference, control laws and limits; one command per measurement."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ DEFAULT_GAINS: Final[Mapping[str, Mapping[str, Gains]]] = {
     'pid': {'insertion': PidGains(), 'rotation': PidGains(kp=2.1e-7, ki=0.0, kd=2.1e-8)},
 }
 
-#: The law that kinds of gains are for.
+#: Law of each class of gains.
 LAW_OF: Final[Mapping[type[Gains], type[Law]]] = {
     AdaptiveGains: Adaptive,
     InverseDynamicsGains: InverseDynamics,
@@ -62,8 +62,8 @@ class ControllerSettings:
         0.1, 's', 'age from which a measurement is stale', open_low=True
     )
     jump: float = constant(
-        2e-3, 'm', 'displacement, at once or within 2 s, that the measured speed does not explain '
-        'and that counts as a fault; after one of this size during a fault the target is cleared',
+        2e-3, 'm', 'displacement, at once or within 2 s, that is inconsistent with the measured '
+        'velocity and is a fault; a displacement of this size during a fault clears the target',
         open_low=True,
     )  # fmt: skip
     stability_margin: float = constant(
@@ -72,14 +72,14 @@ class ControllerSettings:
     rotation: bool = field(
         default=True,
         metadata={
-            'description': 'whether the robot turns the needle; without it the torque is zero'
+            'description': 'whether the robot rotates the needle; if false, the torque is zero'
         },
     )
     lowest_depth: float = constant(
-        0.0, 'm', 'least inserted length to control; minimum_depth if that is larger'
+        0.0, 'm', 'least insertion depth to control; minimum_depth if that is larger'
     )
     highest_depth: float = constant(
-        10.0, 'm', 'largest inserted length to control; the needle length if that is smaller',
+        10.0, 'm', 'largest insertion depth to control; the needle length if that is smaller',
         open_low=True,
     )  # fmt: skip
 
@@ -92,17 +92,12 @@ class ControllerSettings:
 
     def depths(self, parameters: NeedleParameters) -> tuple[float, float]:
         """
-        Return the least and largest inserted length to control a needle [m].
+        Return the least and largest insertion depth to control [m].
 
         Parameters
         ----------
         parameters : NeedleParameters
             The needle.
-
-        Returns
-        -------
-        tuple of float
-            Both lengths [m].
 
         Raises
         ------
@@ -131,11 +126,11 @@ class Measurement:
     time : float
         Time of the sample [s].
     depth, speed : float
-        Inserted length [m] and insertion speed [m/s], positive into the tissue.
+        Insertion depth [m] and insertion velocity [m/s], positive into the tissue.
     angle, angular_speed : float
-        Rotation of the base about x [rad], [rad/s].
+        Rotation of the base about x [rad] and its velocity [rad/s].
     force : float
-        Axial force on the needle as the robot reports it [N]; NaN if it does not.
+        Axial force on the needle as reported by the robot [N]; NaN if it is not reported.
 
     """
 
@@ -152,7 +147,7 @@ class Measurement:
         return insertion and isfinite(self.angle) and isfinite(self.angular_speed)
 
 
-#: Time over which positions and speeds are compared [s].
+#: Time over which positions and velocities are compared [s].
 _MEMORY: Final = 2.0
 
 #: Setpoint of a command without a reference.
@@ -162,7 +157,7 @@ NO_SETPOINT: Final = Setpoint(nan)
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Command:
     """
-    The answer of a controller to a measurement.
+    Command of a controller in response to a measurement.
 
     Attributes
     ----------
@@ -171,7 +166,7 @@ class Command:
     torque : float
         tau about x [N m].
     setpoint : Setpoint
-        Reference of the inserted length at the time of the measurement; NaN without one.
+        Reference of the insertion depth at the time of the measurement; NaN without a reference.
     fault : str or None
         Why no force is commanded.
     notice : str or None
@@ -192,34 +187,34 @@ class Command:
 
 class Controller:
     """
-    Drives the needle to a target depth or along a path.
+    Drive the needle to a target depth or along a path of depths.
 
     Parameters
     ----------
     parameters : NeedleParameters
-        Needle and tissue as the controller believes them to be.
+        Nominal needle and tissue.
     law : str
         Control law, one of `LAWS`.
     gains : Mapping[str, Mapping[str, Gains]], optional
-        Gains by law and axis, such as ``{'pid': {'insertion': PidGains(kp=2000.0)}}``. What is
-        missing has the values of `DEFAULT_GAINS`.
+        Gains by law and axis, such as ``{'pid': {'insertion': PidGains(kp=2000.0)}}``. Missing
+        gains have the values of `DEFAULT_GAINS`.
     settings : ControllerSettings, optional
         Rate, delay and limits.
     reference : str
-        Motion to a target, a key of `REFERENCES`.
+        Reference generator, a key of `REFERENCES`.
     limits : ReferenceLimits, optional
         Limits of the reference.
     uncertainty : Uncertainty, optional
-        How far the needle may be from its constants: the gains shall be stable for all of that.
+        Uncertainty of the nominal constants; the gains must be stable within it.
 
     Attributes
     ----------
     parameters, law, settings
         As given.
     guide : Guide
-        The reference: targets, paths, pauses.
+        The reference generator: targets, paths, pauses.
     limits : dict of str to Limit
-        What limits the stability of each axis.
+        Stability limit of each axis.
     period : float
         Sample period [s].
     delay : int
@@ -269,7 +264,7 @@ class Controller:
     def _checked(
         self, name: str, parameters: NeedleParameters, gains: Mapping[str, Mapping[str, Gains]]
     ) -> tuple[list[Law], dict[str, Limit]]:
-        """Return the laws and what limits them, or reject unstable gains."""
+        """Return the laws and their stability limits; reject unstable gains."""
         if name not in LAWS:
             raise ParameterError(f'unknown law {name!r}; valid: {", ".join(LAWS)}')
         require_complete(parameters)
@@ -300,7 +295,7 @@ class Controller:
         """
         Continue with other constants, gains or another law; target, reference and memory stay.
 
-        During a motion the first forces are the last ones again.
+        During a motion the switch is bumpless: the force is continuous.
 
         Parameters
         ----------
@@ -309,7 +304,7 @@ class Controller:
         law : str, optional
             Control law.
         gains : Mapping[str, Mapping[str, Gains]], optional
-            Gains by law and axis; what is missing stays.
+            Gains by law and axis; missing gains stay.
 
         Raises
         ------
@@ -330,22 +325,22 @@ class Controller:
 
     @property
     def target(self) -> float | None:
-        """Inserted length to reach [m]; None without a target."""
+        """Target insertion depth [m]; None without a target."""
         return self.guide.target
 
     @property
     def learned(self) -> dict[str, tuple[float, float]]:
-        """Learned friction of insertion beyond the model; see `SampledLoop.learned`."""
+        """Learned correction of the insertion friction; see `SampledLoop.learned`."""
         return self._insertion.learned
 
     def set_target(self, depth: float) -> None:
         """
-        Go to an inserted length [m]; see `Guide.aim`.
+        Set the target insertion depth; see `Guide.aim`.
 
         Parameters
         ----------
         depth : float
-            Inserted length [m].
+            Insertion depth [m].
 
         Raises
         ------
@@ -354,7 +349,7 @@ class Controller:
 
         """
         self.guide.aim(depth)
-        # A target that is given now counts, wherever the needle has been.
+        # A new target is valid, also if the needle has moved before.
         self._last_depth = None
 
     def follow(
@@ -364,7 +359,7 @@ class Controller:
         speeds: Sequence[float] | None = None,
     ) -> None:
         """
-        Follow a path of inserted lengths from now on; see `Guide.follow`.
+        Follow a path of insertion depths from now on; see `Guide.follow`.
 
         Parameters
         ----------
@@ -381,21 +376,21 @@ class Controller:
         self._last_depth = None
 
     def forget(self) -> None:
-        """Forget target, motion and the memory of the laws."""
+        """Discard target, motion and the memory of the laws."""
         self.guide.forget()
         self._insertion.reset()
         self._rotation.reset()
         self._seen: Measurement | None = None
-        #: Displacement that the speeds of the last seconds do not explain [m].
+        #: Displacement unexplained by the velocities of the last seconds [m].
         self._unexplained = 0.0
         self._last_depth = None
         self._stopped = False
 
     def release(self) -> None:
         """
-        Forget the motion: the next measurement starts a new one from where the needle is.
+        Discard the motion: the next measurement starts a new one from the measured depth.
 
-        Integrals stay as they are while nothing is commanded.
+        Integrals are frozen while no force is commanded.
         """
         self.guide.release()
         self._insertion.stop()
@@ -403,7 +398,7 @@ class Controller:
         self._stopped = True
 
     def unwind(self) -> None:
-        """Forget what the laws have integrated; for a time when their force has no effect."""
+        """Reset the integrals of the laws, for times when their force has no effect."""
         self._insertion.unwind()
         self._rotation.unwind()
 
@@ -414,7 +409,7 @@ class Controller:
         return 0.0 if 0.0 <= elapsed <= most else elapsed
 
     def _fault(self, measured: Measurement, gap: float) -> str | None:
-        """Return why a measurement that comes after a gap [s], or none, cannot be answered."""
+        """Return why a measurement after a gap [s], or without, is rejected; or None."""
         if not measured.is_finite():
             return f'joint_states must be finite, got {measured}'
         before, self._seen = self._seen, measured
@@ -425,14 +420,14 @@ class Controller:
         moved = measured.depth - before.depth
         rest = moved - 0.5 * (before.speed + measured.speed) * elapsed
         if not abs(rest) <= jump:
-            # It is there now; the next ones may well be good.
+            # The position jumped; the next measurements may be consistent.
             self._unexplained = 0.0
             return (
                 f'insertion moved by {moved:.6g} m in {elapsed:.6g} s at speeds of '
                 f'{before.speed:.6g} and {measured.speed:.6g} m/s'
             )
         unexplained = exp(-elapsed / _MEMORY) * self._unexplained + rest
-        # No more than it takes: as soon as position and speed agree again it is well.
+        # Clipped, so that the fault ends as soon as position and velocity agree again.
         self._unexplained = min(max(unexplained, -jump), jump)
         if abs(unexplained) > jump:
             return (
@@ -453,9 +448,9 @@ class Controller:
         Returns
         -------
         Command
-            Zero force without a target, or with the fault of the measurement: it is not finite,
-            or the needle moved by more than its speed explains. After a gap or a step back in
-            time the motion starts again from where the needle is.
+            Zero force without a target, or on a fault of the measurement: a value is not finite,
+            or the displacement is inconsistent with the velocity. After a gap or a step back in
+            time the motion restarts from the measured depth.
 
         """
         notice = None
@@ -487,7 +482,7 @@ class Controller:
         )
 
     def _returned(self, measured: Measurement) -> str | None:
-        """Clear the target if the needle has moved during a fault; return a message then."""
+        """Clear the target if the needle moved during a fault; return a message then."""
         last, self._last_depth = self._last_depth, measured.depth
         moved = abs(measured.depth - last) if last is not None else 0.0
         elsewhere = self._stopped and moved > self.settings.jump and self.target is not None

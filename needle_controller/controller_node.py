@@ -1,4 +1,4 @@
-"""Node `controller`: turns encoder readings and a target into forces on the needle."""
+"""Node `controller`: compute needle forces from encoder measurements and a target."""
 
 from __future__ import annotations
 
@@ -43,17 +43,17 @@ from trajectory_msgs.msg import JointTrajectory
 
 _RETRACT = 'retract_depth'
 
-#: Where to retract to by default [m], or as near to it as the range of depths has.
+#: Default retract depth [m], limited to the range of depths.
 _RETRACT_DEPTH = 0.01
 
-#: Number of times that the last command is repeated at deactivation, because the driver may have
-#: no timeout, and time between them [s].
+#: Number of repetitions of the last command at deactivation, because the driver may have no
+#: timeout, and time between them [s].
 _AGAIN, _PAUSE = 5, 0.02
 
-#: Checks without joint states until that is logged.
+#: Checks without joint states before a warning is logged.
 _PATIENCE = 20
 
-#: Joints that no axis law moves.
+#: Joints that no axis law controls.
 _GUIDE = {joint.name for joint in contract.STEERING_JOINTS}
 
 #: Sources of the load of the bent needle.
@@ -62,15 +62,15 @@ FEEDBACKS = ('observer', 'ground_truth', 'none')
 
 class ControllerNode(ModelNode):
     """
-    Answers each ``joint_states`` with a ``wrench_command`` (force.y [N], torque.x [N m]).
+    Answer each ``joint_states`` with a ``wrench_command`` (force.y [N], torque.x [N m]).
 
-    ``target`` (point.y [m]) is the inserted length to reach, ``joint_trajectory`` (joint
-    `insertion`: positions, and velocities or none) a path to follow. With ``steered`` a target is
-    for the node `steering`, and only paths are followed. The command is zero before
-    the first of them, while measurements are stale, jump or are not finite, and while another node
-    commands too. It is also zero from ``~/emergency_stop`` or a measurement beyond a limit until
-    ``~/clear_stop``. It carries the stamp of the measurement that it answers; one that answers
-    none is of now. ``~/pause`` brakes the reference and holds it, ``~/retract`` goes to
+    ``target`` (point.y [m]) is the target insertion depth, ``joint_trajectory`` (joint
+    `insertion`: positions, and velocities or none) a path to follow. With ``steered`` only paths
+    are followed, and targets are executed by the node `steering`. The command is zero before the
+    first target or path, while measurements are stale, jump or are not finite, and while another
+    node publishes commands. It is also zero from ``~/emergency_stop`` or a measurement beyond a
+    limit until ``~/clear_stop``. It has the stamp of the measurement that it answers, otherwise
+    the present time. ``~/pause`` brakes the reference and holds it, ``~/retract`` moves to
     ``retract_depth``. ``reference`` and ``tracking_error`` are the reference and its error.
 
     An observer estimates the load of the bent needle from ``tip_deflection`` and ``base_wrench``,
@@ -116,13 +116,15 @@ class ControllerNode(ModelNode):
             f'one of {", ".join(FEEDBACKS)} (ground_truth: simulation only)',
         )
         self.declare_text(
-            'steered', False, 'targets are for the node steering: only trajectories are followed'
+            'steered',
+            False,
+            'targets are executed by the node steering: only trajectories are followed',
         )
         self.declare_parameter(
             _RETRACT,
             _RETRACT_DEPTH,
             ParameterDescriptor(
-                description='inserted length to retract to [m]', dynamic_typing=True
+                description='insertion depth of ~/retract [m]', dynamic_typing=True
             ),
         )
         self.declare_settings('', ControllerSettings())
@@ -138,7 +140,7 @@ class ControllerNode(ModelNode):
 
         self._supervisor = supervisor = Supervisor()
         self._truths: Subscription | None = None
-        #: Adapter of a robot with topics of its own; why it could not be created.
+        #: Adapter of a robot with its own topics; the error if it could not be created.
         self._driver: Driver | None = None
         self._no_driver: NeedleError | None = None
         self._hardware = HardwareSettings()
@@ -154,7 +156,7 @@ class ControllerNode(ModelNode):
         self._serve(Trigger, 'clear_stop', lambda _: supervisor.clear_stop(self.now()))
         self._serve(SetBool, 'pause', lambda request: supervisor.pause(request.data))
         self._serve(Trigger, 'retract', lambda _: supervisor.retract(self.now()))
-        #: A clock that stands still or jumps does not stop the watchdog.
+        #: A stopped or jumping ROS clock does not stop the watchdog.
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
 
     def _connect(self) -> None:
@@ -192,7 +194,7 @@ class ControllerNode(ModelNode):
         """Create the controller from the parameters; reject unstable gains."""
         if self.settings('hardware.', HardwareSettings) != self._hardware:
             raise ParameterError(
-                'hardware.* is read when the node starts: give it on its command line or in its '
+                'hardware.* is read when the node starts: set it on the command line or in the '
                 'parameter file'
             )
         if self._no_driver is not None:
@@ -263,7 +265,7 @@ class ControllerNode(ModelNode):
             self._truths = None
 
     def activate(self) -> None:
-        """Begin to answer measurements and to watch for their absence."""
+        """Start to answer measurements and to check for missing inputs."""
         self._supervisor.activate(self.now(), self._who_publishes())
         self._looks, self._missing = 0, ''
         self._watchdog = self.create_timer(
@@ -295,7 +297,7 @@ class ControllerNode(ModelNode):
     # Inputs.
 
     def _passing(self, take: Callable[[Reading, int], Answer | None]) -> Callable[[Reading], None]:
-        """Return a callback that passes a measurement on, and publishes the command."""
+        """Return a callback that processes a measurement and publishes the command."""
 
         def on_reading(reading: Reading) -> None:
             self._act(take(reading, self.now()))
@@ -303,7 +305,7 @@ class ControllerNode(ModelNode):
         return on_reading
 
     def _serve(self, kind: Any, name: str, act: Callable[[Any], Reply]) -> None:
-        """Offer a service that executes a request, and publishes the command."""
+        """Offer a service that executes a request and publishes the command."""
 
         def on_request(request: Any, response: Any) -> Any:
             response.success, response.message, answer = act(request)
@@ -324,9 +326,9 @@ class ControllerNode(ModelNode):
 
     def _on_trajectory(self, message: JointTrajectory) -> None:
         if message.joint_names and {*message.joint_names} <= _GUIDE:
-            # The guide of a steered needle is moved by the plant.
+            # The plant moves the guide of a steered needle.
             return
-        # One more than permitted is enough to reject it.
+        # One point above the limit is enough to reject it.
         points = message.points[: MOST_POINTS + 1]
         self._act(
             self._supervisor.trajectory(
@@ -352,7 +354,7 @@ class ControllerNode(ModelNode):
                 self._look_for(self._driver)
 
     def _look_for(self, driver: Driver) -> None:
-        """Log why no joint states are received, once each reason, after discovery."""
+        """Log why no joint states are received, each reason once, after discovery."""
         self._looks += 1
         missing = driver.missing() if self._looks > _PATIENCE else ''
         if missing != self._missing:

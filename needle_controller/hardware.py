@@ -1,4 +1,4 @@
-"""A robot whose driver does not know the contract: what it says, and what it is told."""
+"""Adapter for robot drivers with their own topics, joints and units."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from needle_ros.settings import check_constants, constant
 from needle_ros.timing import NANOSECONDS
 from needle_ros.wire import Reading
 
-#: What the robot is told.
+#: Kinds of joint commands.
 EFFORT: Final = 'effort'
 POSITION: Final = 'position'
 COMMANDS: Final = (EFFORT, POSITION)
 
-#: Stands for the name of the topic, if there is one of its type.
+#: Selects the only topic of its type.
 BY_TYPE: Final = 'auto'
 
-#: By which messages it is told, and what says where it is; the first is that of the contract.
+#: Message types of commands and joint states; the first is the type of the contract.
 COMMAND_TYPES: Final = {
     'wrench': 'geometry_msgs/msg/WrenchStamped',
     'float64_multi_array': 'std_msgs/msg/Float64MultiArray',
@@ -38,12 +38,12 @@ STATE_TYPES: Final = {
     'dynamic_joint_state': 'control_msgs/msg/DynamicJointState',
 }
 
-#: When a measurement was taken: as its header says, or when it came.
+#: Source of measurement stamps: message header or receive time.
 STAMPS: Final = ('header', 'receive')
 
 _AXES: Final = 'xyz'
 
-#: Time constant of an estimated velocity, and from which gap on it begins anew [s].
+#: Time constant of an estimated velocity, and the gap after which it restarts [s].
 _FILTER: Final = 5e-3
 _GAP: Final = 0.1
 
@@ -57,19 +57,19 @@ def _text(default: str, description: str) -> Any:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class HardwareSettings:
-    """How the driver of a robot is read and commanded; the defaults are the contract."""
+    """Joints, units, topics and commands of a robot driver; the defaults are the contract."""
 
-    joint: str = _text(INSERTION, 'joint that inserts the needle')
+    joint: str = _text(INSERTION, 'insertion joint of the robot')
     sign: float = constant(
-        1.0, '1', '1 if the position of the robot grows into the tissue, else -1', low=-1.0,
+        1.0, '1', '1 if the position of the robot increases into the tissue, else -1', low=-1.0,
         high=1.0,
     )  # fmt: skip
     scale: float = constant(
-        1.0, 'm', 'inserted length per unit of the position of the robot: 1e-3 for mm',
+        1.0, 'm', 'insertion depth per unit of the position of the robot: 1e-3 for mm',
         open_low=True,
     )  # fmt: skip
     zero: float = constant(
-        0.0, 'unit of the robot', 'position of the robot at inserted length 0', low=-1e9, high=1e9
+        0.0, 'unit of the robot', 'position of the robot at insertion depth 0', low=-1e9, high=1e9
     )
     state_topic: str = _text(
         '', f'topic of the joint states; empty: joint_states; {BY_TYPE}: the only one of its type'
@@ -77,8 +77,8 @@ class HardwareSettings:
     state_type: str = _text('joint_state', f'one of {", ".join(STATE_TYPES)}')
     stamps: str = _text(
         STAMPS[0],
-        f'one of {", ".join(STAMPS)}: time of a measurement is that of its header, or when it '
-        'came, for a driver that does not stamp',
+        f'one of {", ".join(STAMPS)}: measurement time from the header, or the receive time '
+        'for a driver that does not stamp',
     )
     wrench_topic: str = _text(
         '', f'topic of the force sensor; empty: base_wrench; {BY_TYPE}: the only one of its type'
@@ -88,32 +88,32 @@ class HardwareSettings:
         'y', 'axis of the force sensor that points into the tissue; may be signed: -z'
     )
     lateral_axis: str = _text(
-        '', 'axis of the force sensor along which the tip deflects; may be signed; empty: the one '
-        'after force_axis',
+        '', 'axis of the force sensor along which the tip deflects; may be signed; empty: the '
+        'axis after force_axis',
     )  # fmt: skip
     reaction: bool = field(
         default=False,
         metadata={
-            'description': 'the sensor says what the needle exerts on it, not what it exerts on '
-            'the needle'
+            'description': 'the sensor reports the force of the needle on the sensor, not the '
+            'force on the needle'
         },
     )
-    command: str = _text(EFFORT, f'one of {", ".join(COMMANDS)}: what the robot is told')
+    command: str = _text(EFFORT, f'one of {", ".join(COMMANDS)}: kind of joint command')
     command_topic: str = _text('', 'topic of the commands; empty: wrench_command')
     command_type: str = _text('wrench', f'one of {", ".join(COMMAND_TYPES)}')
     command_joints: tuple[str, ...] = field(
         default=(),
         metadata={
-            'description': 'joints of a command, in their order; empty: the one that inserts. The '
-            'others get no effort, or hold the position that they have at activation'
+            'description': 'joints of a command, in their order; empty: only the insertion joint. '
+            'The others get zero effort, or hold their position at activation'
         },
     )
     speed: float = constant(
         0.05, 'm/s', 'command position: largest speed of the commanded position', open_low=True
     )
     lead: float = constant(
-        2e-3, 'm', 'command position: farthest that the commanded position may be from the '
-        'measured one', open_low=True,
+        2e-3, 'm', 'command position: largest distance of the commanded position from the '
+        'measured position', open_low=True,
     )  # fmt: skip
 
     def __post_init__(self) -> None:
@@ -153,7 +153,7 @@ class HardwareSettings:
 
         if self.command_type != 'wrench' and not self.command_topic:
             raise ParameterError(
-                f"command_topic must be that of the driver for {self.command_type}, got ''"
+                f"command_topic must be the driver's topic for {self.command_type}, got ''"
             )
 
     @property
@@ -163,12 +163,12 @@ class HardwareSettings:
 
     def axes(self) -> tuple[tuple[int, float], ...]:
         """
-        Return where the sensor has each axis of ``needle_base``, by a proper rotation.
+        Return the sensor axes along x, y and z of ``needle_base``, a proper rotation.
 
         Returns
         -------
         tuple of (int, float)
-            Number and sign of the axis of the sensor, for x, y and z of ``needle_base``.
+            Index and sign of the axis of the sensor, for x, y and z of ``needle_base``.
 
         Raises
         ------
@@ -185,13 +185,13 @@ class HardwareSettings:
                 f'lateral_axis must be across force_axis {self.force_axis!r}, got '
                 f'{self.lateral_axis!r}'
             )
-        # x is y cross z.
+        # x = y cross z.
         third = sign * other * (1.0 if (along + 1) % 3 == aside else -1.0)
         return (3 - along - aside, third), (along, sign), (aside, other)
 
 
 def _signed_axis(name: str, text: str) -> tuple[int, float]:
-    """Return number and sign of an axis."""
+    """Return index and sign of an axis."""
     axis = text.removeprefix('-')
     if len(axis) != 1 or axis not in _AXES:
         raise ParameterError(f'{name} must be x, y, z, -x, -y or -z, got {text!r}')
@@ -205,24 +205,9 @@ def dynamic_reading(
     interfaces: Sequence[tuple[Sequence[str], Sequence[float]]],
 ) -> Reading:
     """
-    Read a DynamicJointState as a JointState.
+    Convert a DynamicJointState to a JointState reading; missing values are NaN.
 
-    Parameters
-    ----------
-    stamp : int
-        Time of the header [ns].
-    frame : str
-        Frame of the header.
-    joints : sequence of str
-        Names of the joints.
-    interfaces : sequence of tuple
-        Names and values of the interfaces of each joint.
-
-    Returns
-    -------
-    Reading
-        Positions, velocities and efforts, NaN where a joint does not have one.
-
+    Each entry of ``interfaces`` has the names and values of the interfaces of one joint.
     """
     columns = tuple(
         tuple(
@@ -236,19 +221,19 @@ def dynamic_reading(
 
 class Robot:
     r"""
-    A robot in the terms of the contract.
+    Convert between the joints and units of a robot and the insertion axis.
 
-    With the position p of its joint, the inserted length is :math:`s = g (p - p_0)` with
-    :math:`g` = sign * scale. Velocities go with g, and the effort of the joint is :math:`e = g f`,
-    so that power is the same on both sides: :math:`e \dot{p} = f \dot{s}`.
+    With the position p of its joint, the insertion depth is :math:`s = g (p - p_0)` with :math:`g`
+    = sign * scale. Velocities scale with g, and the effort of the joint is :math:`e = g f`, so
+    that power is the same on both sides: :math:`e \dot{p} = f \dot{s}`.
 
-    Where positions are commanded, a velocity that the driver does not report is estimated: by
-    differences of positions, through a filter of first order with 5 ms.
+    With position commands, a velocity that the driver does not report is estimated by differences
+    of positions, with a first-order filter of 5 ms.
 
     Parameters
     ----------
     settings : HardwareSettings
-        How it is read and commanded.
+        Joints, units and commands.
 
     Attributes
     ----------
@@ -267,12 +252,12 @@ class Robot:
         self.begin()
 
     def begin(self) -> None:
-        """Forget what was measured and commanded."""
+        """Discard all measurements and commands."""
         self.estimates = False
         self._speed = _Speed()
-        #: Inserted length that was last read [m].
+        #: Last measured insertion depth [m].
         self._depth = nan
-        #: Where the other joints of a command stay, in the unit of the robot.
+        #: Positions of the other joints of a command to hold, in the unit of the robot.
         self._others: dict[str, float] = {}
         if self._base is not None:
             self._base.hold()
@@ -280,7 +265,7 @@ class Robot:
 
     def configure(self, controller: Controller) -> None:
         """
-        Take over what a controller believes of the needle, for commands of positions.
+        Take the nominal model and limits of a controller, for position commands.
 
         Parameters
         ----------
@@ -298,7 +283,7 @@ class Robot:
 
     def believe(self, parameters: NeedleParameters) -> None:
         """
-        Go on with another friction.
+        Continue with another nominal friction.
 
         Parameters
         ----------
@@ -313,24 +298,19 @@ class Robot:
 
     def length(self, position: float) -> float:
         """
-        Return the inserted length at a position of the robot.
+        Return the insertion depth at a position of the robot.
 
         Parameters
         ----------
         position : float
             Position of the joint, in its unit.
 
-        Returns
-        -------
-        float
-            Inserted length [m].
-
         """
         return self._gain * (position - self.settings.zero)
 
     def force(self, effort: float) -> float:
         """
-        Return the force along the needle of an effort of the robot.
+        Return the axial force on the needle for an effort of the robot.
 
         Parameters
         ----------
@@ -347,7 +327,7 @@ class Robot:
 
     def measurement(self, reading: Reading) -> Measurement:
         """
-        Read a joint state.
+        Convert a joint state to a measurement.
 
         Parameters
         ----------
@@ -357,13 +337,13 @@ class Robot:
         Returns
         -------
         Measurement
-            What it says of the needle; the force is NaN if it does not say it, or if positions
-            are commanded.
+            Depth, velocity, angle and force; the force is NaN if it is not reported, or with
+            position commands.
 
         Raises
         ------
         ParameterError
-            If it lacks what is needed: a joint, a position, or a velocity for efforts.
+            If a required joint, position, or velocity for efforts is missing.
 
         """
         settings, names = self.settings, reading.names
@@ -402,32 +382,32 @@ class Robot:
         )  # fmt: skip
 
     def _find(self, joint: str, reading: Reading) -> int:
-        """Return the number of a joint that has a position."""
+        """Return the index of a joint that has a position."""
         names, positions = reading.names, reading.values[0]
         i = names.index(joint) if joint in names else len(positions)
         if i >= len(positions) or isnan(positions[i]):
             there = [repr(name) for name, one in zip(names, positions, strict=False) if one == one]
             found = ', '.join(there) or 'none'
             raise ParameterError(
-                f'joint_states has no position of the joint {joint!r}; it has those of {found} '
+                f'joint_states has no position of the joint {joint!r}; positions found: {found} '
                 '(hardware.joint, hardware.command_joints)'
             )
         return i
 
     def wrench(self, reading: Reading) -> Reading:
         """
-        Turn a reading of the force sensor into the axes and the sign of the contract.
+        Convert a force sensor reading to the axes and the sign of the contract.
 
         Parameters
         ----------
         reading : Reading
-            What the sensor says, in its own frame.
+            Reading of the sensor, in its own frame.
 
         Returns
         -------
         Reading
-            What the base exerts on the needle, along the axes of ``needle_base``, with the frame
-            as it was. The moment is still about the origin of the sensor.
+            Wrench of the base on the needle, along the axes of ``needle_base``; the frame name is
+            unchanged, and the moment is still about the origin of the sensor.
 
         """
         numbers = reading.values[0]
@@ -443,21 +423,21 @@ class Robot:
         self, answer: Answer, load: float = 0.0, *, stopped: bool = False
     ) -> list[float] | None:
         """
-        Return what the joints of a command are told because of an answer.
+        Return the joint commands for a force command.
 
         Parameters
         ----------
         answer : Answer
-            What the controller says.
+            Force command of the controller.
         load : float
-            Force against the motion that its force has to overcome [N].
+            Load against insertion that the force must overcome [N].
         stopped : bool
-            Whether a stop is latched: then the position is the one last measured.
+            Whether a stop is latched: then the position command is the last measured position.
 
         Returns
         -------
         list of float or None
-            Efforts, or positions, in the units of the robot; None if there is no position yet.
+            Efforts or positions, in the units of the robot; None if there is no position yet.
 
         """
         settings = self.settings
@@ -466,7 +446,7 @@ class Robot:
             return [effort if joint == settings.joint else 0.0 for joint in settings.joints]
         base, length = self._base, None
         if base is not None and isfinite(self._depth):
-            # Without a reference nothing is wanted, beside a message that came twice.
+            # Without a reference no motion is requested, except for a repeated message.
             if stopped:
                 length = base.give_way()
             elif answer.reference:
@@ -483,7 +463,7 @@ class Robot:
 
 
 class _Speed:
-    """Velocity from differences of positions, through a filter of first order."""
+    """Velocity from differences of positions, with a first-order filter."""
 
     def __init__(self) -> None:
         self._time = self._position = nan
@@ -495,7 +475,7 @@ class _Speed:
         if elapsed == 0.0:
             return self._value
         self._time, self._position = time, position
-        # Written so that what is not a number begins anew.
+        # NaN restarts the filter.
         if not (0.0 < elapsed < _GAP and isfinite(moved)):
             self._value = 0.0
         else:

@@ -1,4 +1,4 @@
-"""The driver of a robot that does not know the contract: its topics and messages."""
+"""ROS adapter for a robot driver with its own topics and message types."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-#: Longest time to find a topic by its type, and time between two looks [s].
+#: Longest time to find a topic by its type, and time between two checks [s].
 _DISCOVERY: Final = 10.0
 _LOOK: Final = 0.1
 
 
 def _named(topic: Topic, name: str, type_name: str) -> Topic:
-    """Return a topic of the contract as the driver has it."""
+    """Return a topic of the contract under the driver's name and type."""
     if name:
         try:
             validate_topic_name(name)
@@ -50,21 +50,15 @@ def _named(topic: Topic, name: str, type_name: str) -> Topic:
 
 
 def _of(lease: Topic, topic: Topic) -> Topic:
-    """Return a lease of the contract under the name of another topic."""
+    """Return a lease topic of the contract under the name of another topic."""
     return replace(lease, name=f'{topic.name}/{lease.name.rpartition("/")[2]}')
 
 
 class Topics(NamedTuple):
     """
-    What a controller listens to and publishes.
+    Topics of a controller: joint states, force sensor, commands.
 
-    Attributes
-    ----------
-    state, wrench, command : Topic
-        Joint states, force sensor, commands.
-    measurer, commander : Topic
-        Leases of who publishes the first and the last of them.
-
+    `measurer` and `commander` are the leases of the publishers of joint states and commands.
     """
 
     state: Topic
@@ -74,7 +68,7 @@ class Topics(NamedTuple):
     commander: Topic
 
 
-#: Those of the contract.
+#: Topics of the contract.
 CONTRACT: Final = Topics(
     contract.JOINT_STATES,
     contract.BASE_WRENCH,
@@ -86,28 +80,28 @@ CONTRACT: Final = Topics(
 
 class Driver:
     """
-    Topics and messages by which a controller reads and commands a robot.
+    Read and command a robot by its own topics and message types.
 
     Parameters
     ----------
     node : BaseNode
         The controller.
     settings : HardwareSettings
-        How the robot is read and commanded.
+        Joints, units, topics and commands of the robot.
 
     Attributes
     ----------
     robot : Robot
-        What the messages mean.
+        Conversion of joints and units.
     topics : Topics
-        Its topics.
+        Topics of the robot.
 
     Raises
     ------
     ParameterError
-        If a topic cannot have its name, or there is not one of its type.
+        If a topic name is invalid, or there is not exactly one topic of its type.
     MessageError
-        If the type of the joint states is not installed.
+        If the message type of the joint states is not installed.
 
     """
 
@@ -141,7 +135,7 @@ class Driver:
         self._period = Duration()
 
     def _found(self, topic: Topic, name: str, type_name: str) -> str:
-        """Return the name of a topic: for `BY_TYPE` that of the only one of its type."""
+        """Return the name of a topic; `BY_TYPE` selects the only topic of its type."""
         if name != BY_TYPE or topic is contract.WRENCH_COMMAND:
             return name
         deadline = monotonic() + _DISCOVERY
@@ -152,7 +146,7 @@ class Driver:
             if found or monotonic() > deadline:
                 raise ParameterError(
                     f'hardware: {BY_TYPE} for {topic.name} needs one topic of {type_name} that '
-                    f'others publish, found {", ".join(found) or "none"}'
+                    f'other nodes publish, found {", ".join(found) or "none"}'
                 )
             sleep(_LOOK)
 
@@ -179,15 +173,9 @@ class Driver:
         matched: Callable[[int], None],
     ) -> None:
         """
-        Subscribe to what is measured.
+        Subscribe to joint states, passed on unconverted, and forces, converted to the contract.
 
-        Parameters
-        ----------
-        take_state, take_wrench : callable
-            Called with joint states as they are, and with forces as in the contract.
-        matched : callable
-            As for `BaseNode.listen`.
-
+        ``matched`` is as for `BaseNode.listen`.
         """
         node, robot = self._node, self.robot
 
@@ -228,7 +216,7 @@ class Driver:
         )
 
     def describe(self) -> dict[str, object]:
-        """Return what diagnostics say of it."""
+        """Return the diagnostics of the robot."""
         joints = ', '.join(self._settings.joints)
         return {
             'robot': f'{self.topics.state.name}, {self._settings.command} of {joints} on '
@@ -237,19 +225,11 @@ class Driver:
         }
 
     def missing(self) -> str:
-        """
-        Say why no joint states come, as far as the graph shows it.
-
-        Returns
-        -------
-        str
-            Who publishes what instead.
-
-        """
+        """Describe from the ROS graph why no joint states are received."""
         node, topic = self._node, self.topics.state
         types = {one.topic_type for one in node.get_publishers_info_by_topic(topic.name)}
         if types == {topic.type_name}:
-            return f'{topic.name} is published, but no message has come'
+            return f'{topic.name} is published, but no message was received'
         if types:
             return (
                 f'{topic.name} is published as {", ".join(sorted(types))}, and read as '
@@ -257,41 +237,20 @@ class Driver:
             )
         others = self._published(topic.type_name)
         return (
-            f'nobody publishes {topic.name}; {topic.type_name} is published on '
+            f'no node publishes {topic.name}; {topic.type_name} is published on '
             f'{", ".join(others) or "no topic"} (hardware.state_topic)'
         )
 
     # To the robot.
 
     def configure(self, controller: Controller) -> None:
-        """
-        Take over what a controller believes of the needle, and its period.
-
-        Parameters
-        ----------
-        controller : Controller
-            The controller.
-
-        """
+        """Take the nominal model and the period of a controller."""
         self.robot.configure(controller)
         whole, part = divmod(round(controller.period * NANOSECONDS), NANOSECONDS)
         self._period = Duration(sec=whole, nanosec=part)
 
     def message(self, answer: Answer, load: float, *, stopped: bool) -> Any:
-        """
-        Return the command for an answer.
-
-        Parameters
-        ----------
-        answer, load, stopped
-            As for `Robot.command`.
-
-        Returns
-        -------
-        message or bytes or None
-            What to publish; None for nothing.
-
-        """
+        """Return the message for a command, see `Robot.command`, or None."""
         settings, stamp = self._settings, answer.stamp
         kind, joints = settings.command_type, list(settings.joints)
         if kind == 'wrench':
@@ -303,7 +262,7 @@ class Driver:
             return Float64MultiArray(data=values)
         pushes = settings.command == EFFORT
         if kind == 'joint_trajectory':
-            # Without a stamp it begins at once; without velocities it ends wherever it is.
+            # Without a stamp it begins at once; without velocities its end velocity is free.
             field = {'effort' if pushes else 'positions': values}
             point = JointTrajectoryPoint(**field, time_from_start=self._period)
             return JointTrajectory(joint_names=joints, points=[point])

@@ -1,16 +1,15 @@
 """
-Poles of the sampled loops, and the rejection of gains that are unstable.
+Poles of the sampled control loops, and rejection of unstable gains.
 
-Accepted gains have all poles within 1 - margin on the axis as modeled, at the configured delay. On
-every axis that `Uncertainty` allows, and with one more period of delay that the law does not know,
-all poles are within 1. The setting ``margin`` requires convergence: every error decreases by at
-least this part in a period. The poles of slow loops are close to one (the paper's k_p = 1,
-k_v = 0.1 at 1 kHz: 1 - 5e-5). The default margin is therefore small, but far above the rounding of
-an eigenvalue.
+Accepted gains have all poles within 1 - margin on the nominal axis at the configured delay. On
+every axis within `Uncertainty`, and with one more period of unmodeled delay, all poles are within
+1. The setting ``margin`` requires convergence: every error decreases by at least this fraction in
+a period. The poles of slow loops are close to one (the paper's k_p = 1, k_v = 0.1 at 1 kHz: 1 -
+5e-5). The default margin is therefore small, but far above the rounding of an eigenvalue.
 
-Poles do not show a limit cycle of dry friction. It occurs if a law compensates more dry friction
-than there is, in the direction of the measured speed, or if its integral is too fast. Such laws
-are also run on each axis.
+Poles do not show a limit cycle of dry friction. It occurs if a law overcompensates dry friction in
+the direction of the measured velocity, or if its integral is too fast. Such laws are also
+simulated on each axis.
 """
 
 from __future__ import annotations
@@ -40,10 +39,10 @@ import numpy as np
 #: Default distance of the spectral radius from one.
 MARGIN: Final = 1e-6
 
-#: Periods of delay in reserve, unknown to the law.
+#: Periods of unmodeled delay in reserve.
 RESERVE: Final = 1
 
-#: Largest factors on gains and rate in the search for stable ones.
+#: Largest factors on gains and rate in the search for stable gains.
 _MOST_GAIN: Final = 1e6
 _MOST_RATE: Final = 1e3
 
@@ -51,7 +50,7 @@ _MOST_RATE: Final = 1e3
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Limit:
     """
-    What limits the stability of a loop.
+    Stability limit of a loop: the critical axis, its poles and its limit cycle.
 
     Attributes
     ----------
@@ -60,11 +59,11 @@ class Limit:
     bound : float
         Largest valid radius: 1 - margin, or with the reserve just below 1.
     unmodeled : int
-        Periods of delay that the law does not know: 0 or RESERVE.
+        Periods of delay that the law does not model: 0 or RESERVE.
     plant : Axis
         The true axis.
     cycle : float
-        Amplitude of a limit cycle of dry friction [m] or [rad]; 0 if there is none.
+        Amplitude of a limit cycle of dry friction [m] or [rad]; 0 without a cycle.
 
     """
 
@@ -84,11 +83,12 @@ def transition_matrix(
     law: Law, delay: int, unmodeled: int = 0, plant: Axis | None = None
 ) -> FloatArray:
     """
-    One period of the closed loop as a matrix, exact for its linear part.
+    Compute the transition matrix of the closed loop over one period, exact for its linear part.
 
-    The state is position, speed, the memory of the law (integral, filtered rate and modeled
-    motion, if its gains use them) and the pending commands; the last ones are those that the law
-    knows. The matrix is found from the loop itself, so that what is analyzed is what runs.
+    The state is position, velocity, the memory of the law (integral, filtered rate and modeled
+    motion, if its gains use them) and the pending commands; the latest are known to the law.
+    The matrix is computed by running the implemented loop on unit states, so that analysis and
+    implementation agree.
 
     Parameters
     ----------
@@ -97,9 +97,9 @@ def transition_matrix(
     delay : int
         Periods from measurement to effect that the law takes into account.
     unmodeled : int
-        Further periods that the law does not know.
+        Additional periods of delay, unknown to the law.
     plant : Axis, optional
-        The true axis, if it is another one than the law believes; its dry friction is left out.
+        The true axis, if it differs from the nominal axis of the law; without its dry friction.
 
     Returns
     -------
@@ -110,7 +110,7 @@ def transition_matrix(
     linear, late = law.linear(), delay + unmodeled
     moved = (plant or law.axis).without_coulomb()
     loop, rest = SampledLoop(linear, delay, inf), Setpoint(0.0)
-    # Only memory that the gains use belongs to the loop; the offset after a switch just fades.
+    # Only memory used by the gains is part of the loop; the offset after a switch decays.
     c = law.constants
     follows = c.kp if c.kind == INVERSE_DYNAMICS else 0.0
     uses = {INTEGRAL: c.ki, RATE: c.filter_time * c.kd, POSITION: follows, SPEED: follows}
@@ -138,20 +138,15 @@ def spectral_radius(law: Law, delay: int, unmodeled: int = 0, plant: Axis | None
     law, delay, unmodeled, plant
         As for `transition_matrix`.
 
-    Returns
-    -------
-    float
-        The modulus.
-
     """
     matrix = transition_matrix(law, delay, unmodeled, plant)
     return float(np.abs(np.linalg.eigvals(matrix)).max())
 
 
 def _limits(law: Law, delay: int, margin: float, plants: Sequence[Axis]) -> Iterator[Limit]:
-    """Yield what limits the stability on the axis as modeled, and then on others."""
+    """Yield the stability limits on the nominal axis, and then on the other axes."""
     inside = float(np.nextafter(1.0, 0.0))
-    # Dry friction does not change the poles, and cycles are looked for at bounds of friction.
+    # Dry friction does not change the poles; limit cycles are searched at the bounds of friction.
     radii: dict[tuple[float, ...], float] = {}
     axes = (law.axis, *plants)
     dry, viscous = (
@@ -180,7 +175,7 @@ def stability_limit(
     law: Law, delay: int, *, margin: float = MARGIN, plants: Sequence[Axis] = ()
 ) -> Limit:
     """
-    Find what limits the stability of a loop, with its delay and with the reserve.
+    Find the stability limit of a loop over all axes, with its delay and with the delay in reserve.
 
     Parameters
     ----------
@@ -191,12 +186,12 @@ def stability_limit(
     margin : float
         Required distance of the spectral radius from one, in [0, 1).
     plants : sequence of Axis
-        Other axes on which it shall be stable, such as those of `Uncertainty.axes`.
+        Other axes on which the loop must be stable, such as those from `Uncertainty.axes`.
 
     Returns
     -------
     Limit
-        The largest limit cycle, or else the radius that is farthest from its bound.
+        The largest limit cycle, or else the radius with the largest excess over its bound.
 
     Raises
     ------
@@ -221,7 +216,7 @@ def check_stability(
     law: Law, delay: int, name: str, *, margin: float = MARGIN, plants: Sequence[Axis] = ()
 ) -> Limit:
     """
-    Reject gains that are unstable on any of the axes, or would be with the delay in reserve.
+    Reject gains that are unstable on any of the axes, also with the delay in reserve.
 
     Parameters
     ----------
@@ -233,13 +228,13 @@ def check_stability(
     Returns
     -------
     Limit
-        What limits the stability.
+        The stability limit.
 
     Raises
     ------
     ParameterError
-        If the gains are unstable. The message names gains, rate, delay, the axis and the spectral
-        radius or limit cycle there, and the nearest stable change: the feedback of inverse
+        If the gains are unstable. The message contains gains, rate, delay, the axis with its
+        spectral radius or limit cycle, and the nearest stable change: the feedback of inverse
         dynamics, a common factor on the gains, or else a rate.
 
     Examples
@@ -270,7 +265,7 @@ def check_stability(
 
 
 def _difference(plant: Axis, modeled: Axis) -> str:
-    """Say in what an axis differs from the modeled one."""
+    """Describe how an axis differs from the nominal one, '' if it does not."""
     units = {'coulomb': 'coulomb friction', 'viscous': 'viscous friction', 'inertia': 'inertia'}
     changed = [
         f'{words} {getattr(plant, name):.4g} instead of {getattr(modeled, name):.4g}'
@@ -281,10 +276,10 @@ def _difference(plant: Axis, modeled: Axis) -> str:
 
 
 def _advice(law: Law, delay: int, margin: float, plants: Sequence[Axis], worst: Limit) -> str:
-    """Say what would be stable: feedback, a factor on all gains, or else a rate."""
+    """Describe the nearest stable change: feedback, a factor on all gains, or a rate."""
 
     def accepts(changed: Law) -> bool:
-        # The axis that was the worst is the likeliest to reject it again.
+        # The worst axis first: it is the most likely to reject the change.
         most = stability_limit(changed, delay, margin=margin, plants=(worst.plant,))
         return most.stable and all(
             limit.stable for limit in _limits(changed, delay, margin, plants)
@@ -292,14 +287,14 @@ def _advice(law: Law, delay: int, margin: float, plants: Sequence[Axis], worst: 
 
     known = ''
     if worst.plant is not law.axis and stability_limit(law, delay, margin=margin).stable:
-        known = '; or say by uncertainty.* how well the model is known: as modeled it is stable'
+        known = '; or set uncertainty.* to the real model uncertainty: the nominal loop is stable'
     if isinstance(law, InverseDynamics) and law.gains.bandwidth == 0.0:
         with_feedback = replace(law, gains=replace(law.gains, bandwidth=BANDWIDTH))
         if accepts(with_feedback):
             return f'with feedback, bandwidth = {BANDWIDTH:g}, they would be stable{known}'
     for factor in _nearby():
         if accepts(law.scaled(factor)):
-            return f'all of them times {factor:g} would be stable{known}'
+            return f'all gains times {factor:g} would be stable{known}'
     for factor in _upwards(_MOST_RATE):
         rate = _digits(factor / law.period, 3)
         if accepts(replace(law, period=1.0 / rate)):
@@ -311,16 +306,15 @@ def _advice(law: Law, delay: int, margin: float, plants: Sequence[Axis], worst: 
     missing = [name for name, gain in gains.items() if gain == 0.0]
     if missing:
         return f'{" and ".join(missing)} must not be zero'
-    return f'neither a common factor on them nor a higher rate would be stable{known}'
+    return f'no common factor on the gains and no higher rate would be stable{known}'
 
 
 def _digits(value: float, digits: int) -> float:
-    """Round a positive number to significant digits."""
     return round(value, digits - 1 - floor(log10(value)))
 
 
 def _upwards(most: float) -> Iterator[float]:
-    """Yield factors above one, each 1.1 times the one before."""
+    """Yield factors above one, in ratios of 1.1."""
     factor = 1.1
     while factor <= most:
         yield factor

@@ -1,4 +1,4 @@
-"""Node `steering`: steers the tip to a target by motions of the guide."""
+"""Node `steering`: steer the tip to a target by motions of the guide."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ _PRESET = 'bending_35mm'
 #: Time between two checks for missing inputs, and for a plan that is computed [s].
 _WATCH = 0.05
 
-#: Longest time in which a motion arrives, in lock-step.
+#: Longest time until a motion is acknowledged, in lock-step.
 _ARRIVAL = Delay(seconds=1.0)
 
 
@@ -53,19 +53,19 @@ class SteeringNode(CompiledNode):
     """
     Steer the tip to a ``target`` (point x, y, z [m]; y is the depth) by guide and roll.
 
-    The needle is inserted in steps. At the end of each it rests, and the readings of
+    The needle is inserted in steps. At the end of each step it rests, and the readings of
     ``tip_deflection`` are averaged to a measurement of the tip. Then the guide moves, by a
     ``joint_trajectory`` of `insertion`, `guide_x` and `guide_z`, with ``turns`` also `roll`; when
-    it has arrived the next step begins. If it is ``continuous`` the needle does not rest, and the
+    it has arrived the next step begins. With ``continuous`` the needle does not rest, and the
     guide follows its depth. A robot follows all joints; where a controller moves the needle, with
     its parameter ``steered``, it follows the insertion. ``joint_states`` must have these joints.
 
     The nominal model of needle and tissue is ``model.*`` and ``steering.*``, its uncertainty
     ``belief.*``. The plan is computed in a thread: messages and ``~/stop`` do not wait for it. A
     target out of reach is rejected with the reachable range. Each motion is sent again until the
-    robot follows it. The needle stops when the tip freezes, is lost, slips or is implausible, when
-    a node rejects a motion, when a joint does not arrive, and by ``~/stop``. ``tip_expected`` is
-    the expected position of the tip at the target depth.
+    robot follows it. The needle stops when the tip measurement freezes, is missing, slips or is
+    implausible, when a node rejects a motion, when a joint does not arrive, and by ``~/stop``.
+    ``tip_expected`` is the expected position of the tip at the target depth.
 
     The node passes messages to an `OuterLoop`, which decides, and publishes its motions.
     """
@@ -76,7 +76,7 @@ class SteeringNode(CompiledNode):
         super().__init__('steering', **node_options)
         self.declare_settings('', OuterLoopSettings())
         self.declare_settings('belief.', SteeringBelief())
-        # Fixed at start: the other defaults follow from it.
+        # Fixed at start: it determines the other defaults.
         self.declare_parameter(
             'model.preset',
             _PRESET,
@@ -87,7 +87,7 @@ class SteeringNode(CompiledNode):
             self.declare_settings(prefix, defaults_of(prefix, preset), names)
 
         self._loop: OuterLoop | None = None
-        #: The expected tip that was published last.
+        #: Expected tip of the last publication.
         self._told: TipEstimate | None = None
         self._measurers = Publishers(self, contract.MEASURER, self._watch)
         self._trajectory = self.publisher(contract.JOINT_TRAJECTORY)
@@ -100,19 +100,19 @@ class SteeringNode(CompiledNode):
         self.subscribe(contract.TARGET, self._on_target)
         self.subscribe(contract.DIAGNOSTICS, self._on_diagnostics)
         self.create_service(Trigger, '~/stop', self._on_stop)
-        #: Reports which sample was processed, while the time is that of a plant.
+        #: Reports the processed sample, with simulated time.
         self._processed: Publisher | None = None
-        #: Sample that is processed and not reported yet: a plan is computed first.
+        #: Processed sample that is not reported yet: a plan is computed first.
         self._unreported: int | None = None
         #: Whether a motion was sent since the last report.
         self._moved = False
-        #: A clock that stands still or jumps does not stop the checks.
+        #: A stopped or jumping ROS clock does not stop the checks.
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
 
     # Transitions.
 
     def configure(self) -> None:
-        """Create the loop from the parameters."""
+        """Create the steering executive from the parameters."""
         preset, values = self.text('model.preset', tuple(NEEDLES)), self.values()
 
         def given(prefix: str, names: Collection[str]) -> dict[str, Any]:
@@ -122,17 +122,17 @@ class SteeringNode(CompiledNode):
         needle = from_values(NeedleParameters, given('model.', OF_NEEDLE), 'model.')
         steering = from_values(SteeringParameters, given('steering.', OF_STEERING), 'steering.')
         belief = self.settings('belief.', SteeringBelief)
-        # Load or compile the functions before anything moves; and reject invalid constants.
+        # Load or compile the functions before any motion; and reject invalid constants.
         SteeringModel(needle, steering, [0.0, 1e-3], belief)
         settings = self.settings('', OuterLoopSettings)
         self._loop = OuterLoop(needle, steering, belief, settings, start=ThreadJob)
 
     def cleanup(self) -> None:
-        """Discard the loop."""
+        """Discard the steering executive."""
         self._loop = self._told = None
 
     def activate(self) -> None:
-        """Begin to listen, and to check for missing inputs."""
+        """Start to process measurements, and to check for missing inputs."""
         self._timer = self.create_timer(_WATCH, self._watch, clock=self._steady)
         if self.get_parameter('use_sim_time').value:
             self._processed = self.publisher(contract.PROCESSED, always=True)
@@ -161,7 +161,7 @@ class SteeringNode(CompiledNode):
     def _passing(
         self, take: Callable[[OuterLoop, Reading, int], Move | None]
     ) -> Callable[[Reading], None]:
-        """Return a callback that passes a measurement on, and publishes the motion."""
+        """Return a callback that processes a measurement and publishes the motion."""
 
         def on_reading(reading: Reading) -> None:
             if self._loop is not None and self.is_active:
@@ -173,7 +173,7 @@ class SteeringNode(CompiledNode):
         return on_reading
 
     def _report_processed(self) -> None:
-        """Report to a plant in lock-step that a sample is processed, once all motions arrived."""
+        """Report a processed sample to a plant in lock-step, after all motions arrived."""
         processed, stamp, loop = self._processed, self._unreported, self._loop
         if processed is None or stamp is None or loop is None or loop.busy:
             return
@@ -202,7 +202,7 @@ class SteeringNode(CompiledNode):
         self._act(self._loop.target(stamp, header.frame_id, at, self.now()))
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
-        """Pass the answers of other nodes to the motions on."""
+        """Pass other nodes' answers to motions to the executive."""
         if self._loop is None or not self.is_active:
             return
         for status in message.status:

@@ -1,4 +1,4 @@
-"""Supervise the axial control loop, without ROS: checks of inputs, stops, requests, commands."""
+"""Axial supervisor, without ROS: input checks, stops, requests, force commands."""
 
 from __future__ import annotations
 
@@ -30,18 +30,18 @@ from needle_ros.wire import Reading
 
 _WAITING: Final = 'no joint_states yet'
 
-#: Topics that the observer lives on.
+#: Topics used by the observer.
 _SENSORS: Final = ('base_wrench', 'tip_deflection')
 
 
 class Supervisor:
     """
-    Answer measurements by forces, and command none on any fault.
+    Answer each measurement with a force command, and command zero force on any fault.
 
-    Every event is a method: it takes the time now [ns] of the clock that stamps the messages, and
-    returns a command. None leaves the last command as it is. `journal` has lines for the
-    log. Without a target, during a fault, and from a stop until it is cleared,
-    all forces are zero.
+    Every event is a method: it takes the present time [ns] of the clock that stamps the messages,
+    and returns a command. None leaves the last command unchanged. `journal` contains lines for the
+    log. Without a target, during a fault, and from a stop until it is cleared, all forces are
+    zero.
 
     Parameters
     ----------
@@ -185,7 +185,7 @@ class Supervisor:
 
     def activate(self, now: int, publishers: Mapping[str, int]) -> None:
         """
-        Begin to answer measurements; see `watch`.
+        Start to answer measurements; see `watch`.
 
         Parameters
         ----------
@@ -197,7 +197,7 @@ class Supervisor:
         if self.controller is not None:
             self._lateness = Lateness(self.controller.delay, self.controller.period)
             settings, robot = self.controller.settings, self._robot
-            # Times of arrival do not show single periods.
+            # Receive times do not resolve single periods.
             stamped = robot is None or robot.settings.stamps == STAMPS[0]
             pace = Pace(settings.rate, settings.measurement_timeout)
             self._pace = pace if stamped else None
@@ -214,11 +214,6 @@ class Supervisor:
         now : int
             Time [ns].
 
-        Returns
-        -------
-        Answer
-            Zero force.
-
         """
         if self.controller is not None:
             self.controller.forget()
@@ -227,7 +222,7 @@ class Supervisor:
         return self._command(Answer(now))
 
     def _begin(self, now: int) -> None:
-        """Forget all measurements and requests."""
+        """Discard all measurements and requests."""
         self._due = None
         self.safety.begin(now)
         self.requests.forget()
@@ -247,12 +242,12 @@ class Supervisor:
 
     def receive(self, *, targets: bool) -> None:
         """
-        Begin to take requests.
+        Set which requests are accepted.
 
         Parameters
         ----------
         targets : bool
-            Whether this controller takes targets; else only trajectories.
+            Whether this controller accepts targets; otherwise only trajectories.
 
         """
         moved = (INSERTION,)
@@ -263,14 +258,14 @@ class Supervisor:
         self, stamp: int, frame: str, depth: float, deflection: float, now: int
     ) -> Answer | None:
         """
-        Take a target: an insertion depth to reach [m]; a target deflection [m] is ignored.
+        Take a target insertion depth [m]; its deflection [m] is ignored.
 
         Parameters
         ----------
         stamp : int
             Stamp of the message [ns]; 0 if it has none.
         frame : str
-            Its frame.
+            Frame of the message.
         depth, deflection : float
             Insertion depth and deflection [m].
         now : int
@@ -306,7 +301,7 @@ class Supervisor:
         now: int,
     ) -> Answer | None:
         """
-        Take a path: times from now [s], positions [m] of the joints, velocities or none.
+        Take a path: times from now [s], positions [m] of the joints, velocities [m/s] or none.
 
         Parameters
         ----------
@@ -348,7 +343,7 @@ class Supervisor:
                 self.journal.refuse(f'{topic.name} rejected: {known.reason}')
             return answer
         self._drop_due(f'a newer {topic.name} is followed', Verdict.SUPERSEDED)
-        # It counts from the first sample after its stamp on, also if it overtook a sample.
+        # Valid from the first sample after its stamp on, in any order of arrival.
         self._due = stamp, topic, act
         self.requests.answer(topic, stamp, Verdict.RECEIVED)
         newest = self.safety.streams['joint_states'].last
@@ -374,7 +369,7 @@ class Supervisor:
         self.requests.answer(topic, sent, verdict, reason, (INSERTION,))
 
     def _drop_due(self, reason: str, verdict: Verdict = Verdict.REJECTED) -> None:
-        """Refuse a request that still waits for a sample, if any."""
+        """Reject a request that still waits for a sample, if any."""
         if self._due is not None:
             (sent, topic, _), self._due = self._due, None
             self.requests.answer(topic, sent, verdict, reason)
@@ -388,11 +383,6 @@ class Supervisor:
         now : int
             Time [ns].
 
-        Returns
-        -------
-        Reply
-            Success, and zero force.
-
         """
         self.requests.supersede(now)
         answer = self._stop_for('emergency stop', now)
@@ -400,7 +390,7 @@ class Supervisor:
 
     def clear_stop(self, now: int) -> Reply:
         """
-        Release the stop, unless something is still beyond a limit.
+        Release the stop, unless a measurement is still beyond a limit.
 
         Parameters
         ----------
@@ -424,7 +414,7 @@ class Supervisor:
         self.fault = _WAITING
         self.bending.forget()
         self.journal.say(Severity.INFO, 'the stop is cleared')
-        return Reply(True, 'cleared; the motion starts again', answer)
+        return Reply(True, 'cleared; the motion restarts', answer)
 
     def pause(self, hold: bool) -> Reply:
         """
@@ -438,7 +428,7 @@ class Supervisor:
         Returns
         -------
         Reply
-            Refused unless the controller is active.
+            Rejected unless the controller is active.
 
         """
         if self._active is None:
@@ -450,7 +440,7 @@ class Supervisor:
 
     def retract(self, now: int) -> Reply:
         """
-        Go to `retract_depth`.
+        Retract to `retract_depth`.
 
         Parameters
         ----------
@@ -460,7 +450,7 @@ class Supervisor:
         Returns
         -------
         Reply
-            Refused during a stop, and unless the controller is active.
+            Rejected during a stop, and unless the controller is active.
 
         """
         if self._active is None or self.safety.stop is not None:
@@ -470,13 +460,13 @@ class Supervisor:
         self._drop_due('the needle is retracted', Verdict.SUPERSEDED)
         self._active.guide.resume()
         self._active.set_target(self.retract_depth)
-        return Reply(True, f'goes to {self.retract_depth:g} m')
+        return Reply(True, f'retracting to {self.retract_depth:g} m')
 
     # Sensors.
 
     def tip(self, reading: Reading, now: int) -> Answer | None:
         """
-        Take in `tip_deflection`.
+        Take a `tip_deflection` measurement.
 
         Parameters
         ----------
@@ -496,14 +486,14 @@ class Supervisor:
         answer, deflection = self._check_clock(now), reading.values[0][2]
         if self._counts('tip_deflection', reading, [deflection], now):
             answer = self._stop_for(self.safety.guard.tip(deflection), now) or answer
-            # A reading beyond a limit is left out, even a single one.
+            # Every reading beyond a limit is discarded, also a single one.
             if not self.safety.guard.is_beyond('tip_deflection'):
                 self.bending.take_tip(reading.stamp, deflection)
         return answer
 
     def wrench(self, reading: Reading, now: int) -> Answer | None:
         """
-        Take in `base_wrench`.
+        Take a `base_wrench` measurement.
 
         Parameters
         ----------
@@ -523,7 +513,7 @@ class Supervisor:
             answer = (
                 self._stop_for(self.safety.guard.wrench(axial, lateral, moment), now) or answer
             )
-            # The sensor also feels the torque that turns the base.
+            # The sensor also measures the commanded torque of the base.
             moment -= self._last.torque
             newest = self.safety.streams['joint_states'].last
             if not self.safety.guard.is_beyond('base_wrench'):
@@ -553,14 +543,14 @@ class Supervisor:
             try:
                 self.bending.take_truth(state)
             except NeedleError as error:
-                self._warn('ground_truth', f'ground_truth: {error}; not taken in')
+                self._warn('ground_truth', f'ground_truth: {error}; ignored')
         return answer
 
     def _counts(self, name: str, reading: Reading, values: Sequence[float], now: int) -> bool:
-        """Return whether a measurement is valid; log once a second why not."""
+        """Return whether a measurement is valid; log the reason once a second if not."""
         refusal = self.safety.streams[name].check(reading.stamp, now, reading.frame, values)
         if refusal is not None and not refusal.harmless:
-            self._warn(f'{name} {refusal.kind}', f'{refusal.line}; not taken in')
+            self._warn(f'{name} {refusal.kind}', f'{refusal.line}; ignored')
         return refusal is None
 
     def _warn(self, kind: str, line: str) -> None:
@@ -568,7 +558,7 @@ class Supervisor:
 
     def encoders(self, reading: Reading, now: int) -> Answer | None:
         """
-        Answer `joint_states`: a repeated one as before, one that is late not at all.
+        Answer `joint_states`; a repeated message gets the same command, a late one none.
 
         Parameters
         ----------
@@ -599,7 +589,7 @@ class Supervisor:
         if measured.is_finite():
             self._stop_for(self.safety.guard.encoders(measured), stamp)
             if self.safety.guard.is_beyond('joint_states'):
-                # Alone it is a fault of the sensor: neither law nor observer gets it.
+                # A single reading is a sensor fault: neither law nor observer uses it.
                 if self.safety.stop is not None:
                     return self._command(Answer(stamp))
                 return self._let_go('joint_states is beyond a limit', stamp)
@@ -612,14 +602,13 @@ class Supervisor:
         return self._answer(controller, stamp, measured)
 
     def _again(self, stamp: int) -> Answer:
-        """Command the same again, or nothing if that was not the last word."""
+        """Repeat the last command if it answered this stamp, else command zero force."""
         last = self._last
         if last.stamp == stamp:
             return Answer(stamp, last.force, last.torque)
         return self._command(Answer(stamp))
 
     def _answer(self, controller: Controller, stamp: int, measured: Measurement) -> Answer | None:
-        """Command the output of the controller."""
         safety = self.safety
         if safety.stop is not None:
             return self._command(Answer(stamp))
@@ -629,7 +618,7 @@ class Supervisor:
         if command.fault is not None:
             return self._let_go(command.fault, stamp)
         if not command.is_finite():
-            # The memory of the laws is not valid any more.
+            # The memory of the laws is invalid.
             controller.forget()
             return self._stop_for('the command is not finite', stamp)
         if command.notice is not None:
@@ -660,7 +649,7 @@ class Supervisor:
         if force > most:
             self._warn(
                 'buckling',
-                f"{force:.3g} N is more than Euler's load {most:.3g} N of the part outside of the "
+                f"{force:.3g} N exceeds Euler's load {most:.3g} N of the part outside of the "
                 'tissue: without a guide it buckles; lower force_limit',
             )
         full = abs(force) >= limits.force_limit or abs(torque) >= limits.torque_limit
@@ -691,19 +680,19 @@ class Supervisor:
         if safety.rivals is not None:
             answer = self._let_go(safety.rivals, now)
         elif silence > timeout:
-            answer = self._let_go(f'joint_states is stale: the last came {silence:.3f} s ago', now)
+            answer = self._let_go(f'joint_states is stale: none received for {silence:.3f} s', now)
         answer = self._stop_for(safety.muddled(now), now) or answer
         if safety.streams['ground_truth'].silence(now) > timeout:
             self.bending.load = 0.0
         for line in safety.news(now):
-            self._warn(line.partition(' ')[0], f'{line}; the observer goes on without it')
+            self._warn(line.partition(' ')[0], f'{line}; the observer continues without it')
         if safety.limits.sensors_required:
             answer = self._stop_for(safety.warning(now), now) or answer
         self._watch_pace()
         return answer
 
     def _watch_pace(self) -> None:
-        """Log when the rate of the measurements begins to differ from the rate of the laws."""
+        """Log the start of a deviation of the measurement rate from the nominal rate."""
         if self._pace is None:
             return
         joints = self.safety.streams['joint_states']
@@ -713,10 +702,10 @@ class Supervisor:
             self._warn('pace', line)
         self._off_pace = line is not None
 
-    # No force.
+    # Zero force.
 
     def _stop_for(self, reason: str | None, stamp: int) -> Answer | None:
-        """Stop until it is cleared, if there is a reason and no stop yet."""
+        """Latch a stop, if there is a reason and no stop yet."""
         if not self.safety.latch(reason):
             return None
         self.fault = reason
@@ -725,13 +714,13 @@ class Supervisor:
         return self._release(stamp)
 
     def _let_go(self, fault: str, stamp: int) -> Answer:
-        """Command zero force for a fault, which is logged when it begins."""
+        """Command zero force on a fault, and log its beginning."""
         self._say_fault(fault, 'no force is commanded')
         return self._release(stamp)
 
     def _say_fault(self, fault: str, consequence: str) -> None:
-        """Record a fault, which is logged when it begins."""
-        # Faults of one kind begin with the same word.
+        """Record a fault, and log its beginning."""
+        # The first word of the line identifies the kind of fault.
         kind = fault.partition(' ')[0]
         if self.fault is None or not self.fault.startswith(kind):
             self.journal.say(Severity.ERROR, f'{fault}; {consequence}', kind)
@@ -759,15 +748,6 @@ class Supervisor:
         ----------
         now : int
             Time [ns].
-
-        Returns
-        -------
-        severity : Severity
-            Severity of the state.
-        held : str or None
-            The fault.
-        values : dict
-            Values by name.
 
         """
         values: dict[str, object] = {}

@@ -1,4 +1,4 @@
-"""How far the true axis may be from the modeled one, and limit cycles of dry friction there."""
+"""Uncertainty of the true axis about the nominal one, and limit cycles of dry friction."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from needle_controller.laws.law import Law
 from needle_ros.settings import check_constants, constant
 import numpy as np
 
-#: Parts of the mass of the carriage that are tried.
+#: Fractions of the carriage mass that are checked.
 _PARTS: Final = (1.0 / 64.0, 1.0 / 16.0, 1.0 / 4.0, 1.0)
 
-#: Starts of the runs that look for a limit cycle [m] or [rad].
+#: Initial positions of the simulations for limit cycles [m] or [rad].
 _STARTS: Final = (1e-3, 5e-5)
 
-#: Time of such a run [s]: at least, at most. Errors decrease to this part in each third of it.
+#: Duration of such a simulation [s]: minimum, maximum. Decrease of errors in each third of it.
 _SHORTEST: Final = 0.5
 _LONGEST: Final = 20.0
 _DECREASE: Final = 0.1
 
-#: Spans of the motion below this are no limit cycle [m] or [rad].
+#: Least range of motion that is a limit cycle [m] or [rad].
 _LEAST: Final = 1e-6
 
 
@@ -37,7 +37,7 @@ class Uncertainty:
     coulomb: float = constant(0.3, '1', 'relative uncertainty of Coulomb friction', high=0.9)
     inertia: float = constant(0.3, '1', 'relative uncertainty of the moving mass', high=0.9)
     carriage: float = constant(
-        2.0, 'kg', 'mass that may move with the needle beyond model.carriage_mass'
+        2.0, 'kg', 'mass that may move with the needle in addition to model.carriage_mass'
     )
 
     def __post_init__(self) -> None:
@@ -45,19 +45,14 @@ class Uncertainty:
 
     def axes(self, axis: Axis, *, carriage: bool = False) -> list[Axis]:
         """
-        Return the axes at the bounds, and some with a part of the carriage.
+        Return the axes at the uncertainty bounds, also with fractions of the carriage mass.
 
         Parameters
         ----------
         axis : Axis
-            The axis as modeled.
+            The nominal axis.
         carriage : bool
             Whether the axis may carry the carriage.
-
-        Returns
-        -------
-        list of Axis
-            The axes.
 
         """
         extra = [part * self.carriage for part in _PARTS if carriage and self.carriage > 0.0]
@@ -78,27 +73,12 @@ def _bounds(value: float, share: float) -> list[float]:
 
 def limit_cycle(law: Law, delay: int, unmodeled: int, plant: Axis, radius: float) -> float:
     """
-    Look for a limit cycle of dry friction on another axis, by running the law on it.
+    Simulate a law on another axis; return the amplitude of a limit cycle [m] or [rad], 0 without.
 
-    A law can have one if it has an integral, or if it compensates friction in the direction of
-    the measured speed, as inverse dynamics without feedback does. Others are not run.
-
-    Parameters
-    ----------
-    law : Law
-        Control law.
-    delay, unmodeled : int
-        Periods of delay that the law knows, and those that it does not.
-    plant : Axis
-        The true axis.
-    radius : float
-        Spectral radius of the loop, below 1.
-
-    Returns
-    -------
-    float
-        Largest amplitude [m] or [rad]; 0 without a limit cycle.
-
+    A limit cycle is possible if the law has an integral, or compensates friction in the direction
+    of the measured velocity, as inverse dynamics without feedback does. Other laws are not
+    simulated. ``delay`` and ``unmodeled`` are the modeled and unmodeled periods of delay;
+    ``radius`` is the spectral radius of the loop, below 1.
     """
     c = law.constants
     measured = c.kind == INVERSE_DYNAMICS and c.kp == 0.0

@@ -1,1 +1,1 @@
-"""What must be well before a force may be commanded: inputs, limits, and the stop."""
+"""Safety checks before each force command: inputs, limits, latched stop."""

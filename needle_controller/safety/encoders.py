@@ -1,4 +1,4 @@
-"""The encoders of the robot: what a joint state says of the needle."""
+"""Encoder measurements of the needle from joint states."""
 
 from __future__ import annotations
 
@@ -12,23 +12,9 @@ from needle_ros.wire import Reading
 
 def read_encoders(reading: Reading) -> Measurement:
     """
-    Read a joint state; `rotation` and efforts may be missing, or raise a ParameterError.
+    Convert a joint state to a measurement; `rotation` and efforts may be missing.
 
-    Parameters
-    ----------
-    reading : Reading
-        The joint state.
-
-    Returns
-    -------
-    Measurement
-        What it says of the needle.
-
-    Raises
-    ------
-    ParameterError
-        If `insertion` is missing, or a joint has no position or velocity.
-
+    Raises ParameterError if `insertion` is missing, or a joint has no position or velocity.
     """
     names, (positions, velocities, efforts) = reading.names, reading.values
     try:

@@ -1,4 +1,4 @@
-"""Whether the plant does what is commanded."""
+"""Response monitor: check that the plant follows its commands."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ from typing import Final, NamedTuple
 
 from needle_ros.timing import NANOSECONDS
 
-#: For how long the plant must do nothing before it counts as one that does not follow [ns].
+#: Time without response after which the plant does not follow [ns].
 _PATIENCE: Final = NANOSECONDS // 10
 
-#: Less than this part of what is commanded, or of the way that the reference goes, is nothing.
+#: Least response, as a fraction of the commanded force or of the distance of the reference.
 _NOTHING: Final = 0.1
 
 
 class _Mark(NamedTuple):
-    """When the plant began to do nothing, and where needle and reference were then."""
+    """Stamp [ns], insertion depth and reference depth [m] at the start of a lack of response."""
 
     stamp: int
     depth: float
@@ -23,24 +23,19 @@ class _Mark(NamedTuple):
 
 class Following:
     """
-    Compares what is commanded with what the robot reports.
+    Compare the commanded force with the response that the robot reports.
 
-    A plant does not follow if it reports next to no force while one is commanded, and the needle
-    rests while its reference moves. It follows again as soon as one of both is over. A robot that
-    reports no force is not judged.
-
-    Attributes
-    ----------
-    lost : bool
-        Whether the plant does not follow.
-
+    A plant does not follow if it reports almost no force while a force is commanded, and the
+    needle rests while its reference moves. It follows again as soon as one of these conditions
+    ends. A robot that reports no force is not checked. ``lost`` is whether the plant does not
+    follow.
     """
 
     def __init__(self) -> None:
         self.forget()
 
     def forget(self) -> None:
-        """Take it that the plant follows."""
+        """Reset to a plant that follows."""
         self.lost = False
         self._mark: _Mark | None = None
 
@@ -48,24 +43,12 @@ class Following:
         self, stamp: int, depth: float, aim: float, commanded: float, reported: float
     ) -> bool:
         """
-        Take in a measurement.
+        Process a measurement at a stamp [ns]; return whether the plant does not follow.
 
-        Parameters
-        ----------
-        stamp : int
-            Its stamp [ns].
-        depth, aim : float
-            Inserted length, and where it should be [m].
-        commanded, reported : float
-            Force that was commanded last, and that the robot reports [N]; NaN if it reports none.
-
-        Returns
-        -------
-        bool
-            Whether the plant does not follow.
-
+        Takes insertion depth and reference depth [m], and the last commanded and the reported
+        force [N]; the latter is NaN if the robot reports none.
         """
-        # Where nothing is commanded there is nothing to follow.
+        # Without a command no response is expected.
         if commanded == 0.0 or not abs(reported) < _NOTHING * abs(commanded):
             self.forget()
             return False

@@ -1,4 +1,4 @@
-"""Measurements against their limits."""
+"""Comparison of measurements with their limits."""
 
 from __future__ import annotations
 
@@ -7,20 +7,20 @@ from typing import Final
 from needle_controller.controller import Measurement
 from needle_controller.safety.limits import SafetyLimits
 
-#: Readings in a row that have to be beyond a limit: one alone may be a fault of the sensor.
+#: Readings in a row beyond a limit that violate it: a single one may be a sensor fault.
 _IN_A_ROW: Final = 2
 
 
 class Guard:
     """
-    Holds measurements against the limits; two in a row beyond one violate it.
+    Compare measurements with the limits; two readings in a row beyond a limit violate it.
 
     Parameters
     ----------
     limits : SafetyLimits
         Limits.
     depths : tuple of float
-        Least and largest inserted length to control [m].
+        Least and largest insertion depth to control [m].
 
     """
 
@@ -28,13 +28,13 @@ class Guard:
         self.limits = limits
         low, high = depths
         self._depths = low - limits.depth_tolerance, high + limits.depth_tolerance
-        #: What each topic is beyond, and for how many readings in a row.
+        #: By topic: description of the limit, and readings in a row beyond it.
         self._beyond: dict[str, tuple[str, int]] = {}
 
     def _hold(self, topic: str, *readings: tuple[str, float, float, str, str]) -> str | None:
         """Compare readings: quantity, value, limit, unit, name of the limit."""
         for quantity, value, limit, unit, name in readings:
-            # Written so that what is not a number is beyond every limit.
+            # Written so that NaN is beyond every limit.
             if not abs(value) <= limit:
                 return self._count(
                     topic,
@@ -51,34 +51,29 @@ class Guard:
 
     def is_beyond(self, topic: str) -> bool:
         """
-        Return whether the last reading of a topic is beyond a limit, alone or not.
+        Return whether the last reading of a topic is beyond a limit, also a single reading.
 
         Parameters
         ----------
         topic : str
             The topic.
 
-        Returns
-        -------
-        bool
-            Whether it is.
-
         """
         return topic in self._beyond
 
     def encoders(self, measured: Measurement) -> str | None:
         """
-        Return the limit that the encoders violate.
+        Check the encoder measurements against their limits.
 
         Parameters
         ----------
         measured : Measurement
-            Inserted length, angle and their velocities.
+            Insertion depth, angle and their velocities.
 
         Returns
         -------
         str or None
-            The line; None within the limits.
+            Description of the violated limit; None within the limits.
 
         """
         low, high = self._depths
@@ -86,7 +81,7 @@ class Guard:
         if not low <= depth <= high:
             return self._count(
                 'joint_states',
-                f'inserted length {depth:.6g} m is outside [{low:g}, {high:g}] m '
+                f'insertion depth {depth:.6g} m is outside [{low:g}, {high:g}] m '
                 '(lowest_depth, highest_depth, safety.depth_tolerance)',
             )
         return self._hold(
@@ -99,17 +94,17 @@ class Guard:
 
     def tracking(self, error: float) -> str | None:
         """
-        Return the limit that the distance from the reference [m] violates.
+        Check the tracking error against its limit.
 
         Parameters
         ----------
         error : float
-            Distance [m].
+            Distance from the reference [m].
 
         Returns
         -------
         str or None
-            The line; None within the limit.
+            Description of the violated limit; None within the limit.
 
         """
         limit = self.limits.tracking_error
@@ -117,7 +112,7 @@ class Guard:
 
     def wrench(self, axial: float, lateral: float, moment: float) -> str | None:
         """
-        Return the limit that forces [N] or the moment [N m] on the sensor violate.
+        Check the forces and the moment on the sensor against their limits.
 
         Parameters
         ----------
@@ -127,7 +122,7 @@ class Guard:
         Returns
         -------
         str or None
-            The line; None within the limits.
+            Description of the violated limit; None within the limits.
 
         """
         return self._hold(
@@ -139,7 +134,7 @@ class Guard:
 
     def tip(self, deflection: float) -> str | None:
         """
-        Return the limit that the deflection of the tip [m] violates.
+        Check the deflection of the tip against its limit.
 
         Parameters
         ----------
@@ -149,7 +144,7 @@ class Guard:
         Returns
         -------
         str or None
-            The line; None within the limit.
+            Description of the violated limit; None within the limit.
 
         """
         limit = self.limits.tip_deflection
@@ -159,7 +154,7 @@ class Guard:
 
     def forget(self, topic: str) -> None:
         """
-        Forget what a topic said last.
+        Discard the last reading of a topic.
 
         Parameters
         ----------
@@ -171,5 +166,5 @@ class Guard:
 
     @property
     def violated(self) -> str | None:
-        """What was last measured beyond a limit."""
+        """Description of the last reading beyond a limit; None without one."""
         return next((line for line, _ in self._beyond.values()), None)

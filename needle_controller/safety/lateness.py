@@ -1,4 +1,4 @@
-"""Whether answers come as late as the delay that the laws are made for."""
+"""Latency monitor: compare the latency of the commands with the configured delay."""
 
 from __future__ import annotations
 
@@ -6,19 +6,19 @@ from typing import Final
 
 from needle_ros.timing import RateCounter
 
-#: Share of answers that may be later, and how many per second in any case [Hz].
+#: Tolerated fraction of late commands, and tolerated number per second [Hz].
 _BORNE: Final = 0.05
 _FEW: Final = 3.0
 
 
 class Lateness:
     """
-    Counts the answers that come later than the laws take them to.
+    Count the commands that are later than the delay of the control laws.
 
     Parameters
     ----------
     delay : int
-        Periods from a measurement to the effect of its answer that the laws count on.
+        Configured delay from a measurement to the effect of its command, in periods.
     period : float
         Period [s].
 
@@ -31,17 +31,7 @@ class Lateness:
         self._window = RateCounter()
 
     def add(self, now: int, age: float) -> None:
-        """
-        Take in an answer.
-
-        Parameters
-        ----------
-        now : int
-            Time [ns].
-        age : float
-            Age of the measurement that it answers [s].
-
-        """
+        """Add a command at a time [ns] that answers a measurement of an age [s]."""
         late = age > self._longest
         self._answered += 1
         self._late += late
@@ -49,30 +39,17 @@ class Lateness:
         self._window.add(now, late)
 
     def warning(self, now: int) -> str | None:
-        """
-        Return which share of the answers of the last second was late, if it was too large.
-
-        Parameters
-        ----------
-        now : int
-            Time [ns].
-
-        Returns
-        -------
-        str or None
-            The share; None if all is well.
-
-        """
+        """Return a warning if too many commands of the last second were late, else None."""
         share = self._window.share(now)
         if share <= _BORNE or share * self._window.rate(now) < _FEW:
             return None
         return (
-            f'{share:.0%} of the answers come too late for delay {self._delay}: raise it, lower '
+            f'{share:.0%} of the commands are too late for delay {self._delay}: raise it, lower '
             'the rate, or free the machine'
         )
 
     def describe(self) -> dict[str, object]:
-        """Return what diagnostics say of it."""
+        """Return the diagnostics of the latency."""
         return {
             'measurements answered': self._answered,
             'answered too late for the delay': self._late,

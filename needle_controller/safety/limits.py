@@ -1,4 +1,4 @@
-"""The limits of what is measured, as parameters."""
+"""Limits of the measurements, as parameters."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from needle_ros.settings import check_constants, constant
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SafetyLimits:
     """
-    Limits of what is measured; beyond them the controller stops until ``~/clear_stop``.
+    Limits of the measurements; beyond them the controller stops until ``~/clear_stop``.
 
-    The force sensor of the paper ends at 100 N and 5 N m. Friction keeps the needle of the
-    presets `phantom` and `paper_mm` below 0.05 m/s at 15 N; `paper_si` has next to none.
+    The range of the paper's force sensor is 100 N and 5 N m. Friction keeps the needle of the
+    presets `phantom` and `paper_mm` below 0.05 m/s at 15 N; `paper_si` has almost no friction.
     """
 
     speed: float = constant(
@@ -24,7 +24,7 @@ class SafetyLimits:
         0.01, 'm', 'largest distance of the needle from the reference', open_low=True
     )
     depth_tolerance: float = constant(
-        2e-3, 'm', 'how far beyond lowest_depth and highest_depth the needle may be'
+        2e-3, 'm', 'allowed insertion depth beyond lowest_depth and highest_depth'
     )
     angular_speed: float = constant(
         100.0, 'rad/s', 'largest angular speed of the base, in both directions', open_low=True
@@ -45,27 +45,27 @@ class SafetyLimits:
         1.0, 'N m', 'largest moment on the force sensor, in both directions', open_low=True
     )
     tip_jump: float = constant(
-        0.02, 'm', 'change of tip_deflection from one sample to the next that is a fault of '
-        'its sensor', open_low=True,
+        0.02, 'm', 'change of tip_deflection between two samples that is a sensor fault',
+        open_low=True,
     )  # fmt: skip
     lateral_jump: float = constant(
-        5.0, 'N', 'change of the lateral force from one sample to the next that is a fault of '
-        'its sensor', open_low=True,
+        5.0, 'N', 'change of the lateral force between two samples that is a sensor fault',
+        open_low=True,
     )  # fmt: skip
     moment_jump: float = constant(
-        0.5, 'N m', 'change of the moment from one sample to the next that is a fault of its '
-        'sensor', open_low=True,
+        0.5, 'N m', 'change of the moment between two samples that is a sensor fault',
+        open_low=True,
     )  # fmt: skip
     sensor_timeout: float = constant(
-        1.0, 's', 'age at which base_wrench and tip_deflection no longer count; time without a '
-        'reading, or without a change of a noisy one, that is reported',
+        1.0, 's', 'age at which base_wrench and tip_deflection are stale; time without a '
+        'reading, or without a change of a noisy reading, that is reported',
         open_low=True, high=3600.0,
     )  # fmt: skip
     sensors_required: bool = field(
         default=False,
         metadata={
             'description': 'stop when base_wrench or tip_deflection, which the observer expects, '
-            'are stale; else the observer goes on without them'
+            'are stale; else the observer continues without them'
         },
     )
 

@@ -1,4 +1,4 @@
-"""Whether measurements come at the rate that the laws are made for."""
+"""Rate monitor: compare the rate of the measurements with the rate of the control laws."""
 
 from __future__ import annotations
 
@@ -8,26 +8,26 @@ from typing import Final
 
 from needle_ros.timing import NANOSECONDS
 
-#: Steps that are compared, and how many it takes: a second of them.
+#: Largest and least number of compared steps: a second of them.
 _MOST: Final = 40
 _FEWEST: Final = 20
 
-#: How far a period may be off, and which share of the periods must be for a word.
+#: Relative tolerance of a period, and fraction of periods out of tolerance for a warning.
 _BORNE: Final = 0.2
 _SHARE: Final = 0.9
 
 
 class Pace:
     """
-    Compares the time between two measurements, by their stamps, with the period.
+    Compare the time between two measurements, by their stamps, with the period.
 
-    It looks at some of them only, so that it costs nothing per measurement. Lost measurements and
-    jitter make some steps longer and others shorter; another rate makes nearly all of them so.
+    Only a sample of the measurements is compared, to save computing time. Lost measurements and
+    jitter make some steps longer and others shorter; a wrong rate changes nearly all of them.
 
     Parameters
     ----------
     rate : float
-        Rate that the laws are made for [Hz].
+        Configured rate of the control laws [Hz].
     longest : float
         Time between two measurements that is a gap [s].
 
@@ -41,30 +41,16 @@ class Pace:
 
     def add(self, stamp: int, step: int) -> None:
         """
-        Look at the newest measurement, some times per second.
+        Add the newest measurement, a few times per second.
 
-        Parameters
-        ----------
-        stamp : int
-            Its stamp [ns].
-        step : int
-            How much later it is than the one before [ns].
-
+        ``stamp`` is its time and ``step`` the time since the measurement before [ns].
         """
         if stamp != self._seen and 0 < step <= self._longest:
             self._steps.append(step * self._rate / NANOSECONDS)
         self._seen = stamp
 
     def warning(self) -> str | None:
-        """
-        Return at which rate measurements come, if that is another one.
-
-        Returns
-        -------
-        str or None
-            Both rates and what to set; None if all is well, or as long as too few are known.
-
-        """
+        """Return a warning with both rates if they differ; None otherwise or with few samples."""
         steps = self._steps
         if len(steps) < _FEWEST:
             return None
@@ -75,6 +61,6 @@ class Pace:
             return None
         found = self._rate / median(steps)
         return (
-            f'joint_states comes at {found:.4g} Hz, rate is {self._rate:g} Hz: set rate to '
+            f'joint_states is received at {found:.4g} Hz, rate is {self._rate:g} Hz: set rate to '
             f'{found:.3g}, or the robot to {self._rate:g} Hz'
         )

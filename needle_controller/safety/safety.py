@@ -1,4 +1,4 @@
-"""All inputs of a controller, the stop that latches, and who else publishes them."""
+"""Inputs of a controller, the latched stop, and duplicate publishers."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from needle_dynamics import NeedleParameters
 from needle_ros.contract import BASE
 from needle_ros.timing import NANOSECONDS, RateCounter
 
-#: Topics without which, and with several sources of which, there is no force.
+#: Topics whose absence or duplicate publishers prevent any force.
 _VITAL: Final = ('wrench_command', 'joint_states')
 
-#: Topics whose messages come in the order of their stamps.
+#: Topics with messages in the order of their stamps.
 _MEASURED: Final = ('joint_states', 'ground_truth', 'base_wrench', 'tip_deflection')
 
-#: Shares of messages after later ones: what is said, and what is not borne; of so many [Hz].
+#: Fractions of messages out of order for a warning and for a stop; above this rate [Hz].
 _LATE: Final = 0.5
 _MUDDLED: Final = 0.9
 _FEW: Final = 10.0
@@ -27,7 +27,7 @@ _FEW: Final = 10.0
 
 class Safety:
     """
-    Everything that has to be well before a force may be commanded.
+    Conditions for a force command: valid inputs, limits, no latched stop, one publisher per topic.
 
     Parameters
     ----------
@@ -38,24 +38,24 @@ class Safety:
     parameters : NeedleParameters
         Needle.
     expected : sequence of str
-        Topics that should come all the time.
+        Topics that must be published continuously.
     noise : Mapping[str, Sequence[float]]
-        Noise of what the sensors report, by topic.
+        Noise of the sensor values, by topic.
     wrench_frame : str
         Frame of the force sensor.
 
     Attributes
     ----------
     stop : str or None
-        Why nothing is commanded until it is cleared.
+        Reason of the latched stop; None if there is no stop.
     stops : int
-        How often it was latched.
+        Number of stops so far.
     rivals : str or None
-        Why nobody knows whose command, or whose measurement, it is.
+        Topics with duplicate publishers of commands or measurements, or None.
     streams : dict of str to Stream
         Inputs by topic.
     saturation : RateCounter
-        Commands, those at their limit marked.
+        Commands, with a mark for commands at their limit.
 
     """
 
@@ -77,7 +77,7 @@ class Safety:
         self.saturation = RateCounter()
         noise = noise or {}
         timeout = limits.sensor_timeout
-        # A stamp that is ahead would make those of the true source late.
+        # A stamp in the future would make the stamps of the true source late.
         ahead = 1.0 / settings.rate
         self.streams = {
             stream.name: stream
@@ -99,13 +99,13 @@ class Safety:
         self._expected = expected
         self._back = round(settings.measurement_timeout * NANOSECONDS)
         self._seen = 0
-        #: Since when the encoders have come without a gap [ns]; at 0 there is no /clock yet.
+        #: Start of encoder measurements without a gap [ns]; 0: no /clock yet.
         self._begun: int | None = None
         self._stale: set[str] = set()
 
     def begin(self, now: int) -> None:
         """
-        Forget all readings, and expect new ones from a time [ns] on; a stop stays.
+        Discard all readings, and expect new readings from a time [ns] on; a stop stays.
 
         Parameters
         ----------
@@ -122,17 +122,12 @@ class Safety:
 
     def clock_went_back(self, now: int) -> float:
         """
-        Return by how much the clock was set back since the last call [s], or zero.
+        Return the step back of the clock since the last call [s], or zero.
 
         Parameters
         ----------
         now : int
             Time now [ns].
-
-        Returns
-        -------
-        float
-            Step back [s].
 
         """
         back, self._seen = self._seen - now, now
@@ -140,24 +135,19 @@ class Safety:
 
     def latch(self, reason: str | None) -> bool:
         """
-        Stop for a reason, if there is one; return whether it begins with this.
+        Latch a stop for a reason, if not None; return whether the stop begins now.
 
         Parameters
         ----------
         reason : str or None
             The reason.
 
-        Returns
-        -------
-        bool
-            Whether the stop begins now.
-
         """
         if reason is None or self.stop is not None:
             return False
         self.stop = reason
         self.stops += 1
-        # There is no reference any more, so the distance from it no longer counts.
+        # A stop discards the reference, and so the tracking error.
         self.guard.forget('reference')
         return True
 
@@ -177,7 +167,7 @@ class Safety:
 
         """
         for stream in self.streams.values():
-            # Readings from before the silence say nothing about the present.
+            # Readings from before the silence are outdated.
             if stream.silence(now) * NANOSECONDS > stream.timeout:
                 self.guard.forget(stream.name)
         required = self.warning(now) if self.limits.sensors_required else None
@@ -188,7 +178,7 @@ class Safety:
 
     def count_publishers(self, publishers: Mapping[str, int]) -> None:
         """
-        Take in how many nodes publish what may have one source only, this controller included.
+        Set the number of publishers of topics with a single source, including this controller.
 
         Parameters
         ----------
@@ -208,7 +198,7 @@ class Safety:
 
     def muddled(self, now: int) -> str | None:
         """
-        Return why the encoders are not those of one robot with one clock.
+        Return a fault if nearly all encoder messages are out of order: several robots or clocks.
 
         Parameters
         ----------
@@ -218,14 +208,14 @@ class Safety:
         Returns
         -------
         str or None
-            Which share of their messages came after later ones, if that is nearly all.
+            Fraction of messages out of order; None if it is tolerable.
 
         """
         window = self.streams['joint_states'].window
         share = window.share(now)
         if share <= _MUDDLED or window.rate(now) < _FEW:
             return None
-        return f'joint_states has {share:.0%} of its messages after later ones'
+        return f'joint_states has {share:.0%} of its messages out of order'
 
     def _silent(self, now: int) -> dict[str, str]:
         """Return a line for each expected topic that is silent while the encoders are not."""
@@ -239,7 +229,7 @@ class Safety:
             for name in self._expected
         }
         return {
-            name: f'{name} is stale: none that counts for {silence:.1f} s'
+            name: f'{name} is stale: no valid message for {silence:.1f} s'
             for name, silence in silences.items()
             if silence > self.limits.sensor_timeout
         }
@@ -253,11 +243,6 @@ class Safety:
         now : int
             Time [ns].
 
-        Returns
-        -------
-        list of str
-            The lines.
-
         """
         silent = self._silent(now)
         lines = [line for name, line in silent.items() if name not in self._stale]
@@ -266,7 +251,7 @@ class Safety:
 
     def warning(self, now: int) -> str | None:
         """
-        Return which expected topics are stale or frozen, and which come out of order.
+        Return the expected topics that are stale or frozen, and the topics out of order.
 
         Parameters
         ----------
@@ -276,7 +261,7 @@ class Safety:
         Returns
         -------
         str or None
-            The topics and since when; None if all are well.
+            The topics with their state; None if all are valid.
 
         """
         frozen = (
@@ -288,7 +273,7 @@ class Safety:
             name: line for name, line in self._silent(now).items() if not self.streams[name].frozen
         }
         late = (
-            f'{name} has {share:.0%} of its messages after later ones'
+            f'{name} has {share:.0%} of its messages out of order'
             for name, stream in self.streams.items()
             if name in _MEASURED
             and (share := stream.window.share(now)) > _LATE
@@ -298,17 +283,12 @@ class Safety:
 
     def describe(self, now: int) -> dict[str, object]:
         """
-        Return what diagnostics say of inputs, stops and saturation.
+        Return the diagnostics of inputs, stops and saturation.
 
         Parameters
         ----------
         now : int
             Time [ns].
-
-        Returns
-        -------
-        dict
-            Values by name.
 
         """
         return {

@@ -1,4 +1,4 @@
-"""One input, and what a message of it must be to count."""
+"""Input monitor: check stamp, frame and values of the messages of a topic."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from typing import Final, NamedTuple
 
 from needle_ros.timing import apart, NANOSECONDS, RateCounter
 
-#: Kinds of messages that do not count and do no harm.
+#: Kinds of discarded messages that are harmless.
 REPEATED: Final = 'repeated'
 DROPPED: Final = 'dropped'
 
-#: Steps beyond noise that make a sensor a noisy one, of which identical readings are suspicious.
+#: Changes above noise level after which a sensor is noisy, and identical readings are a fault.
 _LIVELY: Final = 10
 
 
@@ -22,53 +22,53 @@ _ROUNDING: Final = 2
 
 
 class Refusal(NamedTuple):
-    """Why a message does not count: a kind to count by, and a line for people."""
+    """Reason to discard a message: a kind for counters, and a line for the log."""
 
     kind: str
     line: str
 
     @property
     def harmless(self) -> bool:
-        """Whether the message is counted only, and nobody needs to hear of it."""
+        """Whether the message is only counted, and not reported."""
         return self.kind in (REPEATED, DROPPED)
 
 
 class Stream:
     """
-    Judges the messages of one topic.
+    Check the messages of one topic.
 
     Parameters
     ----------
     name : str
         Topic.
     timeout : float
-        Age from which a message no longer counts [s]; also how far its stamp may be ahead.
+        Age from which a message is stale [s]; also the largest lead of its stamp.
     frames : sequence of str
         Valid frames; none: any.
     jumps : sequence of float
-        Change of each value from one message to the next that is not believed.
+        Change of each value between two messages that is implausible.
     noise : sequence of float
-        Noise of each value: a stream that had it and is frozen is not believed. None: it may
-        be as still as it likes.
+        Noise of each value: a noisy stream with constant values is frozen. None: constant values
+        are valid.
     ahead : float, optional
-        How far a stamp may be ahead [s]; as far as it may be old, if it is not given.
+        Largest lead of a stamp [s]; by default the timeout.
 
     Attributes
     ----------
     last : int
         Stamp of the newest message that was in time [ns], -1 before the first.
     step : int
-        How much later that was than the one before it [ns].
+        Time between that message and the one before [ns].
     counted : int or None
-        When the last message came that counts [ns].
+        Time at which the last valid message was received [ns].
     counts : Counter
-        Messages by what became of them.
+        Messages by result of the check.
     frozen : bool
         Whether a noisy stream has had the same values for longer than the timeout.
     publishers : int
-        How many nodes publish the topic. While there are several no message counts.
+        Number of nodes that publish the topic. With several publishers no message is valid.
     window : RateCounter
-        Messages, those that came after a later one marked.
+        Messages, with a mark for messages out of order.
 
     """
 
@@ -93,7 +93,7 @@ class Stream:
         self.forget()
 
     def forget(self) -> None:
-        """Forget what came before, but for the counts: a first message is the next one."""
+        """Discard all messages, except for the counts."""
         self.last = -1
         self.step = 0
         self.counted: int | None = None
@@ -105,21 +105,21 @@ class Stream:
         self, stamp: int, now: int, frame: str = '', values: Sequence[float] = ()
     ) -> Refusal | None:
         """
-        Judge a message.
+        Check a message.
 
         Parameters
         ----------
         stamp, now : int
-            Its stamp, and the time now [ns].
+            Stamp of the message, and the present time [ns].
         frame : str
-            Its frame.
+            Frame of the message.
         values : sequence of float
-            Its numbers, always as many.
+            Values of the message, always as many.
 
         Returns
         -------
         Refusal or None
-            None for a message that counts.
+            None for a valid message.
 
         """
         refusal = self._judge(stamp, now, frame, values)
@@ -153,9 +153,9 @@ class Stream:
                 return Refusal('not stamped', f'{self.name} is stale: it is not stamped')
             return Refusal('stale', f'{self.name} is stale: its stamp is {apart(age)}')
         if stamp == self.last:
-            return Refusal(REPEATED, f'{self.name} came twice')
+            return Refusal(REPEATED, f'{self.name} received twice')
         if stamp < self.last:
-            return Refusal(DROPPED, f'{self.name} came after a later one')
+            return Refusal(DROPPED, f'{self.name} received out of order')
         self.step, self.last = stamp - self.last, stamp
         return None
 
@@ -180,17 +180,12 @@ class Stream:
 
     def silence(self, now: int) -> float:
         """
-        Return for how long nothing that counts has come [s]; zero before the first.
+        Return the time since the last valid message [s]; zero before the first.
 
         Parameters
         ----------
         now : int
             Time [ns].
-
-        Returns
-        -------
-        float
-            Silence [s].
 
         """
         return (now - self.counted) / NANOSECONDS if self.counted is not None else 0.0
@@ -203,11 +198,6 @@ class Stream:
         ----------
         now : int
             Time [ns].
-
-        Returns
-        -------
-        str
-            The line.
 
         """
         refused = {

@@ -1,1 +1,1 @@
-"""Guides that move so that the tip hits its target: our controller, and those of others."""
+"""Steering: controllers that move the guide so that the tip hits its target, and baselines."""

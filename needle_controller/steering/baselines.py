@@ -1,11 +1,11 @@
 """
-How others steer, after what they published, with the interface of our controller.
+Published steering methods as baselines, with the interface of `SteeringController`.
 
-`Broyden` is after [Bernardes2023]_: the tip is taken to move by a matrix times the motion of the
-guide and of the depth, which is corrected after each step. `Springs` is after [Glozman2007]_: the
-inverse of a beam on springs that pull it to the axis. `RollTowards` is after [Rucker2013]_: a
-guide that rests, and a bevel that is turned towards the target. All are written anew from what is
-published, not the code of their authors.
+`Broyden` follows [Bernardes2023]_: tip motion is a matrix times the motion of guide and depth, and
+the matrix is corrected after each step. `Springs` follows [Glozman2007]_: the inverse of a beam on
+springs that pull it to the axis. `RollTowards` follows [Rucker2013]_: a fixed guide, and a bevel
+that is turned towards the target. All are written from the publications, without the code of their
+authors.
 
 References
 ----------
@@ -35,28 +35,28 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.optimize import lsq_linear
 
-#: Part of an error of the prediction by which the matrix of Broyden is corrected.
+#: Fraction of a prediction error that corrects the matrix of Broyden.
 _ALPHA: Final = 0.65
 
 #: Depth at which tissue holds the needle [m].
 _HELD: Final = 0.02
 
-#: A response of the springs below which their inverse says nothing.
+#: Least response of the springs that is inverted.
 _LEAST: Final = 1e-3
 
 
 class OpenLoop:
     """
-    A guide that stays where it is.
+    A fixed guide.
 
     Parameters
     ----------
     depths : array_like, shape (n + 1,)
-        Depths of the looks [m].
+        Depths of the tip measurements [m].
     target : array_like, shape (2,)
-        Where the tip shall be at the end, x and z [m].
+        Target position of the tip at the last depth, x and z [m].
     position_limit : float
-        Farthest position of the guide along each axis [m].
+        Largest position of the guide along each axis [m].
 
     """
 
@@ -68,20 +68,7 @@ class OpenLoop:
         self.roll = 0.0
 
     def next(self, tip: FloatArray | None) -> Guidance:
-        """
-        Take a look at the tip, and return where guide and roll shall be in the next step.
-
-        Parameters
-        ----------
-        tip : ndarray of shape (2,) or None
-            Position of the tip in x and z [m]; None if it was not seen.
-
-        Returns
-        -------
-        Guidance
-            Guide and roll.
-
-        """
+        """Process a tip measurement, x and z [m], or None; return guide and roll of the step."""
         if tip is not None and self.step < len(self.depths) - 1:
             self.guide = np.clip(self._choose(tip), -self.limit, self.limit)
         self.step += 1
@@ -94,24 +81,16 @@ class OpenLoop:
 
 class Broyden(OpenLoop):
     """
-    A matrix from motions of guide and depth to those of the tip, corrected after each step.
+    A matrix from motions of guide and depth to motions of the tip, corrected after each step.
 
-    Each step brings the tip as near to the target as the matrix says that the guide can. In the
-    source this is a horizon of four steps; without a price of motion the first of them is the
-    same for any horizon. Two things are ours: the first matrix comes from a simulated insertion of
-    the believed needle, and the guide rests until the needle is held by tissue. Near the skin the
-    tip goes with the guide, deeper against it, and a wrong sign drives the guide to its limit,
-    where nothing is learned.
+    Each step minimizes the distance of the tip from the target, as predicted by the matrix. The
+    source has a horizon of four steps; without a cost of motion its first step is the same for any
+    horizon. Two changes against the source: the first matrix is from a simulated insertion of
+    the nominal needle, and the guide is fixed until tissue holds the needle. Near the skin the tip
+    moves with the guide, deeper against it, and a wrong sign drives the guide to its limit,
+    without any further correction.
 
-    Parameters
-    ----------
-    needle : NeedleParameters
-        Needle and tissue as they are believed.
-    steering : SteeringParameters
-        What they have beyond.
-    depths, target, position_limit
-        As for `OpenLoop`.
-
+    Needle, tissue and steering constants are nominal; other parameters as for `OpenLoop`.
     """
 
     def __init__(
@@ -123,7 +102,7 @@ class Broyden(OpenLoop):
         position_limit: float = 6e-3,
     ) -> None:
         super().__init__(depths, target, position_limit)
-        #: Of x and z of the tip, by x and z of the guide and the depth.
+        #: Derivatives of x and z of the tip by x and z of the guide and the depth.
         self._matrix = np.zeros((2, 3))
         self._before: tuple[FloatArray, FloatArray] | None = None
         earlier = SteeredNeedle(needle, steering)
@@ -156,15 +135,7 @@ class Springs(OpenLoop):
     """
     The inverse of a beam on springs, along a straight line to the target.
 
-    Parameters
-    ----------
-    needle : NeedleParameters
-        Needle and tissue as they are believed.
-    steering : SteeringParameters
-        What they have beyond.
-    depths, target, position_limit
-        As for `OpenLoop`.
-
+    Needle, tissue and steering constants are nominal; other parameters as for `OpenLoop`.
     """
 
     def __init__(
@@ -185,23 +156,18 @@ class Springs(OpenLoop):
         if abs(then) < _LEAST:
             return self.guide
         wanted = self.target * self.depths[self.step + 1] / self.depths[-1]
-        # What the springs do not explain stays.
+        # The unmodeled deflection is assumed constant.
         return np.asarray((wanted - (tip - now * self.guide)) / then)
 
 
 class RollTowards(OpenLoop):
     """
-    A bevel that is turned so that it pushes towards the target, as the needle now goes.
+    A bevel that is turned to push towards the target, along the present heading of the tip.
 
-    In the source the needle turns all the time, the faster the farther the target is from the
-    plane in which it bends; in steps that is a turn into that plane. The heading of the tip comes
-    from two looks. At zero roll the bevel pushes along z.
-
-    Parameters
-    ----------
-    depths, target, position_limit
-        As for `OpenLoop`.
-
+    In the source the needle rotates continuously, with a rate that grows with the distance of the
+    target from the bending plane; in steps this is a turn into that plane. The heading of the tip
+    is computed from two measurements. At zero roll the bevel pushes along z. Parameters as for
+    `OpenLoop`.
     """
 
     def __init__(self, depths: ArrayLike, target: ArrayLike, position_limit: float = 6e-3) -> None:
@@ -214,6 +180,6 @@ class RollTowards(OpenLoop):
         if before is not None:
             heading = (tip - before[1]) / (depth - before[0])
             x, z = (self.target - tip) - heading * (self.depths[-1] - depth)
-            # At a roll of phi it pushes along (sin phi, cos phi).
+            # At a roll of phi the bevel pushes along (sin phi, cos phi).
             self.roll += remainder(0.5 * pi - atan2(z, x) - self.roll, tau)
         return self.guide

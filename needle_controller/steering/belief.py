@@ -1,4 +1,4 @@
-"""What a steering controller believes of needle, tissue, path and sensor before it starts."""
+"""Prior uncertainty of needle, tissue, path and sensor for a steering controller."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from needle_ros.settings import check_constants, constant
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SteeringBelief:
     """
-    How far needle and tissue may differ from what is believed of them, and what nobody knows.
+    Prior uncertainty of needle, tissue, guide, path and sensor.
 
     Raises
     ------
@@ -20,24 +20,24 @@ class SteeringBelief:
     """
 
     spread: float = constant(
-        0.3, '1', 'part by which bending length and skin may differ from the believed ones',
+        0.3, '1', 'relative uncertainty of bending length and skin stiffness',
         high=0.9,
     )  # fmt: skip
     tilt: float = constant(0.04, 'rad', 'standard deviation of the tilt of the guide')
     frame: float = constant(
-        0.06, 'rad', 'standard deviation of the turn between the frames of guide and sensor'
+        0.06, 'rad', 'standard deviation of the rotation between the frames of guide and sensor'
     )
     bevel: float = constant(0.3, 'N', 'standard deviation of the lateral load of the bevel')
     offset: float = constant(1e-3, 'm', 'standard deviation of the origin of the sensor')
     path_noise: float = constant(
-        1e-4, 'rad^2/m', 'variance of the direction of the path that grows per length',
+        1e-4, 'rad^2/m', 'growth of the variance of the path direction per length',
         open_low=True,
     )  # fmt: skip
     path_noise_length: float = constant(
-        5e-3, 'm', 'length over which that noise forgets itself', open_low=True
+        5e-3, 'm', 'correlation length of the path noise', open_low=True
     )
     noise: float = constant(
-        4e-5, 'm', 'standard deviation of a look at the tip, along each axis', open_low=True
+        4e-5, 'm', 'standard deviation of a tip measurement, along each axis', open_low=True
     )
 
     def __post_init__(self) -> None:

@@ -1,21 +1,21 @@
 r"""
-The controller that steers the tip to a target by guide and roll, one step at a time.
+Steering controller: bring the tip to a target by guide and roll, one step at a time.
 
-**What it knows.** Each hypothesis of `SteeringModel` is linear, so that what a look at the tip
-says of its constants is a Kalman update, and what it says of the hypothesis is the likelihood of
-that look. Together they are a mixture of normal distributions.
+**Estimation.** Each hypothesis of `SteeringModel` is linear: a tip measurement updates its
+constants by a Kalman update, and its weight by the likelihood of the measurement. All hypotheses
+together are a mixture of normal distributions.
 
-**What it does.** In a hypothesis the tip would end at
+**Control.** In a hypothesis the final position of the tip is
 
 .. math:: c + a_k b_k + u, \quad |u| \le r = \rho \sum_{j>k} |a_j| b_{max}
 
-with c what has been done and is expected, the next position of the guide :math:`b_k`, and what
-later positions can still add. The next position is the one that leaves least of the target out of
-reach, in the mean square over all hypotheses and their errors: **what any of the tissues that may
-be true would need later must stay possible**, since it is later that the tissue is known. Where
-many positions do that equally, it is the one nearest to a plan for the mean, of least motion.
-The needle is turned only if that leaves less out of reach than the guide alone can. As long as a
-turn is left, the bevel may later push wherever it has to.
+with c from past motion and expected disturbances, the next position of the guide :math:`b_k`, and
+the contribution u of later positions. The next position minimizes the mean squared distance of the
+target from the reachable set, over all hypotheses and their errors: **the plan keeps the target
+reachable for every hypothesis**, because the tissue is identified only during the insertion. Among
+equivalent positions, the nearest to a plan for the mean with least motion is used. The needle is
+turned only if that reduces the distance below the best distance by the guide alone. As long as a
+turn is left, the later load of the bevel may have any direction.
 """
 
 from __future__ import annotations
@@ -48,23 +48,23 @@ from needle_ros.errors import JobError, ParameterError, ShapeError
 import numpy as np
 from numpy.typing import ArrayLike
 
-#: A target that is reached in less of what may be true is refused at the start, and warned of on
-#: the way.
+#: Probability of a hit below which a target is rejected at the start, or warned of during the
+#: insertion.
 _REFUSED, _WARNED = 0.05, 0.5
 
 
 class Reach(NamedTuple):
     """
-    Where the tip can be brought, by each hypothesis.
+    Reachable set of the tip, for each hypothesis.
 
     Attributes
     ----------
     middles : ndarray of complex, shape (h,)
-        Where it goes without further motion, x + i z [m].
+        Final position without further motion, x + i z [m].
     sizes : ndarray of complex, shape (h,)
-        How far it can be brought from there, along x + i along z [m].
+        Half width of the reachable set, along x + i along z [m].
     weights : ndarray, shape (h,)
-        Probability of each hypothesis.
+        Weight (probability) of each hypothesis.
 
     """
 
@@ -80,9 +80,9 @@ class OutOfReachError(JobError):
     Parameters
     ----------
     why : str
-        For people.
+        Description for the user.
     reach : Reach
-        What is within reach.
+        The reachable set.
 
     """
 
@@ -92,13 +92,13 @@ class OutOfReachError(JobError):
 
 
 class SteeringFaultError(JobError):
-    """The tip that is seen is not that of this needle, or it is not seen."""
+    """The tip measurement is implausible, frozen or missing."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TipEstimate:
     """
-    Where the tip is, or will be.
+    Estimated or predicted position of the tip.
 
     Attributes
     ----------
@@ -115,12 +115,12 @@ class TipEstimate:
 
 class Guidance(NamedTuple):
     """
-    What to do before the next step: guide and needle move while the tip rests.
+    Guide setpoint for the next step: guide and roll move while the tip rests.
 
     Attributes
     ----------
     x, z : float
-        Where the guide shall be [m].
+        Position of the guide [m].
     roll : float
         Roll of the needle [rad].
 
@@ -133,56 +133,56 @@ class Guidance(NamedTuple):
 
 class SteeringController:
     """
-    Steers the tip to a target: takes a look at each depth, and returns what to do next.
+    Steer the tip to a target: one tip measurement and one guide setpoint for each step.
 
     Parameters
     ----------
     model : SteeringModel
-        What may be true, with the depths of the looks.
+        Hypotheses, with the depths of the tip measurements.
     target : array_like, shape (2,)
-        Where the tip shall be at the last depth, x and z in the frame of the sensor [m].
+        Target position of the tip at the last depth, x and z in the frame of the sensor [m].
     position_limit : float
-        Farthest position of the guide along x and along z [m]; 0 for a guide that cannot move.
+        Largest position of the guide along x and along z [m]; 0 for a fixed guide.
     turns : int
-        How often the needle may be turned.
+        Allowed number of turns of the needle.
     load_limit : float
         Largest force of the guide on needle and tissue that is planned, along x and along z [N].
     roll : float
         Roll of the needle at the start [rad].
     step_limit : float
-        Farthest that the guide may go from one step to the next along x and along z [m].
+        Largest change of the guide from one step to the next along x and along z [m].
 
     Attributes
     ----------
     target : ndarray, shape (2,)
         The target [m].
     step : int
-        Number of looks so far.
+        Number of tip measurements so far.
     turns : int
-        Turns that are left.
+        Number of turns left.
     weights : ndarray, shape (h,)
-        Probability of each hypothesis.
+        Weight (probability) of each hypothesis.
 
     Raises
     ------
     ShapeError, ParameterError
         If the target is not two finite numbers, or a limit is not valid.
     OutOfReachError
-        If the tip cannot be brought there; the message says what is within reach.
+        If the target is out of reach; the message contains the reachable set.
 
     Examples
     --------
-    A needle whose tissue is 20 % softer than believed, and whose guide is tilted:
+    A needle in tissue 20 % softer than nominal, with a tilted guide:
 
     >>> from dataclasses import replace
     >>> import numpy as np
     >>> from needle_controller.steering.controller import SteeringController
     >>> from needle_controller.steering.responses import SteeringModel
     >>> from needle_dynamics import SteeredNeedle, STEERING_PRESETS
-    >>> believed, steering, _ = STEERING_PRESETS['bending_35mm']
+    >>> nominal, steering, _ = STEERING_PRESETS['bending_35mm']
     >>> depths = np.linspace(0.0, 0.1, 21)
-    >>> control = SteeringController(SteeringModel(believed, steering, depths), (2e-3, -1e-3))
-    >>> softer = replace(believed, tissue_stiffness=0.8 * believed.tissue_stiffness)
+    >>> control = SteeringController(SteeringModel(nominal, steering, depths), (2e-3, -1e-3))
+    >>> softer = replace(nominal, tissue_stiffness=0.8 * nominal.tissue_stiffness)
     >>> needle = SteeredNeedle(softer, steering, tilt=(0.02, 0.01))
     >>> for depth in depths[1:]:
     ...     x, z, _ = control.next(needle.tip[[0, 2]])
@@ -246,19 +246,19 @@ class SteeringController:
 
     def aim(self, target: ArrayLike) -> None:
         """
-        Go on to another target at the same depth.
+        Continue to another target at the same depth.
 
         Parameters
         ----------
         target : array_like, shape (2,)
-            Where the tip shall be at the last depth, x and z in the frame of the sensor [m].
+            Target position of the tip at the last depth, x and z in the frame of the sensor [m].
 
         Raises
         ------
         ShapeError, ParameterError
             If the target is not two finite numbers.
         OutOfReachError
-            If the tip cannot be brought there. The target stays as it was then.
+            If the target is out of reach. The target is then unchanged.
 
         """
         new = np.array(target, dtype=np.float64)
@@ -273,7 +273,7 @@ class SteeringController:
             self._now.target[:] = before
             raise error
 
-    # What is known.
+    # Estimates.
 
     @property
     def target(self) -> FloatArray:
@@ -282,12 +282,12 @@ class SteeringController:
 
     @property
     def step(self) -> int:
-        """Number of looks so far."""
+        """Number of tip measurements so far."""
         return int(self._now.counts[STEP])
 
     @property
     def turns(self) -> int:
-        """Turns that are left."""
+        """Number of turns left."""
         return int(self._now.counts[TURNS])
 
     @property
@@ -297,18 +297,18 @@ class SteeringController:
 
     @property
     def bending(self) -> float:
-        """Bending length over the believed one, as far as it is known."""
+        """Estimated bending length, relative to the nominal one."""
         return float(self.weights @ self._model.lengths)
 
     def expected(self, at: int = -1) -> TipEstimate:
         """
-        Return where the tip is expected.
+        Return the predicted position of the tip.
 
         Parameters
         ----------
         at : int
-            Number of the depth; by default the last one. Guide and roll are expected to stay as
-            they were last sent.
+            Number of the depth; by default the last one. Guide and roll are assumed to stay at
+            their last setpoint.
 
         Returns
         -------
@@ -321,18 +321,18 @@ class SteeringController:
 
     @property
     def chance(self) -> float:
-        """How probable it is that the tip can still come within a millimeter of the target."""
+        """Probability that a hit within 1 mm of the target is still possible."""
         return chance(self._held)
 
     @property
     def reach(self) -> Reach:
-        """Where the tip can be brought from here."""
+        """Reachable set of the tip."""
         middles, sizes, _ = reach(self._held)
         return Reach(middles, sizes, self.weights)
 
     @property
     def warning(self) -> str:
-        """What is to be said of the target now, '' for nothing."""
+        """Warning if the target is probably out of reach, '' otherwise."""
         return '' if self.chance >= _WARNED else self._unreachable()
 
     def _unreachable(self) -> str:
@@ -340,36 +340,36 @@ class SteeringController:
         middle, size = 1e3 * complex(w @ middles), 1e3 * complex(w @ sizes)
         x, z = 1e3 * self.target
         return (
-            f'the target x = {x:.2f} mm, z = {z:.2f} mm is out of reach: from here a tip at '
+            f'the target x = {x:.2f} mm, z = {z:.2f} mm is out of reach: reachable are '
             f'x = {middle.real:.2f} ± {size.real:.2f} mm, z = {middle.imag:.2f} ± '
             f'{size.imag:.2f} mm'
         )
 
-    # What is done.
+    # Steps.
 
     def next(self, tip: Sequence[float] | FloatArray | None) -> Guidance:
         """
-        Take a look at the tip, and return where guide and roll shall be in the next step.
+        Process a tip measurement, and return guide and roll for the next step.
 
         Parameters
         ----------
         tip : array_like of shape (2,) or None
-            Position of the tip in x and z in the frame of the sensor [m]; None if it was not seen.
+            Position of the tip in x and z in the frame of the sensor [m]; None if it is missing.
 
         Returns
         -------
         Guidance
-            Guide and roll; after the last look as they are.
+            Guide and roll; unchanged after the last measurement.
 
         Raises
         ------
         ShapeError
-            If the look does not have two numbers.
+            If the measurement does not have two numbers.
         JobError
             If all steps are done.
         SteeringFaultError
-            If the tip has not been seen for too long, has frozen, or cannot be that of this
-            needle. Then the needle shall stop.
+            If the measurements are missing for too long, have frozen, or are implausible. The
+            needle must then stop.
 
         """
         self.see(tip, self.step)
@@ -377,7 +377,7 @@ class SteeringController:
 
     def see(self, tip: Sequence[float] | FloatArray | None, at: int, noise: float = 0.0) -> None:
         """
-        Take a look at the tip, of now or of an earlier depth.
+        Update the hypotheses by a tip measurement at the present or an earlier depth.
 
         Parameters
         ----------
@@ -386,7 +386,7 @@ class SteeringController:
         at : int
             Number of the depth, not greater than `step`.
         noise : float
-            Its standard deviation along each axis, if that is more than is believed [m].
+            Standard deviation of the measurement along each axis, if above the configured one [m].
 
         Raises
         ------
@@ -402,7 +402,7 @@ class SteeringController:
             raise ParameterError(f'at must be in [0, {self.step}], got {at!r}')
         seen = np.full(2, nan) if tip is None else np.array(tip, dtype=np.float64)
         if seen.shape != (2,):
-            raise ShapeError(f'a look must be x and z, got shape {seen.shape}')
+            raise ShapeError(f'a tip measurement must be x and z, got shape {seen.shape}')
         x, z = seen.tolist()
         variance = max(self._model.belief.noise, noise) ** 2
         kind, off_x, off_z = see(self._held, at, x, z, variance)
@@ -410,18 +410,18 @@ class SteeringController:
             return
         if kind == LOST:
             missing = self._now.counts[MISSING]
-            raise SteeringFaultError(f'the tip was not seen in {missing} looks')
+            raise SteeringFaultError(f'{missing} tip measurements are missing')
         if kind == FROZEN:
             same = self._now.counts[SAME] + 1
-            raise SteeringFaultError(f'the sensor of the tip is frozen: {same} looks are the same')
+            raise SteeringFaultError(f'the tip sensor is frozen: {same} identical measurements')
         raise SteeringFaultError(
-            f'the tip is {1e3 * off_x:+.2f} mm in x and {1e3 * off_z:+.2f} mm in z from where any '
-            f'needle of the belief can be'
+            f'the tip is {1e3 * off_x:+.2f} mm in x and {1e3 * off_z:+.2f} mm in z from its '
+            f'expected position, outside the model uncertainty (belief.*)'
         )
 
     def plan(self) -> Guidance:
         """
-        Return where guide and roll shall be in the next step, and go on to it.
+        Return guide and roll for the next step, and advance to it.
 
         Returns
         -------

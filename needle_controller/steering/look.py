@@ -1,4 +1,4 @@
-"""A look at the tip, while the needle rests or on its way: many readings, one position."""
+"""Averaged tip measurement: one position from many readings, at rest or during motion."""
 
 from __future__ import annotations
 
@@ -8,30 +8,30 @@ from typing import Final, NamedTuple
 from needle_dynamics.arrays import BoolArray, FloatArray
 import numpy as np
 
-#: A reading farther than this from the median, in standard deviations, is an outlier.
+#: Distance of an outlier from the median, in standard deviations.
 _OUTLIER: Final = 5.0
 
 #: Standard deviation of a normal distribution over the median of its absolute deviations.
 _NORMAL: Final = 1.4826
 
-#: Fewer readings have no outliers.
+#: Least number of readings for outlier rejection.
 _FEW: Final = 3
 
 
 class Seen(NamedTuple):
     """
-    What a look has seen.
+    Result of an averaged tip measurement.
 
     Attributes
     ----------
     tip : ndarray, shape (3,)
         Position of the tip, x, y, z [m].
     error : float
-        Standard error of it along x or z, as the readings scatter [m]; 0 for few of them.
+        Standard error along x or z, from the scatter of the readings [m]; 0 for few readings.
     readings : int
-        How many count.
+        Number of valid readings.
     frozen : bool
-        Whether they are all the same in x and z, and more than a few.
+        Whether at least three readings are identical in x and z.
 
     """
 
@@ -42,39 +42,21 @@ class Seen(NamedTuple):
 
 
 class Look:
-    """Readings of the tip at a depth, or on the way to it."""
+    """Averaged tip measurement at a depth, or during the motion through it."""
 
     def __init__(self) -> None:
         self._readings: list[tuple[float, ...]] = []
 
     def take(self, tip: tuple[float, ...], before: float = 0.0) -> None:
-        """
-        Take a reading.
-
-        Parameters
-        ----------
-        tip : tuple of float
-            Position of the tip, x, y, z [m].
-        before : float
-            How far before the depth the needle was then [m].
-
-        """
+        """Add a reading of the tip, x, y, z [m], at a distance before the depth [m]."""
         self._readings.append((*tip, before))
 
     def seen(self, noise: float) -> Seen | None:
         """
-        Return the mean without outliers; on the way, a line through them at the depth.
+        Return the mean without outliers, or during motion a fitted line at the depth; or None.
 
-        Parameters
-        ----------
-        noise : float
-            Deviation of a look as it is believed [m]: less than it makes no outlier.
-
-        Returns
-        -------
-        Seen or None
-            The position; None if there are no readings.
-
+        ``noise`` is the configured standard deviation of a measurement [m], a lower bound in the
+        outlier test.
         """
         if not self._readings:
             return None
@@ -95,20 +77,20 @@ class Look:
         left, error = tips - basis @ found, 0.0
         free = count - basis.shape[1]
         if free > 1:
-            # At the end of a line it is twice as far as of a mean.
+            # The error at the end of a line is twice the error of a mean.
             scale = basis.shape[1] / sqrt(free * count)
             error = float(np.sqrt((left[:, [0, 2]] ** 2).sum(axis=0)).max()) * scale
         across = tips[:, [0, 2]]
         frozen = count >= _FEW and bool((across == across[0]).all())
         tip = found[0]
         if frozen:
-            # Exactly, so that looks can be compared.
+            # Exactly, so that measurements can be compared.
             tip[[0, 2]] = across[0]
         return Seen(tip, error, count, frozen)
 
 
 def _fitted(basis: FloatArray, tips: FloatArray) -> FloatArray:
-    """Return median, or a line by medians: through those of the first and of the last half."""
+    """Return the median, or a line through the medians of the first and of the last half."""
     if basis.shape[1] == 1:
         return np.median(tips, axis=0)[np.newaxis]
     order = np.argsort(basis[:, 1])

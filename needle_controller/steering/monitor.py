@@ -1,4 +1,4 @@
-"""Monitor of a motion: whether the robot follows it, and which node has rejected it."""
+"""Monitor of a motion: check that the robot follows it, and that no node rejects it."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from needle_ros.status import Acknowledgement, REPEAT_AFTER, REPEATS, RequestSta
 from needle_ros.timing import NANOSECONDS
 import numpy as np
 
-#: A joint that has moved by more than this, or than its tolerance, follows [m, rad].
+#: Least displacement of a joint that follows, if less than its tolerance [m, rad].
 _MOVED: Final = 1e-4
 
 #: Time for a robot to react to a motion [s].
 _REACTION: Final = 0.3
 
-#: Stamps of a stream of motions that are kept: more than are sent in a second.
+#: Number of kept stamps of a stream of motions: more than in a second.
 _STREAMED: Final = 64
 
 
 class MotionMonitor:
     """
-    Compares the motion that was sent last with the joints, and with the answers to it.
+    Compare the last motion with the joint positions, and with the answers to it.
 
     Parameters
     ----------
@@ -46,7 +46,7 @@ class MotionMonitor:
         self.forget()
 
     def forget(self) -> None:
-        """Forget the motion: nothing is to be followed."""
+        """Discard the motion: nothing is monitored."""
         self._stamps.clear()
         self._streamed.clear()
         self._begin = self._goal = np.zeros(len(self._joints))
@@ -58,20 +58,11 @@ class MotionMonitor:
         self, move: Move, at: FloatArray, *, again: bool = False, arrives: bool = False
     ) -> None:
         """
-        Begin to monitor a motion.
+        Start to monitor a motion from positions ``at`` [m, rad], shape (joints,).
 
-        Parameters
-        ----------
-        move : Move
-            The motion.
-        at : ndarray, shape (joints,)
-            Positions from which it begins [m, rad].
-        again : bool
-            Whether it repeats the motion before.
-        arrives : bool
-            Whether the joints must arrive in time, where a part of the motion may have been
-            followed already; else they must begin to move in time.
-
+        ``again`` marks a repetition of the motion. With ``arrives`` the joints must arrive in
+        time, where a part of the motion may have been followed already; otherwise they must begin
+        to move in time.
         """
         if not again:
             self._stamps.clear()
@@ -95,45 +86,19 @@ class MotionMonitor:
         return np.minimum(self._tolerances, _MOVED)
 
     def stream(self, move: Move) -> None:
-        """
-        Take note of a motion that the next one replaces soon: only its answers count.
-
-        Parameters
-        ----------
-        move : Move
-            The motion.
-
-        """
+        """Add a motion that is soon replaced by the next: only its answers are monitored."""
         self._streamed.append(move.stamp)
 
     def wait(self, duration: int) -> None:
-        """
-        Wait longer.
-
-        Parameters
-        ----------
-        duration : int
-            Time in which a person has paused the motion [ns].
-
-        """
+        """Extend the deadline by the time in which a user paused the motion [ns]."""
         self._overdue += duration
 
     def is_late(self, at: FloatArray, stamp: int) -> bool:
         """
-        Return whether the motion should be followed by now and is not.
+        Return whether the motion is overdue and must be repeated.
 
-        Parameters
-        ----------
-        at : ndarray, shape (joints,)
-            Positions [m, rad].
-        stamp : int
-            Their stamp [ns].
-
-        Returns
-        -------
-        bool
-            Whether it is to be repeated.
-
+        ``at`` are the positions of the joints [m, rad], shape (joints,), and ``stamp`` is their
+        time [ns].
         """
         if not self._pending.any():
             return False
@@ -146,25 +111,14 @@ class MotionMonitor:
 
     @property
     def exhausted(self) -> bool:
-        """Whether the motion has been repeated as often as it may be."""
+        """Whether the largest number of repetitions is reached."""
         return len(self._stamps) > REPEATS
 
     def hear(self, node: str, status: RequestStatus) -> str:
         """
-        Take the status of a node that takes trajectories.
+        Process the status of a node that takes trajectories.
 
-        Parameters
-        ----------
-        node : str
-            Its name.
-        status : RequestStatus
-            Its status.
-
-        Returns
-        -------
-        str
-            Why it does not execute the motion, '' if it does.
-
+        Returns why the node does not execute the motion, '' if it does.
         """
         if JOINT_TRAJECTORY.name not in status.takes:
             return ''
@@ -175,7 +129,7 @@ class MotionMonitor:
         return ''
 
     def _refuses(self, answer: Acknowledgement) -> bool:
-        """Return whether an answer refuses the motion that was sent last."""
+        """Return whether an answer rejects the last motion."""
         if answer.verdict is Verdict.REJECTED:
             return answer.stamp in self._stamps or answer.stamp in self._streamed
         # The motions before the newest are superseded by it.
@@ -183,7 +137,7 @@ class MotionMonitor:
 
     @property
     def paused(self) -> str:
-        """Name of a node whose motion a person has paused, '' if none is paused."""
+        """Name of a node whose motion a user has paused, '' if none is paused."""
         return next((node for node, status in self._receivers.items() if status.paused), '')
 
     @property
@@ -192,7 +146,7 @@ class MotionMonitor:
         return self._pending
 
     def failure(self) -> str:
-        """Return how a motion was sent that is not followed, and who answered, for people."""
+        """Describe how often the motion was sent, and which nodes answered."""
         names = {self._joints[k] for k in np.flatnonzero(self._pending)}
         takers = {
             node: status

@@ -1,4 +1,4 @@
-"""Motions of needle and guide from rest to rest."""
+"""Joint motions of needle and guide from rest to rest."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _INTERVAL: Final = 0.05
 
 class Move(NamedTuple):
     """
-    A motion of needle and guide, as a robot or a controller follows it.
+    Joint motion of needle and guide, for a robot or a controller.
 
     Attributes
     ----------
@@ -49,49 +49,25 @@ class Move(NamedTuple):
 
 def smooth(joints: tuple[str, ...], begin: FloatArray, end: FloatArray, duration: float) -> Move:
     """
-    Return a motion from rest to rest, in which all joints go in proportion.
+    Return a minimum-jerk motion (fifth-order polynomial) from rest to rest of proportional joints.
 
-    Parameters
-    ----------
-    joints : tuple of str
-        Names of the joints.
-    begin, end : ndarray, shape (joints,)
-        Positions [m, rad].
-    duration : float
-        Its duration [s].
-
-    Returns
-    -------
-    Move
-        A polynomial of fifth order, of least jerk.
-
+    ``begin`` and ``end`` are positions [m, rad], shape (joints,); ``duration`` is in s.
     """
     count = max(_POINTS, ceil(duration / _INTERVAL))
     part = np.arange(1, count + 1) / count
     gone = part**3 * (10.0 - 15.0 * part + 6.0 * part**2)
     rate = 30.0 * (part * (1.0 - part)) ** 2 / duration
     way = end - begin
-    # Exactly at the end.
+    # The last point is exact.
     positions = np.vstack([begin + np.outer(gone[:-1], way), end])
     return Move(joints, duration * part, positions, np.outer(rate, way))
 
 
 def duration_of(way: FloatArray, settings: OuterLoopSettings) -> float:
     """
-    Return the shortest duration of a smooth motion within the limits.
+    Return the shortest duration [s] of a smooth motion within speed and acceleration limits.
 
-    Parameters
-    ----------
-    way : ndarray, shape (joints,)
-        How far the joints go [m, rad].
-    settings : OuterLoopSettings
-        Limits of speed and acceleration.
-
-    Returns
-    -------
-    float
-        The duration [s].
-
+    ``way`` is the displacement of the joints [m, rad], shape (joints,).
     """
     along, across = float(abs(way[0])), float(np.hypot(way[1], way[2]))
     return max(

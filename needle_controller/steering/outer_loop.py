@@ -1,10 +1,10 @@
 """
-The steering executive: plan, measure the tip, move the guide, insert the needle; without ROS.
+Steering executive: plan, measure the tip, move the guide, insert the needle; without ROS.
 
-It asks for motions of needle and guide, which a robot that follows positions executes, or an axis
-law that turns the insertion into forces. In steps, the guide moves while the needle rests, and
-the needle once the guide has arrived: so the path does not depend on the speed of either. If it
-is continuous, the needle is inserted without rests, and the guide follows its measured depth.
+It requests motions of needle and guide, which a position-controlled robot executes, or an axis law
+that converts the insertion to forces. In steps, the guide moves while the needle rests, and the
+needle moves when the guide has arrived: the path is independent of their speeds. With
+`continuous`, the needle is inserted without rests, and the guide follows its measured depth.
 """
 
 from __future__ import annotations
@@ -56,13 +56,13 @@ _JUMPS: Final = (5e-3, 5e-3, 5e-3, 1.0)
 #: Tolerance of a moving joint, as a multiple of its tolerance at rest.
 _LAGGING: Final = 5.0
 
-#: A needle that moves by less while it settles, rests [m].
+#: Largest displacement of a needle at rest [m].
 _STILL: Final = 1e-4
 
-#: The needle counts as outside tissue up to this depth: there the guide may move freely [m].
+#: Largest depth of a needle outside tissue, where the guide may move freely [m].
 _OUTSIDE: Final = 1e-3
 
-#: Positions that are the same [m, rad].
+#: Tolerance of equal positions [m, rad].
 _SAME: Final = 1e-6
 
 #: Most steps of a plan.
@@ -89,7 +89,7 @@ class Phase(Enum):
     STOPPED = 'stopped'
 
 
-#: Phases for people.
+#: Descriptions of the phases for the user.
 _DESCRIPTIONS: Final = {
     Phase.IDLE: 'waits for a target',
     Phase.PLANNING: 'computes the plan',
@@ -104,8 +104,8 @@ class OuterLoop:
     Execute a steered insertion, and stop it on any fault.
 
     Every event is a method: it takes the time now [ns] of the clock that stamps the messages, and
-    returns a motion of needle and guide to send; None leaves them to the motion that was sent
-    last. A motion is sent again until the joints follow it, see `MotionMonitor`.
+    returns a motion of needle and guide to send; None leaves the last motion in effect.
+    A motion is sent again until the joints follow it, see `MotionMonitor`.
 
     Parameters
     ----------
@@ -133,7 +133,7 @@ class OuterLoop:
     phase : Phase
         State.
     fault : str
-        Why it has stopped, '' if it has not.
+        Reason of the stop, '' without a stop.
     control : SteeringController or None
         The controller of the latest insertion.
     expected : TipEstimate or None
@@ -160,8 +160,8 @@ class OuterLoop:
         self.phase, self.fault = Phase.IDLE, ''
         self.control: SteeringController | None = None
         self.expected: TipEstimate | None = None
-        #: The plan that is computed; stamp [ns] and target [m] of the request, depths of the steps
-        #: and positions of the joints [m, rad] that it is for, and the phase before.
+        #: Plan in computation; stamp [ns] and target [m] of its request, depths of the steps and
+        #: positions of the joints [m, rad] at its start, and the phase before.
         self._start_job = start
         self._job: Job[SteeringController] | None = None
         self._wanted: tuple[int, tuple[float, float, float], FloatArray, FloatArray] = (
@@ -177,18 +177,18 @@ class OuterLoop:
         self._origin = self._goal = np.zeros(len(settings.joints))
         self._due = 0
         self._monitor = MotionMonitor(settings.joints, settings.tolerances)
-        #: Makes the motion again, from the present positions.
+        #: Creates the motion again, from the present positions.
         self._again: Callable[[int], Move | None] = lambda _now: None
-        #: Stamp of the newest motion [ns]: each has its own.
+        #: Stamp of the newest motion [ns], unique for each motion.
         self._stamp = 0
-        #: Positions at which the joints were stopped, stamp [ns] and insertion depth [m] of the
-        #: last check whether they rest, and number of stops that may still be sent.
+        #: Positions of the stop, stamp [ns] and insertion depth [m] of the last check for rest,
+        #: and number of stops left to send.
         self._halt: FloatArray | None = None
         self._halted: tuple[int, float] | None = None
         self._stops = 0
         #: Largest deviation of a reading of the tip so far [m].
         self._scatter = 0.0
-        #: Stamp [ns] and insertion depth [m] since which the needle rests.
+        #: Stamp [ns] and insertion depth [m] at the start of rest.
         self._rest: tuple[int, float] | None = None
         self._look: Look | None = None
         #: Stamps between which readings belong to a measurement at rest [ns].
@@ -231,14 +231,14 @@ class OuterLoop:
         self, stamp: int, frame: str, point: tuple[float, float, float], now: int
     ) -> Move | None:
         """
-        Plan an insertion to a target, and begin it; during an insertion, change its target.
+        Plan an insertion to a target and begin it; during an insertion, change its target.
 
         Parameters
         ----------
         stamp : int
             Stamp of the message [ns]; 0 if it has none.
         frame : str
-            Its frame.
+            Frame of the message.
         point : tuple of float
             Target of the tip, x, y, z [m].
         now : int
@@ -398,7 +398,7 @@ class OuterLoop:
         Parameters
         ----------
         why : str
-            For people.
+            Reason for the user.
         now : int
             Time [ns].
         silence : float
@@ -421,7 +421,7 @@ class OuterLoop:
         if not moves or self._at is None:
             return None
         end, limit = self._at.copy(), self.settings.guide_limit
-        # It needs a distance to brake, and the positions may be implausible.
+        # Includes the braking distance; clipped, because the positions may be implausible.
         end[0] += (0.5 * _BRAKING + silence) * self.settings.speed
         end[0] = min(max(end[0], self._origin[0]), self._goal[0])
         end[1:3] = np.clip(end[1:3], -limit, limit)
@@ -461,14 +461,14 @@ class OuterLoop:
 
     def hear(self, node: str, status: RequestStatus, now: int) -> Move | None:
         """
-        Take the status of another node: its answers to the motions.
+        Process the status of another node: its answers to the motions.
 
         Parameters
         ----------
         node : str
-            Its name.
+            Name of the node.
         status : RequestStatus
-            Its status.
+            Status of the node.
         now : int
             Time [ns].
 
@@ -483,7 +483,7 @@ class OuterLoop:
             return None
         if self.steers:
             return self.stop(refusal, now)
-        # Once: the answer is repeated each second.
+        # Only once: the answer is repeated each second.
         self._monitor.forget()
         if self.phase is Phase.STOPPED:
             self.journal.say(Severity.ERROR, f'the stop failed: {refusal}')
@@ -493,7 +493,7 @@ class OuterLoop:
 
     def joints(self, reading: Reading, now: int) -> Move | None:
         """
-        Take `joint_states`.
+        Process `joint_states`.
 
         Parameters
         ----------
@@ -535,7 +535,7 @@ class OuterLoop:
         if self.phase not in (Phase.GUIDING, Phase.INSERTING):
             return None
         if self._monitor.paused:
-            # A person decides how long.
+            # The user determines the duration of a pause.
             self._due += elapsed
             self._monitor.wait(elapsed)
         if self._monitor.is_late(self._at, reading.stamp):
@@ -553,7 +553,7 @@ class OuterLoop:
         return self._again(now)
 
     def _astray(self) -> str:
-        """Say which joint has left its way, '' if none has."""
+        """Describe the first joint outside its motion, '' if none is."""
         if not self.steers or self._at is None:
             return ''
         low, high = np.minimum(self._origin, self._goal), np.maximum(self._origin, self._goal)
@@ -561,13 +561,13 @@ class OuterLoop:
         for k, name in enumerate(self.settings.joints[:3]):
             if not low[k] - room[k] <= self._at[k] <= high[k] + room[k]:
                 return (
-                    f'{name} is at {1e3 * self._at[k]:.3f} mm, and was sent from '
+                    f'{name} is at {1e3 * self._at[k]:.3f} mm, outside its motion from '
                     f'{1e3 * self._origin[k]:.3f} to {1e3 * self._goal[k]:.3f} mm'
                 )
         return ''
 
     def _missed(self, which: BoolArray | None = None) -> str:
-        """Name the joints that are not at their goal, '' if all are; of some joints if given."""
+        """Describe the joints (or given joints) that are not at their goal, '' if all are."""
         settings, at, goal = self.settings, self._at, self._goal
         if at is None:
             return ''
@@ -583,7 +583,7 @@ class OuterLoop:
         return ' and '.join(missed)
 
     def _wait(self, stamp: int, now: int) -> Move | None:
-        """Wait until needle and guide rest where they were sent."""
+        """Wait until needle and guide rest at their goal."""
         if stamp < self._due or self._at is None:
             return None
         missed, depth = self._missed(), float(self._at[0])
@@ -605,7 +605,7 @@ class OuterLoop:
 
     def tip(self, reading: Reading, now: int) -> Move | None:
         """
-        Take `tip_deflection`.
+        Process `tip_deflection`.
 
         Parameters
         ----------
@@ -630,7 +630,7 @@ class OuterLoop:
                 self._look.take(tip)
             return self._step(now) if reading.stamp >= until else None
         if self.phase is Phase.INSERTING and self.settings.continuous and self._at is not None:
-            # Where the needle was then.
+            # Insertion depth at the time of the reading.
             depth = float(self._at[0]) - self._speed * (now - reading.stamp) / NANOSECONDS
             at = int(np.searchsorted(self._depths, depth))
             if 0 < at < len(self._depths):
@@ -678,12 +678,12 @@ class OuterLoop:
 
     def count_publishers(self, joint_states: int, tip_deflection: int) -> None:
         """
-        Take the numbers of nodes that publish the measurements: each may have one source only.
+        Set the numbers of publishers of the measurements: each must have one source only.
 
         Parameters
         ----------
         joint_states, tip_deflection : int
-            Publishers of each.
+            Number of publishers.
 
         """
         self._joint_stream.publishers = joint_states
@@ -698,7 +698,7 @@ class OuterLoop:
             return None
         k = control.step
         try:
-            # Readings of the step before that were late.
+            # Late readings of the step before.
             self._take(control, self._passing.pop(k - 1, None), k - 1)
             self._take(control, look, k, depth=float(self._at[0]))
         except SteeringFaultError as error:
@@ -719,7 +719,7 @@ class OuterLoop:
     def _take(
         self, control: SteeringController, look: Look | None, at: int, depth: float | None = None
     ) -> None:
-        """Update the controller by a measurement of the tip, which may have no readings."""
+        """Update the controller by a tip measurement, which may have no readings."""
         if look is None:
             return
         self._seen = seen = look.seen(self._belief.noise)
@@ -763,7 +763,7 @@ class OuterLoop:
         return min(max(at, float(self._origin[0])), float(self._goal[0]))
 
     def _follow(self, stamp: int, now: int) -> Move | None:
-        """Send the guide with the needle, and plan at each depth that the needle passes."""
+        """Send the guide with the needle, and plan at each passed depth."""
         control, at = self.control, self._at
         if control is None or at is None:
             return None
@@ -786,7 +786,7 @@ class OuterLoop:
             self._passed, self._due = last, stamp
             return self._end_guide(now)
         if stamp > self._due + self.settings.patience * NANOSECONDS:
-            # The guide is at its position of this depth.
+            # The guide is at its setpoint of this depth.
             self._goal[1:] = at[1:]
             return self._wait(stamp, now)
         interval = 1.0 / self.settings.rate
@@ -803,7 +803,7 @@ class OuterLoop:
         return move
 
     def _end_guide(self, now: int, *, again: bool = False) -> Move | None:
-        """Send the guide to the end of the last step, where it must arrive."""
+        """Send the guide to the end of the last step, with a check of its arrival."""
         if self._at is None:
             return None
         self._again = lambda later: self._end_guide(later, again=True)
@@ -823,7 +823,7 @@ class OuterLoop:
         return self._stamped(move, now)
 
     def _pass(self, control: SteeringController, at: FloatArray) -> str:
-        """Take the measurement of the depth before, and plan; return the fault, '' if none."""
+        """Process the measurement of the depth before, and plan; return the fault, '' if none."""
         k, there = self._passed, self._between[1]
         if np.abs(at[1:3] - there).max() > _LAGGING * self.settings.guide_tolerance:
             x, z = 1e3 * at[1:3]
@@ -844,7 +844,7 @@ class OuterLoop:
     # Faults and motions.
 
     def _slip(self, seen: Seen | None, depth: float) -> str:
-        """Return the fault if the tip is not as deep as the needle is inserted, '' if it is."""
+        """Return the fault if tip depth and insertion depth differ, '' if not."""
         if seen is None:
             return ''
         ahead = float(seen.tip[1]) - depth
@@ -854,14 +854,14 @@ class OuterLoop:
         if abs(slipped) <= self.settings.slip_tolerance:
             return ''
         if seen.frozen:
-            return f'the sensor of the tip is frozen: {seen.readings} readings are the same'
+            return f'the tip sensor is frozen: {seen.readings} identical readings'
         return (
             f'the tip is {1e3 * abs(slipped):.2f} mm {"less" if slipped < 0.0 else "more"} deep '
-            'than the needle was inserted: it slips, or the sensor is of another needle'
+            'than the needle was inserted: it slips, or the sensor measures another needle'
         )
 
     def _send(self, phase: Phase, goal: FloatArray, now: int) -> Move | None:
-        """Send needle and guide to positions, from the positions where they were sent last."""
+        """Send needle and guide to positions, from their last goal."""
         self.phase, self._rest = phase, None
         self._origin, self._goal = self._goal, goal
         return self._move(now, self._origin)
@@ -870,10 +870,10 @@ class OuterLoop:
         duration = duration_of(self._goal - begin, self.settings)
         self._due = now + round(duration * NANOSECONDS)
         if np.abs(self._goal - begin).max() < _SAME:
-            # Too short to be a motion: the times of its points would be the same.
+            # Too short: the times of the points would be equal.
             self._monitor.forget()
             return None
-        # Again from the present positions: it never jumps.
+        # Repeated from the present positions, without a jump.
         self._again = lambda later: (
             self._move(later, self._at, again=True) if self._at is not None else None
         )
@@ -882,7 +882,7 @@ class OuterLoop:
         return move
 
     def _stamped(self, move: Move, now: int) -> Move:
-        """Return a motion with a stamp of its own: simulated time may stand still."""
+        """Return a motion with a unique stamp: simulated time may stand still."""
         self._stamp = max(now, self._stamp + 1)
         return move._replace(stamp=self._stamp)
 
@@ -928,15 +928,6 @@ class OuterLoop:
         ----------
         now : int
             Time [ns].
-
-        Returns
-        -------
-        severity : Severity
-            Severity of the state.
-        state : str
-            For people.
-        values : dict
-            Values by name.
 
         """
         values, warning = self._describe_control()

@@ -1,4 +1,4 @@
-"""Jobs that compute a plan: at once, or in a thread that can be cancelled."""
+"""Jobs that compute a plan: synchronously, or in a thread that can be cancelled."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Job(Protocol[_Result_co]):
         """Return the result, or raise the error of the computation."""
 
     def cancel(self) -> None:
-        """End it soon; its result is not used."""
+        """Cancel it; its result is not used."""
 
 
 class StartJob(Protocol):
@@ -49,7 +49,7 @@ class StartJob(Protocol):
 
 class ComputedJob(Generic[_Result]):
     """
-    A job that is computed where it is started, for simulations.
+    A job that is computed synchronously, for simulations.
 
     Parameters
     ----------
@@ -65,28 +65,27 @@ class ComputedJob(Generic[_Result]):
         self._error: Exception | None = None
         try:
             self._result = work(lambda _done, _parts: None)
-        # It is raised again by `result`.
+        # Raised again by `result`.
         except Exception as error:  # noqa: BLE001
             self._error = error
 
     def result(self) -> _Result:
-        """Return the result, or raise the error of the computation."""
         if self._error is not None:
             raise self._error
         return self._result
 
     def cancel(self) -> None:
-        """Do nothing: it has ended."""
+        """Do nothing: the job has ended."""
 
 
 class ThreadJob(Generic[_Result]):
     """
-    A job in a thread of its own.
+    A job in its own thread.
 
     Parameters
     ----------
     work : callable
-        Computes the result; it calls the function that it is given between its parts.
+        Computes the result; it calls its argument between its parts.
 
     """
 
@@ -95,14 +94,14 @@ class ThreadJob(Generic[_Result]):
         self._cancelled, self._ended = Event(), Event()
         self._fraction = 0.0
         self._error: Exception | None = JobError(_NOT_DONE)
-        # A process that ends does not wait for it.
+        # A daemon: the end of the process does not wait for it.
         Thread(target=self._run, name='plan', daemon=True).start()
 
     def _run(self) -> None:
         try:
             self._result = self._work(self._progress)
             self._error = None
-        # It is raised again by `result`, in the thread of the caller.
+        # Raised again by `result`, in the thread of the caller.
         except Exception as error:  # noqa: BLE001
             self._error = error
         self._ended.set()
@@ -114,20 +113,17 @@ class ThreadJob(Generic[_Result]):
 
     @property
     def done(self) -> bool:
-        """Whether it has ended, with a result or an error."""
         return self._ended.is_set()
 
     @property
     def fraction(self) -> float:
-        """Fraction that is done, 0 to 1."""
         return self._fraction
 
     def result(self) -> _Result:
-        """Return the result, or raise the error of the computation."""
         if self._error is not None:
             raise self._error
         return self._result
 
     def cancel(self) -> None:
-        """End it before its next part; its result is not used."""
+        """Cancel it before its next part; its result is not used."""
         self._cancelled.set()

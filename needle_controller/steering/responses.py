@@ -6,15 +6,14 @@ bevel, and in the loads that bend its path away from the nominal one:
 
 .. math:: z_k = \sum_j A_{kj} b_j + H_k \theta
 
-with positions :math:`b_j` of the guide in the steps, and unknown constants
-:math:`\theta`: origin and rotation of the sensor's frame, tilt, bevel, and a curvature of the
-path at each depth, linear between the depths. A and H depend on the bending length and on the
-stiffness of the skin. A hypothesis is a point of a grid of these two. A position between two
-points of the grid is two more unknown constants, with the difference of A from one point to the
-next.
+with positions :math:`b_j` of the guide in the steps, and unknown constants :math:`\theta`: origin
+and rotation of the sensor's frame, tilt, bevel, and a curvature of the path at each depth, linear
+between the depths. A and H depend on the bending length and on the stiffness of the skin. A
+hypothesis is a point of a grid of these two. A position between two points of the grid is
+described by two more unknown constants, with the difference of A between the points.
 
-Both planes have the same, so that everything is a complex number, x + i z. At a roll
-:math:`\varphi` the bevel pushes along :math:`i e^{-i \varphi}`.
+The responses are equal in both planes, so that all quantities are complex numbers, x + i z. At a
+roll :math:`\varphi` the bevel pushes along :math:`i e^{-i \varphi}`.
 """
 
 from __future__ import annotations
@@ -57,7 +56,7 @@ _BEYOND: Final = 1.1
 #: Longest element [m]: good to a few micrometers.
 _ELEMENT: Final = 1.25e-3
 
-#: Depths that are no farther apart are the same [m].
+#: Tolerance of equal depths [m].
 _SAME: Final = 1e-9
 
 #: Standard deviation of a uniform distribution over a cell of the grid.
@@ -93,7 +92,7 @@ class SteeringModel:
     belief : SteeringBelief
         As given.
     lengths, skins : ndarray, shape (h,)
-        Bending length and skin stiffness of each hypothesis, relative to the nominal ones.
+        Bending length and skin stiffness of each hypothesis, relative to the nominal values.
     guide : ndarray, shape (h, n + 1, n)
         Shift of the tip at each depth per position of the guide in each step.
     causes : ndarray, shape (h, n + 1, 5 + n)
@@ -218,7 +217,7 @@ class SteeringModel:
             to[0][:], to[2][:] = found[:, guide], found[:, bevel]
             to[1][:, 0], to[1][:, 1], to[1][:, 2] = origin, turn, found[:, n]
             to[1][:, 3], to[1][:, 4:] = found[:, bevel].sum(axis=1), found[:, curvature]
-        # A bevel that is turned at rest moves the tip at once.
+        # A turn of the bevel at rest moves the tip elastically.
         self.elastic[i, :n] = (moved - tip[:-1])[:, n + 2 : 2 * n + 2].diagonal()
         self.elastic[i, n] = self.elastic[i, n - 1]
 
@@ -265,10 +264,10 @@ class _Rows:
             posed[1, 2 * k + 1 : 2 * k + 3, n + 2 + k] = 1.0
         whole = np.array(poses).astype(np.int64)
         part = (np.array(poses) - whole)[:, np.newaxis]
-        # Evenly from pose to pose.
+        # Linear from pose to pose.
         later = np.minimum(whole + 1, 2 * n)
         posed = (1.0 - part) * posed[:, whole] + part * posed[:, later]
-        # Compiled code takes contiguous arrays.
+        # Compiled code requires contiguous arrays.
         self.guide, self.bevel = np.ascontiguousarray(posed)
         self.tilt = np.zeros(3 * n + 3)
         self.tilt[n] = 1.0
@@ -280,7 +279,7 @@ class _Rows:
 
 
 def _layers(starts: FloatArray, depths: ArrayLike) -> IntArray:
-    """Return the layers that begin at depths or hold them."""
+    """Return the layers that begin at depths or contain them."""
     return np.asarray(np.searchsorted(starts, np.asarray(depths) + _SAME, side='right') - 1)
 
 

@@ -1,4 +1,4 @@
-"""Steps, looks and limits of a needle that is steered, as parameters."""
+"""Steps, tip measurements and limits of a steered insertion, as parameters."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from needle_ros.errors import ParameterError
 from needle_ros.settings import check_constants, constant
 import numpy as np
 
-#: How often the guide is sent on within a step, at least.
+#: Least number of guide commands within a step.
 _PER_STEP: Final = 4.0
 
-#: Joints that are moved; the last one only if the needle may be turned.
+#: Joints that are moved; roll only if turns are allowed.
 JOINTS: Final = (INSERTION, GUIDE_X, GUIDE_Z, ROLL)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OuterLoopSettings:
-    """Steps, looks and limits of a needle that is steered."""
+    """Steps, tip measurements and limits of a steered insertion."""
 
     step_length: float = constant(
         5e-3, 'm', 'insertion from one tip measurement to the next', open_low=True
@@ -38,11 +38,11 @@ class OuterLoopSettings:
     acceleration: float = constant(
         0.1,
         'm/s^2',
-        'highest acceleration of needle and guide; not of a guide that is continuous',
+        'highest acceleration of needle and guide; not of the guide if continuous',
         open_low=True,
     )
-    turns: int = constant(0, '1', 'how often the needle may be turned')
-    roll_speed: float = constant(2.0, 'rad/s', 'fastest roll', open_low=True)
+    turns: int = constant(0, '1', 'allowed number of turns of the needle')
+    roll_speed: float = constant(2.0, 'rad/s', 'highest angular speed of the roll', open_low=True)
     load_limit: float = constant(
         8.0, 'N', 'largest lateral force of the guide that is planned, along x and along z; the '
         'reachable set is computed without it',
@@ -51,13 +51,11 @@ class OuterLoopSettings:
     continuous: bool = field(
         default=False,
         metadata={
-            'description': 'the needle goes in without rests, and the guide with it; else it '
-            'rests at the end of each step'
+            'description': 'the needle is inserted without rests, and the guide follows its '
+            'depth; else it rests at the end of each step'
         },
     )
-    rate: float = constant(
-        20.0, 'Hz', 'continuous: how often the guide is sent on', low=1.0, high=50.0
-    )
+    rate: float = constant(20.0, 'Hz', 'continuous: rate of guide commands', low=1.0, high=50.0)
     settle_time: float = constant(0.1, 's', 'time at rest before a tip measurement')
     look_time: float = constant(
         0.5, 's', 'duration of a tip measurement, whose readings are averaged', open_low=True
@@ -72,8 +70,8 @@ class OuterLoopSettings:
         0.02, 'rad', 'largest difference of the roll at rest from its goal', open_low=True
     )
     slip_tolerance: float = constant(
-        3e-3, 'm', 'how much the depth of the tip may differ from the inserted length, beyond '
-        'the first look', open_low=True,
+        3e-3, 'm', 'largest change of the difference between tip depth and insertion depth '
+        'since the first measurement', open_low=True,
     )  # fmt: skip
     patience: float = constant(
         5.0,
@@ -83,7 +81,7 @@ class OuterLoopSettings:
         open_low=True,
     )
     measurement_timeout: float = constant(
-        0.5, 's', 'age at which joint_states and tip_deflection no longer count; largest delay of '
+        0.5, 's', 'age at which joint_states and tip_deflection are stale; largest delay of '
         'a reading of the tip', open_low=True,
     )  # fmt: skip
 
@@ -117,17 +115,12 @@ class OuterLoopSettings:
 
     def farthest(self, step: float) -> float:
         """
-        Return the largest change of the guide from one step to the next along each axis.
+        Return the largest change of the guide per step along each axis [m].
 
         Parameters
         ----------
         step : float
-            Way of the needle in a step [m].
-
-        Returns
-        -------
-        float
-            The change [m].
+            Insertion distance of a step [m].
 
         """
         if not self.continuous:
@@ -137,7 +130,7 @@ class OuterLoopSettings:
 
     @property
     def tolerances(self) -> FloatArray:
-        """How far each of them may be from where it was sent [m, rad]."""
+        """Position tolerance of each moved joint at rest [m, rad]."""
         guide = self.guide_tolerance
         every = [self.depth_tolerance, guide, guide, self.roll_tolerance]
         return np.array(every[: len(self.joints)])

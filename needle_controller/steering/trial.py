@@ -1,4 +1,4 @@
-"""A needle that differs from what is believed of it, and its insertion under a controller."""
+"""Simulated needle that differs from the nominal model, and its insertion under a controller."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ import numpy as np
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Truth:
     """
-    A needle as it is, and the turn of the sensor that sees it.
+    Ground truth of a simulated needle, and the rotation of its sensor.
 
     Attributes
     ----------
     needle : NeedleParameters
         Needle and tissue.
     steering : SteeringParameters
-        What they have beyond.
+        Their constants for steering.
     tilt : tuple of float
         Tilt of the guide in x and z.
     bevel : ndarray, shape (2,)
         Load of the bevel in x and z [N].
     frame : ndarray, shape (2,)
-        Turn of the sensor's frame: shift of the tip in x and z per depth [rad].
+        Rotation of the sensor's frame: shift of the tip in x and z per depth [rad].
     seed : int
         Seed of the noise of the path.
 
@@ -46,33 +46,12 @@ class Truth:
     seed: int
 
     def start(self) -> SteeredNeedle:
-        """
-        Return the needle before it is inserted.
-
-        Returns
-        -------
-        SteeredNeedle
-            The needle.
-
-        """
+        """Return the needle before the insertion."""
         roll = float(np.arctan2(*self.bevel))
         return SteeredNeedle(self.needle, self.steering, tilt=self.tilt, roll=roll, seed=self.seed)
 
     def tip(self, one: SteeredNeedle) -> FloatArray:
-        """
-        Return where the tip is in the frame of the sensor.
-
-        Parameters
-        ----------
-        one : SteeredNeedle
-            The needle.
-
-        Returns
-        -------
-        ndarray, shape (2,)
-            x and z [m].
-
-        """
+        """Return the tip position of a needle in the frame of the sensor, x and z [m]."""
         return np.asarray(one.tip[[0, 2]] + self.frame * one.depth)
 
 
@@ -84,26 +63,10 @@ def drawn(
     seed: int,
 ) -> Truth:
     """
-    Draw a needle that may be true.
+    Sample a true needle from the prior uncertainty of a nominal needle.
 
-    Parameters
-    ----------
-    needle : NeedleParameters
-        Needle and tissue as they are believed.
-    steering : SteeringParameters
-        What they have beyond; bevel and path noise are those of the belief.
-    belief : SteeringBelief
-        Its spread is even, its deviations are normal.
-    rng : Generator
-        Where the numbers come from.
-    seed : int
-        Seed of the noise of the path.
-
-    Returns
-    -------
-    Truth
-        The needle.
-
+    The spread of ``belief`` is uniform, its standard deviations are normal; it also gives bevel
+    and path noise. ``seed`` is the seed of the path noise.
     """
     length, skin = (1.0 + belief.spread * rng.uniform(-1.0, 1.0, 2)).tolist()
     sizes = belief.tilt, belief.frame, belief.bevel
@@ -123,18 +86,18 @@ def drawn(
 
 class Inserted(NamedTuple):
     """
-    An insertion that has ended.
+    Result of an insertion.
 
     Attributes
     ----------
     needle : SteeredNeedle
         The needle at the end.
     way : float
-        Way of the guide [m].
+        Distance moved by the guide [m].
     turns : int
-        How often the needle was turned.
+        Number of turns of the needle.
     load : float
-        Largest force on the guide after a motion of it [N].
+        Largest force on the guide after a motion of the guide [N].
 
     """
 
@@ -152,27 +115,11 @@ def insert(
     watch: Callable[[SteeredNeedle], object] | None = None,
 ) -> Inserted:
     """
-    Insert a needle in steps: look at the tip, move the guide and turn the needle, then insert it.
+    Insert a needle in steps: measure the tip, move guide and roll, then insert.
 
-    Parameters
-    ----------
-    truth : Truth
-        The needle.
-    depths : ndarray, shape (n + 1,)
-        Depths of the looks [m].
-    look : callable
-        Takes the tip in the frame of the sensor, shape (2,), and returns what it says of it, or
-        None.
-    controller : callable
-        Takes that, and returns where guide and roll shall be in the next step.
-    watch : callable, optional
-        Called with the needle after each step.
-
-    Returns
-    -------
-    Inserted
-        The needle at the end, and what it took.
-
+    ``depths`` are the depths of the measurements [m], shape (n + 1,). ``look`` returns the
+    measurement of the tip, shape (2,), or None; ``controller`` takes it and returns guide and roll
+    for the next step. ``watch`` is called with the needle after each step.
     """
     one = truth.start()
     begun, to, way, turns, load = one.roll, Guidance(0.0, 0.0), 0.0, 0, 0.0

@@ -1,4 +1,4 @@
-"""Friction learned on the way: right, bounded, and without effect on stability."""
+"""Adaptive friction: accurate, bounded, and without effect on stability."""
 
 from dataclasses import replace
 from math import inf, pi, sin
@@ -53,7 +53,7 @@ def drive(loop: SampledLoop, plant: Axis, duration: float) -> None:
         position, speed = plant.propagate(position, speed, force, PERIOD)
 
 
-def test_what_differs_from_the_model_is_learned() -> None:
+def test_friction_mismatch_is_learned() -> None:
     """Dry and viscous friction of both directions, within three standard deviations."""
     truth = replace(PHANTOM, coulomb=0.7, viscous=240.0, withdrawal=0.8)
     loop = SampledLoop(law(), 0, 20.0)
@@ -67,7 +67,7 @@ def test_what_differs_from_the_model_is_learned() -> None:
     for name, value in expected.items():
         found, error = loop.learned[name]
         assert abs(found - value) < 3.0 * error, name
-        # The interval says that the difference is known: 4 % of dry, 5 % of viscous friction.
+        # The interval is small: 4 % of dry, 5 % of viscous friction.
         assert error < (0.02 if 'dry' in name else 15.0), name
 
 
@@ -78,15 +78,15 @@ def test_what_differs_from_the_model_is_learned() -> None:
     ),
     st.floats(0.1, 3.0),
 )
-def test_it_never_leaves_its_bounds(
+def test_learned_force_stays_within_its_bounds(
     measured: list[tuple[float, float, float, float]], bound: float
 ) -> None:
-    """Whatever is measured, the force beyond the model is within the bounds, and finite."""
+    """For any measurements, the learned force is finite and within the bounds."""
     loop = SampledLoop(law(bound=bound), 1, inf)
     most = bounds(bound, PHANTOM.coulomb, PHANTOM.viscous)
     position = 0.05
     for speed, jump, target, share in measured:
-        # Some of the motions are what their speed says, so that they count.
+        # Some of the motions agree with their speed, so that they are used.
         position += PERIOD * speed + (1e-3 * jump if share < 0.0 else 0.0)
         loop.command(position, speed, Setpoint(target))
         for block in loop.memory[LEARNED:].reshape(2, -1):
@@ -95,8 +95,8 @@ def test_it_never_leaves_its_bounds(
                 assert abs(force) <= (most[0] + 0.01 * most[1]) * (1.0 + 1e-12)
 
 
-def test_frozen_it_stays() -> None:
-    """`learn: false` keeps what is learned and uses it."""
+def test_frozen_learning_keeps_its_estimate() -> None:
+    """`learn: false` keeps and applies the learned friction."""
     truth = replace(PHANTOM, coulomb=0.7, viscous=240.0)
     loop = SampledLoop(law(), 0, 20.0)
     drive(loop, truth, 2.0)
@@ -107,8 +107,8 @@ def test_frozen_it_stays() -> None:
     assert loop.learned['learned dry friction, insertion [N]'][0] > 0.1
 
 
-def test_it_survives_a_stop_but_not_another_needle() -> None:
-    """A pause, a stop and other gains keep what is learned; other constants and a reset do not."""
+def test_estimate_survives_a_stop_but_not_other_constants() -> None:
+    """A pause, a stop and other gains keep the estimate; other constants discard it."""
     loop = SampledLoop(law(), 0, 20.0)
     drive(loop, replace(PHANTOM, coulomb=0.7), 2.0)
     learned = loop.learned
@@ -123,8 +123,8 @@ def test_it_survives_a_stop_but_not_another_needle() -> None:
     assert loop.learned == {}
 
 
-def test_a_missing_sample_is_not_learned_from() -> None:
-    """Two periods between measurements look like twice the speed, and do not count."""
+def test_missing_samples_are_excluded_from_learning() -> None:
+    """Two periods between measurements appear as twice the speed, and are ignored."""
     loop = SampledLoop(law(), 0, 20.0)
     loop.command(0.05, 0.01, Setpoint(0.05, 0.01))
     loop.command(0.05 + 2.5 * PERIOD * 0.01, 0.01, Setpoint(0.05, 0.01))
@@ -135,13 +135,13 @@ def test_a_missing_sample_is_not_learned_from() -> None:
     assert loop.memory[SEEN] == 0.0
 
 
-def test_learning_is_outside_of_the_loop() -> None:
-    """Its poles are those of inverse dynamics."""
+def test_learning_does_not_change_the_poles() -> None:
+    """The poles equal the poles of inverse dynamics."""
     other = InverseDynamics(axis=PHANTOM, gains=InverseDynamicsGains(), period=PERIOD)
     assert_allclose(transition_matrix(law(), 1, 1), transition_matrix(other, 1, 1), rtol=1e-12)
 
 
-def test_without_friction_there_is_nothing_to_learn() -> None:
+def test_no_learning_without_friction() -> None:
     """On the axis of rotation all bounds are zero."""
     loop = SampledLoop(law(Axis(inertia=1e-9)), 0, 1.0)
     drive(loop, Axis(inertia=1e-9), 0.2)
@@ -149,8 +149,8 @@ def test_without_friction_there_is_nothing_to_learn() -> None:
 
 
 @pytest.mark.parametrize('delay', [0, 1])
-def test_it_follows_better_than_inverse_dynamics(delay: int) -> None:
-    """On needles with friction 50 % off, each rms error is smaller; the end is as good."""
+def test_adaptive_law_tracks_better_than_inverse_dynamics(delay: int) -> None:
+    """With friction 50 % off, each rms error is smaller; the final error is as small."""
     plants = [
         replace(NEEDLE, coulomb_friction=0.56 * dry, viscous_friction=300.0 * viscous)
         for dry in (0.5, 1.5)
@@ -168,8 +168,8 @@ def test_it_follows_better_than_inverse_dynamics(delay: int) -> None:
     assert np.abs(learned.final).max() < 1e-5
 
 
-def test_the_controller_tells_what_it_has_learned() -> None:
-    """By name, with unit and standard deviation; nothing under another law."""
+def test_controller_reports_learned_friction() -> None:
+    """By name, with unit and standard deviation; nothing with another law."""
     controller = Controller(NEEDLE, 'adaptive')
     controller.set_target(0.05)
     assert controller.learned == {}

@@ -1,4 +1,4 @@
-"""The virtual base that turns forces into positions: laws."""
+"""Laws of the admittance, a virtual base that converts forces to positions."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def base_of(axis: Axis = BELIEVED, **changes: float) -> Admittance:
 
 
 @given(axis=AXES, forces=FORCES)
-def test_the_base_is_passive(axis: Axis, forces: list[float]) -> None:
+def test_virtual_base_is_passive(axis: Axis, forces: list[float]) -> None:
     """Its energy never grows by more than the work of the force, step by step."""
     base = base_of(axis)
     at, energy = 0.02, 0.0
@@ -44,8 +44,8 @@ def test_the_base_is_passive(axis: Axis, forces: list[float]) -> None:
 
 
 @given(force=st.floats(1.0, 14.0), sign=st.sampled_from([-1.0, 1.0]))
-def test_a_constant_force_leads_to_the_exact_speed(force: float, sign: float) -> None:
-    """Which is (f - mu_s) / mu_v, in both directions."""
+def test_constant_force_gives_the_exact_speed(force: float, sign: float) -> None:
+    """The speed is (f - mu_s) / mu_v, in both directions."""
     base = base_of()
     for k in range(100):
         before = base.position or 0.02
@@ -57,15 +57,15 @@ def test_a_constant_force_leads_to_the_exact_speed(force: float, sign: float) ->
 
 @given(forces=st.lists(st.floats(-1.0, 1.0), max_size=40))
 def test_forces_below_friction_hold_the_position_exactly(forces: list[float]) -> None:
-    """No creep, whatever they are."""
+    """No creep, for any force below friction."""
     base = base_of()
     for k, share in enumerate(forces):
         assert base.step(0.999 * share * PHANTOM.coulomb_friction, 0.02, k * STEP) == 0.02
 
 
 @given(forces=st.lists(st.tuples(st.floats(-1e6, 1e6), st.integers(0, 10**9)), min_size=1))
-def test_the_command_stays_within_its_limits(forces: list[tuple[float, int]]) -> None:
-    """Speed and range, whatever the law asks for; no more than two periods are made up."""
+def test_command_stays_within_its_limits(forces: list[tuple[float, int]]) -> None:
+    """Speed and range, for any force; a gap is limited to two periods."""
     base = Admittance(BELIEVED, period=PERIOD, speed=0.05, lead=2e-3, depths=(0.015, 0.022))
     at, now = 0.02, 0
     for force, wait in forces:
@@ -78,23 +78,23 @@ def test_the_command_stays_within_its_limits(forces: list[tuple[float, int]]) ->
 
 
 @given(st.lists(st.tuples(st.floats(-15.0, 15.0), st.floats(-0.1, 0.1)), min_size=1))
-def test_the_command_stays_near_the_robot(samples: list[tuple[float, float]]) -> None:
-    """Wherever the robot is moved to; it does not wind up against an obstacle."""
+def test_command_stays_within_lead_of_robot(samples: list[tuple[float, float]]) -> None:
+    """For any measured position; the command does not wind up against an obstacle."""
     base = base_of(lead=2e-3)
     for k, (force, measured) in enumerate(samples):
         assert abs(base.step(force, measured, k * STEP) - measured) <= 2e-3 + 1e-12
 
 
-def test_it_does_not_jump_into_the_range() -> None:
-    """A robot outside of the range is not sent back without a force, and no farther with one."""
+def test_base_outside_the_range_does_not_jump() -> None:
+    """Outside of the range it moves inward only by a force, and never further out."""
     base = Admittance(BELIEVED, period=PERIOD, speed=0.05, lead=2e-3, depths=(0.03, 0.1))
     assert base.step(0.0, 0.02, 0) == 0.02
     assert base.step(-10.0, 0.02, STEP) == 0.02
     assert 0.02 < base.step(10.0, 0.02, 2 * STEP) < 0.0202
 
 
-def test_it_rests_when_it_is_told_to() -> None:
-    """At its last position, or where the robot was; a stamp that was answered moves nothing."""
+def test_hold_and_give_way_stop_the_base() -> None:
+    """At its last position, or at the measured position; a repeated stamp moves nothing."""
     base = base_of(lead=1e-3)
     assert base.hold() is None
     assert base.give_way() is None
@@ -134,18 +134,18 @@ def follow(
 @pytest.mark.parametrize('law', ['adaptive', 'inverse_dynamics', 'pid'])
 @pytest.mark.parametrize(('lag', 'dead'), [(0.0, 0.0), (0.01, 0.0), (0.05, 0.0), (0.05, 0.02)])
 @pytest.mark.parametrize('rate', [100.0, 500.0])
-def test_the_shipped_gains_are_stable_with_a_robot_that_lags(
+def test_default_gains_are_stable_with_a_lagging_robot(
     law: str, lag: float, dead: float, rate: float
 ) -> None:
-    """Up to 50 ms and 20 ms of dead time: it rests within 0.05 mm, and overshoots by 0.8 mm."""
+    """Up to 50 ms lag and 20 ms dead time: rest within 0.05 mm, and overshoot below 0.8 mm."""
     over, error, motion = follow(law, rate, lag, dead)
     assert over < 8e-4
     assert error < 5e-5
     assert motion < 1e-5
 
 
-def test_a_lag_of_a_fifth_of_a_second_is_too_much() -> None:
-    """It swings: the test above can fail, and the documentation names the limit."""
+def test_lag_of_200_ms_is_unstable() -> None:
+    """It oscillates: the test above can fail, and the documentation contains the limit."""
     over, _, motion = follow('adaptive', 500.0, 0.2)
     assert over > 2e-3
     assert motion > 1e-3

@@ -1,4 +1,4 @@
-"""The laws of the source in continuous time, and how the sampled ones tend to them."""
+"""Continuous-time laws of the paper, and convergence of the sampled laws to them."""
 
 from dataclasses import replace
 from typing import Any
@@ -30,7 +30,7 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 from support.closed_loop import closed_loop
 
-#: Friction slow enough for explicit solvers, and so weak that PID does not get stuck in it.
+#: Friction with a slow transient for explicit solvers, and too weak to stick under PID.
 MODEL = NeedleModel(
     NeedleParameters.preset('phantom', viscous_friction=0.5, coulomb_friction=0.01)
 )
@@ -52,7 +52,7 @@ def moving(depth: float = DEPTH, deflection: float = 5e-4) -> FloatArray:
 
 
 def goal(time: float) -> FloatArray:
-    """Return a steady insertion, 1 mm ahead of where the needle starts, to no deflection."""
+    """Return a steady insertion, 1 mm ahead of the initial depth, with zero deflection."""
     wanted = np.zeros((3, 4))
     wanted[0, 0] = MODEL.parameters.length - (DEPTH + 1e-3 + SPEED * time)
     wanted[1, 0] = -SPEED
@@ -60,7 +60,7 @@ def goal(time: float) -> FloatArray:
 
 
 @pytest.mark.parametrize('skew', [0.0, 20.0])
-def test_inverse_dynamics_makes_the_error_linear(skew: float) -> None:
+def test_inverse_dynamics_gives_linear_error_dynamics(skew: float) -> None:
     """With its own model as the plant, e_ddot + k_v e_dot + k_p e = 0 on all coordinates."""
     kp, kv = matrix([900.0, 400.0, 1600.0, 2500.0], skew), matrix([60.0, 40.0, 30.0, 20.0], skew)
     law = ContinuousInverseDynamics(model=MODEL, actuation='modal', kp=kp, kv=kv)
@@ -75,8 +75,8 @@ def test_inverse_dynamics_makes_the_error_linear(skew: float) -> None:
     assert_allclose(end, linear, rtol=1e-7, atol=1e-7 * np.abs(linear).max())
 
 
-def test_physical_actuation_forces_the_base_alone() -> None:
-    """Both laws leave q1..qn alone; the base follows the error equation of its own gains."""
+def test_physical_actuation_acts_on_the_base_only() -> None:
+    """Both laws act on no other coordinate; the base follows its error equation."""
     law = ContinuousInverseDynamics(model=MODEL, kp=[900.0, 100.0], kv=[60.0, 20.0])
     forces = law.forces(moving(), goal(0.0))
     assert_allclose(forces[2:], 0.0, atol=0.0)
@@ -87,12 +87,12 @@ def test_physical_actuation_forces_the_base_alone() -> None:
     pid = ContinuousPid(model=MODEL, kp=[50.0, 1.0], kd=[3.0, 2.0], ki=[7.0, 0.0])
     error = goal(0.0)[0, 0] - moving()[0]
     found = pid.forces(moving(), goal(0.0), [0.1, 0.2])
-    # f_y pushes into the tissue, and d grows the other way.
+    # f_y pushes into the tissue, and d increases in the opposite direction.
     assert_allclose(found, [-(50.0 * error + 0.7), -2.0 * 0.4, 0.0, 0.0], rtol=1e-12)
 
 
 def test_inverse_dynamics_breaks_away() -> None:
-    """At rest friction counts in the direction of the wanted acceleration."""
+    """At rest friction is compensated in the direction of the desired acceleration."""
     rest = MODEL.state_at(DEPTH)
     kp, kv = [900.0, 100.0], [60.0, 20.0]
     for breakaway_speed in (0.0, 1e-6):
@@ -108,8 +108,8 @@ def test_inverse_dynamics_breaks_away() -> None:
     'friction', ['coulomb', 'stribeck', 'tanh'], ids=['coulomb', 'stribeck', 'tanh']
 )
 @pytest.mark.parametrize('speed', [-0.02, 0.02])
-def test_full_compensation_is_the_friction_of_the_model(friction: str, speed: float) -> None:
-    """Beyond the breakaway speed the smooth compensation is friction itself, in either way."""
+def test_full_compensation_equals_model_friction(friction: str, speed: float) -> None:
+    """Beyond the breakaway speed the smooth compensation equals friction, in both directions."""
     model = NeedleModel(replace(MODEL.parameters, friction_law=friction, withdrawal_friction=1.5))
     state = moving()
     state[4] = -speed
@@ -123,8 +123,8 @@ def test_full_compensation_is_the_friction_of_the_model(friction: str, speed: fl
     assert_allclose(smooth, exact, rtol=1e-12)
 
 
-def test_the_law_may_believe_in_another_needle() -> None:
-    """The forces are those of the law's own model, whatever the plant is."""
+def test_law_with_another_nominal_needle() -> None:
+    """The forces depend on the nominal model of the law only, for any plant."""
     other = NeedleModel(
         replace(MODEL.parameters, viscous_friction=0.7, tissue_stiffness=700.0, area=1e-6)
     )
@@ -179,8 +179,8 @@ PID_GAINS = (
 
 
 @pytest.mark.parametrize('kind', ['inverse_dynamics', 'pid'])
-def test_the_sampled_law_tends_to_the_continuous_one(kind: str) -> None:
-    """Half the period, half the difference of the closed loops, in every coordinate together."""
+def test_sampled_law_converges_to_the_continuous_law(kind: str) -> None:
+    """Half the period, half the difference of the closed loops, in all coordinates together."""
     gains: tuple[InverseDynamicsGains | PidGains, ...] = ID_GAINS
     law: ContinuousInverseDynamics | ContinuousPid
     if kind == 'inverse_dynamics':
@@ -230,7 +230,7 @@ def test_the_sampled_law_tends_to_the_continuous_one(kind: str) -> None:
         ({'breakaway_speed': -1.0}, ParameterError, 'breakaway_speed must be finite and >= 0'),
     ],
 )
-def test_bad_gains_are_named(
+def test_invalid_gains_are_rejected(
     changes: dict[str, Any], error: type[ParameterError] | type[ShapeError], words: str
 ) -> None:
     """Sizes, numbers, definiteness and names, each in one line."""
@@ -239,8 +239,8 @@ def test_bad_gains_are_named(
         ContinuousInverseDynamics(model=MODEL, **{**valid, **changes})
 
 
-def test_bad_arguments_are_named() -> None:
-    """An integral gain may vanish but not be negative; goals and integrals have their sizes."""
+def test_invalid_arguments_are_rejected() -> None:
+    """An integral gain may be zero but not negative; goals and integrals have fixed sizes."""
     with pytest.raises(ParameterError, match='ki must be positive semidefinite'):
         ContinuousPid(model=MODEL, kp=[1.0, 1.0], kd=[1.0, 1.0], ki=[1.0, -1.0])
     pid = ContinuousPid(model=MODEL, kp=[1.0, 1.0], kd=[1.0, 1.0], ki=[1.0, 0.0])

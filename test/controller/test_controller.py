@@ -1,4 +1,4 @@
-"""The controller as an object, around the true needle."""
+"""The controller as an object, in a loop around the simulated needle."""
 
 from math import inf, nan
 from typing import Any
@@ -46,11 +46,11 @@ def insert(
 
 
 def test_inverse_dynamics_tracks_the_insertion() -> None:
-    """With the model it believes in, the depth follows within 20 um from start to end."""
+    """With its nominal model, the depth follows within 20 um from start to end."""
     steering = controller()
     steering.set_target(0.05)
     depths, aims = insert(steering, NeedleParameters.preset('phantom'), 3.5)
-    # Start and stop: within the breakaway speed the Coulomb term is not yet full, 1e-4 m/s for
+    # Start and stop: within the breakaway speed the Coulomb term is reduced, 1e-4 m/s for
     # some tens of milliseconds; the initial bend, unknown to the law, adds its force of 0.2 N.
     assert np.abs(depths - aims).max() < 5e-5
     assert abs(depths[-1] - 0.05) < 2e-5
@@ -58,7 +58,7 @@ def test_inverse_dynamics_tracks_the_insertion() -> None:
 
 @pytest.mark.parametrize('law', ['inverse_dynamics', 'pid'])
 @pytest.mark.parametrize('scale', [0.7, 1.3])
-def test_both_laws_arrive_in_spite_of_a_wrong_model(law: str, scale: float) -> None:
+def test_both_laws_reach_the_target_with_model_mismatch(law: str, scale: float) -> None:
     """Friction 30 % off: the target is still reached, with less than 1 mm of overshoot."""
     truth = NeedleParameters.preset(
         'phantom', coulomb_friction=0.56 * scale, viscous_friction=300.0 * scale
@@ -66,20 +66,20 @@ def test_both_laws_arrive_in_spite_of_a_wrong_model(law: str, scale: float) -> N
     steering = controller(law)
     steering.set_target(0.05)
     depths, _ = insert(steering, truth, 5.0)
-    # A Coulomb term 0.17 N short is made up at 0.17 / (mu_v h kp) = 0.6 mm by inverse dynamics.
+    # Inverse dynamics compensates a Coulomb error of 0.17 N at 0.17 / (mu_v h kp) = 0.6 mm.
     assert abs(depths[-1] - 0.05) < 7e-4
     assert depths.max() < 0.051
 
 
-def test_an_unknown_delay_of_one_period_is_survived() -> None:
-    """One period more than stated still ends at the target: the margin that was checked."""
+def test_one_period_of_unmodeled_delay_is_stable() -> None:
+    """One period more than configured still ends at the target: the checked margin."""
     steering = controller()
     steering.set_target(0.03)
     depths, _ = insert(steering, NeedleParameters.preset('phantom'), 2.0, late=2)
     assert abs(depths[-1] - 0.03) < 2e-5
 
 
-def test_no_force_before_a_target_nor_for_what_is_not_finite() -> None:
+def test_zero_force_without_target_and_for_nan_measurements() -> None:
     """Zero force until there is a target, and zero force for a measurement of NaN."""
     steering = controller()
     good = Measurement(time=0.0, depth=0.02, speed=0.0)
@@ -89,13 +89,13 @@ def test_no_force_before_a_target_nor_for_what_is_not_finite() -> None:
     assert steering.command(Measurement(time=0.1, depth=0.02, speed=0.0)).force > 0.0
     lost = steering.command(Measurement(time=0.101, depth=nan, speed=0.0))
     assert (lost.force, lost.torque) == (0.0, 0.0)
-    # It begins anew from where the needle is, not where the old reference would be by now.
+    # The motion restarts from the measured depth, not from the old reference.
     again = steering.command(Measurement(time=5.0, depth=0.021, speed=0.0))
     assert again.setpoint.position == 0.021
 
 
-def test_a_new_target_in_motion_does_not_make_the_reference_jump() -> None:
-    """Position and speed of the reference are continuous when the target changes."""
+def test_reference_is_continuous_when_the_target_changes() -> None:
+    """Position and velocity of the reference are continuous when the target changes."""
     steering = controller()
     steering.set_target(0.05)
     points = []
@@ -110,8 +110,8 @@ def test_a_new_target_in_motion_does_not_make_the_reference_jump() -> None:
     assert speeds.min() < -0.009
 
 
-def test_it_goes_on_with_other_constants() -> None:
-    """Told the right friction in mid-motion, it keeps its target and reference and arrives."""
+def test_change_of_constants_continues_the_motion() -> None:
+    """With corrected friction in mid-motion, it keeps its target and reference and arrives."""
     truth = NeedleParameters.preset('phantom', coulomb_friction=1.0, viscous_friction=500.0)
     steering, told = controller(), controller()
     told.change(truth)
@@ -125,13 +125,13 @@ def test_it_goes_on_with_other_constants() -> None:
     # One period at 0.01 m/s.
     assert steering.command(where).setpoint.position == pytest.approx(before.position, abs=1.1e-5)
     depths, aims = insert(told, truth, 3.5)
-    # As with the right model from the start.
+    # As with the correct model from the start.
     assert np.abs(depths - aims).max() < 5e-5
     assert np.abs(believed - aims[:2000]).max() > 1e-4
 
 
-def test_constants_that_its_gains_cannot_bear_are_refused() -> None:
-    """Less friction than the gains need is refused with what would do; the law stays."""
+def test_constants_with_unstable_gains_are_rejected() -> None:
+    """Too little friction for the gains is rejected with a valid change; the law stays."""
     steering, other = controller('pid'), controller('pid')
     thin = NeedleParameters.preset('phantom', viscous_friction=0.3)
     with pytest.raises(ParameterError, match=r'pid.insertion gains are unstable at 1000 Hz'):
@@ -144,7 +144,7 @@ def test_constants_that_its_gains_cannot_bear_are_refused() -> None:
 
 
 def test_forces_stay_within_their_limit() -> None:
-    """No command exceeds the force limit, whatever the error."""
+    """No command exceeds the force limit, for any error."""
     steering = controller(force_limit=2.0)
     steering.set_target(0.2)
     forces = [
@@ -154,14 +154,14 @@ def test_forces_stay_within_their_limit() -> None:
 
 
 @pytest.mark.parametrize('depth', [nan, -0.01, 0.0, 0.21, np.inf])
-def test_targets_out_of_reach_are_refused(depth: float) -> None:
-    """Before the skin, beyond the hub and not a number: refused with the valid range."""
+def test_targets_out_of_range_are_rejected(depth: float) -> None:
+    """Before the skin, beyond the hub and not a number: rejected with the valid range."""
     with pytest.raises(ParameterError, match=r'target depth must be in \[0.001, 0.2\] m'):
         controller().set_target(depth)
 
 
-def test_unknown_names_are_listed() -> None:
-    """An unknown law is answered with the known ones."""
+def test_unknown_law_is_rejected_with_valid_names() -> None:
+    """An unknown law is rejected with the valid names."""
     with pytest.raises(ParameterError, match='inverse_dynamics, pid'):
         controller('sliding_mode')
 
@@ -178,13 +178,13 @@ def test_unknown_names_are_listed() -> None:
     ],
 )
 def test_gains_of_other_names_or_laws_are_rejected(gains: Any, reason: str) -> None:
-    """Only the gains of a law on its axes are taken."""
+    """Only the gains of a law on its axes are accepted."""
     with pytest.raises(ParameterError, match=reason):
         Controller(NeedleParameters.preset('phantom'), gains=gains)
 
 
-def test_gains_that_are_not_given_have_their_defaults() -> None:
-    """A robot without rotation gives gains of insertion only; a change keeps the others."""
+def test_missing_gains_have_their_defaults() -> None:
+    """A robot without rotation has gains of insertion only; a change keeps the others."""
     plain = Controller(NeedleParameters.preset('phantom'), 'pid')
     given = Controller(
         NeedleParameters.preset('phantom'), 'pid', gains={'pid': {'insertion': PidGains()}}
@@ -197,8 +197,8 @@ def test_gains_that_are_not_given_have_their_defaults() -> None:
     assert plain.command(measured).torque < 0.0
 
 
-def test_the_printed_formulation_is_rejected() -> None:
-    """It is for the model and the integrator; a controller has the complete equations."""
+def test_printed_formulation_is_rejected() -> None:
+    """It is for the model and the integrator; a controller uses the complete equations."""
     printed = NeedleParameters.preset('phantom', formulation='as_printed')
     with pytest.raises(ParameterError, match=r"formulation must be 'complete'.* got 'as_printed'"):
         Controller(printed)
@@ -206,20 +206,20 @@ def test_the_printed_formulation_is_rejected() -> None:
         controller().change(printed)
 
 
-def test_fractional_delay_is_refused() -> None:
+def test_fractional_delay_is_rejected() -> None:
     """A delay is a whole number of periods."""
     with pytest.raises(ParameterError, match='whole number'):
         ControllerSettings(delay=1.5)
 
 
 @pytest.mark.parametrize('switch', ['law', 'gains'])
-def test_a_switch_in_motion_goes_on_with_the_last_force(switch: str) -> None:
-    """Another law, or other gains, begin with the force before; then it does not jump either."""
+def test_switch_in_motion_is_bumpless(switch: str) -> None:
+    """Another law, or other gains, start with the last force; it does not jump later either."""
     truth = NeedleParameters.preset('phantom')
     steering = controller()
     steering.set_target(0.1)
     insert(steering, truth, 1.0)
-    # What the last command was, from where it then was.
+    # The last command, and the depth at its time.
     needle = Integrator(truth, NeedleModel(truth).state_at(0.02, 5e-4), 2e-5)
     steering = controller()
     steering.set_target(0.1)
@@ -235,15 +235,15 @@ def test_a_switch_in_motion_goes_on_with_the_last_force(switch: str) -> None:
         waiting.append(forces[-1])
         needle.advance(PERIOD, waiting.pop(0))
     steps = np.abs(np.diff(forces))
-    # The first force is the last one to rounding; from then on it changes as the laws have it:
-    # what is left of the offset fades by 1 % a period.
+    # The first force equals the last force to rounding; later it changes as the laws do: the
+    # offset decays by 1 % a period.
     assert steps[1999] < 1e-9
     assert steps[1999:].max() < 0.02 * abs(forces[1999])
     assert steering.law == ('pid' if switch == 'law' else 'inverse_dynamics')
 
 
-def test_a_switch_to_gains_that_cannot_be_stable_is_refused() -> None:
-    """The reason names them, and the old law goes on."""
+def test_switch_to_unstable_gains_is_rejected() -> None:
+    """The error names them, and the old law continues."""
     steering = controller()
     unstable = InverseDynamicsGains(kv=3000.0)
     with pytest.raises(ParameterError, match=r'inverse_dynamics.insertion gains are unstable'):
@@ -253,8 +253,8 @@ def test_a_switch_to_gains_that_cannot_be_stable_is_refused() -> None:
     assert steering.law == 'inverse_dynamics'
 
 
-def test_what_limits_the_stability_is_told() -> None:
-    """A radius for each axis; a margin that the gains do not have is refused."""
+def test_stability_limits_are_reported() -> None:
+    """A radius for each axis; a margin above the margin of the gains is rejected."""
     steering = controller()
     assert set(steering.limits) == {'insertion', 'rotation'}
     assert all(limit.stable for limit in steering.limits.values())
@@ -266,8 +266,8 @@ def test_what_limits_the_stability_is_told() -> None:
     ('depth', 'speed', 'fault'),
     [(0.025, 0.0, 'moved by 0.005 m'), (0.02, 9e3, 'moved by 0 m'), (nan, 0.0, 'must be finite')],
 )
-def test_a_measurement_that_jumps_is_not_answered(depth: float, speed: float, fault: str) -> None:
-    """More than its speed explains, or a speed that the depth denies: no force, and why."""
+def test_inconsistent_measurement_gives_zero_force(depth: float, speed: float, fault: str) -> None:
+    """A displacement inconsistent with the velocity gives zero force and the reason."""
     steering = controller()
     steering.set_target(0.05)
     for i in range(100):
@@ -276,7 +276,7 @@ def test_a_measurement_that_jumps_is_not_answered(depth: float, speed: float, fa
     wrong = steering.command(Measurement(time=0.1, depth=depth, speed=speed))
     assert (wrong.force, wrong.torque) == (0.0, 0.0)
     assert fault in wrong.fault
-    # Back where it was, and told so once more, it goes on to its target.
+    # Two consistent measurements at the old depth: it continues to its target.
     for i in range(101, 200):
         command = steering.command(Measurement(time=i * PERIOD, depth=0.02, speed=0.0))
     assert command.fault is None
@@ -284,8 +284,8 @@ def test_a_measurement_that_jumps_is_not_answered(depth: float, speed: float, fa
     assert steering.target == 0.05
 
 
-def test_a_needle_that_is_elsewhere_for_good_is_not_driven_to_the_old_target() -> None:
-    """It says so once, and waits for a target."""
+def test_needle_moved_during_a_fault_clears_the_target() -> None:
+    """One message, and no motion before a new target."""
     steering = controller()
     steering.set_target(0.05)
     commands = [
@@ -299,8 +299,8 @@ def test_a_needle_that_is_elsewhere_for_good_is_not_driven_to_the_old_target() -
     assert not any(c.force for c in commands[51:])
 
 
-def test_the_integral_is_frozen_while_nothing_is_commanded() -> None:
-    """After a fault PID goes on with the friction that it had learned."""
+def test_integral_is_frozen_without_a_command() -> None:
+    """After a fault PID continues with its integral."""
     truth = NeedleParameters.preset('phantom')
     steering = controller('pid')
     steering.set_target(0.05)
@@ -318,8 +318,8 @@ def test_the_integral_is_frozen_while_nothing_is_commanded() -> None:
 
 
 @pytest.mark.parametrize('step', [7.0, -7.0], ids=['forward', 'back'])
-def test_a_gap_or_a_step_back_in_time_starts_the_motion_anew(step: float) -> None:
-    """No fault, no jump of the reference: on to the same target from where the needle is."""
+def test_gap_or_step_back_in_time_restarts_the_motion(step: float) -> None:
+    """No fault and no jump of the reference: to the same target from the measured depth."""
     steering = controller()
     steering.set_target(0.05)
     for i in range(500):
@@ -344,8 +344,8 @@ def test_a_gap_or_a_step_back_in_time_starts_the_motion_anew(step: float) -> Non
 
 
 @pytest.mark.parametrize('load', [nan, inf])
-def test_a_command_knows_whether_it_is_finite(load: float) -> None:
-    """A load that is none makes a command that must not go out."""
+def test_command_detects_non_finite_values(load: float) -> None:
+    """An invalid load gives a command that must not be sent."""
     steering = controller()
     steering.set_target(0.05)
     measured = Measurement(time=0.0, depth=0.02, speed=0.0)
@@ -354,8 +354,8 @@ def test_a_command_knows_whether_it_is_finite(load: float) -> None:
     assert not Command(force=0.0, torque=load, setpoint=Setpoint(0.02)).is_finite()
 
 
-def test_a_range_of_depths_bounds_the_targets() -> None:
-    """Targets outside it are refused, and one that leaves nothing of the needle too."""
+def test_depth_range_limits_the_targets() -> None:
+    """Targets outside it are rejected, and also an empty range."""
     steering = controller(lowest_depth=0.02, highest_depth=0.1)
     for depth in (0.01, 0.11):
         with pytest.raises(ParameterError, match=r'must be in \[0.02, 0.1\] m'):

@@ -1,4 +1,4 @@
-"""What a foreign driver says and is told: laws of the translation."""
+"""Conversion between the messages of a robot driver and the contract."""
 
 from __future__ import annotations
 
@@ -48,32 +48,32 @@ def state(
 
 
 def forces(**settings: Any) -> Robot:
-    """Return a robot that takes efforts."""
+    """Return a robot with effort commands."""
     return Robot(HardwareSettings(**{**PUSHES, **settings}))
 
 
 def moves(**settings: Any) -> Robot:
-    """Return a robot that takes positions, and that a controller believes in."""
+    """Return a configured robot with position commands."""
     robot = Robot(HardwareSettings(**{**MOVES, **settings}))
     robot.configure(Controller(NeedleParameters.preset('phantom')))
     return robot
 
 
 def push(stamp: int, force: float = 10.0) -> Answer:
-    """Return an answer in motion."""
+    """Return a force command during a motion."""
     return Answer(stamp, force, 0.0, (0.03, 0.01), (0.0, 0.0))
 
 
 @given(robot=ROBOTS, position=NUMBERS)
-def test_there_and_back(robot: Robot, position: float) -> None:
-    """A position that is read is commanded as it was; the sign and the zero are as they say."""
+def test_position_commands_invert_measurements(robot: Robot, position: float) -> None:
+    """A measured position is commanded unchanged, for any sign, scale and zero."""
     settings = robot.settings
     length = robot.length(position)
     assert np.sign(length) == np.sign(settings.sign * (position - settings.zero))
     assert length / (settings.sign * settings.scale) + settings.zero == pytest.approx(
         position, abs=1e-9
     )
-    # Within the lead of a command that rests.
+    # Within the lead of a resting command.
     sent = Robot(HardwareSettings(**MOVES, sign=settings.sign, scale=settings.scale,
                                   zero=settings.zero))  # fmt: skip
     sent.configure(Controller(NeedleParameters.preset('phantom')))
@@ -83,7 +83,7 @@ def test_there_and_back(robot: Robot, position: float) -> None:
 
 @given(robot=ROBOTS, force=NUMBERS, velocity=NUMBERS)
 def test_power_is_preserved(robot: Robot, force: float, velocity: float) -> None:
-    """Effort times velocity of the robot is force times velocity of the needle."""
+    """Effort times velocity of the robot equals force times velocity of the needle."""
     settings = robot.settings
     measured = robot.measurement(state(['insertion'], [0.0], [velocity]))
     told = forces(sign=settings.sign, scale=settings.scale, zero=settings.zero)
@@ -95,8 +95,8 @@ def test_power_is_preserved(robot: Robot, force: float, velocity: float) -> None
 
 
 @given(st.permutations(['slide', 'a', 'b', 'rotation']))
-def test_the_joint_is_found_by_name(names: list[str]) -> None:
-    """Whatever the order and the other joints; only a torque turns the needle."""
+def test_joint_is_found_by_name(names: list[str]) -> None:
+    """In any order and with other joints; only a torque rotates the needle."""
     place = {'slide': 0.03, 'a': 1.0, 'b': nan, 'rotation': 0.5}
     reading = state(names, [place[n] for n in names], [place[n] / 3.0 for n in names])
     for robot, angle in (
@@ -108,26 +108,26 @@ def test_the_joint_is_found_by_name(names: list[str]) -> None:
         assert isnan(found.force)
 
 
-def test_what_is_missing_is_said() -> None:
-    """With the joints that there are."""
+def test_missing_joints_and_velocities_are_named() -> None:
+    """With the available joints."""
     with pytest.raises(
-        ParameterError, match="no position of the joint 'slide'; it has those of 'a', 'b' "
+        ParameterError, match="no position of the joint 'slide'; positions found: 'a', 'b' "
     ):
         forces(joint='slide').measurement(state(['a', 'b'], [0.0, 1.0], [0.0, 0.0]))
-    with pytest.raises(ParameterError, match='it has those of none'):
+    with pytest.raises(ParameterError, match='positions found: none'):
         forces(joint='slide').measurement(state(['slide'], []))
     for velocities in ([], [nan]):
         with pytest.raises(ParameterError, match="no velocity of 'slide': efforts need it"):
             forces(joint='slide').measurement(state(['slide'], [0.0], velocities))
-    with pytest.raises(ParameterError, match="joint 'b'; it has those of 'slide', 'a' "):
+    with pytest.raises(ParameterError, match="joint 'b'; positions found: 'slide', 'a' "):
         moves(joint='slide', command_joints=('slide', 'b')).measurement(
             state(['slide', 'a', 'b'], [0.0, 1.0, nan])
         )
 
 
 @pytest.mark.parametrize('velocities', [[], [nan]])
-def test_a_velocity_is_estimated_where_positions_are_commanded(velocities: list[float]) -> None:
-    """It settles with the time constant of its filter, and begins anew after a gap."""
+def test_velocity_is_estimated_for_position_commands(velocities: list[float]) -> None:
+    """It settles with the time constant of its filter, and restarts after a gap."""
     robot = moves(scale=1e-3)
     period = 1_000_000
     found = [
@@ -145,8 +145,8 @@ def test_a_velocity_is_estimated_where_positions_are_commanded(velocities: list[
 
 
 @pytest.mark.parametrize(('along', 'aside'), [*product(SIGNED, ['', *SIGNED])])
-def test_the_axes_are_a_proper_rotation(along: str, aside: str) -> None:
-    """For each pair that is one; the axes that are named are y and z of the base."""
+def test_sensor_axes_are_a_proper_rotation(along: str, aside: str) -> None:
+    """For each valid pair; the named axes are y and z of the base."""
     if aside and along[-1] == aside[-1]:
         with pytest.raises(ParameterError, match='lateral_axis must be across force_axis'):
             HardwareSettings(force_axis=along, lateral_axis=aside)
@@ -167,8 +167,8 @@ def test_the_axes_are_a_proper_rotation(along: str, aside: str) -> None:
         assert (read.stamp, read.frame) == (5, 'tool')
 
 
-def test_the_default_is_the_contract() -> None:
-    """Nothing is turned, shifted or scaled."""
+def test_default_settings_are_the_contract() -> None:
+    """No rotation, offset or scale."""
     robot = Robot(HardwareSettings())
     values = (1.0, -2.0, 3.0, -4.0, 5.0, -6.0)
     assert robot.wrench(Reading(0, 'needle_base', (), (values,))).values == (values,)
@@ -179,8 +179,8 @@ def test_the_default_is_the_contract() -> None:
     assert (found.angle, found.angular_speed) == (0.1, 0.2)
 
 
-def test_a_dynamic_joint_state_is_a_joint_state() -> None:
-    """Interfaces in any order and any number; what a joint does not have is not a number."""
+def test_dynamic_joint_state_is_converted() -> None:
+    """Interfaces in any order and any number; missing values are NaN."""
     reading = dynamic_reading(
         7,
         'world',
@@ -200,14 +200,14 @@ def test_a_dynamic_joint_state_is_a_joint_state() -> None:
     assert (found.depth, found.speed, found.force) == (0.02, 0.01, 3.0)
 
 
-def test_other_joints_get_no_effort() -> None:
+def test_other_joints_get_zero_effort() -> None:
     """In the order of command_joints."""
     robot = forces(joint='slide', command_joints=('a', 'slide', 'b'), sign=-1.0)
     assert robot.command(Answer(0, 3.0)) == [0.0, -3.0, 0.0]
 
 
 def test_other_joints_hold_their_position() -> None:
-    """That of the first measurement, until the node is activated again."""
+    """The position of the first measurement, until the next activation."""
     robot = moves(joint='slide', command_joints=('a', 'slide'))
     assert robot.command(push(SECOND)) is None
     robot.measurement(state(['slide', 'a'], [0.02, 1.0], [0.0, 0.0]))
@@ -221,25 +221,25 @@ def test_other_joints_hold_their_position() -> None:
     assert robot.command(push(SECOND, 0.0)) == [2.0, 0.03]
 
 
-def test_a_position_rests_when_nothing_is_wanted() -> None:
-    """It holds the last command in a fault, and gives way to the robot in a stop."""
+def test_position_command_rests_without_a_reference() -> None:
+    """It holds the last command in a fault, and yields to the robot in a stop."""
     robot = moves(scale=1e-3)
     for k in range(1, 100):
         stamp = SECOND + k * 1_000_000
         robot.measurement(state(['insertion'], [20.0], [0.0], stamp=stamp))
         (last,) = robot.command(push(stamp)) or [nan]
     assert last == pytest.approx(22.0)
-    # The same measurement again is no reason to rest.
+    # A repeated measurement does not stop the motion.
     assert robot.command(Answer(stamp, 10.0)) == [last]
     assert robot.command(Answer(stamp + 1)) == [last]
-    # What was measured meanwhile may be insane: it is not what is commanded.
+    # Implausible measurements do not change the command.
     robot.measurement(state(['insertion'], [1e9], [0.0], stamp=stamp + 2))
     assert robot.command(Answer(stamp + 2), stopped=True) == pytest.approx([20.0])
     assert robot.command(Answer(stamp + 3), stopped=True) == pytest.approx([20.0])
 
 
-def test_another_friction_counts_at_once() -> None:
-    """What the law is told while it runs, its virtual base has too."""
+def test_friction_change_applies_at_once() -> None:
+    """The virtual base gets the changed friction of the law."""
     phantom, robot = NeedleParameters.preset('phantom'), moves()
     ways = []
     for k, share in enumerate((1.0, 1.0, 2.0)):
@@ -253,8 +253,8 @@ def test_another_friction_counts_at_once() -> None:
     assert ways[149] - ways[148] == pytest.approx(0.5 * (ways[99] - ways[98]), rel=1e-6)
 
 
-def test_a_known_load_does_not_move_the_base() -> None:
-    """The law adds it to its force; the virtual base does not feel it."""
+def test_known_load_does_not_move_the_virtual_base() -> None:
+    """The law adds the load to its force; the virtual base excludes it."""
     robot = moves()
     robot.measurement(state(['insertion'], [0.02], [0.0]))
     assert robot.command(push(SECOND, 5.0), 5.0) == [0.02]
@@ -271,7 +271,7 @@ def test_a_known_load_does_not_move_the_base() -> None:
         ({'command': 'velocity'}, 'hardware.command must be one of effort, position, got'),
         ({'command_type': 'twist'}, 'hardware.command_type must be one of wrench, float64'),
         ({'command': 'position'}, 'hardware.command_type must be one of float64_multi'),
-        (PUSHES | {'command_topic': ''}, 'hardware.command_topic must be that of the driver'),
+        (PUSHES | {'command_topic': ''}, "hardware.command_topic must be the driver's topic"),
         ({'state_type': 'x'}, 'hardware.state_type must be one of joint_state, dynamic'),
         ({'stamps': 'now'}, "hardware.stamps must be one of header, receive, got 'now'"),
         ({'command_joints': ['a']}, "hardware.command_joints must have the joint 'insertion'"),
@@ -281,8 +281,8 @@ def test_a_known_load_does_not_move_the_base() -> None:
         ({'state_topc': 'x'}, "unknown parameter 'hardware.state_topc'; did you mean"),
     ],
 )  # fmt: skip
-def test_bad_settings_are_one_line(values: dict[str, Any], said: str) -> None:
-    """What was found, and what would be valid."""
+def test_invalid_settings_are_rejected_in_one_line(values: dict[str, Any], said: str) -> None:
+    """With the invalid and the valid values."""
     with pytest.raises(ParameterError) as raised:
         from_values(HardwareSettings, values, 'hardware.')
     assert str(raised.value).startswith(said)

@@ -1,4 +1,4 @@
-"""The laws inside the simulation: friction as a set, sampled loops, and batches of them."""
+"""Control laws in the simulation: set-valued friction, sampled loops, and batches."""
 
 from dataclasses import replace
 from typing import Any
@@ -40,7 +40,7 @@ from numpy.testing import assert_allclose
 import pytest
 from scipy.linalg import expm
 
-#: Friction slow enough to be looked at, deflection damped.
+#: Friction with a slow transient, and damped deflection.
 MODEL = NeedleModel(
     NeedleParameters.preset('phantom', viscous_friction=0.5, coulomb_friction=0.02)
 )
@@ -60,22 +60,22 @@ def pid(kp: float, kd: float) -> ContinuousPid:
     return ContinuousPid(model=MODEL, kp=[kp, 1e-6], kd=[kd, 1e-8])
 
 
-def test_a_piece_of_sliding_is_the_linear_flow_with_constant_dry_friction() -> None:
-    """Until it first comes to rest: M x_ddot = - kp x - (kd + mu_v) x_dot - mu_s, for x = e."""
+def test_sliding_is_linear_flow_with_constant_dry_friction() -> None:
+    """Until the first rest: M x_ddot = - kp x - (kd + mu_v) x_dot - mu_s, for x = e."""
     law, p = pid(2.0, 0.01), MODEL.parameters
     run = run_continuous(law, MODEL, STRAIGHT, goal(0.19), np.linspace(0.0, 0.4, 81))
-    # The goal shifted by mu_s / kp, as friction acts against the motion inward.
+    # The goal shifted by mu_s / kp, because friction acts against the insertion.
     center = 0.19 - p.coulomb_friction / 2.0
     m = p.moving_mass
     flow = np.array([[0.0, 1.0], [-2.0 / m, -(0.01 + p.viscous_friction) / m]])
     for t, depth in zip(run.time[::20], run.depth[::20], strict=True):
         expected = center + (expm(t * flow) @ [0.15 - center, 0.0])[0]
-        # 1e-6: ten times the solver's tolerance, over the way of 4 cm.
+        # 1e-6: ten times the solver's tolerance, over the distance of 4 cm.
         assert_allclose(depth, expected, atol=4e-8 * 10.0)
 
 
-def test_it_sticks_inside_the_bound_and_says_when() -> None:
-    """An underdamped PID swings, comes to rest, and stays where |kp e| <= mu_s, exactly."""
+def test_needle_sticks_within_friction_bound_and_reports_the_time() -> None:
+    """An underdamped PID oscillates, comes to rest, and stays where abs(kp e) <= mu_s, exactly."""
     model = NeedleModel(replace(MODEL.parameters, viscous_friction=0.01))
     law = ContinuousPid(model=model, kp=[5.0, 1e-6], kd=[0.005, 1e-8])
     run = run_continuous(law, model, STRAIGHT, goal(0.17), np.linspace(0.0, 1.0, 201))
@@ -88,8 +88,8 @@ def test_it_sticks_inside_the_bound_and_says_when() -> None:
     assert 5.0 * abs(0.17 - run.depth[-1]) <= model.parameters.coulomb_friction
 
 
-def test_a_growing_push_breaks_away_when_it_reaches_the_bound() -> None:
-    """A PID with its goal moving off at 1 cm/s reaches mu_s = kp v t, and slides from then on."""
+def test_breakaway_at_the_friction_bound() -> None:
+    """A PID with a goal moving at 1 cm/s reaches mu_s = kp v t, and slides from then on."""
 
     def moving(time: float) -> np.ndarray:
         wanted = goal(0.15 + 0.01 * time)
@@ -106,7 +106,7 @@ def test_a_growing_push_breaks_away_when_it_reaches_the_bound() -> None:
     assert run.depth[-1] > 0.15 + 1e-4
 
 
-def test_inverse_dynamics_goes_through_reversals_as_if_there_were_no_friction() -> None:
+def test_inverse_dynamics_cancels_friction_through_reversals() -> None:
     """With its own model as the plant d obeys its error equation, at rest for an instant only."""
     kp, kv = [400.0, 100.0], [4.0, 20.0]
     law = ContinuousInverseDynamics(model=MODEL, kp=kp, kv=kv)
@@ -120,8 +120,8 @@ def test_inverse_dynamics_goes_through_reversals_as_if_there_were_no_friction() 
     assert_allclose(run.depth, expected, atol=2e-7)
 
 
-def test_the_hub_stops_the_needle_and_lets_it_go_again() -> None:
-    """On the hub d = 0 and d_dot = 0; a goal that comes out again takes the needle along."""
+def test_hub_stops_and_releases_the_needle() -> None:
+    """On the hub d = 0 and d_dot = 0; a goal that leaves it moves the needle again."""
 
     def swinging(time: float) -> np.ndarray:
         return goal(0.25 - 0.15 * time)
@@ -133,14 +133,14 @@ def test_the_hub_stops_the_needle_and_lets_it_go_again() -> None:
     assert names.index('breaks away outward') > names.index('touches the hub')
     assert run.states[:, 0].min() == 0.0
     held = run.states[:, 0] == 0.0
-    # But for the sample where it leaves.
+    # Except for the sample where it leaves.
     assert np.count_nonzero(run.states[held, 4]) <= 1
     assert held.sum() > 50
     assert run.depth[-1] < 0.15
 
 
 def test_agrees_with_the_sampled_law_inside_the_integrator() -> None:
-    """The implicit PID at a short period, without delay, tends to the continuous one."""
+    """The implicit PID at a short period, without delay, converges to the continuous PID."""
     law, p = pid(5.0, 0.2), MODEL.parameters
     state = MODEL.state_at(0.15, 5e-4)
     run = run_continuous(law, MODEL, state, goal(0.19), [0.0, 0.1])
@@ -163,7 +163,7 @@ def test_agrees_with_the_sampled_law_inside_the_integrator() -> None:
     assert errors[-1] < 1e-5
 
 
-def test_refuses_what_it_cannot_run() -> None:
+def test_unsupported_models_are_rejected() -> None:
     law = pid(2.0, 0.01)
     with pytest.raises(ShapeError, match='times must be at least two, increasing'):
         run_continuous(law, MODEL, STRAIGHT, goal(0.16), [0.0])
@@ -175,7 +175,7 @@ def test_refuses_what_it_cannot_run() -> None:
     assert issubclass(InsertedLengthError, NeedleError)
 
 
-def test_tips_of_many_states_are_those_of_each() -> None:
+def test_tips_of_a_batch_equal_single_tips() -> None:
     states = np.array([MODEL.state_at(depth, 1e-3 * depth) for depth in (0.02, 0.1, 0.2)])
     found = [MODEL.tip_deflection(x) for x in states]
     # Closed form here, series there: rounding of cosh and sinh at small depth.
@@ -207,8 +207,8 @@ def plants(count: int) -> list[NeedleParameters]:
 
 @pytest.mark.parametrize('name', ['inverse_dynamics', 'pid'])
 @pytest.mark.parametrize('delay', [0, 1, 3])
-def test_a_batch_is_the_controller_of_the_node(name: str, delay: int) -> None:
-    """Every run of a batch is, to the bit, that of the controller object."""
+def test_batch_equals_the_controller_of_the_node(name: str, delay: int) -> None:
+    """Every run of a batch equals the run of the controller object, to the bit."""
     axis = Axis.insertion(BELIEVED)
     inverse, gains = InverseDynamicsGains(kp=400.0, kv=40.0), PidGains(kp=1000.0, ki=3000.0)
     law = (
@@ -231,10 +231,10 @@ def test_a_batch_is_the_controller_of_the_node(name: str, delay: int) -> None:
         )
         controller.set_target(0.024)
         run = run_controller(controller, plant, START, duration=DURATION, step=1e-4)
-        # 1e-9: the same arithmetic, but for what the compiler may join.
+        # 1e-9: the same arithmetic, except for fused operations of the compiler.
         assert_allclose(batch.depths[i], run.depth, rtol=1e-9)
         assert_allclose(batch.states[i], run.states[-1], rtol=1e-9, atol=1e-12)
-        # Of what each coordinate reaches: rates swing by kilohertz.
+        # Relative to the range of each coordinate: rates oscillate at kilohertz.
         reached = np.abs(run.states).max(axis=0) + 1e-12
         assert_allclose(batch.courses[i] / reached, run.states / reached, atol=1e-9)
         # A command takes effect after its delay.
@@ -263,8 +263,8 @@ class Proportional:
         return Command(force=2000.0 * (0.024 - measured.depth), torque=1e-9)
 
 
-def test_an_own_law_runs_in_the_loop() -> None:
-    """Its commands act after its delay, on what the encoders measured; the load on request."""
+def test_user_defined_law_runs_in_the_loop() -> None:
+    """Its commands act after its delay, on the encoder measurements; the load on request."""
     own = Proportional()
     run = run_controller(own, BELIEVED, START, duration=0.1)
     assert len(own.seen) == len(run.time) - 1 == 100
@@ -282,7 +282,7 @@ def test_an_own_law_runs_in_the_loop() -> None:
 
 
 class Blurred:
-    """A controller whose measurements have noise, and whose commands another force besides."""
+    """A controller with measurement noise and an additional force on its commands."""
 
     def __init__(self, controller: Controller, noise: FloatArray) -> None:
         self._controller, self._noise = controller, iter(noise)
@@ -295,8 +295,8 @@ class Blurred:
         )
 
 
-def test_noise_in_a_batch_is_that_of_the_encoders() -> None:
-    """It is added to what the law sees, and not to the needle; what acts besides moves it."""
+def test_batch_noise_is_encoder_noise() -> None:
+    """Noise is added to the measurements, not to the needle; the additional force moves it."""
     law = Pid(axis=Axis.insertion(BELIEVED), gains=PidGains(), period=PERIOD)
     count = round(DURATION / PERIOD)
     noise = np.random.default_rng(3).standard_normal((count, 3)) * [2e-6, 2e-4, 0.0]
@@ -321,7 +321,7 @@ def test_noise_in_a_batch_is_that_of_the_encoders() -> None:
         run_batch(law, BELIEVED, START, REFERENCE, late=-1, **options)
 
 
-def test_a_batch_does_not_depend_on_threads_nor_on_its_step() -> None:
+def test_batch_is_independent_of_threads_and_step() -> None:
     law = Pid(axis=Axis.insertion(BELIEVED), gains=PidGains(), period=PERIOD)
     needles = plants(5)
 
@@ -335,7 +335,7 @@ def test_a_batch_does_not_depend_on_threads_nor_on_its_step() -> None:
     assert_allclose(one.largest, fine.largest, atol=1e-9)
 
 
-def test_a_needle_that_leaves_its_range_is_told_apart() -> None:
+def test_runs_that_leave_the_depth_range_are_marked() -> None:
     shallow = NeedleModel(BELIEVED).state_at(0.0012)
     out = MinimumJerk(Setpoint(0.0012), 0.0, ReferenceLimits())
     law = Pid(axis=Axis.insertion(BELIEVED), gains=PidGains(), period=PERIOD)
@@ -343,7 +343,7 @@ def test_a_needle_that_leaves_its_range_is_told_apart() -> None:
     assert 0 < batch.completed[0] < 1000
 
 
-def test_a_batch_refuses_what_does_not_agree() -> None:
+def test_batch_rejects_inconsistent_arguments() -> None:
     law = Pid(axis=Axis.insertion(BELIEVED), gains=PidGains(), period=PERIOD)
     options: Any = {'delay': 1, 'limit': 15.0, 'duration': 0.1}
     with pytest.raises(ShapeError, match='same number of runs'):
@@ -355,8 +355,8 @@ def test_a_batch_refuses_what_does_not_agree() -> None:
         run_batch(law, BELIEVED, START, REFERENCE, delay=1, limit=15.0, duration=0.0)
 
 
-def test_friction_along_the_way_is_that_of_another_needle() -> None:
-    """From the beginning it is a needle with more friction; from later on, the same until then."""
+def test_friction_change_during_a_run_equals_another_needle() -> None:
+    """From the start it equals a needle with more friction; later, the same until the change."""
     needle, start = NeedleParameters.preset('phantom'), Setpoint(0.02)
     reference = MinimumJerk(start, 0.03, ReferenceLimits())
     law = Pid(axis=Axis.insertion(needle), gains=PidGains(), period=1e-3)

@@ -1,4 +1,4 @@
-"""Any finite floats on any input, then sane ones: sane force, and motion after one clear_stop."""
+"""Any finite floats on any input: limited force, and motion after one clear_stop."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ import pytest
 
 PHANTOM = NeedleParameters.preset('phantom')
 
-#: Samples per second, the insane one, its successors, and those from the release of the stop on.
+#: Samples per second, the implausible sample, its successors, and samples from the release on.
 RATE, AT, AFTER, SANE = 100.0, 50, 100, 1000
 
 TOPICS = ('joint_states', 'base_wrench', 'tip_deflection', 'target')
 
 
 class Insane(Fault):
-    """Says these numbers in place of the first ones."""
+    """Replaces the first values by these numbers."""
 
     def __init__(self, values: Sequence[float]) -> None:
         self._values = values
@@ -42,8 +42,10 @@ class Insane(Fault):
     st.lists(st.floats(allow_nan=False, allow_infinity=False), min_size=6, max_size=6),
     st.integers(1, 3),
 )
-def test_it_recovers(law: str, topic: str, values: list[float], times: int) -> None:
-    """At most one stop is to be cleared; then the needle goes to its target, with sane force."""
+def test_controller_recovers_from_implausible_inputs(
+    law: str, topic: str, values: list[float], times: int
+) -> None:
+    """At most one stop must be cleared; then the target is reached with a limited force."""
     loop = Loop(law, RATE)
     loop.target(0.05)
     for k in range(AFTER):
@@ -61,12 +63,12 @@ def test_it_recovers(law: str, topic: str, values: list[float], times: int) -> N
         assert abs(loop.acting) <= 15.0
         assert loop.supervisor.safety.stop is None
     assert abs(loop.depth - 0.03) < 1e-4
-    # At rest nothing but dry friction is held.
+    # At rest the force is within dry friction.
     assert abs(loop.acting) < 2.0
 
 
-def test_the_observer_refuses_an_absurd_speed() -> None:
-    """It is finite, and would make a load of 1e296 N."""
+def test_observer_rejects_an_implausible_velocity() -> None:
+    """It is finite, and would give a load of 1e296 N."""
     observer = Observer(PHANTOM, ObserverSettings(), 1e-3)
     observer.update(0.0, 0.05, 0.0)
     with pytest.raises(ParameterError, match='the speed at most a needle length in a period'):

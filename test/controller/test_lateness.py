@@ -1,4 +1,4 @@
-"""Whether answers come in time for the delay that the laws count on."""
+"""The latency monitor compares commands with the configured delay."""
 
 from __future__ import annotations
 
@@ -11,8 +11,10 @@ import pytest
     ('rate', 'late', 'said'),
     [(1000, 40, False), (1000, 60, True), (20, 2, False), (20, 10, True)],
 )
-def test_more_than_one_late_answer_in_twenty_is_said(rate: int, late: int, said: bool) -> None:
-    """Of the last full second, and not for the sake of one or two."""
+def test_more_than_five_percent_late_commands_give_a_warning(
+    rate: int, late: int, said: bool
+) -> None:
+    """In the last full second, and more than one or two."""
     period = 1.0 / rate
     lateness = Lateness(delay=1, period=period)
     for k in range(2 * rate + 1):
@@ -20,12 +22,12 @@ def test_more_than_one_late_answer_in_twenty_is_said(rate: int, late: int, said:
         # Two periods are in time; a little more is not.
         lateness.add(now, 2.0 * period if k % rate >= late else 2.1 * period)
     warning = lateness.warning(now)
-    share = f'{late / rate:.0%} of the answers come too late for delay 1: raise it'
+    share = f'{late / rate:.0%} of the commands are too late for delay 1: raise it'
     assert (warning is not None and warning.startswith(share)) == said
     values = lateness.describe()
     assert values['measurements answered'] == 2 * rate + 1
     assert values['answered too late for the delay'] == 2 * late + 1
-    # A second without any: all is well again.
+    # A second without commands ends the warning.
     lateness.add(now + 1 * NANOSECONDS, 0.0)
     lateness.add(now + 2 * NANOSECONDS, 0.0)
     assert lateness.warning(now + 2 * NANOSECONDS) is None

@@ -1,4 +1,4 @@
-"""What the sampled laws do to the axes they believe in."""
+"""Sampled control laws on their nominal axes."""
 
 from math import inf, isfinite
 from typing import Any
@@ -35,10 +35,10 @@ viscosities = st.floats(0.0, 500.0)
 
 @settings(deadline=None, derandomize=True)
 @given(numbers, numbers, numbers, inertias, viscosities)
-def test_inverse_dynamics_gives_the_speed_it_aims_at(
+def test_inverse_dynamics_gives_the_commanded_velocity(
     position: float, speed: float, load: float, inertia: float, viscous: float
 ) -> None:
-    """Held over the period, the force brings about u + h a exactly, on every axis."""
+    """Held over the period, the force gives the velocity u + h a exactly, on every axis."""
     axis = Axis(inertia=inertia, viscous=viscous)
     law = InverseDynamics(axis=axis, gains=InverseDynamicsGains(), period=PERIOD)
     aim = Setpoint(0.1, 0.02, 0.3)
@@ -50,7 +50,7 @@ def test_inverse_dynamics_gives_the_speed_it_aims_at(
     assert abs(reached - (speed + PERIOD * acceleration)) < 1e-11 * scale
 
 
-def test_inverse_dynamics_tends_to_the_continuous_law() -> None:
+def test_inverse_dynamics_converges_to_the_continuous_law() -> None:
     """As h -> 0 the force is M a + mu_v u + mu_s sgn(u) + N, with an error of order one."""
     axis = PAPER_SI
     aim, gains = Setpoint(0.1, 0.02, 0.3), InverseDynamicsGains(kp=9.0, kv=6.0)
@@ -79,7 +79,7 @@ def test_pid_is_evaluated_at_the_end_of_the_period(
     filter_time: float,
     filtered: float,
 ) -> None:
-    """The force equals kp e + ki int e + kd e_dot at the state that it itself brings about."""
+    """The force equals kp e + ki int e + kd e_dot at the state at the end of the period."""
     axis = Axis(inertia=inertia, viscous=viscous)
     gains = PidGains(kp=50.0, ki=20.0, kd=3.0, filter_time=filter_time)
     aim, memory = Setpoint(0.1, 0.02, 0.3), no_memory()
@@ -104,7 +104,7 @@ def test_pid_is_evaluated_at_the_end_of_the_period(
 @settings(deadline=None, derandomize=True, max_examples=200)
 @given(st.floats(-3.0, 6.0), st.sampled_from([1e-6, 1e-3]))
 def test_response_is_exact(damping: float, t: float) -> None:
-    """Every entry agrees with the matrix exponential in 40 digits, damped a little or a lot."""
+    """Every entry agrees with the matrix exponential in 40 digits, for weak and strong damping."""
     gamma = 10.0**damping
     response = Axis(inertia=1.0, viscous=gamma).response(t)
     with mpmath.workdps(40):
@@ -116,10 +116,10 @@ def test_response_is_exact(damping: float, t: float) -> None:
     assert_allclose(vv, exact[1], rtol=1e-14, atol=1e-15)
 
 
-def test_response_joins_its_limits() -> None:
-    """Hardly any friction is like none, to first order."""
+def test_response_is_continuous_at_zero_friction() -> None:
+    """Weak friction equals zero friction, to first order."""
     free = Axis(inertia=2e-3).response(PERIOD)
-    # x = mu_v h / M = 5e-6 is the relative size of what changes.
+    # x = mu_v h / M = 5e-6 is the relative size of the change.
     assert_allclose(Axis(inertia=2e-3, viscous=1e-5).response(PERIOD), free, rtol=1e-5)
 
 
@@ -138,8 +138,8 @@ def test_invalid_axes_are_rejected(changes: dict[str, Any], words: str) -> None:
 
 @settings(deadline=None, derandomize=True, max_examples=30)
 @given(st.integers(0, 5), st.lists(numbers, min_size=8, max_size=8))
-def test_the_loop_predicts_its_delay_away(delay: int, kicks: list[float]) -> None:
-    """With the axis it believes in, delay only delays: the depths are those without it, later."""
+def test_prediction_compensates_the_delay(delay: int, kicks: list[float]) -> None:
+    """With its nominal axis, the depths equal the depths without delay, shifted by the delay."""
 
     def run(late: int) -> list[float]:
         law = InverseDynamics(axis=PAPER_SI, gains=InverseDynamicsGains(), period=PERIOD)
@@ -147,20 +147,20 @@ def test_the_loop_predicts_its_delay_away(delay: int, kicks: list[float]) -> Non
         waiting = [0.0] * late
         position, speed, path = 0.05, 0.0, []
         for i in range(200 + late):
-            # The reference is that of the time at which the command takes effect.
+            # The reference at the time at which the command takes effect.
             kick = kicks[min(i, 199) // 25]
             waiting.append(loop.command(position, speed, Setpoint(0.05 + 1e-3 * kick)))
             position, speed = PAPER_SI.propagate(position, speed, waiting.pop(0), PERIOD)
             path.append(position)
         return path[late:]
 
-    # The same arithmetic in the same order, but for the rounding of a prediction at rest.
+    # The same arithmetic in the same order, except for the rounding of a prediction at rest.
     assert_allclose(run(delay), run(0), rtol=0.0, atol=1e-12)
 
 
 @pytest.mark.parametrize('period', [1e-5, 1e-4, 1e-3])
 def test_breakaway_overcomes_coulomb_friction_at_rest(period: float) -> None:
-    """At rest with an error the inverse dynamics breaks away, at the sign of the error."""
+    """At rest with an error the inverse dynamics breaks away, in the direction of the error."""
     law = InverseDynamics(axis=PHANTOM, gains=InverseDynamicsGains(), period=period)
     for sign in (-1.0, 1.0):
         position, speed = 0.05, 0.0
@@ -174,8 +174,8 @@ def test_breakaway_overcomes_coulomb_friction_at_rest(period: float) -> None:
 # Anti-windup, feed-forward, memory.
 
 
-def test_the_integral_neither_winds_up_nor_hunts() -> None:
-    """In a limit the integral stands still, and within the tolerance at rest it is frozen."""
+def test_integral_neither_winds_up_nor_hunts() -> None:
+    """At a limit the integral is constant, and within the tolerance at rest it is frozen."""
     loop = SampledLoop(Pid(axis=PHANTOM, gains=PidGains(), period=PERIOD), 0, 1.0)
     for _ in range(100):
         assert loop.command(0.0, 0.0, Setpoint(0.1)) == 1.0
@@ -188,7 +188,7 @@ def test_the_integral_neither_winds_up_nor_hunts() -> None:
 
 
 def test_back_calculation_unwinds_in_its_tracking_time() -> None:
-    """Without an error what exceeds the limit fades as exp(-t / tracking_time)."""
+    """Without an error the excess over the limit decays as exp(-t / tracking_time)."""
     gains = PidGains(anti_windup='back_calculation', tracking_time=0.05, tolerance=0.0)
     law = Pid(axis=PHANTOM, gains=gains, period=1e-5)
     loop = SampledLoop(law, 0, 1.0)
@@ -202,8 +202,8 @@ def test_back_calculation_unwinds_in_its_tracking_time() -> None:
 
 
 @pytest.mark.parametrize('anti_windup', ['conditional', 'back_calculation'])
-def test_a_limit_does_not_make_the_integral_overshoot(anti_windup: str) -> None:
-    """After a long time in the limit the axis arrives without more overshoot than unlimited."""
+def test_force_limit_causes_no_integral_overshoot(anti_windup: str) -> None:
+    """After a long time at the limit the axis has no more overshoot than without a limit."""
     gains = PidGains(anti_windup=anti_windup, tracking_time=0.02)
     loop = SampledLoop(Pid(axis=PHANTOM, gains=gains, period=PERIOD), 1, 4.0)
     position, speed, waiting, path = 0.0, 0.0, [0.0], []
@@ -211,14 +211,14 @@ def test_a_limit_does_not_make_the_integral_overshoot(anti_windup: str) -> None:
         waiting.append(loop.command(position, speed, Setpoint(0.05)))
         position, speed = PHANTOM.propagate(position, speed, waiting.pop(0), PERIOD)
         path.append(position)
-    # The integral that slides at the limit, 4 N, is 0.7 mm of kp beyond what rest asks for.
+    # The integral during motion at the limit, 4 N, is 0.7 mm of kp above the force at rest.
     assert max(path) < 0.0512
     assert abs(path[-1] - 0.05) < 1e-4
 
 
 @pytest.mark.parametrize('axis', [PHANTOM, PAPER_SI], ids=['phantom', 'si'])
-def test_feed_forward_follows_the_reference_by_itself(axis: Axis) -> None:
-    """With the axis it believes in, almost nothing is left to the feedback; without it a lot."""
+def test_feed_forward_follows_the_reference(axis: Axis) -> None:
+    """With the nominal axis, the feedback is almost zero; without feed-forward it is large."""
     reference = MinimumJerk(Setpoint(0.0), 0.01, ReferenceLimits(speed=0.02, acceleration=0.2))
     worst = {}
     for feed_forward in (False, True):
@@ -250,22 +250,22 @@ def test_feed_forward_follows_the_reference_by_itself(axis: Axis) -> None:
         ]
     ),
 )
-def test_a_switch_has_no_bump(
+def test_switch_between_laws_is_bumpless(
     position: float, speed: float, last: float, axis: Axis, gains: InverseDynamicsGains | PidGains
 ) -> None:
-    """Whatever law follows, its first force is the last one of the law before."""
+    """For each pair of laws, the first force equals the last force before the switch."""
     law: Any = InverseDynamics if isinstance(gains, InverseDynamicsGains) else Pid
     loop = SampledLoop(Pid(axis=axis, gains=PidGains(), period=PERIOD), 1, 20.0)
     loop.last = last
     loop.switch(law(axis=axis, gains=gains, period=PERIOD))
     # Rounding of forces of the size of the gains, times the divisor of PID.
     assert loop.command(position, speed, Setpoint(0.1, 0.01, 0.2)) == pytest.approx(last, abs=1e-9)
-    # The next command is the law's own again: finite, whatever the bridge took.
+    # The next command is computed by the law: finite, for any offset.
     assert isfinite(loop.command(position, speed, Setpoint(0.1, 0.01, 0.2)))
 
 
-def test_what_bridges_a_switch_fades() -> None:
-    """The force that a law without integral took over is gone after ten times its 0.1 s."""
+def test_offset_after_a_switch_decays() -> None:
+    """The offset of a law without integral is zero after ten times its 0.1 s."""
     loop = SampledLoop(Pid(axis=PHANTOM, gains=PidGains(), period=PERIOD), 0, 20.0)
     loop.last = 3.0
     gains = InverseDynamicsGains(bandwidth=0.0)
@@ -277,8 +277,8 @@ def test_what_bridges_a_switch_fades() -> None:
     assert loop.memory[OFFSET] < 2e-4
 
 
-def test_a_stopped_loop_keeps_what_it_knows() -> None:
-    """A stop takes the commands off the way; the integral waits, and a reset forgets it."""
+def test_stop_keeps_the_integral() -> None:
+    """A stop discards the pending commands; the integral is frozen, and a reset discards it."""
     loop = SampledLoop(Pid(axis=PHANTOM, gains=PidGains(), period=PERIOD), 2, 20.0)
     for _ in range(10):
         loop.command(0.05, 0.0, Setpoint(0.051))
@@ -290,8 +290,8 @@ def test_a_stopped_loop_keeps_what_it_knows() -> None:
     assert not loop.memory.any()
 
 
-def test_a_switch_keeps_the_period() -> None:
-    """A law of another period belongs into another loop."""
+def test_switch_to_another_period_is_rejected() -> None:
+    """A law of another period requires another loop."""
     law = Pid(axis=PHANTOM, gains=PidGains(), period=PERIOD)
     with pytest.raises(ParameterError, match=r'period must stay 0\.001 s'):
         SampledLoop(law, 0, 1.0).switch(Pid(axis=PHANTOM, gains=PidGains(), period=2e-3))
@@ -306,7 +306,7 @@ def test_a_switch_keeps_the_period() -> None:
         ({'tracking_time': 0.0}, 'tracking_time must be finite, > 0 s'),
     ],
 )
-def test_gains_that_are_none_are_refused(changes: dict[str, Any], words: str) -> None:
-    """Unknown names and numbers out of range, with what would be valid."""
+def test_invalid_gains_are_rejected(changes: dict[str, Any], words: str) -> None:
+    """Unknown names and numbers out of range, with the valid values."""
     with pytest.raises(ParameterError, match=words):
         PidGains(**changes)

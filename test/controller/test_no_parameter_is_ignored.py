@@ -1,4 +1,4 @@
-"""No parameter is accepted and ignored: each is read, and each constant of friction has effect."""
+"""Every parameter has effect: each is read, and each friction constant changes the command."""
 
 import ast
 from collections.abc import Iterator
@@ -47,7 +47,7 @@ def names_read() -> Iterator[str]:
     for package in ('needle_dynamics', 'needle_controller'):
         for path in (ROOT / package).rglob('*.py'):
             for node in ast.walk(ast.parse(path.read_text(encoding='utf-8'))):
-                # What only checks a value does not count; laws are made there.
+                # Checks of a value are ignored, except where laws are created.
                 if isinstance(node, ast.FunctionDef) and node.name == '__post_init__':
                     node.body = [] if '_set_constants' not in ast.unparse(node) else node.body
                 if isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Load):
@@ -56,14 +56,14 @@ def names_read() -> Iterator[str]:
 
 @pytest.mark.parametrize('settings', SETTINGS, ids=lambda one: str(one.__name__))
 def test_every_parameter_is_read(settings: Any) -> None:
-    """By its name, somewhere in the code that computes."""
+    """By its name, in computing code."""
     known: Any = getattr(settings, '_fields', None) or [one.name for one in fields(settings)]
-    # Those of friction are read together.
+    # Friction constants are read together.
     assert set(known) <= {*names_read(), *_FRICTION_FIELDS.values()}
 
 
 def forces(law: str, gains: dict[str, Any], **changes: Any) -> list[float]:
-    """Return what a law commands to a needle that moves in, rests, and is to move out."""
+    """Return the commands of a law to a needle that moves in, rests, and has a goal outside."""
     parameters = NeedleParameters.preset('phantom', **changes)
     controller = Controller(parameters, law, gains=gains)
     controller.set_target(0.05)
@@ -95,6 +95,6 @@ def forces(law: str, gains: dict[str, Any], **changes: Any) -> list[float]:
 def test_every_constant_of_friction_changes_the_command(
     law: str, base: dict[str, Any], name: str, value: Any
 ) -> None:
-    """Under each law; PID has feed-forward here, since otherwise it knows no friction."""
+    """For each law; PID with feed-forward, because it does not compensate friction otherwise."""
     gains = {'pid': {'insertion': PidGains(feed_forward=True)}} if law == 'pid' else {}
     assert forces(law, gains, **base) != forces(law, gains, **{**base, name: value})

@@ -39,17 +39,17 @@ preset = NeedleParameters.preset
 
 PERIOD = 1e-3
 
-#: Longest step of the plant by default [s], and speed at which its needle goes in [m/s].
+#: Longest step of the plant by default [s], and insertion speed [m/s].
 STEP, SPEED = 2e-5, 0.008
 
-#: A needle without a lateral force at the tip, and a sensor without offset: those of the plant.
+#: Needle without a lateral force at the tip, and sensor without offset, as in the plant.
 NO_LOADS: dict[str, Any] = {
     'tip_force': 0.0,
     'force_offset': 0.0,
     'torque_offset': 0.0,
 }
 
-#: Least depth at which n modes are told apart.
+#: Least depth at which n modes are distinguishable.
 LEAST_DEPTH = {1: 0.001, 2: 0.001, 3: 0.03}
 
 
@@ -59,7 +59,7 @@ def phantom(modes: int = 2, **changes: Any) -> NeedleParameters:
 
 class Reference:
     """
-    The linear model that the observer stands on, written densely with matrix exponentials.
+    The linear model of the observer, in dense form with matrix exponentials.
 
     The state is q, p = rho A G q_dot, the impulses of lateral force and moment, the integral of
     the tip deflection, and a lateral force at the tip; depth is frozen at its mean over a sample.
@@ -139,7 +139,7 @@ class Reference:
         order = 2 * len(self.sections)
         memory = np.zeros((2 * order, 2 * (order + 1)))
         if order:
-            # The low-pass as matrices, by what it does to units.
+            # Matrices of the low-pass, from its response to unit vectors.
             a, b = np.empty((order, order)), np.empty(order)
             for k in range(order):
                 unit = np.eye(order)[k].reshape(-1, 2)
@@ -175,7 +175,7 @@ class Reference:
         return first, np.array(loads)
 
     def remembered(self, loads: FloatArray) -> FloatArray:
-        """Return what loads, shape (3, cases), have left in the memories of the low-pass."""
+        """Return the contribution of loads, shape (3, cases), to the memories of the low-pass."""
         arms = 1.0, self.model.parameters.length
         parts = []
         for c in range(2):
@@ -198,8 +198,8 @@ class Reference:
         """
         Return states (q, p) on the grid, readings of the wrench, and means over windows.
 
-        The last axis of all inputs and results numbers cases, which are run side by side.
-        ``kicks`` has shape (samples, 2, n, cases): the noise at both ends of each sample.
+        The last axis of all inputs and results is the case. ``kicks`` is the noise at both ends of
+        each sample, shape (samples, 2, n, cases).
         """
         n, count, cases = self.n, len(depths) - 1, start.shape[-1]
         x = start.copy()
@@ -264,7 +264,7 @@ class Reference:
         _, before = self.modes(*old)
         omega, after = self.modes(*new)
         change = np.linalg.solve(after, before)
-        # The modes are those of either sign.
+        # The sign of each mode is arbitrary.
         signs = np.tile(np.sign(np.diag(change)[:n]), 2)
         after *= signs
         change = signs[:, np.newaxis] * change - np.eye(2 * n)
@@ -291,7 +291,7 @@ class Reference:
 
 
 def draw(reference: Reference, depth: float, count: int, cases: int, rng: Any) -> list[FloatArray]:
-    """Draw starts, memories, kicks and noise as the observer believes them to be."""
+    """Draw starts, memories, kicks and noise from the prior of the observer."""
     root, memory = reference.prior(depth)
     return [
         root @ rng.normal(size=(len(root), cases)),
@@ -329,8 +329,8 @@ BATCH_CASES: dict[str, tuple[int, dict[str, Any], dict[str, Any]]] = {
 
 
 @pytest.mark.parametrize('case', BATCH_CASES)
-def test_is_the_conditional_mean_of_all_that_was_measured(case: str) -> None:
-    """With late, early, disordered and missing samples: a dense batch solution says the same."""
+def test_estimate_is_the_conditional_mean_of_all_measurements(case: str) -> None:
+    """With late, early, disordered and missing samples it equals a dense batch solution."""
     modes, changes, options = BATCH_CASES[case]
     parameters = phantom(modes, **changes)
     beliefs = ObserverSettings(
@@ -378,7 +378,7 @@ def test_is_the_conditional_mean_of_all_that_was_measured(case: str) -> None:
     wrench_read[rng.random(wrench_read.shape) < 0.2] = nan
 
     observer = Observer(parameters, beliefs, PERIOD)
-    # Out of order, one before its sample, the first one last of all.
+    # Out of order: one wrench before its sample, the first wrench last.
     arrivals = {3: [1], 14: [3, 2], 20: [5, 4], count: [0]} if len(ends) == 6 else {9: [1, 0, 2]}
     for k in range(count + 1):
         wrench = None if k == 0 else (float(wrench_read[k - 1, 0]), float(wrench_read[k - 1, 1]))
@@ -402,7 +402,7 @@ def test_is_the_conditional_mean_of_all_that_was_measured(case: str) -> None:
     assert observer.refused == 0
     assert observer.nis.degrees == len(y)
     deviation = np.sqrt(np.diag(covariance))
-    # 1e-6 of a standard deviation: the batch solution inverts what spans many decades.
+    # 1e-6 of a standard deviation: the batch solution inverts matrices over many decades.
     assert_allclose(
         np.concatenate(observer.modal) / deviation, expected / deviation, rtol=0.0, atol=1e-6
     )
@@ -418,8 +418,8 @@ def test_is_the_conditional_mean_of_all_that_was_measured(case: str) -> None:
     )
 
 
-def test_errors_are_as_large_as_said_over_200_runs() -> None:
-    """NEES and NIS within their bands of 95 % where the truth is the model with its noise."""
+def test_observer_is_consistent_over_200_runs() -> None:
+    """NEES and NIS within their bands of 95 %, with the model and its noise as the truth."""
     parameters, beliefs = phantom(), ObserverSettings(tip_exposure=5e-3)
     reference = Reference(parameters, beliefs)
     cases, count = 200, 100
@@ -465,10 +465,11 @@ def under_tip_force(
     force: float, tip_period: int, late: int, beliefs: ObserverSettings, cases: int, count: int
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """
-    Watch needles at 10 cm that begin to bend under a constant force at the tip.
+    Observe needles at 10 cm that begin to bend under a constant force at the tip.
 
-    The tip comes every ``tip_period`` samples, ``late`` samples after its exposure. Returns error
-    and standard deviation of the tip at the end, NEES, and NIS with its degrees, by case.
+    A tip sample is received every ``tip_period`` samples, ``late`` samples after its exposure.
+    Returns error and standard deviation of the tip at the end, NEES, and NIS with its degrees, by
+    case.
     """
     parameters = phantom()
     reference = Reference(parameters, beliefs)
@@ -506,8 +507,8 @@ def under_tip_force(
 
 @pytest.mark.parametrize('force', [0.05, 0.2, 0.5])
 @pytest.mark.parametrize('sensor', ['1 kHz', '25 Hz, 50 ms late'])
-def test_a_constant_force_at_the_tip_is_told_from_noise(force: float, sensor: str) -> None:
-    """What a bevel does: errors are as large as said, and far smaller than those of the sensor."""
+def test_constant_tip_force_is_estimated_consistently(force: float, sensor: str) -> None:
+    """Bevel force: consistent errors, far smaller than the errors of the sensor."""
     if sensor == '1 kHz':
         beliefs, (tip_period, late) = ObserverSettings(tip_noise=1e-4), (1, 0)
     else:
@@ -523,8 +524,8 @@ def test_a_constant_force_at_the_tip_is_told_from_noise(force: float, sensor: st
 
 
 @pytest.mark.parametrize('rate', [30.0, 300.0, 1500.0])
-def test_any_sample_rate_will_do(rate: float) -> None:
-    """Rates that do not divide that of the force sensor: the error is as large as said."""
+def test_observer_is_consistent_at_any_sample_rate(rate: float) -> None:
+    """Rates that do not divide the rate of the force sensor."""
     parameters, period, beliefs = phantom(), 1.0 / rate, ObserverSettings(tip_exposure=2e-4)
     needle = Integrator(parameters, NeedleModel(parameters).state_at(0.1, 1e-3), 1e-4)
     reference = Reference(parameters, beliefs)
@@ -556,8 +557,8 @@ def test_any_sample_rate_will_do(rate: float) -> None:
     assert observer.refused == 0
 
 
-def test_a_tip_stamped_on_arrival_counts_where_it_was_taken() -> None:
-    """`tip_latency` is what another stamp would be."""
+def test_tip_latency_corrects_receive_stamps() -> None:
+    """`tip_latency` is equivalent to a shift of the stamp."""
     plain, late = (
         Observer(phantom(), ObserverSettings(tip_latency=latency), PERIOD)
         for latency in (0.0, 0.06)
@@ -571,7 +572,7 @@ def test_a_tip_stamped_on_arrival_counts_where_it_was_taken() -> None:
 
 
 class Irregular(Integrator):
-    """The simulated needle with the distributed noise force that the observer believes in."""
+    """The simulated needle with the distributed noise force of the observer model."""
 
     def __init__(
         self, parameters: NeedleParameters, state: FloatArray, size: float, seed: int
@@ -584,7 +585,7 @@ class Irregular(Integrator):
     def advance(self, duration: float, *inputs: Any, **options: Any) -> Interval:
         n = self.model.modes.count
         if abs(self.depth - self._known) > 1e-3 * self.depth:
-            # G goes with the fifth power of the depth at most: good to half a percent.
+            # G grows at most with the fifth power of the depth: accurate to half a percent.
             self._known = self.depth
             root = cholesky(self.model.modes.integrals(self.depth).gram, lower=True)
             self._root = self._size * np.linalg.inv(root.T)
@@ -609,7 +610,7 @@ def plant(
     beliefs: ObserverSettings,
     irregularity: float = 0.0,
 ) -> tuple[Plant, float]:
-    """Return the plant with default sensors, as bent as is believed, and a force to move it."""
+    """Return the plant with default sensors, bent by the prior, and a force to move it."""
     rng = np.random.default_rng(seed)
     root, model, n = prior(parameters, beliefs, depth), NeedleModel(parameters), parameters.modes
     start = root @ rng.normal(size=2 * n)
@@ -628,7 +629,7 @@ def plant(
 
 
 def watch_plant(observer: Observer, simulated: Plant, force: float, count: int) -> list[Sample]:
-    """Let the observer see what the plant's sensors report."""
+    """Update the observer by the plant's sensors."""
     needle = simulated.integrator
     observer.reset()
     observer.update(0.0, needle.depth, needle.velocity)
@@ -644,7 +645,7 @@ def watch_plant(observer: Observer, simulated: Plant, force: float, count: int) 
 
 
 def test_defaults_of_plant_and_observer_agree() -> None:
-    """What the observer believes of the sensors is what they are, noise behind the filters."""
+    """The sensor settings of observer and plant are equal, with noise behind the filters."""
     beliefs, sensor, tip = ObserverSettings(), ForceSensorParameters(), TipParameters()
     assert (beliefs.cutoffs, beliefs.filter_rate) == (sensor.cutoffs, sensor.rate)
     impulse = np.zeros(20_000)
@@ -664,17 +665,15 @@ def test_defaults_of_plant_and_observer_agree() -> None:
 @pytest.mark.parametrize(
     ('name', 'irregularity'), [('phantom', ObserverSettings().irregularity), ('paper_mm', 0.0)]
 )
-def test_errors_on_the_plant_are_as_large_as_said_over_200_runs(
-    name: str, irregularity: float
-) -> None:
+def test_observer_is_consistent_on_the_plant_over_200_runs(name: str, irregularity: float) -> None:
     """
-    NEES, error of the tip and NIS within their bands of 95 % where the needle is as believed.
+    NEES, error of the tip and NIS within their bands of 95 % for the nominal needle.
 
-    The plant moves under a force and has its sensors as they are by default; the observer has
-    its defaults, also where the tissue is as irregular as these say, or not at all.
+    The plant moves under a force with its default sensors; the observer has its defaults, with
+    tissue as irregular as configured, or regular.
     """
     parameters = preset(name)
-    # What the low-pass held at the start is a guess: NIS counts the samples after that.
+    # The initial state of the low-pass is a guess: NIS is computed from later samples.
     beliefs = ObserverSettings(irregularity=irregularity, history=0.06, **NO_LOADS)
     observer = Observer(parameters, beliefs, PERIOD)
     runs, count, n = 200, 100, parameters.modes
@@ -694,8 +693,8 @@ def test_errors_on_the_plant_are_as_large_as_said_over_200_runs(
         assert Consistency.of(total, freedom).holds
 
 
-def test_a_tissue_without_irregularity_and_a_perfect_tip_sensor_are_on_the_safe_side() -> None:
-    """Then errors are smaller than the defaults say: NEES and NIS below their bands."""
+def test_observer_is_conservative_without_irregularity_and_tip_noise() -> None:
+    """Errors are smaller than predicted: NEES and NIS below their bands."""
     parameters, beliefs = preset('paper_mm'), ObserverSettings()
     observer = Observer(parameters, beliefs, PERIOD)
     nees, squares, degrees = 0.0, 0.0, 0
@@ -721,12 +720,12 @@ def simulate(
     **options: Any,
 ) -> tuple[Observer, FloatArray]:
     """
-    Watch the plant with its default force sensor; the tip at 50 Hz, 20 ms late.
+    Observe the plant with its default force sensor; the tip at 50 Hz, 20 ms late.
 
-    Against its friction the bent needle's pull is nothing: the speed is the same all the time.
+    The pull of the bent needle is small against friction: the speed is constant.
 
     Returns the observer, and for every sample NEES, true tip deflection, its estimate, the
-    standard deviation of that, and the last tip sample that has come.
+    standard deviation of the estimate, and the last received tip sample.
     """
     beliefs = ObserverSettings(**options)
     rng = np.random.default_rng([seed, 3])
@@ -759,8 +758,8 @@ def simulate(
     return observer, np.array(rows)
 
 
-def test_low_pass_belongs_to_the_state() -> None:
-    """Taken for white noise, what the sensor's filter leaves is neither white nor in time."""
+def test_low_pass_is_part_of_the_state() -> None:
+    """As white noise, the output of the sensor's filter would be neither white nor in time."""
     parameters = preset('paper_mm')
     cases: list[tuple[dict[str, Any], bool]] = [({}, True), ({'cutoffs': ()}, False)]
     for options, consistent in cases:
@@ -770,21 +769,21 @@ def test_low_pass_belongs_to_the_state() -> None:
         assert (error < 5.0 * rows[40:, 3].max()) == consistent
 
 
-def test_fast_modes_keep_their_action_while_the_depth_changes() -> None:
+def test_action_of_fast_modes_is_conserved_while_the_depth_changes() -> None:
     """
-    At 2 cm, where a sample is 2 and 22 turns of the modes, without any noise believed.
+    At 2 cm, where a sample is 2 and 22 periods of the modes, without configured irregularity.
 
-    A change of basis all at once, in whatever phase the modes are, is wrong by a thousandth each
-    time: after 150 samples errors would be ten times as large as said.
+    An abrupt change of basis, at any phase of the modes, has an error of a thousandth each time:
+    after 150 samples the errors would be ten times the prediction.
     """
     nees = np.zeros(150)
     for seed in range(10):
-        # As much as its force sensor bears: with 1 mm the moment there would be 9 N m.
+        # Limited by the range of the force sensor: with 1 mm the moment would be 9 N m.
         _, rows = simulate(
             seed, preset('paper_mm'), 0.02, 150, irregularity=0.0, initial_deflection=2e-4
         )
         nees += rows[:, 0] / 40.0
-    # Band of 95 % up to 1.48, and what a depth frozen over each sample leaves.
+    # Band of 95 % up to 1.48, and the error of a depth frozen over each sample.
     assert nees[[50, 100, 149]].max() < 2.0
 
 
@@ -800,27 +799,25 @@ def test_tip_estimate_is_better_than_the_tip_sensor(name: str, depth: float, mod
     _, truth, estimate, spread, raw = rows[60:].T
     noise = ObserverSettings().tip_noise
     error = np.sqrt(np.mean((estimate - truth) ** 2))
-    # The needle turns over several times before a late sample comes.
-    # Deep in, the wrench says little of it: a sample of the force has 0.05 N of noise.
+    # Several periods of the needle pass before a late sample.
+    # At large depth the wrench is insensitive: a sample of the force has 0.05 N of noise.
     assert error < 0.75 * noise
     assert error < 0.75 * np.sqrt(np.mean((raw - truth) ** 2))
     assert error < 1.5 * np.sqrt(np.mean(spread**2))
 
 
-# Not 3 cm, where a mode has the rate of the samples: the wrench does not tell it.
+# Not 3 cm, where a mode has the sample rate: the wrench does not observe it.
 @pytest.mark.parametrize('depth', [0.035, 0.06, 0.1])
 @pytest.mark.parametrize('factor', [0.7, 1.3])
-def test_default_irregularity_covers_a_tissue_that_is_not_as_believed(
-    depth: float, factor: float
-) -> None:
-    """Stiffness 30 % off on the needle that rings for ever: errors are about as large as said."""
+def test_default_irregularity_covers_a_stiffness_mismatch(depth: float, factor: float) -> None:
+    """Stiffness 30 % off on the undamped needle: errors are approximately consistent."""
     believed = preset('paper_mm')
     parameters = preset('paper_mm', tissue_stiffness=factor * believed.tissue_stiffness)
     observer, rows = simulate(4, parameters, depth, 300, believed=believed)
     _, truth, estimate, spread, _ = rows[60:].T
     assert np.sqrt(np.mean((estimate - truth) ** 2)) < 2.0 * np.sqrt(np.mean(spread**2))
     assert observer.nis.ratio < 1.5
-    # With none believed it cannot be right, and says so.
+    # Without configured irregularity it is inconsistent, and detects it.
     observer, _ = simulate(4, parameters, depth, 300, believed=believed, irregularity=0.0)
     assert observer.nis.ratio > 2.0 * observer.nis.high
 
@@ -829,7 +826,7 @@ def test_default_irregularity_covers_a_tissue_that_is_not_as_believed(
 @pytest.mark.parametrize('depth', [0.03, 0.08, 0.2])
 @pytest.mark.parametrize('name', ['paper_mm', 'phantom'])
 def test_deflection_is_observable(name: str, depth: float, modes: int) -> None:
-    """Modal coordinates and rates are seen by the tip alone, and better with the wrench."""
+    """Modal coordinates and rates are observable by the tip only, and better with the wrench."""
     parameters = preset(name, modes=modes, minimum_depth=LEAST_DEPTH[modes])
     model = NeedleModel(parameters)
     system = linearize(model, operating_point(model, depth, 0.0, 0.01))
@@ -856,7 +853,7 @@ def test_deflection_is_observable(name: str, depth: float, modes: int) -> None:
 
 
 def exact(depth: float, modes: int, **changes: Any) -> tuple[Observer, Integrator]:
-    """Watch the simulated needle with sensors that hardly err."""
+    """Observe the simulated needle with very accurate sensors."""
     parameters = phantom(modes, **changes)
     needle = Integrator(parameters, NeedleModel(parameters).state_at(depth, 1e-3), 2e-6)
     beliefs = ObserverSettings(
@@ -876,7 +873,7 @@ def exact(depth: float, modes: int, **changes: Any) -> tuple[Observer, Integrato
 @pytest.mark.parametrize('modes', [1, 2, 3])
 @pytest.mark.parametrize('depth', [0.03, 0.1])
 def test_agrees_with_the_simulated_needle(depth: float, modes: int) -> None:
-    """What modal state, tip deflection and load mean is what the model means by them."""
+    """Modal state, tip deflection and load agree with the model."""
     observer, needle = exact(depth, modes, tissue_damping=0.0)
     model, state = needle.model, needle.state
     modal, rates = observer.modal
@@ -886,7 +883,7 @@ def test_agrees_with_the_simulated_needle(depth: float, modes: int) -> None:
     value, spread = observer.tip_deflection
     assert_allclose(value, model.tip_deflection(state), rtol=0, atol=1e-7)
     assert 0.0 < spread < 1e-7
-    # The load is that of the modes below half the rate alone.
+    # The load includes only modes below half the sample rate.
     mass, stiffness = model.mass_matrix(state)[2:, 2:], model.stiffness_matrix(depth)
     squares, shapes = eigh(stiffness, mass)
     kept = shapes[:, np.sqrt(squares) * PERIOD < np.pi]
@@ -901,8 +898,8 @@ def test_agrees_with_the_simulated_needle(depth: float, modes: int) -> None:
 
 @settings(deadline=None, max_examples=15)
 @given(st.permutations(range(1, 21)), st.integers(1, 20))
-def test_a_wrench_may_come_apart_from_its_encoder_sample(order: list[int], shown: int) -> None:
-    """Late, early, in whatever order: it counts where its stamp says."""
+def test_wrench_is_used_at_its_stamp_in_any_order(order: list[int], shown: int) -> None:
+    """Late, early, in any order relative to its encoder sample."""
     together, apart = (Observer(phantom(), ObserverSettings(), PERIOD) for _ in range(2))
     clock = 1.7e9
 
@@ -913,7 +910,7 @@ def test_a_wrench_may_come_apart_from_its_encoder_sample(order: list[int], shown
         together.update(clock + k * PERIOD, 0.1, 0.0, wrench(k))
         apart.update(clock + k * PERIOD, 0.1, 0.0)
         if k == shown:
-            # At most sixteen wait.
+            # At most sixteen wrenches wait.
             late = [j for j in order if j <= k] + [j for j in order if j > k][:16]
             for j in late:
                 apart.add_wrench(clock + j * PERIOD, *wrench(j))
@@ -939,7 +936,7 @@ def watch(
     origin: float = 0.0,
     at_once: bool = True,
 ) -> Observer:
-    """Forty samples with a made-up wrench; tips when their time has come, or at the end."""
+    """Forty samples with an artificial wrench; tips at their time, or at the end."""
     observer = Observer(phantom(), ObserverSettings(), PERIOD)
     waiting = list(tips)
     for k in range(41):
@@ -957,8 +954,10 @@ def watch(
 
 @settings(deadline=None, max_examples=25)
 @given(st.dictionaries(ticks, readings, max_size=8), st.randoms(use_true_random=False))
-def test_order_of_arrival_does_not_matter(samples: dict[int, float], random: Any) -> None:
-    """Whatever the order in which tip samples come, the estimate is the same."""
+def test_estimate_is_independent_of_the_order_of_arrival(
+    samples: dict[int, float], random: Any
+) -> None:
+    """Of tip samples."""
     tips = [(k * PERIOD, value) for k, value in samples.items()]
     inorder = watch(sorted(tips))
     random.shuffle(tips)
@@ -974,8 +973,10 @@ def test_order_of_arrival_does_not_matter(samples: dict[int, float], random: Any
 
 @settings(deadline=None, max_examples=25)
 @given(st.dictionaries(ticks, readings, max_size=8), st.floats(-1e9, 1e9))
-def test_mirror_and_clock_do_not_matter(samples: dict[int, float], origin: float) -> None:
-    """A mirrored needle is estimated mirrored, on a clock that starts anywhere."""
+def test_estimate_is_invariant_to_mirror_and_clock_origin(
+    samples: dict[int, float], origin: float
+) -> None:
+    """A mirrored needle has a mirrored estimate, for any origin of the clock."""
     tips = sorted((k * PERIOD, value) for k, value in samples.items())
     plain, mirrored, moved = watch(tips), watch(tips, sign=-1.0), watch(tips, origin=origin)
     for one, other, later in zip(plain.modal, mirrored.modal, moved.modal, strict=True):
@@ -985,7 +986,7 @@ def test_mirror_and_clock_do_not_matter(samples: dict[int, float], origin: float
     assert plain.load == mirrored.load
 
 
-def test_repeated_and_unusable_samples_are_refused() -> None:
+def test_repeated_and_invalid_samples_are_rejected() -> None:
     clean, tips = watch([(0.02, 1e-4)]), [(0.02, 1e-4)]
     observer = watch(tips)
     before = observer.modal
@@ -1016,7 +1017,7 @@ def test_each_channel_may_be_missing(missing: tuple[float, float]) -> None:
     assert (informed.sum() < ignorant.sum()) == bool(given)
 
 
-def test_bad_encoder_samples_leave_the_estimate_as_it_is() -> None:
+def test_invalid_encoder_samples_do_not_change_the_estimate() -> None:
     observer = watch([(0.02, 1e-4)])
     before = observer.modal
     for bad in ((nan, 0.1, 0.0), (0.05, nan, 0.0), (0.05, 0.1, float('inf'))):
@@ -1038,7 +1039,9 @@ def test_bad_encoder_samples_leave_the_estimate_as_it_is() -> None:
         ((-5.0, 0.1, 0.0), 'encoders went from 0.04 to -5 s'),
     ],
 )
-def test_starts_anew_where_it_lost_track(sample: tuple[float, float, float], reason: str) -> None:
+def test_observer_restarts_after_implausible_samples(
+    sample: tuple[float, float, float], reason: str
+) -> None:
     observer = watch([(0.02, 1e-4)])
     observer.update(*sample)
     assert observer.warning is not None
@@ -1055,8 +1058,8 @@ def test_starts_anew_where_it_lost_track(sample: tuple[float, float, float], rea
         observer.modal  # noqa: B018
 
 
-def test_a_gap_is_bridged() -> None:
-    """Missing encoder samples cost nothing where the depth went evenly in between."""
+def test_gap_in_encoder_samples_is_bridged() -> None:
+    """Missing encoder samples have no effect for a depth linear in time."""
     whole, gap = (Observer(phantom(), ObserverSettings(), PERIOD) for _ in range(2))
     for k in range(31):
         wrench = (0.1, 0.01) if k < 10 or k == 30 else None
@@ -1071,7 +1074,7 @@ def test_a_gap_is_bridged() -> None:
 
 @pytest.mark.parametrize('name', ['paper_mm', 'phantom'])
 def test_covariance_stays_finite_without_measurements(name: str) -> None:
-    """Ten minutes of encoders alone: uncertainty grows as noise does, symmetric and positive."""
+    """Ten minutes of encoders only: the covariance grows as the noise, symmetric and positive."""
     parameters = preset(name)
     # Longer samples for less time spent here: a gap is ten of them.
     observer = Observer(parameters, ObserverSettings(history=0.06, **NO_LOADS), 5.0 * PERIOD)
@@ -1088,14 +1091,14 @@ def test_covariance_stays_finite_without_measurements(name: str) -> None:
     assert observer.tip_deflection[1] < (1e-2 if name == 'paper_mm' else 1e-3)
 
 
-def test_covariance_stays_positive_with_measurements_that_hardly_err() -> None:
+def test_covariance_stays_positive_with_very_accurate_measurements() -> None:
     observer, _ = exact(0.05, 2)
     covariance = observer.covariance
     scale = np.sqrt(np.diag(covariance))
     assert np.linalg.eigvalsh(covariance / np.outer(scale, scale))[0] > 0.0
 
 
-def test_consistency_bands_are_those_of_chi_squared() -> None:
+def test_consistency_bands_follow_chi_squared() -> None:
     rng = np.random.default_rng(7)
     sums = (rng.normal(size=(4000, 30)) ** 2).sum(axis=1)
     inside = sum(Consistency.of(total, 30).holds for total in sums)
@@ -1116,24 +1119,24 @@ def test_consistency_bands_are_those_of_chi_squared() -> None:
         ({}, 1e-4, 'whole multiple of the sample rate'),
     ],
 )
-def test_bad_settings_are_named(options: dict[str, Any], period: float, match: str) -> None:
+def test_invalid_settings_are_rejected(options: dict[str, Any], period: float, match: str) -> None:
     with pytest.raises(ParameterError, match=match):
         Observer(phantom(), ObserverSettings(**options), period)
 
 
-def test_the_formulation_as_printed_is_rejected() -> None:
+def test_printed_formulation_is_rejected() -> None:
     with pytest.raises(ParameterError, match="formulation must be 'complete'"):
         Observer(phantom(formulation='as_printed'), ObserverSettings(), PERIOD)
 
 
-def test_nees_wants_the_right_shape() -> None:
+def test_nees_rejects_wrong_shapes() -> None:
     observer = watch([])
     with pytest.raises(ShapeError, match=r'must have shape \(2,\) each'):
         observer.nees([0.0], [0.0])
 
 
-def test_an_observer_that_does_not_explain_its_measurements_is_not_used() -> None:
-    """A moment that jumps back and forth is no needle: a warning, and no load; then both go."""
+def test_inconsistent_observer_is_not_used() -> None:
+    """An alternating moment gives a warning and zero load; both end with the moment."""
     bending = Bending(phantom(), Observer(phantom(), ObserverSettings(), PERIOD))
     rng, stamps = np.random.default_rng(4), iter(range(0, 10**10, 10**6))
 
@@ -1147,7 +1150,7 @@ def test_an_observer_that_does_not_explain_its_measurements_is_not_used() -> Non
     assert bending.warning is None
     assert bending.load != 0.0
     watch(300, 0.2)
-    assert 'does not explain what is measured: NIS is' in str(bending.warning)
+    assert 'inconsistent with the measurements: NIS is' in str(bending.warning)
     assert bending.load == 0.0
     watch(1000, 0.0)
     assert bending.warning is None

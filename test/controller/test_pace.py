@@ -1,4 +1,4 @@
-"""Whether another rate is found, and the true one never is."""
+"""The rate monitor detects a wrong rate, without false alarms."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import pytest
 def judged(
     rate: float, true: float, rng: Generator, *, jitter: float = 0.0, lost: float = 0.0
 ) -> str | None:
-    """Return what is said of five seconds of samples, looked at every 50 ms."""
+    """Return the warning after five seconds of samples, checked every 50 ms."""
     pace = Pace(rate, 0.1)
     stamps = np.arange(int(5.0 * true)) / true
     stamps += jitter / true * rng.uniform(-1.0, 1.0, stamps.shape)
@@ -23,7 +23,7 @@ def judged(
     look, newest = 0, (0, 0)
     for before, stamp in pairwise(times):
         if stamp >= look:
-            # What came last before the look.
+            # The last sample before the check.
             pace.add(*newest)
             look = stamp + NANOSECONDS // 20
         newest = stamp, stamp - before
@@ -31,20 +31,20 @@ def judged(
 
 
 @pytest.mark.parametrize(('rate', 'true'), [(1000.0, 500.0), (500.0, 1000.0), (100.0, 125.0)])
-def test_another_rate_is_said(rate: float, true: float) -> None:
-    """With both numbers and what to set, with jitter too."""
+def test_wrong_rate_gives_a_warning(rate: float, true: float) -> None:
+    """The warning has both rates and the correction, with jitter too."""
     rng = np.random.default_rng(1)
     for jitter in (0.0, 0.02):
         said = judged(rate, true, rng, jitter=jitter)
         assert said is not None
-        found = float(said.partition(' comes at ')[2].partition(' Hz')[0])
+        found = float(said.partition(' is received at ')[2].partition(' Hz')[0])
         assert found == pytest.approx(true, rel=0.03)
         assert f'rate is {rate:g} Hz: set rate to {found:.3g}' in said
 
 
 @pytest.mark.parametrize('rate', [50.0, 200.0, 1000.0])
-def test_the_true_rate_never_is(rate: float) -> None:
-    """Whatever jitter, lost samples and small differences of clocks there are."""
+def test_correct_rate_gives_no_warning(rate: float) -> None:
+    """For any jitter, lost samples and small clock differences."""
     rng = np.random.default_rng(2)
     for jitter in (0.0, 0.1, 0.45):
         for lost in (0.0, 0.2, 0.4):
@@ -53,8 +53,8 @@ def test_the_true_rate_never_is(rate: float) -> None:
                 assert said is None, (jitter, lost, drift, said)
 
 
-def test_it_takes_a_second_of_samples() -> None:
-    """A few steps say nothing, nor do gaps, nor the same sample seen again."""
+def test_rate_monitor_needs_a_second_of_samples() -> None:
+    """A few steps give no warning, nor do gaps or repeated samples."""
     pace = Pace(100.0, 0.1)
     for k in range(19):
         pace.add(k * 20_000_000, 20_000_000)
@@ -64,5 +64,5 @@ def test_it_takes_a_second_of_samples() -> None:
     assert pace.warning() is None
     pace.add(2 * 10**10, 20_000_000)
     assert pace.warning() == (
-        'joint_states comes at 50 Hz, rate is 100 Hz: set rate to 50, or the robot to 100 Hz'
+        'joint_states is received at 50 Hz, rate is 100 Hz: set rate to 50, or the robot to 100 Hz'
     )

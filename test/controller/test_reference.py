@@ -1,4 +1,4 @@
-"""References keep their limits, join what was before, and arrive."""
+"""References keep their limits, are continuous with the state before, and reach their target."""
 
 from collections.abc import Callable
 from typing import Any
@@ -24,10 +24,10 @@ speeds = st.floats(-0.02, 0.02)
 @BOTH
 @settings(deadline=None)
 @given(depths, speeds, depths)
-def test_starts_where_it_was_and_ends_at_the_target_at_rest(
+def test_motion_starts_at_start_and_ends_at_target_at_rest(
     kind: type[MinimumJerk] | type[Trapezoid], start: float, speed: float, target: float
 ) -> None:
-    """The ends are exact, before and after it rests there."""
+    """The ends are exact; before and after, the reference rests."""
     motion = kind(Setpoint(start, speed), target, LIMITS)
     assume(motion.duration > 0.0)
     first, last = motion.at(0.0), motion.at(motion.duration)
@@ -41,10 +41,10 @@ def test_starts_where_it_was_and_ends_at_the_target_at_rest(
 @BOTH
 @settings(deadline=None)
 @given(depths, speeds, depths)
-def test_position_speed_and_acceleration_belong_together(
+def test_position_velocity_and_acceleration_are_consistent(
     kind: type[MinimumJerk] | type[Trapezoid], start: float, speed: float, target: float
 ) -> None:
-    """The speed is the derivative of the position and stays within what limits and start allow."""
+    """The velocity is the derivative of the position and within limits and start velocity."""
     motion = kind(Setpoint(start, speed), target, LIMITS)
     assume(motion.duration > 1e-2)
     times = np.linspace(0.0, motion.duration, 801)
@@ -66,12 +66,12 @@ ends = st.builds(Setpoint, depths, speeds, st.one_of(st.just(0.0), st.floats(-0.
 @settings(deadline=None)
 @given(ends, ends, st.floats(-3.0, 2.0))
 def test_extremes_of_a_quintic_are_found(start: Setpoint, end: Setpoint, exponent: float) -> None:
-    """No sample of position, speed or acceleration is beyond them, and some are near them."""
+    """All samples of position, velocity and acceleration are within the extremes."""
     motion = Quintic(start, end, 10.0**exponent)
     points = [motion.at(x * motion.duration) for x in np.linspace(0.0, 1.0, 1001)]
     found = np.array([(p.position, p.speed, p.acceleration) for p in points]).T
     low, high = motion.extremes.T
-    # The size of the terms that rounding, and a thousandth of the duration, act on.
+    # The size of the terms affected by rounding and by a thousandth of the duration.
     t = motion.duration
     terms = sum(
         abs(e.position) + t * abs(e.speed) + t * t * abs(e.acceleration) for e in (start, end)
@@ -79,7 +79,7 @@ def test_extremes_of_a_quintic_are_found(start: Setpoint, end: Setpoint, exponen
     size = 100.0 * terms / np.array([1.0, t, t * t]) + 1e-300
     assert (low <= found.min(axis=1) + 1e-13 * size).all()
     assert (high >= found.max(axis=1) - 1e-13 * size).all()
-    # Sampled at half a thousandth off an extreme: a second derivative of 60 terms.
+    # Sampled within half a thousandth of an extreme: a second derivative of 60 terms.
     assert (np.abs(low - found.min(axis=1)) <= 1e-4 * size).all()
     assert (np.abs(high - found.max(axis=1)) <= 1e-4 * size).all()
 
@@ -87,7 +87,7 @@ def test_extremes_of_a_quintic_are_found(start: Setpoint, end: Setpoint, exponen
 @settings(deadline=None)
 @given(depths, depths)
 def test_trapezoid_is_the_fastest_motion(start: float, target: float) -> None:
-    """Its duration is the least that speed and acceleration allow from rest to rest."""
+    """Its duration is the minimum for the limits of speed and acceleration from rest to rest."""
     distance = abs(target - start)
     motion = Trapezoid(Setpoint(start), target, LIMITS)
     v, a = LIMITS.speed, LIMITS.acceleration
@@ -95,7 +95,7 @@ def test_trapezoid_is_the_fastest_motion(start: float, target: float) -> None:
     assert motion.duration == pytest.approx(least, rel=1e-9, abs=1e-12)
 
 
-def test_minimum_jerk_meets_its_limit() -> None:
+def test_minimum_jerk_reaches_its_speed_limit() -> None:
     """From rest to rest the peak speed is the limit, reached half-way."""
     motion = MinimumJerk(Setpoint(0.02), 0.12, LIMITS)
     # Peak of the quintic at half time: 15/8 of the mean speed.
@@ -113,7 +113,7 @@ def samples(motion: Callable[..., Any], end: float, count: int = 801) -> tuple[F
 def check_smooth(
     motion: Callable[..., Any], end: float, extra_speed: float = 0.0, extra_ramp: float = 0.0
 ) -> None:
-    """Check that position and speed do not jump and keep the limits, and what a start exceeds."""
+    """Check continuity and limits of position and velocity, with the excess of the start."""
     times, position, speed, _ = samples(motion, end)
     step = times[1]
     top = max(LIMITS.speed, abs(extra_speed))
@@ -126,7 +126,7 @@ def check_smooth(
 
 REACH = (0.001, 0.2)
 
-#: Points of a path: time to the next one, and part of the highest speed on the way there.
+#: Points of a path: time to the next point, and fraction of the highest speed.
 legs = st.lists(st.tuples(st.floats(0.3, 3.0), st.floats(-1.0, 1.0)), min_size=1, max_size=6)
 
 
@@ -142,7 +142,7 @@ def lines(legs: list[tuple[float, float]], start: float = 0.1) -> tuple[list[flo
 
 @settings(deadline=None, max_examples=60)
 @given(legs, st.floats(0.05, 0.15), speeds, st.booleans())
-def test_a_path_is_joined_from_anywhere_without_a_jump_and_followed_to_its_end(
+def test_path_is_joined_continuously_from_any_state_and_followed_to_its_end(
     legs: list[tuple[float, float]], start: float, speed: float, cubic: bool
 ) -> None:
     """Lines, or cubics at rest in their points: joined within the limits, ended exactly."""
@@ -158,7 +158,7 @@ def test_a_path_is_joined_from_anywhere_without_a_jump_and_followed_to_its_end(
     assert motion.at(motion.duration) == Setpoint(positions[-1])
 
 
-def test_lines_are_followed_to_the_bit_between_their_corners() -> None:
+def test_lines_are_followed_exactly_between_their_corners() -> None:
     """In the middle of each line the path is the line; a corner is cut by dv^2 / 8a at most."""
     times, positions = [0.0, 2.0, 4.0], [0.1, 0.118, 0.11]
     path = Path(times, positions, None, LIMITS, REACH)
@@ -187,10 +187,10 @@ def test_lines_are_followed_to_the_bit_between_their_corners() -> None:
         ([0.0, 4.0], [0.1995, 0.1995], [0.009, 0.0], r'must stay in \[0.001, 0.2\] m'),
     ],
 )
-def test_a_path_that_cannot_be_followed_is_refused(
+def test_infeasible_paths_are_rejected(
     times: list[float], positions: list[float], rates: list[float] | None, reason: str
 ) -> None:
-    """In one line, with what was found and what would be valid."""
+    """In one line, with the invalid and the valid values."""
     with pytest.raises(ParameterError, match=reason):
         Path(times, positions, rates, LIMITS, REACH)
 
@@ -221,10 +221,10 @@ events = st.lists(
 @KINDS
 @settings(deadline=None, max_examples=25)
 @given(st.data(), events)
-def test_no_change_makes_the_reference_jump(
+def test_reference_is_continuous_across_all_changes(
     kind: str, data: Any, events: list[tuple[str, float]]
 ) -> None:
-    """Targets, paths, pauses and resumptions in any order: position and speed are continuous."""
+    """Targets, paths, pauses and resumptions in any order: no jump of position or velocity."""
     walk = Walk(kind)
     walk.guide.aim(0.12)
     for event, wait in events:
@@ -247,8 +247,8 @@ def test_no_change_makes_the_reference_jump(
 
 
 @KINDS
-def test_a_pause_brakes_to_rest_holds_and_is_resumed(kind: str) -> None:
-    """In motion it stops within v^2 / 2a (2.9 times as far with little jerk), then goes on."""
+def test_pause_brakes_holds_and_resumes(kind: str) -> None:
+    """In motion it stops within v^2 / 2a (2.9 times that with minimum jerk), then continues."""
     walk = Walk(kind)
     walk.guide.aim(0.1)
     before = walk.on(2.0)
@@ -265,8 +265,8 @@ def test_a_pause_brakes_to_rest_holds_and_is_resumed(kind: str) -> None:
 
 
 @KINDS
-def test_a_paused_path_is_resumed_where_it_was_left(kind: str) -> None:
-    """It goes on behind where it stopped, to the end of the path, as late as the pause took."""
+def test_paused_path_is_resumed_at_its_interruption(kind: str) -> None:
+    """It continues from its rest position to the end of the path, delayed by the pause."""
     times, positions = [0.0, 4.0, 8.0], [0.05, 0.08, 0.06]
     walk = Walk(kind)
     walk.guide.follow(times, positions)
@@ -278,13 +278,13 @@ def test_a_paused_path_is_resumed_where_it_was_left(kind: str) -> None:
     walk.on(10.0)
     after = np.array([p.position for p in walk.points[start:]])
     assert after.min() == pytest.approx(0.06, abs=1e-9)
-    # It still goes to the farthest point, less what its corner is cut.
+    # It still reaches the extreme point, less its cut corner.
     assert after.max() == pytest.approx(0.08, abs=0.0125**2 / 0.8 + 1e-9)
     assert after[0] == held.position
     assert walk.points[-1] == Setpoint(0.06)
 
 
-#: A reach of ten stopping distances at the highest speed.
+#: A range of ten stopping distances at the highest speed.
 NARROW = (0.05, 0.055)
 inside = st.one_of(st.sampled_from(NARROW), st.floats(*NARROW))
 
@@ -296,7 +296,7 @@ def narrow_paths(draw: Callable[..., Any]) -> tuple[list[float], list[float]]:
     for _ in range(draw(st.integers(0, 4))):
         positions.append(draw(inside))
         distance = abs(positions[-1] - positions[-2])
-        # Time for the way, and for the corners at both its ends.
+        # Time for the line, and for the corners at both ends.
         pause = draw(st.floats(0.21, 1.0))
         times.append(times[-1] + distance / LIMITS.speed + pause)
     return times, positions
@@ -315,8 +315,8 @@ narrow_events = st.lists(
 @KINDS
 @settings(deadline=None, max_examples=40)
 @given(start=inside, events=narrow_events)
-def test_the_reference_never_leaves_the_reach(kind: str, start: float, events: list[Any]) -> None:
-    """Targets, paths and pauses at its ends, at any speed: it turns before them, and no jump."""
+def test_reference_stays_in_the_depth_range(kind: str, start: float, events: list[Any]) -> None:
+    """Targets, paths and pauses at its ends, at any speed: it turns before them, smoothly."""
     guide, time, points = Guide(kind, LIMITS, NARROW), 0.0, []
     guide.aim(NARROW[1])
     for event, wait in [('resume', 0.3), *events, ('resume', 2.0)]:
@@ -332,7 +332,7 @@ def test_the_reference_never_leaves_the_reach(kind: str, start: float, events: l
     positions, rates = np.array([(point.position, point.speed) for point in points]).T
     assert np.abs(np.diff(positions)).max() <= 2e-3 * LIMITS.speed * (1.0 + 1e-6)
     if kind == 'trapezoid':
-        # What keeps the limits and the reach can always brake before its end.
+        # A reference within limits and range can always brake before the end of the range.
         assert np.abs(np.diff(rates)).max() <= 2e-3 * LIMITS.acceleration * (1.0 + 1e-6)
     # Extremes of polynomials are found to 1e-9 of the reach.
     assert positions.min() >= NARROW[0] - 1e-11

@@ -1,4 +1,4 @@
-"""What counts as a message, what violates a limit, and what latches."""
+"""Input monitor, limits and the latched stop."""
 
 from math import inf, nan
 from typing import Any
@@ -27,7 +27,7 @@ def stream(**options: Any) -> Stream:
 
 
 def safety(expected: tuple[str, ...] = (), **limits: Any) -> Safety:
-    """Return the safety of a needle of the phantom that has begun at 10 s."""
+    """Return the safety checks of a phantom needle, begun at 10 s."""
     whole = Safety(
         SafetyLimits(**limits), ControllerSettings(), NeedleParameters(), expected=expected
     )
@@ -45,8 +45,10 @@ def safety(expected: tuple[str, ...] = (), **limits: Any) -> Safety:
         (0, 'not stamped', 'base_wrench is stale: it is not stamped'),
     ],
 )
-def test_a_stamp_must_be_of_now(stamp: int, kind: str | None, words: str) -> None:
-    """Old, from the future or missing: refused, and each counted by its kind."""
+def test_stale_future_and_missing_stamps_are_rejected(
+    stamp: int, kind: str | None, words: str
+) -> None:
+    """Each is counted by its kind."""
     wrench = stream()
     refusal = wrench.check(stamp, 10 * SECOND)
     assert (refusal.kind if refusal else None) == kind
@@ -54,28 +56,28 @@ def test_a_stamp_must_be_of_now(stamp: int, kind: str | None, words: str) -> Non
     assert wrench.counts[kind or 'taken'] == 1
 
 
-def test_a_time_that_starts_at_zero_has_stamps_of_zero() -> None:
-    """The first sample of a simulation is one, not a message without a stamp."""
+def test_zero_stamps_are_valid_at_time_zero() -> None:
+    """The first sample of a simulation has a stamp of zero, and is not unstamped."""
     wrench = stream()
     assert wrench.check(0, 0) is None
     assert wrench.check(0, 0).kind == 'repeated'
     assert wrench.check(MILLISECOND, MILLISECOND) is None
 
 
-def test_order_is_kept() -> None:
-    """One that comes twice, or after a later one, does not count and is no fault."""
+def test_repeated_and_out_of_order_messages_are_discarded() -> None:
+    """A repeated or late message is discarded, and is no fault."""
     wrench = stream()
     stamps = [1, 2, 2, 4, 3, 5]
     kinds = [wrench.check(10 * SECOND + s, 10 * SECOND) for s in stamps]
     assert [r.kind if r else '' for r in kinds] == ['', '', 'repeated', '', 'dropped', '']
-    # A clock that was set back begins anew.
+    # A clock that was set back restarts the stream.
     wrench.forget()
     assert wrench.check(5 * SECOND, 5 * SECOND) is None
     assert '5 taken, 1 repeated, 1 dropped; refused: none' in wrench.describe(5 * SECOND)
 
 
-def test_frame_and_numbers_are_checked() -> None:
-    """Another frame and what is not finite are refused with what came."""
+def test_wrong_frames_and_non_finite_values_are_rejected() -> None:
+    """With the received frame and values."""
     wrench = stream(frames=('needle_base',))
     now = 10 * SECOND
     refusal = wrench.check(now, now, 'world', [1.0])
@@ -87,7 +89,7 @@ def test_frame_and_numbers_are_checked() -> None:
 
 
 def feed(watched: Stream, readings: list[Any]) -> list[str]:
-    """Return what becomes of readings at 1 kHz from 10 s on, '' for those that count."""
+    """Return the verdicts on readings at 1 kHz from 10 s on, '' for valid readings."""
     kinds = []
     for i, value in enumerate(readings):
         now = 10 * SECOND + i * MILLISECOND
@@ -96,15 +98,15 @@ def feed(watched: Stream, readings: list[Any]) -> list[str]:
     return kinds
 
 
-def test_a_jump_is_not_believed_at_once() -> None:
-    """A spike counts neither up nor down; a step counts from its second reading on."""
+def test_first_reading_after_a_jump_is_rejected() -> None:
+    """Both edges of a spike are rejected; a step is valid from its second reading on."""
     assert feed(stream(jumps=[1.0]), [0, 0, 9, 0, 0]) == ['', '', 'jump', 'jump', '']
     assert feed(stream(jumps=[1.0]), [0, 9, 9, 9]) == ['', 'jump', '', '']
     assert feed(stream(jumps=[1.0]), [0, 0.9, 1.8]) == [''] * 3
 
 
-def test_a_noisy_reading_that_stands_still_is_frozen() -> None:
-    """After the timeout of 0.5 s it does not count until it changes."""
+def test_constant_readings_of_a_noisy_sensor_are_frozen() -> None:
+    """After the timeout of 0.5 s they are rejected until a change."""
     rng = np.random.default_rng(1)
     noisy = [*rng.normal(0.0, 0.01, 100)]
     wrench = stream(noise=[0.01])
@@ -122,7 +124,7 @@ def test_a_noisy_reading_that_stands_still_is_frozen() -> None:
     [[0.0] * 2000, [0.1 * 0.9**i if i < 300 else 0.0 for i in range(2000)]],
     ids=['still from the start', 'comes to rest'],
 )
-def test_a_reading_without_noise_may_stand_still(readings: list[float]) -> None:
+def test_constant_readings_of_a_noise_free_sensor_are_valid(readings: list[float]) -> None:
     """A perfect sensor at rest is not frozen."""
     assert set(feed(stream(noise=[0.01]), readings)) == {''}
 
@@ -140,8 +142,8 @@ GUARD = [
     ),
     ('encoders', (encoded(0.05, -0.11),), 'insertion speed -0.11 m/s'),
     ('encoders', (encoded(0.0025, nan),), 'insertion speed nan m/s'),
-    ('encoders', (encoded(0.103, 0.0),), 'inserted length 0.103 m is outside [-0.001, 0.102] m'),
-    ('encoders', (encoded(-0.002, 0.0),), 'inserted length -0.002 m'),
+    ('encoders', (encoded(0.103, 0.0),), 'insertion depth 0.103 m is outside [-0.001, 0.102] m'),
+    ('encoders', (encoded(-0.002, 0.0),), 'insertion depth -0.002 m'),
     ('encoders', (encoded(0.05, 0.0, 1001.0),), 'angle 1001 rad'),
     ('encoders', (encoded(0.05, 0.0, 0.0, -101.0),), 'angular speed -101 rad/s'),
     ('tracking', (0.011,), 'tracking error 0.011 m is beyond the limit of 0.01 m'),
@@ -156,7 +158,7 @@ GUARD = [
 def test_two_readings_beyond_a_limit_violate_it(
     name: str, values: tuple[Any, ...], words: str
 ) -> None:
-    """Quantity, value, limit and unit in one line; one reading alone does not count."""
+    """Quantity, value, limit and unit in one line; a single reading does not violate it."""
     guard = Guard(SafetyLimits(), (0.001, 0.1))
     good = {'encoders': (encoded(0.05, 0.0),), 'wrench': (0.0, 0.0, 0.0)}.get(name, (0.0,))
     hold = getattr(guard, name)
@@ -170,7 +172,7 @@ def test_two_readings_beyond_a_limit_violate_it(
 
 
 def test_readings_at_a_limit_are_within_it() -> None:
-    """Limits are the largest values that may be."""
+    """Limits are the largest valid values."""
     guard, limits = Guard(SafetyLimits(), (0.001, 0.1)), SafetyLimits()
     for _ in range(3):
         edge = Measurement(
@@ -186,8 +188,8 @@ def test_readings_at_a_limit_are_within_it() -> None:
         assert guard.tracking(-limits.tracking_error) is None
 
 
-def test_a_stop_holds_until_it_may_be_cleared() -> None:
-    """The first reason stays; clearing is refused with what is still beyond its limit."""
+def test_stop_cannot_be_cleared_beyond_a_limit() -> None:
+    """The first reason stays; clearing is rejected with the limit that is still exceeded."""
     whole = safety()
     now = 10 * SECOND
     for _ in range(2):
@@ -203,8 +205,8 @@ def test_a_stop_holds_until_it_may_be_cleared() -> None:
     assert (whole.stop, whole.stops) == (None, 1)
 
 
-def test_a_sensor_that_fell_silent_does_not_keep_the_stop() -> None:
-    """What it said before says nothing of now."""
+def test_silent_sensor_does_not_block_clearing_the_stop() -> None:
+    """Its last reading is outdated."""
     whole = safety()
     now = 10 * SECOND
     whole.streams['base_wrench'].check(now, now, 'needle_base', [0.0, 0.0])
@@ -214,16 +216,16 @@ def test_a_sensor_that_fell_silent_does_not_keep_the_stop() -> None:
     assert whole.clear(now + 2 * SECOND) is None
 
 
-def test_the_error_of_a_reference_that_was_let_go_does_not_keep_the_stop() -> None:
-    """The motion starts anew from where the needle is."""
+def test_discarded_reference_does_not_block_clearing_the_stop() -> None:
+    """The motion restarts from the measured depth."""
     whole = safety()
     whole.guard.tracking(0.02)
     assert whole.latch(whole.guard.tracking(0.02))
     assert whole.clear(10 * SECOND) is None
 
 
-def test_sensors_are_missed_while_the_encoders_speak() -> None:
-    """Said once when they stop, shown as long as they are silent, and not before a plant is up."""
+def test_silent_sensors_give_a_warning_while_encoders_are_received() -> None:
+    """Logged once, shown until the sensor is back, and not before the plant starts."""
     whole = safety(expected=('base_wrench',), sensor_timeout=0.5)
     joints, wrench = (whole.streams[name] for name in ('joint_states', 'base_wrench'))
     now = 15 * SECOND
@@ -236,16 +238,16 @@ def test_sensors_are_missed_while_the_encoders_speak() -> None:
         if i < 1000:
             wrench.check(now, now, 'needle_base', [0.0, 0.0])
         said += whole.news(now)
-    assert said == ['base_wrench is stale: none that counts for 0.5 s']
-    assert whole.warning(now) == 'base_wrench is stale: none that counts for 1.0 s'
+    assert said == ['base_wrench is stale: no valid message for 0.5 s']
+    assert whole.warning(now) == 'base_wrench is stale: no valid message for 1.0 s'
     now += MILLISECOND
     wrench.check(now, now, 'needle_base', [0.0, 0.0])
     assert whole.warning(now) is None
-    # No plant, no news.
+    # No warnings without a plant.
     assert whole.news(now + 9 * SECOND) == []
 
 
-def test_silence_does_not_count_from_before_the_clock() -> None:
+def test_silence_is_measured_from_the_first_clock_message() -> None:
     """A node with simulated time is at 0 before the first /clock."""
     whole = safety(expected=('base_wrench',), sensor_timeout=0.5)
     whole.begin(0)
@@ -255,8 +257,8 @@ def test_silence_does_not_count_from_before_the_clock() -> None:
     assert whole.news(now) == []
 
 
-def test_a_stop_for_want_of_sensors_is_kept_while_they_are_missing() -> None:
-    """With `sensors_required` clearing is refused until they are back."""
+def test_stop_for_missing_sensors_stays_until_they_are_back() -> None:
+    """With `sensors_required` clearing is rejected until then."""
     whole = safety(expected=('base_wrench',), sensor_timeout=0.5, sensors_required=True)
     joints, wrench = (whole.streams[name] for name in ('joint_states', 'base_wrench'))
     now = 11 * SECOND
@@ -271,15 +273,15 @@ def test_a_stop_for_want_of_sensors_is_kept_while_they_are_missing() -> None:
     assert whole.clear(later) is None
 
 
-def test_a_clock_set_back_is_told_from_one_that_stands() -> None:
-    """By more than the timeout of 0.1 s; forward and still are no matter."""
+def test_clock_set_back_is_detected() -> None:
+    """By more than the timeout of 0.1 s; forward steps and pauses of the clock are no fault."""
     whole = safety()
     steps = [10.0, 10.0, 10.5, 99.0, 98.95, 50.0, 50.0]
     assert [whole.clock_went_back(round(t * SECOND)) for t in steps] == [0, 0, 0, 0, 0, 48.95, 0]
 
 
-def test_who_else_commands_is_named() -> None:
-    """Each topic with more than one publisher, until it is alone again."""
+def test_duplicate_publishers_of_commands_are_reported() -> None:
+    """Each topic with more than one publisher, until there is one again."""
     whole = safety()
     whole.count_publishers({'wrench_command': 2})
     assert whole.rivals == '2 nodes publish wrench_command'
@@ -287,8 +289,8 @@ def test_who_else_commands_is_named() -> None:
     assert whole.rivals is None
 
 
-def test_a_sensor_with_two_sources_is_not_believed() -> None:
-    """Encoders of two robots are no encoders; without the others it goes on, without them."""
+def test_sensor_with_two_publishers_is_rejected() -> None:
+    """No force with duplicate encoders; after the duplicate ends, the sensor is valid again."""
     whole, now = safety(), 5 * SECOND
     whole.count_publishers({'joint_states': 2, 'base_wrench': 3})
     assert whole.rivals == '2 nodes publish joint_states'
@@ -298,13 +300,13 @@ def test_a_sensor_with_two_sources_is_not_believed() -> None:
         assert (refusal.kind, refusal.line) == ('disputed', f'{count} nodes publish {name}')
     whole.count_publishers({'joint_states': 1, 'base_wrench': 2})
     assert whole.rivals is None
-    # What the other said has left no trace.
+    # Messages of the other publisher have no effect.
     assert whole.streams['joint_states'].check(now - SECOND // 100, now) is None
 
 
 @pytest.mark.parametrize('name', ['joint_states', 'ground_truth', 'base_wrench', 'tip_deflection'])
-def test_a_stamp_may_be_ahead_by_a_period(name: str) -> None:
-    """By more it is refused: it would make those of the true source late."""
+def test_stamp_may_be_one_period_in_the_future(name: str) -> None:
+    """A larger lead is rejected: the stamps of the true source would be late."""
     whole, now = safety(), 5 * SECOND
     stream, frame = whole.streams[name], 'needle_entry' if name[0] == 't' else 'needle_base'
     period = round(SECOND / ControllerSettings().rate)
@@ -315,8 +317,8 @@ def test_a_stamp_may_be_ahead_by_a_period(name: str) -> None:
     assert stream.check(now + period + 1, now, frame) is None
 
 
-def test_encoders_of_two_clocks_stop_the_motion() -> None:
-    """More than nine in ten after later ones stop, more than half are said; few say nothing."""
+def test_out_of_order_encoders_stop_the_motion() -> None:
+    """A stop above 90 % of out-of-order messages, a warning above 50 %; none at low rates."""
     for late, warned, stopped in ((4, False, False), (6, True, False), (19, True, True)):
         whole, now = safety(), 5 * SECOND
         stream = whole.streams['joint_states']
@@ -325,7 +327,7 @@ def test_encoders_of_two_clocks_stop_the_motion() -> None:
             stream.check(now if k % (late + 1) == 0 else now - SECOND // 50, now)
         share = late / (late + 1)
         assert (stream.window.share(now) > 0.5) == (share > 0.5)
-        said = f'joint_states has {stream.window.share(now):.0%} of its messages after later ones'
+        said = f'joint_states has {stream.window.share(now):.0%} of its messages out of order'
         assert whole.warning(now) == (said if warned or share > 0.5 else None)
         assert whole.muddled(now) == (said if stopped else None)
 
@@ -340,7 +342,7 @@ def test_encoders_of_two_clocks_stop_the_motion() -> None:
     ],
 )
 def test_limits_must_be_finite(change: dict[str, Any], reason: str) -> None:
-    """There is no way to switch a limit off."""
+    """No limit can be switched off."""
     with pytest.raises(ParameterError, match=reason):
         SafetyLimits(**change)
 
@@ -367,9 +369,9 @@ def test_encoders_are_read_by_name() -> None:
         (['elbow'], [0.02], [0.0]),
     ],
 )
-def test_encoders_that_are_not_complete_are_refused(
+def test_incomplete_joint_states_are_rejected(
     names: list[str], positions: list[float], speeds: list[float]
 ) -> None:
-    """In one line that says what came."""
+    """In one line with the received names."""
     with pytest.raises(ParameterError, match=r"needs position and velocity of 'insertion', got"):
         read_encoders(joints(names, positions, speeds))

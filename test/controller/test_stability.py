@@ -1,4 +1,4 @@
-"""What is accepted is stable, and what is refused is not."""
+"""The stability check accepts stable gains and rejects unstable gains."""
 
 from contextlib import nullcontext
 from dataclasses import replace
@@ -39,8 +39,8 @@ PROPERTY = settings(
 @pytest.mark.parametrize('delay', [0, 1, 3])
 @pytest.mark.parametrize('unmodeled', [0, 1, 2])
 @pytest.mark.parametrize('filter_time', [0.0, 5e-3])
-def test_transition_matrix_is_the_loop(delay: int, unmodeled: int, filter_time: float) -> None:
-    """Powers of the matrix are what the running loop does to an initial error."""
+def test_transition_matrix_equals_the_loop(delay: int, unmodeled: int, filter_time: float) -> None:
+    """Powers of the matrix propagate an initial error as the running loop."""
     axis = PHANTOM.without_coulomb()
     gains = PidGains(tolerance=0.0, filter_time=filter_time)
     law = Pid(axis=axis, gains=gains, period=PERIOD)
@@ -77,7 +77,7 @@ def decays(law: InverseDynamics | Pid, unmodeled: int) -> bool:
 @pytest.mark.parametrize('axis', [PHANTOM, PAPER_SI], ids=['phantom', 'paper_si'])
 @pytest.mark.parametrize('scale', [0.1, 1.0, 10.0, 100.0, 1000.0])
 @pytest.mark.parametrize('law', [InverseDynamics, Pid])
-def test_what_is_accepted_is_stable_and_what_is_refused_is_not(
+def test_stability_check_agrees_with_simulation(
     axis: Axis, law: type[InverseDynamics] | type[Pid], scale: float
 ) -> None:
     """Acceptance and the growth of the error in the running loop agree."""
@@ -132,7 +132,7 @@ def law_of(gains: InverseDynamicsGains | PidGains, axis: Axis) -> InverseDynamic
     st.integers(0, 2),
     st.integers(0, 1),
 )
-def test_whatever_is_accepted_is_stable_at_every_depth(
+def test_accepted_gains_are_stable_at_every_depth(
     gains: InverseDynamicsGains | PidGains,
     preset: str,
     coulomb: float,
@@ -140,7 +140,7 @@ def test_whatever_is_accepted_is_stable_at_every_depth(
     delay: int,
     unmodeled: int,
 ) -> None:
-    """Around the true, bent needle the error stays bounded and ends within what friction holds."""
+    """On the true, bent needle the error stays bounded and ends within the friction band."""
     truth = NeedleParameters.preset(preset, coulomb_friction=coulomb)
     law = law_of(gains, Axis.insertion(truth))
     assume(stability_limit(law, delay).stable)
@@ -150,7 +150,7 @@ def test_whatever_is_accepted_is_stable_at_every_depth(
     assume(periods <= 3000)
     model = NeedleModel(truth)
     state = model.state_at(depth, 2e-4 * depth)
-    # The bent needle pulls by the change of its energy, that of a beam goes as s^-3.
+    # The bent needle pulls by the change of its energy, which is proportional to s^-3.
     pull = 5.0 * model.energy(state) / depth
     needle = Integrator(truth, state, 1e-4)
     error = 1e-4 if depth < 0.1 else -1e-4
@@ -161,29 +161,29 @@ def test_whatever_is_accepted_is_stable_at_every_depth(
         errors.append(depth + error - measured[0])
         waiting.append(loop.command(*measured, Setpoint(depth + error)))
         needle.advance(PERIOD, waiting.pop(0))
-    # Friction holds the needle where the law asks for less than it: at rest, the compensation
-    # of inverse dynamics leans by kp e 1 ms / breakaway_speed. An undamped needle keeps pulling.
+    # Friction holds the needle against smaller forces of the law: at rest, the compensation of
+    # inverse dynamics grows by kp e 1 ms / breakaway_speed. An undamped needle keeps pulling.
     c = law.constants
     if isinstance(gains, InverseDynamicsGains) and not gains.bandwidth:
         band = (1e-4 / (1e-3 * gains.kp) if coulomb else 0.0) + pull / (PHANTOM.inertia * gains.kp)
     else:
-        # The law counts on a motion that friction does not allow, and divides its push by what
-        # that would take off. What sticks and slips under the integral goes as far beyond.
+        # The law predicts a motion that friction prevents, and divides its force by the predicted
+        # reduction. Stick-slip under the integral overshoots by the same distance.
         r, h = law.axis.response(PERIOD), PERIOD
         share = h / (h + c.filter_time)
         divisor = 1.0 + (c.kp + h * c.ki) * r.pf + c.kd * share * r.vf
         band = divisor * (2.0 * coulomb + pull) / c.kp
-    # A fast loop with a period of delay that it does not know of swings before it settles.
+    # A fast loop with a period of unmodeled delay oscillates before it settles.
     assert max(map(abs, errors)) < 20.0 * (abs(error) + band)
     assert max(map(abs, errors[-20:])) < 0.02 * abs(error) + band
 
 
 @settings(PROPERTY, max_examples=60)
 @given(gains_of_a_law, st.sampled_from([PHANTOM, PAPER_SI]), st.integers(0, 3), st.integers(0, 1))
-def test_what_has_a_pole_outside_diverges(
+def test_pole_outside_the_unit_circle_diverges(
     gains: InverseDynamicsGains | PidGains, axis: Axis, delay: int, unmodeled: int
 ) -> None:
-    """In the running loop without friction an error grows as the spectral radius says."""
+    """In the running loop without friction the error grows by the spectral radius."""
     law = law_of(gains, axis)
     radius = spectral_radius(law, delay, unmodeled)
     assume(radius > 1.0 + 1e-3)
@@ -198,8 +198,8 @@ def test_what_has_a_pole_outside_diverges(
     assert abs(position) > 1.0
 
 
-def test_the_gains_of_the_source_hold_in_the_implicit_form() -> None:
-    """On 2 g at 1 kHz kp = 1e3, kv = 1e4 are stable here; the textbook form explodes."""
+def test_gains_of_the_paper_are_stable_in_implicit_form() -> None:
+    """On 2 g at 1 kHz kp = 1e3, kv = 1e4 are stable here; the textbook form diverges."""
     law = Pid(axis=PAPER_SI, gains=PidGains(kp=1e3, ki=0.0, kd=1e4), period=PERIOD)
     assert spectral_radius(law, 0) < 1.0
     r = PAPER_SI.response(PERIOD)
@@ -208,8 +208,8 @@ def test_the_gains_of_the_source_hold_in_the_implicit_form() -> None:
 
 
 @pytest.mark.parametrize('rate', [100.0, 1e3, 1e4])
-def test_the_slow_gains_of_the_source_are_within_the_margin(rate: float) -> None:
-    """k_p = 1, k_v = 0.1 take a minute to settle; the default margin does not forbid that."""
+def test_slow_gains_of_the_paper_are_within_the_margin(rate: float) -> None:
+    """k_p = 1, k_v = 0.1 take a minute to settle; the default margin permits them."""
     law = InverseDynamics(
         axis=PAPER_SI, gains=InverseDynamicsGains(kp=1.0, kv=0.1), period=1.0 / rate
     )
@@ -218,8 +218,8 @@ def test_the_slow_gains_of_the_source_are_within_the_margin(rate: float) -> None
     assert_allclose(1.0 - spectral_radius(law, 1), 0.05 / rate, rtol=0.05)
 
 
-def test_the_margin_is_kept() -> None:
-    """A margin beyond what the loop has is refused, and named; less is accepted."""
+def test_margin_is_enforced() -> None:
+    """A margin larger than the margin of the loop is rejected, a smaller one accepted."""
     law = Pid(axis=PHANTOM, gains=PidGains(ki=0.0), period=PERIOD)
     # The slow pole is at -kp / (mu_v + kd) = -15 1/s.
     assert_allclose(spectral_radius(law, 1), 1.0 - 0.015, atol=5e-4)
@@ -233,18 +233,18 @@ def test_the_margin_is_kept() -> None:
         check_stability(law, 1, 'gains', margin=1.0)
 
 
-def test_gains_that_cannot_be_stable_are_named() -> None:
-    """The refusal names the gains, the rate, what was found and what would do."""
+def test_unstable_gains_are_rejected_with_advice() -> None:
+    """The error contains the gains, the rate, the spectral radius and a stable change."""
     law = InverseDynamics(axis=PHANTOM, gains=InverseDynamicsGains(kv=3000.0), period=PERIOD)
     words = (
         r'my gains are unstable at 1000 Hz with a delay of 1 period: spectral radius .* '
-        r'must be <= 1 - 1e-06; all of them times ([\d.]+) would be stable'
+        r'must be <= 1 - 1e-06; all gains times ([\d.]+) would be stable'
     )
     with pytest.raises(ParameterError, match=words) as refusal:
         check_stability(law, 1, 'my gains')
     factor = float(re.search(words, str(refusal.value))[1])
     check_stability(law.scaled(factor), 1, 'my gains')
-    # A tenth more would not do.
+    # Gains larger by 10 % are unstable.
     assert not stability_limit(law.scaled(1.15 * factor), 1).stable
 
 
@@ -253,13 +253,13 @@ def test_gains_that_cannot_be_stable_are_named() -> None:
     [(InverseDynamicsGains(kp=0.0), 'kp'), (PidGains(kp=0.0, ki=0.0, kd=0.0), 'kp and kd')],
 )
 def test_missing_gains_are_named(gains: InverseDynamicsGains | PidGains, missing: str) -> None:
-    """No factor makes up for a gain of zero."""
+    """No common factor replaces a gain of zero."""
     with pytest.raises(ParameterError, match=f'{missing} must not be zero'):
         check_stability(law_of(gains, PAPER_SI), 1, 'gains')
 
 
-def test_the_box_holds_its_bounds() -> None:
-    """The axes to try have every combination of bounds, and the whole carriage at most."""
+def test_uncertainty_axes_cover_all_bounds() -> None:
+    """The axes have every combination of bounds, and at most the whole carriage mass."""
     axes = Uncertainty(viscous=0.2, coulomb=0.1, inertia=0.5, carriage=1.0).axes(
         PHANTOM, carriage=True
     )
@@ -276,15 +276,15 @@ def test_the_box_holds_its_bounds() -> None:
 
 @pytest.mark.parametrize('delay', [0, 1, 2])
 @pytest.mark.parametrize('rate', [50.0, 100.0, 1000.0, 4000.0])
-def test_the_default_is_stable_on_all_axes_of_the_box(rate: float, delay: int) -> None:
-    """Friction and mass 50 % off, with a carriage of 2 kg that nobody has told the law of."""
+def test_default_gains_are_stable_on_all_uncertain_axes(rate: float, delay: int) -> None:
+    """Friction and mass 50 % off, with an unmodeled carriage of 2 kg."""
     half = Uncertainty(viscous=0.5, coulomb=0.5, inertia=0.5)
     law = InverseDynamics(axis=PHANTOM, gains=InverseDynamicsGains(), period=1.0 / rate)
     check_stability(law, delay, 'gains', plants=half.axes(PHANTOM, carriage=True))
 
 
-def test_friction_that_is_smaller_than_modeled_is_named() -> None:
-    """The law of the paper compensates too much of it: a limit cycle, or a pole outside."""
+def test_overcompensated_friction_is_rejected() -> None:
+    """The law of the paper compensates too much friction: a limit cycle, or an unstable pole."""
     gains = InverseDynamicsGains(bandwidth=0.0)
     law = InverseDynamics(axis=PHANTOM, gains=gains, period=PERIOD)
     less_dry = replace(PHANTOM, coulomb=0.7 * PHANTOM.coulomb)
@@ -293,7 +293,7 @@ def test_friction_that_is_smaller_than_modeled_is_named() -> None:
     less = replace(PHANTOM, viscous=0.7 * PHANTOM.viscous)
     with pytest.raises(ParameterError, match=r'viscous friction 210 .* bandwidth = 30'):
         check_stability(law, 0, 'gains', plants=[less])
-    # As modeled, it is what the paper promises.
+    # The nominal axis is stable, as in the paper.
     check_stability(law, 0, 'gains')
 
 
@@ -323,7 +323,7 @@ def comes_to_rest(law: InverseDynamics | Pid, plant: Axis, delay: int, unmodeled
     st.sampled_from([0.0, 0.5, 2.0]),
     st.data(),
 )
-def test_what_is_accepted_comes_to_rest_at_the_corners(
+def test_accepted_laws_settle_on_all_uncertain_axes(
     gains: InverseDynamicsGains | PidGains,
     axis: Axis,
     rate: float,
@@ -332,7 +332,7 @@ def test_what_is_accepted_comes_to_rest_at_the_corners(
     carriage: float,
     data: st.DataObject,
 ) -> None:
-    """No false acceptance: on any axis of the box, with dry friction, nothing goes on moving."""
+    """No false acceptance: the motion ends on each axis, with dry friction."""
     law = replace(law_of(gains, axis), period=1.0 / rate)
     box = Uncertainty(viscous=width, coulomb=width, inertia=width, carriage=carriage)
     plants = box.axes(axis, carriage=True)

@@ -1,4 +1,4 @@
-"""What a control loop commands, whatever happens to it: laws, without a graph."""
+"""Commands of the axial supervisor for any sequence of events, without ROS."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ TOPIC = '/wrench_command'
 
 
 class Loop:
-    """A supervisor with a target, its time, and all that it has commanded."""
+    """A supervisor with a target, its time, and all its commands."""
 
     def __init__(
         self, target: float | None = 0.1, observed: ObserverSettings | None = None
@@ -80,7 +80,7 @@ class Loop:
         return self.supervisor.clear_stop(self.now).answer
 
     def pushes(self) -> Answer:
-        """Measure until a force comes."""
+        """Measure until a force is commanded."""
         answers = (self.measure() for _ in range(50))
         return next(answer for answer in answers if answer is not None and answer.force > 0.5)
 
@@ -88,7 +88,7 @@ class Loop:
         return [line for _, line in self.supervisor.journal.take()]
 
 
-#: What may happen to a loop, but a release of the stop.
+#: Events of a control loop, except for a release of the stop.
 EVENTS: list[Callable[[Loop], Answer | None]] = [
     Loop.measure,
     lambda loop: loop.measure(1e-6, 1e-3),
@@ -122,10 +122,10 @@ events = st.lists(st.sampled_from(EVENTS), max_size=40)
 
 
 @given(events, events)
-def test_a_stop_gives_no_force_until_it_is_cleared(
+def test_stop_gives_zero_force_until_cleared(
     before: list[Callable[[Loop], Answer | None]], after: list[Callable[[Loop], Answer | None]]
 ) -> None:
-    """Whatever happened before and happens after, no command has a force or a motion."""
+    """No command has a force or a motion, for any events before and after."""
     loop = Loop()
     for event in before:
         event(loop)
@@ -138,10 +138,10 @@ def test_a_stop_gives_no_force_until_it_is_cleared(
 
 
 @given(st.lists(st.sampled_from([*EVENTS, Loop.clear]), max_size=60))
-def test_every_command_is_of_a_measurement_or_of_now(
+def test_commands_have_the_stamp_of_a_measurement_or_the_present_time(
     happens: list[Callable[[Loop], Answer | None]],
 ) -> None:
-    """Its stamp is that of what it answers; a force is finite, within its limit, and answers."""
+    """A nonzero force is finite, within its limit, and answers a measurement."""
     loop = Loop()
     measured = set()
     encoders = loop.supervisor.encoders
@@ -164,10 +164,10 @@ def test_every_command_is_of_a_measurement_or_of_now(
 
 
 @given(events)
-def test_good_measurements_bring_the_motion_back(
+def test_valid_measurements_restart_the_motion_after_faults(
     happens: list[Callable[[Loop], Answer | None]],
 ) -> None:
-    """After any faults, a second of good inputs, a release and a target, the needle is pushed."""
+    """After any faults, a second of valid inputs, a cleared stop and a target give a force."""
     loop = Loop()
     for event in happens:
         event(loop)
@@ -179,7 +179,7 @@ def test_good_measurements_bring_the_motion_back(
         loop.wrench()
         loop.tip()
     loop.clear()
-    # A needle that was elsewhere meanwhile needs a new target.
+    # A needle that was moved during the fault needs a new target.
     loop.measure()
     loop.aim(0.1)
     answer = loop.pushes()
@@ -189,16 +189,16 @@ def test_good_measurements_bring_the_motion_back(
 
 
 @given(st.lists(st.sampled_from(EVENTS[:21]), max_size=30))
-def test_without_a_target_there_is_no_force(
+def test_zero_force_without_a_target(
     happens: list[Callable[[Loop], Answer | None]],
 ) -> None:
-    """Nothing but a wish of the user moves the needle."""
+    """For any events except a target or a trajectory."""
     loop = Loop(target=None)
     assert all(answer.force == 0.0 for event in happens if (answer := event(loop)) is not None)
 
 
 class Robot:
-    """A loop around a robot that does as it is told, or nothing; it may report its force."""
+    """A control loop around a robot that follows its commands or not, and may report its force."""
 
     def __init__(self, reports: bool = True) -> None:
         self.loop, self.reports = Loop(), reports
@@ -219,8 +219,8 @@ class Robot:
         return self.loop.supervisor._last.reference[0]
 
 
-def test_the_reference_waits_for_a_plant_that_does_not_follow() -> None:
-    """No stop is latched, the force stays, and the motion goes on when the plant follows."""
+def test_reference_waits_while_plant_does_not_follow() -> None:
+    """No stop is latched, the force stays, and the motion continues when the plant follows."""
     robot = Robot()
     supervisor = robot.loop.supervisor
     robot.runs(200, obeys=True)
@@ -234,9 +234,9 @@ def test_the_reference_waits_for_a_plant_that_does_not_follow() -> None:
     robot.runs(4000, obeys=False)
     assert robot.aim == waits
     assert supervisor.safety.stop is None
-    # A tenth of a second at the velocity of the reference, and its brake.
+    # A tenth of a second at the velocity of the reference, and its braking distance.
     assert 0.0 < waits - start < 0.01
-    # Nothing is integrated meanwhile: the force does not grow.
+    # The integral is frozen: the force does not grow.
     assert supervisor._last.force == pytest.approx(force, rel=1e-6)
     assert 0.0 < force < 10.0
     robot.runs(3000, obeys=True)
@@ -244,8 +244,8 @@ def test_the_reference_waits_for_a_plant_that_does_not_follow() -> None:
     assert robot.aim > waits + 0.02
 
 
-def test_a_gap_does_not_keep_the_reference_waiting() -> None:
-    """After it the motion starts from where the needle is, where no force is due yet."""
+def test_gap_ends_the_wait_of_the_reference() -> None:
+    """The motion restarts from the measured depth after a gap, with zero force at first."""
     robot = Robot()
     robot.runs(200, obeys=True)
     robot.runs(300, obeys=False)
@@ -259,8 +259,8 @@ def test_a_gap_does_not_keep_the_reference_waiting() -> None:
 
 
 @pytest.mark.parametrize('moves', [False, True])
-def test_a_robot_that_reports_no_force_or_moves_is_not_judged(moves: bool) -> None:
-    """Without efforts nothing is known; where the needle moves, reported zeros do not count."""
+def test_response_monitor_ignores_robots_without_force_or_in_motion(moves: bool) -> None:
+    """Missing efforts, or zero efforts of a moving needle, are no fault."""
     robot = Robot(reports=False)
     robot.runs(500, obeys=moves)
     if moves:
@@ -270,19 +270,19 @@ def test_a_robot_that_reports_no_force_or_moves_is_not_judged(moves: bool) -> No
     assert not robot.loop.supervisor.controller.guide.waits
 
 
-def test_a_measurement_that_comes_again_has_the_same_answer() -> None:
-    """Its reference is not said again; after a stop the answer is zero."""
+def test_repeated_measurement_gets_the_same_command() -> None:
+    """The reference is not published again; after a stop the command is zero."""
     loop = Loop()
     answer = loop.pushes()
     assert loop.encoders(loop.now, loop.depth, 0.0) == Answer(*answer[:3])
     loop.stop()
     assert loop.encoders(loop.now, loop.depth, 0.0) == Answer(loop.now)
-    # One that is late is not answered at all.
+    # A late measurement gets no command.
     assert loop.encoders(loop.now - PERIOD, loop.depth, 0.0) is None
 
 
-def test_a_measurement_beyond_a_limit_is_answered_once_and_with_its_stamp() -> None:
-    """The stop is the answer: two readings in a row, and no third command."""
+def test_measurement_beyond_a_limit_gets_one_zero_command_with_its_stamp() -> None:
+    """The second reading in a row latches the stop, with no further command."""
     loop = Loop()
     loop.pushes()
     loop.supervisor.safety.guard.encoders(Measurement(time=0.0, depth=0.02, speed=0.2))
@@ -294,8 +294,8 @@ def test_a_measurement_beyond_a_limit_is_answered_once_and_with_its_stamp() -> N
     )
 
 
-def test_before_activation_only_the_stop_is_heard() -> None:
-    """It survives configuration, and measurements are not answered."""
+def test_inactive_supervisor_accepts_only_the_stop() -> None:
+    """The stop survives configuration, and measurements are not answered."""
     supervisor = Supervisor()
     reading = Reading(SECOND, '', ('insertion',), ((0.02,), (0.0,), ()))
     assert supervisor.emergency_stop(SECOND).answer == Answer(SECOND)
@@ -312,8 +312,8 @@ def test_before_activation_only_the_stop_is_heard() -> None:
     )
 
 
-def test_the_load_of_a_true_state_is_compensated() -> None:
-    """It adds to the force of the law; a state without forces adds nothing."""
+def test_load_of_ground_truth_is_compensated() -> None:
+    """The load is added to the force of the law; a straight state adds nothing."""
     straight, bent = Loop(), Loop()
     state = [PHANTOM.length - 0.02, 0.0, 3e-4, 0.0]
     rest = (0.0,) * 4
@@ -327,11 +327,11 @@ def test_the_load_of_a_true_state_is_compensated() -> None:
     wild = Reading(bent.now, '', (), ((0.18, 0.0, 1e308, 0.0), rest, ()))
     bent.supervisor.truth(wild, bent.now)
     assert bent.supervisor.bending.load == 0.0
-    assert 'not taken in' in bent.said()[-1]
+    assert 'ignored' in bent.said()[-1]
 
 
-def test_the_wrench_of_a_measurement_waits_for_it() -> None:
-    """A wrench that comes before the encoders of its stamp is taken in with them."""
+def test_wrench_waits_for_encoders_of_its_stamp() -> None:
+    """A wrench received before the encoder sample of its stamp is used with that sample."""
     loop = Loop(observed=ObserverSettings())
     taken: list[tuple[float, float] | None] = []
     observer = loop.supervisor.bending.observer
@@ -344,16 +344,16 @@ def test_the_wrench_of_a_measurement_waits_for_it() -> None:
     assert taken == [None, (0.0, 0.25), None]
 
 
-def test_settings_that_an_observer_cannot_have_are_named() -> None:
-    """As the parameter that holds them."""
+def test_invalid_observer_settings_are_named() -> None:
+    """The error contains the parameter name."""
     with pytest.raises(ValueError, match=r'^observer\.filter_rate must be a whole multiple'):
         Supervisor().configure(
             Controller(PHANTOM), SafetyLimits(), ObserverSettings(filter_rate=1234.5)
         )
 
 
-def test_nothing_is_said_twice_in_a_second() -> None:
-    """Each kind of complaint has its own second; a line without a kind is always said."""
+def test_log_lines_of_a_kind_are_limited_to_one_per_second() -> None:
+    """Each kind has its own limit; a line without a kind is always logged."""
     times = iter([0.0, 0.5, 1.0, 1.9, 2.1, 2.1])
     journal = Journal(steady=lambda: next(times))
     for number in range(5):
@@ -362,7 +362,7 @@ def test_nothing_is_said_twice_in_a_second() -> None:
     journal.say(Severity.INFO, 'always')
     assert journal.changed
     said = [line for _, line in journal.take()]
-    # What was left out is counted in the next line of its kind.
+    # Suppressed lines are counted in the next line of their kind.
     assert said == [
         *('line 0', 'line 2 (1 more like it)', 'line 4 (1 more like it)'),
         *('another', 'always'),
@@ -371,8 +371,8 @@ def test_nothing_is_said_twice_in_a_second() -> None:
     assert journal.take() == []
 
 
-def test_a_flood_of_refused_targets_is_one_line_a_second() -> None:
-    """All are counted; /diagnostics change as rarely as the lines come."""
+def test_many_rejected_targets_give_one_log_line_per_second() -> None:
+    """All are counted; /diagnostics changes as often as the log."""
     loop = Loop()
     changes = 0
     for _ in range(1000):
@@ -383,8 +383,8 @@ def test_a_flood_of_refused_targets_is_one_line_a_second() -> None:
     assert changes == 1
 
 
-def test_a_path_of_a_million_points_is_refused_in_a_short_line() -> None:
-    """By their number, whatever they are; long and unprintable lines are shortened."""
+def test_path_with_too_many_points_is_rejected_in_a_short_line() -> None:
+    """The number of points is checked first; long and unprintable lines are shortened."""
     loop = Loop()
     loop.said()
     many = [[float(k)] for k in range(MOST_POINTS + 1)]
@@ -400,8 +400,8 @@ def test_a_path_of_a_million_points_is_refused_in_a_short_line() -> None:
     assert line.isprintable()
 
 
-def test_a_push_beyond_eulers_load_is_warned_of() -> None:
-    """Almost the whole needle is outside, and something holds it: it buckles at 13 N."""
+def test_force_above_eulers_load_gives_a_warning() -> None:
+    """With almost the whole needle outside and an obstacle, it buckles at 13 N."""
     loop = Loop()
     loop.depth = 0.002
     loop.supervisor.target(0, '', 0.1, 0.0, loop.now)
@@ -410,14 +410,14 @@ def test_a_push_beyond_eulers_load_is_warned_of() -> None:
         loop.measure()
         said += loop.said()
     (line,) = (one for one in said if 'Euler' in one)
-    assert "is more than Euler's load 13.2 N of the part outside" in line
+    assert "exceeds Euler's load 13.2 N of the part outside" in line
 
 
 @pytest.mark.parametrize('what', ['target', 'trajectory'])
-def test_a_request_counts_from_its_stamp_on_whether_it_overtakes_a_sample_or_not(
+def test_request_is_valid_from_its_stamp_in_any_order_of_arrival(
     what: str,
 ) -> None:
-    """It may come before or after the sample of its stamp: the answers are the same."""
+    """The commands are equal if it arrives before or after the sample of its stamp."""
 
     def run(before: int) -> list[Answer | None]:
         loop, answers = Loop(target=None), []
@@ -436,7 +436,7 @@ def test_a_request_counts_from_its_stamp_on_whether_it_overtakes_a_sample_or_not
         assert loop.said() == []
         return answers
 
-    # That with index 10 is of the stamp.
+    # The sample with index 10 has the stamp.
     late = run(before=11)
     assert late == run(before=10)
     forces = [answer.force for answer in late if answer is not None]
@@ -444,8 +444,8 @@ def test_a_request_counts_from_its_stamp_on_whether_it_overtakes_a_sample_or_not
     assert all(forces[11:])
 
 
-def test_a_stamp_ahead_is_waited_for_and_a_retreat_supersedes_it() -> None:
-    """Of two requests the later one counts."""
+def test_request_with_future_stamp_waits_and_retract_supersedes_it() -> None:
+    """The later of two requests is executed."""
     loop = Loop(target=None)
     loop.measure()
     loop.supervisor.target(loop.now + 10 * PERIOD, '', 0.1, 0.0, loop.now)

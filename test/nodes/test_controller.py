@@ -407,7 +407,7 @@ def test_pauses_goes_on_and_retracts(ros_graph: RosGraph) -> None:
     assert loop.said('paused') is True
     assert loop.call(SetBool, 'pause', SetBool.Request(data=False)).success
     loop.until(lambda: loop.speed() > 0.0, 'motion')
-    assert loop.call(Trigger, 'retract', Trigger.Request()).message == 'goes to 0.019 m'
+    assert loop.call(Trigger, 'retract', Trigger.Request()).message == 'retracting to 0.019 m'
     loop.until(lambda: loop.aims[-1].position[0] == 0.019, 'the way back')
     loop.until(lambda: abs(loop.states[-1].position[0] - 0.019) < 1e-4, 'the needle')
     # No jump in all of it: one period at the limits, and rounding.
@@ -543,7 +543,7 @@ def test_the_integral_is_frozen_while_it_is_stopped(ros_graph: RosGraph) -> None
 #: Beyond each limit, and what is well within it.
 BEYOND = {
     'speed': (lambda b: b.measure(0.02, 0.15), 'insertion speed 0.15 m/s is beyond'),
-    'depth': (lambda b: b.measure(0.204), 'inserted length 0.204 m is outside'),
+    'depth': (lambda b: b.measure(0.204), 'insertion depth 0.204 m is outside'),
     'axial': (lambda b: b.wrench(axial=-40.0), 'axial force -40 N is beyond the limit of 30 N'),
     'lateral': (lambda b: b.wrench(lateral=12.0), 'lateral force 12 N is beyond'),
     'moment': (lambda b: b.wrench(moment=1.5), 'moment 1.5 N m is beyond'),

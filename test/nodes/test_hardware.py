@@ -352,11 +352,11 @@ def test_it_says_why_nothing_comes(ros_graph: RosGraph, stranger: Node, there: s
     parameters = {**FORCE, 'hardware.state_topic': topic}
     controller = ros_graph.add(ControllerNode, parameters=parameters)
     expected = {
-        'elsewhere': 'no joint_states yet: nobody publishes arm/states; '
+        'elsewhere': 'no joint_states yet: no node publishes arm/states; '
         'sensor_msgs/msg/JointState is published on /arm/joint_states (hardware.state_topic)',
         'another type': 'no joint_states yet: arm/states is published as std_msgs/msg/String, and '
         'read as sensor_msgs/msg/JointState (hardware.state_topic, hardware.state_type)',
-        'other joints': "joint_states has no position of the joint 'slide'; it has those of 'a', "
+        'other joints': "joint_states has no position of the joint 'slide'; positions found: 'a', "
         "'b' (hardware.joint, hardware.command_joints)",
     }[there]
 
@@ -382,7 +382,7 @@ def test_topics_are_found_by_type(ros_graph: RosGraph) -> None:
     assert late.failure is not None
     assert late.failure.startswith(
         'hardware: auto for joint_states needs one topic of sensor_msgs/msg/JointState that '
-        'others publish, found /arm/joint_states, /joint_states'
+        'other nodes publish, found /arm/joint_states, /joint_states'
     )
 
 
@@ -499,7 +499,7 @@ def test_another_rate_is_said(ros_graph: RosGraph) -> None:
     """Both numbers and what to set; nothing at the true rate."""
     bench = Bench(ros_graph, rate=1000.0)
     bench.until(lambda: ' Hz, rate is 1000 Hz: set rate to ' in bench.said, 'the rate')
-    assert bench.said.startswith('joint_states comes at ')
+    assert bench.said.startswith('joint_states is received at ')
 
 
 @pytest.mark.parametrize(

@@ -253,7 +253,7 @@ def test_a_sensor_that_freezes_stops_it(ros_graph: RosGraph) -> None:
     ]
     assert bench.plant.set_parameters_atomically(frozen).successful
     bench.until(lambda: bench.said.startswith(('done', 'stopped')), 'the end')
-    assert 'stopped: the sensor of the tip is frozen' in bench.said
+    assert 'stopped: the tip sensor is frozen' in bench.said
     depth = bench.at('insertion')
     count = len(bench.moves)
     end = bench.user.get_clock().now().nanoseconds + 500_000_000

@@ -1,4 +1,4 @@
-"""Many needles at once."""
+"""Batches of steered needles."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ DEPTHS = np.linspace(0.0, 0.1, 12)
 
 
 def drawn(runs: int) -> dict[str, Any]:
-    """Return different needles, tissues, ways and seeds."""
+    """Return different needles, tissues, paths and seeds."""
     rng = np.random.default_rng(1)
     several = [
         replace(NEEDLE, tissue_stiffness=k, layer_depths=(0.04,) * n, layer_stiffnesses=(5e4,) * n)
@@ -46,7 +46,7 @@ def drawn(runs: int) -> dict[str, Any]:
     }
 
 
-def test_each_run_is_that_needle_alone() -> None:
+def test_each_run_equals_a_single_needle() -> None:
     values = drawn(20)
     tips = insert_batch(**values)
     for i, found in enumerate(tips):
@@ -65,14 +65,14 @@ def test_each_run_is_that_needle_alone() -> None:
 
 
 @pytest.mark.parametrize('workers', [2, 3, 7])
-def test_workers_do_not_change_a_bit(workers: int) -> None:
+def test_results_are_independent_of_workers(workers: int) -> None:
     values = drawn(20)
     assert_array_equal(insert_batch(**values, workers=workers), insert_batch(**values, workers=1))
 
 
 @settings(max_examples=30)
 @given(some.data())
-def test_what_is_for_all_runs_is_given_once(data: some.DataObject) -> None:
+def test_common_values_are_broadcast_to_all_runs(data: some.DataObject) -> None:
     runs, poses = 3, 4
     depths = np.linspace(0.0, 0.1, poses)
     given_: dict[str, Any] = {}
@@ -91,7 +91,7 @@ def test_what_is_for_all_runs_is_given_once(data: some.DataObject) -> None:
 
 
 @given(broadcastable_shapes((3, 4), min_dims=1, max_dims=4))
-def test_other_shapes_are_named(shape: tuple[int, ...]) -> None:
+def test_wrong_shapes_are_rejected(shape: tuple[int, ...]) -> None:
     depths, rolls = np.linspace(0.0, 0.1, 4), np.zeros(shape)
     if shape[-1] == 4 and len(shape) < 3:
         tips = insert_batch(NEEDLE, STEERING, depths, rolls=rolls)
@@ -121,13 +121,13 @@ def test_other_shapes_are_named(shape: tuple[int, ...]) -> None:
         ),
     ],
 )
-def test_bad_values_are_named(change: dict[str, Any], error: type, words: str) -> None:
+def test_invalid_values_are_rejected(change: dict[str, Any], error: type, words: str) -> None:
     values: dict[str, Any] = {'needles': NEEDLE, 'steering': STEERING, 'depths': [0.0, 0.1]}
     with pytest.raises(error, match=words):
         insert_batch(**values | change)
 
 
-def test_a_short_needle_does_not_reach() -> None:
+def test_needle_shorter_than_the_depth_is_rejected() -> None:
     short = NeedleParameters.preset('phantom', length=0.1)
     with pytest.raises(ParameterError, match=r'depths must be in \[0, 0\.06\] m'):
         insert_batch([NEEDLE, short], STEERING, DEPTHS)

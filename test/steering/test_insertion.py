@@ -1,4 +1,4 @@
-"""Laws along the insertion axis of a steered needle."""
+"""Axial motion of a steered needle: friction, cutting, membranes."""
 
 from __future__ import annotations
 
@@ -45,8 +45,8 @@ def force_at(depth: float, velocity: float) -> float:
     return dry + (300.0 + 100.0 * above + 50.0 * below) * velocity
 
 
-def test_the_paper_is_the_special_case() -> None:
-    """Without what is new the axis moves as that of the 8-state model, while it is straight."""
+def test_axial_model_of_the_paper_is_a_special_case() -> None:
+    """Without the added effects the axis moves as in the 8-state model of a straight needle."""
     needle = NeedleParameters.preset('phantom')
     one = Insertion(needle, depth=0.05)
     other = Integrator(needle, NeedleModel(needle).state_at(0.05))
@@ -58,8 +58,8 @@ def test_the_paper_is_the_special_case() -> None:
         assert one.velocity == pytest.approx(other.velocity, abs=1e-13)
 
 
-def test_force_of_an_even_motion() -> None:
-    """Friction grows with the inserted length of each layer; the membrane is a spring first."""
+def test_force_at_constant_velocity() -> None:
+    """Friction grows with the inserted length in each layer; the membrane is a spring at first."""
     one, velocity = Insertion(NEEDLE, STEERING), 5e-3
     one.carry(0.1, velocity)
     for _ in range(1500):
@@ -79,7 +79,7 @@ def test_force_of_an_even_motion() -> None:
 
 
 def test_events_are_exact_in_time() -> None:
-    """A membrane gives at its strength, whatever the steps of time."""
+    """A membrane ruptures at its strength, for any time steps."""
     times = []
     for step in (1e-3, 1e-5):
         one = Insertion(NEEDLE, STEERING, depth=0.018, step=step)
@@ -94,14 +94,14 @@ def test_events_are_exact_in_time() -> None:
         assert one.punctured == (True,)
         ways.append(one.depth)
     errors = np.abs(np.array(ways[:-1]) - ways[-1])
-    # Of second order, with stops, layers and a puncture on the way.
+    # Of second order, with stops, layers and a puncture during the motion.
     assert (np.log2(errors[:-1] / errors[1:]) > 1.6).all()
     assert errors[-1] < 1e-7
 
 
 @given(some.floats(-5.0, 5.0), some.floats(1e-3, 0.1))
-def test_rest_holds_what_friction_and_cutting_bear(force: float, depth: float) -> None:
-    """Cutting resists insertion only, friction both ways; a membrane pushes the needle out."""
+def test_needle_rests_within_friction_and_cutting_forces(force: float, depth: float) -> None:
+    """Cutting resists insertion only, friction resists both; a membrane pushes outward."""
     steering = replace(STEERING, membrane_depths=(), membrane_strengths=())
     one = Insertion(NEEDLE, steering, depth=depth)
     cutting = 1.0 if depth < 0.03 else 2.0
@@ -111,8 +111,8 @@ def test_rest_holds_what_friction_and_cutting_bear(force: float, depth: float) -
     assert np.sign(one.depth - depth) in (0.0, np.sign(force))
 
 
-def test_withdrawn_and_in_again_it_does_not_cut() -> None:
-    """Down its own path there is friction only, up to the depth where it last cut."""
+def test_reinsertion_has_no_cutting_force() -> None:
+    """Along its own path there is friction only, up to the deepest cut."""
     one = Insertion(NEEDLE, STEERING, depth=0.05)
     tip = one.needle.tip
     one.carry(0.1, -0.02)
@@ -125,7 +125,7 @@ def test_withdrawn_and_in_again_it_does_not_cut() -> None:
         middle = 0.5 * (before + one.depth)
         expected = force_at(middle, 4e-3) - 2.0
         assert one.depth >= 0.05 or force == pytest.approx(expected, rel=1e-9)
-    # Uncut tissue is felt from 1 mm before it.
+    # Uncut tissue acts from 1 mm before it.
     assert (one.needle.load == 0.0).all()
     while one.depth < 0.05:
         force = one.carry(0.01, 4e-3)
@@ -134,12 +134,12 @@ def test_withdrawn_and_in_again_it_does_not_cut() -> None:
     assert one.needle.tip[2] == pytest.approx(tip[2], abs=1e-4)
 
 
-def test_a_membrane_that_holds_pushes_the_needle_back() -> None:
+def test_unpunctured_membrane_pushes_the_needle_back() -> None:
     frictionless = replace(NEEDLE, coulomb_friction=0.0, viscous_friction=30.0)
     steering = replace(STEERING, coulomb_per_length=(0.0,), cutting_force=(0.0,))
     one = Insertion(frictionless, steering, depth=0.02)
     one.push(20.0, 1.5)
-    # At rest the spring bears the force.
+    # At rest the spring balances the force.
     assert one.depth == pytest.approx(0.02 + 1.5 / 500.0, abs=1e-9)
     one.push(20.0, 0.0)
     assert one.depth == pytest.approx(0.02, abs=1e-9)
@@ -148,7 +148,7 @@ def test_a_membrane_that_holds_pushes_the_needle_back() -> None:
     assert one.punctured == (True,)
 
 
-def test_the_hub_stops_on_the_guide() -> None:
+def test_hub_stops_on_the_guide() -> None:
     one = Insertion(NEEDLE, STEERING, depth=0.1)
     one.push(30.0, 50.0)
     assert one.depth == pytest.approx(0.18, abs=1e-15)
@@ -160,7 +160,7 @@ def test_the_hub_stops_on_the_guide() -> None:
         one.carry(10.0, 0.05)
 
 
-def test_out_of_the_skin_is_an_error_that_leaves_it_there() -> None:
+def test_motion_out_of_the_skin_is_an_error_without_effect() -> None:
     one = Insertion(NEEDLE, STEERING, depth=0.01)
     with pytest.raises(InsertedLengthError, match='the needle reached the skin'):
         one.push(10.0, -20.0)
@@ -169,7 +169,7 @@ def test_out_of_the_skin_is_an_error_that_leaves_it_there() -> None:
 
 
 def test_breathing_drags_the_needle() -> None:
-    """Friction holds the tip to tissue that moves along it, when nothing holds the base."""
+    """Friction couples a free needle to tissue that moves along it."""
     needle = replace(NEEDLE, carriage_mass=0.0, viscous_friction=0.0)
     one = Insertion(needle, replace(STEERING, viscous_per_length=(0.0,)), depth=0.05)
     for k in range(1, 1001):
@@ -179,15 +179,15 @@ def test_breathing_drags_the_needle() -> None:
     held = Insertion(needle, STEERING, depth=0.05)
     for k in range(1, 1001):
         held.carry(1e-3, 0.0, tissue=(0.0, -3e-3 * sin(1.5e-3 * k), 0.0))
-    # The tissue came to meet a needle that was held: it was cut further.
+    # The tissue moved against a fixed needle, which cut further.
     assert held.depth == pytest.approx(0.05, abs=1e-12)
     assert held.needle.deepest - held.needle.path.depths[0] == pytest.approx(
         0.05 + 3e-3 * sin(1.5), abs=1e-9
     )
 
 
-def test_wrench_is_what_holds_the_needle() -> None:
-    """A shift of the guide to z is pushed back to -z by the tissue: the base pushes to z."""
+def test_wrench_balances_the_needle() -> None:
+    """The tissue opposes a guide shift to z with a force to -z: the base pushes to z."""
     one = Insertion(NEEDLE, STEERING, depth=0.05)
     start = one.wrench
     one.push(1e-3, 0.0, guide=(0.0, 1e-3))
@@ -209,15 +209,15 @@ def test_wrench_is_what_holds_the_needle() -> None:
         ({'tissue': (0.0, 0.06, 0.0)}, 'tissue must stay between guide and tip'),
     ],
 )
-def test_bad_inputs_are_named(values: dict[str, Any], words: str) -> None:
+def test_invalid_inputs_are_rejected(values: dict[str, Any], words: str) -> None:
     one = Insertion(NEEDLE, STEERING, depth=0.05)
     with pytest.raises(ParameterError, match=words):
         one.push(**{'duration': 0.01, 'force': 9.0} | values)
-    # Neither along nor across has anything moved.
+    # No motion along or across the axis.
     assert (one.depth, one.needle.depth, one.velocity, one.time) == (0.05, 0.05, 0.0, 0.0)
 
 
-def test_bad_constants_are_named() -> None:
+def test_invalid_constants_are_rejected() -> None:
     for needle, words in (
         (replace(NEEDLE, friction_law='tanh'), "friction_law must be coulomb .* got 'tanh'"),
         (replace(NEEDLE, swelling=0.1), 'swelling must be 0'),

@@ -1,4 +1,4 @@
-"""Laws of a needle that cuts its path."""
+"""The needle that cuts its path."""
 
 from __future__ import annotations
 
@@ -50,27 +50,29 @@ def inserted(
     start: dict[str, Any] | None = None,
     **steering: Any,
 ) -> SteeredNeedle:
-    """Return a needle that was inserted without any motion of the guide."""
+    """Return a needle that was inserted with a fixed guide."""
     one = SteeredNeedle(needle_in(tissue, layers), SteeringParameters(**steering), **(start or {}))
     one.move(depth=depth)
     return one
 
 
 @pytest.mark.parametrize('part', [1, 2, 4])
-def test_a_long_needle_cuts_an_arc(part: int) -> None:
-    """Its curvature is F lambda / (E I), whatever the elements: parabolas hold an arc."""
+def test_long_needle_cuts_an_arc(part: int) -> None:
+    """Its curvature is F lambda / (E I), for any elements: parabolas represent an arc."""
     length, load = 0.03, 0.2
     one = inserted(
         tissue_of(EI, length), 0.5, element=length / part, bevel_load=(load,), free_length=0.02
     )
     end = one.path.depths >= 0.4
     bend = 2.0 * np.polyfit(one.path.depths[end], one.path.deflections[end, 1], 2)[0]
-    # 13 bending lengths: what is left of the beginning is exp(-13).
+    # 13 bending lengths: the initial transient decays to exp(-13).
     assert bend == pytest.approx(load * length / EI, rel=1e-5)
 
 
 @given(some.floats(-0.05, 0.05), some.floats(0.005, 0.15), some.floats(0.0, 1e5))
-def test_straight_in_at_an_angle_takes_no_force(tilt: float, depth: float, tissue: float) -> None:
+def test_straight_oblique_insertion_needs_no_force(
+    tilt: float, depth: float, tissue: float
+) -> None:
     one = inserted(tissue, depth, start={'tilt': (0.0, tilt)}, skin_stiffness=300.0)
     line = tilt * (0.02 + one.shape.depths)
     assert_allclose(one.shape.deflections[:, 1], line, atol=1e-15)
@@ -79,7 +81,7 @@ def test_straight_in_at_an_angle_takes_no_force(tilt: float, depth: float, tissu
     assert_allclose(one.guide_load, 0.0, atol=1e-10)
 
 
-def test_authority_of_the_guide_changes_its_sign() -> None:
+def test_guide_response_changes_its_sign_with_depth() -> None:
     """Static shift of the tip per shift of the guide, by tissue and depth."""
     found = {
         tissue: [inserted(tissue, depth).authority[0, 0] for depth in np.arange(1, 6) * 0.02]
@@ -92,11 +94,11 @@ def test_authority_of_the_guide_changes_its_sign() -> None:
         1e5: [0.40, -0.15, -0.26, -0.18, -0.08],
     }
     for tissue, row in found.items():
-        # They were given with two digits.
+        # The reference values have two digits.
         assert_allclose(row, expected[tissue], atol=0.01)
 
 
-def test_a_shift_before_cutting_on_steers_more_than_a_static_one() -> None:
+def test_guide_shift_before_cutting_steers_more_than_at_rest() -> None:
     tissue = tissue_of(EI, 0.035)
     found = []
     for depth in (0.01, 0.015, 0.03, 0.05, 0.07, 0.09):
@@ -104,7 +106,7 @@ def test_a_shift_before_cutting_on_steers_more_than_a_static_one() -> None:
         one.move(guide=(0.0, 1e-3))
         one.move(depth=0.1)
         found.append(1e3 * one.tip[2])
-    # The figures are of another path within elements of 1.25 mm; two have one digit.
+    # The reference values are from another path in elements of 1.25 mm; two have one digit.
     assert_allclose(found, [-0.9, -1.3, -1.5, -0.94, -0.41, -0.13], atol=0.05)
 
 
@@ -131,12 +133,12 @@ def steered(load: float, **more: Any) -> SteeredNeedle:
 
 def test_motion_is_linear_in_guide_and_load() -> None:
     both, guide, load = (way(steered(f), s) for f, s in ((0.3, 2.0), (0.0, 2.0), (0.3, 0.0)))
-    # Only where the load jumps does the path begin anew: as little as an element is wrong by.
+    # The path restarts only at a jump of the load: an error of the order of an element's.
     assert_allclose(both[:, [0, 2]], (guide + load)[:, [0, 2]], atol=1e-7)
 
 
-def test_planes_may_be_turned() -> None:
-    """Turn all that goes in by a right angle about y; the tips turn with it."""
+def test_motion_is_invariant_to_rotation_about_y() -> None:
+    """Rotate all inputs by a right angle about y; the tips rotate with them."""
     one = steered(0.3)
     first = []
     for depth in np.linspace(0.0, 0.1, 41)[1:]:
@@ -153,8 +155,8 @@ def test_planes_may_be_turned() -> None:
     assert_allclose(np.array(second)[:, 2], -x, atol=1e-15)
 
 
-def test_the_bevel_lets_go_gradually_on_the_way_back() -> None:
-    """Over a millimeter, in proportion; a needle that comes back by nanometers does not jump."""
+def test_bevel_load_decays_gradually_during_retraction() -> None:
+    """Over a millimeter, in proportion; a retraction by nanometers causes no jump."""
     one = SteeredNeedle(PAPER, SteeringParameters(bevel_load=(0.5,)))
     one.move(depth=0.05)
     tip, load = one.tip, one.load
@@ -168,7 +170,7 @@ def test_the_bevel_lets_go_gradually_on_the_way_back() -> None:
     assert_allclose(one.tip, tip, atol=1e-15)
 
 
-def test_out_and_in_again_follows_the_path() -> None:
+def test_reinsertion_follows_the_path() -> None:
     one = steered(0.3)
     way(one)
     end, path = one.shape, one.path
@@ -181,13 +183,13 @@ def test_out_and_in_again_follows_the_path() -> None:
         for other in again:
             assert_allclose(other.deflections, first.deflections, rtol=0.0, atol=0.0)
     one.move(depth=0.1)
-    # The tip was found with the path when it cut, and now on it.
+    # The tip was solved with the path when it cut, and now on a fixed path.
     assert_allclose(one.shape.deflections, end.deflections, rtol=0.0, atol=1e-17)
     assert_allclose(one.path.deflections, path.deflections, rtol=0.0, atol=0.0)
 
 
 def test_forces_balance() -> None:
-    """What tissue, skin and bevel do to the needle, the guide feels."""
+    """The forces of tissue, skin and bevel on the needle balance the force on the guide."""
     one = SteeredNeedle(
         needle_in(2e4, [(0.04, 6e4)]),
         SteeringParameters(bevel_load=(0.3,), skin_stiffness=500.0, element=0.1e-3),
@@ -202,7 +204,7 @@ def test_forces_balance() -> None:
     skin = 500.0 * away[0]
     force = width @ pulls + one.load + skin
     moment = (width * (middle + 0.02)) @ pulls + one.load * 0.12 + skin * 0.02
-    # Trapezoids of 0.1 mm beside the 36 mm over which it bends, (h / lambda)^2, of what cancels.
+    # Trapezoids of 0.1 mm with a bending length of 36 mm: (h / lambda)^2 of the canceling terms.
     assert_allclose(one.guide_load[0], force, rtol=1e-5)
     assert_allclose(one.guide_load[1], moment, rtol=1e-5)
 
@@ -211,19 +213,19 @@ def tip_with(element: float, steps: int, **more: Any) -> np.ndarray:
     return np.asarray(way(steered(0.3, element=element, **more), steps=steps)[-1])
 
 
-def test_error_falls_with_the_third_power_of_the_element() -> None:
-    """Bevel, layers, skin, guide and roll are all in it."""
-    # So many steps that the way of the guide is smooth beside the error of the elements.
+def test_error_is_of_third_order_in_the_element_length() -> None:
+    """With bevel, layers, skin, guide and roll."""
+    # Enough steps for a guide motion that is smooth relative to the error of the elements.
     fine = tip_with(0.125e-3, 6400)
     errors = [np.abs(tip_with(h, 6400) - fine).max() for h in (4e-3, 2e-3, 1e-3)]
     orders = np.log2(np.array(errors[:-1]) / errors[1:])
     assert (orders > 2.7).all()
-    # A micrometer in a hundred thousand: far below any sensor.
+    # 1e-5 um: far below the resolution of any sensor.
     assert errors[-1] < 1e-7
 
 
-def test_steps_of_the_insertion_do_not_matter() -> None:
-    """Whole elements at once, or a hundredth of one: what is between nodes is cut anew."""
+def test_path_is_independent_of_insertion_steps() -> None:
+    """Whole elements at once, or a hundredth of an element."""
     depth = 0.0777
     ends = []
     for steps in (1, 7, 100, 10_000):
@@ -239,8 +241,8 @@ def test_steps_of_the_insertion_do_not_matter() -> None:
 
 
 @pytest.mark.parametrize('skin', [0.0, 800.0])
-def test_agrees_with_elements_that_scipy_solves(skin: float) -> None:
-    """Another beam, another path between nodes, another way to solve it."""
+def test_agrees_with_finite_elements_solved_by_scipy(skin: float) -> None:
+    """Another beam element, another path between nodes, another solver."""
     parameters = needle_in(2e4, [(0.05, 6e4)])
     errors = []
     for h in (1e-3, 0.5e-3):
@@ -253,13 +255,13 @@ def test_agrees_with_elements_that_scipy_solves(skin: float) -> None:
             one.move(depth=k * h, guide=(0.0, guide))
             shape = other.advance(guide, 0.02, 0.1)
         errors.append(abs(one.tip[2] - shape[-1, 0]))
-    # Straight pieces of path are of first order; both end in the same place.
+    # Straight path segments are of first order; both converge to the same tip.
     assert errors[1] < 0.6 * errors[0] < 1e-5
 
 
 @pytest.mark.parametrize('tissue', [520.0, 5e3])
 def test_agrees_with_the_static_limit_of_the_paper(tissue: float) -> None:
-    """On an axis that it did not leave, clamped at the entry: the paper's modes converge to it."""
+    """For a path along the axis, clamped at the entry: the paper's modes converge to it."""
     depth, off = 0.2, []
     exact = inserted(tissue, depth, free_length=0.0).compliance[0, 0]
     for modes in (1, 2, 4, 8):
@@ -274,8 +276,8 @@ def test_agrees_with_the_static_limit_of_the_paper(tissue: float) -> None:
     assert off[-1] < 2e-3
 
 
-def test_the_tip_lags_the_roll() -> None:
-    """Friction holds the tip until the windup is taken up, and after a reversal twice that."""
+def test_tip_roll_lags_base_roll() -> None:
+    """Friction holds the tip until the windup is complete, and twice that after a reversal."""
     one = SteeredNeedle(
         needle_in(2e4), SteeringParameters(torsional_friction=0.1, torsional_stiffness=0.02)
     )
@@ -290,14 +292,14 @@ def test_the_tip_lags_the_roll() -> None:
     assert_allclose(tips, expected, atol=1e-15)
 
 
-def test_without_friction_the_tip_turns_with_the_base() -> None:
+def test_without_friction_the_tip_rolls_with_the_base() -> None:
     one = SteeredNeedle(needle_in(2e4), SteeringParameters(bevel_load=(0.2,)))
     one.move(depth=0.05, roll=1.2)
     assert one.tip_roll == one.roll == 1.2
     assert_allclose(one.load, 0.2 * np.array([np.sin(1.2), np.cos(1.2)]), rtol=1e-15)
 
 
-def test_moving_tissue_and_guide_together_is_no_motion() -> None:
+def test_common_motion_of_tissue_and_guide_has_no_effect() -> None:
     one = steered(0.3)
     way(one)
     tip, felt = one.tip, one.guide_load
@@ -307,14 +309,14 @@ def test_moving_tissue_and_guide_together_is_no_motion() -> None:
     assert_allclose(one.guide_load, felt, atol=1e-11)
 
 
-def test_tissue_that_comes_towards_the_guide_is_cut() -> None:
-    """Breathing moves tissue along the needle: it goes deeper into it, or comes out."""
+def test_tissue_motion_along_the_needle_cuts_tissue() -> None:
+    """Breathing moves tissue along the needle, which cuts deeper into it, or retracts."""
     one = steered(0.3)
     way(one)
     cut = one.path.depths[-1]
     one.move(tissue=(0.0, 2e-3, 0.0))
     assert one.depth == pytest.approx(0.1, abs=1e-15)
-    # The end of the path has gone with the tissue, away from the tip.
+    # The end of the path moved with the tissue, away from the tip.
     assert one.path.depths[-1] == pytest.approx(cut + 2e-3, abs=1e-15)
     assert (one.load == 0.0).all()
     assert one.shape.depths[0] == pytest.approx(-0.02, abs=1e-15)
@@ -323,8 +325,8 @@ def test_tissue_that_comes_towards_the_guide_is_cut() -> None:
     assert (one.load != 0.0).any()
 
 
-def test_a_guide_beside_another_entry_is_the_same_needle() -> None:
-    """A longer free length that is reached by moving tissue is that free length."""
+def test_tissue_shift_equals_another_free_length() -> None:
+    """A longer free length by moving tissue equals that free length."""
     moved = SteeredNeedle(needle_in(2e4), SteeringParameters(free_length=0.02))
     moved.move(depth=0.08)
     moved.move(tissue=(0.0, 0.01, 0.0))
@@ -340,13 +342,13 @@ def test_presets_cut_a_path(name: str) -> None:
     one = SteeredNeedle(needle, replace(steering, bevel_load=(0.01,)))
     one.move(depth=0.1)
     assert np.isfinite(one.shape.deflections).all()
-    # The bevel pushes to z; ever further with depth.
+    # The bevel pushes to z, with a deflection that grows with depth.
     assert one.tip[0] == 0.0
     assert (np.diff(one.path.deflections[:, 1]) > 0.0).all()
 
 
-def test_noise_of_the_path_spreads_the_tips() -> None:
-    """By its variance per length, whatever the elements; the same seed gives the same path."""
+def test_path_noise_spreads_the_tips() -> None:
+    """By its variance per length, for any elements; the same seed gives the same path."""
     needle, noise = needle_in(tissue_of(EI, 0.035)), 3e-4
     depths = np.array([0.0, 0.05, 0.1, 0.3])
     ends = [
@@ -355,7 +357,7 @@ def test_noise_of_the_path_spreads_the_tips() -> None:
         )
         for h in (1e-3, 0.25e-3)
     ]
-    # Corners of the loads, a millimeter apart, beside parabolas: of second order.
+    # Corners of the loads, a millimeter apart, against parabolas: of second order.
     assert_allclose(ends[0], ends[1], atol=3e-5)
     found = ends[0][:, -1, [0, 2]].std()
     # A direction that wanders for 0.3 m, with its variance growing evenly, ends so far aside. The
@@ -380,7 +382,9 @@ def test_noise_of_the_path_spreads_the_tips() -> None:
         ({'tissue': (0.0, -0.03, 0.0)}, ParameterError, 'tissue must stay between guide and tip'),
     ],
 )
-def test_bad_poses_change_nothing(pose: dict[str, Any], error: type, words: str) -> None:
+def test_invalid_poses_are_rejected_without_effect(
+    pose: dict[str, Any], error: type, words: str
+) -> None:
     one = inserted(2e4, 0.05)
     before = one.shape
     with pytest.raises(error, match=words):
@@ -389,7 +393,7 @@ def test_bad_poses_change_nothing(pose: dict[str, Any], error: type, words: str)
     assert_allclose(one.shape.deflections, before.deflections, rtol=0.0)
 
 
-def test_bad_constants_are_named() -> None:
+def test_invalid_constants_are_rejected() -> None:
     with pytest.raises(ParameterError, match='bevel_load must have one value, or one for each of'):
         SteeredNeedle(needle_in(2e4), SteeringParameters(bevel_load=(0.1, 0.2, 0.3)))
     with pytest.raises(ParameterError, match='free_length must be < length'):

@@ -1,4 +1,4 @@
-"""The loop that steers, with a robot that does what it is told, or does not; without a graph."""
+"""The steering executive with a simulated robot, with and without faults; without ROS."""
 
 from __future__ import annotations
 
@@ -36,10 +36,10 @@ from support.steered_robot import (
     end=st.tuples(st.floats(0.0, 0.1), *[st.floats(-6e-3, 6e-3)] * 2),
     duration=st.floats(0.01, 20.0),
 )
-def test_a_motion_is_smooth_and_goes_in_proportion(
+def test_motion_is_smooth_proportional_and_monotonic(
     begin: tuple[float, ...], end: tuple[float, ...], duration: float
 ) -> None:
-    """It ends at rest exactly where it shall, is as fast as it says, and never turns back."""
+    """It ends at rest exactly at its goal, within its speed limits, and never reverses."""
     one, other = np.array(begin), np.array(end)
     move = smooth(NAMES, one, other, duration)
     assert (move.positions[-1] == other).all()
@@ -53,12 +53,12 @@ def test_a_motion_is_smooth_and_goes_in_proportion(
     assert (np.abs(move.velocities) <= 1.8751 * np.abs(way) / duration + 1e-15).all()
 
 
-def test_it_hits_and_says_how_well() -> None:
-    """Within what it says of the tip; the guide rests while the needle goes in, within limits."""
+def test_insertion_hits_the_target_with_a_consistent_estimate() -> None:
+    """The error is within the reported interval; the guide rests during the insertion."""
     robot = Robot()
     robot.steer()
     assert robot.loop.phase is Phase.DONE
-    # 16 readings of 0.18 mm a look, the last of which decides: three deviations.
+    # 16 readings of 0.18 mm per measurement; three deviations of the last measurement.
     assert robot.miss < 3.0 * 1.8e-4 / np.sqrt(16.0) + 1e-4
     there = robot.loop.expected
     off = robot.needle.tip[[0, 2]] - there.mean
@@ -73,7 +73,7 @@ def test_it_hits_and_says_how_well() -> None:
     assert 'mm from the target' in robot.loop.diagnose(robot.now)[1]
 
 
-def test_late_and_lost_readings_do_no_harm() -> None:
+def test_late_and_lost_readings_are_tolerated() -> None:
     """Ultrasound: 66 ms late, one in four ticks, 5 % lost."""
     robot = Robot(replace(SETTINGS, look_time=0.5))
     robot.late = 66_000_000
@@ -111,7 +111,7 @@ def lost(robot: Robot) -> None:
 
 
 def slips(robot: Robot) -> None:
-    """Leave the tip behind: the guide does not hold the needle."""
+    """Leave the tip behind: the needle slips in the guide."""
 
     def sees(tip: Any) -> Any:
         tip[1] -= max(0.0, 0.5 * (robot.at[0] - 0.02))
@@ -125,7 +125,7 @@ def silent(robot: Robot) -> None:
 
 
 def creeps(robot: Robot) -> None:
-    """Move the needle by somebody else, while the loop looks at its tip."""
+    """Move the needle externally, during a measurement of the tip."""
 
     def moves(wanted: Any) -> Any:
         if robot.loop.phase is Phase.MEASURING and wanted[0] > 0.03:
@@ -144,14 +144,14 @@ def creeps(robot: Robot) -> None:
             'insertion is at 30.000 mm, not at 35.000 mm: joint_trajectory sent 4 times, contr',
             0.031,
         ),
-        (frozen, 'the sensor of the tip is frozen: 20 readings are the same', 0.036),
-        (lost, 'the tip was not seen in 7 looks', 0.056),
+        (frozen, 'the tip sensor is frozen: 20 identical readings', 0.036),
+        (lost, '7 tip measurements are missing', 0.056),
         (slips, 'mm less deep than the needle was inserted: it slips', 0.031),
         (silent, r'no joint_states received within 0\.5\d s', 0.036),
         (creeps, r'during the measurement of the tip insertion is at 3.\.000 mm', 0.037),
     ],
 )
-def test_what_goes_wrong_stops_it_and_is_said(
+def test_faults_stop_the_insertion_with_a_message(
     fault: Callable[[Robot], None], said: str, deepest: float
 ) -> None:
     """The needle rests soon after, and no step follows."""
@@ -165,7 +165,7 @@ def test_what_goes_wrong_stops_it_and_is_said(
     with pytest.raises(AssertionError, match=said):
         raise AssertionError(robot.loop.fault)
     robot.tick(300)
-    # At most 10 mm beyond where it was found: the step under way.
+    # At most 10 mm deeper than the detection: the step under way.
     assert robot.at[0] <= deepest + 1e-9
     before = robot.at
     robot.tick(100)
@@ -176,8 +176,8 @@ def test_what_goes_wrong_stops_it_and_is_said(
     ('step', 'rate', 'late'),
     [(5e-3, 20.0, 0), (5e-3, 8.0, 0), (2.5e-3, 50.0, 20_000_000), (2.5e-3, 20.0, 66_000_000)],
 )
-def test_without_rests_it_hits_too(step: float, rate: float, late: int) -> None:
-    """In 12 s instead of 18, with readings of the way, also late ones; the guide never jumps."""
+def test_continuous_insertion_hits_the_target(step: float, rate: float, late: int) -> None:
+    """In 12 s instead of 18, with readings during motion, also late; the guide never jumps."""
     robot = Robot(replace(CONTINUOUS, step_length=step, rate=rate))
     robot.late = late
     robot.steer()
@@ -186,15 +186,15 @@ def test_without_rests_it_hits_too(step: float, rate: float, late: int) -> None:
     assert robot.seconds < 14.0
     tracked = np.array(robot.tracked)
     going = (tracked[:, 0] > 1e-3) & (tracked[:, 0] < 0.059)
-    # It does not rest on its way.
+    # No rest during the insertion.
     assert (np.diff(tracked[going, 0]) > 0.0).all()
     ways = np.abs(np.diff(tracked[:, 1:], axis=0)).max(axis=0) / (1e-9 * PERIOD)
-    # Twice the even speed of the largest step, at the peak of the insertion speed.
+    # Twice the mean speed of the largest step, at the peak of the insertion speed.
     assert (ways <= 2.0 * CONTINUOUS.guide_step / step * CONTINUOUS.speed).all()
 
 
-def test_the_guide_waits_for_a_needle_that_stalls() -> None:
-    """For two seconds in the midst of a step; then the same guide at the same depth."""
+def test_guide_waits_for_a_stalled_needle() -> None:
+    """For two seconds within a step; then the guide has the same position at the same depth."""
     robot, held = Robot(CONTINUOUS), 0
 
     def moves(wanted: Any) -> Any:
@@ -225,20 +225,20 @@ def test_the_guide_waits_for_a_needle_that_stalls() -> None:
             'insertion is at 0.000 mm, not at 60.000 mm: joint_traj',
             0.0,
         ),
-        (frozen, 'the sensor of the tip is frozen', 0.048),
-        (lost, 'the tip was not seen in 7 looks', 0.061),
+        (frozen, 'the tip sensor is frozen', 0.048),
+        (lost, '7 tip measurements are missing', 0.061),
         (slips, 'deep than the needle was inserted: it slips', 0.04),
         (silent, r'no joint_states received within 0\.5\d s', 0.061),
     ],
 )
-def test_what_goes_wrong_on_the_way_stops_it_and_is_said(
+def test_faults_stop_a_continuous_insertion_with_a_message(
     fault: Callable[[Robot], None], said: str, deepest: float
 ) -> None:
     """
     The needle rests soon after.
 
-    But when `joint_states` end: then nobody knows where it is, and what moves it goes on to the
-    target depth, unless it stops itself without them, as our controller does.
+    Except without `joint_states`: then the depth is unknown, and the needle moves to the target
+    depth, unless its driver stops without `joint_states`, as our controller does.
     """
     robot = Robot(CONTINUOUS)
     fault(robot)
@@ -259,10 +259,10 @@ def test_what_goes_wrong_on_the_way_stops_it_and_is_said(
     acceleration=st.floats(0.01, 1.0),
     way=st.floats(5e-4, 0.1),
 )
-def test_an_axis_law_with_the_same_limits_takes_every_motion(
+def test_axis_law_with_the_same_limits_accepts_every_motion(
     speed: float, acceleration: float, way: float
 ) -> None:
-    """It joins the points by cubics, whose speed and acceleration it checks."""
+    """It interpolates the points by cubics, and checks their speed and acceleration."""
     own = OuterLoopSettings(speed=speed, acceleration=acceleration)
     begin, end = np.array([0.01, 0.0, 0.0]), np.array([0.01 + way, 0.0, 0.0])
     move = smooth(own.joints, begin, end, duration_of(end - begin, own))
@@ -275,8 +275,8 @@ def test_an_axis_law_with_the_same_limits_takes_every_motion(
 
 
 @pytest.mark.parametrize('continuous', [False, True])
-def test_a_single_absurd_reading_moves_nothing(continuous: bool) -> None:
-    """An encoder that says 150 mm once, and a guide that is at 50 mm for one message."""
+def test_single_implausible_reading_has_no_effect(continuous: bool) -> None:
+    """An encoder reading of 150 mm, and a guide position of 50 mm, for one message."""
     robot = Robot(replace(SETTINGS, continuous=continuous))
     robot.tick(20)
     robot.aim()
@@ -292,8 +292,8 @@ def test_a_single_absurd_reading_moves_nothing(continuous: bool) -> None:
 
 
 @pytest.mark.parametrize('continuous', [False, True])
-def test_a_needle_that_runs_on_is_stopped_at_once_and_asked_again(continuous: bool) -> None:
-    """By 20 mm/s, whatever it was asked for; the robot hears the second stop."""
+def test_stop_is_sent_again_to_a_needle_that_still_moves(continuous: bool) -> None:
+    """It moves at 20 mm/s against its commands; the robot follows the second stop."""
     robot = Robot(replace(SETTINGS, continuous=continuous))
     runs, asked = False, 0
 
@@ -319,7 +319,7 @@ def test_a_needle_that_runs_on_is_stopped_at_once_and_asked_again(continuous: bo
     runs, begun = True, robot.at[0]
     while robot.loop.steers:
         robot.tick()
-    # Within the step under way, or the way, and 1.5 mm beyond.
+    # Within the step or the insertion under way, and 1.5 mm more.
     assert robot.at[0] <= (TARGET[1] if continuous else begun + SETTINGS.step_length) + 2e-3
     assert 'insertion is at' in robot.loop.fault
     robot.tick(400)
@@ -329,14 +329,14 @@ def test_a_needle_that_runs_on_is_stopped_at_once_and_asked_again(continuous: bo
     assert_allclose(robot.at, before, atol=1e-9)
 
 
-def test_a_slow_needle_is_not_one_that_does_not_move() -> None:
+def test_slow_needle_is_no_fault() -> None:
     robot = Robot(replace(CONTINUOUS, speed=5e-3))
     robot.steer()
     assert robot.loop.phase is Phase.DONE
 
 
-def test_after_a_retraction_the_next_target_is_taken() -> None:
-    """With the guide wherever it was: it goes to its zero first."""
+def test_target_after_a_retraction_is_accepted() -> None:
+    """From any guide position: the guide moves to zero first."""
     robot = Robot()
     robot.steer()
     assert np.abs(robot.at[1:]).max() > 1e-4
@@ -347,7 +347,7 @@ def test_after_a_retraction_the_next_target_is_taken() -> None:
     assert robot.loop.steers
 
 
-def test_what_cannot_be_continuous_is_named() -> None:
+def test_settings_incompatible_with_continuous_are_rejected() -> None:
     with pytest.raises(ParameterError, match='turns must be 0 if continuous'):
         OuterLoopSettings(continuous=True, turns=2)
     with pytest.raises(ParameterError, match='continuous must be true or false'):
@@ -356,7 +356,7 @@ def test_what_cannot_be_continuous_is_named() -> None:
         OuterLoopSettings(continuous=True, rate=5.0)
 
 
-def test_one_source_of_each_sensor() -> None:
+def test_duplicate_publishers_of_measurements_are_rejected() -> None:
     for counts in ((2, 1), (1, 2)):
         robot = Robot()
         robot.tick(5)
@@ -370,7 +370,7 @@ def test_one_source_of_each_sensor() -> None:
         assert '2 nodes publish' in robot.loop.fault
 
 
-def test_a_clock_that_is_set_back_stops_it() -> None:
+def test_clock_set_back_stops_the_insertion() -> None:
     robot = Robot()
     robot.tick(5)
     robot.aim()
@@ -390,10 +390,10 @@ def test_a_clock_that_is_set_back_stops_it() -> None:
         ((0.0, 0.0, 0.0), '', 'the needle is at 0.00 mm already'),
     ],
 )
-def test_a_target_that_cannot_be_is_refused(
+def test_invalid_targets_are_rejected(
     point: tuple[float, float, float], frame: str, complaint: str
 ) -> None:
-    """Nothing moves, and another target is taken."""
+    """Nothing moves, and another target is accepted."""
     robot = Robot()
     assert robot.aim() == 'target rejected: no joint_states received within 0.5 s'
     robot.tick(5)
@@ -405,15 +405,15 @@ def test_a_target_that_cannot_be_is_refused(
     assert robot.aim() == ''
 
 
-def test_too_many_steps_are_refused() -> None:
-    """A plan of them would take the memory of the machine."""
+def test_too_many_steps_are_rejected() -> None:
+    """Their plan would exceed the memory."""
     robot = Robot(replace(SETTINGS, step_length=1e-4, depth_tolerance=1e-5))
     robot.tick(5)
     assert 'it would take 600 steps of 0.1 mm, at most 200 are possible' in robot.aim()
 
 
-def test_a_needle_must_be_straight_at_the_start() -> None:
-    """Outside tissue the guide goes to its zero first; in tissue it must be there."""
+def test_needle_must_be_straight_at_the_start() -> None:
+    """Outside tissue the guide moves to its zero first; in tissue it must be there."""
     robot = Robot()
     robot.ways[1] = np.zeros(1), np.array([3e-3])
     robot.tick(20)
@@ -428,7 +428,7 @@ def test_a_needle_must_be_straight_at_the_start() -> None:
     assert 'the guide is 3.00 mm off its zero with the needle at 20.00 mm' in robot.aim()
 
 
-def test_a_target_may_move_but_not_its_depth() -> None:
+def test_target_may_move_laterally_but_not_in_depth() -> None:
     robot = Robot()
     robot.tick(5)
     robot.aim((0.0, 0.06, 0.0))
@@ -444,7 +444,7 @@ def test_a_target_may_move_but_not_its_depth() -> None:
 
 
 def test_stop_brings_needle_and_guide_to_rest() -> None:
-    """On its way within 3 mm; afterwards it has to be retracted before another insertion."""
+    """Within 3 mm; afterwards the needle must be retracted before another insertion."""
     robot = Robot()
     robot.tick(5)
     robot.aim()
@@ -458,8 +458,8 @@ def test_stop_brings_needle_and_guide_to_rest() -> None:
     assert 'has been steered; retract it to 0.00 mm first' in robot.aim()
 
 
-def test_readings_that_scatter_are_said() -> None:
-    """Five times the noise that is believed."""
+def test_noisy_readings_give_a_warning() -> None:
+    """Five times the configured noise."""
     robot = Robot(belief=SteeringBelief(noise=8e-6))
     robot.tick(5)
     robot.aim()
@@ -469,8 +469,8 @@ def test_readings_that_scatter_are_said() -> None:
     assert 'noise of the tip measurement is 0.0' in state
 
 
-def test_a_look_leaves_out_what_is_absurd() -> None:
-    """Many readings, two of them elsewhere; and none."""
+def test_averaged_measurement_rejects_outliers() -> None:
+    """Many readings with two outliers; and no readings."""
     look = Look()
     assert look.seen(1e-5) is None
     rng = np.random.default_rng(1)
@@ -499,11 +499,11 @@ numbers = st.floats(allow_nan=True, allow_infinity=True) | st.floats(-0.1, 0.1)
     ),
     continuous=st.booleans(),
 )
-def test_whatever_is_said_no_motion_leaves_the_limits(
+def test_motions_stay_within_limits_for_any_input(
     said: list[tuple[str, tuple[float, float, float]]],
     continuous: bool,
 ) -> None:
-    """Between sane messages: each motion ends within guide and target, never nan."""
+    """Each motion ends within guide limit and target depth, never NaN."""
     robot = Robot(
         replace(SETTINGS, look_time=0.05, step_length=0.02, settle_time=0.0, continuous=continuous)
     )
@@ -538,8 +538,8 @@ def test_whatever_is_said_no_motion_leaves_the_limits(
             assert low - 1e-12 <= column.min() <= column.max() <= high + 1e-12
 
 
-def test_a_motion_of_rounding_is_none() -> None:
-    """The times of its points would all be the same, which a controller rejects."""
+def test_motion_of_rounding_size_is_not_sent() -> None:
+    """A controller rejects a motion with equal times of its points."""
     robot = Robot()
     robot.tick(5)
     robot.aim()

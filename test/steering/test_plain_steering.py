@@ -1,4 +1,4 @@
-"""The controller beside a plain statement of its formulas in NumPy, a hundred insertions long."""
+"""The steering controller against its formulas in plain NumPy, over a hundred insertions."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ MODELS = {
 
 
 class Plain:
-    """What the controller does, array by array; it takes each look for one of this needle."""
+    """The formulas of the controller in NumPy; without plausibility checks of measurements."""
 
     def __init__(
         self,
@@ -64,7 +64,7 @@ class Plain:
         return means, variances + (0.03 * model.elastic[:, at] * abs(self.mean[:, 3])) ** 2, shared
 
     def held(self) -> ComplexArray:
-        """Return the guide as if it rests."""
+        """Return the guide at rest at its last position."""
         guide, done = self.guide.copy(), min(self.step, len(self.guide))
         guide[done:] = guide[done - 1] if done else 0.0
         return guide
@@ -77,7 +77,7 @@ class Plain:
         return np.array([mean.real, mean.imag]), (w * off) @ off.T + w @ variances * np.eye(2)
 
     def see(self, look: FloatArray) -> None:
-        """Learn."""
+        """Update the hypotheses by a tip measurement."""
         means, variances, shared = self.tip(self.step, self.held())
         whole, off = variances + self.model.belief.noise**2, complex(*look) - means
         self.mean += (off / whole)[:, None] * shared
@@ -85,7 +85,7 @@ class Plain:
         self.logs -= 0.5 * abs(off) ** 2 / whole + np.log(whole)
 
     def ends(self, turns: int, first: int) -> tuple[ComplexArray, FloatArray, FloatArray]:
-        """Return means, standard deviations, and what later turns can do."""
+        """Return means, standard deviations, and the range of later turns."""
         means, variances, _ = self.tip(-1, self.guide)
         later, turned = self.model.bevel[:, -1, first:], np.zeros(len(means))
         if turns:
@@ -94,14 +94,14 @@ class Plain:
         return means, np.sqrt(variances), turned
 
     def room(self, begin: FloatArray, count: int) -> tuple[FloatArray, FloatArray]:
-        """Return middles and half widths of where the guide can go, (positions, count)."""
+        """Return centers and half widths of the guide range, (positions, count)."""
         low = np.maximum(begin[:, None] - self.ways[:count], -self.limit)
         high = np.minimum(begin[:, None] + self.ways[:count], self.limit)
         return (low + high) / 2.0, (high - low) / 2.0
 
     @property
     def chance(self) -> float:
-        """Return how probable it is that the tip can still come near."""
+        """Return the probability of a hit near the target."""
         means, errors, turned = self.ends(self.turns, self.step + 1)
         shifts, chance = self.model.guide[:, -1, self.step :], 1.0
         there = self.guide[self.step - 1] if 0 < self.step <= self.model.steps else 0j
@@ -117,13 +117,13 @@ class Plain:
         return chance
 
     def tried(self, count: int) -> FloatArray:
-        """Return positions that are compared, (2, count)."""
+        """Return the compared positions, (2, count)."""
         there = self.guide[self.step - 1] if self.step else 0j
         middle, half = self.room(np.array([there.real, there.imag]), 1)
         return np.asarray(middle + half * np.linspace(-1.0, 1.0, count))
 
     def costs(self, ends: tuple[Any, ...], tried: FloatArray) -> FloatArray:
-        """Return what positions leave out of reach, (2, count)."""
+        """Return the distance of the target from the reachable set for positions, (2, count)."""
         (means, errors, turned), k, w, model = ends, self.step, self.weights, self.model
         now, after = model.guide[:, -1, k], model.guide[:, -1, k + 1 :]
         push = (model.bevel_load[:, k] @ self.turned) * self.mean[:, 3]
@@ -144,7 +144,7 @@ class Plain:
         return found
 
     def best(self, ends: tuple[Any, ...], tried: FloatArray) -> tuple[float, complex]:
-        """Return what the best position leaves out of reach, and it."""
+        """Return the least distance from the reachable set, and its position."""
         w, shifts = self.weights, self.model.guide[:, -1, self.step :]
         normal = (w * shifts.T) @ shifts + 1e-2 * np.eye(shifts.shape[1])
         plan = np.linalg.solve(normal, (w * shifts.T) @ (self.goal - ends[0]))[0]
@@ -154,7 +154,7 @@ class Plain:
         return costs[[0, 1], at].sum(), complex(*tried[[0, 1], at])
 
     def choose(self) -> complex:
-        """Return the next position, and turn the needle if that is worth it."""
+        """Return the next position, and turn the needle if that reduces the distance."""
         k, tried = self.step, self.tried(121)
         ends = self.ends(self.turns, k + 2)
         cost, guide = self.best(ends, tried)
@@ -175,7 +175,7 @@ class Plain:
         return self.best(others[one], tried)[1]
 
     def plan(self) -> Guidance:
-        """Go on to the next step."""
+        """Advance to the next step."""
         k, last = self.step, self.model.steps - 1
         if k <= last:
             self.guide[k] = self.choose()
@@ -194,10 +194,10 @@ class Plain:
         (0.0, 4, inf, inf),
     ],
 )
-def test_a_hundred_insertions_are_those_of_the_plain_formulas(
+def test_a_hundred_insertions_equal_the_plain_formulas(
     limit: float, turns: int, load_limit: float, step_limit: float
 ) -> None:
-    """The same motions, to a millionth of a micrometer, and the same is said; twenty each."""
+    """The same motions, to a millionth of a micrometer, and the same estimates; twenty each."""
     model = MODELS[0.8 if turns else 0.0]
     for seed in range(20):
         rng = np.random.default_rng(seed)

@@ -37,12 +37,12 @@ QUICK = replace(SETTINGS, look_time=0.1, settle_time=0.02, step_length=0.015, sp
 QUICK_CONTINUOUS = replace(CONTINUOUS, step_length=0.015, speed=0.02, guide_speed=0.05,
                            acceleration=0.5, look_time=0.1)  # fmt: skip
 
-#: Messages of an insertion by topic, about: those of a topic that is sampled are many.
+#: Approximate number of messages of an insertion by topic: sampled topics have many.
 FEW = {'joint_trajectory': 40, 'diagnostics': 60, 'joint_states': 800, 'tip_deflection': 800}
 
 
 class Relayed(Robot):
-    """A robot whose messages pass a relay, which loses, delays or duplicates some of them."""
+    """A robot with a relay that loses, delays or duplicates some of its messages."""
 
     def __init__(self, faults: dict[tuple[str, int], list[float]], **options: Any) -> None:
         super().__init__(**options)
@@ -67,7 +67,7 @@ class Relayed(Robot):
                 deliver()
 
     def insert(self, seconds: float = 60.0) -> None:
-        """Aim, and go on until the insertion ends and all messages are delivered."""
+        """Send a target, and run until the insertion ends and all messages are delivered."""
         self.tick(20)
         self.aim()
         for _ in range(round(seconds * SECOND / PERIOD)):
@@ -103,10 +103,10 @@ ONE_FAULT = st.tuples(
 
 @settings(max_examples=60, deadline=None)
 @given(fault=ONE_FAULT, continuous=st.booleans())
-def test_one_lost_delayed_or_duplicated_message_changes_no_insertion(
+def test_single_lost_delayed_or_duplicated_message_is_tolerated(
     fault: tuple[str, str, float, float], continuous: bool
 ) -> None:
-    """Each insertion reaches its target: no message is final."""
+    """Each insertion reaches its target, for a fault of any message."""
     kind, topic, where, delay = fault
     number = 1 + int(where * FEW[topic])
     delays = {'drop': [], 'delay': [delay], 'duplicate': [0.0, delay]}[kind]
@@ -128,10 +128,10 @@ def test_one_lost_delayed_or_duplicated_message_changes_no_insertion(
     ),
     continuous=st.booleans(),
 )
-def test_many_faults_end_at_the_target_or_in_one_line(
+def test_many_message_faults_end_at_the_target_or_in_a_stop(
     faults: list[tuple[str, float, list[float]]], continuous: bool
 ) -> None:
-    """None hangs, and nothing moves after a stop."""
+    """No insertion hangs, and nothing moves after a stop."""
     chosen = {(topic, 1 + int(where * FEW[topic])): delays for topic, where, delays in faults}
     robot = Relayed(chosen, own=QUICK_CONTINUOUS if continuous else QUICK)
     robot.insert()
@@ -143,7 +143,7 @@ def test_many_faults_end_at_the_target_or_in_one_line(
     ('silent', 'line'),
     [('controller', 'no answer of controller'), ('plant', 'no answer of plant')],
 )
-def test_a_node_that_gets_no_motion_is_named_within_five_seconds(
+def test_unresponsive_node_is_named_within_five_seconds(
     continuous: bool, silent: str, line: str
 ) -> None:
     """All motions to it are lost."""
@@ -155,7 +155,7 @@ def test_a_node_that_gets_no_motion_is_named_within_five_seconds(
             execute(name, log, move)
 
     setattr(robot, 'execute', deaf)  # noqa: B010
-    # The continuous guide of a needle that moves off is found at the next depth.
+    # A continuous guide that does not follow is detected at the next depth.
     robot.tick(150)
     begun = robot.seconds
     robot.aim()
@@ -170,7 +170,7 @@ def test_a_node_that_gets_no_motion_is_named_within_five_seconds(
 
 
 @pytest.mark.parametrize('continuous', [False, True])
-def test_a_rejection_stops_the_insertion_at_once_with_its_reason(continuous: bool) -> None:
+def test_rejected_motion_stops_the_insertion_with_its_reason(continuous: bool) -> None:
     robot = Relayed({}, own=QUICK_CONTINUOUS if continuous else QUICK)
     robot.rejects = lambda name, _move: (
         'speed must be within 0.001 m/s' if name == 'controller' else ''
@@ -180,8 +180,8 @@ def test_a_rejection_stops_the_insertion_at_once_with_its_reason(continuous: boo
     assert robot.at[0] == 0.0
 
 
-def test_a_pause_of_a_person_may_last() -> None:
-    """A minute in the midst of a step is no fault; the insertion then continues."""
+def test_pause_by_the_user_may_last() -> None:
+    """A minute within a step is no fault; the insertion then continues."""
     robot = Relayed({}, own=QUICK)
     robot.tick(20)
     robot.aim()
@@ -201,8 +201,8 @@ def test_a_pause_of_a_person_may_last() -> None:
     assert robot.loop.phase is Phase.DONE
 
 
-def test_a_late_stop_supersedes_the_motion_and_is_repeated() -> None:
-    """The stop is lost once, and the motion before it arrives again after it."""
+def test_lost_stop_is_repeated_and_supersedes_the_motion() -> None:
+    """The stop is lost once, and the motion before it is received again after it."""
     robot = Relayed({}, own=SETTINGS)
     robot.tick(20)
     robot.aim()
@@ -222,7 +222,7 @@ def test_a_late_stop_supersedes_the_motion_and_is_repeated() -> None:
 
 
 class Manual:
-    """A job that ends when the test lets it."""
+    """A job that is ended by the test."""
 
     made: list[Manual]
 
@@ -260,7 +260,7 @@ class Planning(Robot):
         return self.now
 
 
-def test_messages_are_taken_while_a_plan_is_computed() -> None:
+def test_messages_are_processed_during_planning() -> None:
     robot = Planning()
     stamp = robot.aim_at()
     assert robot.loop.busy
@@ -275,20 +275,20 @@ def test_messages_are_taken_while_a_plan_is_computed() -> None:
     assert robot.verdict(stamp) == ('accepted', '')
 
 
-def test_a_stop_cancels_a_plan() -> None:
+def test_stop_cancels_planning() -> None:
     robot = Planning()
     stamp = robot.aim_at()
     assert robot.loop.stop('~/stop', robot.now) is None
     assert Manual.made[0].cancelled
     assert robot.loop.phase is Phase.IDLE
     assert robot.verdict(stamp) == ('rejected', 'stopped: ~/stop')
-    # A target that was sent before the stop and arrives after it begins nothing.
+    # A target sent before the stop and received after it is not executed.
     assert robot.loop.target(stamp - 1, '', POINT, robot.now) is None
     assert robot.verdict(stamp - 1)[0] == 'superseded'
     assert not robot.loop.busy
 
 
-def test_a_new_target_cancels_a_plan() -> None:
+def test_new_target_cancels_planning() -> None:
     robot = Planning()
     first, second = robot.aim_at(), robot.aim_at((0.0, 0.05, 0.0))
     assert [one.cancelled for one in Manual.made] == [True, False]
@@ -299,7 +299,7 @@ def test_a_new_target_cancels_a_plan() -> None:
     assert robot.loop.depth == pytest.approx(0.05)
 
 
-def test_a_target_out_of_reach_is_rejected_when_that_is_computed() -> None:
+def test_target_out_of_reach_is_rejected_after_planning() -> None:
     robot = Planning()
     stamp = robot.aim_at((0.05, 0.06, 0.0))
     Manual.made[0].done = True
@@ -310,7 +310,7 @@ def test_a_target_out_of_reach_is_rejected_when_that_is_computed() -> None:
     assert robot.loop.phase is Phase.IDLE
 
 
-def test_a_needle_that_is_moved_during_planning_is_not_inserted() -> None:
+def test_needle_moved_during_planning_is_not_inserted() -> None:
     robot = Planning()
     stamp = robot.aim_at()
     robot.ways[0] = robot.now + np.array([0.0, 1e9]), np.array([0.0, 4e-3])
@@ -369,13 +369,13 @@ def accept(own: RequestLog, stamp: int, *joints: str) -> Acknowledgement | None:
     return answer
 
 
-def test_a_duplicate_is_answered_again_and_not_executed() -> None:
+def test_duplicate_request_is_answered_again_and_not_executed() -> None:
     own = log()
     assert accept(own, NOW - 5, 'insertion') is None
     again = accept(own, NOW - 5, 'insertion')
     assert again is not None
     assert again.verdict is Verdict.ACCEPTED
-    # Without a stamp nothing tells them apart.
+    # Requests without a stamp cannot be distinguished.
     assert accept(own, 0, 'insertion') is None
     assert accept(own, 0, 'insertion') is None
 
@@ -405,7 +405,7 @@ def test_an_older_request_for_the_same_joints_is_superseded() -> None:
         (0.0, 'world', "joint_trajectory must be in frame '' or 'needle_entry', got 'world'"),
     ],
 )
-def test_a_stale_request_is_rejected(age: float, frame: str, reason: str) -> None:
+def test_stale_request_is_rejected(age: float, frame: str, reason: str) -> None:
     own = log()
     stamp = NOW - round(age * SECOND)
     answer = own.check(JOINT_TRAJECTORY, stamp, NOW, frame, ['insertion'])
@@ -424,10 +424,8 @@ def test_a_stale_request_is_rejected(age: float, frame: str, reason: str) -> Non
     ),
     paused=st.booleans(),
 )
-def test_a_status_is_read_as_it_was_written(
-    answers: list[tuple[int, Verdict, str]], paused: bool
-) -> None:
-    """Its latest answers, whatever the reasons contain; other values do no harm."""
+def test_status_values_round_trip(answers: list[tuple[int, Verdict, str]], paused: bool) -> None:
+    """Its latest answers, for any reasons; other values are ignored."""
     own = log()
     for stamp, verdict, reason in answers:
         own.answer(JOINT_TRAJECTORY, stamp, verdict, reason)
@@ -440,7 +438,7 @@ def test_a_status_is_read_as_it_was_written(
         assert status.answer_to('joint_trajectory', stamp).verdict is verdict
 
 
-def test_many_requests_do_not_lead_to_as_many_statuses() -> None:
+def test_status_rate_is_limited_for_many_requests() -> None:
     now = [0.0]
     own = RequestLog({JOINT_TRAJECTORY: ('insertion',)}, steady=lambda: now[0])
     assert not own.due()
@@ -486,7 +484,7 @@ def test_a_request_is_repeated_until_it_is_answered() -> None:
         assert pending.outcome == line
 
 
-def test_the_contract_decides_which_stamps_are_checked() -> None:
+def test_contract_defines_the_topics_of_requests() -> None:
     """A log takes requests only; the topics of requests and samples are these."""
     found = {kind: {one.name for one in TOPICS if one.stamp is kind} for kind in Stamp}
     assert found[Stamp.REQUEST] == {'target', 'joint_trajectory'}

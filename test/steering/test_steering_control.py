@@ -1,4 +1,4 @@
-"""The controller that steers the tip: what it predicts, where it hits, and what it refuses."""
+"""The steering controller: predictions, accuracy, and rejected inputs."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ import pytest
 NEEDLE, _STEERING, _ = STEERING_PRESETS['bending_35mm']
 STEERING = replace(_STEERING, skin_stiffness=0.02 * NEEDLE.tissue_stiffness)
 DEPTHS = np.linspace(0.0, 0.1, 21)
-#: What may be true: made once, it takes a fifth of a second.
+#: The hypotheses, created once: that takes a fifth of a second.
 MODEL = SteeringModel(NEEDLE, STEERING, DEPTHS)
 
 
@@ -55,7 +55,7 @@ def steer(
     noise: float = 1e-7,
     seed: int = 0,
 ) -> FloatArray:
-    """Insert a needle; return where its tip ends. No sensor says the same twice."""
+    """Insert a needle; return the final tip position. Each measurement has its own noise."""
     rng = np.random.default_rng(seed)
     to = Guidance(0.0, 0.0)
     begun = needle.roll
@@ -68,8 +68,8 @@ def steer(
 
 
 @pytest.mark.parametrize(('length', 'skin'), [(1.0, 1.0), (0.8, 1.2)])
-def test_what_it_predicts_is_what_the_needle_does(length: float, skin: float) -> None:
-    """The tip at each depth is that of `SteeredNeedle`, for any guide, tilt and bevel."""
+def test_predictions_agree_with_the_simulated_needle(length: float, skin: float) -> None:
+    """The tip at each depth agrees with `SteeredNeedle`, for any guide, tilt and bevel."""
     needle, steering = other(length, skin)
     alone = SteeringModel(needle, steering, DEPTHS, SteeringBelief(spread=0.0))
     assert alone.guide.shape == (1, 21, 20)
@@ -85,11 +85,11 @@ def test_what_it_predicts_is_what_the_needle_does(length: float, skin: float) ->
         assert_allclose(one.tip[[0, 2]], expected[k + 1], atol=5e-6)
 
 
-def test_a_path_that_strays_is_a_line_between_its_curvatures() -> None:
-    """An even curvature of the path is that of a bevel whose load makes it."""
+def test_path_curvature_is_linear_between_depths() -> None:
+    """A constant curvature of the path equals the path of a bevel with the corresponding load."""
     alone = SteeringModel(NEEDLE, STEERING, DEPTHS, SteeringBelief(spread=0.0))
     load = NEEDLE.bending_stiffness / 0.035
-    # Loads by cells of 1.25 mm, beside one of all cells.
+    # Loads by cells of 1.25 mm, against one load of all cells.
     assert_allclose(alone.causes[0, :, 4:].sum(axis=1), load * alone.causes[0, :, 3], atol=2e-5)
 
 
@@ -102,7 +102,7 @@ def test_a_path_that_strays_is_a_line_between_its_curvatures() -> None:
     roll=st.floats(-3.0, 3.0),
     target=st.tuples(*[st.floats(-3e-3, 3e-3)] * 2),
 )
-def test_it_hits_whatever_of_its_belief_is_true(
+def test_target_is_hit_within_the_prior_uncertainty(
     length: float,
     skin: float,
     tilt: tuple[float, float],
@@ -110,12 +110,12 @@ def test_it_hits_whatever_of_its_belief_is_true(
     roll: float,
     target: tuple[float, float],
 ) -> None:
-    """With next to no noise within 0.2 mm; open loop misses by millimeters."""
+    """With almost no noise within 0.2 mm; open loop misses by millimeters."""
     needle, steering = other(length, skin)
     one = SteeredNeedle(needle, replace(steering, bevel_load=(bevel,)), tilt=tilt, roll=roll)
     controller = SteeringController(MODEL, target)
     tip = steer(controller, one)
-    # Between two of the positions that are compared, and what is left of the unknown.
+    # Half the distance of the compared positions, and the remaining uncertainty.
     assert np.hypot(*(tip - target)) < 2e-4
     assert np.abs(one.guide).max() <= 6e-3
     there = controller.expected()
@@ -123,8 +123,8 @@ def test_it_hits_whatever_of_its_belief_is_true(
 
 
 @pytest.mark.parametrize('again', [copy.deepcopy, lambda one: pickle.loads(pickle.dumps(one))])  # noqa: S301
-def test_copies_go_their_own_way(again: Callable[[Any], Any]) -> None:
-    """Of needle and controller, half way in; they end where the first ones end."""
+def test_copies_are_independent(again: Callable[[Any], Any]) -> None:
+    """Of needle and controller, half way in; they end at the same tip as the originals."""
     one, controller = SteeredNeedle(*other(0.9)), SteeringController(MODEL, (2e-3, 1e-3))
     to, copies = Guidance(0.0, 0.0), list[tuple[SteeredNeedle, SteeringController, Guidance]]()
     rng = np.random.default_rng(3)
@@ -144,8 +144,8 @@ def test_copies_go_their_own_way(again: Callable[[Any], Any]) -> None:
     assert one.depth == DEPTHS[-1]
 
 
-def test_planes_are_alike() -> None:
-    """What is swapped, or mirrored, gives the same motion, swapped or mirrored."""
+def test_both_planes_are_equivalent() -> None:
+    """Swapped or mirrored inputs give the same motion, swapped or mirrored."""
     tips = {}
     turns: dict[str, Callable[[Sequence[float]], tuple[float, float]]] = {
         'as it is': lambda v: (v[0], v[1]),
@@ -155,13 +155,13 @@ def test_planes_are_alike() -> None:
     for name, turn in turns.items():
         one = SteeredNeedle(*other(0.9), tilt=turn((0.01, -0.02)))
         tips[name] = turn(steer(SteeringController(MODEL, turn((2e-3, 1e-3))), one).tolist())
-    # What the noise makes of it.
+    # The effect of the noise.
     assert_allclose(tips['swapped'], tips['as it is'], atol=2e-5)
     assert_allclose(tips['mirrored'], tips['as it is'], atol=2e-5)
 
 
-def test_it_learns_how_the_needle_bends() -> None:
-    """The hypotheses that are left are near the truth, and weights are a distribution."""
+def test_bending_length_is_identified() -> None:
+    """The remaining hypotheses are near the truth, and weights are a distribution."""
     controller = SteeringController(MODEL, (3e-3, -2e-3))
     assert_allclose(controller.weights, 1.0 / len(MODEL.lengths))
     steer(controller, SteeredNeedle(*other(1.2)), noise=4e-5)
@@ -171,8 +171,8 @@ def test_it_learns_how_the_needle_bends() -> None:
     assert weights @ MODEL.lengths == pytest.approx(1.2, abs=0.05)
 
 
-def test_a_look_that_is_noisier_says_less() -> None:
-    """The same look with four times its noise leaves more open; there is none of the future."""
+def test_noisier_measurement_reduces_uncertainty_less() -> None:
+    """The same measurement with four times its noise; a future depth is rejected."""
     left = []
     for noise in (0.0, 1.6e-4):
         controller = SteeringController(MODEL, (0.0, 0.0))
@@ -183,17 +183,17 @@ def test_a_look_that_is_noisier_says_less() -> None:
         controller.see((0.0, 0.0), 1)
 
 
-def test_a_target_out_of_reach_is_refused_with_what_is_within_it() -> None:
+def test_target_out_of_reach_is_rejected_with_the_reachable_set() -> None:
     with pytest.raises(
-        OutOfReachError, match=r'x = 40\.00 mm, z = 0\.00 mm is out of reach: from'
+        OutOfReachError, match=r'x = 40\.00 mm, z = 0\.00 mm is out of reach: reachable'
     ):
         SteeringController(MODEL, (0.04, 0.0))
     with pytest.raises(OutOfReachError, match=r'a tip at x = 0\.00 ± \d'):
         SteeringController(MODEL, (8e-3, 0.0), position_limit=1e-4)
 
 
-def test_it_warns_as_soon_as_the_target_leaves_the_reach() -> None:
-    """A guide that is stuck leaves the needle to its drift; it is said before the end."""
+def test_warning_when_the_target_leaves_the_reachable_set() -> None:
+    """A stuck guide leaves the needle to its drift; the warning is before the end."""
     controller = SteeringController(MODEL, (0.0, 4e-3))
     assert controller.warning == ''
     one = SteeredNeedle(*other(1.0), tilt=(0.0, -0.05))
@@ -204,7 +204,7 @@ def test_it_warns_as_soon_as_the_target_leaves_the_reach() -> None:
         try:
             controller.next(one.tip[[0, 2]])
         except SteeringFaultError:
-            # Or it does not believe that the guide goes where it is sent.
+            # Or the measurements are implausible for the commanded guide.
             first = first or k
             break
         if controller.warning and first is None:
@@ -214,7 +214,7 @@ def test_it_warns_as_soon_as_the_target_leaves_the_reach() -> None:
 
 
 def faulty(change: dict[int, Any]) -> tuple[SteeringController, SteeredNeedle]:
-    """Steer with some looks replaced; a number is how far a look is off in x [m]."""
+    """Steer with some measurements replaced; a number is the offset of a measurement in x [m]."""
     controller, one = SteeringController(MODEL, (2e-3, 1e-3)), SteeredNeedle(*other(0.9))
     guide, rng = (0.0, 0.0), np.random.default_rng(4)
     before: Any = None
@@ -243,8 +243,8 @@ def faulty(change: dict[int, Any]) -> tuple[SteeringController, SteeredNeedle]:
         dict.fromkeys(range(8, 14), 'nan'),
     ],
 )
-def test_a_fault_that_passes_does_no_harm(change: dict[int, Any]) -> None:
-    """One jump, small or absurd, one look that is repeated, 30 mm without a tip."""
+def test_transient_faults_are_tolerated(change: dict[int, Any]) -> None:
+    """One jump, small or implausible, one repeated measurement, 30 mm without a tip."""
     controller, one = faulty(change)
     assert np.hypot(*(one.tip[[0, 2]] - controller.target)) < 4e-4
 
@@ -252,22 +252,25 @@ def test_a_fault_that_passes_does_no_harm(change: dict[int, Any]) -> None:
 @pytest.mark.parametrize(
     ('change', 'complaint'),
     [
-        (dict.fromkeys(range(8, 21), 'same'), 'the sensor of the tip is frozen: 3 looks are'),
-        (dict.fromkeys(range(8, 21), 'lost'), 'the tip was not seen in 7 looks'),
+        (
+            dict.fromkeys(range(8, 21), 'same'),
+            'the tip sensor is frozen: 3 identical measurements',
+        ),
+        (dict.fromkeys(range(8, 21), 'lost'), '7 tip measurements are missing'),
         (
             dict.fromkeys(range(8, 21), 0.02),
-            r'the tip is \+\d+\.\d\d mm in x and .* from where any',
+            r'the tip is \+\d+\.\d\d mm in x and .* from its expected',
         ),
     ],
 )
-def test_a_fault_that_stays_ends_it(change: dict[int, Any], complaint: str) -> None:
+def test_persistent_faults_raise_an_error(change: dict[int, Any], complaint: str) -> None:
     with pytest.raises(SteeringFaultError, match=complaint):
         faulty(change)
 
 
 @pytest.mark.parametrize('seed', range(6))
-def test_a_frame_that_is_wrong_by_ten_degrees_hits_or_is_said(seed: int) -> None:
-    """About the needle: the tip goes aside of where the guide sends it."""
+def test_frame_error_of_ten_degrees_is_tolerated_or_detected(seed: int) -> None:
+    """About the needle axis: the tip deviates laterally from the command."""
     rng = np.random.default_rng(seed)
     target = 3e-3 * rng.uniform(-1.0, 1.0, 2)
     tilt = (0.02 * rng.standard_normal(2)).tolist()
@@ -286,13 +289,13 @@ def test_a_frame_that_is_wrong_by_ten_degrees_hits_or_is_said(seed: int) -> None
             said = str(error)
             break
     if said:
-        assert 'from where any needle of the belief can be' in said
+        assert 'outside the model uncertainty' in said
         assert depth <= 0.05
     else:
         assert np.hypot(*(tip - target)) < 5e-4
 
 
-def test_bad_input_is_named() -> None:
+def test_invalid_input_is_rejected() -> None:
     for depths in ([0.0, 0.05, 0.05], [0.05], [[0.0, 0.1]], [0.0, np.nan]):
         with pytest.raises(ParameterError, match='depths must be numbers that increase'):
             SteeringModel(NEEDLE, STEERING, depths)
@@ -317,7 +320,7 @@ def test_bad_input_is_named() -> None:
     with pytest.raises(ParameterError, match='spread must be finite'):
         SteeringBelief(spread=-0.1)
     controller = SteeringController(MODEL, (0.0, 0.0))
-    with pytest.raises(ShapeError, match='a look must be x and z'):
+    with pytest.raises(ShapeError, match='a tip measurement must be x and z'):
         controller.next([0.0, 0.0, 0.0])
     done = SteeringController(MODEL, (0.0, 0.0))
     steer(done, SteeredNeedle(*other(1.0)))
@@ -325,8 +328,8 @@ def test_bad_input_is_named() -> None:
         done.next([0.0, 0.0])
 
 
-def test_others_do_what_they_say() -> None:
-    """Open loop rests; the others come nearer, and keep the limit."""
+def test_baselines_behave_as_published() -> None:
+    """Open loop rests; the others reduce the miss, and keep the limit."""
     target = (3e-3, -2e-3)
     miss = {}
     controllers: Mapping[str, SteeringController | OpenLoop] = {
@@ -342,18 +345,18 @@ def test_others_do_what_they_say() -> None:
         assert (np.abs(one.guide).max() == 0.0) == (name == 'open')
     assert miss['ours'] < 1e-4 < miss['springs'] < miss['open']
     assert miss['Broyden'] < miss['open']
-    # A tip that was not seen moves nothing.
+    # A missing measurement causes no motion.
     rests = Broyden(NEEDLE, STEERING, DEPTHS, target)
     assert rests.next(None) == Guidance(0.0, 0.0)
 
 
-#: A needle with a bevel, as it is believed.
+#: A nominal needle with a bevel.
 BEVELED = replace(STEERING, bevel_load=(0.8,))
 BEVEL_MODEL = SteeringModel(NEEDLE, BEVELED, DEPTHS)
 
 
 def test_tip_and_load_are_linear_in_guide_roll_and_bevel() -> None:
-    """Those of `SteeredNeedle` that is turned in every step; the load after each motion."""
+    """As in a `SteeredNeedle` that is turned in every step; the load after each motion."""
     alone = SteeringModel(NEEDLE, STEERING, DEPTHS, SteeringBelief(spread=0.0))
     rng = np.random.default_rng(2)
     guide, rolls = 3e-3 * rng.standard_normal((20, 2)), np.cumsum(rng.standard_normal(20))
@@ -374,14 +377,14 @@ def test_tip_and_load_are_linear_in_guide_roll_and_bevel() -> None:
 
 @pytest.mark.parametrize(('limit', 'turns', 'within'), [(0.0, 6, 1.5e-3), (6e-3, 6, 8e-4)])
 @pytest.mark.parametrize('seed', range(4))
-def test_a_bevel_is_turned_towards_the_target(
+def test_bevel_is_turned_towards_the_target(
     limit: float, turns: int, within: float, seed: int
 ) -> None:
     """
-    By roll alone, and with the guide; as often as it may be.
+    By roll only, and with the guide; up to the allowed number of turns.
 
-    95 % of such needles end within 2.8 and 0.6 mm (`needle bench steering`), with targets that are
-    twice as far and a sensor that is turned.
+    95 % of such needles end within 2.8 and 0.6 mm (`needle bench steering`), with targets at twice
+    the distance and a rotated sensor.
     """
     rng = np.random.default_rng(seed)
     reach = 0.8 * np.abs(BEVEL_MODEL.bevel[26, -1]).sum()
@@ -404,8 +407,8 @@ def test_a_bevel_is_turned_towards_the_target(
     assert max(miss['ours'], miss['towards']) < miss['rests']
 
 
-def test_the_guide_goes_by_small_steps_and_still_hits() -> None:
-    """A third of its range; what it cannot reach then is refused."""
+def test_guide_with_limited_steps_hits_the_target() -> None:
+    """A third of its range per step; targets out of reach are rejected."""
     controller = SteeringController(MODEL, (3e-3, 2e-3), step_limit=2e-3)
     one, to, ways = SteeredNeedle(*other(1.2), tilt=(0.01, 0.0)), Guidance(0.0, 0.0), [0.0]
     rng = np.random.default_rng(1)
@@ -415,15 +418,15 @@ def test_the_guide_goes_by_small_steps_and_still_hits() -> None:
             one.move(depth=depth)
         before, to = to, controller.next(one.tip[[0, 2]] + 1e-5 * rng.standard_normal(2))
         ways += [abs(to.x - before.x), abs(to.z - before.z)]
-    # What is rounded.
+    # Rounding.
     assert max(ways) <= 2e-3 * (1.0 + 1e-12)
     assert np.hypot(*(one.tip[[0, 2]] - controller.target)) < 3e-4
     with pytest.raises(OutOfReachError):
         SteeringController(MODEL, (0.02, 0.0), step_limit=1e-4)
 
 
-def test_the_load_on_the_guide_stays_within_its_limit() -> None:
-    """Where no limit is, the guide would push twice as hard; the target is still hit."""
+def test_guide_load_stays_within_its_limit() -> None:
+    """Without a limit the guide load is twice as large; the target is still hit."""
     target, loads, miss = (3e-3, 2e-3), {}, {}
     for limit in (np.inf, 2.0):
         controller = SteeringController(MODEL, target, load_limit=limit)
@@ -437,6 +440,6 @@ def test_the_load_on_the_guide_stays_within_its_limit() -> None:
             to = controller.next(one.tip[[0, 2]] + 1e-5 * rng.standard_normal(2))
         loads[limit], miss[limit] = max(felt), np.hypot(*(one.tip[[0, 2]] - target))
     assert loads[np.inf] > 3.5
-    # Until it is learned how the needle bends, what is planned is what is believed.
+    # The plan uses the nominal model until the bending length is identified.
     assert loads[2.0] < 3.0
     assert miss[2.0] < 1e-3

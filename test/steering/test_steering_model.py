@@ -13,7 +13,7 @@ from numpy.testing import assert_allclose
 import pytest
 
 NEEDLE, _STEERING, _ = STEERING_PRESETS['bending_35mm']
-#: Two layers, and elements of the same length as those of the model.
+#: Two layers, and elements of the same length as in the model.
 NEEDLE = replace(NEEDLE, layer_depths=(0.03125,), layer_stiffnesses=(4e4,))
 STEERING = replace(_STEERING, skin_stiffness=400.0, bevel_load=(1.0, 0.5), element=1.25e-3)
 DEPTHS = np.linspace(0.005, 0.08, 16)
@@ -22,7 +22,7 @@ EXACT = SteeringBelief(spread=0.0)
 
 @pytest.mark.parametrize('together', [False, True])
 @pytest.mark.parametrize('cause', ['guide 0', 'guide 7', 'tilt', 'bevel 0', 'bevel 8'])
-def test_each_response_is_an_insertion_with_that_cause_alone(cause: str, together: bool) -> None:
+def test_each_response_equals_an_insertion_with_one_cause(cause: str, together: bool) -> None:
     """A unit of each cause gives the tip and the force on the guide of `SteeredNeedle`."""
     model = SteeringModel(NEEDLE, STEERING, DEPTHS, EXACT, together=together)
     kind, _, number = cause.partition(' ')
@@ -59,14 +59,14 @@ def test_each_response_is_an_insertion_with_that_cause_alone(cause: str, togethe
     assert_allclose(load, force, atol=1e-12 * np.abs(force).max())
 
 
-def test_elements_end_where_steps_and_layers_do() -> None:
+def test_elements_end_at_steps_and_layers() -> None:
     """Between nodes at steps and borders the needle is exact: shorter elements change nothing."""
     needle = replace(NEEDLE, layer_depths=(0.0317,))
     uneven = np.array([0.0037, 0.011, 0.0291, 0.03, 0.04, 0.052])
     whole = SteeringModel(needle, STEERING, uneven, EXACT)
     halved = np.sort(np.append(uneven, 0.5 * (uneven[:-1] + uneven[1:])))
     fine = SteeringModel(needle, STEERING, halved, EXACT)
-    # A position of the guide in both halves of a step is that in the step.
+    # A position of the guide in both halves of a step equals the position in the step.
     pairs = fine.guide[0, ::2].reshape(len(uneven), -1, 2).sum(axis=2)
     # A path that is straight in an element is straight in its parts: rounding only.
     assert_allclose(whole.guide[0], pairs, atol=1e-12)
