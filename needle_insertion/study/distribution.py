@@ -2,29 +2,57 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from math import isfinite
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from needle_dynamics import FloatArray
 from needle_ros.errors import ParameterError
 import numpy as np
-from scipy.special import gammainc, gammaincinv, ndtr, ndtri
+from scipy import stats
 
-#: Kinds, and the parameters of each.
-KINDS: Final[Mapping[str, tuple[str, ...]]] = {
-    'uniform': ('low', 'high'),
-    'normal': ('mean', 'standard deviation'),
-    'lognormal': ('median', 'standard deviation of the logarithm'),
-    'gamma': ('mean', 'standard deviation'),
+
+class Kind(NamedTuple):
+    """A kind of distribution, with two parameters."""
+
+    parameters: tuple[str, str]
+    valid: Callable[[float, float], bool]
+    rule: str
+    frozen: Callable[[float, float], Any]
+
+
+KINDS: Final = {
+    'uniform': Kind(
+        ('low', 'high'),
+        lambda low, high: low < high,
+        'low < high',
+        lambda low, high: stats.uniform(low, high - low),
+    ),
+    'normal': Kind(
+        ('mean', 'standard deviation'),
+        lambda _mean, deviation: deviation > 0.0,
+        'standard deviation > 0',
+        stats.norm,
+    ),
+    'lognormal': Kind(
+        ('median', 'standard deviation of the logarithm'),
+        lambda median, deviation: min(median, deviation) > 0.0,
+        'standard deviation of the logarithm > 0 and median > 0',
+        lambda median, deviation: stats.lognorm(deviation, scale=median),
+    ),
+    'gamma': Kind(
+        ('mean', 'standard deviation'),
+        # The quantile function is exact in this range.
+        lambda mean, deviation: min(mean, deviation) > 0.0 and 1e-3 < mean / deviation < 1e6,
+        'mean > 0, standard deviation > 0, and their ratio from 0.001 to 1e+06',
+        lambda mean, deviation: stats.gamma(
+            (mean / deviation) ** 2, scale=mean / (mean / deviation) ** 2
+        ),
+    ),
 }
 
 #: Largest valid magnitude of a parameter.
 _LARGEST: Final = 1e100
-
-#: Least and largest mean of a gamma distribution over its standard deviation.
-_FLATTEST, _SHARPEST = 1e-3, 1e6
 
 _WITHIN: Final = 'within'
 _CHOICE: Final = 'choice'
@@ -36,7 +64,7 @@ class Distribution:
 
     #: One of `KINDS`, or ``choice``.
     kind: str
-    #: Parameters as in `KINDS`, or equally probable values.
+    #: Parameters of the kind, or equally probable values.
     numbers: tuple[float, ...]
     #: Low and high end of a truncated distribution.
     within: tuple[float, float] = (-np.inf, np.inf)
@@ -47,9 +75,9 @@ class Distribution:
             number = len(self.numbers)
             at = np.minimum((parts * number).astype(int), number - 1)
             return np.asarray(np.array(self.numbers)[at])
-        low, high = map(self._below, self.within)
-        values = self._at(low + parts * (high - low))
-        return np.asarray(np.clip(values, *self.within))
+        frozen = KINDS[self.kind].frozen(*self.numbers)
+        low, high = frozen.cdf(self.within)
+        return np.asarray(np.clip(frozen.ppf(low + parts * (high - low)), *self.within))
 
     def ends(self, least: float, most: float) -> tuple[float, float]:
         """Return the values at two probabilities; not finite on overflow."""
@@ -59,32 +87,11 @@ class Distribution:
             low, high = self.quantiles(np.array([least, most])).tolist()
         return low, high
 
-    def _at(self, parts: FloatArray) -> FloatArray:
-        first, second = self.numbers
-        match self.kind:
-            case 'uniform':
-                return np.asarray(first + parts * (second - first))
-            case 'normal':
-                return np.asarray(first + second * ndtri(parts))
-            case 'lognormal':
-                return np.asarray(first * np.exp(second * ndtri(parts)))
-        shape = (first / second) ** 2
-        return np.asarray(first / shape * gammaincinv(shape, parts))
-
-    def _below(self, value: float) -> float:
-        """Return the cumulative probability at a value."""
-        first, second = self.numbers
-        if not isfinite(value):
-            return float(value > 0.0)
-        match self.kind:
-            case 'uniform':
-                return float(np.clip((value - first) / (second - first), 0.0, 1.0))
-            case 'normal':
-                return float(ndtr((value - first) / second))
-            case 'lognormal':
-                return float(ndtr(np.log(value / first) / second)) if value > 0.0 else 0.0
-        shape = (first / second) ** 2
-        return float(gammainc(shape, max(0.0, value) * shape / first))
+    @property
+    def is_empty(self) -> bool:
+        """Whether no value is between the ends of the truncation."""
+        low, high = KINDS[self.kind].frozen(*self.numbers).cdf(self.within)
+        return not low < high
 
 
 def distribution(name: str, given: Any) -> Distribution:
@@ -108,36 +115,26 @@ def distribution(name: str, given: Any) -> Distribution:
         if not numbers or _WITHIN in given:
             raise ParameterError(f'{name}: {kind} must have values, and no {_WITHIN}')
         return found
-    wanted = KINDS[kind]
-    if len(numbers) != len(wanted):
-        raise ParameterError(f'{name}: {kind} takes [{", ".join(wanted)}], got {list(numbers)}')
-    first, second = numbers
-    if kind == 'uniform':
-        valid = first < second
-    else:
-        valid = second > 0.0 and (kind == 'normal' or first > 0.0)
-    if valid and kind == 'gamma' and not _FLATTEST < first / second < _SHARPEST:
-        raise ParameterError(
-            f'{name}: gamma must have a mean over standard deviation from {_FLATTEST:g} to '
-            f'{_SHARPEST:g}, got {list(numbers)}'
-        )
-    if not valid:
-        rule = 'low < high' if kind == 'uniform' else f'{wanted[1]} > 0'
-        rule += '' if kind in ('uniform', 'normal') else f' and {wanted[0]} > 0'
-        raise ParameterError(f'{name}: {kind} must have {rule}, got {list(numbers)}')
+    row = KINDS[kind]
+    if len(numbers) != len(row.parameters):
+        takes = ', '.join(row.parameters)
+        raise ParameterError(f'{name}: {kind} takes [{takes}], got {list(numbers)}')
+    if not row.valid(*numbers):
+        raise ParameterError(f'{name}: {kind} must have {row.rule}, got {list(numbers)}')
     if _WITHIN not in given:
         return found
     ends = _numbers(f'{name}: {_WITHIN}', given[_WITHIN])
-    if len(ends) != 2 or ends[0] >= ends[1] or found._below(ends[0]) == found._below(ends[1]):
+    found = Distribution(kind, numbers, (ends[0], ends[-1]) if ends else (0.0, 0.0))
+    if len(ends) != 2 or found.is_empty:
         raise ParameterError(
             f'{name}: {_WITHIN} takes [low, high] with values of the {kind} distribution between '
             f'them, got {list(ends)}'
         )
-    return Distribution(kind, numbers, (ends[0], ends[1]))
+    return found
 
 
 def _kinds() -> str:
-    kinds = [f'{{{kind}: [{", ".join(numbers)}]}}' for kind, numbers in KINDS.items()]
+    kinds = [f'{{{kind}: [{", ".join(row.parameters)}]}}' for kind, row in KINDS.items()]
     return ', '.join([*kinds, f'{{{_CHOICE}: [values]}}'])
 
 

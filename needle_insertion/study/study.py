@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from math import isfinite
 from pathlib import Path
 from typing import Any, Final
@@ -29,8 +30,8 @@ DESIGNS: Final = ('sobol', 'random', 'latin')
 _MOST: Final = 2**30
 _DIMENSIONS: Final = 21201
 
-#: Rounds of the Feistel network.
-_ROUNDS: Final = 8
+#: Largest number of samples of a Latin hypercube: each process holds a permutation per dimension.
+_MOST_LATIN: Final = 2**24
 
 #: Smallest and largest probability at which a quantile is evaluated.
 _INSIDE: Final = 2.0**-54
@@ -85,9 +86,8 @@ class Study:
         ).reshape(count, dimensions)
         if self.design != 'latin':
             return chance
-        numbers = np.arange(first, first + count, dtype=np.uint64)
         strata = [
-            _permuted(numbers, self.samples, (self.seed, dimension))
+            _permutation(self.samples, self.seed, dimension)[first : first + count]
             for dimension in range(dimensions)
         ]
         return np.asarray((np.transpose(strata) + chance) / self.samples).reshape(chance.shape)
@@ -108,31 +108,12 @@ class Study:
         }
 
 
-def _permuted(numbers: NDArray[np.uint64], count: int, key: tuple[int, int]) -> NDArray[np.uint64]:
-    """
-    Return the images of numbers under a permutation of ``range(count)``, without storing it.
-
-    A Feistel network on the least even number of bits; values outside the range pass through the
-    network again until they are inside.
-    """
-    half = np.uint64(max(1, ((count - 1).bit_length() + 1) // 2))
-    low = np.uint64((1 << int(half)) - 1)
-    # Keys of the generators of samples have two numbers, this key has three.
-    words = np.random.SeedSequence(key[0], spawn_key=(key[1], 0, 0)).generate_state(
-        _ROUNDS, np.uint64
-    )
-    found = numbers.copy()
-    outside = np.ones(len(found), dtype=bool)
-    while outside.any():
-        left, right = found[outside] >> half, found[outside] & low
-        for word in words:
-            # The finalizer of SplitMix64: each bit of a number changes half of the bits.
-            mixed = (right + word) * np.uint64(0xBF58476D1CE4E5B9)
-            mixed = (mixed ^ (mixed >> np.uint64(31))) * np.uint64(0x94D049BB133111EB)
-            left, right = right, left ^ ((mixed ^ (mixed >> np.uint64(29))) & low)
-        found[outside] = (left << half) | right
-        outside = found >= count
-    return found
+@lru_cache(maxsize=64)
+def _permutation(count: int, seed: int, dimension: int) -> NDArray[np.int64]:
+    """Return a permutation of ``range(count)``, the strata of a dimension by sample number."""
+    # The generators of samples have two numbers in their key, this generator has three.
+    key = np.random.SeedSequence(seed, spawn_key=(dimension, 0, 0))
+    return np.random.default_rng(key).permutation(count)
 
 
 def read_study(path: Path) -> Study:
@@ -154,6 +135,8 @@ def made(document: Any) -> Study:
     kind = one_of('protocol', document.get('protocol'), PROTOCOLS)
     samples, seed = (_whole(document, key, low) for key, low in (('samples', 1), ('seed', 0)))
     design = one_of('design', document.get('design', DESIGNS[0]), DESIGNS)
+    if design == 'latin' and samples > _MOST_LATIN:
+        raise ParameterError(f'design latin takes at most {_MOST_LATIN} samples, got {samples}')
     settings, given = (mapping(key, document.get(key)) for key in ('settings', 'population'))
     protocol = PROTOCOLS[kind](settings)
     known = protocol.quantities
