@@ -1,5 +1,5 @@
 """
-The contract on the wire: every topic of the suite, what its messages hold, and who publishes it.
+Contract of all topics: type, publisher, QoS, frame, joints, units and stamp.
 
 Lengths are in m, angles in rad, forces in N and torques in N m. Depths, velocities and forces
 along the needle are positive into the tissue. Stamps are sample times.
@@ -13,17 +13,17 @@ from typing import Final, NamedTuple
 
 from needle_ros.wire import JOINT_STATE, POINT, POSE, Template, WRENCH
 
-#: Frames: at rest at the entry point, and parallel to it at the needle base.
+#: Frames: fixed at the entry point; at the needle base, parallel to the first.
 ENTRY: Final = 'needle_entry'
 BASE: Final = 'needle_base'
-#: At the tip, y along the needle.
+#: Frame at the tip, y along the needle.
 TIP: Final = 'needle_tip'
 
-#: The joint along the needle, and that of the base about x.
+#: Joint along the needle, and joint of the base about x.
 INSERTION: Final = 'insertion'
 ROTATION: Final = 'rotation'
 
-#: The joints of a robot that steers: the guide across the needle, its tilt, and the roll.
+#: Joints of a steering robot: lateral position and tilt of the guide, and roll of the needle.
 GUIDE_X: Final = 'guide_x'
 GUIDE_Z: Final = 'guide_z'
 TILT_X: Final = 'guide_tilt_x'
@@ -41,18 +41,17 @@ class Qos(NamedTuple):
     Attributes
     ----------
     name : str
-        What it is called in the documentation.
+        Name in the documentation.
     reliable : bool
         Whether a lost message is sent again.
     latched : bool
-        Whether readers that come late get the messages of before.
+        Whether late-joining subscribers receive the previous messages.
     depth : int
-        Messages kept for a reader that is busy or comes late.
+        Messages kept for a busy or late-joining subscriber.
     lossy : bool
-        Whether our own nodes take what comes: they request best effort from who offers more.
+        Whether the nodes of the suite subscribe with best effort also to a reliable publisher.
     lease : float
-        Time after which a publisher that has died counts as dead [s]; 0 leaves it to DDS, which
-        takes 20 s.
+        Liveliness lease [s]; 0 leaves the detection of a dead publisher to DDS, which takes 20 s.
 
     """
 
@@ -68,38 +67,38 @@ class Stamp(Enum):
     """
     Meaning of the stamp of a message, which decides whether its age matters.
 
-    Every node checks stamps by this: `needle_controller.safety.stream.Stream` those of samples,
-    `needle_ros.status.RequestLog` those of requests.
+    Every node checks stamps by this rule: `needle_controller.safety.stream.Stream` checks samples,
+    `needle_ros.status.RequestLog` checks requests.
     """
 
-    #: Time of a sample, or of the sample that a command answers. It counts for a short time only,
-    #: which is a parameter of the reader (``measurement_timeout``, ``sensor_timeout``,
-    #: ``command_timeout``); a message that is older or out of order is left out.
+    #: Time of a sample, or of the sample that a command answers. Older messages and messages
+    #: out of order are discarded; the limit is a parameter of the subscriber
+    #: (``measurement_timeout``, ``sensor_timeout``, ``command_timeout``).
     SAMPLE = 'sample'
-    #: Time at which the request was sent. It identifies the request and orders it: a duplicate is
-    #: answered but not executed again, one that is older than the request that is followed is not
-    #: executed. It counts for `REQUEST_AGE`. Zero means now.
+    #: Time at which the request was sent. It identifies and orders requests: a duplicate is
+    #: answered but not executed again, and a request older than the current request is not
+    #: executed. It is valid for `REQUEST_AGE`. Zero means now.
     REQUEST = 'request'
-    #: Not checked: the message is a result, or for people.
+    #: Not checked: the message is a result, or information for users.
     UNCHECKED = 'unchecked'
 
 
-#: Age up to which a request counts [s]: three repetitions, a second apart, and a delay of a second
-#: are within it; a request of a recording that is played back is not.
+#: Maximum age of a request [s]. It covers three repetitions at intervals of 1 s and a delay of
+#: 1 s, and excludes requests of a recording that is played back.
 REQUEST_AGE: Final = 5.0
 
 
-#: A reader with default settings gets it; for our nodes a late sample is worth no second try. A
-#: burst after a stall of the reader is not lost.
+#: Compatible with subscribers with default QoS; nodes of the suite do not need retransmission of a
+#: late sample. The depth holds a burst after a stall of the subscriber.
 SENSOR: Final = Qos('reliable or best effort', reliable=True, latched=False, depth=50, lossy=True)
 
-#: Only the newest counts, and it must arrive.
+#: Only the newest message matters, and delivery must be reliable.
 COMMAND: Final = Qos('reliable', reliable=True, latched=False, depth=1)
 
-#: No messages: who publishes it is alive.
+#: No messages: liveliness of a publisher.
 ALIVE: Final = Qos('lease of 0.5 s', reliable=True, latched=False, depth=1, lease=0.5)
 
-#: The last message reaches readers that come late.
+#: The last message reaches late-joining subscribers.
 LATCHED: Final = Qos('latched', reliable=True, latched=True, depth=1)
 
 
@@ -112,9 +111,9 @@ class Joint(NamedTuple):
     name : str
         Name of the joint.
     unit : str
-        Unit of its position; that of its velocity is the same per second.
+        Unit of the position; the unit of the velocity is the same per second.
     effort : str
-        Unit of its effort, '' if the topic has no efforts.
+        Unit of the effort, '' if the topic has no efforts.
 
     """
 
@@ -124,17 +123,7 @@ class Joint(NamedTuple):
 
 
 class Quantity(NamedTuple):
-    """
-    A number of a message.
-
-    Attributes
-    ----------
-    name : str
-        Field, with the joint if there is one: ``force.y``, ``position of insertion``.
-    unit : str
-        SI unit.
-
-    """
+    """A number of a message: name such as ``force.y`` or ``position of insertion``, SI unit."""
 
     name: str
     unit: str
@@ -144,7 +133,7 @@ def _vector(field: str, unit: str, axes: str = 'xyz') -> tuple[Quantity, ...]:
     return tuple(Quantity(f'{field}.{axis}', unit) for axis in axes)
 
 
-#: Numbers of the message types whose numbers are always the same, in their order.
+#: Numbers of the message types with fixed fields, in order.
 _QUANTITIES: Final = {
     WRENCH: _vector('force', 'N') + _vector('torque', 'N m'),
     POINT: _vector('point', 'm'),
@@ -155,7 +144,7 @@ _QUANTITIES: Final = {
 @dataclass(frozen=True, slots=True)
 class Topic:
     """
-    A topic.
+    A topic of the contract.
 
     Attributes
     ----------
@@ -164,17 +153,17 @@ class Topic:
     type_name : str
         Message type.
     publisher : str
-        Who publishes it: nodes, `EVERY_NODE`, or `USER`.
+        Publishing nodes, `EVERY_NODE`, or `USER`.
     meaning : str
-        What its messages hold, for people.
+        Content of the messages, for the documentation.
     qos : Qos
         Quality of service.
     frame : str
-        Frame of the header, '' if it has none.
+        Frame of the header, '' if there is none.
     joints : tuple of Joint
         Joints of a JointState.
     stamp : Stamp
-        Whether the age of its stamp matters.
+        Meaning of the stamp.
 
     """
 
@@ -189,7 +178,7 @@ class Topic:
 
     @property
     def quantities(self) -> tuple[Quantity, ...]:
-        """Numbers of a message, in their order; empty for a type that `wire` does not know."""
+        """Numbers of a message in order; empty for types that `wire` does not parse."""
         if self.type_name != JOINT_STATE:
             return _QUANTITIES.get(self.type_name, ())
         return (
@@ -199,15 +188,7 @@ class Topic:
         )
 
     def template(self) -> Template:
-        """
-        Return the template of its messages.
-
-        Returns
-        -------
-        Template
-            It writes and reads them.
-
-        """
+        """Return a template that writes and reads messages of this topic."""
         efforts = sum(bool(joint.effort) for joint in self.joints)
         return Template(
             self.type_name,
@@ -228,7 +209,7 @@ JOINT_STATES: Final = Topic(
     stamp=Stamp.SAMPLE,
 )
 
-#: The joints beside `insertion` of a needle that is steered.
+#: Joints of a steered needle in addition to `insertion`.
 STEERING_JOINTS: Final = (
     Joint(GUIDE_X, 'm', 'N'), Joint(GUIDE_Z, 'm', 'N'), Joint(TILT_X, 'rad', 'N m'),
     Joint(TILT_Z, 'rad', 'N m'), Joint(ROLL, 'rad', 'N m'),
@@ -236,15 +217,7 @@ STEERING_JOINTS: Final = (
 
 
 def steered_states() -> Topic:
-    """
-    Return `JOINT_STATES` of a needle that is steered.
-
-    Returns
-    -------
-    Topic
-        The topic with `insertion` and the joints of the guide.
-
-    """
+    """Return `JOINT_STATES` of a steered needle: `insertion` and the guide joints."""
     return replace(JOINT_STATES, joints=(JOINT_STATES.joints[0], *STEERING_JOINTS))
 
 
@@ -282,20 +255,9 @@ GROUND_TRUTH: Final = Topic(
 
 def ground_truth(modes: int, *, commanded: bool) -> Topic:
     """
-    Return `GROUND_TRUTH` of a plant.
+    Return `GROUND_TRUTH` with all joints of a plant with a number of shape modes.
 
-    Parameters
-    ----------
-    modes : int
-        Number of shape modes.
-    commanded : bool
-        Whether it has efforts: those of a needle that moves under commands, mode `simulation`.
-
-    Returns
-    -------
-    Topic
-        The topic with all joints.
-
+    `commanded` adds the efforts of mode `simulation`, in which commands move the needle.
     """
     bending = [Joint(f'q{k + 1}', 'm^1.5', 'N m^-0.5') for k in range(modes)]
     joints = (Joint('d', 'm', 'N'), Joint('theta', 'rad', 'N m'), *bending)
@@ -305,20 +267,7 @@ def ground_truth(modes: int, *, commanded: bool) -> Topic:
 
 
 def steered_truth(*, commanded: bool) -> Topic:
-    """
-    Return `GROUND_TRUTH` of a needle that is steered.
-
-    Parameters
-    ----------
-    commanded : bool
-        As for `ground_truth`.
-
-    Returns
-    -------
-    Topic
-        The topic with where the tip is.
-
-    """
+    """Return `GROUND_TRUTH` of a steered needle; `commanded` adds the efforts."""
     joints: tuple[Joint, ...] = (
         Joint('d', 'm', 'N'), Joint('tip_x', 'm', 'N'), Joint('tip_z', 'm', 'N'),
         Joint('tip_roll', 'rad', 'N m'),
@@ -357,7 +306,7 @@ CLOCK: Final = Topic(
     'rosgraph_msgs/msg/Clock',
     'plant',
     'simulated time, with `publish_clock` or `lockstep`',
-    # As rclpy listens to it.
+    # Like the subscription of rclpy.
     qos=SENSOR._replace(depth=1),
 )
 
@@ -367,7 +316,7 @@ EVENTS: Final = Topic(
     'plant',
     'what the plant began to apply beside commands, and the number of the sample from '
     'which it counts: [replay.md](replay.md)',
-    # All of them, also for a reader that comes late.
+    # All events, also for a late-joining subscriber.
     qos=LATCHED._replace(depth=1000),
 )
 
@@ -415,7 +364,7 @@ PROCESSED: Final = Topic(
     'steering',
     'lock-step: stamp of a sample that a node (its name is `frame_id`) has processed, after its '
     'motions; a plant with `lockstep` waits for all nodes that publish it; not recorded',
-    # Of several nodes.
+    # Several nodes publish.
     qos=COMMAND._replace(depth=10),
 )
 
@@ -469,7 +418,7 @@ TIP_POSE: Final = Topic(
     'slicer',
     'where the tip is, y along the needle, 20 Hz; its direction is measured only where '
     '`needle_poses` come',
-    # SlicerROS2 asks for what is reliable.
+    # SlicerROS2 requests reliable QoS.
     qos=COMMAND,
     frame=ENTRY,
 )

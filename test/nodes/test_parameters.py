@@ -62,7 +62,7 @@ def test_text_that_is_a_number_counts_as_one(ros_graph: RosGraph) -> None:
 @pytest.mark.parametrize(
     ('section', 'name', 'status', 'said'),
     [
-        ('/**', 'law', 0, 'parameters for several nodes that this one does not have: law'),
+        ('/**', 'law', 0, 'shared parameters that this node does not declare: law'),
         ('/plant', 'law', 2, "unknown parameter 'law'"),
         ('/**/plant', 'law', 2, "unknown parameter 'law'"),
         ('/plnat', 'rate', 0, 'has no parameters for /plant, only for /plnat'),

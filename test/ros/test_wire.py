@@ -179,7 +179,7 @@ def test_bytes_beyond_the_type_are_invalid() -> None:
     """Up to three bytes are padding."""
     whole = wrench(10**18, 1.0)
     assert Template.of(whole + bytes(3), WRENCH).read(whole + bytes(3)) is not None
-    with pytest.raises(MessageError, match="has 80 bytes, 76 are its type's"):
+    with pytest.raises(MessageError, match='has 80 bytes, 76 expected'):
         Template.of(whole + bytes(4), WRENCH)
 
 
