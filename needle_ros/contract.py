@@ -202,7 +202,7 @@ JOINT_STATES: Final = Topic(
     'joint_states',
     JOINT_STATE,
     'plant',
-    'encoders of the robot: inserted length and rotation; effort: axial force and torque '
+    'encoders of the robot: insertion depth and rotation; effort: axial force and torque '
     'on the needle; steered: `insertion`, `guide_x`, `guide_z` [m], `guide_tilt_x`, '
     '`guide_tilt_z`, `roll` [rad]',
     joints=(Joint(INSERTION, 'm', 'N'), Joint(ROTATION, 'rad', 'N m')),
@@ -225,7 +225,7 @@ BASE_WRENCH: Final = Topic(
     'base_wrench',
     WRENCH,
     'plant',
-    'force sensor, what the base exerts on the needle: `force.y` axial, `force.z` lateral '
+    'force sensor, force of the base on the needle: `force.y` axial, `force.z` lateral '
     '[N], `torque.x` [N m]; mode `indenter`: force of the end-effector on the tissue',
     frame=BASE,
     stamp=Stamp.SAMPLE,
@@ -235,7 +235,7 @@ TIP_DEFLECTION: Final = Topic(
     'tip_deflection',
     POINT,
     'plant',
-    'tracker or imager: `point.y` inserted length, `point.z` deflection of the tip [m]; '
+    'tracker or imager: `point.y` insertion depth, `point.z` deflection of the tip [m]; '
     'steered: `point.x` too',
     frame=ENTRY,
     stamp=Stamp.SAMPLE,
@@ -245,9 +245,9 @@ GROUND_TRUTH: Final = Topic(
     'ground_truth',
     JOINT_STATE,
     'plant',
-    'simulation only: d (length outside the tissue), theta and q1..qn, the whole state; '
+    'simulation only: d (length outside the tissue), theta and q1..qn, the full state; '
     'steered: d, `tip_x`, `tip_z` [m], `tip_roll` [rad]; effort, in mode `simulation`: '
-    'generalized forces that were applied since the sample before',
+    'generalized forces applied since the previous sample',
     joints=(Joint('d', 'm'), Joint('theta', 'rad'), Joint('q1', 'm^1.5'), Joint('q2', 'm^1.5')),
     stamp=Stamp.SAMPLE,
 )
@@ -289,7 +289,7 @@ NEEDLE_SHAPE: Final = Topic(
     'needle_shape',
     'visualization_msgs/msg/Marker',
     'plant',
-    'the needle as a line, and the path that it cut, 30 Hz while there is a subscriber',
+    'the needle as a line, and its cut path, 30 Hz while there is a subscriber',
     frame=ENTRY,
 )
 
@@ -314,8 +314,8 @@ EVENTS: Final = Topic(
     '~/events',
     'diagnostic_msgs/msg/DiagnosticArray',
     'plant',
-    'what the plant began to apply beside commands, and the number of the sample from '
-    'which it counts: [replay.md](replay.md)',
+    'inputs of the plant other than commands (trajectories, disturbances), with the number of '
+    'their first sample: [replay.md](replay.md)',
     # All events, also for a late-joining subscriber.
     qos=LATCHED._replace(depth=1000),
 )
@@ -324,8 +324,8 @@ WRENCH_COMMAND: Final = Topic(
     'wrench_command',
     WRENCH,
     'controller',
-    'force and torque on the needle: `force.y` [N], `torque.x` [N m]; the stamp is that '
-    'of the sample it answers',
+    'force and torque on the needle: `force.y` [N], `torque.x` [N m]; stamp of the answered '
+    'sample',
     qos=COMMAND,
     frame=BASE,
     stamp=Stamp.SAMPLE,
@@ -335,8 +335,8 @@ JOINT_COMMANDS: Final = Topic(
     'joint_commands',
     JOINT_STATE,
     'ros2_control',
-    'from the hardware interface of ros2_control, NaN where nobody commands; mode `simulation`: '
-    'efforts, in the place of `wrench_command`; mode `robot`: positions, or velocities; steered, '
+    'from the hardware interface of ros2_control, NaN without a command; mode `simulation`: '
+    'efforts, in place of `wrench_command`; mode `robot`: positions, or velocities; steered, '
     'in both modes: guide and roll: [howto/ros2-control.md](howto/ros2-control.md)',
     qos=COMMAND,
     joints=(Joint(INSERTION, 'm', 'N'), Joint(ROTATION, 'rad', 'N m')),
@@ -347,7 +347,7 @@ COMMANDER: Final = Topic(
     'wrench_command/alive',
     'std_msgs/msg/Empty',
     'controller',
-    'no messages: its lease tells the others when a controller has died',
+    'no messages: the end of its lease indicates a dead controller',
     qos=ALIVE,
 )
 
@@ -355,15 +355,15 @@ MEASURER: Final = replace(
     COMMANDER,
     name='joint_states/alive',
     publisher='plant',
-    meaning='no messages: its lease tells the others when a plant has died',
+    meaning='no messages: the end of its lease indicates a dead plant',
 )
 
 PROCESSED: Final = Topic(
     'joint_states/_processed',
     'std_msgs/msg/Header',
     'steering',
-    'lock-step: stamp of a sample that a node (its name is `frame_id`) has processed, after its '
-    'motions; a plant with `lockstep` waits for all nodes that publish it; not recorded',
+    'lockstep: stamp of a sample that a node (named in `frame_id`) has processed, after its '
+    'motions; a plant with `lockstep` waits for all publishers; not recorded',
     # Several nodes publish.
     qos=COMMAND._replace(depth=10),
 )
@@ -372,15 +372,15 @@ RECORDED: Final = replace(
     PROCESSED,
     name='joint_states/_recorded',
     publisher='recorder',
-    meaning='stamp of the newest sample that a recorder has, zero at its end; a plant with a '
-    'time of its own is at most 80 samples ahead of it, with `lockstep` 10; not recorded',
+    meaning='stamp of the newest recorded sample, zero at the end of recording; a plant with an '
+    'independent time is at most 80 samples ahead of it, with `lockstep` 10; not recorded',
 )
 
 REFERENCE: Final = Topic(
     'reference',
     JOINT_STATE,
     'controller',
-    'inserted length and velocity that the controller aims at',
+    'insertion depth and velocity of the reference',
     joints=(Joint(INSERTION, 'm'),),
 )
 
@@ -388,7 +388,7 @@ TRACKING_ERROR: Final = Topic(
     'tracking_error',
     JOINT_STATE,
     'controller',
-    'reference less measurement',
+    'reference minus measurement',
     joints=(Joint(INSERTION, 'm'),),
 )
 
@@ -396,7 +396,7 @@ TARGET: Final = Topic(
     'target',
     POINT,
     f'{USER}, slicer',
-    '`point.y`: inserted length to reach [m]; to the node `steering`: where the tip shall be, '
+    '`point.y`: target insertion depth [m]; to the node `steering`: target position of the tip, '
     'x, y, z [m]',
     qos=COMMAND,
     frame=ENTRY,
@@ -407,7 +407,7 @@ TIP_EXPECTED: Final = Topic(
     'tip_expected',
     'geometry_msgs/msg/PoseWithCovarianceStamped',
     'steering',
-    'where the tip will be at the target depth, with covariance, after each look',
+    'predicted tip pose at the target depth, with covariance, after each tip measurement',
     qos=COMMAND,
     frame=ENTRY,
 )
@@ -416,8 +416,8 @@ TIP_POSE: Final = Topic(
     'tip_pose',
     POSE,
     'slicer',
-    'where the tip is, y along the needle, 20 Hz; its direction is measured only where '
-    '`needle_poses` come',
+    'tip pose, y along the needle, 20 Hz; the direction is measured only if `needle_poses` are '
+    'published',
     # SlicerROS2 requests reliable QoS.
     qos=COMMAND,
     frame=ENTRY,
@@ -427,8 +427,8 @@ JOINT_TRAJECTORY: Final = Topic(
     'joint_trajectory',
     'trajectory_msgs/msg/JointTrajectory',
     f'{USER}, steering',
-    'to the controller: `insertion`, positions [m] to follow, and velocities [m/s] or '
-    'none; to a plant in mode `robot`: `insertion`, positions [m], or efforts [N] of a push; '
+    'to the controller: `insertion`, positions [m], and optionally velocities [m/s]; '
+    'to a plant in mode `robot`: `insertion`, positions [m], or efforts [N] of a push; '
     'steered, in both modes: guide and roll [m, rad]; in mode `indenter`: efforts of `x` and '
     '`z` [N]',
     qos=COMMAND,
@@ -439,7 +439,7 @@ ROBOT_DESCRIPTION: Final = Topic(
     'robot_description',
     'std_msgs/msg/String',
     'robot_state_publisher',
-    'URDF of the robot, made of `description/`, with `ros2_control.launch.py`',
+    'URDF of the robot from `description/`, with `ros2_control.launch.py`',
     qos=LATCHED,
 )
 

@@ -52,7 +52,7 @@ def test_an_unknown_word_is_refused(ros_graph: RosGraph) -> None:
     asked = started(ros_graph, 'plant', 'rate:=500')
     said, _ = asked.communicate(timeout=60.0)
     assert asked.returncode == 2
-    assert 'unknown: rate:=500; parameters are given by --ros-args -p NAME:=VALUE' in said
+    assert 'unknown: rate:=500; set parameters with --ros-args -p NAME:=VALUE' in said
 
 
 def test_a_node_says_that_it_runs_and_a_second_ctrl_c_changes_nothing(

@@ -98,7 +98,7 @@ def start(*words: str) -> subprocess.Popen[str]:
         (['params_file:=/no/such.yaml'], 'params_file /no/such.yaml does not exist'),
         (['law:=bang'], 'adaptive'),
         (['rviz:=true'], 'rviz2'),
-        (['steering:=true', 'mode:=indenter'], 'needs a needle that is steered'),
+        (['steering:=true', 'mode:=indenter'], 'needs a steered needle'),
     ],
 )
 def test_launch_refuses_before_a_node_starts(words: list[str], reason: str) -> None:
