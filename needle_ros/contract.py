@@ -159,7 +159,7 @@ class Topic:
     qos : Qos
         Quality of service.
     frame : str
-        Frame of the header, '' if there is none.
+        Frame of the header, '' without a frame.
     joints : tuple of Joint
         Joints of a JointState.
     stamp : Stamp

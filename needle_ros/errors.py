@@ -7,7 +7,7 @@ _LONGEST: Final = 500
 
 
 class NeedleError(Exception):
-    """Base class of all intentional errors; the message is one line for users."""
+    """Base class of all intentional errors, each with a one-line message for users."""
 
     def __str__(self) -> str:
         # The message may quote names from a recording or an external folder.

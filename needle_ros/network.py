@@ -35,7 +35,7 @@ OPEN: Final = ('SUBNET', 'SYSTEM_DEFAULT')
 
 def stay_local(environment: MutableMapping[str, str]) -> None:
     """
-    Restrict an environment to this machine, unless `RANGE` is one of `OPEN`.
+    Restrict an environment to this machine, unless `RANGE` has a value of `OPEN`.
 
     The range OFF, a configured Fast DDS profile, and another middleware are kept.
     """

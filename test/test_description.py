@@ -85,7 +85,7 @@ def pose(urdf: ET.Element, link: str, at: dict[str, float]) -> tuple[FloatArray,
 
 
 @pytest.mark.parametrize(('mode', 'steered'), KINDS)
-def test_urdf_joints_equal_those_of_joint_states(mode: str, steered: bool) -> None:
+def test_urdf_joints_equal_joint_states(mode: str, steered: bool) -> None:
     """A missing joint would break the tree of robot_state_publisher."""
     urdf = described(mode, steered)
     states = steered_states() if steered else JOINT_STATES
@@ -106,7 +106,7 @@ def test_urdf_joints_equal_those_of_joint_states(mode: str, steered: bool) -> No
 
 @pytest.mark.parametrize('preset', NEEDLES)
 @pytest.mark.parametrize(('mode', 'steered'), KINDS)
-def test_urdf_limits_equal_those_of_the_plant(mode: str, steered: bool, preset: str) -> None:
+def test_urdf_limits_equal_plant_limits(mode: str, steered: bool, preset: str) -> None:
     needle = NEEDLES[preset]
     known = STEERING_PRESETS.get(preset)
     free = (known.steering if known else SteeringParameters()).free_length
@@ -149,7 +149,7 @@ def test_urdf_limits_equal_those_of_the_plant(mode: str, steered: bool, preset: 
     }
 
 
-def test_urdf_base_position_equals_that_of_the_model() -> None:
+def test_urdf_base_position_equals_the_model() -> None:
     """At y = s - l, parallel to the entry frame."""
     urdf = described('simulation', False, length=0.25)
     for depth in (0.001, 0.02, 0.2):
@@ -160,7 +160,7 @@ def test_urdf_base_position_equals_that_of_the_model() -> None:
         np.testing.assert_allclose(place, plant.plant.outline().base, atol=1e-15)
 
 
-def test_steered_urdf_base_position_equals_that_of_the_plant() -> None:
+def test_steered_urdf_base_position_equals_the_plant() -> None:
     """The plant linearizes the tilts, the URDF rotates."""
     preset, depth = 'bending_35mm', 0.06
     free = STEERING_PRESETS[preset].steering.free_length

@@ -103,7 +103,7 @@ class Rig:
         point.time_from_start.sec = 0
         point.time_from_start.nanosec = round(1e9 * duration)
         message = JointTrajectory(joint_names=['insertion'], points=[point])
-        self.until(self.course.get_subscription_count, 'who takes it')
+        self.until(self.course.get_subscription_count, 'the subscriber')
         begin = self.depth
         self.course.publish(message)
         self.until(lambda: abs(self.depth - begin) > 1e-4, 'a motion')

@@ -516,7 +516,7 @@ def test_observer_estimates_the_tip(ros_graph: RosGraph) -> None:
     ros_graph.spin_until(lambda: len(tips) > 25, 'tips')
     said = node.diagnose()[2]
     estimate, _, spread = str(said['tip deflection [m]']).split()
-    # The needle oscillates to rest; three standard deviations plus those of the last measurement.
+    # The needle oscillates to rest; three standard deviations, of estimate and last measurement.
     assert abs(float(estimate) - tips[-1].point.z) < 3.0 * (float(spread) + 1e-4) + 5e-4
     assert 'in [' in said['observer consistency (NIS)']
     assert said['observer restarts'] == 0
@@ -587,7 +587,7 @@ def test_limit_violation_latches_a_stop(ros_graph: RosGraph, limit: str) -> None
         bench.tip(0.0)
         bench.measure(0.02)
     ros_graph.spin_until(
-        lambda: not bench.controller._supervisor.safety.guard.violated, 'what is well'
+        lambda: not bench.controller._supervisor.safety.guard.violated, 'values within the limits'
     )
     assert bench.call('clear_stop').success
     assert bench.value('stops latched') == '1'

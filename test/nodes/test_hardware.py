@@ -153,7 +153,7 @@ def test_example_drivers_are_short_and_independent() -> None:
         assert not any(word in ast.unparse(driver) for word in ('needle', 'insertion'))
 
 
-def test_documented_parameters_equal_those_of_the_test() -> None:
+def test_documented_parameters_equal_tested_parameters() -> None:
     page = (ROOT / 'docs/howto/own-robot.md').read_text(encoding='utf-8')
     lines = [
         {name: yaml.safe_load(value) for name, value in re.findall(r'-p (\S+?):=(\S+)', block)}
@@ -415,7 +415,7 @@ def test_zero_command_is_repeated_after_loss_of_measurements(ros_graph: RosGraph
         bench.robot.destroy_timer(timer)
     bench.until(lambda: 'joint_states is stale' in bench.said, 'the watchdog')
     count = len(bench.commands)
-    bench.until(lambda: len(bench.commands) > count + 15, 'more of them')
+    bench.until(lambda: len(bench.commands) > count + 15, 'more commands')
     assert {*bench.values()[-10:]} == {0.0}
 
 
@@ -428,7 +428,7 @@ def test_final_command_is_repeated(ros_graph: RosGraph, which: str) -> None:
     last = bench.values()[-1]
     bench.commands.clear()
     bench.controller.trigger_deactivate()
-    bench.until(lambda: len(bench.commands) >= 6, 'the last ones')
+    bench.until(lambda: len(bench.commands) >= 6, 'the last commands')
     (rest,) = {*bench.values()[-5:]}
     assert rest == (0.0 if which == 'force' else pytest.approx(last, abs=1.0))
     if which == 'force':

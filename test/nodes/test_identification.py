@@ -278,7 +278,7 @@ def test_result_is_applied_to_another_process(ros_graph: RosGraph, bags: list[st
     parameters = asker.create_client(GetParameters, 'plant/get_parameters')
     ros_graph.wait_for(asker, 'plant')
     # The nodes may not be discovered yet.
-    ros_graph.spin_until(lambda: call(ros_graph, 'apply')[0], 'that the plant takes it')
+    ros_graph.spin_until(lambda: call(ros_graph, 'apply')[0], 'the accepted parameter')
     answer = parameters.call_async(GetParameters.Request(names=['model.coulomb_friction']))
     ros_graph.spin_until(answer.done, 'the parameter')
     value = answer.result().values[0].double_value

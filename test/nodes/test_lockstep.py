@@ -108,7 +108,7 @@ def drive(
         graph.spin_until(aims, 'the target')
         if course is not None:
             # For the plant, and for the controller, which ignores it.
-            graph.spin_until(lambda: move.get_subscription_count() >= 2, 'who takes the course')
+            graph.spin_until(lambda: move.get_subscription_count() >= 2, 'the subscribers')
             move.publish(course)
         graph.wait_for(probe, 'plant')
         answer = pause.call_async(SetBool.Request(data=False))

@@ -279,7 +279,7 @@ def environment(source: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     venv.create(folder / 'venv')
     python = folder / 'venv/bin/python'
     places = sysconfig.get_paths(vars={'base': str(folder / 'venv')})
-    # The dependencies of this environment, after those of the fresh one.
+    # The dependencies of this environment, with lower priority than the fresh environment.
     Path(places['purelib'], 'dependencies.pth').write_text(sysconfig.get_paths()['purelib'])
     options = ('--no-index', '--no-deps', '--no-build-isolation', '--ignore-installed')
     pip = (sys.executable, '-m', 'pip', '--python', python)
@@ -309,7 +309,7 @@ def test_sdist_installs_and_runs(environment: Path, ros_graph: RosGraph, tmp_pat
         env=ros_graph.environment,
     ) as node:
         try:
-            ros_graph.spin_until(lambda: probe.count_publishers('recorder/configuration'), 'it')
+            ros_graph.spin_until(lambda: probe.count_publishers('recorder/configuration'), 'node')
             node.send_signal(signal.SIGINT)
             assert node.wait(30.0) == 0
         finally:

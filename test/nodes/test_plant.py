@@ -483,8 +483,8 @@ def test_trajectory_before_activation_starts_with_it(ros_graph: RosGraph) -> Non
         assert course.wait_for_all_acked(Duration(seconds=10))
         for _ in range(10):
             ros_graph.executor.spin_once(timeout_sec=0.02)
-        # Only the newest command applies: the rejection of this one shows that the first was
-        # received.
+        # Only the newest command applies: the rejection of the next command shows that the first
+        # was received.
         course.publish(trajectory(['insertion']))
         ros_graph.spin_until(partial(has_refused_one, plant), 'the refusal')
         (sender,) = (p for p in plant.publishers if p.topic_name.endswith('base_wrench'))
@@ -496,7 +496,7 @@ def test_trajectory_before_activation_starts_with_it(ros_graph: RosGraph) -> Non
     assert runs[0] == runs[1]
 
 
-def test_encoder_resolution_is_one_micrometer(ros_graph: RosGraph) -> None:
+def test_encoder_resolution_of_a_micrometer(ros_graph: RosGraph) -> None:
     """In mode robot the joint position is rounded to the encoder resolution."""
     bench = Bench(ros_graph, mode='robot', depth=0.1, **{'base.encoder_resolution': 1e-4})
     bench.course.publish(trajectory(['insertion'], (0.5, [0.102], [])))

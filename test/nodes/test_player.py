@@ -222,7 +222,7 @@ def test_latched_messages_reach_late_subscribers(ros_graph: RosGraph, tmp_path: 
     assert player.diagnose()[1] == f'at the end of {bag}'
 
 
-def test_qos_equals_that_of_the_recording(ros_graph: RosGraph, tmp_path: Path) -> None:
+def test_qos_equals_the_recorded_qos(ros_graph: RosGraph, tmp_path: Path) -> None:
     """Best effort, reliable or latched."""
     play(ros_graph, small_bag(tmp_path / 'bag'))
     probe = ros_graph.node('probe')

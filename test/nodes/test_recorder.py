@@ -183,7 +183,7 @@ def test_topic_of_an_unknown_type_is_reported_once(
     ros_graph.spin_until(text.get_subscription_count, 'subscription')
     reports = ros_graph.listen(probe, DiagnosticArray, '/diagnostics', 10)
     # The recorder checks the graph ten times a second.
-    ros_graph.spin_until(lambda: len(reports) >= 2, 'a few more looks')
+    ros_graph.spin_until(lambda: len(reports) >= 2, 'a few more checks')
     assert set(node.diagnose()[2]) == {'messages', 'bytes', '/text'}
     assert goals.get_subscription_count() == 0
     [said] = [log.msg for log in logs if 'left out' in log.msg]
@@ -382,7 +382,7 @@ def test_ctrl_c_completes_the_bag(ros_graph: RosGraph, tmp_path: Path) -> None:
     publish(ros_graph, probe, 50)
     counted = KeyValue(key='/text', value='50')
     ros_graph.spin_until(
-        lambda: any(counted in status.values for r in reports for status in r.status), 'all of it'
+        lambda: any(counted in status.values for r in reports for status in r.status), 'messages'
     )
     process.interrupt()
     assert (tmp_path / 'bag' / 'metadata.yaml').exists()

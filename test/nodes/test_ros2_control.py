@@ -119,7 +119,7 @@ class Driver:
     def further(self, seconds: float) -> None:
         """Spin for a duration in real time."""
         end = self.node.get_clock().now().nanoseconds + seconds * 1e9
-        self.until(lambda: self.node.get_clock().now().nanoseconds > end, 'that time')
+        self.until(lambda: self.node.get_clock().now().nanoseconds > end, 'the duration')
 
 
 class Trajectory:

@@ -123,7 +123,7 @@ def seen_in_graph(folder: Path, name: str, tries: int = 3) -> Profile:
     with RosGraph(folder) as graph:
         node = graph.add(node_class(name), parameters=filled(SETTINGS[name][0], folder))
         try:
-            graph.spin_until(partial(is_seen, node), 'all that it has made', timeout=20.0)
+            graph.spin_until(partial(is_seen, node), 'all entities', timeout=20.0)
             return used(node)
         except GraphError:
             if tries == 1:

@@ -105,7 +105,7 @@ class Bench:
                 self.graph.executor.spin_once(timeout_sec=PERIOD * 1e-9)
             if len(self.states) == seen:
                 return
-        pytest.fail('samples come all the time')
+        pytest.fail('samples do not stop')
 
 
 def test_command_has_one_period_of_delay(ros_graph: RosGraph) -> None:
@@ -149,7 +149,7 @@ def test_pause_stops_time_and_steps_take_single_samples(ros_graph: RosGraph) -> 
     first = bench.further(20)[0]
     assert stamp_ns(first) == before + 4 * PERIOD
     last = bench.states[-1].header.stamp
-    bench.until(lambda: any(message.clock == last for message in clocks), 'its time')
+    bench.until(lambda: any(message.clock == last for message in clocks), 'simulated time')
 
 
 def test_start_in_pause(ros_graph: RosGraph) -> None:
@@ -253,7 +253,7 @@ def test_stale_and_wrong_frame_commands_are_discarded(ros_graph: RosGraph) -> No
 
 
 def test_overloaded_plant_accepts_commands(ros_graph: RosGraph) -> None:
-    """It drops samples instead of publishing stale ones, which could not be answered in time."""
+    """It drops samples instead of publishing stale samples, which have a command timeout."""
     # 10^7 steps per second exceed any machine. On a busy machine, an answer may take longer than
     # 0.1 s.
     bench = Bench(ros_graph, rate=1000.0, step=1e-7, command_timeout=2.0)
@@ -261,7 +261,7 @@ def test_overloaded_plant_accepts_commands(ros_graph: RosGraph) -> None:
     bench.force = 8.0
     bench.until(lambda: bench.states[-1].position[0] > 0.03, 'motion')
     given_up = bench.counts('samples given up')
-    bench.until(lambda: bench.counts('samples given up') > given_up, 'more of it')
+    bench.until(lambda: bench.counts('samples given up') > given_up, 'more samples')
 
 
 def test_backlog_is_limited_by_the_command_timeout(ros_graph: RosGraph) -> None:
@@ -287,7 +287,7 @@ def test_duplicate_commanders_apply_no_force(ros_graph: RosGraph) -> None:
     bench.until(lambda: bench.states[-1].velocity[0] > 0.0, 'motion')
 
 
-def test_needle_shape_equals_that_of_the_model(ros_graph: RosGraph) -> None:
+def test_needle_shape_equals_the_model_shape(ros_graph: RosGraph) -> None:
     """The line from the base through the entry point to the tip; the poses are on it."""
     bench = Bench(ros_graph, depth=0.1, tip_deflection=0.005, **{'model.tissue_damping': 0.0})
     shapes = ros_graph.listen(bench.probe, Marker, 'needle_shape', SENSOR)

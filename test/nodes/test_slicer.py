@@ -118,7 +118,7 @@ def test_target_is_received_and_needle_is_sent(room: Room) -> None:
     # Messages have 24 bits: 6e-8 of 0.1 m, in three coordinates.
     np.testing.assert_allclose((at.x, at.y, at.z), TARGET, atol=1e-7)
 
-    # A window of 2 s; a busy machine may need another one.
+    # A window of 2 s; a busy machine may need another window.
     room.until(lambda: shapes_at_20_hz(peer, 40), '40 shapes at 20 Hz')
     room.until(lambda: poses.message and tips.message, 'the poses')
     there = [(p.position.x, p.position.y, p.position.z) for p in poses.message.poses]
@@ -247,7 +247,7 @@ def test_invalid_needle_poses_are_rejected(room: Room) -> None:
     room.until(lambda: node.diagnose()[1].endswith(f'shape: {MEASURED}'), 'the shape')
 
 
-def test_target_flood_is_one_line_and_the_newest_is_used(
+def test_target_flood_is_reported_once_and_the_newest_is_used(
     room: Room, capfd: pytest.CaptureFixture[str]
 ) -> None:
     """Also for invalid targets: at most one line a second, and shapes continue."""
@@ -271,7 +271,7 @@ def test_target_flood_is_one_line_and_the_newest_is_used(
 
         room.until(send, 'the flood')
         room.until(
-            lambda: room.targets and abs(room.targets[-1].point.y - 0.1) < 1e-6, 'the last one'
+            lambda: room.targets and abs(room.targets[-1].point.y - 0.1) < 1e-6, 'the last target'
         )
     # Fewer than sent; superseded targets of the same moment are dropped.
     assert node.diagnose()[2]['targets passed on'] < 1000
@@ -286,7 +286,7 @@ def test_port_in_use_is_reported_and_retried(room: Room) -> None:
     """On /diagnostics; the node listens as soon as the port is free."""
     with closing(socket.create_server(('127.0.0.1', room.port))):
         room.slicer()
-        room.until(lambda: 'the port is in use' in room.state(), 'the complaint')
+        room.until(lambda: 'the port is in use' in room.state(), 'the error')
         levels = [s.level for a in room.states for s in a.status if 'in use' in s.message]
         assert DiagnosticStatus.ERROR in levels
     room.until(lambda: room.state().startswith('waits for a peer'), 'the port')

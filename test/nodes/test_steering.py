@@ -106,7 +106,7 @@ class Bench:
 
     def aim(self, point: tuple[float, float, float] = TARGET) -> None:
         """Send a target when the sensors are available, and wait for the answer."""
-        self.until(lambda: self.target.get_subscription_count() >= self.takers, 'who takes it')
+        self.until(lambda: self.target.get_subscription_count() >= self.takers, 'the subscriber')
         self.until(
             lambda: all(
                 ' 0 taken' not in self.taken(topic) for topic in ('joint_states', 'tip_deflection')
@@ -145,7 +145,7 @@ def test_tip_reaches_its_target(ros_graph: RosGraph) -> None:
     # Remaining uncertainty of tissue and tilt after six measurements; a fixed guide misses by 2
     # mm.
     assert np.hypot(*(bench.tip - np.array(TARGET)[[0, 2]])) < 5e-4
-    bench.until(lambda: len(bench.expected) == 6, 'what it says')
+    bench.until(lambda: len(bench.expected) == 6, 'the predicted tip poses')
     last = bench.expected[-1]
     assert last.header.frame_id == 'needle_entry'
     assert last.pose.pose.position.y == TARGET[1]
@@ -264,7 +264,7 @@ def test_frozen_sensor_stops_the_insertion(ros_graph: RosGraph) -> None:
 
 @pytest.mark.parametrize('how', ['service', 'deactivated'])
 def test_stop_service_during_a_step(ros_graph: RosGraph, how: str) -> None:
-    """Needle and guide come to rest."""
+    """Needle and guide stop."""
     bench = Bench(ros_graph, speed=0.01)
     bench.aim()
     bench.until(lambda: 0.012 < bench.at('insertion') < 0.019, 'the second step')

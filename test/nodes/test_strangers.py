@@ -28,7 +28,7 @@ def test_second_commander_does_not_move_the_needle(
 
 @pytest.mark.parametrize('ahead', [0.0, 0.09])
 def test_second_robot_does_not_move_the_needle(ros_graph: RosGraph, ahead: float) -> None:
-    """Its measurements are discarded; its stamps do not make those of the first late."""
+    """Its measurements are discarded; its stamps do not make measurements of the first late."""
     bystander = Bystander(ros_graph)
     word = '2 nodes publish joint_states'
     found, moved = bystander.endures(LIAR, ahead, 30.0, word=word)

@@ -53,7 +53,7 @@ def test_job_of_a_killed_worker_is_repeated(tmp_path: Path, delay: float) -> Non
 
 
 def test_job_that_always_kills_its_worker_fails() -> None:
-    """The error is one line; other jobs are not affected."""
+    """The job fails with a one-line error; other jobs are not affected."""
     with processes(2) as pool:
         lost, other = pool.submit(die), pool.submit(abs, -3)
         with pytest.raises(

@@ -61,7 +61,7 @@ def second(template: Template) -> list[int]:
 
 @settings(max_examples=150, deadline=None)
 @given(MESSAGES)
-def test_batch_values_equal_those_of_rosbags(
+def test_batch_values_equal_rosbags_values(
     drawn: list[tuple[int, list[str], list[float], list[float], bool]],
 ) -> None:
     """Both byte orders, any names and array lengths."""
