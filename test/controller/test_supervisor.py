@@ -364,7 +364,7 @@ def test_nothing_is_said_twice_in_a_second() -> None:
     said = [line for _, line in journal.take()]
     # What was left out is counted in the next line of its kind.
     assert said == [
-        *('line 0', 'line 2 (1 similar omitted)', 'line 4 (1 similar lines omitted)'),
+        *('line 0', 'line 2 (1 similar omitted)', 'line 4 (1 similar omitted)'),
         *('another', 'always'),
     ]
     assert not journal.changed

@@ -220,7 +220,7 @@ def test_duplicate_commanders_move_nothing(ros_graph: RosGraph, tmp_path: Path) 
     driver.until(lambda: driver.state['insertion', 'velocity'] > 1e-3, 'the push')
     for kind, topic in ((WrenchStamped, 'wrench_command'), (JointState, 'joint_commands')):
         rival = driver.node.create_publisher(kind, topic, COMMAND)
-        driver.until(lambda: driver.complaint == '2 nodes command', 'the word of it')
+        driver.until(lambda: driver.complaint == '2 nodes command', 'the report')
         driver.until(lambda: driver.state['insertion', 'velocity'] == 0.0, 'rest')
         before = driver.at()
         driver.further(0.3)
@@ -288,7 +288,7 @@ def test_duplicate_position_commanders_are_not_followed(
 ) -> None:
     driver = Driver(ros_graph, tmp_path, CARRIED, mode='robot', depth=0.03)
     rival = driver.node.create_publisher(JointState, 'joint_commands', COMMAND)
-    driver.until(lambda: driver.complaint == '2 nodes command', 'the word of it')
+    driver.until(lambda: driver.complaint == '2 nodes command', 'the report')
     driver.set['insertion', 'position'] = 0.031
     driver.further(0.5)
     assert driver.at() == pytest.approx(0.03, abs=1e-6)

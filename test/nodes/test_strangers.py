@@ -21,7 +21,7 @@ def test_second_commander_does_not_move_the_needle(
     assert found > 0
     # 14 N would move the needle by 2 mm in 48 ms.
     assert moved < 1e-3
-    bystander.until(lambda: bystander.was_told('2 nodes command'), 'the word of it')
+    bystander.until(lambda: bystander.was_told('2 nodes command'), 'the report')
     bystander.goes_to(NEXT)
     assert bystander.stops == {'0'}
 
@@ -34,7 +34,7 @@ def test_second_robot_does_not_move_the_needle(ros_graph: RosGraph, ahead: float
     found, moved = bystander.endures(LIAR, ahead, 30.0, word=word)
     assert found > 0
     assert moved < 1e-3
-    bystander.until(lambda: bystander.was_told(word), 'the word of it')
+    bystander.until(lambda: bystander.was_told(word), 'the report')
     bystander.goes_to(NEXT)
     assert bystander.stops == {'0'}
 
