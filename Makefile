@@ -1,4 +1,4 @@
-# From a clone to a result: `make demo`, `make test`. Everything lives in .venv.
+# First run of a clone: `make demo`, `make test`. All dependencies are installed in .venv.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
@@ -18,7 +18,7 @@ check: $(VENV)/.dev
 	$(BIN)/mypy
 	$(BIN)/python -m tools.language
 
-# The site, without the network; what Sphinx warns of is an error.
+# Documentation site, without network access; Sphinx warnings are errors.
 docs: $(VENV)/.docs
 	$(BIN)/python -m sphinx -q -W --keep-going -b html docs docs/_build/html
 	@echo 'docs/_build/html/index.html'
@@ -29,18 +29,18 @@ format: $(VENV)/.dev
 
 setup: compiled
 
-# Machine code for this processor: a second if it is there already.
+# Machine code for this processor; 1 s if it exists.
 compiled: $(VENV)/.complete
 	$(BIN)/needle compile
 
-# The marker is written last: an interrupted set-up starts anew.
+# The marker is written last: an interrupted setup restarts.
 $(VENV)/.complete: requirements.lock setup.py package.xml
 	$(PYTHON) -m venv --clear $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements.lock
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
 	touch $@
 
-# What tests and checks need besides.
+# Additional dependencies of tests and checks.
 $(VENV)/.dev: requirements-dev.lock $(VENV)/.complete
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements-dev.lock
 	touch $@
@@ -49,7 +49,7 @@ $(VENV)/.docs: requirements-docs.lock $(VENV)/.complete
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements-docs.lock
 	touch $@
 
-# Pins for every supported Python at once; run after a change of dependencies in setup.py.
+# Pins for all supported Python versions; run after a change of dependencies in setup.py.
 lock:
 	uv pip compile --quiet --universal --python-version 3.10 --no-annotate --no-header \
 		--extra ros setup.py requirements-build.in -o requirements.lock
@@ -59,14 +59,14 @@ lock:
 	uv pip compile --quiet --universal --python-version 3.10 --no-annotate --no-header \
 		--extra docs --constraints requirements-dev.lock setup.py -o requirements-docs.lock
 
-# The shipped recordings, made anew through real nodes.
+# Regenerate the shipped recordings with the nodes.
 bags: setup
 	rm -rf bags/friction_* bags/stiffness_*
 	$(BIN)/needle experiment friction --rate 100 --speed 20 bags
 	$(BIN)/needle experiment stiffness --rate 40 --speed 40 bags
 	cd bags && sha256sum friction_*/* stiffness_*/* > SHA256SUMS
 
-# What the shipped recordings give.
+# Results of the shipped recordings.
 results: setup
 	set -e; { printf '# Tables 1 and 2 from the shipped recordings\n\n'; \
 	printf 'This page is generated. Do not edit it, but run `make results` again.\n\n'; \
@@ -75,7 +75,7 @@ results: setup
 	printf '\n```bash\nneedle reproduce %s\n```\n\n```text\n' $$table; $(BIN)/needle reproduce $$table; printf '```\n'; \
 	done; } > docs/results/tables.md
 
-# The figures of docs/benchmarks.md, on a machine that does nothing else. A missed bar does not end it.
+# Numbers of docs/benchmarks.md, on an otherwise idle machine. A missed bar does not stop the run.
 bench: $(VENV)/.bench
 	status=0; for name in control laws dynamics steering-model steering-fit steering safety identification 'graph --full' slicer study pool calibration; do \
 	$(BIN)/needle bench $$name -o docs/results/$${name%% *}.md || status=1; \

@@ -1,4 +1,4 @@
-"""Package needle_insertion for pip and for ament; package.xml holds name and version."""
+"""Package needle_insertion for pip and ament; package.xml holds name and version."""
 
 from pathlib import Path
 import runpy
@@ -6,14 +6,14 @@ import xml.etree.ElementTree as ET
 
 from setuptools import find_packages, setup
 
-# colcon --symlink-install runs a link to this file, in a folder without README.md.
+# colcon --symlink-install runs this file through a link, in a folder without README.md.
 ROOT = Path(__file__).resolve().parent
 MANIFEST = ET.parse(ROOT / 'package.xml').getroot()  # noqa: S314
 NAME = MANIFEST.findtext('name')
 NODES = runpy.run_path(str(ROOT / 'needle_insertion/nodes.py'))['NODES']
-#: What the node `slicer` speaks OpenIGTLink with.
+#: OpenIGTLink library of the node `slicer`.
 SLICER = ['pyigtl>=0.3.4']
-#: What `needle study` writes, what its `--scheduler` is, and environments for learning.
+#: Output format of `needle study`, its `--scheduler`, and learning environments.
 STUDY = ['pyarrow>=15']
 DASK = [*STUDY, 'distributed>=2024.5']
 GYM = ['gymnasium>=1.1']
@@ -33,7 +33,7 @@ TEST = [
 
 
 def files(folder: str, pattern: str) -> list[str]:
-    """List files below a folder as paths from here, as setuptools wants them."""
+    """List files below a folder as relative paths for setuptools."""
     return [str(path.relative_to(ROOT)) for path in sorted((ROOT / folder).glob(pattern))]
 
 
@@ -63,7 +63,7 @@ setup(
         (f'share/{NAME}/description', files('description', '*.*')),
         (f'share/{NAME}/description/meshes', files('description/meshes', '*.stl')),
         (f'share/{NAME}/launch', files('launch', '*.launch.py')),
-        # ros2 run looks here; pip puts the same nodes on PATH as needle-<name>.
+        # Folder of ros2 run; pip installs the same nodes on PATH as needle-<name>.
         (f'lib/{NAME}', [f'scripts/{node}' for node in NODES]),
     ],
     install_requires=[
@@ -92,7 +92,7 @@ setup(
             'ros-jazzy-rmw-fastrtps-cpp>=8.4',
         ],
         'slicer': SLICER,
-        # The name by which colcon test knows pytest.
+        # Name of the extra that colcon test expects for pytest.
         'test': TEST,
         'dev': [
             *TEST,
@@ -101,12 +101,12 @@ setup(
             'pytest-xdist>=3.5',
             'ruff>=0.9',
         ],
-        # `make docs`; locked apart from the rest, in requirements-docs.lock.
+        # `make docs`; locked separately in requirements-docs.lock.
         'docs': ['furo>=2024.8', 'myst-parser>=4.0', 'numpydoc>=1.8', 'sphinx>=8.1,<9'],
         'study': STUDY,
         'dask': DASK,
         'gym': GYM,
-        # What `needle bench` is measured beside.
+        # Reference tools of `needle bench`.
         'bench': [
             'mcap-ros2-support>=0.5.6',
             'mujoco>=3.2',

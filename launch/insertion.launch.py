@@ -1,4 +1,4 @@
-"""Plant and controller, and optionally what aims the tip, a recorder and RViz."""
+"""Launch plant and controller, and optionally steering, a recorder and RViz."""
 
 import os
 from pathlib import Path
@@ -19,12 +19,12 @@ from launch_ros.actions import Node
 from needle_ros.network import LOCAL, RANGE, stay_local
 import yaml
 
-#: Default, meaning and values of each argument; an empty one leaves the value of the parameter
-#: file. Without a list of values all are allowed.
+#: Default, description and valid values of each argument. An empty argument keeps the value of the
+#: parameter file; an empty list allows any value.
 ARGUMENTS = {
     'params_file': (
         '',
-        'ROS parameter file; empty: the one for it in config/ of this package',
+        'ROS parameter file; empty: insertion.yaml or steering.yaml in config/ of this package',
         [],
     ),
     'mode': (
@@ -39,18 +39,18 @@ ARGUMENTS = {
     ),
     'steered': (
         '',
-        'the needle bends, cuts its own path, and has a guide that moves',
+        'the needle bends and cuts a curved path, and the guide moves',
         ['', 'true', 'false'],
     ),
     'steering': (
         'false',
-        'the node steering aims the tip: needle steered, target for that node',
+        'the node steering guides the tip to the target; implies steered',
         ['true', 'false'],
     ),
     'law': ('', 'law of the controller', ['', 'adaptive', 'inverse_dynamics', 'pid']),
     'lockstep': (
         '',
-        'each sample waits for the command that answers the sample before, and for steering',
+        'each sample waits for the command, and for steering, of the previous sample',
         ['', 'true', 'false'],
     ),
     'real_time_factor': ('', 'simulated seconds per second; 0: as fast as possible', []),
@@ -64,12 +64,12 @@ ARGUMENTS = {
     'rviz': ('false', 'show the needle in RViz, which must be installed', ['true', 'false']),
     'discovery': (
         '',
-        'SUBNET lets other machines in; empty: ROS_AUTOMATIC_DISCOVERY_RANGE or LOCALHOST',
+        'SUBNET includes other machines; empty: ROS_AUTOMATIC_DISCOVERY_RANGE or LOCALHOST',
         ['', 'LOCALHOST', 'SUBNET', 'OFF', 'SYSTEM_DEFAULT'],
     ),
 }
 
-#: Parameters that arguments set, by node.
+#: Parameters set by launch arguments, by node.
 PARAMETERS = {
     'plant': {
         'mode': 'mode',
@@ -85,17 +85,17 @@ PARAMETERS = {
 
 
 def ended(event: ProcessExited, context: LaunchContext) -> Action | None:
-    """End the others with a node; a node that failed makes launch fail."""
+    """End all nodes with the first node; a failed node makes launch fail."""
     if context.is_shutdown:
         return None
     reason = f'{event.process_name} has ended with exit code {event.returncode}'
     if event.returncode:
-        raise RuntimeError(f'{reason}; its log says why. All nodes are ended')
+        raise RuntimeError(f'{reason}; see its log. All nodes are stopped')
     return Shutdown(reason=reason)
 
 
 def share(package: str, why: str) -> Path:
-    """Return the share of a package, or say that it is needed."""
+    """Return the share directory of a package; the error names the option that needs it."""
     try:
         return Path(get_package_share_directory(package))
     except PackageNotFoundError:
@@ -103,8 +103,8 @@ def share(package: str, why: str) -> Path:
 
 
 def start(context: LaunchContext) -> list[Action]:
-    """Return what the arguments ask for, or refuse it before any node has started."""
-    # A terminal that is closed ends launch; the nodes shall end with it.
+    """Return the actions for the launch arguments; reject invalid arguments before any start."""
+    # Closing the terminal ends launch and must end the nodes too.
     signal.signal(signal.SIGHUP, lambda *_: os.kill(os.getpid(), signal.SIGINT))
     given = {name: LaunchConfiguration(name).perform(context) for name in ARGUMENTS}
     config = share('needle_insertion', 'this launch file') / 'config'
@@ -114,7 +114,7 @@ def start(context: LaunchContext) -> list[Action]:
     if not file.is_file():
         raise RuntimeError(f'params_file {file} does not exist')
     values = {
-        # Typed as in a parameter file.
+        # Types as in a parameter file.
         node: {key: yaml.safe_load(given[name]) for name, key in table.items() if given[name]}
         for node, table in PARAMETERS.items()
     }
@@ -123,7 +123,7 @@ def start(context: LaunchContext) -> list[Action]:
         names.append('controller')
     if steering:
         if given['mode'] == 'indenter' or given['steered'] == 'false':
-            raise RuntimeError('steering:=true needs a needle that is steered')
+            raise RuntimeError('steering:=true needs a steered needle')
         names.append('steering')
         values['plant'].setdefault('steered', True)
         values['controller']['steered'] = True
@@ -137,7 +137,7 @@ def start(context: LaunchContext) -> list[Action]:
     common = {
         'namespace': given['namespace'],
         'on_exit': ended,
-        # On SIGTERM launch leaves its nodes behind.
+        # On SIGTERM, launch leaves its nodes running.
         'additional_env': {'NEEDLE_END_WITH_PARENT': '1'},
     }
     nodes = [
@@ -153,7 +153,7 @@ def start(context: LaunchContext) -> list[Action]:
         share('rviz2', 'rviz:=true')
         layout = str(config / 'insertion.rviz')
         nodes.append(Node(package='rviz2', executable='rviz2', arguments=['-d', layout], **common))
-    # What is open is said: by the argument, or by the environment.
+    # The argument or the environment selects the discovery range.
     environment = {**os.environ, **({RANGE: given['discovery']} if given['discovery'] else {})}
     stay_local(environment)
     variables = [

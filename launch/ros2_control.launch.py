@@ -1,4 +1,4 @@
-"""The plant as hardware of ros2_control, with its stock controllers and robot_state_publisher."""
+"""Launch the plant as ros2_control hardware, with stock controllers and robot_state_publisher."""
 
 import os
 
@@ -17,7 +17,7 @@ from launch_ros.parameter_descriptions import ParameterValue
 from needle_dynamics.steering.parameters import NEEDLES, STEERING_PRESETS, SteeringParameters
 from needle_ros.network import LOCAL, RANGE, stay_local
 
-#: Default, meaning and values of each argument; without a list of values all are allowed.
+#: Default, description and valid values of each argument; an empty list allows any value.
 ARGUMENTS = {
     'mode': (
         'robot',
@@ -26,20 +26,20 @@ ARGUMENTS = {
     ),
     'steered': (
         'false',
-        'the needle bends, cuts its own path, and has a guide that moves',
+        'the needle bends and cuts a curved path, and the guide moves',
         ['true', 'false'],
     ),
-    'preset': ('phantom', 'constants of needle and tissue', [*NEEDLES]),
-    'depth': ('0.02', 'inserted length at the start [m]', []),
+    'preset': ('phantom', 'preset of needle and tissue parameters', [*NEEDLES]),
+    'depth': ('0.02', 'initial insertion depth [m]', []),
     'namespace': ('', 'namespace of all nodes', []),
     'discovery': (
         '',
-        'SUBNET lets other machines in; empty: ROS_AUTOMATIC_DISCOVERY_RANGE or LOCALHOST',
+        'SUBNET includes other machines; empty: ROS_AUTOMATIC_DISCOVERY_RANGE or LOCALHOST',
         ['', 'LOCALHOST', 'SUBNET', 'OFF', 'SYSTEM_DEFAULT'],
     ),
 }
 
-#: Packages of a ROS machine that no wheel has.
+#: Packages of a ROS installation that are not available as wheels.
 NEEDED = (
     'controller_manager',
     'effort_controllers',
@@ -52,7 +52,7 @@ NEEDED = (
 
 
 def installed(package: str) -> bool:
-    """Tell whether a package is installed."""
+    """Return whether a package is installed."""
     try:
         get_package_share_path(package)
     except PackageNotFoundError:
@@ -61,7 +61,7 @@ def installed(package: str) -> bool:
 
 
 def spawned(mode: str, *, steered: bool) -> tuple[list[str], list[str]]:
-    """Return the controllers of config/ros2_control.yaml to activate, and those to have ready."""
+    """Return the controllers of config/ros2_control.yaml: active, and loaded but inactive."""
     active, ready = ['insertion_position'], []
     if mode == 'simulation':
         active, ready = ['insertion_effort'], ['force']
@@ -69,7 +69,7 @@ def spawned(mode: str, *, steered: bool) -> tuple[list[str], list[str]]:
 
 
 def start(context: LaunchContext) -> list[Action]:
-    """Return what the arguments ask for, or refuse it before any node has started."""
+    """Return the actions for the launch arguments; reject invalid arguments before any start."""
     given = {name: LaunchConfiguration(name).perform(context) for name in ARGUMENTS}
     lacking = [name for name in NEEDED if not installed(name)]
     if lacking:
@@ -105,7 +105,7 @@ def start(context: LaunchContext) -> list[Action]:
             additional_env={'NEEDLE_END_WITH_PARENT': '1'},
             **common,
         ),
-        # It tells the controller manager, too, what the robot is.
+        # The controller manager reads the robot description from this node, too.
         Node(
             package='robot_state_publisher',
             executable='robot_state_publisher',
@@ -120,7 +120,7 @@ def start(context: LaunchContext) -> list[Action]:
         ),
     ]
     active, ready = spawned(mode, steered=steered)
-    # No joint_state_broadcaster: the plant itself publishes joint_states.
+    # No joint_state_broadcaster: the plant publishes joint_states.
     for names, options in ((active, []), (ready, ['--inactive'])):
         if names:
             nodes.append(
@@ -131,7 +131,7 @@ def start(context: LaunchContext) -> list[Action]:
                     namespace=given['namespace'],
                 )
             )
-    # What is open is said: by the argument, or by the environment.
+    # The argument or the environment selects the discovery range.
     environment = {**os.environ, **({RANGE: given['discovery']} if given['discovery'] else {})}
     stay_local(environment)
     variables = [
@@ -141,7 +141,7 @@ def start(context: LaunchContext) -> list[Action]:
 
 
 def generate_launch_description() -> LaunchDescription:
-    """Return the plant, the controller manager and what describes the robot."""
+    """Return the plant, the controller manager and the robot_state_publisher."""
     return LaunchDescription(
         [
             *(

@@ -1,4 +1,4 @@
-"""An insertion whose tip is aimed: `insertion.launch.py` with the node `steering`."""
+"""Launch a steered insertion: `insertion.launch.py` with the node `steering`."""
 
 from pathlib import Path
 
@@ -8,7 +8,7 @@ from launch.launch_description_sources import PythonLaunchDescriptionSource
 
 
 def generate_launch_description() -> LaunchDescription:
-    """Return the nodes of an insertion that is steered; arguments are those of the other file."""
+    """Include `insertion.launch.py` with steering; the arguments are the same."""
     here = Path(__file__).resolve().parent
     return LaunchDescription(
         [

@@ -1,1 +1,1 @@
-"""What every node shares: the contract on the wire, settings, time and the common node."""
+"""Common base of all nodes: topic contract, CDR messages, settings, time, node base class."""

@@ -1,9 +1,9 @@
 """
-What all nodes share: lifecycle, topics of the contract, parameters from dataclasses, diagnostics.
+Base class of all nodes: life cycle, contract topics, parameters, diagnostics.
 
-The parameters of a node are the fields of frozen dataclasses. `constant` gives each a unit, a
-meaning and a range, and the dataclass checks them when it is made. So an invalid parameter file
-ends in a refused `configure` with one line that names the parameter.
+The parameters of a node are the fields of frozen dataclasses. `constant` gives each field a unit,
+a description and a range, and the constructor of the dataclass checks them. An invalid parameter
+file therefore fails the `configure` transition, with a one-line error that names the parameter.
 """
 
 from __future__ import annotations
@@ -41,22 +41,7 @@ import yaml
 
 
 def profile(qos: Qos, *, request: bool = False) -> QoSProfile:
-    """
-    Return a quality of service of the contract as rclpy takes it.
-
-    Parameters
-    ----------
-    qos : Qos
-        Quality of service.
-    request : bool
-        Whether it is for a reader; else for who publishes.
-
-    Returns
-    -------
-    QoSProfile
-        The profile.
-
-    """
+    """Convert a contract QoS to rclpy; `request` selects the profile of a subscription."""
     reliable, latched = qos.reliable and not (request and qos.lossy), qos.latched
     lease = {'liveliness_lease_duration': Duration(seconds=qos.lease)} if qos.lease else {}
     return QoSProfile(
@@ -70,28 +55,13 @@ def profile(qos: Qos, *, request: bool = False) -> QoSProfile:
 
 def message_class(*type_names: str) -> Any:
     """
-    Import the class of the messages of a topic.
+    Import the class of the only message type of a topic, such as ``sensor_msgs/msg/JointState``.
 
-    rosidl_runtime_py does the same, but is not in the wheels.
-
-    Parameters
-    ----------
-    *type_names : str
-        Types of the topic, such as ``sensor_msgs/msg/JointState``: there must be one.
-
-    Returns
-    -------
-    type
-        The class.
-
-    Raises
-    ------
-    MessageError
-        If there are several types, or the package of the type is not installed.
-
+    It raises `MessageError` for several types, and for a package that is not installed.
+    rosidl_runtime_py has the same function, but is not in the wheels.
     """
     if len(type_names) != 1:
-        raise MessageError(f'it has several types: {", ".join(type_names)}')
+        raise MessageError(f'topic has several types: {", ".join(type_names)}')
     package, _, name = type_names[0].partition('/msg/')
     try:
         return getattr(import_module(f'{package}.msg'), name)
@@ -99,17 +69,17 @@ def message_class(*type_names: str) -> Any:
         raise MessageError(f'{type_names[0]} is not installed') from error
 
 
-#: The qualities of service of the contract, as our nodes request them.
+#: QoS profiles of the subscriptions of the suite.
 LATCHED, COMMAND, SENSOR = (
     profile(qos, request=True) for qos in (contract.LATCHED, contract.COMMAND, contract.SENSOR)
 )
 
-#: Text that rcl takes for true and false in a parameter file.
+#: Strings that rcl parses as booleans in a parameter file.
 _READ_AS_BOOL = ('y', 'n')
 
 
 class _Dumper(yaml.SafeDumper):  # type: ignore[misc]
-    """Quotes what rcl would not take for text, but PyYAML would."""
+    """Quotes strings that rcl would parse as booleans and PyYAML would not."""
 
 
 _Dumper.add_representer(
@@ -122,12 +92,12 @@ _Dumper.add_representer(
 _Settings = TypeVar('_Settings')
 _SUCCESS = TransitionCallbackReturn.SUCCESS
 
-#: Time between two lines of the log about a preparation [s].
+#: Period of log lines about a running preparation [s].
 _LONG = 2.0
 
 
 def _same(new: Any, old: Any) -> bool:
-    """Return whether a parameter stays as it is."""
+    """Return whether a parameter keeps its value."""
     if isinstance(new, (list, tuple, array)):
         new = list(new)
     return bool(new == old)
@@ -135,30 +105,30 @@ def _same(new: Any, old: Any) -> bool:
 
 class BaseNode(LifecycleNode):
     """
-    A lifecycle node that reads its parameters into dataclasses and reports its state.
+    Lifecycle node with parameters from dataclasses and diagnostics.
 
     A subclass declares its parameters in ``__init__`` (`declare_settings`) and overrides
-    `configure`, `activate`, `deactivate` and `diagnose`. It raises `NeedleError` where a
-    transition is not possible: the transition is then refused and the reason logged. Parameters
-    that it names in `LIVE` may change while it is configured: `change` is then called.
+    `configure`, `activate`, `deactivate` and `diagnose`. It raises `NeedleError` to refuse a
+    transition; the error is logged. Parameters in `LIVE` may change in the configured node, which
+    then calls `change`.
 
     Attributes
     ----------
     failure : str or None
-        Why the last transition was refused.
+        Reason of the last refused transition.
     failed : bool
-        Whether the node could not do what it is for: its process ends with status 1.
+        Whether the node failed at its task: its process then ends with status 1.
     invalid : Counter
         Number of invalid messages by topic.
     shared : frozenset of str
-        Names of parameters that a file gives to several nodes: what this one does not have, others
-        do.
+        Names of parameters that a file sets for several nodes; names that this node does not
+        declare are not an error.
 
     """
 
-    #: Names of the parameters that may change while the node is configured.
+    #: Names of the parameters that may change in the configured node.
     LIVE: ClassVar[frozenset[str]] = frozenset()
-    #: Modules that the node imports before it is configured, because their import takes long.
+    #: Modules with a slow import, imported before `configure`.
     IMPORTS: ClassVar[tuple[str, ...]] = ()
 
     def __init__(self, name: str, **node_options: Any) -> None:
@@ -166,7 +136,7 @@ class BaseNode(LifecycleNode):
         self.failure: str | None = None
         self.failed = False
         self.invalid: Counter[str] = Counter()
-        #: Names of the parameters that are numbers.
+        #: Names of numeric parameters.
         self._numbers: set[str] = set()
         self.shared: frozenset[str] = frozenset()
         self._configured = False
@@ -176,153 +146,59 @@ class BaseNode(LifecycleNode):
         self._configuration = self.publisher(contract.CONFIGURATION, always=True)
         self._diagnostics = self.publisher(contract.DIAGNOSTICS, always=True)
         self._last_level = DiagnosticStatus.OK
-        # Not the node's clock: a paused simulation is reported too.
+        # Steady clock: diagnostics continue in a paused simulation.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._health_timer = self.create_timer(1.0, self.publish_diagnostics, clock=steady)
         self.add_on_set_parameters_callback(self._check_change)
         self.add_post_set_parameters_callback(self._after_change)
 
-    # What a subclass fills in.
+    # Hooks of subclasses.
 
     def preparation(self) -> Iterable[Progress]:
         """
-        Return the steps that take long: imports, and functions to load or to compile.
+        Return the slow steps before `configure`: imports, loading or compiling functions.
 
-        They are done in a thread, while services are answered, before the node is configured.
-
-        Returns
-        -------
-        iterable of Progress
-            Taking the next element does the next step.
-
+        The steps run in a thread, while services are answered.
         """
         return imports(self.IMPORTS)
 
     def cleanup(self) -> None:
-        """Undo `configure`, also if it raised halfway."""
+        """Undo `configure`, also after an error halfway."""
 
     def configure(self) -> None:
-        """
-        Read the parameters and make what the node needs.
-
-        Raises
-        ------
-        NeedleError
-            To refuse the transition.
-
-        """
+        """Read the parameters and create the resources of the node."""
 
     def activate(self) -> None:
-        """
-        Begin to act.
-
-        Raises
-        ------
-        NeedleError
-            To refuse the transition.
-
-        """
+        """Start the periodic work of the node."""
 
     def about(self) -> str:
-        """
-        Return what is said when the node has become active.
-
-        Returns
-        -------
-        str
-            What it works with, and the topics that count; ``''`` for nothing more.
-
-        """
+        """Return the log line of the activation: configuration and main topics; may be empty."""
         return ''
 
     def deactivate(self) -> None:
-        """Stop acting, and leave no force applied."""
+        """Stop the periodic work, and command zero force."""
 
     def change(self, changes: Mapping[str, Any]) -> None:
-        """
-        Go on with other values of parameters that are in `LIVE`.
-
-        Parameters
-        ----------
-        changes : Mapping[str, Any]
-            The new values by parameter name.
-
-        Raises
-        ------
-        NeedleError
-            To refuse them.
-
-        """
+        """Apply new values of `LIVE` parameters by name; raise `NeedleError` to reject them."""
 
     def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
-        """
-        Return what /diagnostics says of the node.
-
-        Returns
-        -------
-        level : bytes
-            A level of DiagnosticStatus.
-        message : str
-            The state in one line.
-        values : dict
-            Values by name.
-
-        """
+        """Return level, one-line message and values of the DiagnosticStatus."""
         return DiagnosticStatus.OK, 'active' if self.is_active else 'not active', {}
 
     # Messages.
 
     def now(self) -> int:
-        """
-        Return the time of the node's clock.
-
-        Returns
-        -------
-        int
-            Time [ns].
-
-        """
-        # Clock.now makes objects, which takes three times as long.
+        """Return the time of the node clock [ns]."""
+        # Clock.now creates objects and takes three times as long.
         return int(self.get_clock().handle.get_now().nanoseconds)
 
     def publisher(self, topic: Topic, *, always: bool = False) -> Publisher:
-        """
-        Offer a topic of the contract.
-
-        Parameters
-        ----------
-        topic : Topic
-            The topic.
-        always : bool
-            Whether it is published also while the node is not active.
-
-        Returns
-        -------
-        Publisher
-            Takes messages, or their bytes.
-
-        """
+        """Create a publisher of a contract topic, limited to the active state unless `always`."""
         create = self.create_publisher if always else self.create_lifecycle_publisher
         offered: Publisher = create(message_class(topic.type_name), topic.name, profile(topic.qos))
         return offered
 
     def subscribe(self, topic: Topic, take: Callable[[Any], None]) -> Subscription:
-        """
-        Subscribe to a topic of the contract.
-
-        Parameters
-        ----------
-        topic : Topic
-            The topic.
-        take : callable
-            Called with each message.
-
-        Returns
-        -------
-        Subscription
-            The subscription.
-
-        """
         kind = message_class(topic.type_name)
         return self.create_subscription(kind, topic.name, take, profile(topic.qos, request=True))
 
@@ -333,23 +209,10 @@ class BaseNode(LifecycleNode):
         matched: Callable[[int], None] | None = None,
     ) -> Subscription:
         """
-        Subscribe to a topic that comes at the sample rate; its messages are read from their bytes.
+        Subscribe to a high-rate topic of a type in `wire.TYPES`, parsing messages from bytes.
 
-        Parameters
-        ----------
-        topic : Topic
-            The topic, of a type that `wire` knows.
-        take : callable
-            Called with each `Reading`.
-        matched : callable, optional
-            Called with the number of publishers that have come since the last call, before
-            their first message, and with zero when one has gone.
-
-        Returns
-        -------
-        Subscription
-            The subscription.
-
+        `matched` receives the number of new publishers, before their first message, and zero after
+        a publisher has left.
         """
         name, read = topic.name, Reader(topic.type_name).read
 
@@ -359,7 +222,7 @@ class BaseNode(LifecycleNode):
             except MessageError as error:
                 self.invalid[name] += 1
                 self.get_logger().error(
-                    f'invalid message on {name}: it {error}', throttle_duration_sec=1.0
+                    f'invalid message on {name}: message {error}', throttle_duration_sec=1.0
                 )
                 return
             take(reading)
@@ -381,38 +244,14 @@ class BaseNode(LifecycleNode):
     # Parameters.
 
     def declare_text(self, name: str, default: str | bool | list[str], description: str) -> None:
-        """
-        Declare a parameter that is not a number.
-
-        Parameters
-        ----------
-        name : str
-            Its name.
-        default : str, bool or list of str
-            Its default.
-        description : str
-            What it is.
-
-        """
-        # YAML 1.1 reads y as true: `text` understands it.
+        """Declare a parameter that is not a number."""
+        # YAML 1.1 parses y as true; `text` converts it back.
         dynamic = default in _READ_AS_BOOL
         descriptor = ParameterDescriptor(description=description, dynamic_typing=dynamic)
         self.declare_parameter(name, default, descriptor)
 
     def declare_settings(self, prefix: str, defaults: object, names: Collection[str] = ()) -> None:
-        """
-        Declare one parameter per field of a dataclass.
-
-        Parameters
-        ----------
-        prefix : str
-            Namespace of the parameters, ``''`` for none.
-        defaults : object
-            Instance of the dataclass that holds the default values.
-        names : collection of str
-            The fields; all if empty.
-
-        """
+        """Declare one parameter per dataclass field; without ``names`` for all fields."""
         for item in fields(defaults):  # type: ignore[arg-type]
             if names and item.name not in names:
                 continue
@@ -420,7 +259,7 @@ class BaseNode(LifecycleNode):
             unit = f' [{meta["unit"]}]' if meta.get('unit') else ''
             descriptor = ParameterDescriptor(
                 description=f'{meta.get("description", item.name)}{unit}',
-                # An integer is accepted where a float is meant; the dataclass checks the rest.
+                # Integers are accepted for floats; the dataclass checks the value.
                 dynamic_typing=True,
             )
             if 'low' in meta:
@@ -440,29 +279,7 @@ class BaseNode(LifecycleNode):
         kind: Callable[..., _Settings],
         changes: Mapping[str, Any] | None = None,
     ) -> _Settings:
-        """
-        Read the parameters that `declare_settings` declared into the dataclass.
-
-        Parameters
-        ----------
-        prefix : str
-            Namespace of the parameters.
-        kind : type
-            The dataclass.
-        changes : Mapping[str, Any], optional
-            Values to take instead, by parameter name.
-
-        Returns
-        -------
-        object
-            The dataclass instance.
-
-        Raises
-        ------
-        ParameterError
-            If a value is not valid; the message names the parameter.
-
-        """
+        """Return the dataclass filled from the parameters; ``changes`` override values."""
         values = {}
         for item in fields(kind):  # type: ignore[arg-type]
             name = f'{prefix}{item.name}'
@@ -473,7 +290,7 @@ class BaseNode(LifecycleNode):
         return from_values(kind, values, prefix)
 
     def _meant(self, name: str, value: Any) -> Any:
-        """Return the number where a text stands for one: PyYAML reads 1e-3 as text."""
+        """Parse numbers that PyYAML reads as strings, such as 1e-3."""
         if name in self._numbers and isinstance(value, str):
             with suppress(ValueError):
                 return float(value)
@@ -488,29 +305,7 @@ class BaseNode(LifecycleNode):
         valid: tuple[str, ...] = (),
         changes: Mapping[str, Any] | None = None,
     ) -> str:
-        """
-        Read a text parameter.
-
-        Parameters
-        ----------
-        name : str
-            Its name.
-        valid : tuple of str
-            Valid values; any if empty.
-        changes : Mapping[str, Any], optional
-            Values to take instead, by parameter name.
-
-        Returns
-        -------
-        str
-            Its value.
-
-        Raises
-        ------
-        ParameterError
-            If the value is not valid.
-
-        """
+        """Return a text parameter; ``changes`` override it, empty ``valid`` allows any value."""
         value = (changes or {}).get(name, self._value(name))
         if isinstance(value, bool):
             value = _READ_AS_BOOL[not value]
@@ -519,41 +314,25 @@ class BaseNode(LifecycleNode):
         return value
 
     def configuration(self) -> str:
-        """
-        Return all parameters as a ROS parameter file.
-
-        Returns
-        -------
-        str
-            YAML.
-
-        """
+        """Return all parameters as a ROS parameter file (YAML)."""
         values = self.values()
         document = {self.get_fully_qualified_name(): {'ros__parameters': values}}
         return str(yaml.dump(document, Dumper=_Dumper, sort_keys=False))
 
     def values(self) -> dict[str, Any]:
-        """
-        Return all parameters.
-
-        Returns
-        -------
-        dict
-            Values by name.
-
-        """
+        """Return all parameters by name."""
         values = {}
         for name, parameter in sorted(self._parameters.items()):
             value = parameter.value
             if value is None or isinstance(value, (list, tuple, array)):
-                # rcl has an empty list of a parameter file as None.
+                # rcl returns an empty list of a parameter file as None.
                 value = list(value or ())
             if not name.startswith(('qos_overrides', 'start_type')):
                 values[name] = self._meant(name, value)
         return values
 
     def _is_valid(self) -> bool:
-        """Return whether the node has all parameters that were given."""
+        """Return whether all parameter overrides are declared."""
         try:
             self._check_overrides()
         except ParameterError:
@@ -565,20 +344,20 @@ class BaseNode(LifecycleNode):
         others = sorted(self.shared - set(known))
         if others:
             self.get_logger().warning(
-                f'parameters for several nodes that this one does not have: {", ".join(others)}'
+                f'shared parameters that this node does not declare: {", ".join(others)}'
             )
         unknown = sorted(set(self._parameter_overrides) - set(known) - self.shared)
         if unknown:
             count = len(self._parameter_overrides)
             complaints = '; '.join(unknown_name(name, known) for name in unknown)
             raise ParameterError(
-                f'{count - len(unknown)} of {count} parameters given are known: {complaints}'
+                f'{count - len(unknown)} of {count} given parameters are known: {complaints}'
             )
 
     def _check_change(self, parameters: list[Parameter]) -> SetParametersResult:
         if not self._configured:
             return SetParametersResult(successful=True)
-        # What stays as it is does not change: a whole parameter file can be loaded again.
+        # Unchanged values are accepted, so that a whole parameter file can be loaded again.
         now = self.values()
         parameters = [
             one
@@ -607,19 +386,10 @@ class BaseNode(LifecycleNode):
 
     @property
     def is_active(self) -> bool:
-        """Whether the node is active."""
         return bool(self._state_machine.current_state[1] == 'active')
 
     def begin(self, refused: Callable[[], None]) -> None:
-        """
-        Prepare, configure and activate, while the executor spins.
-
-        Parameters
-        ----------
-        refused : callable
-            Called if a transition is not made.
-
-        """
+        """Prepare, configure and activate in a spinning executor; `refused` handles a failure."""
 
         def start() -> None:
             if not self.start():
@@ -629,23 +399,14 @@ class BaseNode(LifecycleNode):
 
     @property
     def is_preparing(self) -> bool:
-        """Whether the thread that prepares the node is at work."""
+        """Whether the preparation thread is running."""
         return self._preparation.is_running
 
     def start(self) -> bool:
-        """
-        Configure and activate, at once.
-
-        Returns
-        -------
-        bool
-            Whether both transitions were made.
-
-        """
+        """Configure and activate synchronously; return whether both transitions succeeded."""
         return bool(self.trigger_configure() == _SUCCESS and self.trigger_activate() == _SUCCESS)
 
     def stop(self) -> None:
-        """Deactivate if active."""
         if self.is_active:
             self.trigger_deactivate()
 
@@ -663,13 +424,13 @@ class BaseNode(LifecycleNode):
             self._configured = True
             if self._parameter_overrides:
                 count = len(self._parameter_overrides)
-                self.get_logger().info(f'{count} of {count} parameters given applied')
+                self.get_logger().info(f'{count} of {count} given parameters applied')
             self._configuration.publish(String(data=self.configuration()))
 
         return self._attempt(configure, super().on_configure, state)
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Call `activate`, and say so; rclpy calls this."""
+        """Call `activate`, and log the activation; rclpy calls this."""
         done = self._attempt(self.activate, super().on_activate, state)
         if done == _SUCCESS:
             self.get_logger().info(': '.join(filter(None, ('active', self.about()))))
@@ -680,7 +441,7 @@ class BaseNode(LifecycleNode):
         return self._attempt(self.deactivate, super().on_deactivate, state)
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Call `cleanup`, and let parameters change; rclpy calls this."""
+        """Call `cleanup`, and unlock the parameters; rclpy calls this."""
         self._configured = False
         return self._attempt(self.cleanup, super().on_cleanup, state)
 
@@ -694,7 +455,7 @@ class BaseNode(LifecycleNode):
         return self._attempt(leave, super().on_shutdown, state)
 
     def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Return to unconfigured after an unforeseen error; rclpy calls this."""
+        """Return to unconfigured after an unexpected error; rclpy calls this."""
         self._configured = False
         self.cleanup()
         return super().on_error(state)
@@ -711,7 +472,7 @@ class BaseNode(LifecycleNode):
             self.failure = printable(str(error))
             self.get_logger().error(self.failure)
             return TransitionCallbackReturn.FAILURE
-        # rclpy would ignore it.
+        # rclpy would ignore the error.
         except Exception as error:  # noqa: BLE001
             self.failure = f'{type(error).__name__}: {error}'
             self.get_logger().error(traceback.format_exc())
@@ -722,7 +483,7 @@ class BaseNode(LifecycleNode):
     # Diagnostics.
 
     def publish_diagnostics(self) -> None:
-        """Publish the state of the node, once a second and when it changes."""
+        """Publish the state of the node; called once a second and on change."""
         level, message, values = self.diagnose()
         if self.is_preparing:
             message = str(self._preparation.progress)
@@ -743,20 +504,12 @@ class BaseNode(LifecycleNode):
         self._diagnostics.publish(array)
 
     def tell(self, journal: Journal) -> None:
-        """
-        Write what there is to say to the log, and publish diagnostics, if anything is new.
-
-        Parameters
-        ----------
-        journal : Journal
-            What there is to say.
-
-        """
+        """Log the new lines of an event log (`Journal`), and publish diagnostics on change."""
         if not journal.changed:
             return
         log = self.get_logger()
         for severity, line in journal.take():
-            # rclpy refuses another severity from the same place.
+            # rclpy allows only one severity per call site.
             if severity is Severity.ERROR:
                 log.error(line)
             elif severity is Severity.WARNING:
@@ -766,6 +519,6 @@ class BaseNode(LifecycleNode):
         self.publish_diagnostics()
 
     def report_change(self) -> None:
-        """Publish diagnostics now if the level has changed."""
+        """Publish diagnostics if the level has changed."""
         if self.diagnose()[0] != self._last_level:
             self.publish_diagnostics()

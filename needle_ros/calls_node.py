@@ -1,4 +1,4 @@
-"""Calls of services that are repeated until a node answers."""
+"""Service calls with repetition until a response."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from rclpy.clock_type import ClockType
 from rclpy.node import Node
 from rclpy.task import Future
 
-#: Time between two checks [s].
+#: Period of the checks [s].
 _CHECK: Final = 0.25
 
 
 @dataclass(slots=True)
 class _Call:
-    """A call that is repeated."""
+    """A pending call."""
 
     client: Client
     request: Any
@@ -28,7 +28,7 @@ class _Call:
     repeats: int = 0
 
     def send(self) -> None:
-        """Send the request; the first answer counts."""
+        """Send the request; the first response is used."""
         answer = self.client.call_async(self.request)
 
         def on_answer(done: Future) -> None:
@@ -40,48 +40,27 @@ class _Call:
 
 class Calls:
     """
-    Calls services, and repeats each call without an answer after 1 s, three times.
+    Service client that repeats each call without a response after 1 s, up to three times.
 
-    A request may so be executed twice: only services for which that is the same as once may be
-    called, which all services of the suite are.
-
-    Parameters
-    ----------
-    node : Node
-        Node that calls; its owner spins it.
-
+    A request may be executed twice, so only idempotent services may be called; all services of the
+    suite are idempotent. The owner of ``node`` spins it.
     """
 
     def __init__(self, node: Node) -> None:
         self._calls: list[_Call] = []
-        # A simulation that is paused does not keep a caller waiting.
+        # Steady clock: timeouts also elapse in a paused simulation.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         node.create_timer(_CHECK, self._check, clock=steady)
 
     def call(self, client: Client, request: Any) -> Future:
-        """
-        Call a service.
-
-        Parameters
-        ----------
-        client : Client
-            Its client.
-        request : object
-            The request.
-
-        Returns
-        -------
-        Future
-            Its result is the response; None if the node does not answer within `CALL_TIMEOUT`.
-
-        """
+        """Call a service; the future has result None after `CALL_TIMEOUT` without a response."""
         made = _Call(client, request, Future(), monotonic())
         self._calls.append(made)
         made.send()
         return made.later
 
     def _check(self) -> None:
-        """Repeat calls without an answer, or give them up."""
+        """Repeat calls without a response, and end those after the timeout."""
         now = monotonic()
         for one in self._calls:
             elapsed = now - one.begun

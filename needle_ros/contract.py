@@ -1,5 +1,5 @@
 """
-The contract on the wire: every topic of the suite, what its messages hold, and who publishes it.
+Contract of all topics: type, publisher, QoS, frame, joints, units and stamp.
 
 Lengths are in m, angles in rad, forces in N and torques in N m. Depths, velocities and forces
 along the needle are positive into the tissue. Stamps are sample times.
@@ -13,17 +13,17 @@ from typing import Final, NamedTuple
 
 from needle_ros.wire import JOINT_STATE, POINT, POSE, Template, WRENCH
 
-#: Frames: at rest at the entry point, and parallel to it at the needle base.
+#: Frames: fixed at the entry point; at the needle base, parallel to the first.
 ENTRY: Final = 'needle_entry'
 BASE: Final = 'needle_base'
-#: At the tip, y along the needle.
+#: Frame at the tip, y along the needle.
 TIP: Final = 'needle_tip'
 
-#: The joint along the needle, and that of the base about x.
+#: Joint along the needle, and joint of the base about x.
 INSERTION: Final = 'insertion'
 ROTATION: Final = 'rotation'
 
-#: The joints of a robot that steers: the guide across the needle, its tilt, and the roll.
+#: Joints of a steering robot: lateral position and tilt of the guide, and roll of the needle.
 GUIDE_X: Final = 'guide_x'
 GUIDE_Z: Final = 'guide_z'
 TILT_X: Final = 'guide_tilt_x'
@@ -41,18 +41,17 @@ class Qos(NamedTuple):
     Attributes
     ----------
     name : str
-        What it is called in the documentation.
+        Name in the documentation.
     reliable : bool
         Whether a lost message is sent again.
     latched : bool
-        Whether readers that come late get the messages of before.
+        Whether late-joining subscribers receive the previous messages.
     depth : int
-        Messages kept for a reader that is busy or comes late.
+        Messages kept for a busy or late-joining subscriber.
     lossy : bool
-        Whether our own nodes take what comes: they request best effort from who offers more.
+        Whether the nodes of the suite subscribe with best effort also to a reliable publisher.
     lease : float
-        Time after which a publisher that has died counts as dead [s]; 0 leaves it to DDS, which
-        takes 20 s.
+        Liveliness lease [s]; 0 leaves the detection of a dead publisher to DDS, which takes 20 s.
 
     """
 
@@ -68,38 +67,38 @@ class Stamp(Enum):
     """
     Meaning of the stamp of a message, which decides whether its age matters.
 
-    Every node checks stamps by this: `needle_controller.safety.stream.Stream` those of samples,
-    `needle_ros.status.RequestLog` those of requests.
+    Every node checks stamps by this rule: `needle_controller.safety.stream.Stream` checks samples,
+    `needle_ros.status.RequestLog` checks requests.
     """
 
-    #: Time of a sample, or of the sample that a command answers. It counts for a short time only,
-    #: which is a parameter of the reader (``measurement_timeout``, ``sensor_timeout``,
-    #: ``command_timeout``); a message that is older or out of order is left out.
+    #: Time of a sample, or of the sample that a command answers. Older messages and messages
+    #: out of order are discarded; the limit is a parameter of the subscriber
+    #: (``measurement_timeout``, ``sensor_timeout``, ``command_timeout``).
     SAMPLE = 'sample'
-    #: Time at which the request was sent. It identifies the request and orders it: a duplicate is
-    #: answered but not executed again, one that is older than the request that is followed is not
-    #: executed. It counts for `REQUEST_AGE`. Zero means now.
+    #: Time at which the request was sent. It identifies and orders requests: a duplicate is
+    #: answered but not executed again, and a request older than the current request is not
+    #: executed. It is valid for `REQUEST_AGE`. Zero means now.
     REQUEST = 'request'
-    #: Not checked: the message is a result, or for people.
+    #: Not checked: the message is a result, or information for users.
     UNCHECKED = 'unchecked'
 
 
-#: Age up to which a request counts [s]: three repetitions, a second apart, and a delay of a second
-#: are within it; a request of a recording that is played back is not.
+#: Maximum age of a request [s]. It covers three repetitions at intervals of 1 s and a delay of
+#: 1 s, and excludes requests of a recording that is played back.
 REQUEST_AGE: Final = 5.0
 
 
-#: A reader with default settings gets it; for our nodes a late sample is worth no second try. A
-#: burst after a stall of the reader is not lost.
+#: Compatible with subscribers with default QoS; nodes of the suite do not need retransmission of a
+#: late sample. The depth holds a burst after a stall of the subscriber.
 SENSOR: Final = Qos('reliable or best effort', reliable=True, latched=False, depth=50, lossy=True)
 
-#: Only the newest counts, and it must arrive.
+#: Only the newest message matters, and delivery must be reliable.
 COMMAND: Final = Qos('reliable', reliable=True, latched=False, depth=1)
 
-#: No messages: who publishes it is alive.
+#: No messages: liveliness of a publisher.
 ALIVE: Final = Qos('lease of 0.5 s', reliable=True, latched=False, depth=1, lease=0.5)
 
-#: The last message reaches readers that come late.
+#: The last message reaches late-joining subscribers.
 LATCHED: Final = Qos('latched', reliable=True, latched=True, depth=1)
 
 
@@ -112,9 +111,9 @@ class Joint(NamedTuple):
     name : str
         Name of the joint.
     unit : str
-        Unit of its position; that of its velocity is the same per second.
+        Unit of the position; the unit of the velocity is the same per second.
     effort : str
-        Unit of its effort, '' if the topic has no efforts.
+        Unit of the effort, '' if the topic has no efforts.
 
     """
 
@@ -124,17 +123,7 @@ class Joint(NamedTuple):
 
 
 class Quantity(NamedTuple):
-    """
-    A number of a message.
-
-    Attributes
-    ----------
-    name : str
-        Field, with the joint if there is one: ``force.y``, ``position of insertion``.
-    unit : str
-        SI unit.
-
-    """
+    """A number of a message: name such as ``force.y`` or ``position of insertion``, SI unit."""
 
     name: str
     unit: str
@@ -144,7 +133,7 @@ def _vector(field: str, unit: str, axes: str = 'xyz') -> tuple[Quantity, ...]:
     return tuple(Quantity(f'{field}.{axis}', unit) for axis in axes)
 
 
-#: Numbers of the message types whose numbers are always the same, in their order.
+#: Numbers of the message types with fixed fields, in order.
 _QUANTITIES: Final = {
     WRENCH: _vector('force', 'N') + _vector('torque', 'N m'),
     POINT: _vector('point', 'm'),
@@ -155,7 +144,7 @@ _QUANTITIES: Final = {
 @dataclass(frozen=True, slots=True)
 class Topic:
     """
-    A topic.
+    A topic of the contract.
 
     Attributes
     ----------
@@ -164,17 +153,17 @@ class Topic:
     type_name : str
         Message type.
     publisher : str
-        Who publishes it: nodes, `EVERY_NODE`, or `USER`.
+        Publishing nodes, `EVERY_NODE`, or `USER`.
     meaning : str
-        What its messages hold, for people.
+        Content of the messages, for the documentation.
     qos : Qos
         Quality of service.
     frame : str
-        Frame of the header, '' if it has none.
+        Frame of the header, '' without a frame.
     joints : tuple of Joint
         Joints of a JointState.
     stamp : Stamp
-        Whether the age of its stamp matters.
+        Meaning of the stamp.
 
     """
 
@@ -189,7 +178,7 @@ class Topic:
 
     @property
     def quantities(self) -> tuple[Quantity, ...]:
-        """Numbers of a message, in their order; empty for a type that `wire` does not know."""
+        """Numbers of a message in order; empty for types that `wire` does not parse."""
         if self.type_name != JOINT_STATE:
             return _QUANTITIES.get(self.type_name, ())
         return (
@@ -199,15 +188,7 @@ class Topic:
         )
 
     def template(self) -> Template:
-        """
-        Return the template of its messages.
-
-        Returns
-        -------
-        Template
-            It writes and reads them.
-
-        """
+        """Return a template that writes and reads messages of this topic."""
         efforts = sum(bool(joint.effort) for joint in self.joints)
         return Template(
             self.type_name,
@@ -221,14 +202,14 @@ JOINT_STATES: Final = Topic(
     'joint_states',
     JOINT_STATE,
     'plant',
-    'encoders of the robot: inserted length and rotation; effort: axial force and torque '
+    'encoders of the robot: insertion depth and rotation; effort: axial force and torque '
     'on the needle; steered: `insertion`, `guide_x`, `guide_z` [m], `guide_tilt_x`, '
     '`guide_tilt_z`, `roll` [rad]',
     joints=(Joint(INSERTION, 'm', 'N'), Joint(ROTATION, 'rad', 'N m')),
     stamp=Stamp.SAMPLE,
 )
 
-#: The joints beside `insertion` of a needle that is steered.
+#: Joints of a steered needle in addition to `insertion`.
 STEERING_JOINTS: Final = (
     Joint(GUIDE_X, 'm', 'N'), Joint(GUIDE_Z, 'm', 'N'), Joint(TILT_X, 'rad', 'N m'),
     Joint(TILT_Z, 'rad', 'N m'), Joint(ROLL, 'rad', 'N m'),
@@ -236,15 +217,7 @@ STEERING_JOINTS: Final = (
 
 
 def steered_states() -> Topic:
-    """
-    Return `JOINT_STATES` of a needle that is steered.
-
-    Returns
-    -------
-    Topic
-        The topic with `insertion` and the joints of the guide.
-
-    """
+    """Return `JOINT_STATES` of a steered needle: `insertion` and the guide joints."""
     return replace(JOINT_STATES, joints=(JOINT_STATES.joints[0], *STEERING_JOINTS))
 
 
@@ -252,7 +225,7 @@ BASE_WRENCH: Final = Topic(
     'base_wrench',
     WRENCH,
     'plant',
-    'force sensor, what the base exerts on the needle: `force.y` axial, `force.z` lateral '
+    'force sensor, force of the base on the needle: `force.y` axial, `force.z` lateral '
     '[N], `torque.x` [N m]; mode `indenter`: force of the end-effector on the tissue',
     frame=BASE,
     stamp=Stamp.SAMPLE,
@@ -262,7 +235,7 @@ TIP_DEFLECTION: Final = Topic(
     'tip_deflection',
     POINT,
     'plant',
-    'tracker or imager: `point.y` inserted length, `point.z` deflection of the tip [m]; '
+    'tracker or imager: `point.y` insertion depth, `point.z` deflection of the tip [m]; '
     'steered: `point.x` too',
     frame=ENTRY,
     stamp=Stamp.SAMPLE,
@@ -272,9 +245,9 @@ GROUND_TRUTH: Final = Topic(
     'ground_truth',
     JOINT_STATE,
     'plant',
-    'simulation only: d (length outside the tissue), theta and q1..qn, the whole state; '
+    'simulation only: d (length outside the tissue), theta and q1..qn, the full state; '
     'steered: d, `tip_x`, `tip_z` [m], `tip_roll` [rad]; effort, in mode `simulation`: '
-    'generalized forces that were applied since the sample before',
+    'generalized forces applied since the previous sample',
     joints=(Joint('d', 'm'), Joint('theta', 'rad'), Joint('q1', 'm^1.5'), Joint('q2', 'm^1.5')),
     stamp=Stamp.SAMPLE,
 )
@@ -282,20 +255,9 @@ GROUND_TRUTH: Final = Topic(
 
 def ground_truth(modes: int, *, commanded: bool) -> Topic:
     """
-    Return `GROUND_TRUTH` of a plant.
+    Return `GROUND_TRUTH` with all joints of a plant with a number of shape modes.
 
-    Parameters
-    ----------
-    modes : int
-        Number of shape modes.
-    commanded : bool
-        Whether it has efforts: those of a needle that moves under commands, mode `simulation`.
-
-    Returns
-    -------
-    Topic
-        The topic with all joints.
-
+    `commanded` adds the efforts of mode `simulation`, in which commands move the needle.
     """
     bending = [Joint(f'q{k + 1}', 'm^1.5', 'N m^-0.5') for k in range(modes)]
     joints = (Joint('d', 'm', 'N'), Joint('theta', 'rad', 'N m'), *bending)
@@ -305,20 +267,7 @@ def ground_truth(modes: int, *, commanded: bool) -> Topic:
 
 
 def steered_truth(*, commanded: bool) -> Topic:
-    """
-    Return `GROUND_TRUTH` of a needle that is steered.
-
-    Parameters
-    ----------
-    commanded : bool
-        As for `ground_truth`.
-
-    Returns
-    -------
-    Topic
-        The topic with where the tip is.
-
-    """
+    """Return `GROUND_TRUTH` of a steered needle; `commanded` adds the efforts."""
     joints: tuple[Joint, ...] = (
         Joint('d', 'm', 'N'), Joint('tip_x', 'm', 'N'), Joint('tip_z', 'm', 'N'),
         Joint('tip_roll', 'rad', 'N m'),
@@ -340,7 +289,7 @@ NEEDLE_SHAPE: Final = Topic(
     'needle_shape',
     'visualization_msgs/msg/Marker',
     'plant',
-    'the needle as a line, and the path that it cut, 30 Hz while there is a subscriber',
+    'the needle as a line, and its cut path, 30 Hz while there is a subscriber',
     frame=ENTRY,
 )
 
@@ -357,7 +306,7 @@ CLOCK: Final = Topic(
     'rosgraph_msgs/msg/Clock',
     'plant',
     'simulated time, with `publish_clock` or `lockstep`',
-    # As rclpy listens to it.
+    # Like the subscription of rclpy.
     qos=SENSOR._replace(depth=1),
 )
 
@@ -365,9 +314,9 @@ EVENTS: Final = Topic(
     '~/events',
     'diagnostic_msgs/msg/DiagnosticArray',
     'plant',
-    'what the plant began to apply beside commands, and the number of the sample from '
-    'which it counts: [replay.md](replay.md)',
-    # All of them, also for a reader that comes late.
+    'inputs of the plant other than commands (trajectories, disturbances), with the number of '
+    'their first sample: [replay.md](replay.md)',
+    # All events, also for a late-joining subscriber.
     qos=LATCHED._replace(depth=1000),
 )
 
@@ -375,8 +324,8 @@ WRENCH_COMMAND: Final = Topic(
     'wrench_command',
     WRENCH,
     'controller',
-    'force and torque on the needle: `force.y` [N], `torque.x` [N m]; the stamp is that '
-    'of the sample it answers',
+    'force and torque on the needle: `force.y` [N], `torque.x` [N m]; stamp of the answered '
+    'sample',
     qos=COMMAND,
     frame=BASE,
     stamp=Stamp.SAMPLE,
@@ -386,8 +335,8 @@ JOINT_COMMANDS: Final = Topic(
     'joint_commands',
     JOINT_STATE,
     'ros2_control',
-    'from the hardware interface of ros2_control, NaN where nobody commands; mode `simulation`: '
-    'efforts, in the place of `wrench_command`; mode `robot`: positions, or velocities; steered, '
+    'from the hardware interface of ros2_control, NaN without a command; mode `simulation`: '
+    'efforts, in place of `wrench_command`; mode `robot`: positions, or velocities; steered, '
     'in both modes: guide and roll: [howto/ros2-control.md](howto/ros2-control.md)',
     qos=COMMAND,
     joints=(Joint(INSERTION, 'm', 'N'), Joint(ROTATION, 'rad', 'N m')),
@@ -398,7 +347,7 @@ COMMANDER: Final = Topic(
     'wrench_command/alive',
     'std_msgs/msg/Empty',
     'controller',
-    'no messages: its lease tells the others when a controller has died',
+    'no messages: the end of its lease indicates a dead controller',
     qos=ALIVE,
 )
 
@@ -406,16 +355,16 @@ MEASURER: Final = replace(
     COMMANDER,
     name='joint_states/alive',
     publisher='plant',
-    meaning='no messages: its lease tells the others when a plant has died',
+    meaning='no messages: the end of its lease indicates a dead plant',
 )
 
 PROCESSED: Final = Topic(
     'joint_states/_processed',
     'std_msgs/msg/Header',
     'steering',
-    'lock-step: stamp of a sample that a node (its name is `frame_id`) has processed, after its '
-    'motions; a plant with `lockstep` waits for all nodes that publish it; not recorded',
-    # Of several nodes.
+    'lockstep: stamp of a sample that a node (named in `frame_id`) has processed, after its '
+    'motions; a plant with `lockstep` waits for all publishers; not recorded',
+    # Several nodes publish.
     qos=COMMAND._replace(depth=10),
 )
 
@@ -423,15 +372,15 @@ RECORDED: Final = replace(
     PROCESSED,
     name='joint_states/_recorded',
     publisher='recorder',
-    meaning='stamp of the newest sample that a recorder has, zero at its end; a plant with a '
-    'time of its own is at most 80 samples ahead of it, with `lockstep` 10; not recorded',
+    meaning='stamp of the newest recorded sample, zero at the end of recording; a plant with an '
+    'independent time is at most 80 samples ahead of it, with `lockstep` 10; not recorded',
 )
 
 REFERENCE: Final = Topic(
     'reference',
     JOINT_STATE,
     'controller',
-    'inserted length and velocity that the controller aims at',
+    'insertion depth and velocity of the reference',
     joints=(Joint(INSERTION, 'm'),),
 )
 
@@ -439,7 +388,7 @@ TRACKING_ERROR: Final = Topic(
     'tracking_error',
     JOINT_STATE,
     'controller',
-    'reference less measurement',
+    'reference minus measurement',
     joints=(Joint(INSERTION, 'm'),),
 )
 
@@ -447,7 +396,7 @@ TARGET: Final = Topic(
     'target',
     POINT,
     f'{USER}, slicer',
-    '`point.y`: inserted length to reach [m]; to the node `steering`: where the tip shall be, '
+    '`point.y`: target insertion depth [m]; to the node `steering`: target position of the tip, '
     'x, y, z [m]',
     qos=COMMAND,
     frame=ENTRY,
@@ -458,7 +407,7 @@ TIP_EXPECTED: Final = Topic(
     'tip_expected',
     'geometry_msgs/msg/PoseWithCovarianceStamped',
     'steering',
-    'where the tip will be at the target depth, with covariance, after each look',
+    'predicted tip pose at the target depth, with covariance, after each tip measurement',
     qos=COMMAND,
     frame=ENTRY,
 )
@@ -467,9 +416,9 @@ TIP_POSE: Final = Topic(
     'tip_pose',
     POSE,
     'slicer',
-    'where the tip is, y along the needle, 20 Hz; its direction is measured only where '
-    '`needle_poses` come',
-    # SlicerROS2 asks for what is reliable.
+    'tip pose, y along the needle, 20 Hz; the direction is measured only if `needle_poses` are '
+    'published',
+    # SlicerROS2 requests reliable QoS.
     qos=COMMAND,
     frame=ENTRY,
 )
@@ -478,8 +427,8 @@ JOINT_TRAJECTORY: Final = Topic(
     'joint_trajectory',
     'trajectory_msgs/msg/JointTrajectory',
     f'{USER}, steering',
-    'to the controller: `insertion`, positions [m] to follow, and velocities [m/s] or '
-    'none; to a plant in mode `robot`: `insertion`, positions [m], or efforts [N] of a push; '
+    'to the controller: `insertion`, positions [m], and optionally velocities [m/s]; '
+    'to a plant in mode `robot`: `insertion`, positions [m], or efforts [N] of a push; '
     'steered, in both modes: guide and roll [m, rad]; in mode `indenter`: efforts of `x` and '
     '`z` [N]',
     qos=COMMAND,
@@ -490,7 +439,7 @@ ROBOT_DESCRIPTION: Final = Topic(
     'robot_description',
     'std_msgs/msg/String',
     'robot_state_publisher',
-    'URDF of the robot, made of `description/`, with `ros2_control.launch.py`',
+    'URDF of the robot from `description/`, with `ros2_control.launch.py`',
     qos=LATCHED,
 )
 

@@ -1,4 +1,4 @@
-"""YAML from elsewhere: metadata of recordings, recorded parameters, parameter files."""
+"""Safe reading of YAML from external files: bag metadata, recorded parameters, parameter files."""
 
 from __future__ import annotations
 
@@ -7,39 +7,24 @@ from typing import Any, Final
 from needle_ros.errors import NeedleError
 import yaml
 
-#: Largest document [characters], and deepest nesting.
+#: Maximum document length [characters], and maximum nesting depth.
 LARGEST: Final = 2**20
 _DEEPEST: Final = 32
 
-#: That of LibYAML is ten times as fast; it is not everywhere.
+#: The LibYAML loader is ten times as fast, but not always installed.
 _LOADER: Final = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
 
 
 class DocumentError(NeedleError, ValueError):
-    """A text is not YAML, or more than is read of YAML from elsewhere."""
+    """A text is not YAML, or exceeds the limits of `read_document`."""
 
 
 def read_document(text: str) -> Any:
     """
-    Read a YAML document that somebody else has written.
+    Parse a YAML document of an external author.
 
-    Anchors are not needed there, and a few of them can stand for more than the memory holds.
-
-    Parameters
-    ----------
-    text : str
-        The text.
-
-    Returns
-    -------
-    object
-        What it says.
-
-    Raises
-    ------
-    DocumentError
-        If it is not YAML, has more than 2^20 characters, an alias, or more than 32 levels.
-
+    It raises `DocumentError` for a text that is not YAML, has more than 2^20 characters, an alias,
+    or more than 32 levels: a few aliases can expand to more than the memory holds.
     """
     if len(text) > LARGEST:
         raise DocumentError(f'has {len(text)} characters, at most {LARGEST} are read')

@@ -1,21 +1,21 @@
-"""What can go wrong, as types: every error of these packages is a `NeedleError`."""
+"""Error types; every error of the packages is a `NeedleError`."""
 
 from typing import Final
 
-#: Longest line that is said.
+#: Maximum length of a log line [characters].
 _LONGEST: Final = 500
 
 
 class NeedleError(Exception):
-    """Base of all errors raised on purpose; its message is one line for a person."""
+    """Base class of all intentional errors, each with a one-line message for users."""
 
     def __str__(self) -> str:
-        # It may have names from a recording, or from another's folder.
+        # The message may quote names from a recording or an external folder.
         return shown(super().__str__())
 
 
 class JobError(NeedleError):
-    """A job failed though nothing was wrong with what it was given."""
+    """A job failed with valid inputs."""
 
 
 class ParameterError(NeedleError, ValueError):
@@ -23,27 +23,18 @@ class ParameterError(NeedleError, ValueError):
 
 
 class MessageError(NeedleError, ValueError):
-    """Bytes are not a message of the type that they should be."""
+    """Bytes are not a valid message of the expected type."""
 
 
 class ShapeError(NeedleError, ValueError):
-    """An array does not have the shape that is needed."""
+    """An array has the wrong shape."""
 
 
 def shown(text: str) -> str:
     """
-    Return text as a terminal and a file can show it in a line: without what would steer them.
+    Replace line ends by blanks and unprintable characters by question marks.
 
-    Parameters
-    ----------
-    text : str
-        May have whatever a message or a name has.
-
-    Returns
-    -------
-    str
-        The text, with blanks for line ends, and question marks for what cannot be printed.
-
+    Names from a recording or a message cannot insert terminal control sequences.
     """
     if text.isprintable():
         return text
@@ -51,18 +42,5 @@ def shown(text: str) -> str:
 
 
 def printable(line: str) -> str:
-    """
-    Return a line for a log: as `shown`, and not too long.
-
-    Parameters
-    ----------
-    line : str
-        May have whatever a message had.
-
-    Returns
-    -------
-    str
-        The line.
-
-    """
+    """Return a line for a log: as `shown`, and at most 500 characters."""
     return shown(f'{line[: _LONGEST - 4]} ...' if len(line) > _LONGEST else line)

@@ -1,4 +1,4 @@
-"""Files that are there whole or not at all."""
+"""Atomic writing of files."""
 
 from __future__ import annotations
 
@@ -10,22 +10,7 @@ from needle_ros.errors import ParameterError
 
 
 def write_whole(path: Path | str, content: bytes) -> None:
-    """
-    Write a file so that a reader sees the old content or the new, never a part.
-
-    Parameters
-    ----------
-    path : Path or str
-        File to write.
-    content : bytes
-        All of its content.
-
-    Raises
-    ------
-    ParameterError
-        If the file cannot be written.
-
-    """
+    """Write a file atomically: a reader sees the old or the new content, never a part."""
     path = Path(path)
     if not path.name or path.is_dir():
         raise ParameterError(f'{path} cannot be written: it is not the name of a file')

@@ -1,4 +1,4 @@
-"""What a node has to say: lines for the log, and when /diagnostics have changed."""
+"""Event log of a node: log lines, and changes of /diagnostics."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from typing import Final
 
 from needle_ros.errors import printable
 
-#: Shortest time between two lines of one kind [s].
+#: Minimum time between two lines of the same kind [s].
 _PAUSE: Final = 1.0
 
 
 class Severity(IntEnum):
-    """How bad a state is; the numbers are the levels of DiagnosticStatus."""
+    """Severity of a state; the numbers are the levels of DiagnosticStatus."""
 
     INFO = 0
     WARNING = 1
@@ -24,27 +24,27 @@ class Severity(IntEnum):
 
     @property
     def level(self) -> bytes:
-        """The level, as DiagnosticStatus has it."""
+        """Level of DiagnosticStatus."""
         return bytes([self])
 
 
 class Journal:
     """
-    Collects what there is to say until somebody takes it.
+    Event log: collects log lines until the node publishes them.
 
     Parameters
     ----------
     steady : callable
-        Returns the time of a clock that never jumps [s].
+        Returns the time of a steady clock [s].
 
     Attributes
     ----------
     refused : int
-        Number of inputs refused.
+        Number of rejected inputs.
     complaint : str
-        Why the last one was, or what was last wrong with the motion.
+        Reason of the last rejection, or last fault of the motion.
     changed : bool
-        Whether there is anything to take.
+        Whether there are new lines or changes.
 
     """
 
@@ -59,19 +59,10 @@ class Journal:
 
     def say(self, severity: Severity, line: str = '', kind: str = '') -> None:
         """
-        Say a line, if any, and tell that /diagnostics changed: at most once a second of a kind.
+        Add a line, and mark /diagnostics as changed; at most once a second per non-empty `kind`.
 
-        The next line of a kind says how many have been left out.
-
-        Parameters
-        ----------
-        severity : Severity
-            How bad it is.
-        line : str
-            The line; '' only tells of the change.
-        kind : str
-            What is said at most once a second; '' for what is always said.
-
+        The next line of a kind contains the number of suppressed lines. An empty line only marks
+        the change.
         """
         if kind:
             now = self._steady()
@@ -80,27 +71,19 @@ class Journal:
                 return
             self._told[kind] = now
             more = self._left_out.pop(kind, 0)
-            line = f'{line} ({more} more like it)' if line and more else line
+            line = f'{line} ({more} similar omitted)' if line and more else line
         if line:
             self._lines.append((severity, printable(line)))
         self.changed = True
 
     def refuse(self, complaint: str) -> None:
-        """
-        Say what was not taken, and why; count it.
-
-        Parameters
-        ----------
-        complaint : str
-            What was not taken, and why.
-
-        """
+        """Count a rejected input, and add an error line with its name and the reason."""
         self.refused += 1
         self.complaint = printable(complaint)
-        # Those of one topic or service begin alike.
+        # The first word is the topic or service.
         self.say(Severity.ERROR, complaint, f'refused {complaint.partition(" ")[0]}')
 
     def take(self) -> list[tuple[Severity, str]]:
-        """Return what was said since the last call."""
+        """Return and clear the collected lines."""
         lines, self._lines, self.changed = self._lines, [], False
         return lines

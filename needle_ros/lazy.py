@@ -1,4 +1,4 @@
-"""Public names of a package that are imported when they are first used (PEP 562)."""
+"""Lazy import of the public names of a package (PEP 562)."""
 
 from __future__ import annotations
 
@@ -12,21 +12,10 @@ from typing import Any
 
 def lazy_names(package: str) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
     """
-    Make ``__getattr__`` and ``__dir__`` of a package, so that importing it is cheap.
+    Return ``__getattr__`` and ``__dir__`` of a package, so that importing it is cheap.
 
     The names are those that its ``__init__.py`` imports under ``if TYPE_CHECKING:``, where type
-    checkers see them.
-
-    Parameters
-    ----------
-    package : str
-        The package, ``__name__`` in its ``__init__.py``.
-
-    Returns
-    -------
-    getattr, dir : callable
-        To be assigned to ``__getattr__`` and ``__dir__``, in the ``else`` branch.
-
+    checkers see them; assign the two functions in the ``else`` branch.
     """
     module = sys.modules[package]
     modules = _modules_by_name(Path(str(module.__file__)).read_text(encoding='utf-8'))
@@ -42,7 +31,7 @@ def lazy_names(package: str) -> tuple[Callable[[str], Any], Callable[[], list[st
 
 
 def _modules_by_name(source: str) -> dict[str, str]:
-    """Return the module of each name that is imported under ``if TYPE_CHECKING:``."""
+    """Return the module of each name imported under ``if TYPE_CHECKING:``."""
     return {
         alias.name: str(imported.module)
         for branch in ast.parse(source).body

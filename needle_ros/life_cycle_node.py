@@ -1,4 +1,4 @@
-"""Transitions of a lifecycle node: requests are refused in one line, or wait for a preparation."""
+"""Lifecycle service: reject invalid transitions, and defer `configure` until preparation ends."""
 
 from __future__ import annotations
 
@@ -27,20 +27,21 @@ _TRIGGERS: Final = {
 
 class LifeCycle:
     """
-    Responds to the service `change_state` in the place of rclpy.
+    Handler of the `change_state` service in place of the rclpy handler.
 
-    A transition that is not valid in the present state is refused; rclpy raises an error that
-    ends the node. `configure` begins with the preparation: the response is sent after it, and the
-    executor spins meanwhile.
+    A transition that is invalid in the current state is rejected; rclpy raises an error that ends
+    the node. `configure` first runs the preparation while the executor spins; the response follows
+    it.
 
     Parameters
     ----------
     node : LifecycleNode
         The node.
     preparation : Preparation
-        Work to do before it is configured.
+        Work before `configure`.
     is_valid : callable
-        Returns whether the parameters are valid; if not, it is refused without the preparation.
+        Returns whether the parameters are valid; if not, the preparation is skipped and
+        `configure` fails at once.
 
     """
 
@@ -48,9 +49,9 @@ class LifeCycle:
         self, node: LifecycleNode, preparation: Preparation, is_valid: Callable[[], bool]
     ) -> None:
         self._node, self._preparation, self._is_valid = node, preparation, is_valid
-        #: Continues when the node is prepared.
+        #: Deferred action, called after the preparation.
         self._waiting: Callable[[], None] | None = None
-        #: The response that is sent then, and the header of its request.
+        #: Deferred response, and the header of its request.
         self._later: ChangeState.Response | None = None
         self._header: Any = None
         service: Any = node._service_change_state
@@ -58,15 +59,7 @@ class LifeCycle:
         service.callback, service.send_response = self._on_request, self._on_response
 
     def when_prepared(self, act: Callable[[], None]) -> None:
-        """
-        Call a function once the node is prepared.
-
-        Parameters
-        ----------
-        act : callable
-            Called at once, or later by the executor.
-
-        """
+        """Call `act` after the preparation: immediately if complete, else from the executor."""
         if self._preparation.is_complete or not self._is_valid():
             act()
             return
@@ -83,7 +76,7 @@ class LifeCycle:
 
     def _resume(self) -> None:
         act, self._waiting = self._waiting, None
-        # A full collection takes 0.2 s: what was imported is left out.
+        # A full collection takes 0.2 s: imported objects are excluded from it.
         gc.freeze()
         if act is not None:
             act()
@@ -110,7 +103,7 @@ class LifeCycle:
         return response
 
     def _on_response(self, response: ChangeState.Response, header: Any) -> None:
-        """Send a response, unless it is sent later; the executor calls this."""
+        """Send a response, unless it is deferred; the executor calls this."""
         if response is self._later:
             self._header = header
         else:

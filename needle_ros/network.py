@@ -1,4 +1,4 @@
-"""Which machines can reach what is started here."""
+"""Network range of DDS: restrict nodes to this machine unless the environment opens it."""
 
 from __future__ import annotations
 
@@ -8,41 +8,36 @@ from typing import Final
 
 from needle_ros.errors import ParameterError
 
-#: Environment variable of ROS 2: how far a node looks for others.
+#: Environment variable of ROS 2: range of node discovery.
 RANGE: Final = 'ROS_AUTOMATIC_DISCOVERY_RANGE'
 
-#: Environment variables by which Fast DDS 2 and 3 find their profile.
+#: Environment variables with the profile file of Fast DDS 2 and 3.
 PROFILES: Final = ('FASTRTPS_DEFAULT_PROFILES_FILE', 'FASTDDS_DEFAULT_PROFILES_FILE')
 
-#: Variables that keep a node on this machine: its transport is 127.0.0.1, and there is no socket
-#: that another machine could send to. The range LOCALHOST would be no wall (another machine that
-#: names this one as a static peer is let in), and it brings shared memory: where a process that
-#: used it was killed, the next one hears nothing for up to 3 s.
+#: Variables that restrict a node to this machine: its transport is 127.0.0.1, without a socket
+#: that another machine could reach. The range LOCALHOST does not isolate (another machine connects
+#: by naming this machine as a static peer), and it enables shared memory: if a process is
+#: killed while it uses shared memory, the next process receives nothing for up to 3 s.
 LOCAL: Final = {
     RANGE: 'SUBNET',
     **dict.fromkeys(PROFILES, str(Path(__file__).with_name('loopback.xml'))),
 }
 
-#: Environment variable of ROS 2: nodes of another domain do not see each other.
+#: Environment variable of ROS 2: nodes of different domains are isolated.
 DOMAIN: Final = 'ROS_DOMAIN_ID'
 
-#: The largest domain whose ports exist, with those of some processes.
+#: Largest domain ID with valid UDP ports for several processes.
 _LARGEST_DOMAIN: Final = 232
 
-#: Ranges that let other machines in.
+#: Discovery ranges that include other machines.
 OPEN: Final = ('SUBNET', 'SYSTEM_DEFAULT')
 
 
 def stay_local(environment: MutableMapping[str, str]) -> None:
     """
-    Keep what is started on this machine, unless the environment opens it.
+    Restrict an environment to this machine, unless `RANGE` has a value of `OPEN`.
 
-    Parameters
-    ----------
-    environment : MutableMapping[str, str]
-        Environment to change. `RANGE` set to one of `OPEN` opens it; the range OFF, a profile
-        that is set, and another middleware than Fast DDS stay.
-
+    The range OFF, a configured Fast DDS profile, and another middleware are kept.
     """
     if environment.get(RANGE) in OPEN:
         return
@@ -54,25 +49,7 @@ def stay_local(environment: MutableMapping[str, str]) -> None:
 
 
 def domain_of(environment: Mapping[str, str]) -> int:
-    """
-    Return the domain that an environment chooses.
-
-    Parameters
-    ----------
-    environment : Mapping[str, str]
-        Environment.
-
-    Returns
-    -------
-    int
-        The domain; 0 if none is chosen.
-
-    Raises
-    ------
-    ParameterError
-        If it is not a number of a domain.
-
-    """
+    """Return the domain ID of an environment, by default 0; ParameterError if invalid."""
     text = environment.get(DOMAIN) or '0'
     if not text.isascii() or not text.isdecimal() or int(text) > _LARGEST_DOMAIN:
         raise ParameterError(

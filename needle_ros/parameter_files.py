@@ -1,4 +1,4 @@
-"""Which nodes a ROS parameter file is for; rcl itself says nothing of it."""
+"""Match the sections of ROS parameter files to nodes; rcl reports no unused section."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ _MARK = 'ros__parameters'
 
 class Section(NamedTuple):
     """
-    Parameters for some nodes.
+    Section of a parameter file.
 
     Attributes
     ----------
     file : str
         The file.
     nodes : str
-        Full name of the nodes, in which ``*`` stands for one name and ``**`` for any number.
+        Full name of the nodes; ``*`` matches one name, ``**`` any number of names.
     names : frozenset of str
         Names of the parameters.
 
@@ -33,20 +33,7 @@ class Section(NamedTuple):
     names: frozenset[str]
 
     def is_for(self, node: str) -> bool:
-        """
-        Return whether it is for a node.
-
-        Parameters
-        ----------
-        node : str
-            Full name of the node, such as ``/plant``.
-
-        Returns
-        -------
-        bool
-            Whether it is.
-
-        """
+        """Return whether the section applies to a node with a full name such as ``/plant``."""
         parts = [part for part in self.nodes.split('/') if part]
         pattern = ''.join(
             '(/[^/]+)*' if part == '**' else '/[^/]+' if part == '*' else '/' + re.escape(part)
@@ -56,20 +43,7 @@ class Section(NamedTuple):
 
 
 def sections(arguments: Sequence[str]) -> list[Section]:
-    """
-    Read the parameter files of a command line.
-
-    Parameters
-    ----------
-    arguments : sequence of str
-        The command line, of which rcl has read the same files.
-
-    Returns
-    -------
-    list of Section
-        All sections, in their order.
-
-    """
+    """Read the parameter files of a command line that rcl has already parsed."""
     files = [file for flag, file in pairwise(arguments) if flag == '--params-file']
     return [
         Section(file, f'/{name}', frozenset(_flat(values)))
@@ -79,22 +53,7 @@ def sections(arguments: Sequence[str]) -> list[Section]:
 
 
 def strangers(found: Sequence[Section], node: str) -> list[str]:
-    """
-    Return a line for each file that has nothing for a node.
-
-    Parameters
-    ----------
-    found : sequence of Section
-        What `sections` returned.
-    node : str
-        Full name of the node.
-
-    Returns
-    -------
-    list of str
-        The lines.
-
-    """
+    """Return a warning for each file without a section for a node."""
     lines = []
     for file in dict.fromkeys(section.file for section in found):
         own = [section for section in found if section.file == file]
@@ -105,28 +64,13 @@ def strangers(found: Sequence[Section], node: str) -> list[str]:
 
 
 def shared_names(found: Sequence[Section], node: str) -> frozenset[str]:
-    """
-    Return the parameters that files give to a node and to others of any name, by ``/**``.
-
-    Parameters
-    ----------
-    found : sequence of Section
-        What `sections` returned.
-    node : str
-        Full name of the node.
-
-    Returns
-    -------
-    frozenset of str
-        Names of the parameters.
-
-    """
+    """Return the parameters that wildcard sections (``/**``) set for a node."""
     shared = (one for one in found if '*' in one.nodes.rpartition('/')[2] and one.is_for(node))
     return frozenset(name for section in shared for name in section.names)
 
 
 def _nodes(content: Any, namespace: str = '') -> Iterator[tuple[str, Mapping[str, Any]]]:
-    """Yield the nodes of a file, which may be nested in namespaces, and their parameters."""
+    """Yield nodes, which may be nested in namespaces, and their parameters."""
     for name, below in content.items() if isinstance(content, Mapping) else ():
         path = f'{namespace}/{name}'.strip('/')
         if isinstance(below, Mapping) and _MARK in below:
@@ -136,7 +80,7 @@ def _nodes(content: Any, namespace: str = '') -> Iterator[tuple[str, Mapping[str
 
 
 def _flat(values: Mapping[str, Any], prefix: str = '') -> Iterator[str]:
-    """Yield the names of parameters that may be nested."""
+    """Yield the dotted names of nested parameters."""
     for name, value in values.items():
         if isinstance(value, Mapping):
             yield from _flat(value, f'{prefix}{name}.')

@@ -1,4 +1,4 @@
-"""Work that a node does before it is configured, in a thread of its own."""
+"""Preparation of a node in a thread before `configure`."""
 
 from __future__ import annotations
 
@@ -9,17 +9,7 @@ from typing import NamedTuple
 
 
 class Progress(NamedTuple):
-    """
-    State of a preparation.
-
-    Attributes
-    ----------
-    done, total : int
-        Steps that are complete, and all steps.
-    step : str
-        Name of the next step; '' after the last.
-
-    """
+    """Progress of a preparation: completed steps, total steps, and name of the next step."""
 
     done: int
     total: int
@@ -30,20 +20,7 @@ class Progress(NamedTuple):
 
 
 def imports(modules: Iterable[str]) -> Iterator[Progress]:
-    """
-    Import modules, one at each step of the iterator.
-
-    Parameters
-    ----------
-    modules : iterable of str
-        Their names.
-
-    Yields
-    ------
-    Progress
-        Before each step, and after the last.
-
-    """
+    """Import modules, one per iteration, and yield the progress."""
     names = list(modules)
     for done, name in enumerate(names):
         yield Progress(done, len(names), name)
@@ -53,21 +30,21 @@ def imports(modules: Iterable[str]) -> Iterator[Progress]:
 
 class Preparation:
     """
-    Steps that are taken once, by the caller or by a thread.
+    Steps that run once, in the thread of the caller or in a separate thread.
 
     Parameters
     ----------
     steps : iterable of Progress
-        Taking the next element does the next step.
+        Each iteration executes the next step.
 
     Attributes
     ----------
     progress : Progress
         The latest state.
     error : Exception or None
-        Error that ended it.
+        Error of a step.
     is_complete : bool
-        Whether all steps are done, or an error ended it.
+        Whether all steps are done, or a step failed.
 
     """
 
@@ -80,19 +57,10 @@ class Preparation:
 
     @property
     def is_running(self) -> bool:
-        """Whether the thread is at work."""
         return self._thread is not None and not self.is_complete
 
     def complete(self) -> None:
-        """
-        Take the steps that are left, in the thread of the caller.
-
-        Raises
-        ------
-        Exception
-            The error that ended it, now or earlier.
-
-        """
+        """Run the remaining steps in the calling thread; raise the error of a failed step."""
         if self._thread is not None:
             self._thread.join()
         if not self.is_complete:
@@ -101,15 +69,7 @@ class Preparation:
             raise self.error
 
     def start(self, report: Callable[[], None]) -> None:
-        """
-        Take the steps in a thread of its own.
-
-        Parameters
-        ----------
-        report : callable
-            Called by that thread after the last step, or an error.
-
-        """
+        """Run the steps in a thread, which calls `report` at the end, also after an error."""
 
         def work() -> None:
             self._run()
@@ -122,7 +82,7 @@ class Preparation:
         try:
             for progress in self._steps:
                 self.progress = progress
-        # Raised by `complete`, in the thread that waits for it.
+        # `complete` raises the error in the waiting thread.
         except Exception as error:  # noqa: BLE001
             self.error = error
         self.is_complete = True

@@ -1,11 +1,11 @@
 """
-A pool of worker processes that cannot hang.
+Process pool without shared queues, robust against killed workers.
 
-Workers share nothing. The pools of the standard library and of joblib give all workers one queue:
-a worker that is killed while it holds the lock of the queue, or while it writes a result that the
-pipe cannot hold, blocks the others or the parent for ever. Here each worker has its own pipe. The
-kernel closes it when the worker ends, at any moment from its first instruction, and the parent
-gives the job to a new worker.
+The pools of the standard library and of joblib give all workers one queue: a worker that is killed
+while it holds the lock of the queue, or while it writes a result larger than the pipe buffer,
+blocks the other workers or the parent forever. Here each worker has its own pipe. The kernel
+closes the pipe when the worker ends, at any moment from its first instruction, and the parent
+assigns the job to a new worker.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from typing import Any, Final, ParamSpec, TypeVar
 
 from needle_ros.errors import JobError
 
-#: Workers that are lost before a job is given up.
+#: Number of lost workers after which a job fails.
 _TRIES: Final = 10
 
 _P = ParamSpec('_P')
@@ -32,30 +32,30 @@ _T = TypeVar('_T')
 
 
 class _WorkerError(Exception):
-    """The traceback of an exception in a worker, as its cause."""
+    """Traceback of an exception in a worker, used as its cause."""
 
     def __str__(self) -> str:
         return f'\n{self.args[0]}'
 
 
 class _Worker:
-    """A process and the only pipe to it."""
+    """A worker process and its pipe."""
 
     def __init__(self) -> None:
         context = get_context('spawn')
         self._pipe, end = context.Pipe()
         self.process = context.Process(target=_work, args=(end,), daemon=True)
-        # With the end of the worker open here, the pipe would outlive the worker.
+        # A copy of the worker end in this process would keep the pipe open after the worker.
         with end:
             self.process.start()
 
     def run(self, job: bytes) -> bytes:
-        """Return the result of a job; EOFError or OSError if the worker ends before."""
+        """Return the pickled result of a job; EOFError or OSError if the worker ends earlier."""
         self._pipe.send_bytes(job)
         return self._pipe.recv_bytes()
 
     def end(self) -> int | None:
-        """End the worker; return its exit code."""
+        """Kill the worker; return its exit code."""
         self.process.kill()
         self.process.join()
         self._pipe.close()
@@ -78,7 +78,7 @@ class _Pool(ThreadPoolExecutor):
         return super().submit(self._run, function, *args, **kwargs)
 
     def _run(self, *job: Any, **kwargs: Any) -> Any:
-        """Compute a job, with another worker each time that one is lost."""
+        """Execute a job, and repeat it in a new worker after the loss of a worker."""
         data = pickle.dumps((job, kwargs))
         code = None
         for _ in range(_TRIES):
@@ -112,7 +112,7 @@ class _Pool(ThreadPoolExecutor):
             return worker
 
     def end(self) -> None:
-        """Kill all workers: a thread that waits for one wakes, and no new one starts."""
+        """Kill all workers: waiting threads return, and no new worker starts."""
         self.shutdown(wait=False, cancel_futures=True)
         with self._guard:
             self._open = False
@@ -126,22 +126,12 @@ class _Pool(ThreadPoolExecutor):
 @contextmanager
 def processes(workers: int) -> Iterator[Executor]:
     """
-    Start worker processes of this machine.
+    Start a pool of at most `workers` processes; each is started when the first job needs it.
 
-    A job must be a pure function: it is computed again if its worker is killed, by the kernel for
-    example. Workers are spawned, ignore SIGINT, and end when this process ends, also by SIGKILL.
-
-    Parameters
-    ----------
-    workers : int
-        Largest number of workers; each is started when the first job needs it.
-
-    Yields
-    ------
-    Executor
-        A job whose worker is lost 10 times in a row raises `JobError`. At the end of the
-        context, jobs that run are ended with their workers, and the others are cancelled.
-
+    A job must be a pure function: it is executed again if its worker is killed, for example by the
+    kernel. A job whose worker is lost 10 times in a row raises `JobError`. Workers are spawned,
+    ignore SIGINT, and end with this process, also after SIGKILL. At the end of the context,
+    running jobs are killed with their workers, and pending jobs are cancelled.
     """
     pool = _Pool(workers)
     try:
@@ -151,10 +141,10 @@ def processes(workers: int) -> Iterator[Executor]:
 
 
 def _work(pipe: Connection) -> None:
-    """Compute jobs until the parent closes the pipe."""
-    # Only the parent answers Ctrl-C.
+    """Execute jobs until the parent closes the pipe."""
+    # Only the parent handles Ctrl-C.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    # A worker that computes does not read its pipe, and would outlive a parent that was killed.
+    # A busy worker does not read its pipe, and would outlive a killed parent.
     Thread(target=_end_with_parent, daemon=True).start()
     with suppress(EOFError, OSError):
         while True:
@@ -162,7 +152,7 @@ def _work(pipe: Connection) -> None:
 
 
 def _answer(data: bytes) -> bytes:
-    """Return the result of a job, or its exception with the traceback."""
+    """Return the pickled result of a job, or its exception with the traceback."""
     try:
         (function, *args), kwargs = pickle.loads(data)  # noqa: S301
         return pickle.dumps((function(*args, **kwargs), None, ''))

@@ -1,4 +1,4 @@
-"""Who publishes what may have one source only, and is alive."""
+"""Detection of duplicate publishers and of their liveliness."""
 
 from __future__ import annotations
 
@@ -16,15 +16,10 @@ from rclpy.parameter import Parameter
 
 def offer_lease(node: BaseNode, lease: Topic) -> None:
     """
-    Offer a lease, before a topic: a publisher without one never counts as dead.
+    Offer a liveliness lease, before creating the publisher of the topic itself.
 
-    Parameters
-    ----------
-    node : BaseNode
-        The node that publishes the topic.
-    lease : Topic
-        Topic of the lease. It is named after a topic, and goes where that one is remapped to.
-
+    A publisher without a lease never counts as dead. The lease topic follows the remapping of its
+    topic.
     """
     node.create_publisher(message_class(lease.type_name), _name(node, lease), profile(lease.qos))
 
@@ -36,18 +31,10 @@ def _name(node: BaseNode, lease: Topic) -> str:
 
 def request_stamp(node: Node) -> Time:
     """
-    Return the stamp of a request that is made now, in the time of the graph.
+    Return the stamp of a request that is sent now, in the time of the graph.
 
-    Parameters
-    ----------
-    node : Node
-        The node that makes it. It uses simulated time from now on where there is a ``/clock``.
-
-    Returns
-    -------
-    Time
-        The time now; zero, which stands for the time of arrival, before the first ``/clock``.
-
+    The node switches to simulated time if a ``/clock`` exists. Before the first ``/clock`` message
+    the stamp is zero, which means the time of arrival.
     """
     if node.count_publishers(contract.CLOCK.name) and not node.get_parameter('use_sim_time').value:
         node.set_parameters([Parameter('use_sim_time', value=True)])
@@ -57,20 +44,20 @@ def request_stamp(node: Node) -> Time:
 
 class Publishers:
     """
-    Counts the nodes that publish a topic.
+    Number of live publishers of a topic.
 
-    A node that was killed stays in the graph for 20 s. If it offers a lease, it no longer counts
-    when this is over, after 0.5 s. Others, such as ``ros2 topic pub``, count as long as the graph
-    has them.
+    A killed node stays in the graph for 20 s. With a lease it no longer counts after the end of
+    the lease, 0.5 s. Publishers without a lease, such as ``ros2 topic pub``, count as long as they
+    are in the graph.
 
     Parameters
     ----------
     node : BaseNode
-        The node that wants to know.
+        The subscribing node.
     lease : Topic
-        Topic on which publishers offer a lease, see `offer_lease`.
+        Topic of the lease, see `offer_lease`.
     on_change : callable, optional
-        Called when a lease ends or begins again.
+        Called when a lease ends or is renewed.
 
     """
 
@@ -95,27 +82,16 @@ class Publishers:
 
     def count(self, topic: Topic, matched: int = 0) -> int:
         """
-        Count those that are alive, active or not.
+        Return the number of live publishers of a topic, in any lifecycle state.
 
-        Parameters
-        ----------
-        topic : Topic
-            The topic.
-        matched : int
-            Its publishers that a subscription has been matched with, dead ones too: the graph
-            may learn of them later.
-
-        Returns
-        -------
-        int
-            Its publishers, but those whose lease is over.
-
+        `matched` is the number of publishers matched with a subscription, dead publishers
+        included: the graph may be updated later.
         """
         publishers = self._node.get_publishers_info_by_topic(topic.name)
         number = max(len(publishers), matched)
         if not self._over:
             return number
-        # Who only offers a lease, and lets it end, must not hide a stranger.
+        # A process with an expired lease but no publisher must not hide a duplicate publisher.
         processes = {_process(one) for one in publishers}
         others = sum(
             _process(one) not in processes
@@ -125,5 +101,5 @@ class Publishers:
 
 
 def _process(endpoint: Any) -> bytes:
-    """Return what the identifiers of all endpoints of a process begin with."""
+    """Return the common prefix of the endpoint identifiers of a process."""
     return bytes(endpoint.endpoint_gid[:12])

@@ -1,4 +1,4 @@
-"""A process that runs one node."""
+"""Main function of a node process."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.task import Future
 from rclpy.utilities import remove_ros_args
 
-#: Environment variable: if it is set, a node ends when the process that started it ends.
+#: Environment variable: if set, a node ends with its parent process.
 END_WITH_PARENT = 'NEEDLE_END_WITH_PARENT'
 
 _PR_SET_PDEATHSIG = 1
 
-#: What ends a node; SIGHUP comes when its terminal is closed.
+#: Signals that end a node; closing a terminal sends SIGHUP.
 _ENDINGS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 _USAGE = '%(prog)s [-h] [--ros-args [-p NAME:=VALUE ...] [--params-file FILE] ...]'
@@ -41,25 +41,9 @@ def run(kind: Callable[[], BaseNode]) -> int:
     """
     Run one node until SIGINT, SIGTERM or SIGHUP, then deactivate it while it can still publish.
 
-    An error in a callback ends the process too: the node is deactivated, and the error raised.
-
-    This is the whole life of a process: its signals are taken over for good.
-
-    Parameters
-    ----------
-    kind : callable
-        Makes the node.
-
-    Returns
-    -------
-    int
-        Exit status: 0, 1 if the node `failed`, or 2 if it refused to start.
-
-    Raises
-    ------
-    SystemExit
-        After ``--help`` and for unknown words.
-
+    It returns the exit status: 0, 1 if the node `failed`, or 2 if it refused to start; SystemExit
+    follows ``--help`` and unknown arguments. An error in a callback deactivates the node, ends the
+    process and is raised. The function replaces the signal handlers of the process permanently.
     """
     stopping = spinning = False
 
@@ -67,11 +51,11 @@ def run(kind: Callable[[], BaseNode]) -> int:
         nonlocal stopping
         stopping = True
         if not spinning:
-            # Nothing has been commanded yet. An exception would be an error of the compiler.
+            # No command has been sent yet. An exception would appear as a compiler error.
             os._exit(0)
 
     if os.environ.get(END_WITH_PARENT):
-        # Linux sends the signal when the process that started this one ends, in whatever way.
+        # Linux sends the signal when the parent process ends for any reason.
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
     for one in _ENDINGS:
         signal.signal(one, stop)
@@ -79,13 +63,12 @@ def run(kind: Callable[[], BaseNode]) -> int:
     try:
         try:
             _check_words(kind, sys.argv)
-            # Not rclpy's handlers: they end the context before the node can publish its last
-            # command.
+            # The handlers of rclpy end the context before the node can publish its last command.
             rclpy.init(signal_handler_options=rclpy.signals.SignalHandlerOptions.NO)
             node = kind()
         except (ParameterException, NeedleError, RuntimeError) as error:
-            # RuntimeError is rcl's, for arguments or a parameter file that it cannot read, and
-            # for a node that its security refuses.
+            # rcl raises RuntimeError for invalid arguments or parameter files, and for a node that
+            # SROS2 rejects.
             sys.stderr.write(f'error: {" ".join(str(error).split())}\n')
             return 2
         _read_files(node)
@@ -95,7 +78,7 @@ def run(kind: Callable[[], BaseNode]) -> int:
 
         def refuse() -> None:
             nonlocal status
-            # The reason, on /diagnostics.
+            # Publish the reason on /diagnostics.
             node.publish_diagnostics()
             status = 2
 
@@ -104,17 +87,17 @@ def run(kind: Callable[[], BaseNode]) -> int:
             if node.get_parameter('autostart').value:
                 node.begin(refuse)
             while not stopping and status == 0:
-                # Unlike spin_once it does not return to Python at each event.
+                # Unlike spin_once, this call does not return to Python at each event.
                 executor.spin_until_future_complete(Future(), timeout_sec=0.1)
         finally:
-            # An error shall not leave a force applied either.
+            # Command zero force also after an error.
             node.stop()
-        # The last messages (a zero force, a latched result) are still to be sent.
+        # Send the last messages (zero force, latched result).
         deadline = time.monotonic() + 0.1
         while time.monotonic() < deadline:
             executor.spin_once(timeout_sec=0.02)
         if node.is_preparing:
-            # Nothing has been commanded, and a compiler in a thread cannot be ended otherwise.
+            # No command has been sent, and a compiler thread cannot be stopped otherwise.
             sys.stderr.flush()
             os._exit(status)
         executor.shutdown()
@@ -122,13 +105,13 @@ def run(kind: Callable[[], BaseNode]) -> int:
         return status or int(node.failed)
     finally:
         rclpy.utilities.try_shutdown()
-        # A second Ctrl-C shall not change how the process ends.
+        # A second Ctrl-C must not change the exit status.
         for one in _ENDINGS:
             signal.signal(one, signal.SIG_IGN)
 
 
 def _read_files(node: BaseNode) -> None:
-    """Name what parameter files give to other nodes, and warn of sections for none."""
+    """Set the shared parameters of a node, and warn of files without a section for it."""
     found, name = sections(sys.argv), node.get_fully_qualified_name()
     for line in strangers(found, name):
         node.get_logger().warning(line)
@@ -136,7 +119,7 @@ def _read_files(node: BaseNode) -> None:
 
 
 def _check_words(kind: Callable[[], BaseNode], words: Sequence[str]) -> None:
-    """Refuse words that are not for ROS, and answer ``--help``, by SystemExit."""
+    """Reject unknown arguments, and print ``--help``, both by SystemExit."""
     program, *others = remove_ros_args(list(words))
     parser = argparse.ArgumentParser(Path(program).name, usage=_USAGE, add_help=False)
     parser.add_argument('-h', '--help', action='store_true')
@@ -147,20 +130,20 @@ def _check_words(kind: Callable[[], BaseNode], words: Sequence[str]) -> None:
         parser.exit()
     if unknown:
         parser.error(
-            f'unknown: {" ".join(unknown)}; parameters are given by --ros-args -p NAME:=VALUE'
+            f'unknown: {" ".join(unknown)}; set parameters with --ros-args -p NAME:=VALUE'
         )
 
 
 def _described(kind: Callable[[], BaseNode]) -> list[str]:
-    """Return what a node is for, and what it declares, in lines."""
-    # No other node may see this one: it would count as a rival.
+    """Return the help text: class summary and parameters of a node."""
+    # Hidden from other nodes, which would report a duplicate node.
     os.environ.update({**LOCAL, RANGE: 'OFF'})
     os.environ.pop('ROS_STATIC_PEERS', None)
     rclpy.init(args=[])
     try:
         node = kind()
         summary, *_ = inspect.cleandoc(type(node).__doc__ or '').split('\n\n')
-        lines = [summary, '', 'Parameters, with their defaults:']
+        lines = [summary, '', 'Parameters and defaults:']
         for name, value in node.values().items():
             lines.append(f'  {name}: {value}')
             meaning = node.describe_parameter(name).description

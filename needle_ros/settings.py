@@ -1,4 +1,4 @@
-"""Settings: frozen dataclasses whose fields have a unit, a meaning and a range."""
+"""Settings: frozen dataclasses whose fields have a unit, a description and a range."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from needle_ros.errors import ParameterError
 
 _Settings = TypeVar('_Settings')
 
-#: What may stand for a tuple.
+#: Types accepted for a tuple.
 _LISTS: Final = (list, array, type(None))
 
 #: Larger integers cannot be converted to float.
@@ -30,26 +30,11 @@ def constant(
     open_low: bool = False,
 ) -> Any:
     """
-    Declare a numeric field with its unit, meaning and valid range.
+    Declare a numeric dataclass field with unit, description and valid range.
 
-    Parameters
-    ----------
-    default : float or tuple of float
-        Default value [``unit``]; a tuple makes it a field of several numbers, each in the range.
-    unit : str
-        SI unit as people write it, ``1`` for a pure number.
-    description : str
-        What the number is; becomes the description of the ROS parameter.
-    low, high : float
-        Valid range.
-    open_low : bool
-        True if ``low`` itself is not valid.
-
-    Returns
-    -------
-    Any
-        A dataclass field.
-
+    A tuple as default declares an array field, whose elements all have the range. The unit is an
+    SI unit, ``1`` for a pure number. The description becomes the description of the ROS parameter.
+    `open_low` excludes ``low`` itself.
     """
     return field(
         default=default,
@@ -65,18 +50,10 @@ def constant(
 
 def check_constants(values: object) -> None:
     """
-    Check that every numeric field is finite and in its declared range.
+    Check that every numeric field of a dataclass is finite and within its range.
 
-    Parameters
-    ----------
-    values : object
-        A dataclass instance whose numeric fields were made by `constant`.
-
-    Raises
-    ------
-    ParameterError
-        If one is not; the message names the field, the value and the valid range with its unit.
-
+    The message of the `ParameterError` contains the field, the value, and the valid range with its
+    unit.
     """
     for item in fields(values):  # type: ignore[arg-type]
         if 'unit' not in item.metadata:
@@ -106,29 +83,11 @@ def from_values(
     kind: Callable[..., _Settings], values: Mapping[str, Any], prefix: str = ''
 ) -> _Settings:
     """
-    Make settings from values by name.
+    Construct settings from values by field name.
 
-    Parameters
-    ----------
-    kind : type
-        The dataclass.
-    values : Mapping[str, Any]
-        Values by field name; integers are accepted where a float is meant, lists and arrays where
-        a tuple is meant. None stands for an empty tuple: so an empty list in a parameter file
-        arrives.
-    prefix : str
-        Namespace of the names in messages, such as ``model.``.
-
-    Returns
-    -------
-    object
-        The dataclass instance.
-
-    Raises
-    ------
-    ParameterError
-        If a name is unknown or a value is not valid; the message names the field.
-
+    Integers are accepted for floats, lists and arrays for tuples. None means an empty tuple,
+    because rcl returns an empty list of a parameter file as None. The message of a
+    `ParameterError` contains the field with ``prefix``, such as ``model.``.
     """
     known = {item.name: item for item in fields(kind)}  # type: ignore[arg-type]
     given = {}
@@ -147,7 +106,7 @@ def from_values(
 
 
 def _as_number(value: Any) -> Any:
-    """Convert integers to float, also within a tuple; other values stay as they are."""
+    """Convert integers to float, also within a tuple; keep other values."""
     if isinstance(value, tuple):
         return tuple(_as_number(number) for number in value)
     is_integer = isinstance(value, int) and not isinstance(value, bool)
@@ -155,22 +114,7 @@ def _as_number(value: Any) -> Any:
 
 
 def unknown_name(name: str, valid: Iterable[str]) -> str:
-    """
-    Return the message for an unknown parameter.
-
-    Parameters
-    ----------
-    name : str
-        Its name.
-    valid : iterable of str
-        Valid names.
-
-    Returns
-    -------
-    str
-        The message, with the nearest valid name, or all of them if none is near.
-
-    """
+    """Return the error message for an unknown parameter, with the nearest valid name."""
     names = sorted(valid)
     close = get_close_matches(name, names, n=1)
     hint = f'did you mean {close[0]!r}?' if close else f'valid: {", ".join(names)}'

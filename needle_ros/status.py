@@ -1,9 +1,9 @@
 """
-Requests on topics and their acknowledgement in the status of the node that receives them.
+Requests on topics, and their acknowledgement in the status of the receiver.
 
-A request is a message on a topic whose stamp is `Stamp.REQUEST` in the contract: a target or a
-trajectory. Its receiver answers through its status on ``/diagnostics``, at once and again each
-second, so that a lost message is healed. The sender repeats the request until it is answered.
+A request is a message on a topic with stamp `Stamp.REQUEST` in the contract: a target or a
+trajectory. The receiver answers in its status on ``/diagnostics``, immediately and then once a
+second, so that a lost message is replaced. The sender repeats the request until the answer.
 """
 
 from __future__ import annotations
@@ -18,26 +18,25 @@ from needle_ros.contract import REQUEST_AGE, Stamp, Topic
 from needle_ros.errors import printable
 from needle_ros.timing import apart, NANOSECONDS
 
-#: Time without an answer after which a request is repeated [s], and the number of repetitions.
+#: Interval of repetitions without an answer [s], and the maximum number of repetitions.
 REPEAT_AFTER: Final = 1.0
 REPEATS: Final = 3
 
-#: Time after which a request without an answer has failed [s]: a receiver that gets it later
-#: rejects it as stale, so that it is not executed after that.
+#: Timeout of a request without an answer [s]: a later receiver rejects it as stale, so that it is
+#: not executed after the timeout.
 _GIVE_UP: Final = REQUEST_AGE + 1.0
 
-#: Time after which the call of a service without an answer has failed [s]: longer than a node
-#: needs on a slow machine.
+#: Timeout of a service call [s], longer than the response time on a slow machine.
 CALL_TIMEOUT: Final = 10.0
 
-#: Acknowledgements that a status contains, and that are kept to recognize duplicates.
+#: Number of answers in a status, and number of answers kept to detect duplicates.
 _PUBLISHED: Final = 8
 _KEPT: Final = 64
 
-#: Shortest time between two statuses that are published for an acknowledgement [s].
+#: Minimum time between two statuses published for an answer [s].
 _PAUSE: Final = 0.05
 
-#: Keys in a status, and beginnings of keys.
+#: Keys and key prefixes in a status.
 _TAKES: Final = 'takes '
 _REQUEST: Final = 'request '
 _PAUSED: Final = 'paused'
@@ -46,31 +45,31 @@ _MOST_AGE: Final = round(REQUEST_AGE * NANOSECONDS)
 
 
 class Verdict(Enum):
-    """The answer of a receiver to a request."""
+    """Result of a request."""
 
-    #: Received and being examined; another verdict follows.
+    #: Received and being checked; another verdict follows.
     RECEIVED = 'received'
     ACCEPTED = 'accepted'
     REJECTED = 'rejected'
-    #: Not executed, because the receiver follows a newer request.
+    #: Not executed, because the receiver executes a newer request.
     SUPERSEDED = 'superseded'
 
 
 @dataclass(frozen=True, slots=True)
 class Acknowledgement:
     """
-    The answer of a receiver to one request.
+    Answer of a receiver to a request.
 
     Attributes
     ----------
     topic : str
-        Topic of the request, as the contract names it.
+        Topic of the request, by its name in the contract.
     stamp : int
-        Stamp of its message [ns]; 0 for a message without a stamp.
+        Stamp of the request [ns]; 0 for a message without a stamp.
     verdict : Verdict
-        The answer.
+        The result.
     reason : str
-        Why it was not accepted, for people.
+        Reason of a rejection, for users.
 
     """
 
@@ -88,16 +87,16 @@ class Acknowledgement:
 @dataclass(frozen=True, slots=True)
 class RequestStatus:
     """
-    The requests that a node takes and its latest answers: typed fields of its status.
+    Accepted request topics of a node and its latest answers, as fields of a DiagnosticStatus.
 
     Attributes
     ----------
     takes : Mapping of str to tuple of str
-        Joints that it moves, by topic of the request.
+        Moved joints by topic of the request.
     answers : tuple of Acknowledgement
-        Its latest answers, the newest last.
+        The latest answers, the newest last.
     paused : bool
-        Whether a person has paused its motion: it may take any time.
+        Whether a user has paused the motion, for an unlimited time.
 
     """
 
@@ -118,20 +117,7 @@ class RequestStatus:
 
     @classmethod
     def from_values(cls, values: Mapping[str, str]) -> RequestStatus:
-        """
-        Read the fields from values of a DiagnosticStatus.
-
-        Parameters
-        ----------
-        values : Mapping of str to str
-            Values by key; other values are left out.
-
-        Returns
-        -------
-        RequestStatus
-            The fields.
-
-        """
+        """Parse the fields from values of a DiagnosticStatus; other keys are ignored."""
         takes: dict[str, tuple[str, ...]] = {}
         answers = []
         for key, value in values.items():
@@ -145,22 +131,7 @@ class RequestStatus:
         return cls(takes, tuple(answers), values.get(_PAUSED) == str(True))
 
     def answer_to(self, topic: str, stamp: int) -> Acknowledgement | None:
-        """
-        Return the answer to a request.
-
-        Parameters
-        ----------
-        topic : str
-            Its topic.
-        stamp : int
-            Its stamp [ns].
-
-        Returns
-        -------
-        Acknowledgement or None
-            The answer; None without an answer.
-
-        """
+        """Return the answer to a request with a topic and stamp [ns], or None."""
         for one in self.answers:
             if (one.topic, one.stamp) == (topic, stamp):
                 return one
@@ -172,16 +143,16 @@ _VERDICTS: Final = {one.value for one in Verdict}
 
 class RequestLog:
     """
-    Receive each request once, in the order of the stamps, and record the answers.
+    Log of received requests: accept each once, in the order of the stamps, and record answers.
 
     Parameters
     ----------
     takes : Mapping of Topic to sequence of str
-        Joints that the node moves, by topic of the request.
+        Moved joints by topic of the request.
     frames : sequence of str
         Valid frames of a request.
     steady : callable
-        Returns the time of a clock that never jumps [s].
+        Returns the time of a steady clock [s].
 
     """
 
@@ -203,7 +174,7 @@ class RequestLog:
         self._published = -_PAUSE
 
     def forget(self) -> None:
-        """Forget all requests: after a start, or when the clock was set back."""
+        """Delete all requests, after a start or after the clock was set back."""
         self._answers.clear()
         self._newest.clear()
 
@@ -211,28 +182,11 @@ class RequestLog:
         self, topic: Topic, stamp: int, now: int, frame: str = '', joints: Iterable[str] = ()
     ) -> Acknowledgement | None:
         """
-        Check whether a request is new; else answer it.
+        Return None for a new request, else its answer; times are in ns.
 
-        Parameters
-        ----------
-        topic : Topic
-            Topic of the request.
-        stamp : int
-            Stamp of its message [ns]; 0 for none: it counts as new.
-        now : int
-            Time [ns].
-        frame : str
-            Its frame.
-        joints : iterable of str
-            Joints that it moves.
-
-        Returns
-        -------
-        Acknowledgement or None
-            None if it is to be executed; the caller then answers it. Otherwise the answer: that
-            of the first time for a duplicate, and a refusal for a request that is stale, in a
-            wrong frame, or older than the one that is followed.
-
+        The caller executes and answers a new request; a stamp of 0 always counts as new. A
+        duplicate gets its first answer again. A request with a stale stamp or a wrong frame is
+        rejected, and a request older than the current request of one of its joints is superseded.
         """
         known = self._answers.get((topic.name, stamp)) if stamp else None
         if known is not None:
@@ -251,7 +205,7 @@ class RequestLog:
 
     def _follows(self, joint: str, now: int) -> int:
         newest = self._newest.get(joint, 0)
-        # The clock was set back since.
+        # The clock has been set back.
         return newest if newest <= now + _MOST_AGE else 0
 
     def answer(
@@ -262,29 +216,12 @@ class RequestLog:
         reason: str = '',
         joints: Iterable[str] = (),
     ) -> Acknowledgement:
-        """
-        Record the answer to a request.
-
-        Parameters
-        ----------
-        topic, stamp, joints
-            As for `check`.
-        verdict : Verdict
-            The answer.
-        reason : str
-            Why it is not accepted.
-
-        Returns
-        -------
-        Acknowledgement
-            The answer.
-
-        """
+        """Record and return the answer to a request; arguments as for `check`."""
         made = Acknowledgement(topic.name, stamp, verdict, printable(reason))
         if stamp and not made.refused:
             for joint in joints:
                 self._newest[joint] = max(stamp, self._newest.get(joint, 0))
-        # The newest last.
+        # Newest answer last.
         self._answers.pop((topic.name, stamp), None)
         self._answers[topic.name, stamp] = made
         while len(self._answers) > _KEPT:
@@ -293,25 +230,17 @@ class RequestLog:
         return made
 
     def supersede(self, now: int) -> None:
-        """
-        Supersede all requests that were sent before now: a stop, or a retraction, has priority.
-
-        Parameters
-        ----------
-        now : int
-            Time [ns].
-
-        """
+        """Supersede all requests sent before `now` [ns]: a stop or a retraction has priority."""
         for joints in self._takes.values():
             for joint in joints:
                 self._newest[joint] = max(now, self._newest.get(joint, 0))
 
     def due(self) -> bool:
         """
-        Return whether the status is to be published now, for an answer that is not in it yet.
+        Return whether the status must be published now because of an unpublished answer.
 
-        Call it after each request and with a timer of at most 0.1 s: so many requests at once do
-        not lead to as many statuses.
+        Call it after each request and from a timer of at most 0.1 s: this limits the number of
+        statuses for a burst of requests.
         """
         now = self._steady()
         if not self._changed or now - self._published < _PAUSE:
@@ -320,20 +249,7 @@ class RequestLog:
         return True
 
     def status(self, *, paused: bool = False) -> RequestStatus:
-        """
-        Return the fields of the status.
-
-        Parameters
-        ----------
-        paused : bool
-            As in `RequestStatus`.
-
-        Returns
-        -------
-        RequestStatus
-            The fields, with the latest answers.
-
-        """
+        """Return the status with the latest answers."""
         answers = tuple(self._answers.values())[-_PUBLISHED:]
         return RequestStatus(self._takes, answers, paused)
 
@@ -347,18 +263,18 @@ class PendingRequest:
     topic : Topic
         Its topic.
     stamp : int
-        Its stamp [ns], which all repetitions have, so that it is executed once.
+        Its stamp [ns], equal in all repetitions, so that the request is executed once.
     node : str
-        Name of the node that should answer.
+        Name of the expected receiver.
     steady : callable
-        Returns the time of a clock that never jumps [s].
+        Returns the time of a steady clock [s].
 
     Attributes
     ----------
     answer : Acknowledgement or None
         The latest answer.
     node : str
-        Name of the node that should answer, or has answered.
+        Name of the expected receiver, or of the node that has answered.
 
     """
 
@@ -371,24 +287,14 @@ class PendingRequest:
         self.node = node
 
     def hear(self, node: str, status: RequestStatus) -> None:
-        """
-        Take the status of a node.
-
-        Parameters
-        ----------
-        node : str
-            Its name.
-        status : RequestStatus
-            Its status.
-
-        """
+        """Process the status of a node."""
         answer = status.answer_to(self._topic, self._stamp)
         if answer is not None and (self.answer is None or not self.done):
             self.answer, self.node = answer, node
 
     @property
     def done(self) -> bool:
-        """Whether it is accepted, refused, or so old that no node accepts it any more."""
+        """Whether the request is accepted, refused, or expired."""
         if self.answer is not None:
             return self.answer.verdict is not Verdict.RECEIVED
         return self._elapsed > _GIVE_UP
@@ -398,7 +304,7 @@ class PendingRequest:
         return self._steady() - self._begun
 
     def repeat(self) -> bool:
-        """Return whether it is to be sent again now."""
+        """Return whether the request must be sent again now."""
         due = self._repeats < min(REPEATS, int(self._elapsed / REPEAT_AFTER))
         if self.answer is not None or not due:
             return False
@@ -407,7 +313,7 @@ class PendingRequest:
 
     @property
     def outcome(self) -> tuple[bool, str]:
-        """Whether it was accepted, and one line for people; once it is done."""
+        """Result of a request that is done: whether accepted, and one line for users."""
         if self.answer is None:
             return False, f'{self.node}: no answer to {self._topic} within {_GIVE_UP:g} s'
         verb = self.answer.verdict.value
@@ -417,18 +323,5 @@ class PendingRequest:
 
 
 def no_answer(service: str) -> str:
-    """
-    Return the error of a call without an answer, in one line.
-
-    Parameters
-    ----------
-    service : str
-        Names of node and service.
-
-    Returns
-    -------
-    str
-        The error.
-
-    """
+    """Return the one-line error of a service call without a response."""
     return f'{service}: no answer within {CALL_TIMEOUT:g} s'

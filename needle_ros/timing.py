@@ -1,4 +1,4 @@
-"""Time stamps as integers of nanoseconds, and rates."""
+"""Time stamps in integer nanoseconds, and event rates."""
 
 from __future__ import annotations
 
@@ -6,68 +6,29 @@ from typing import Any, Final
 
 NANOSECONDS: Final = 1_000_000_000
 
-#: Two clocks of this machine are farther apart, two of the same kind are not [ns].
+#: Larger differences indicate stamps of different clocks, such as simulated and system time [ns].
 _DAYS: Final = 10 * 24 * 3600 * NANOSECONDS
 
 
 def nanoseconds(time: Any) -> int:
-    """
-    Convert a time or a duration of a message.
-
-    Parameters
-    ----------
-    time : builtin_interfaces Time or Duration
-        Whatever has ``sec`` and ``nanosec``.
-
-    Returns
-    -------
-    int
-        Time [ns].
-
-    """
+    """Convert a builtin_interfaces Time or Duration to ns."""
     return int(time.sec) * NANOSECONDS + int(time.nanosec)
 
 
 def seconds(time: Any) -> float:
-    """
-    Convert a time or a duration of a message.
-
-    Parameters
-    ----------
-    time : builtin_interfaces Time or Duration
-        Whatever has ``sec`` and ``nanosec``.
-
-    Returns
-    -------
-    float
-        Time [s].
-
-    """
+    """Convert a builtin_interfaces Time or Duration to s."""
     return float(time.sec + time.nanosec / NANOSECONDS)
 
 
 def apart(age: int) -> str:
-    """
-    Say how far a stamp is from now.
-
-    Parameters
-    ----------
-    age : int
-        Now minus the stamp [ns].
-
-    Returns
-    -------
-    str
-        Its age; or that it is of another clock, if it is off by days.
-
-    """
+    """Describe the age of a stamp [ns]; a difference of days is reported as a different clock."""
     if abs(age) > _DAYS:
         return 'of another clock: use_sim_time must be alike in all nodes, with a /clock if true'
     return f'{abs(age) / NANOSECONDS:.3f} s {"old" if age > 0 else "ahead"}'
 
 
 class RateCounter:
-    """Counts events by the second: how many there were, and which share of them was marked."""
+    """Rate of events over the last full second, and fraction of marked events."""
 
     def __init__(self) -> None:
         self._start: int | None = None
@@ -75,17 +36,7 @@ class RateCounter:
         self._rate = self._share = 0.0
 
     def add(self, now: int, marked: bool = False) -> None:
-        """
-        Count an event.
-
-        Parameters
-        ----------
-        now : int
-            Its time [ns].
-        marked : bool
-            Whether it is marked.
-
-        """
+        """Count an event at time `now` [ns]."""
         self._roll(now)
         self._count += 1
         self._marked += marked
@@ -100,37 +51,11 @@ class RateCounter:
         self._start, self._count, self._marked = now, 0, 0
 
     def rate(self, now: int) -> float:
-        """
-        Return the rate in the last full second.
-
-        Parameters
-        ----------
-        now : int
-            Time [ns].
-
-        Returns
-        -------
-        float
-            Events per second [Hz].
-
-        """
+        """Return the event rate in the last full second [Hz]."""
         self._roll(now)
         return self._rate
 
     def share(self, now: int) -> float:
-        """
-        Return which share of the events was marked in the last full second.
-
-        Parameters
-        ----------
-        now : int
-            Time [ns].
-
-        Returns
-        -------
-        float
-            Share, from 0 to 1.
-
-        """
+        """Return the fraction of marked events in the last full second."""
         self._roll(now)
         return self._share

@@ -1,4 +1,4 @@
-"""Points of a joint trajectory, as trajectory_msgs/JointTrajectory has them."""
+"""Validation of trajectory_msgs/JointTrajectory points."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Final
 
 from needle_ros.errors import ParameterError
 
-#: Points that a path may have: a million of bad ones would take seconds.
+#: Maximum number of points: checking a million invalid points would take seconds.
 MOST_POINTS: Final = 10_000
 
 
@@ -16,27 +16,10 @@ def joint_values(
     joint: str, joints: Sequence[str], values: Sequence[Sequence[float]]
 ) -> list[float | None]:
     """
-    Pick one joint from the points of a trajectory.
+    Return the values of one joint at each point of a trajectory, None at points without one.
 
-    Parameters
-    ----------
-    joint : str
-        Name of the joint.
-    joints : sequence of str
-        Names of all joints of the trajectory.
-    values : sequence of sequence of float
-        Values of the joints at each point; may be empty.
-
-    Returns
-    -------
-    list of float or None
-        Value of the joint at each point, None where it has none.
-
-    Raises
-    ------
-    ParameterError
-        If the joint is not among them.
-
+    `joints` are the joint names of the trajectory; `ParameterError` if the joint is not among
+    them.
     """
     if joint not in joints:
         raise ParameterError(f'needs the joint {joint!r}, got {list(joints)}')
@@ -45,20 +28,7 @@ def joint_values(
 
 
 def check_times(times: Sequence[float]) -> None:
-    """
-    Refuse times of a trajectory that it cannot have.
-
-    Parameters
-    ----------
-    times : sequence of float
-        Time of each point from the start [s].
-
-    Raises
-    ------
-    ParameterError
-        If there is none, the first is negative, or they do not increase.
-
-    """
+    """Check that times of trajectory points [s] are non-negative and increasing."""
     if not times:
         raise ParameterError('trajectory has no points')
     if times[0] < 0.0 or any(late <= early for early, late in pairwise(times)):

@@ -1,9 +1,9 @@
 """
-Messages as bytes (CDR): the stamp and the numbers of one message, or of a whole batch.
+Parsing and serialization of CDR messages: stamp and numbers of a message or of a batch.
 
-The messages of a topic differ in their stamp and their numbers only. So one of them is a template
-for the others: where it has its stamp and its numbers, all those have theirs whose other bytes
-are the same. This takes a tenth of the time that rclpy takes to convert a message.
+Messages of a topic differ only in their stamp and numbers. The first message therefore serves as a
+template with the byte positions of the stamp and the numbers; it applies to all messages whose
+other bytes are equal. This takes a tenth of the time of the conversion in rclpy.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ ODOMETRY: Final = 'nav_msgs/msg/Odometry'
 
 
 class _Fields(NamedTuple):
-    """What follows the header of a message type, in this order, each a count of fields."""
+    """Fields after the header of a message type, in this order."""
 
     names: bool = False
     strings: int = 0
@@ -44,22 +44,22 @@ _FIELDS: Final = {
     ODOMETRY: _Fields(strings=1, numbers=7 + 36 + 6 + 36),
 }
 
-#: The message types that can be read and written here.
+#: Supported message types.
 TYPES: Final = tuple(_FIELDS)
 
 #: Alignment of 8-byte numbers by encapsulation: plain CDR and plain XCDR2, big and little endian.
 _WIDEST: Final = {0: 8, 1: 8, 6: 4, 7: 4}
 
-#: Encapsulation that is written: plain CDR, little endian, no options.
+#: Encapsulation of written messages: plain CDR, little endian, no options.
 _HEAD: Final = b'\0\1\0\0'
 
-#: Where the stamp is: seconds and nanoseconds behind the encapsulation.
+#: Position of the stamp (seconds, nanoseconds) after the encapsulation [bytes].
 _STAMP: Final = 4
 
-#: Some middlewares fill up the last word [bytes].
+#: Maximum padding of the last word by some middlewares [bytes].
 _PADDING: Final = 3
 
-#: After so many templates in one batch the remaining messages are read one by one.
+#: Number of templates in a batch after which messages are parsed one by one.
 _TEMPLATES: Final = 32
 
 
@@ -89,7 +89,7 @@ class Reading(NamedTuple):
 
 class _Cursor:
     """
-    Goes through the fields of a message, which it reads, or writes if it is given their values.
+    Cursor over the fields of a message, which it parses, or writes from given values.
 
     Numbers are written as zero.
     """
@@ -102,14 +102,14 @@ class _Cursor:
             )
         self.message = bytearray(message)
         self.order = '<' if kind % 2 else '>'
-        #: Bytes other than the stamp and the numbers: where they begin and end.
+        #: Begin and end of the bytes other than the stamp and the numbers.
         self.fixed = [(0, 2)]
         self._widest = _WIDEST[kind]
         self._end = 4
         self._given: Iterator[Any] | None = None if given is None else iter(given)
 
     def take(self, size: int, number: int = 1) -> int:
-        """Pass over numbers of a size [bytes]; return where they begin."""
+        """Advance over numbers of a size [bytes]; return their position."""
         if number:
             self._end += -(self._end - 4) % min(size, self._widest)
         begin = self._end
@@ -142,16 +142,15 @@ class _Cursor:
 
     def close(self) -> None:
         if len(self.message) - self._end > _PADDING:
-            raise MessageError(f"has {len(self.message)} bytes, {self._end} are its type's")
+            raise MessageError(f'has {len(self.message)} bytes, {self._end} expected')
 
 
 class Template:
     """
-    A message with a header, of which the stamp and the numbers may change.
+    Message with a header as a template with a variable stamp and variable numbers.
 
-    It writes and reads single messages, and `decode` reads many at once by it. Gaps before
-    aligned fields are written as zeros, where rmw leaves what was in memory, and are not compared
-    when a message is read.
+    It writes and reads single messages; `decode` reads a batch. Padding is written as zeros (rmw
+    writes uninitialized memory) and is not compared on reading.
 
     Parameters
     ----------
@@ -171,8 +170,8 @@ class Template:
     names : tuple of str
         Joints; empty if the type has no such field.
     arrays : tuple of (int, int)
-        Position in the message [bytes] and length of each array of numbers: positions,
-        velocities and efforts of a JointState, else all numbers as one.
+        Position in the message [bytes] and length of each array of numbers: positions, velocities
+        and efforts of a JointState, else all numbers as one array.
     order : str
         Byte order, ``<`` or ``>``.
 
@@ -190,33 +189,13 @@ class Template:
 
     @classmethod
     def of(cls, message: bytes, type_name: str) -> Template:
-        """
-        Take a message as the template of others.
-
-        Parameters
-        ----------
-        message : bytes
-            The serialized message.
-        type_name : str
-            One of `TYPES`.
-
-        Returns
-        -------
-        Template
-            One that reads this message.
-
-        Raises
-        ------
-        MessageError
-            If the bytes are not a message of this type.
-
-        """
+        """Create a template from a serialized message; `MessageError` if its type is different."""
         template = cls.__new__(cls)
         template._walk(type_name, _Cursor(message))
         return template
 
     def _walk(self, type_name: str, cursor: _Cursor) -> None:
-        """Find the fields of a message."""
+        """Locate the fields of a message."""
         fields = _FIELDS[type_name]
         cursor.take(4, 2)
         self.frame = cursor.string()
@@ -230,12 +209,12 @@ class Template:
         cursor.close()
         self.arrays, self.order = tuple(arrays), cursor.order
         self._fixed, self._message = cursor.fixed, bytes(cursor.message)
-        #: Made when it is first needed: a batch does without.
+        #: Created on first use; a batch does not need it.
         self._format: _Format | None = None
 
     @property
     def fixed(self) -> NDArray[np.intp]:
-        """Positions of the bytes that a message of this template shares with it."""
+        """Positions of the bytes that are equal in all messages of the template."""
         return np.concatenate([np.arange(begin, end) for begin, end in self._fixed])
 
     def _made(self) -> _Format:
@@ -244,25 +223,9 @@ class Template:
 
     def serialize(self, stamp: int, *values: float) -> bytes:
         """
-        Write a message.
+        Serialize a message with a stamp [ns] and all numbers, in the order of the fields.
 
-        Parameters
-        ----------
-        stamp : int
-            Time of the header [ns].
-        *values : float
-            All numbers, in the order of the fields.
-
-        Returns
-        -------
-        bytes
-            The serialized message.
-
-        Raises
-        ------
-        ShapeError
-            If there are more or fewer values than the message has.
-
+        It raises `ShapeError` for a wrong number of values.
         """
         form = self._format or self._made()
         if len(values) != form.count:
@@ -274,22 +237,9 @@ class Template:
         return form.pack(*parts)
 
     def read(self, message: bytes) -> Reading | None:
-        """
-        Read a message.
-
-        Parameters
-        ----------
-        message : bytes
-            The serialized message.
-
-        Returns
-        -------
-        Reading or None
-            Its content; None if its fixed bytes are not those of the template.
-
-        """
+        """Parse a serialized message; None if its fixed bytes differ from the template."""
         form = self._format or self._made()
-        # One that begins alike and is longer has other counts, but for padding.
+        # A longer message with the same prefix has other counts, except for padding.
         if len(message) < form.size or form.unpack_fixed(message) != form.fixed:
             return None
         found = form.unpack_numbers(message)
@@ -302,40 +252,14 @@ class Template:
 
 
 class Reader:
-    """
-    Reads the messages of a topic one by one, by the template of the message before.
-
-    Parameters
-    ----------
-    type_name : str
-        One of `TYPES`.
-
-    """
+    """Parser of the messages of a topic, with the template of the previous message."""
 
     def __init__(self, type_name: str) -> None:
         self._type_name = type_name
         self._template = Template(type_name)
 
     def read(self, message: bytes) -> Reading:
-        """
-        Read a message.
-
-        Parameters
-        ----------
-        message : bytes
-            The serialized message.
-
-        Returns
-        -------
-        Reading
-            Its content.
-
-        Raises
-        ------
-        MessageError
-            If the bytes are not a message of this type.
-
-        """
+        """Parse a serialized message; `MessageError` if it is not of the expected type."""
         reading = self._template.read(message)
         while reading is None:
             self._template = Template.of(message, self._type_name)
@@ -344,7 +268,7 @@ class Reader:
 
 
 class _Format:
-    """The structs of a template: of the whole message, of what stays, and of what changes."""
+    """Structs of a template: whole message, fixed bytes, and variable numbers."""
 
     def __init__(
         self,
@@ -353,13 +277,13 @@ class _Format:
         fixed: Sequence[tuple[int, int]],
         arrays: Sequence[tuple[int, int]],
     ) -> None:
-        #: Values of the whole, and where the numbers go in it.
+        #: Values of the whole message, and positions of the numbers in it.
         self.parts: list[Any] = [message[:2], 0, 0]
         self.places: list[tuple[slice, slice]] = []
         blocks: list[slice] = []
         whole, stays, changes = '2s2xiI', '2s10x', '4xiI'
         end, self.count = _STAMP + 8, 0
-        # In the order of the message; an empty array lies wherever it is.
+        # In message order; an empty array may be at any position.
         pieces = [(begin, end, False) for begin, end in fixed[1:]]
         pieces += [(begin, begin + 8 * number, True) for begin, number in arrays]
         for begin, after, changing in sorted(pieces):
@@ -374,7 +298,7 @@ class _Format:
                 self.places.append(
                     (slice(first, first + number), slice(self.count, self.count + number))
                 )
-                # Behind the two numbers of the stamp.
+                # After the two numbers of the stamp.
                 blocks.append(slice(2 + self.count, 2 + self.count + number))
                 self.parts += [0.0] * number
                 self.count += number
@@ -388,27 +312,27 @@ class _Format:
         self.blocks, self.fixed = blocks, self.unpack_fixed(message)
 
 
-#: Chooses the numbers wanted from the messages of a template: the position of each [bytes], -1
-#: for one that they do not have; None if the messages are not wanted.
+#: Selects numbers of the messages of a template: the position of each number [bytes], -1 for a
+#: missing number; None discards the messages.
 Choice = Callable[[Template], Sequence[int] | None]
 
 
 class Decoded(NamedTuple):
     """
-    What a batch of messages holds.
+    Content of a batch of messages.
 
     Attributes
     ----------
     stamps : ndarray, shape (n,)
         Stamps of the headers [ns].
     values : ndarray, shape (n, k)
-        The numbers wanted, nan where a message does not have one.
+        The selected numbers, nan where a message has no such number.
     used : ndarray, shape (n,)
-        Which messages these are.
+        Indices of these messages in the batch.
     invalid : int
         Number of invalid messages.
     fault : str
-        What is wrong with the first of them.
+        Error of the first invalid message.
 
     """
 
@@ -428,25 +352,22 @@ def decode(
     columns: int,
 ) -> Decoded:
     """
-    Read stamps and numbers of many messages.
+    Parse stamps and selected numbers of a batch of messages.
+
+    Invalid messages and messages that `choice` does not select are left out.
 
     Parameters
     ----------
     data : ndarray, shape (bytes,)
-        Bytes that hold the messages.
+        Bytes of all messages.
     begin, end : ndarray, shape (m,)
-        Where each message begins and ends [bytes].
+        First byte and end of each message [bytes].
     type_name : str
         One of `TYPES`.
     choice : callable
-        Which numbers are wanted.
+        Selection of the numbers.
     columns : int
-        How many numbers are wanted.
-
-    Returns
-    -------
-    Decoded
-        In the order of the messages, without those that are invalid or not wanted.
+        Number of selected numbers.
 
     """
     stamps = np.zeros(len(begin), dtype=np.int64)
@@ -493,49 +414,15 @@ def _column(rows: NDArray[np.uint8], position: int, kind: str) -> NDArray[Any]:
 
 
 def read_string(message: bytes) -> str:
-    """
-    Read a std_msgs String.
-
-    Parameters
-    ----------
-    message : bytes
-        The serialized message.
-
-    Returns
-    -------
-    str
-        Its text.
-
-    Raises
-    ------
-    MessageError
-        If the bytes end before the text does.
-
-    """
+    """Parse a std_msgs String; `MessageError` if the message is too short."""
     return _Cursor(message).string()
 
 
 def read_line(message: bytes) -> tuple[str, NDArray[np.float64]]:
     """
-    Read a line of a visualization_msgs Marker.
+    Parse a line of a visualization_msgs Marker: namespace and points (n, 3) [m].
 
-    Parameters
-    ----------
-    message : bytes
-        The serialized message.
-
-    Returns
-    -------
-    name : str
-        Its namespace, which names the line.
-    points : ndarray, shape (n, 3)
-        Its points x, y, z [m].
-
-    Raises
-    ------
-    MessageError
-        If the bytes end before the points do.
-
+    It raises `MessageError` if the message is too short.
     """
     cursor = _Cursor(message)
     cursor.take(4, 2)

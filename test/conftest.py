@@ -1,4 +1,4 @@
-"""What all tests share: settings, time limits, and their distribution (``pytest -n``)."""
+"""Common test configuration: settings, time limits, and test distribution (``pytest -n``)."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from hypothesis import settings
 import psutil
 import pytest
 
-# An example may take long where other tests run beside it.
+# No deadline per example: tests run in parallel.
 settings.register_profile('tests', deadline=None)
 settings.load_profile('tests')
 
-#: Files whose tests share what takes long to make: each file runs in one process.
+#: Files whose tests share expensive fixtures: each file runs in one process.
 WHOLE = {
     'test/bench/test_graph.py',
     'test/bench/test_calibration.py',
@@ -30,19 +30,19 @@ WHOLE = {
 }
 
 
-#: A test that has not ended by itself at this multiple of its time limit ends with its process.
+#: Multiple of the time limit after which the process of a hanging test is killed.
 LAST: Final = 1.5
 
-#: Time for a process of tests to end after its last test [s].
+#: Time for a test process to end after its last test [s].
 ENDING: Final = 120.0
 
 #: Time for child processes to print their stacks [s].
 PRINTING: Final = 5.0
 
-#: A copy of standard error that pytest does not capture, and the time limit of a test [s].
+#: A copy of standard error outside the capture of pytest, and the time limit of a test [s].
 STDERR, LIMIT = pytest.StashKey[int](), pytest.StashKey[float]()
 
-# Each Python process that a test starts prints the stacks of its threads on SIGABRT.
+# Python processes started by tests print the stacks of their threads on SIGABRT.
 os.environ['PYTHONFAULTHANDLER'] = '1'
 
 
@@ -55,7 +55,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_timeout_set_timer(item: pytest.Item, settings: Any) -> Generator[None, object, object]:
-    """At the time limit print the stacks of all processes, and end the children of this one."""
+    """At the time limit print the stacks of all processes, and end the child processes."""
     done = yield
     fail: Any = signal.getsignal(signal.SIGALRM)
 
@@ -72,7 +72,7 @@ def pytest_timeout_set_timer(item: pytest.Item, settings: Any) -> Generator[None
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_teardown(item: pytest.Item) -> None:
-    """Limit the time of the teardown: a failed test has no timer any more."""
+    """Limit the time of the teardown: pytest-timeout stops its timer after a failed test."""
     end_later(item)
 
 
@@ -83,20 +83,20 @@ def pytest_timeout_cancel_timer() -> Generator[None, object, object]:
 
 
 def pytest_sessionfinish(session: pytest.Session) -> None:
-    """Limit the time in which this process ends."""
+    """Limit the shutdown time of this process."""
     faulthandler.dump_traceback_later(ENDING, exit=True, file=session.config.stash[STDERR])
 
 
 def end_later(item: pytest.Item) -> None:
-    """End this process some time after the limit, also where its threads cannot run."""
+    """Kill this process some time after the limit, even if its threads are blocked."""
     if limit := item.stash.get(LIMIT, 0.0):
         stderr = item.config.stash[STDERR]
         faulthandler.dump_traceback_later(LAST * limit, exit=True, file=stderr)
 
 
 def abort_children() -> None:
-    """End all processes that descend from this one, each with its stacks."""
-    # The process of multiprocessing that cleans up serves the tests that follow, too.
+    """End all descendant processes, and make them print their stacks."""
+    # The resource tracker of multiprocessing also serves the following tests.
     children = [
         one
         for one in psutil.Process().children(recursive=True)
@@ -110,19 +110,19 @@ def abort_children() -> None:
 
 
 def runs(process: psutil.Process) -> bool:
-    """Whether a process has not ended. It is not waited for: its parent does that."""
+    """Return whether a process is running; its parent reaps it."""
     return process.is_running() and process.status() != psutil.STATUS_ZOMBIE
 
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_auto_num_workers() -> int:
-    """Return how many processes ``-n auto`` means: tests of nodes wait more than they compute."""
+    """Return the number of processes of ``-n auto``; node tests mostly wait."""
     return min(8, (os.cpu_count() or 1) + 1)
 
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
-    """Give each process whole files, those named above, or single tests, as it gets free."""
+    """Assign whole files (`WHOLE`) or single tests to idle processes."""
     from xdist.scheduler.loadscope import LoadScopeScheduling
 
     class Scheduling(LoadScopeScheduling):
@@ -131,15 +131,15 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
             return file if file in WHOLE else nodeid
 
         def schedule(self) -> None:
-            """Give each process two units: it begins a test when it has the next one."""
-            # LoadScopeScheduling gives one to a process that replaces a lost one: it would wait.
+            """Assign two units to each process: a test starts only with the next one queued."""
+            # LoadScopeScheduling assigns one unit to a replacement process, which would wait.
             super().schedule()
             for node in self.nodes:
                 self._reschedule(node)
 
         def remove_node(self, node: Any) -> str | None:
-            """Give the tests of a lost process to others, but not the one that was running."""
-            # LoadScopeScheduling repeats that one, and hangs on units that are complete.
+            """Reassign the tests of a lost process, except the running test."""
+            # LoadScopeScheduling repeats the running test, and hangs on complete units.
             units = self.assigned_work.pop(node).items()
             left = {
                 scope: [test for test, done in unit.items() if not done] for scope, unit in units

@@ -1,4 +1,4 @@
-"""The rules that keep mathematics apart from middleware, read from the source itself."""
+"""Architecture rules: package dependencies, and separation of mathematics and middleware."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 
-#: Which of our packages each of them may import.
+#: Allowed imports between the packages.
 MAY_IMPORT = {
     'needle_ros': set(),
     'needle_dynamics': {'needle_ros'},
@@ -24,12 +24,12 @@ MAY_IMPORT = {
         'needle_ros',
     },
 }
-#: The package that puts the others together may import anything outside.
+#: The top package may import any external package.
 TOP = 'needle_insertion'
 ROS = re.compile(r'(rclpy|rcl_\w+|ros\w+_py|ament_\w+|launch(_\w+)?|\w+_(msgs|srvs|interfaces))$')
 BAGS = {'mcap', 'rosbags'}
 BAG_READERS = 'needle_identification/bags/'
-# In parts, so that this file passes its own test.
+# Split, so that this file passes its own test.
 FORBIDDEN = tuple('/'.join(parts) for parts in (('..', 'shared'), ('work', 'shared')))
 NOT_OURS = {
     '.git',
@@ -48,7 +48,7 @@ NOT_OURS = {
 
 
 def imports(path: str, source: str) -> Iterator[tuple[int, str]]:
-    """Yield line and full name of all that a file imports, wherever in the file it does."""
+    """Yield line and qualified name of all imports of a file, at any level."""
     package = path.removesuffix('.py').split('/')[:-1]
     for node in ast.walk(ast.parse(source, path)):
         if isinstance(node, ast.Import):
@@ -67,7 +67,7 @@ def imports(path: str, source: str) -> Iterator[tuple[int, str]]:
 
 
 def violations(path: str, source: str) -> list[str]:
-    """Say which rules a file of one of our packages breaks; the path is relative to the root."""
+    """Return the rule violations of a file; the path is relative to the root."""
     package = path.partition('/')[0]
     is_node = path.endswith('_node.py')
     found = []
@@ -88,7 +88,7 @@ def violations(path: str, source: str) -> list[str]:
 
 
 def forbidden_words(path: str, content: str) -> list[str]:
-    """Say which lines hold a word that must not leave this machine."""
+    """Return the lines with a word that must not be published."""
     return [
         f'{path}:{number}: mentions {word}'
         for number, line in enumerate(content.splitlines(), 1)
@@ -98,12 +98,12 @@ def forbidden_words(path: str, content: str) -> list[str]:
 
 
 def sources() -> list[Path]:
-    """List the Python files of our packages."""
+    """List the Python files of the packages."""
     return [path for package in MAY_IMPORT for path in sorted((ROOT / package).rglob('*.py'))]
 
 
 def texts() -> Iterator[Path]:
-    """List all files of the repository but what is generated."""
+    """List all files of the repository except generated files."""
     pending = [ROOT]
     while pending:
         for path in sorted(pending.pop().iterdir()):
@@ -115,8 +115,8 @@ def texts() -> Iterator[Path]:
                 yield path
 
 
-def test_imports_run_one_way() -> None:
-    """Packages import downwards only, and ROS and bags stay in the files made for them."""
+def test_packages_import_lower_layers_only() -> None:
+    """Packages import downwards, and ROS and bags only in the designated files."""
     broken = [
         line
         for path in sources()
@@ -125,15 +125,15 @@ def test_imports_run_one_way() -> None:
     assert not broken, '\n'.join(broken)
 
 
-def test_all_packages_are_looked_at() -> None:
-    """The rules cover every package there is, and each has files."""
+def test_all_packages_are_checked() -> None:
+    """The rules cover every package, and each has files."""
     there = {path.parent.name for path in ROOT.glob('needle_*/__init__.py')}
     assert there == set(MAY_IMPORT)
     assert there == {path.relative_to(ROOT).parts[0] for path in sources()}
 
 
 def test_no_file_mentions_a_forbidden_word() -> None:
-    """No file of the repository points to a place outside of it."""
+    """No file of the repository refers to a place outside of it."""
     seen, broken = set(), []
     for path in texts():
         name = path.relative_to(ROOT).as_posix()
@@ -183,8 +183,8 @@ def test_no_file_mentions_a_forbidden_word() -> None:
         ('needle_identification/a_node.py', 'from mcap.reader import x', 'may import mcap'),
     ],
 )
-def test_a_breach_is_found(path: str, source: str, complaint: str) -> None:
-    """The checker can fail: each rule, broken on purpose, is reported with its file and line."""
+def test_rule_violation_is_reported(path: str, source: str, complaint: str) -> None:
+    """Each violation is reported with its file and line."""
     found = violations(path, source)
     assert len(found) == 1
     assert found[0].startswith(f'{path}:')
@@ -203,14 +203,12 @@ def test_a_breach_is_found(path: str, source: str, complaint: str) -> None:
         ('needle_dynamics/a.py', '"""import rclpy"""\nTEXT = "import rclpy"'),
     ],
 )
-def test_what_is_allowed_is_not_reported(path: str, source: str) -> None:
-    """The checker does not cry wolf."""
+def test_allowed_imports_are_not_reported(path: str, source: str) -> None:
     assert violations(path, source) == []
 
 
 @pytest.mark.parametrize('word', FORBIDDEN)
-def test_a_forbidden_word_is_found(word: str) -> None:
-    """The word check can fail, too."""
+def test_forbidden_word_is_reported(word: str) -> None:
     assert forbidden_words('docs/a.md', f'one\nsee {word}/model.md') == [
         f'docs/a.md:2: mentions {word}'
     ]

@@ -1,4 +1,4 @@
-"""The robot description: it expands, its files exist, and it is the robot of the plant."""
+"""Robot description: valid URDF, existing files, and agreement with the plant."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ Point = tuple[float, float, float]
 
 
 def described(mode: str, steered: bool, **others: object) -> ET.Element:
-    """Return the URDF as the launch file has it made."""
+    """Return the URDF generated like in the launch file."""
     given = {'mode': mode, 'steered': str(steered).lower(), **others}
     file = str(FOLDER / 'needle_insertion.urdf.xacro')
     made = xacro.process_file(file, mappings={name: str(value) for name, value in given.items()})
@@ -53,20 +53,20 @@ def numbers(text: str) -> FloatArray:
 
 
 def movable(urdf: ET.Element) -> dict[str, ET.Element]:
-    """Return the joints that `joint_states` must have, by name."""
+    """Return the joints required in `joint_states`, by name."""
     joints = {joint.get('name'): joint for joint in urdf.iter('joint') if joint.get('type')}
     return {name: joint for name, joint in joints.items() if joint.find('mimic') is None}
 
 
 def turn(axis: FloatArray, angle: float) -> FloatArray:
-    """Return the matrix of a turn about an axis of unit length."""
+    """Return the rotation matrix about a unit axis."""
     x, y, z = axis
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     return np.asarray(np.eye(3) + sin(angle) * cross + (1.0 - cos(angle)) * cross @ cross)
 
 
 def pose(urdf: ET.Element, link: str, at: dict[str, float]) -> tuple[FloatArray, FloatArray]:
-    """Return where a link is in `needle_entry`, and how it is turned."""
+    """Return position and rotation of a link in `needle_entry`."""
     joints = {j.find('child').get('link'): j for j in urdf.iter('joint') if j.get('type')}
     if link not in joints:
         assert link == ENTRY
@@ -85,8 +85,8 @@ def pose(urdf: ET.Element, link: str, at: dict[str, float]) -> tuple[FloatArray,
 
 
 @pytest.mark.parametrize(('mode', 'steered'), KINDS)
-def test_its_joints_are_those_of_joint_states(mode: str, steered: bool) -> None:
-    """robot_state_publisher needs each of them; one that is missing leaves a gap in the tree."""
+def test_urdf_joints_equal_joint_states(mode: str, steered: bool) -> None:
+    """A missing joint would break the tree of robot_state_publisher."""
     urdf = described(mode, steered)
     states = steered_states() if steered else JOINT_STATES
     joints = movable(urdf)
@@ -98,7 +98,7 @@ def test_its_joints_are_those_of_joint_states(mode: str, steered: bool) -> None:
     links = Counter(link.get('name') for link in urdf.findall('link'))
     assert set(links.values()) == {1}
     assert {ENTRY, BASE} <= links.keys()
-    # A frame has one parent: that of the tip is said by the plant.
+    # A frame has one parent: the plant publishes the tip frame.
     assert TIP not in links
     for link in links:
         pose(urdf, link, dict.fromkeys(joints, 0.0))
@@ -106,7 +106,7 @@ def test_its_joints_are_those_of_joint_states(mode: str, steered: bool) -> None:
 
 @pytest.mark.parametrize('preset', NEEDLES)
 @pytest.mark.parametrize(('mode', 'steered'), KINDS)
-def test_its_limits_are_those_of_the_plant(mode: str, steered: bool, preset: str) -> None:
+def test_urdf_limits_equal_plant_limits(mode: str, steered: bool, preset: str) -> None:
     needle = NEEDLES[preset]
     known = STEERING_PRESETS.get(preset)
     free = (known.steering if known else SteeringParameters()).free_length
@@ -130,7 +130,7 @@ def test_its_limits_are_those_of_the_plant(mode: str, steered: bool, preset: str
     if not steered:
         assert limits['rotation']['effort'] == own.torque_limit
         return
-    # The plant takes what lies within the limits, and refuses what does not.
+    # The plant accepts positions within the limits, and rejects positions beyond them.
     plant = PlantRun({'mode': mode, 'steered': True, 'model.preset': preset, 'depth': 0.05})
     plant.take(10**9)
     for name, limit in limits.items():
@@ -149,8 +149,8 @@ def test_its_limits_are_those_of_the_plant(mode: str, steered: bool, preset: str
     }
 
 
-def test_its_base_is_where_that_of_the_model_is() -> None:
-    """At y = s - l, parallel to the entry point."""
+def test_urdf_base_position_equals_the_model() -> None:
+    """At y = s - l, parallel to the entry frame."""
     urdf = described('simulation', False, length=0.25)
     for depth in (0.001, 0.02, 0.2):
         place, turned = pose(urdf, BASE, {INSERTION: depth, 'rotation': 1.0})
@@ -160,8 +160,8 @@ def test_its_base_is_where_that_of_the_model_is() -> None:
         np.testing.assert_allclose(place, plant.plant.outline().base, atol=1e-15)
 
 
-def test_a_steered_base_is_where_that_of_the_plant_is() -> None:
-    """The guide carries it; a tilt is small in the plant and a turn here."""
+def test_steered_urdf_base_position_equals_the_plant() -> None:
+    """The plant linearizes the tilts, the URDF rotates."""
     preset, depth = 'bending_35mm', 0.06
     free = STEERING_PRESETS[preset].steering.free_length
     urdf = described('robot', True, free_length=free)
@@ -177,25 +177,25 @@ def test_a_steered_base_is_where_that_of_the_plant_is() -> None:
     assert {name: at[name] for name in goals} == pytest.approx(goals, abs=1e-7)
     place, turned = pose(urdf, BASE, at)
     np.testing.assert_allclose(turned, np.eye(3), atol=1e-15)
-    # Behind the guide, 0.1 m of it: by half the square of the tilt, and less across.
+    # 0.1 m behind the guide: an error of half the square of the tilt, and less laterally.
     np.testing.assert_allclose(place, plant.plant.outline().base, atol=0.1 * 0.5 * 0.05**2)
     guide, tilted = pose(urdf, 'needle_guide', at)
     points = plant.plant.outline()
     np.testing.assert_allclose(guide, points.points[0], atol=1e-8)
-    # A tilt is a slope: it leans to where x and z are positive.
+    # A tilt is a slope: positive toward positive x and z.
     slope = tilted[:, 1] / tilted[1, 1]
     np.testing.assert_allclose(slope[[0, 2]], points.slopes[0], rtol=1e-2)
 
 
-def test_the_tip_is_where_the_last_pose_of_the_needle_is() -> None:
-    """Seen from the base; the turn brings y along the needle."""
+def test_tip_frame_equals_the_last_needle_pose() -> None:
+    """In the base frame; the rotation aligns y with the needle."""
     values = {'model.preset': 'phantom', 'depth': 0.12, 'tip_deflection': 5e-3}
     outline = PlantRun(values).plant.outline()
     place, (i, j, k, w) = outline.tip
     np.testing.assert_allclose(outline.base + place, outline.points[-1], atol=1e-15)
     np.testing.assert_allclose(place, [0.0, 0.2, 5e-3], atol=1e-12)
     assert i * i + j * j + k * k + w * w == pytest.approx(1.0)
-    # The quaternion turned about: y becomes the direction of the needle at its tip.
+    # Rotated y axis: direction of the needle at its tip.
     along = [2.0 * (i * j - w * k), 1.0 - 2.0 * (i * i + k * k), 2.0 * (j * k + w * i)]
     x, z = outline.slopes[-1]
     np.testing.assert_allclose(along, np.array([x, 1.0, z]) / np.sqrt(1.0 + x * x + z * z))
@@ -203,8 +203,8 @@ def test_the_tip_is_where_the_last_pose_of_the_needle_is() -> None:
 
 
 @pytest.mark.parametrize(('mode', 'steered'), KINDS)
-def test_its_hardware_sends_what_the_plant_takes(mode: str, steered: bool) -> None:
-    """Topics are named, all is sent, and no array has gaps."""
+def test_plant_accepts_messages_of_the_described_hardware(mode: str, steered: bool) -> None:
+    """Topics are set, messages are always sent, and arrays have no gaps."""
     (system,) = described(mode, steered).findall('ros2_control')
     hardware = system.find('hardware')
     assert hardware.findtext('plugin') == (
@@ -230,7 +230,7 @@ def test_its_hardware_sends_what_the_plant_takes(mode: str, steered: bool) -> No
     for joint in system.iter('joint'):
         states = [item.get('name') for item in joint.iter('state_interface')]
         assert states == ['position', 'velocity', 'effort']
-    # What it sends before a controller is active, and after: at rest, without a force.
+    # Message before a controller is active, at rest, without a force.
     plant = PlantRun({'mode': mode, 'steered': steered, 'model.preset': 'bending_35mm'})
     names = tuple(commanded)
     sent = [
@@ -241,8 +241,8 @@ def test_its_hardware_sends_what_the_plant_takes(mode: str, steered: bool) -> No
 
 
 @pytest.mark.parametrize(('mode', 'steered'), KINDS)
-def test_the_controllers_claim_what_the_hardware_has(mode: str, steered: bool) -> None:
-    """Those that the launch file starts in this mode, with parameters for each."""
+def test_controllers_claim_existing_interfaces(mode: str, steered: bool) -> None:
+    """For the controllers that the launch file starts in each mode."""
     launch = (ROOT / 'launch/ros2_control.launch.py').read_text(encoding='utf-8')
     space: dict[str, Any] = {}
     begin = launch.index('def spawned')
@@ -269,12 +269,12 @@ def test_the_controllers_claim_what_the_hardware_has(mode: str, steered: bool) -
         ]
         assert set(claims) <= offered
         claimed += claims if name in active else []
-    # Two that are active cannot claim the same.
+    # Two active controllers cannot claim the same interface.
     assert len(claimed) == len({*claimed})
 
 
-def test_the_meshes_are_those_of_the_script_and_all_are_used() -> None:
-    """Made again they are the same, byte for byte."""
+def test_meshes_equal_the_script_output_and_are_used() -> None:
+    """The script output is identical byte for byte."""
     files = {path.stem: path.read_bytes() for path in (FOLDER / 'meshes').iterdir()}
     assert files == {name: MAKER['stl'](make()) for name, make in MAKER['MESHES'].items()}
     used = {mesh.get('filename') for kind in KINDS for mesh in described(*kind).iter('mesh')}
@@ -283,8 +283,8 @@ def test_the_meshes_are_those_of_the_script_and_all_are_used() -> None:
 
 
 @pytest.mark.parametrize('name', MAKER['MESHES'])
-def test_a_mesh_is_closed_and_seen_from_outside(name: str) -> None:
-    """Each edge is that of two triangles, one in each direction; the volume is positive."""
+def test_mesh_is_closed_and_oriented_outwards(name: str) -> None:
+    """Two triangles share each edge in opposite directions; the volume is positive."""
     data = (FOLDER / f'meshes/{name}.stl').read_bytes()
     (count,) = struct.unpack_from('<I', data, 80)
     assert len(data) == 84 + 50 * count

@@ -1,4 +1,4 @@
-"""README and docs/: names, paths and commands exist, and the tutorial runs as it is printed."""
+"""README and docs/: names, paths and commands exist, and the tutorial runs as printed."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ PAGES = sorted(
     ]
     + [ROOT / folder / 'README.md' for folder in ('bags', 'config', 'examples')]
 )
-#: What the changelog names may be gone.
+#: The changelog may name removed items.
 CURRENT = [page for page in PAGES if page.name != 'CHANGELOG.md']
-#: Pages whose `bash` lines are run, one page in one folder, and how these lines begin.
+#: Pages whose `bash` lines are executed, one folder per page, and the prefix of these lines.
 RUN = {
     'README.md': 'needle identify friction ',
     'docs/tutorial.md': 'needle ',
@@ -40,7 +40,7 @@ RUN = {
 }
 
 
-#: The packages whose roots export names.
+#: Packages with exported names.
 PACKAGES = ('needle_dynamics', 'needle_controller', 'needle_identification')
 
 #: Modules with examples in their docstrings.
@@ -58,7 +58,7 @@ def blocks(text: str, *languages: str) -> list[str]:
 
 
 def command_lines(page: Path, program: str) -> list[str]:
-    """Return each command line of a program on a page."""
+    """Return the command lines of a program on a page."""
     text = page.read_text(encoding='utf-8')
     lines = '\n'.join(blocks(text, 'bash', 'console')).splitlines()
     lines += re.findall(r'^    (\S.*)$', text, flags=re.MULTILINE)
@@ -67,16 +67,16 @@ def command_lines(page: Path, program: str) -> list[str]:
 
 
 def is_module(name: str) -> bool:
-    """Return whether a dotted name is that of a module."""
+    """Return whether a dotted name is a module."""
     try:
         return find_spec(name) is not None
     except ModuleNotFoundError:
-        # The part before the last dot is not a package.
+        # The parent is not a package.
         return False
 
 
 def exists(name: str) -> bool:
-    """Return whether a dotted name is a module, or something in one."""
+    """Return whether a dotted name is a module or an attribute of a module."""
     parts = name.split('.')
     modules = ['.'.join(parts[:k]) for k in range(len(parts), 0, -1)]
     module = next((one for one in modules if is_module(one)), '')
@@ -90,7 +90,7 @@ def exists(name: str) -> bool:
 
 @cache
 def functions_in(file: str) -> set[str]:
-    """Return the names of the functions in all test files of a name."""
+    """Return the function names of all test files with a name."""
     return {
         node.name
         for path in (ROOT / 'test').rglob(f'{file}.py')
@@ -100,27 +100,27 @@ def functions_in(file: str) -> set[str]:
 
 
 def is_test(name: str) -> bool:
-    """Return whether there is a test of a name such as `test_model.test_power_balance`."""
+    """Return whether a test such as `test_model.test_power_balance` exists."""
     file, _, test = name.partition('.')
     return test in functions_in(file)
 
 
 def unproved(rows: list[str]) -> list[str]:
-    """Return the rows that name no test and do not say: not in the package."""
+    """Return the rows that neither name a test nor contain: not in the package."""
     proof = re.compile(r'`test_\w+\.test_\w+`|not in the package')
     return [row for row in rows if not proof.search(row) or row.count(' | ') < 2]
 
 
 @pytest.mark.parametrize('module', WITH_EXAMPLES)
-def test_examples_in_docstrings_print_what_they_show(module: str) -> None:
-    """Each `>>>` in a docstring of a module gives the output below it."""
+def test_docstring_examples_print_the_shown_output(module: str) -> None:
+    """Each `>>>` example of a module."""
     found = doctest.testmod(import_module(module), optionflags=doctest.ELLIPSIS)
     assert found.attempted > 0
     assert found.failed == 0
 
 
 def test_names_in_the_documentation_exist() -> None:
-    """Every dotted name of ours in backticks is there, and every test."""
+    """Every dotted name of the packages and every test in backticks."""
     files = ('.py', '.yaml', '.md')
     named = [
         (page.name, name)
@@ -148,7 +148,7 @@ def test_every_equation_and_every_table_has_one_row() -> None:
     assert unproved(rows) == []
 
 
-def test_a_wrong_name_is_found() -> None:
+def test_wrong_name_is_reported() -> None:
     """The checks above can fail."""
     wrong = ('needle_dynamics.nothing', 'needle_dynamics.model.NeedleModel.nothing', 'none.such')
     assert not any(exists(name) for name in wrong)
@@ -157,7 +157,7 @@ def test_a_wrong_name_is_found() -> None:
 
 
 def test_paths_in_the_documentation_exist() -> None:
-    """Every path in backticks below a folder of the repository is there."""
+    """Every path in backticks below a folder of the repository."""
     folders = {path.name for path in ROOT.iterdir() if path.is_dir() and path.name[0] != '.'}
     made = {'build', 'demo_output', 'install', 'log'}
     missing = []
@@ -170,7 +170,7 @@ def test_paths_in_the_documentation_exist() -> None:
 
 
 def test_architecture_names_every_folder_once() -> None:
-    """The table of folders has each folder of the packages, and no folder that is not there."""
+    """The table of folders lists exactly the folders of the packages."""
     page = (ROOT / 'docs/architecture.md').read_text(encoding='utf-8')
     named = re.findall(r'^\| `((?:\w+/)+)` \|', page, flags=re.MULTILINE)
     assert len(named) == len(set(named))
@@ -180,7 +180,7 @@ def test_architecture_names_every_folder_once() -> None:
 
 
 def test_links_in_the_documentation_exist() -> None:
-    """Every link to a file leads to one."""
+    """Every link to a file has an existing target."""
     missing = [
         (page.name, link)
         for page in PAGES
@@ -191,14 +191,14 @@ def test_links_in_the_documentation_exist() -> None:
 
 
 def test_lines_of_the_readme_are_short() -> None:
-    """A terminal shows them whole."""
+    """Lines fit into a terminal."""
     assert [
         line for line in (ROOT / 'README.md').read_text().splitlines() if len(line) > 120
     ] == []
 
 
 def test_commands_in_the_documentation_are_valid() -> None:
-    """The options of every `needle` command are known, whether or not its files are there."""
+    """The options of every `needle` command are valid, even if its files do not exist."""
     lines = [line for page in CURRENT for line in command_lines(page, 'needle')]
     assert len(lines) > 20
     for line in lines:
@@ -224,7 +224,7 @@ def test_citation_names_the_version() -> None:
 
 
 def test_python_in_the_documentation_runs(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Every `python` block runs by itself in the root of a clone."""
+    """Every `python` block runs independently in the root of a clone."""
     monkeypatch.chdir(ROOT)
     found = [body for page in CURRENT for body in blocks(page.read_text('utf-8'), 'python')]
     assert len(found) > 2
@@ -234,7 +234,7 @@ def test_python_in_the_documentation_runs(monkeypatch: pytest.MonkeyPatch) -> No
 
 @pytest.mark.parametrize('name', RUN)
 def test_page_runs_as_printed(name: str, tmp_path: Path) -> None:
-    """The commands of a page run one after the other and print what the page shows."""
+    """The commands of a page print the shown output in sequence."""
     (tmp_path / 'bags').symlink_to(ROOT / 'bags')
     text = (ROOT / name).read_text(encoding='utf-8')
     lines = '\n'.join(blocks(text, 'bash')).splitlines()
@@ -257,7 +257,7 @@ def test_page_runs_as_printed(name: str, tmp_path: Path) -> None:
 
 
 def undocumented(exported: object) -> list[str]:
-    """Return the functions of an exported object without a section for their parameters."""
+    """Return the functions of an exported object without a parameter section."""
     if inspect.isfunction(exported):
         functions = [exported]
     elif inspect.isclass(exported):
@@ -281,7 +281,7 @@ def test_exported_functions_describe_their_parameters(package: str) -> None:
     assert [name for value in exported for name in undocumented(value)] == []
 
 
-def test_a_function_without_parameter_section_is_found() -> None:
+def test_function_without_parameter_section_is_reported() -> None:
     def function(x: float) -> float:
         """Return x."""
         return x

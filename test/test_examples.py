@@ -1,4 +1,4 @@
-"""Every script of examples/ runs, and prints what it says that it prints."""
+"""The scripts of examples/ run and print the expected results."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 
 EXAMPLES = Path(__file__).parents[1] / 'examples'
 
-#: What each script must print, as a pattern.
+#: Required output of each script, as a pattern.
 PRINTED = {
     'aiming': r'steered: 0\.0\d mm from the target\nopen loop: 6\.\d\d mm',
     'batch': r'median \d+\.\d mm, 95 % of them between',
@@ -24,10 +24,10 @@ PRINTED = {
 }
 
 
-#: What a script needs that nothing else does: it is run where that is installed.
+#: Optional dependency of a script, which is skipped without it.
 NEEDS = {'inference': 'sbi'}
 
-#: Run by `test_hardware.py`.
+#: Scripts run by `test_hardware.py`.
 WITH_ROS = {'robot_driver'}
 
 
@@ -38,7 +38,7 @@ def test_example_runs(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """The script runs by itself in an empty folder."""
+    """The script runs alone in an empty folder."""
     if name in NEEDS:
         pytest.importorskip(NEEDS[name])
     monkeypatch.chdir(tmp_path)
@@ -48,7 +48,6 @@ def test_example_runs(
 
 
 def test_readme_lists_every_example() -> None:
-    """The table of examples/README.md has each script."""
     page = (EXAMPLES / 'README.md').read_text(encoding='utf-8')
     assert set(re.findall(r'\]\((\w+)\.py\)', page)) == {
         path.stem for path in EXAMPLES.glob('*.py')

@@ -1,4 +1,4 @@
-"""The layouts for RViz, Foxglove and PlotJuggler name what our nodes publish."""
+"""Layouts of RViz, Foxglove and PlotJuggler, compared with the published topics."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ import yaml
 CONFIG = Path(__file__).parent.parent / 'config'
 NODES = ('plant', 'controller')
 
-#: What flows in an insertion under control.
+#: Streams of an insertion under control.
 STREAMS = (
     '/joint_states',
     '/base_wrench',
@@ -29,13 +29,13 @@ STREAMS = (
     '/tracking_error',
 )
 
-#: Topics for people, whose drawing no recording of measurements needs, and their types.
+#: Visualization topics, which recordings do not need, and their types.
 DRAWN = {
     '/needle_shape': 'visualization_msgs/msg/Marker',
     '/needle_poses': 'geometry_msgs/msg/PoseArray',
 }
 
-#: Message types that the displays of RViz take.
+#: Message types by RViz display.
 DISPLAYS = {
     'Marker': 'visualization_msgs/msg/Marker',
     'PoseArray': 'geometry_msgs/msg/PoseArray',
@@ -71,11 +71,11 @@ class Recording:
         return float(value)
 
     def curve(self, name: str) -> float:
-        """Return the last value of a curve by the name that PlotJuggler gives it."""
+        """Return the last value of a curve by its name in PlotJuggler."""
         _, topic, path = name.split('/', 2)
         topic = f'/{topic}'
         if topic == '/diagnostics':
-            # An empty hardware id leaves the name of the node, which begins with a slash.
+            # With an empty hardware id, the path starts with the node name and its slash.
             found = re.fullmatch(r'(/\w+)/(.+)', path)
             assert found
             return float(self.diagnostics[found[1]][found[2]])
@@ -106,11 +106,11 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Recording:
         recorder = graph.start('recorder', {'path': str(folder / 'bag')})
         for node in NODES:
             graph.start(node, settings[f'/**/{node}']['ros__parameters'])
-        # The first nodes that a new machine runs are compiled, here beside other tests.
+        # On a fresh machine the first nodes compile, in parallel with other tests.
         graph.spin_until(
             lambda: all(int(counts.get(topic, 0)) for topic in STREAMS), 'the streams', 400.0
         )
-        # The recorder has found these nodes, so what they say from now on is recorded.
+        # The recorder has subscribed, so further messages of the nodes are recorded.
         heard.clear()
         graph.spin_until(lambda: set(heard) >= {'/plant', '/controller'}, 'diagnostics')
         heard.clear()
@@ -119,8 +119,8 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Recording:
     return Recording(folder / 'bag')
 
 
-def test_rviz_shows_topics_by_displays_that_take_them(recording: Recording) -> None:
-    """Each display names a topic of its type, received as it is offered, in a frame of ours."""
+def test_rviz_displays_match_topic_types(recording: Recording) -> None:
+    """Each display has a topic of its type, a matching QoS, and a frame of the suite."""
     layout = yaml.safe_load((CONFIG / 'insertion.rviz').read_text())['Visualization Manager']
     shown = {}
     for display in layout['Displays']:
@@ -128,7 +128,7 @@ def test_rviz_shows_topics_by_displays_that_take_them(recording: Recording) -> N
             topic = display['Topic']
             name = topic['Value']
             shown[name] = DISPLAYS[display['Class'].removeprefix('rviz_default_plugins/')]
-            # The nodes offer these as sensor streams; RViz would hear nothing otherwise.
+            # Sensor QoS of the nodes; RViz would receive nothing otherwise.
             assert (topic['Reliability Policy'], topic['Durability Policy']) == (
                 'Best Effort',
                 'Volatile',
@@ -140,14 +140,14 @@ def test_rviz_shows_topics_by_displays_that_take_them(recording: Recording) -> N
 
 
 def panels(node: Any) -> set[str]:
-    """Return the panels that a Foxglove arrangement holds."""
+    """Return the panels of a Foxglove arrangement."""
     if isinstance(node, str):
         return {node}
     return panels(node['first']) | panels(node['second'])
 
 
 def test_foxglove_plots_fields_of_the_recording(recording: Recording) -> None:
-    """Each path is a number of a recorded topic, and every panel has its place."""
+    """Each path is a number of a recorded topic, and every panel is placed."""
     layout = json.loads((CONFIG / 'insertion.foxglove.json').read_text())
     configuration: Mapping[str, Any] = layout['configById']
     assert panels(layout['layout']) == configuration.keys()
@@ -156,7 +156,7 @@ def test_foxglove_plots_fields_of_the_recording(recording: Recording) -> None:
         for line in panel.get('paths', ()):
             topic, _, path = line['value'].partition('.')
             recording.number(topic, path)
-            # Plotted over the time of the sample.
+            # Plotted over the sample time.
             assert recording.last[topic].header.stamp.sec > 0
             plotted.add(topic)
         if name.startswith('3D!'):
@@ -169,7 +169,7 @@ def test_foxglove_plots_fields_of_the_recording(recording: Recording) -> None:
 
 
 def test_plotjuggler_finds_every_curve(recording: Recording) -> None:
-    """Each curve is a number that PlotJuggler makes of the recording, under its name."""
+    """Each curve is a number with the name that PlotJuggler generates."""
     root = ET.parse(CONFIG / 'insertion.plotjuggler.xml').getroot()  # noqa: S314
     names = [curve.attrib['name'] for curve in root.iter('curve')]
     for name in names:
@@ -183,7 +183,7 @@ def test_plotjuggler_finds_every_curve(recording: Recording) -> None:
 @pytest.mark.parametrize(
     'name', ['/joint_states/insertion/force', '/joint_states/elbow/position', '/tip/point/z']
 )
-def test_a_curve_that_does_not_exist_is_found_out(recording: Recording, name: str) -> None:
-    """The check can fail: wrong field, joint or topic."""
+def test_missing_curve_is_reported(recording: Recording, name: str) -> None:
+    """Wrong field, joint or topic."""
     with pytest.raises((AttributeError, KeyError, ValueError)):
         recording.curve(name)

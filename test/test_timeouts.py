@@ -1,4 +1,4 @@
-"""A test that hangs is ended, with the stacks of all processes."""
+"""Termination of hanging tests, with the stacks of all processes."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import sys
 
 ROOT = Path(__file__).parents[1]
 
-#: Hangs in a child process, in the teardown of a test that fails, and with the interpreter locked.
+#: Tests that hang in a child process, in the teardown of a failing test, and with the GIL held.
 TESTS = '''
 import ctypes, subprocess, sys, threading
 import pytest
@@ -50,9 +50,9 @@ def test_good(number):
 '''
 
 
-def test_tests_that_hang_end_with_all_stacks_and_the_others_run(tmp_path: Path) -> None:
+def test_hanging_tests_end_with_stacks_and_others_run(tmp_path: Path) -> None:
     (tmp_path / 'test_hangs.py').write_text(TESTS)
-    # Half of the limit is the time for a report, which takes 0.3 s on an idle machine.
+    # Half of the limit remains for the report, which takes 0.3 s on an idle machine.
     words = ['-p', 'conftest', '--timeout', '6', '-n', '1', '-v']
     done = subprocess.run(
         [sys.executable, '-m', 'pytest', str(tmp_path), *words],
@@ -62,9 +62,9 @@ def test_tests_that_hang_end_with_all_stacks_and_the_others_run(tmp_path: Path) 
         timeout=600.0,
         check=False,
     )
-    # The test that fails hangs in its teardown, too.
+    # The failing test also hangs in its teardown.
     assert '4 failed, 5 passed' in done.stdout, done
-    # The child prints to the standard error that pytest captures; a process that ends does not.
+    # pytest captures the output of the child; the ending process writes to standard error.
     assert 'hangs_in_a_child' in done.stdout
     assert 'in hangs_in_teardown' in done.stderr
     assert 'in test_lock' in done.stderr

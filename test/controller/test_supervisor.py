@@ -364,7 +364,7 @@ def test_log_lines_of_a_kind_are_limited_to_one_per_second() -> None:
     said = [line for _, line in journal.take()]
     # Suppressed lines are counted in the next line of their kind.
     assert said == [
-        *('line 0', 'line 2 (1 more like it)', 'line 4 (1 more like it)'),
+        *('line 0', 'line 2 (1 similar omitted)', 'line 4 (1 similar omitted)'),
         *('another', 'always'),
     ]
     assert not journal.changed

@@ -1,4 +1,4 @@
-"""Real nodes over real DDS inside a test: own context, own domain, errors fail the test."""
+"""Graph of real nodes over DDS for each test: own context and domain, node errors fail it."""
 
 from __future__ import annotations
 
@@ -12,12 +12,11 @@ from support.ros_graph import RosGraph
 
 @pytest.fixture(scope='session', autouse=True)
 def quick_collection() -> None:
-    """Keep what was imported out of the collections at the end of each graph."""
+    """Exclude imported objects from the garbage collection at the end of each graph."""
     gc.freeze()
 
 
 @pytest.fixture
 def ros_graph(tmp_path: Path) -> Iterator[RosGraph]:
-    """Return a graph for one test."""
     with RosGraph(tmp_path / 'logs') as graph:
         yield graph

@@ -1,4 +1,4 @@
-"""Everything that takes long is done before a node is configured, while its services respond."""
+"""Slow imports and compilation happen before `configure`, while services respond."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ from std_srvs.srv import Trigger
 from support.ros_graph import RosGraph
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-#: A node is deaf meanwhile: an import that takes longer counts as large [us].
+#: Duration of a large import, which blocks the node [us].
 LARGEST_IMPORT = 20_000
 
-#: The longest part of a line of ``-X importtime``: own and cumulative time [us], module.
+#: Longest part of a line of ``-X importtime``: own and cumulative time [us], module.
 IMPORT = re.compile(r'import time:\s+\d+ \|\s+(\d+) \|\s*(\S+)')
 
-#: A node that is busy compiling has responded to at least so many requests, one after another.
+#: Minimum number of sequential requests answered by a compiling node.
 RESPONSES = 10
 
 STEERED = {'model.preset': 'bending_35mm', 'steered': True, 'depth': 0.001, 'rate': 200.0}
@@ -46,7 +46,7 @@ STEERING = {
 
 
 class Rig:
-    """Nodes as processes that log their imports, and a user."""
+    """Node processes that log their imports, and a user."""
 
     def __init__(self, graph: RosGraph, logs: Path, **nodes: dict[str, Any]) -> None:
         self.graph, self.logs = graph, logs
@@ -86,30 +86,30 @@ class Rig:
         return sent.outcome
 
     def send(self, *point: float) -> None:
-        """Send a target, again if it is rejected because nothing is measured yet."""
+        """Send a target, and repeat it while measurements are missing."""
         accepted = False
         while not accepted:
             accepted, line = self.answer(*point)
             assert accepted or JOINT_STATES.name in line or TIP_DEFLECTION.name in line, line
 
     def go(self, depth: float) -> None:
-        """Go to a depth."""
+        """Move to a depth [m]."""
         self.send(0.0, depth, 0.0)
         self.until(lambda: abs(self.depth - depth) < 1e-4, f'a depth of {depth} m')
 
     def move(self, depth: float, duration: float) -> None:
-        """Send a trajectory of the insertion until the needle is near its end."""
+        """Send an insertion trajectory, and wait until the needle is near its end."""
         point = JointTrajectoryPoint(positions=[depth])
         point.time_from_start.sec = 0
         point.time_from_start.nanosec = round(1e9 * duration)
         message = JointTrajectory(joint_names=['insertion'], points=[point])
-        self.until(self.course.get_subscription_count, 'who takes it')
+        self.until(self.course.get_subscription_count, 'the subscriber')
         begin = self.depth
         self.course.publish(message)
         self.until(lambda: abs(self.depth - begin) > 1e-4, 'a motion')
 
     def imports(self) -> Iterator[str]:
-        """Yield large imports in nodes that were active."""
+        """Yield large imports of active nodes."""
         for path in self.logs.glob('*.log'):
             active = False
             for line in path.read_text().splitlines():
@@ -121,7 +121,7 @@ class Rig:
 
 @pytest.fixture
 def rig(ros_graph: RosGraph, tmp_path: Path) -> Iterator[Callable[..., Rig]]:
-    """Return what makes the rig; at the end nothing was imported late (nor compiled: RosGraph)."""
+    """Return a factory of rigs, and check for late imports at the end (RosGraph: compilation)."""
     made: list[Rig] = []
 
     def make(**nodes: dict[str, Any]) -> Rig:
@@ -134,9 +134,7 @@ def rig(ros_graph: RosGraph, tmp_path: Path) -> Iterator[Callable[..., Rig]]:
 
 
 @pytest.mark.parametrize('feedback', ['observer', 'ground_truth', 'none'])
-def test_the_controller_has_everything_for_all_laws(
-    rig: Callable[..., Rig], feedback: str
-) -> None:
+def test_controller_preloads_all_laws(rig: Callable[..., Rig], feedback: str) -> None:
     """Targets, trajectories, pauses, retraction, stops, and live changes of law and gains."""
     one = rig(plant={}, controller={'deflection_feedback': feedback})
     one.go(0.025)
@@ -154,12 +152,10 @@ def test_the_controller_has_everything_for_all_laws(
 
 
 @pytest.mark.parametrize('reference', [*REFERENCES])
-def test_the_controller_has_everything_for_all_references(
-    rig: Callable[..., Rig], reference: str
-) -> None:
-    """Each kind of reference reaches a target, also from a motion to another one."""
+def test_controller_preloads_all_references(rig: Callable[..., Rig], reference: str) -> None:
+    """Each reference type reaches a target, also during a motion."""
     one = rig(plant={}, controller={'reference.kind': reference})
-    # A step is a tracking error: beyond `safety.tracking_error` it is a stop.
+    # A step is a tracking error: above `safety.tracking_error` it causes a stop.
     way = 5e-4 if reference == 'step' else 0.01
     one.go(0.02 + way)
     one.send(0.0, 0.02 - way, 0.0)
@@ -176,10 +172,8 @@ def test_the_controller_has_everything_for_all_references(
     ],
     ids=str,
 )
-def test_the_plant_has_everything_in_mode_robot(
-    rig: Callable[..., Rig], plant: dict[str, Any]
-) -> None:
-    """It follows positions, and pushes with a force."""
+def test_plant_preloads_mode_robot(rig: Callable[..., Rig], plant: dict[str, Any]) -> None:
+    """The plant follows positions and applies a push force."""
     one = rig(plant=plant)
     one.move(one.depth + 2e-3, 0.2)
     one.done(one.operator.set('plant', 'model.coulomb_friction', 0.6))
@@ -187,10 +181,9 @@ def test_the_plant_has_everything_in_mode_robot(
 
 @pytest.mark.parametrize('options', [{}, {'continuous': True}, {'turns': 1}], ids=str)
 @pytest.mark.parametrize('mode', ['robot', 'simulation'])
-def test_steering_has_everything(
+def test_steering_preloads_an_insertion(
     rig: Callable[..., Rig], options: dict[str, Any], mode: str
 ) -> None:
-    """From the target to the end of the insertion."""
     nodes = {'plant': {'mode': mode, **STEERED}, 'steering': {**STEERING, **options}}
     if mode == 'simulation':
         nodes['controller'] = {
@@ -206,7 +199,7 @@ def test_steering_has_everything(
 
 
 def test_nodes_respond_while_they_compile(ros_graph: RosGraph, tmp_path: Path) -> None:
-    """Three nodes share an empty folder: each function is compiled once, and none later."""
+    """Three nodes share an empty cache: each function is compiled once, before activation."""
     folder, logs = tmp_path / 'code', tmp_path / 'logs'
     ros_graph.environment['NUMBA_CACHE_DIR'] = str(folder)
     user = ros_graph.node('user')
@@ -243,7 +236,7 @@ def test_nodes_respond_while_they_compile(ros_graph: RosGraph, tmp_path: Path) -
 
 
 def _answers(graph: RosGraph, user: Node, name: str) -> Callable[[], list[str]]:
-    """Ask a node for its state again and again; return its answers so far."""
+    """Request the state of a node repeatedly; return its answers so far."""
     client = user.create_client(GetState, f'{name}/get_state')
     states: list[str] = []
 

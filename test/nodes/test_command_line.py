@@ -1,4 +1,4 @@
-"""A node as a process: its words, its signals, and what it says when it runs."""
+"""Command line, signals and log of a node process."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def started(
     environment: Mapping[str, str] | None = None,
     errors: int = subprocess.STDOUT,
 ) -> subprocess.Popen[str]:
-    """Start a node with words of its command line, and of that of Python."""
+    """Start a node with arguments of the node and of Python."""
     return subprocess.Popen(
         [sys.executable, *python, ROOT / 'scripts' / name, *words],
         env={**ros_graph.environment, **(environment or {})},
@@ -37,7 +37,7 @@ def started(
 
 @pytest.mark.parametrize('name', NODES)
 def test_help_names_every_parameter(ros_graph: RosGraph, name: str) -> None:
-    """It also says what the node is for."""
+    """The help contains the summary of the node, too."""
     asked = started(ros_graph, name, '--help', errors=subprocess.DEVNULL)
     said, _ = asked.communicate(timeout=60.0)
     assert asked.returncode == 0
@@ -47,18 +47,18 @@ def test_help_names_every_parameter(ros_graph: RosGraph, name: str) -> None:
     assert [key for key in node.values() if f'\n  {key}: ' not in said] == []
 
 
-def test_an_unknown_word_is_refused(ros_graph: RosGraph) -> None:
-    """Before the node exists, with the way to give a parameter."""
+def test_unknown_argument_is_rejected(ros_graph: RosGraph) -> None:
+    """Before the node is created, with the syntax of a parameter."""
     asked = started(ros_graph, 'plant', 'rate:=500')
     said, _ = asked.communicate(timeout=60.0)
     assert asked.returncode == 2
-    assert 'unknown: rate:=500; parameters are given by --ros-args -p NAME:=VALUE' in said
+    assert 'unknown: rate:=500; set parameters with --ros-args -p NAME:=VALUE' in said
 
 
-def test_a_node_says_that_it_runs_and_a_second_ctrl_c_changes_nothing(
+def test_active_node_logs_its_state_and_ignores_repeated_ctrl_c(
     ros_graph: RosGraph,
 ) -> None:
-    """One line names needle, rate and topics. It ends with 0, however often Ctrl-C comes."""
+    """One line has needle, rate and topics. The exit status is 0 for any number of Ctrl-C."""
     came = ros_graph.listen(ros_graph.node('probe'), JointState, 'joint_states', SENSOR)
     node = started(ros_graph, 'plant', '--ros-args', '-p', 'rate:=500.0')
     assert node.stdout is not None
@@ -74,8 +74,8 @@ def test_a_node_says_that_it_runs_and_a_second_ctrl_c_changes_nothing(
 
 
 @pytest.mark.parametrize('stage', ['numpy', 'rclpy', 'visualization_msgs.msg'])
-def test_ctrl_c_while_it_imports_ends_it_at_once(ros_graph: RosGraph, stage: str) -> None:
-    """Killed, or refused before it runs; without a traceback, and without waiting."""
+def test_ctrl_c_during_import_ends_the_process(ros_graph: RosGraph, stage: str) -> None:
+    """Immediately, without a traceback."""
     node = started(ros_graph, 'plant', python=('-X', 'importtime'))
     assert node.stdout is not None
     assert any(line.endswith(f' {stage}\n') for line in node.stdout)
@@ -87,8 +87,8 @@ def test_ctrl_c_while_it_imports_ends_it_at_once(ros_graph: RosGraph, stage: str
     assert 'Traceback' not in said
 
 
-def test_ctrl_c_while_it_compiles_ends_it_at_once(ros_graph: RosGraph, tmp_path: Path) -> None:
-    """A fresh machine compiles for a minute."""
+def test_ctrl_c_during_compilation_ends_the_process(ros_graph: RosGraph, tmp_path: Path) -> None:
+    """Compilation takes a minute on a fresh machine."""
     fresh = {'NUMBA_CACHE_DIR': str(tmp_path)}
     node = started(ros_graph, 'controller', environment=fresh)
     assert node.stdout is not None

@@ -1,4 +1,4 @@
-"""The controller as the graph sees it, alone and around the plant."""
+"""The controller node in the graph, alone and with a plant."""
 
 from collections.abc import Callable
 from itertools import pairwise
@@ -26,12 +26,12 @@ from std_srvs.srv._trigger import Trigger_Request, Trigger_Response
 from support.ros_graph import RosGraph
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-#: Both nodes in the test's own thread.
+#: Both nodes in the thread of the test.
 SLOW = {'rate': 200.0}
 
 
 class Bench:
-    """A controller with a probe that plays the plant."""
+    """A controller, and a probe in place of the plant."""
 
     def __init__(self, graph: RosGraph, start: Any = True, **parameters: Any) -> None:
         self.graph = graph
@@ -56,21 +56,21 @@ class Bench:
         )
 
     def now(self) -> Time:
-        """Return the time to stamp with."""
+        """Return the current stamp."""
         return self.node.get_clock().now().to_msg()
 
     def measure(self, depth: float, speed: float = 0.0) -> float:
-        """Publish a measurement and return the force that answers it."""
+        """Publish a measurement and return its force command."""
         message = JointState(name=['insertion'], position=[depth], velocity=[speed])
         return self.ask(message, fresh=True)
 
     def ask(self, message: JointState, fresh: bool = False) -> float:
-        """Publish a joint state and return the force that answers it."""
+        """Publish a joint state and return its force command."""
         count = len(self.commands)
         asked: list[tuple[float, Time]] = []
 
         def answers() -> list[WrenchStamped]:
-            # On a machine that is held up a measurement may be stale before it is read.
+            # On a busy machine a measurement may be stale on arrival.
             if not asked or (fresh and monotonic() - asked[-1][0] > 1.0):
                 if fresh:
                     message.header.stamp = self.now()
@@ -85,13 +85,13 @@ class Bench:
     def call(
         self, name: str, kind: type[SetBool] | type[Trigger] = Trigger, **request: bool
     ) -> SetBool_Response | Trigger_Response:
-        """Return the answer of a service."""
+        """Return the response of a service."""
         client = self.node.create_client(kind, f'controller/{name}')
         self.graph.spin_until(client.service_is_ready, name)
         answers: list[tuple[float, Future]] = []
 
         def answered() -> list[Future]:
-            # One to a client that the node does not know yet is lost; none of them adds up.
+            # The response to an undiscovered client is lost; the services are idempotent.
             if not answers or monotonic() - answers[-1][0] > 1.0:
                 answers.append((monotonic(), client.call_async(kind.Request(**request))))
             return [answer for _, answer in answers if answer.done()]
@@ -100,11 +100,11 @@ class Bench:
         return answered()[0].result()
 
     def said(self) -> str:
-        """Return what its diagnostics say first."""
+        """Return the first diagnostics message."""
         return self.controller.diagnose()[1]
 
     def value(self, key: str) -> str:
-        """Return one value of its diagnostics."""
+        """Return one value of the diagnostics."""
         return str(self.controller.diagnose()[2].get(key, ''))
 
     def wrench(
@@ -115,7 +115,7 @@ class Bench:
         frame: str = 'needle_base',
         stamp: bool = True,
     ) -> None:
-        """Publish a reading of the force sensor."""
+        """Publish a force sensor reading."""
         message = WrenchStamped()
         message.header.frame_id = frame
         if stamp:
@@ -125,7 +125,7 @@ class Bench:
         self.wrenches.publish(message)
 
     def tip(self, deflection: float, frame: str = 'needle_entry', stamp: bool = True) -> None:
-        """Publish a sample of the tip."""
+        """Publish a tip measurement."""
         message = PointStamped()
         message.header.frame_id = frame
         if stamp:
@@ -134,14 +134,14 @@ class Bench:
         self.tips.publish(message)
 
     def aim(self, depth: float, deflection: float = 0.0) -> None:
-        """Publish a target and wait until the controller has it."""
+        """Publish a target and wait until the controller has received it."""
         message = PointStamped()
         message.point.y, message.point.z = depth, deflection
         self.target.publish(message)
         self.graph.spin_until(lambda: self.controller.diagnose()[2]['target [m]'], 'the target')
 
     def push(self) -> float:
-        """Measure until the reference has left and a force comes."""
+        """Publish measurements until the reference moves and a force is commanded."""
         self.graph.spin_until(lambda: self.measure(0.02) > 0.5, 'a force')
         return self.commands[-1].wrench.force.y
 
@@ -149,7 +149,7 @@ class Bench:
 @pytest.mark.parametrize('law', ['adaptive', 'inverse_dynamics', 'pid'])
 @pytest.mark.parametrize('reference', ['trapezoid', 'minimum_jerk'])
 def test_reaches_the_target(ros_graph: RosGraph, law: str, reference: str) -> None:
-    """Around the plant over DDS each law brings the needle to the target with each reference."""
+    """With the plant over DDS, for each law and each reference."""
     probe = ros_graph.node('probe')
     states = ros_graph.listen(probe, JointState, 'joint_states', SENSOR)
     errors = ros_graph.listen(probe, JointState, 'tracking_error', SENSOR)
@@ -162,18 +162,17 @@ def test_reaches_the_target(ros_graph: RosGraph, law: str, reference: str) -> No
     message.point.y = 0.025
     targets.publish(message)
     ros_graph.spin_until(lambda: aims and aims[-1].position[0] == 0.025, 'the end of the motion')
-    # 0.1 mm: the breakaway speed over h kp, five times that at 1 kHz, leaves 22 um at 200 Hz.
+    # 0.1 mm: five times the breakaway velocity over h kp at 1 kHz, which leaves 22 um at 200 Hz.
     ros_graph.spin_until(lambda: abs(errors[-1].position[0]) < 1e-4, 'the target')
     assert max(m.position[0] for m in states) < 0.026
 
 
 def test_no_force_before_a_target(ros_graph: RosGraph) -> None:
-    """Measurements alone are answered with zero."""
+    """Measurements without a target are answered with zero."""
     assert Bench(ros_graph).measure(0.02) == 0.0
 
 
-def test_lets_go_when_measurements_stop(ros_graph: RosGraph) -> None:
-    """A force is withdrawn when the last measurement is older than the timeout."""
+def test_zero_force_after_the_measurement_timeout(ros_graph: RosGraph) -> None:
     bench = Bench(ros_graph, measurement_timeout=0.2)
     bench.aim(0.1)
     assert bench.push() > 0.5
@@ -190,8 +189,8 @@ def test_lets_go_when_measurements_stop(ros_graph: RosGraph) -> None:
     ],
     ids=['not finite', 'no velocity', 'other joint'],
 )
-def test_lets_go_of_a_measurement_it_cannot_use(ros_graph: RosGraph, message: JointState) -> None:
-    """What is not finite, not complete or not the insertion joint is answered with zero force."""
+def test_zero_force_for_invalid_measurements(ros_graph: RosGraph, message: JointState) -> None:
+    """Non-finite or incomplete measurements, and measurements without the insertion joint."""
     bench = Bench(ros_graph)
     bench.aim(0.1)
     assert bench.push() > 0.5
@@ -201,8 +200,8 @@ def test_lets_go_of_a_measurement_it_cannot_use(ros_graph: RosGraph, message: Jo
     assert 'joint_states' in bench.controller.diagnose()[1]
 
 
-def test_an_emergency_stop_latches(ros_graph: RosGraph) -> None:
-    """After a stop every answer is zero until it is cleared; then the motion starts anew."""
+def test_emergency_stop_latches(ros_graph: RosGraph) -> None:
+    """The force is zero until the stop is cleared; then the motion restarts."""
     bench = Bench(ros_graph)
     bench.aim(0.1)
     assert bench.push() > 0.5
@@ -213,8 +212,8 @@ def test_an_emergency_stop_latches(ros_graph: RosGraph) -> None:
     assert bench.push() > 0.5
 
 
-def test_a_target_out_of_reach_is_refused(ros_graph: RosGraph) -> None:
-    """A target beyond the hub leaves the old one in force."""
+def test_target_out_of_range_is_rejected(ros_graph: RosGraph) -> None:
+    """A target beyond the hub keeps the previous target."""
     bench = Bench(ros_graph)
     bench.aim(0.1)
     for depth in (0.3, nan):
@@ -227,8 +226,8 @@ def test_a_target_out_of_reach_is_refused(ros_graph: RosGraph) -> None:
     )
 
 
-def test_unstable_gains_refuse_the_transition(ros_graph: RosGraph) -> None:
-    """Unstable gains leave the node unconfigured with the reason."""
+def test_unstable_gains_fail_configure(ros_graph: RosGraph) -> None:
+    """The node stays unconfigured and reports the reason."""
     controller = ros_graph.add(
         ControllerNode, start=False, parameters={'adaptive.insertion.kv': 3000.0}
     )
@@ -238,14 +237,14 @@ def test_unstable_gains_refuse_the_transition(ros_graph: RosGraph) -> None:
 
 
 def test_unstable_gains_end_the_process(ros_graph: RosGraph) -> None:
-    """Run on its own it says so in one line and exits with 2."""
+    """The process prints one line and exits with status 2."""
     controller = ros_graph.start('controller', {'adaptive.insertion.kv': 3000.0})
     assert controller.process.wait(30) == 2
     assert 'are unstable' in controller.last_line
 
 
 def test_parameters_cannot_change_while_configured(ros_graph: RosGraph) -> None:
-    """A change that would not take effect is refused, with the way to make it."""
+    """The rejection contains the required procedure."""
     controller = ros_graph.add(ControllerNode, parameters=SLOW)
     parameter = Parameter('reference.kind', value='minimum_jerk')
     result = controller.set_parameters([parameter])[0]
@@ -254,8 +253,9 @@ def test_parameters_cannot_change_while_configured(ros_graph: RosGraph) -> None:
 
 
 @pytest.mark.parametrize('offset', [-10.0, 3600.0, None], ids=['old', 'ahead', 'not stamped'])
-def test_lets_go_of_stamps_that_are_not_now(ros_graph: RosGraph, offset: float | None) -> None:
-    """A measurement stamped long ago, in the future or not at all is answered with zero force."""
+def test_zero_force_for_stale_future_and_missing_stamps(
+    ros_graph: RosGraph, offset: float | None
+) -> None:
     bench = Bench(ros_graph)
     bench.aim(0.1)
     assert bench.push() > 0.5
@@ -266,14 +266,14 @@ def test_lets_go_of_stamps_that_are_not_now(ros_graph: RosGraph, offset: float |
     bench.states.publish(message)
     ros_graph.spin_until(lambda: bench.commands[-1].wrench.force.y == 0.0, 'zero force')
     assert 'stale' in bench.controller.diagnose()[1]
-    # Good measurements are answered again.
+    # Valid measurements are answered again.
     assert bench.push() > 0.5
 
 
-def test_forgets_the_target_when_the_needle_is_elsewhere_after_a_fault(
+def test_target_is_discarded_if_the_needle_moved_during_a_fault(
     ros_graph: RosGraph,
 ) -> None:
-    """A needle that comes back at another depth is not pushed towards the old target."""
+    """A needle at another depth is not pushed towards the previous target."""
     bench = Bench(ros_graph, measurement_timeout=0.2)
     bench.aim(0.1)
     assert bench.push() > 0.5
@@ -282,8 +282,8 @@ def test_forgets_the_target_when_the_needle_is_elsewhere_after_a_fault(
     assert bench.controller.diagnose()[2]['target [m]'] is None
 
 
-def test_configuring_again_doubles_nothing(ros_graph: RosGraph) -> None:
-    """Clean up and configure as often as one likes: one subscription to the ground truth."""
+def test_repeated_configure_does_not_duplicate_subscriptions(ros_graph: RosGraph) -> None:
+    """Only one subscription to the ground truth after repeated cleanup and configure."""
     controller = ros_graph.add(
         ControllerNode, parameters={**SLOW, 'deflection_feedback': 'ground_truth'}
     )
@@ -296,8 +296,8 @@ def test_configuring_again_doubles_nothing(ros_graph: RosGraph) -> None:
     assert topics.count('/joint_states') == 1
 
 
-def test_a_refused_configuration_leaves_nothing_behind(ros_graph: RosGraph) -> None:
-    """What was made before the parameter that is not valid is undone."""
+def test_failed_configure_is_undone(ros_graph: RosGraph) -> None:
+    """Resources created before the invalid parameter are destroyed."""
     wrong = {'deflection_feedback': 'ground_truth', 'safety.sensor_timeout': 0.0}
     controller = ros_graph.add(ControllerNode, start=False, parameters={**SLOW, **wrong})
     assert controller.trigger_configure() == TransitionCallbackReturn.FAILURE
@@ -317,7 +317,7 @@ class Loop:
     """
     Controller and simulated plant in one thread, with a probe.
 
-    Time is the plant's: a machine that stalls makes it wait, and is no fault of its own.
+    Time is simulated: it waits for a stalled machine, which is therefore not a fault.
     """
 
     def __init__(
@@ -345,7 +345,7 @@ class Loop:
                 'rate': rate,
                 'use_sim_time': True,
                 'measurement_timeout': 1.0,
-                # A needle that is pushed on while all is held up is ahead of its reference.
+                # On a busy machine the needle may lead its reference.
                 'safety.tracking_error': 0.1,
                 **parameters,
             },
@@ -382,7 +382,7 @@ class Loop:
 
 
 def path(*points: tuple[float, float, None], joint: str = 'insertion') -> JointTrajectory:
-    """Return a trajectory of points: time, position, speed or None."""
+    """Return a trajectory of points: time, position, velocity or None."""
     message = JointTrajectory(joint_names=[joint])
     for time, position, speed in points:
         point = JointTrajectoryPoint(positions=[position])
@@ -393,8 +393,8 @@ def path(*points: tuple[float, float, None], joint: str = 'insertion') -> JointT
     return message
 
 
-def test_pauses_goes_on_and_retracts(ros_graph: RosGraph) -> None:
-    """The reference brakes, holds, goes on to its target, and back out again."""
+def test_pause_resume_and_retract(ros_graph: RosGraph) -> None:
+    """The reference brakes, holds, continues to its target, and retracts."""
     loop = Loop(ros_graph, retract_depth=0.019)
     loop.aim(0.1)
     loop.until(lambda: loop.speed() == 0.01, 'the highest speed')
@@ -410,7 +410,7 @@ def test_pauses_goes_on_and_retracts(ros_graph: RosGraph) -> None:
     assert loop.call(Trigger, 'retract', Trigger.Request()).message == 'retracting to 0.019 m'
     loop.until(lambda: loop.aims[-1].position[0] == 0.019, 'the way back')
     loop.until(lambda: abs(loop.states[-1].position[0] - 0.019) < 1e-4, 'the needle')
-    # No jump in all of it: one period at the limits, and rounding.
+    # Continuous: one period at the limits, and rounding.
     aims = [(m.position[0], m.velocity[0]) for m in loop.aims]
     assert max(abs(b[0] - a[0]) for a, b in pairwise(aims)) < 0.01 * 0.2
     assert loop.call(Trigger, 'emergency_stop', Trigger.Request()).success
@@ -419,8 +419,8 @@ def test_pauses_goes_on_and_retracts(ros_graph: RosGraph) -> None:
     assert not refused.success
 
 
-def test_follows_a_trajectory(ros_graph: RosGraph) -> None:
-    """Lines by positions alone are followed to their end; the plant leaves them to it."""
+def test_trajectory_is_followed(ros_graph: RosGraph) -> None:
+    """Positions without velocities are followed to the end; the plant ignores the trajectory."""
     loop = Loop(ros_graph)
     loop.paths.publish(path((0.5, 0.024, None), (1.0, 0.022, None)))
     loop.until(lambda: loop.aims[-1].position[0] == 0.022, 'the end')
@@ -441,10 +441,10 @@ def test_follows_a_trajectory(ros_graph: RosGraph) -> None:
     ],
     ids=['reach', 'finite', 'times', 'joint', 'speed'],
 )
-def test_a_trajectory_that_it_cannot_follow_is_refused(
+def test_infeasible_trajectory_is_rejected(
     ros_graph: RosGraph, message: JointTrajectory, reason: str
 ) -> None:
-    """In one line, which diagnostics have too; nothing moves."""
+    """One line in log and diagnostics; the needle does not move."""
     bench = Bench(ros_graph)
     paths = bench.node.create_publisher(JointTrajectory, 'joint_trajectory', COMMAND)
     ros_graph.spin_until(paths.get_subscription_count, 'discovery')
@@ -455,18 +455,18 @@ def test_a_trajectory_that_it_cannot_follow_is_refused(
     assert bench.measure(0.02) == 0.0
 
 
-def test_switches_law_and_gains_in_motion_without_a_bump(ros_graph: RosGraph) -> None:
-    """By parameter, over DDS: the commanded force goes on where it was."""
+def test_bumpless_transfer_of_law_and_gains(ros_graph: RosGraph) -> None:
+    """By parameter over DDS: the commanded force is continuous."""
     loop = Loop(ros_graph)
     loop.aim(0.1)
     loop.until(lambda: loop.states[-1].position[0] > 0.022, 'steady motion')
     for name, value in (('law', 'pid'), ('pid.insertion.kp', 4000.0), ('law', 'inverse_dynamics')):
-        # One that is there belongs to the time before.
+        # An earlier command may still arrive.
         count = len(loop.forces)
         assert loop.node.set_parameters([Parameter(name, value=value)])[0].successful
         loop.until(lambda count=count: len(loop.forces) > count + 20, 'commands')
         forces = [m.wrench.force.y for m in loop.forces[count - 1 :]]
-        # 3.6 N; the handover fades by 5 % of its part in a period of 5 ms.
+        # 3.6 N; the handover decays by 5 % of its value in a period of 5 ms.
         assert max(abs(b - a) for a, b in pairwise(forces)) < 0.05 * forces[0]
     assert loop.said('law') == 'inverse_dynamics'
 
@@ -480,10 +480,10 @@ def test_switches_law_and_gains_in_motion_without_a_bump(ros_graph: RosGraph) ->
         ('retract_depth', 0.5, 'retract_depth must be in [0.001, 0.2] m'),
     ],
 )
-def test_gains_that_will_not_do_are_refused_while_running(
+def test_invalid_gains_are_rejected_while_active(
     ros_graph: RosGraph, name: str, value: float | list[float] | str, reason: str
 ) -> None:
-    """The reason is the answer and on /diagnostics; the old value stays."""
+    """The reason is in the response and on /diagnostics; the previous value is kept."""
     node = ros_graph.add(ControllerNode, parameters=SLOW)
     before = node.get_parameter(name).value
     answer = node.set_parameters([Parameter(name, value=value)])[0]
@@ -493,8 +493,8 @@ def test_gains_that_will_not_do_are_refused_while_running(
     assert reason in node.diagnose()[2]['last complaint']
 
 
-def test_a_measurement_that_jumps_is_answered_with_no_force(ros_graph: RosGraph) -> None:
-    """A needle that is 5 mm on within a period is no needle."""
+def test_zero_force_after_a_position_jump(ros_graph: RosGraph) -> None:
+    """A jump of 5 mm within a period is not a needle motion."""
     bench = Bench(ros_graph)
     bench.aim(0.1)
     assert bench.push() > 0.5
@@ -503,8 +503,8 @@ def test_a_measurement_that_jumps_is_answered_with_no_force(ros_graph: RosGraph)
     assert bench.controller.get_parameter('jump').value < 5e-3
 
 
-def test_the_observer_tells_what_it_sees(ros_graph: RosGraph) -> None:
-    """By default it follows the tip of a bent needle from the plant's sensors."""
+def test_observer_estimates_the_tip(ros_graph: RosGraph) -> None:
+    """By default it estimates the tip of a bent needle from the sensors of the plant."""
     probe = ros_graph.node('probe')
     tips = ros_graph.listen(probe, PointStamped, 'tip_deflection', SENSOR)
     ros_graph.add(
@@ -516,7 +516,7 @@ def test_the_observer_tells_what_it_sees(ros_graph: RosGraph) -> None:
     ros_graph.spin_until(lambda: len(tips) > 25, 'tips')
     said = node.diagnose()[2]
     estimate, _, spread = str(said['tip deflection [m]']).split()
-    # The needle swings to rest; three standard deviations and those of the last tip seen.
+    # The needle oscillates to rest; three standard deviations, of estimate and last measurement.
     assert abs(float(estimate) - tips[-1].point.z) < 3.0 * (float(spread) + 1e-4) + 5e-4
     assert 'in [' in said['observer consistency (NIS)']
     assert said['observer restarts'] == 0
@@ -524,8 +524,8 @@ def test_the_observer_tells_what_it_sees(ros_graph: RosGraph) -> None:
     assert min(b - a for a, b in pairwise(stamps)) == pytest.approx(0.02, abs=1e-6)
 
 
-def test_the_integral_is_frozen_while_it_is_stopped(ros_graph: RosGraph) -> None:
-    """What PID has learned of the friction is there again after the stop."""
+def test_integral_is_frozen_during_a_stop(ros_graph: RosGraph) -> None:
+    """The integral of PID, which compensates friction, is kept."""
     bench = Bench(ros_graph, law='pid')
     bench.aim(0.1)
     memory = bench.controller._supervisor.controller._insertion.memory
@@ -540,7 +540,7 @@ def test_the_integral_is_frozen_while_it_is_stopped(ros_graph: RosGraph) -> None
     assert memory[INTEGRAL] != 0.0
 
 
-#: Beyond each limit, and what is well within it.
+#: A value beyond each limit, and a value within it.
 BEYOND = {
     'speed': (lambda b: b.measure(0.02, 0.15), 'insertion speed 0.15 m/s is beyond'),
     'depth': (lambda b: b.measure(0.204), 'insertion depth 0.204 m is outside'),
@@ -552,8 +552,8 @@ BEYOND = {
 
 
 @pytest.mark.parametrize('limit', BEYOND)
-def test_beyond_a_limit_it_stops_until_it_is_cleared(ros_graph: RosGraph, limit: str) -> None:
-    """Zero force, the reason on /diagnostics, and no way back while it is still beyond."""
+def test_limit_violation_latches_a_stop(ros_graph: RosGraph, limit: str) -> None:
+    """Zero force and reason on /diagnostics; the stop cannot be cleared while it persists."""
     exceed, reason = BEYOND[limit]
     bench = Bench(ros_graph)
     arrays = ros_graph.listen(bench.node, DiagnosticArray, '/diagnostics', 10)
@@ -581,25 +581,25 @@ def test_beyond_a_limit_it_stops_until_it_is_cleared(ros_graph: RosGraph, limit:
     refused = bench.call('clear_stop')
     assert not refused.success
     assert reason in refused.message
-    # Well again, it starts anew; a step back is a jump at first.
+    # Value within the limit: the motion restarts; the step back first counts as a jump.
     for _ in range(3):
         bench.wrench()
         bench.tip(0.0)
         bench.measure(0.02)
     ros_graph.spin_until(
-        lambda: not bench.controller._supervisor.safety.guard.violated, 'what is well'
+        lambda: not bench.controller._supervisor.safety.guard.violated, 'values within the limits'
     )
     assert bench.call('clear_stop').success
     assert bench.value('stops latched') == '1'
     if limit == 'depth':
-        # It was elsewhere: the target is forgotten.
+        # The needle has moved: the target is discarded.
         bench.measure(0.02)
         bench.aim(0.1)
     assert bench.push() > 0.5
 
 
-def test_a_needle_that_does_not_follow_is_not_pushed_for_ever(ros_graph: RosGraph) -> None:
-    """Encoders that stand still while the reference goes on are a fault, not a reason to push."""
+def test_frozen_encoders_cause_a_stop(ros_graph: RosGraph) -> None:
+    """Frozen encoders with a moving reference are a fault."""
     bench = Bench(ros_graph)
     bench.aim(0.1)
     ros_graph.spin_until(lambda: bench.measure(0.02) == 0.0 and bench.value('stop'), 'the stop')
@@ -608,8 +608,8 @@ def test_a_needle_that_does_not_follow_is_not_pushed_for_ever(ros_graph: RosGrap
     assert bench.push() > 0.5
 
 
-def test_one_reading_alone_stops_nothing(ros_graph: RosGraph) -> None:
-    """A spike is not taken in, and the needle is pushed on."""
+def test_single_spike_is_rejected_without_a_stop(ros_graph: RosGraph) -> None:
+    """The motion continues."""
     bench = Bench(ros_graph)
     bench.aim(0.1)
     assert bench.push() > 0.5
@@ -633,10 +633,10 @@ def test_one_reading_alone_stops_nothing(ros_graph: RosGraph) -> None:
         (lambda b: b.tip(nan), 'tip_deflection', 'not finite'),
     ],
 )
-def test_a_reading_that_does_not_count_is_not_taken_in(
+def test_invalid_readings_are_counted_and_discarded(
     ros_graph: RosGraph, send: Callable[..., Any], topic: str, kind: str
 ) -> None:
-    """It is counted by its kind; the observer hears nothing of it and the motion goes on."""
+    """The observer does not process them, and the motion continues."""
     bench = Bench(ros_graph)
     bench.aim(0.1)
     assert bench.push() > 0.5
@@ -647,8 +647,8 @@ def test_a_reading_that_does_not_count_is_not_taken_in(
     assert bench.push() > 0.5
 
 
-def test_it_goes_on_without_sensors_that_fall_silent(ros_graph: RosGraph) -> None:
-    """Diagnostics warn for as long as they are; the force stays."""
+def test_motion_continues_without_optional_sensors(ros_graph: RosGraph) -> None:
+    """Diagnostics warn while sensors are missing; the force is unchanged."""
     bench = Bench(ros_graph, **{'safety.sensor_timeout': 0.3, 'safety.tracking_error': 1.0})
     bench.aim(0.1)
     depth = 0.02
@@ -671,8 +671,7 @@ def test_it_goes_on_without_sensors_that_fall_silent(ros_graph: RosGraph) -> Non
     assert bench.measure(depth) > 0.5
 
 
-def test_it_stops_for_want_of_sensors_if_they_are_required(ros_graph: RosGraph) -> None:
-    """A parameter makes of the warning a stop."""
+def test_missing_required_sensors_cause_a_stop(ros_graph: RosGraph) -> None:
     bench = Bench(
         ros_graph,
         **{
@@ -688,8 +687,8 @@ def test_it_stops_for_want_of_sensors_if_they_are_required(ros_graph: RosGraph) 
     assert 'is stale' in bench.call('clear_stop').message
 
 
-def test_two_that_command_both_let_go(ros_graph: RosGraph) -> None:
-    """While another node publishes the same topic the answer is zero; alone again it goes on."""
+def test_duplicate_commanders_command_zero_force(ros_graph: RosGraph) -> None:
+    """The force is zero while another node publishes commands, and returns afterwards."""
     bench = Bench(ros_graph, **{'safety.tracking_error': 1.0})
     bench.aim(0.1)
     assert bench.push() > 0.5
@@ -701,8 +700,8 @@ def test_two_that_command_both_let_go(ros_graph: RosGraph) -> None:
     assert bench.push() > 0.5
 
 
-def test_commands_carry_the_stamp_of_what_they_answer(ros_graph: RosGraph) -> None:
-    """A measurement that comes again is answered as before; what answers nothing is of now."""
+def test_commands_have_the_stamp_of_the_measurement(ros_graph: RosGraph) -> None:
+    """A repeated measurement gets the same command; other commands have the current time."""
     bench = Bench(ros_graph, measurement_timeout=1.0)
     bench.aim(0.1)
     force, stamp = bench.push(), bench.commands[-1].header.stamp
@@ -710,16 +709,16 @@ def test_commands_carry_the_stamp_of_what_they_answer(ros_graph: RosGraph) -> No
     again.header.stamp = stamp
     assert bench.ask(again) == force
     assert '1 repeated' in bench.value('input joint_states')
-    # The watchdog answers nothing.
+    # Commands of the watchdog do not answer a measurement.
     ros_graph.spin_until(lambda: bench.commands[-1].wrench.force.y == 0.0, 'zero force')
     last = bench.commands[-1].header.stamp
     assert (last.sec, last.nanosec) > (stamp.sec, stamp.nanosec)
 
 
-def test_a_measurement_that_comes_again_after_a_stop_is_answered_with_none(
+def test_repeated_measurement_after_a_stop_gets_zero_force(
     ros_graph: RosGraph,
 ) -> None:
-    """The stop was the last word, not the force before it."""
+    """The previous force is not sent again."""
     bench = Bench(ros_graph, measurement_timeout=5.0)
     bench.aim(0.1)
     assert bench.push() > 0.5
@@ -731,7 +730,7 @@ def test_a_measurement_that_comes_again_after_a_stop_is_answered_with_none(
 
 
 class SimulatedTime(Bench):
-    """A bench whose clock is what the test makes it."""
+    """Bench with a clock set by the test."""
 
     def __init__(self, graph: RosGraph, **parameters: Any) -> None:
         super().__init__(graph, use_sim_time=True, **parameters)
@@ -740,7 +739,7 @@ class SimulatedTime(Bench):
         self.set(0.0)
 
     def set(self, seconds: float) -> None:
-        """Set the clock and wait until the controller has it."""
+        """Set the clock and wait until the controller has received it."""
         self.time = round(seconds * 1e9)
         self.clock.publish(Clock(clock=self.now()))
         clock = self.controller.get_clock()
@@ -754,8 +753,7 @@ class SimulatedTime(Bench):
         return super().measure(depth, speed)
 
 
-def test_a_simulation_that_starts_at_zero_is_answered(ros_graph: RosGraph) -> None:
-    """Its first sample has a stamp of zero, and is one."""
+def test_first_sample_with_stamp_zero_is_answered(ros_graph: RosGraph) -> None:
     bench = SimulatedTime(ros_graph)
     message = JointState(name=['insertion'], position=[0.02], velocity=[0.0])
     assert bench.ask(message) == 0.0
@@ -764,8 +762,8 @@ def test_a_simulation_that_starts_at_zero_is_answered(ros_graph: RosGraph) -> No
     assert bench.push() > 0.5
 
 
-def test_a_clock_that_is_set_back_starts_the_motion_anew(ros_graph: RosGraph) -> None:
-    """It lets go, and the next sample is answered again, though older than those before."""
+def test_clock_set_back_restarts_the_motion(ros_graph: RosGraph) -> None:
+    """Zero force first; the next sample is answered despite its earlier stamp."""
     bench = SimulatedTime(ros_graph)
     bench.set(100.0)
     bench.aim(0.1)
@@ -778,8 +776,8 @@ def test_a_clock_that_is_set_back_starts_the_motion_anew(ros_graph: RosGraph) ->
     assert 'clock' not in bench.said()
 
 
-def test_a_clock_that_jumps_ahead_is_a_gap(ros_graph: RosGraph) -> None:
-    """The motion starts anew from where the needle is; nothing is faulty."""
+def test_clock_jump_ahead_restarts_the_motion(ros_graph: RosGraph) -> None:
+    """The motion restarts at the position of the needle, without a fault."""
     bench = SimulatedTime(ros_graph)
     bench.set(100.0)
     bench.aim(0.1)
@@ -792,7 +790,7 @@ def test_a_clock_that_jumps_ahead_is_a_gap(ros_graph: RosGraph) -> None:
         return [one for one in aims if one.header.stamp.sec >= 200]
 
     ros_graph.spin_until(aimed, 'the reference')
-    # Had it gone on, it would be at the target by now.
+    # A continued motion would have reached the target.
     assert aimed()[0].position[0] < 0.021
     assert 'continued after 1' in bench.value('last complaint')
     assert bench.value('stops latched') == '0'
@@ -800,8 +798,8 @@ def test_a_clock_that_jumps_ahead_is_a_gap(ros_graph: RosGraph) -> None:
     assert bench.push() > 0.5
 
 
-def test_a_clock_that_stands_is_no_fault(ros_graph: RosGraph) -> None:
-    """Paused, nothing is stale; the same sample again is answered with the same force."""
+def test_stopped_clock_is_not_a_fault(ros_graph: RosGraph) -> None:
+    """No timeout in paused time; a repeated sample gets the same force."""
     bench = SimulatedTime(ros_graph)
     bench.set(100.0)
     bench.aim(0.1)
@@ -812,7 +810,7 @@ def test_a_clock_that_stands_is_no_fault(ros_graph: RosGraph) -> None:
 
     def repeated() -> bool:
         forces.add(bench.ask(message))
-        # Three times the timeout, by the clock on the wall.
+        # Three times the timeout in real time.
         return monotonic() - start > 0.3
 
     forces: set[float] = set()
@@ -828,10 +826,10 @@ def test_a_clock_that_stands_is_no_fault(ros_graph: RosGraph) -> None:
         ('', Time(sec=5), 'target is stale: its stamp is'),
     ],
 )
-def test_a_target_of_another_frame_or_time_is_refused(
+def test_target_with_wrong_frame_or_stamp_is_rejected(
     ros_graph: RosGraph, frame: str, stamp: Time, reason: str
 ) -> None:
-    """In one line; without frame and stamp it is meant as it is, and now."""
+    """An empty frame and a zero stamp are accepted."""
     bench = Bench(ros_graph)
     message = PointStamped()
     message.header.frame_id, message.header.stamp = frame, stamp
@@ -842,8 +840,8 @@ def test_a_target_of_another_frame_or_time_is_refused(
     assert bench.value('target [m]') == 'None'
 
 
-def test_before_it_is_active_it_answers_and_waits(ros_graph: RosGraph) -> None:
-    """Services say so, a target is refused, and a stop is kept for when it is active."""
+def test_inactive_node_answers_requests(ros_graph: RosGraph) -> None:
+    """Services report the state, targets are rejected, and a stop applies after activation."""
     bench = Bench(ros_graph, start=False)
     assert bench.call('emergency_stop').success
     assert bench.controller.start()
@@ -880,8 +878,8 @@ def test_before_it_is_active_it_answers_and_waits(ros_graph: RosGraph) -> None:
         JointState(name=['insertion', 'rotation'], position=[0.02, nan], velocity=[0.0, 0.0]),
     ],
 )
-def test_no_joint_state_raises(ros_graph: RosGraph, message: JointState) -> None:
-    """Whatever its fields are: zero force with its stamp, and the next good one is answered."""
+def test_malformed_joint_states_raise_no_error(ros_graph: RosGraph, message: JointState) -> None:
+    """Zero force with the same stamp; the next valid measurement is answered."""
     bench = Bench(ros_graph, measurement_timeout=5.0)
     bench.aim(0.1)
     assert bench.push() > 0.5
@@ -901,8 +899,8 @@ def test_no_joint_state_raises(ros_graph: RosGraph, message: JointState) -> None
         JointState(position=[0.18, 0.0, 1e308, 0.0], velocity=[0.0] * 4),
     ],
 )
-def test_no_ground_truth_raises(ros_graph: RosGraph, message: JointState) -> None:
-    """A truth of a wrong length, not finite or of a needle that is none is not taken in."""
+def test_malformed_ground_truth_raises_no_error(ros_graph: RosGraph, message: JointState) -> None:
+    """Ground truth with a wrong length or invalid values is discarded."""
     bench = Bench(ros_graph, deflection_feedback='ground_truth')
     truths = bench.node.create_publisher(JointState, 'ground_truth', SENSOR)
     ros_graph.spin_until(truths.get_subscription_count, 'discovery')
@@ -914,8 +912,8 @@ def test_no_ground_truth_raises(ros_graph: RosGraph, message: JointState) -> Non
     assert bench.push() > 0.5
 
 
-def test_diagnostics_tell_rates_and_saturation(ros_graph: RosGraph) -> None:
-    """Of each input in the last second, and how long the force was all there is."""
+def test_diagnostics_report_rates_and_saturation(ros_graph: RosGraph) -> None:
+    """Rate of each input in the last second, and time at the force limit."""
     bench = SimulatedTime(ros_graph, force_limit=0.7, **{'safety.tracking_error': 0.1})
     bench.aim(0.1)
 
@@ -925,6 +923,6 @@ def test_diagnostics_tell_rates_and_saturation(ros_graph: RosGraph) -> None:
         return seen and bench.value('share of commands at their limit') == '1.000'
 
     ros_graph.spin_until(saturated, 'a second at the limit')
-    # One each 5 ms; one more where a measurement had to be said again.
+    # One message each 5 ms, plus repeated measurements.
     assert float(bench.value('commands per second')) == pytest.approx(200.0, abs=1.0)
     assert float(bench.value('input joint_states').split()[0]) == pytest.approx(200.0, abs=5.0)

@@ -1,4 +1,4 @@
-"""What goes wrong in a graph, and what must then happen: never silence, never force."""
+"""Fault injection in a graph: each fault is reported and leads to zero force."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -24,10 +24,10 @@ from support.ros_graph import RosGraph
 
 RATE, START, TARGET = 200.0, 0.02, 0.025
 
-#: Where dry friction may hold the needle that inverse dynamics has let go of [m].
+#: Position error by dry friction after the end of the force of inverse dynamics [m].
 NEAR = 2e-4
 
-#: Speed below which it rests [m/s]: a law that balances friction to the last digit leaves 1e-13.
+#: Velocity at rest [m/s]: a law with exact friction compensation leaves 1e-13.
 REST = 1e-9
 
 
@@ -35,7 +35,7 @@ class Loop:
     """
     Plant and controller in this process, and a probe.
 
-    Time is the plant's: a machine that stalls makes it wait, and is no fault of its own.
+    Time is simulated: it waits for a stalled machine, which is therefore not a fault.
     """
 
     def __init__(
@@ -64,17 +64,17 @@ class Loop:
         self.graph.spin_until(condition, what)
 
     def said(self, key: str) -> float | None:
-        """Return a figure of the controller's diagnostics."""
+        """Return a value of the controller diagnostics."""
         return self.controller.diagnose()[2][key]
 
     @property
     def depth(self) -> Any:
-        """True inserted length [m]."""
+        """True insertion depth [m]."""
         return 0.2 - self.truth.message.position[0]
 
     @property
     def speed(self) -> float:
-        """True insertion speed [m/s]."""
+        """True insertion velocity [m/s]."""
         return -self.truth.message.velocity[0]
 
     @property
@@ -83,7 +83,7 @@ class Loop:
         return seconds(self.truth.message.header.stamp)
 
     def aim(self, depth: float = TARGET) -> None:
-        """Send a target until it is taken."""
+        """Send a target until it is accepted."""
         message = PointStamped()
         message.point.y = depth
 
@@ -94,7 +94,7 @@ class Loop:
         self.until(taken, 'the target')
 
     def break_down(self, kind: str, topic: str, **values: float) -> None:
-        """Let a stream of the plant suffer from a fault."""
+        """Inject a fault into a stream of the plant."""
         parameters: dict[str, Any] = {'fault.kind': kind, 'fault.topic': topic}
         parameters |= {f'fault.{name}': value for name, value in values.items()}
         changed = self.plant.set_parameters_atomically(
@@ -107,12 +107,12 @@ class Loop:
         self.plant.set_parameters([Parameter('fault.kind', value='none')])
 
     def passes(self, seconds: float) -> None:
-        """Spin for a time of the needle."""
+        """Spin for a simulated duration [s]."""
         end = self.time + seconds
         self.until(lambda: self.time >= end, f'{seconds} s')
 
     def moves(self) -> None:
-        """Spin until the needle is on its way."""
+        """Spin until the needle moves."""
         self.until(lambda: self.speed > 0.005, 'motion')
 
     def arrives(self, depth: float = TARGET) -> None:
@@ -122,7 +122,7 @@ class Loop:
         )
 
     def rests_without_force(self, why: str) -> None:
-        """Spin until nothing is commanded and the reason told; the needle rests."""
+        """Spin until the command is zero with a reported reason, and the needle rests."""
         self.until(lambda: why in self.controller.diagnose()[1], why)
         self.until(lambda: self.speed == 0.0, 'rest')
         depth = self.depth
@@ -130,11 +130,11 @@ class Loop:
         assert self.depth == depth
         assert self.controller.diagnose()[0] != DiagnosticStatus.OK
         force = self.command.message.wrench.force.y
-        # Where no measurement comes the plant has let go by itself.
+        # Without measurements the command timeout of the plant applies.
         assert force == 0.0 or self.plant.diagnose()[2]['commands per second [Hz]'] == '0.0'
 
     def clears(self) -> Trigger_Response:
-        """Release the latched stop."""
+        """Clear the latched stop."""
         client = self.probe.create_client(Trigger, 'controller/clear_stop')
         self.until(client.service_is_ready, 'the service')
         answer = client.call_async(Trigger.Request())
@@ -152,10 +152,10 @@ class Loop:
     ],
 )
 @pytest.mark.parametrize('topic', ['joint_states', 'base_wrench', 'tip_deflection'])
-def test_a_network_that_loses_or_muddles_measurements_is_borne(
+def test_lost_and_reordered_measurements_are_tolerated(
     ros_graph: RosGraph, kind: str, values: dict[str, float], topic: str
 ) -> None:
-    """The needle gets where it shall, and no stop latches."""
+    """The needle reaches its target without a latched stop."""
     loop = Loop(ros_graph)
     loop.break_down(kind, topic, **values)
     loop.aim()
@@ -168,10 +168,10 @@ def test_a_network_that_loses_or_muddles_measurements_is_borne(
     ('kind', 'values'),
     [('drop', {}), ('freeze', {}), ('nan', {}), ('delay', {'delay': 5.0})],
 )
-def test_without_its_sensors_of_bending_it_goes_on(
+def test_motion_continues_without_bending_sensors(
     ros_graph: RosGraph, kind: str, values: dict[str, float], topic: str
 ) -> None:
-    """The observer does without what does not come or is of no use; the diagnostics tell."""
+    """The observer ignores missing or invalid inputs; diagnostics report them."""
     loop = Loop(ros_graph, plant={'tip.noise': 1e-4})
     loop.aim()
     loop.moves()
@@ -184,10 +184,10 @@ def test_without_its_sensors_of_bending_it_goes_on(
 @pytest.mark.parametrize(
     ('kind', 'values'), [('drop', {}), ('nan', {}), ('delay', {'delay': 0.5})]
 )
-def test_without_encoders_it_lets_go_and_goes_on_when_they_are_back(
+def test_encoder_loss_gives_zero_force_until_recovery(
     ros_graph: RosGraph, kind: str, values: dict[str, float]
 ) -> None:
-    """Zero force while they are gone; then to the target, if the needle has not gone far."""
+    """The needle then continues to its target, unless it has moved too much."""
     loop = Loop(ros_graph, controller={'jump': 0.01})
     loop.aim(0.04)
     loop.moves()
@@ -205,10 +205,10 @@ def test_without_encoders_it_lets_go_and_goes_on_when_they_are_back(
         ('bias', {'size': 0.01}, 'insertion moved by'),
     ],
 )
-def test_encoders_that_lie_end_the_motion(
+def test_inconsistent_encoders_end_the_motion(
     ros_graph: RosGraph, kind: str, values: dict[str, float], why: str
 ) -> None:
-    """What the encoders say does not fit the motion: no force, and the reason."""
+    """Zero force and the reason."""
     loop = Loop(ros_graph)
     loop.aim(0.1)
     loop.moves()
@@ -221,10 +221,8 @@ def test_encoders_that_lie_end_the_motion(
     ('topic', 'size', 'why'),
     [('base_wrench', 50.0, 'load'), ('tip_deflection', 0.06, 'tip_deflection')],
 )
-def test_a_load_beyond_the_limits_latches_a_stop(
-    ros_graph: RosGraph, topic: str, size: float, why: str
-) -> None:
-    """Until the reading is within them again and the stop is cleared."""
+def test_overload_latches_a_stop(ros_graph: RosGraph, topic: str, size: float, why: str) -> None:
+    """Until the reading is within the limits and the stop is cleared."""
     loop = Loop(ros_graph)
     loop.aim(0.04)
     loop.moves()
@@ -240,8 +238,8 @@ def test_a_load_beyond_the_limits_latches_a_stop(
     loop.arrives(0.04)
 
 
-def test_a_killed_controller_leaves_the_needle_at_rest(ros_graph: RosGraph) -> None:
-    """The plant lets go after command_timeout; a new controller takes over within seconds."""
+def test_killed_controller_leaves_the_needle_at_rest(ros_graph: RosGraph) -> None:
+    """The plant applies command_timeout; a new controller takes over within seconds."""
     probe = ros_graph.node('probe')
     truth = ros_graph.latest(probe, JointState, 'ground_truth', SENSOR)
     targets = probe.create_publisher(PointStamped, 'target', COMMAND)
@@ -262,7 +260,7 @@ def test_a_killed_controller_leaves_the_needle_at_rest(ros_graph: RosGraph) -> N
     health = ros_graph.latest(probe, DiagnosticArray, '/diagnostics', COMMAND)
     ros_graph.start('controller', parameters)
     ros_graph.spin_until(moves, 'motion', timeout=60.0)
-    # The graph still has the dead one, whose lease is over.
+    # The graph still lists the dead controller, whose lease is over.
     assert probe.count_publishers('wrench_command') == 2
     assert 'nodes command' not in plant.diagnose()[1]
 
@@ -274,8 +272,8 @@ def test_a_killed_controller_leaves_the_needle_at_rest(ros_graph: RosGraph) -> N
     ros_graph.spin_until(is_well, 'no stop')
 
 
-def test_a_killed_plant_is_waited_for(ros_graph: RosGraph) -> None:
-    """The controller commands nothing, says why, and goes on with a plant that takes its place."""
+def test_controller_resumes_after_a_plant_restart(ros_graph: RosGraph) -> None:
+    """It commands zero, reports the reason, and continues with the new plant."""
     probe = ros_graph.node('probe')
     states = ros_graph.latest(probe, JointState, 'joint_states', SENSOR)
     forces = ros_graph.latest(probe, WrenchStamped, 'wrench_command', COMMAND)
@@ -297,10 +295,10 @@ def test_a_killed_plant_is_waited_for(ros_graph: RosGraph) -> None:
     ros_graph.spin_until(moves, 'motion', timeout=60.0)
 
 
-def test_a_recorder_without_disk_says_so_and_keeps_what_it_has(
+def test_recorder_reports_a_full_disk_and_keeps_its_messages(
     ros_graph: RosGraph, tmp_path: Path
 ) -> None:
-    """When no more can be written the recording ends, the node does not, and the bag is read."""
+    """The recording ends, the node continues, and the bag can be read."""
     loop = Loop(ros_graph)
     bag = tmp_path / 'bag'
     health: list[Any] = []
@@ -325,12 +323,12 @@ def test_a_recorder_without_disk_says_so_and_keeps_what_it_has(
     read = Bag(file)
     count = sum(len(batch.received) for batch in read.batches(lambda _topic: True))
     assert file.stat().st_size <= size
-    # More than half of the file are messages, of less than 200 bytes each.
+    # Messages, each of less than 200 bytes, fill more than half of the file.
     assert count > size / 2 / 200
 
 
-def test_a_clock_that_jumps_moves_nothing(ros_graph: RosGraph) -> None:
-    """Under a foreign clock that jumps both ways the loop goes on, without a force in between."""
+def test_clock_jumps_do_not_move_the_needle(ros_graph: RosGraph) -> None:
+    """The loop continues after jumps of an external clock, with zero force in between."""
     clocks = ros_graph.node('clock')
     ticks = clocks.create_publisher(Clock, '/clock', SENSOR)
     probe = ros_graph.node('probe')
@@ -340,7 +338,7 @@ def test_a_clock_that_jumps_moves_nothing(ros_graph: RosGraph) -> None:
     ros_graph.add(PlantNode, parameters=simulated)
     controller = ros_graph.add(ControllerNode, parameters=simulated)
     now = [10_000_000_000_000]
-    # A clock that goes on before all have taken notice would make every message late.
+    # All nodes must receive a clock jump first, or every message would be late.
     seen, waited = [None], [0]
 
     def goes_on(step: int = 0) -> None:
@@ -389,8 +387,8 @@ def test_a_clock_that_jumps_moves_nothing(ros_graph: RosGraph) -> None:
     ros_graph.spin_until(lambda: reached(0.024), 'the needle')
 
 
-def test_a_flood_of_commands_does_not_stop_the_samples(ros_graph: RosGraph) -> None:
-    """Commands as fast as a process can publish them: the plant samples on and warns."""
+def test_command_flood_does_not_stop_sampling(ros_graph: RosGraph) -> None:
+    """The plant samples and warns under commands at the maximum rate of a process."""
     probe = ros_graph.node('probe')
     samples = ros_graph.listen(
         probe,
@@ -400,7 +398,7 @@ def test_a_flood_of_commands_does_not_stop_the_samples(ros_graph: RosGraph) -> N
     )
     health = ros_graph.listen(probe, DiagnosticArray, '/diagnostics', 10)
     commands = probe.create_publisher(WrenchStamped, 'wrench_command', COMMAND)
-    # At 20 Hz, of which a process can publish some hundred times as many.
+    # At 20 Hz; a process can publish hundreds of times as many.
     plant = ros_graph.start('plant', {'rate': 20.0, 'publish_clock': True})
     ros_graph.spin_until(
         lambda: samples and commands.get_subscription_count(), 'discovery', timeout=60.0
@@ -427,5 +425,5 @@ def test_a_flood_of_commands_does_not_stop_the_samples(ros_graph: RosGraph) -> N
     ros_graph.spin_until(further, 'three seconds of samples')
     stamps = [m.header.stamp.sec * 10**9 + m.header.stamp.nanosec for m in samples]
     assert set(np.diff(stamps)) <= {49_999_999, 50_000_000, 50_000_001}
-    # It ends as well as ever.
+    # The process still exits normally.
     plant.interrupt()

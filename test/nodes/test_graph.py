@@ -1,4 +1,4 @@
-"""The private graph of tests, demo and experiments."""
+"""Private ROS graph of tests, demo and experiments."""
 
 from pathlib import Path
 
@@ -8,12 +8,12 @@ from std_srvs.srv import Trigger
 
 
 def threads() -> int:
-    """Return how many threads this process has; a participant of DDS has several."""
+    """Return the number of threads of this process; a DDS participant has several."""
     return len(list(Path('/proc/self/task').iterdir()))
 
 
 def use(graph: Graph) -> None:
-    """Run a node and call one of its services, from another node."""
+    """Run a node and call one of its services from another node."""
     asker, plant = graph.node('asker'), graph.add(PlantNode)
     assert plant.start()
     client = asker.create_client(Trigger, 'plant/tare')
@@ -22,8 +22,8 @@ def use(graph: Graph) -> None:
     graph.spin_until(answer.done, 'the answer')
 
 
-def test_nothing_of_a_graph_outlives_it(tmp_path: Path) -> None:
-    """A node that DDS still knows would be a second one of its name in the next graph."""
+def test_graph_leaves_no_nodes_or_threads(tmp_path: Path) -> None:
+    """A remaining node would be a duplicate in the next graph."""
     counts = []
     for _ in range(3):
         with Graph(tmp_path) as graph:

@@ -1,4 +1,4 @@
-"""Robots whose drivers know nothing of the contract: driven with parameters only, no relay."""
+"""Robot drivers with their own topics, joints and units, controlled by parameters only."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ DRIVERS = runpy.run_path(str(ROOT / 'examples/robot_driver.py'), run_name='drive
 
 COMMON: dict[str, Any] = {'rate': 200.0, 'deflection_feedback': 'none'}
 
-#: The parameters of docs/howto/own-robot.md.
+#: Parameters of docs/howto/own-robot.md.
 FORCE = {
     **COMMON,
     'hardware.joint': 'slide',
@@ -55,7 +55,7 @@ POSITION = {
     'hardware.command_topic': 'stage/joint_trajectory',
     'hardware.command_type': 'joint_trajectory',
 }
-#: The robots, with the first and the last inserted length as they have it.
+#: Robots, with their first and last insertion depth.
 ROBOTS = {'force': (FORCE, 'ForceRobot'), 'position': (POSITION, 'PositionRobot')}
 
 
@@ -85,10 +85,10 @@ class Bench:
         )
 
     def until(self, condition: Callable[[], Any], what: str) -> None:
-        """Spin until a condition holds; a target that is cleared is sent again."""
+        """Spin until a condition holds; repeat a discarded target."""
 
         def holds() -> Any:
-            # A machine that is held up may have let the needle move on during a fault.
+            # On a busy machine a fault may occur during the motion.
             if self.goal is not None and self.controller.diagnose()[2]['target [m]'] is None:
                 self.target.publish(self.goal)
             return condition()
@@ -96,22 +96,22 @@ class Bench:
         self.graph.spin_until(holds, what)
 
     def taken(self, topic: str) -> int:
-        """Return how many messages of a topic counted."""
+        """Return the number of accepted messages of a topic."""
         return int(self.controller._supervisor.safety.streams[topic].counts['taken'])
 
     @property
     def said(self) -> str:
-        """What the diagnostics of the controller say first."""
+        """First diagnostics message of the controller."""
         return str(self.controller.diagnose()[1])
 
     @property
     def stop(self) -> str | None:
-        """Why the controller has stopped."""
+        """Reason of the stop."""
         reason: str | None = self.controller._supervisor.safety.stop
         return reason
 
     def aim(self, depth: float) -> None:
-        """Send a target until it is taken."""
+        """Send a target until it is accepted."""
         self.goal = PointStamped()
         self.goal.point.y = depth
         self.target.publish(self.goal)
@@ -123,20 +123,20 @@ class Bench:
 
     @property
     def depth(self) -> float:
-        """Inserted length of the robot, by its own numbers [m]."""
+        """Insertion depth reported by the robot [m]."""
         if hasattr(self.robot, 'mass'):
             return float(0.2 - self.robot.mass.position)
         return float(1e-3 * (self.robot.position - 100.0))
 
     def values(self) -> list[float]:
-        """Return all that was commanded."""
+        """Return all commanded values."""
         if isinstance(self.commands[0], Float64MultiArray):
             return [one.data[0] for one in self.commands]
         return [one.points[0].positions[0] for one in self.commands]
 
 
-def test_the_drivers_are_short() -> None:
-    """Of 20 lines at most, and they know nothing of the contract."""
+def test_example_drivers_are_short_and_independent() -> None:
+    """At most 20 lines, without the topic contract."""
     page = ast.parse((ROOT / 'examples/robot_driver.py').read_text(encoding='utf-8'))
     drivers = [
         part
@@ -153,8 +153,7 @@ def test_the_drivers_are_short() -> None:
         assert not any(word in ast.unparse(driver) for word in ('needle', 'insertion'))
 
 
-def test_the_documentation_has_these_parameters() -> None:
-    """The command lines of the page are what is tried here."""
+def test_documented_parameters_equal_tested_parameters() -> None:
     page = (ROOT / 'docs/howto/own-robot.md').read_text(encoding='utf-8')
     lines = [
         {name: yaml.safe_load(value) for name, value in re.findall(r'-p (\S+?):=(\S+)', block)}
@@ -165,8 +164,8 @@ def test_the_documentation_has_these_parameters() -> None:
 
 @pytest.mark.parametrize('command', ['effort', 'position'])
 @pytest.mark.parametrize('kind', ['float64_multi_array', 'joint_trajectory', 'joint_state'])
-def test_each_type_says_the_same(ros_graph: RosGraph, kind: str, command: str) -> None:
-    """Over DDS: the joints in their order, and of what is commanded nothing else."""
+def test_message_types_are_equivalent(ros_graph: RosGraph, kind: str, command: str) -> None:
+    """Over DDS: the joints in their order, and only the commanded values."""
     user = ros_graph.node('user')
     states = user.create_publisher(JointState, 'joint_states', SENSOR)
     types = {
@@ -199,7 +198,7 @@ def test_each_type_says_the_same(ros_graph: RosGraph, kind: str, command: str) -
     if kind == 'joint_trajectory':
         assert message.joint_names == ['door', 'slide']
         (point,) = message.points
-        # At once, and there within a period.
+        # Reached within a period.
         assert (message.header.stamp.sec, message.header.stamp.nanosec) == (0, 0)
         assert (point.time_from_start.sec, point.time_from_start.nanosec) == (0, 5_000_000)
         positions, velocities, efforts = point.positions, point.velocities, point.effort
@@ -213,7 +212,7 @@ def test_each_type_says_the_same(ros_graph: RosGraph, kind: str, command: str) -
 
 
 @pytest.mark.parametrize('which', ROBOTS)
-def test_a_foreign_robot_is_driven_with_parameters_only(ros_graph: RosGraph, which: str) -> None:
+def test_foreign_robot_is_controlled_by_parameters_only(ros_graph: RosGraph, which: str) -> None:
     """To 0.05 m and back to 0.03 m, by effort and by position."""
     bench = Bench(ros_graph, which)
     assert bench.depth == pytest.approx(0.02)
@@ -223,18 +222,18 @@ def test_a_foreign_robot_is_driven_with_parameters_only(ros_graph: RosGraph, whi
     assert bench.stop is None
     if which == 'force':
         assert bench.taken('base_wrench') > 100
-        # All of the joint state was read, the effort too: with it a robot is judged.
+        # The whole joint state is read, with the effort, which is monitored.
         assert max(bench.values()) > 0.5 > -0.5 > min(bench.values())
     else:
         values = bench.controller.diagnose()[2]
         assert values['velocity of the robot'] == 'estimated'
         steps = [abs(b - a) for a, b in zip(bench.values(), bench.values()[1:], strict=False)]
-        # In mm: 0.05 m/s for two periods of 5 ms, and no farther from the robot than 2 mm.
+        # In mm: 0.05 m/s for two periods of 5 ms, and at most 2 mm from the robot.
         assert max(steps) <= 2.0
 
 
-def test_the_force_sensor_stops_the_robot(ros_graph: RosGraph) -> None:
-    """Its axis is mapped: the axial force counts as such, and beyond its limit ends the motion."""
+def test_force_sensor_limit_stops_the_robot(ros_graph: RosGraph) -> None:
+    """The mapped axial force above its limit ends the motion."""
     bench = Bench(ros_graph, safety__axial_load=0.3)
     bench.aim(0.05)
     bench.until(lambda: bench.stop, 'the stop')
@@ -243,8 +242,8 @@ def test_the_force_sensor_stops_the_robot(ros_graph: RosGraph) -> None:
     bench.until(lambda: bench.values()[-1] == 0.0 == bench.robot.mass.velocity, 'rest')
 
 
-def test_a_position_robot_gives_way_in_a_stop(ros_graph: RosGraph) -> None:
-    """A load beyond its limit ends the motion where the robot is."""
+def test_position_robot_holds_its_measured_position_after_a_stop(ros_graph: RosGraph) -> None:
+    """A load above its limit ends the motion at the position of the robot."""
     bench = Bench(ros_graph, 'position', hardware__wrench_topic='load')
     loads = bench.user.create_publisher(WrenchStamped, 'load', SENSOR)
     bench.aim(0.05)
@@ -263,14 +262,14 @@ def test_a_position_robot_gives_way_in_a_stop(ros_graph: RosGraph) -> None:
     count = len(bench.commands)
     bench.until(lambda: len(bench.commands) > count + 20, 'commands after it')
     (rest,) = {*bench.values()[-10:]}
-    # Back from the lead, to where it was measured.
+    # Back from the lead to the measured position.
     assert rest < max(bench.values()[:count])
     bench.until(lambda: abs(bench.robot.position - rest) < 1e-3, 'rest')
     assert 0.025 < bench.depth < 0.05
 
 
-def test_a_wrong_frame_is_said(ros_graph: RosGraph) -> None:
-    """With the one that is expected."""
+def test_wrong_frame_is_reported(ros_graph: RosGraph) -> None:
+    """With the expected frame."""
     bench = Bench(ros_graph, hardware__wrench_frame='tool0')
     bench.until(
         lambda: ' frame' in str(bench.controller.diagnose()[2].get('input base_wrench')),
@@ -292,10 +291,10 @@ def test_a_wrong_frame_is_said(ros_graph: RosGraph) -> None:
         ({'hardware.joint': 3}, 'hardware.joint must be text, got 3'),
     ],
 )
-def test_bad_parameters_are_one_line(
+def test_invalid_parameters_fail_configure(
     ros_graph: RosGraph, parameters: dict[str, Any], said: str
 ) -> None:
-    """The node refuses to be configured, with what would be valid."""
+    """One line with the valid values."""
     controller = ros_graph.add(ControllerNode, start=False, parameters=parameters)
     assert not controller.start()
     assert str(controller.failure).startswith(said)
@@ -303,8 +302,8 @@ def test_bad_parameters_are_one_line(
 
 
 @pytest.mark.skipif(find_spec('control_msgs') is not None, reason='control_msgs is installed')
-def test_what_is_not_installed_is_said(ros_graph: RosGraph) -> None:
-    """The package of DynamicJointState is not among the wheels."""
+def test_missing_package_is_reported(ros_graph: RosGraph) -> None:
+    """DynamicJointState is not available as a wheel."""
     controller = ros_graph.add(
         ControllerNode, start=False, parameters={'hardware.state_type': 'dynamic_joint_state'}
     )
@@ -315,16 +314,16 @@ def test_what_is_not_installed_is_said(ros_graph: RosGraph) -> None:
     )
 
 
-def test_the_topics_are_those_at_the_start(ros_graph: RosGraph) -> None:
-    """A later change is refused, and does not pass unnoticed."""
+def test_topic_parameters_are_read_only(ros_graph: RosGraph) -> None:
+    """A later change is rejected."""
     controller = ros_graph.add(ControllerNode, start=False)
     controller.set_parameters([Parameter('hardware.joint', value='slide')])
     assert not controller.start()
     assert str(controller.failure).startswith('hardware.* is read when the node starts')
 
 
-def test_y_is_an_axis(ros_graph: RosGraph) -> None:
-    """A parameter file that says y means the axis, though YAML reads it as true."""
+def test_axis_y_is_not_read_as_true(ros_graph: RosGraph) -> None:
+    """YAML 1.1 parses y as true."""
     parameters = {**FORCE, 'hardware.force_axis': True, 'hardware.lateral_axis': '-x'}
     controller = ros_graph.add(ControllerNode, parameters=parameters)
     assert controller._driver.robot.settings.force_axis == 'y'
@@ -332,7 +331,7 @@ def test_y_is_an_axis(ros_graph: RosGraph) -> None:
 
 @pytest.fixture
 def stranger(ros_graph: RosGraph) -> Iterator[Node]:
-    """Return a node of another participant: one cannot have two types on a topic."""
+    """Return a node of another participant: a participant cannot have two types on a topic."""
     context = Context()
     context.init(domain_id=int(ros_graph.environment['ROS_DOMAIN_ID']))
     node = Node('stranger', context=context)
@@ -342,8 +341,8 @@ def stranger(ros_graph: RosGraph) -> Iterator[Node]:
 
 
 @pytest.mark.parametrize('there', ['elsewhere', 'another type', 'other joints'])
-def test_it_says_why_nothing_comes(ros_graph: RosGraph, stranger: Node, there: str) -> None:
-    """Which topics there are, of which type, and which joints."""
+def test_missing_input_is_explained(ros_graph: RosGraph, stranger: Node, there: str) -> None:
+    """With the existing topics, their types, and their joints."""
     user = ros_graph.node('user')
     states = user.create_publisher(JointState, 'arm/joint_states', SENSOR)
     topic = 'arm/joint_states' if there == 'other joints' else 'arm/states'
@@ -370,7 +369,7 @@ def test_it_says_why_nothing_comes(ros_graph: RosGraph, stranger: Node, there: s
 
 
 def test_topics_are_found_by_type(ros_graph: RosGraph) -> None:
-    """Where there is one; where there are two, both are named."""
+    """A single topic is used; two topics are an error that names both."""
     auto = {'hardware__state_topic': 'auto', 'hardware__wrench_topic': 'auto'}
     bench = Bench(ros_graph, **auto)
     bench.until(lambda: bench.taken('base_wrench') > 0, 'the force sensor')
@@ -393,10 +392,10 @@ def test_topics_are_found_by_type(ros_graph: RosGraph) -> None:
         (JointState, 'joint_states', '2 nodes publish joint_states'),
     ],
 )
-def test_there_may_be_one_source_and_one_commander(
+def test_duplicate_source_or_commander_gives_zero_force(
     ros_graph: RosGraph, kind: type, topic: str, said: str
 ) -> None:
-    """Of the topics that the driver has: a second one of either ends all force."""
+    """For the topics of the driver."""
     bench = Bench(ros_graph)
     bench.aim(0.15)
     bench.until(lambda: bench.depth > 0.021, 'motion')
@@ -407,8 +406,8 @@ def test_there_may_be_one_source_and_one_commander(
     bench.until(lambda: bench.robot.mass.velocity < -1e-3, 'motion again')
 
 
-def test_zero_is_sent_again_and_again_when_measurements_end(ros_graph: RosGraph) -> None:
-    """A driver without a timeout would keep the last effort: so no single message may be lost."""
+def test_zero_command_is_repeated_after_loss_of_measurements(ros_graph: RosGraph) -> None:
+    """A driver without a timeout would keep the last effort if one message is lost."""
     bench = Bench(ros_graph)
     bench.aim(0.15)
     bench.until(lambda: bench.values()[-1] < -0.5, 'a force')
@@ -416,20 +415,20 @@ def test_zero_is_sent_again_and_again_when_measurements_end(ros_graph: RosGraph)
         bench.robot.destroy_timer(timer)
     bench.until(lambda: 'joint_states is stale' in bench.said, 'the watchdog')
     count = len(bench.commands)
-    bench.until(lambda: len(bench.commands) > count + 15, 'more of them')
+    bench.until(lambda: len(bench.commands) > count + 15, 'more commands')
     assert {*bench.values()[-10:]} == {0.0}
 
 
 @pytest.mark.parametrize('which', ROBOTS)
-def test_the_last_command_is_sent_again_and_again(ros_graph: RosGraph, which: str) -> None:
-    """At deactivation: zero effort, or the position where it is."""
+def test_final_command_is_repeated(ros_graph: RosGraph, which: str) -> None:
+    """At deactivation: zero effort, or the current position."""
     bench = Bench(ros_graph, which)
     bench.aim(0.15)
     bench.until(lambda: bench.depth > 0.022, 'motion')
     last = bench.values()[-1]
     bench.commands.clear()
     bench.controller.trigger_deactivate()
-    bench.until(lambda: len(bench.commands) >= 6, 'the last ones')
+    bench.until(lambda: len(bench.commands) >= 6, 'the last commands')
     (rest,) = {*bench.values()[-5:]}
     assert rest == (0.0 if which == 'force' else pytest.approx(last, abs=1.0))
     if which == 'force':
@@ -439,17 +438,17 @@ def test_the_last_command_is_sent_again_and_again(ros_graph: RosGraph, which: st
 
 
 @pytest.mark.parametrize('ending', ['interrupted', 'fails'])
-def test_a_process_that_ends_leaves_no_effort(
+def test_ended_process_leaves_zero_effort(
     ros_graph: RosGraph, tmp_path: Path, ending: str
 ) -> None:
-    """By Ctrl-C, and by an error of its own; not by kill -9, which nothing can answer."""
+    """After Ctrl-C and after an internal error; SIGKILL cannot be handled."""
     robot = ros_graph.add(DRIVERS['ForceRobot'])
     user = ros_graph.node('user')
     efforts = ros_graph.listen(user, Float64MultiArray, 'slide/commands', 100)
     target = user.create_publisher(PointStamped, 'target', COMMAND)
     words = [f'-p {name}:={str(value).lower() if isinstance(value, bool) else value}'
              for name, value in FORCE.items()]  # fmt: skip
-    # What fails is the answer to a pause, while a force is applied.
+    # The response to a pause fails while a force is applied.
     script = textwrap.dedent(
         """
         import sys
@@ -495,8 +494,8 @@ def test_a_process_that_ends_leaves_no_effort(
         process.wait()
 
 
-def test_another_rate_is_said(ros_graph: RosGraph) -> None:
-    """Both numbers and what to set; nothing at the true rate."""
+def test_wrong_rate_is_reported(ros_graph: RosGraph) -> None:
+    """With both rates and the parameter; no warning at the correct rate."""
     bench = Bench(ros_graph, rate=1000.0)
     bench.until(lambda: ' Hz, rate is 1000 Hz: set rate to ' in bench.said, 'the rate')
     assert bench.said.startswith('joint_states is received at ')
@@ -509,8 +508,8 @@ def test_another_rate_is_said(ros_graph: RosGraph) -> None:
         ('receive', 'active'),
     ],
 )
-def test_a_driver_that_does_not_stamp(ros_graph: RosGraph, stamps: str, said: str) -> None:
-    """Is refused, unless the time of arrival is to count."""
+def test_unstamped_messages_need_arrival_time(ros_graph: RosGraph, stamps: str, said: str) -> None:
+    """They are rejected unless the time of arrival is configured."""
     user = ros_graph.node('user')
     states = user.create_publisher(JointState, 'joint_states', SENSOR)
     message = JointState(name=['slide'], position=[0.18], velocity=[0.0])
@@ -523,8 +522,7 @@ def test_a_driver_that_does_not_stamp(ros_graph: RosGraph, stamps: str, said: st
     ros_graph.spin_until(says, said)
 
 
-def test_an_emergency_stop_reaches_a_foreign_driver(ros_graph: RosGraph) -> None:
-    """As any other plant, until it is cleared."""
+def test_emergency_stop_reaches_a_foreign_driver(ros_graph: RosGraph) -> None:
     bench = Bench(ros_graph)
     bench.aim(0.15)
     bench.until(lambda: bench.values()[-1] < -0.5, 'a force')

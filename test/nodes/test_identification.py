@@ -1,4 +1,4 @@
-"""The node identifies from bags and running topics, and sets parameters of other nodes."""
+"""Identification node: results from bags and running topics, and parameters of other nodes."""
 
 import math
 from pathlib import Path
@@ -51,7 +51,7 @@ def call(ros_graph: RosGraph, service: str) -> tuple[bool, str]:
     start = time.monotonic()
 
     def answered() -> bool:
-        # An answer is lost if the server does not know the client yet: ask again.
+        # A response to an undiscovered client is lost: repeat the call.
         if time.monotonic() - start >= 6.0 * len(asked):
             asked.append(client.call_async(Trigger.Request()))
         return any(answer.done() for answer in asked)
@@ -62,7 +62,7 @@ def call(ros_graph: RosGraph, service: str) -> tuple[bool, str]:
 
 
 def apply(ros_graph: RosGraph, target: str) -> tuple[bool, str]:
-    """Call ``~/apply`` until the node has found the other node."""
+    """Call ``~/apply`` until the node has discovered the other node."""
     answers = [(False, f'{target}: no such node')]
 
     def answered() -> bool:
@@ -80,10 +80,8 @@ def statuses(message: DiagnosticArray) -> dict[str, dict[str, str]]:
     return {s.name: {v.key: v.value for v in s.values} for s in message.status}
 
 
-def test_identifies_when_activated_and_latches_the_result(
-    ros_graph: RosGraph, bags: list[str]
-) -> None:
-    """The latched result holds estimate, interval, unit, sample count and quality."""
+def test_activation_publishes_a_latched_result(ros_graph: RosGraph, bags: list[str]) -> None:
+    """Estimate, interval, unit, sample count and quality."""
     ros_graph.add(IdentificationNode, parameters={'bags': bags})
     late = ros_graph.listen(ros_graph.node('late'), DiagnosticArray, 'friction', LATCHED)
     ros_graph.spin_until(lambda: late, 'the result')
@@ -101,7 +99,7 @@ def test_identifies_when_activated_and_latches_the_result(
 
 
 def test_publishes_stiffness_by_force(ros_graph: RosGraph, place: str) -> None:
-    """The result is latched: k_a at the chosen force, and each entry at each force."""
+    """Latched: k_a at the chosen force, and each entry at each force."""
     parameters = {'bags': [place], 'what': 'stiffness', 'level': 1.5}
     ros_graph.add(IdentificationNode, parameters=parameters)
     late = ros_graph.listen(ros_graph.node('late'), DiagnosticArray, 'stiffness', LATCHED)
@@ -112,10 +110,10 @@ def test_publishes_stiffness_by_force(ros_graph: RosGraph, place: str) -> None:
     assert status[place]['presses'] == '16'
 
 
-def test_its_result_is_a_parameter_file_for_nodes_in_any_namespace(
+def test_result_is_a_parameter_file_for_any_namespace(
     ros_graph: RosGraph, bags: list[str], tmp_path: Path
 ) -> None:
-    """Rclpy applies the file to plant and controller in any namespace, and to no other node."""
+    """Rclpy applies the file to plant and controller only."""
     output = tmp_path / 'friction.yaml'
     ros_graph.add(IdentificationNode, parameters={'bags': bags, 'output': str(output)})
     for name, namespace, expected in (
@@ -137,14 +135,14 @@ def test_its_result_is_a_parameter_file_for_nodes_in_any_namespace(
             assert value == pytest.approx(TRUTH.viscous_friction, rel=0.01)
 
 
-def test_the_service_gives_the_reason_if_it_fails(ros_graph: RosGraph) -> None:
-    """The answer to a failure is one line, and the node stays active."""
+def test_service_reports_the_reason_of_a_failure(ros_graph: RosGraph) -> None:
+    """One line, and the node stays active."""
     node = ros_graph.add(IdentificationNode)
     assert call(ros_graph, 'identify') == (False, 'no recordings to identify from')
     assert node.is_active
 
 
-def test_the_service_uses_the_present_bags(ros_graph: RosGraph, bags: list[str]) -> None:
+def test_service_uses_the_current_bags(ros_graph: RosGraph, bags: list[str]) -> None:
     """A running node identifies from other recordings without a restart."""
     node = ros_graph.add(IdentificationNode, parameters={'bags': bags[:1]})
     assert node.set_parameters([Parameter('bags', value=bags)])[0].successful
@@ -170,10 +168,9 @@ def test_the_service_uses_the_present_bags(ros_graph: RosGraph, bags: list[str])
         ({'forgetting': 0.0}, 'forgetting must be finite, > 0'),
     ],
 )
-def test_rejects_invalid_parameters_at_start(
+def test_invalid_parameters_are_rejected_at_start(
     ros_graph: RosGraph, parameters: dict[str, Any], complaint: str
 ) -> None:
-    """A node with invalid parameters does not become active."""
     node = ros_graph.add(IdentificationNode, start=False, parameters=parameters)
     assert not node.start()
     assert complaint in node.failure
@@ -182,8 +179,8 @@ def test_rejects_invalid_parameters_at_start(
 # Running topics.
 
 
-def test_finds_the_friction_of_a_running_plant(ros_graph: RosGraph) -> None:
-    """With a moving simulated plant, the intervals shrink around its friction."""
+def test_friction_of_a_running_plant_is_identified(ros_graph: RosGraph) -> None:
+    """The intervals shrink around the friction of the moving simulated plant."""
     truth = {'coulomb_friction': 0.8, 'viscous_friction': 200.0}
     parameters = {f'model.{name}': value for name, value in truth.items()}
     plant = {'mode': 'robot', 'depth': 0.1, 'rate': 250.0, 'real_time_factor': 4.0}
@@ -219,7 +216,7 @@ def test_finds_the_friction_of_a_running_plant(ros_graph: RosGraph) -> None:
     assert {status.hardware_id for status in found[-1].status} == {'live'}
     status = statuses(found[-1])
     for name, _ in COEFFICIENTS:
-        # Which messages arrive is random: twice the interval.
+        # The number of received messages is random: twice the interval.
         low, high = (float(status[name][f'interval_{end}']) for end in ('low', 'high'))
         assert abs(truth[name] - (low + high) / 2.0) < high - low
     assert int(status['coulomb_friction']['samples']) > 100
@@ -230,7 +227,7 @@ def test_finds_the_friction_of_a_running_plant(ros_graph: RosGraph) -> None:
 
 
 def test_invalid_messages_are_counted_and_the_node_stays_active(ros_graph: RosGraph) -> None:
-    """NaN, decreasing stamps and missing joints are counted, and the node stays active."""
+    """NaN, decreasing stamps and missing joints."""
     node = ros_graph.add(IdentificationNode, parameters={'live': True})
     probe = ros_graph.node('probe')
     joints = probe.create_publisher(JointState, 'joint_states', SENSOR)
@@ -257,8 +254,8 @@ def test_invalid_messages_are_counted_and_the_node_stays_active(ros_graph: RosGr
 # Parameters of running nodes.
 
 
-def test_applies_the_result_to_a_running_plant(ros_graph: RosGraph, bags: list[str]) -> None:
-    """The plant continues with the identified friction, and the answer names it."""
+def test_result_is_applied_to_a_running_plant(ros_graph: RosGraph, bags: list[str]) -> None:
+    """The plant continues with the identified friction; the answer contains it."""
     plant = ros_graph.add(
         PlantNode, parameters={'rate': 200.0, 'model.coulomb_friction': 2.0, 'mode': 'robot'}
     )
@@ -272,24 +269,24 @@ def test_applies_the_result_to_a_running_plant(ros_graph: RosGraph, bags: list[s
         assert value == pytest.approx(getattr(TRUTH, name), rel=0.01)
 
 
-def test_applies_the_result_to_another_process(ros_graph: RosGraph, bags: list[str]) -> None:
-    """A call fails, a later one succeeds, with the executor of the nodes."""
+def test_result_is_applied_to_another_process(ros_graph: RosGraph, bags: list[str]) -> None:
+    """A failed call and a later success, with the executor of the nodes."""
     ros_graph.start('identification', {'bags': bags, 'apply_to': ['plant']})
     assert call(ros_graph, 'apply') == (False, 'plant: no such node')
     ros_graph.start('plant', {'model.coulomb_friction': 2.0})
     asker = ros_graph.node('asker')
     parameters = asker.create_client(GetParameters, 'plant/get_parameters')
     ros_graph.wait_for(asker, 'plant')
-    # The nodes may not have found each other yet.
-    ros_graph.spin_until(lambda: call(ros_graph, 'apply')[0], 'that the plant takes it')
+    # The nodes may not be discovered yet.
+    ros_graph.spin_until(lambda: call(ros_graph, 'apply')[0], 'the accepted parameter')
     answer = parameters.call_async(GetParameters.Request(names=['model.coulomb_friction']))
     ros_graph.spin_until(answer.done, 'the parameter')
     value = answer.result().values[0].double_value
     assert value == pytest.approx(TRUTH.coulomb_friction, rel=0.01)
 
 
-def test_reports_parameters_that_a_node_rejects(ros_graph: RosGraph, place: str) -> None:
-    """A running plant cannot change its tissue: the answer gives the reason."""
+def test_rejected_parameters_are_reported(ros_graph: RosGraph, place: str) -> None:
+    """A running plant cannot change its tissue: the answer contains the reason."""
     ros_graph.add(PlantNode, parameters={'rate': 200.0})
     ros_graph.add(IdentificationNode, parameters={'bags': [place], 'what': 'stiffness'})
     success, message = apply(ros_graph, 'plant')
@@ -298,21 +295,20 @@ def test_reports_parameters_that_a_node_rejects(ros_graph: RosGraph, place: str)
     assert 'cannot change while configured' in message
 
 
-def test_there_is_nothing_to_apply_before_the_first_result(ros_graph: RosGraph) -> None:
-    """The answer says so."""
+def test_apply_before_the_first_result_is_rejected(ros_graph: RosGraph) -> None:
     ros_graph.add(IdentificationNode)
     success, message = call(ros_graph, 'apply')
     assert not success
     assert message.startswith('nothing identified yet')
 
 
-def test_waits_only_a_limited_time_for_an_answer(
+def test_apply_has_a_timeout(
     ros_graph: RosGraph, bags: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The call ends with the reason, and the node is not blocked."""
+    """The call ends with the reason, without blocking the node."""
     monkeypatch.setattr('needle_ros.status.CALL_TIMEOUT', 0.3)
     ros_graph.add(IdentificationNode, parameters={'bags': bags, 'apply_to': ['deaf']})
-    # A node that does not spin has the service, but does not answer.
+    # A node without a spinning executor offers the service, but does not respond.
     deaf = Node('deaf', context=ros_graph.context)
     try:
         assert apply(ros_graph, 'deaf') == (False, 'deaf/set_parameters: no answer within 0.3 s')

@@ -1,4 +1,4 @@
-"""The launch file, read where launch is not installed and run where it is."""
+"""Launch file, parsed as source, and executed if launch is installed."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ def constant(name: str) -> Any:
 ARGUMENTS, PARAMETERS = constant('ARGUMENTS'), constant('PARAMETERS')
 
 
-def test_every_argument_has_a_meaning_and_a_use() -> None:
-    """An argument sets a parameter, or the file asks for it by name."""
+def test_launch_arguments_are_described_and_used() -> None:
+    """An argument sets a parameter, or the file reads it by name."""
     used = {argument for table in PARAMETERS.values() for argument in table}
     assert used <= ARGUMENTS.keys()
     asked = {
@@ -49,14 +49,14 @@ def test_every_argument_has_a_meaning_and_a_use() -> None:
 
 
 @pytest.mark.parametrize('name', PARAMETERS)
-def test_arguments_set_parameters_that_the_nodes_have(ros_graph: RosGraph, name: str) -> None:
-    """Each parameter is one of the node that setup.py installs under this name."""
+def test_launch_arguments_set_existing_parameters(ros_graph: RosGraph, name: str) -> None:
+    """Each is a parameter of the node that setup.py installs under this name."""
     node = ros_graph.add(node_class(name), start=False)
     assert {key for key in PARAMETERS[name].values() if not node.has_parameter(key)} == set()
 
 
-def test_where_ros2_launch_is_installed_it_takes_the_file() -> None:
-    """`ros2 launch` loads the file and shows every argument; elsewhere it is at least Python."""
+def test_ros2_launch_loads_the_file() -> None:
+    """`ros2 launch` shows every argument; without it the file is valid Python."""
     compile(TREE, PATH, 'exec')
     if ros2 := shutil.which('ros2'):
         shown = subprocess.run(
@@ -65,7 +65,7 @@ def test_where_ros2_launch_is_installed_it_takes_the_file() -> None:
         assert [name for name in ARGUMENTS if f"'{name}'" not in shown.stdout] == []
 
 
-#: `ros2 launch PATH name:=value ...` without the command line.
+#: Equivalent of `ros2 launch PATH name:=value ...`.
 LAUNCH = """
 import sys
 from launch import LaunchDescription, LaunchService
@@ -82,7 +82,7 @@ sys.exit(service.run())
 
 
 def start(*words: str) -> subprocess.Popen[str]:
-    """Start the launch file, or skip where launch is not installed."""
+    """Start the launch file, or skip the test if launch is not installed."""
     pytest.importorskip('launch_ros')
     return subprocess.Popen(
         [sys.executable, '-c', LAUNCH, str(PATH), *words],
@@ -98,10 +98,12 @@ def start(*words: str) -> subprocess.Popen[str]:
         (['params_file:=/no/such.yaml'], 'params_file /no/such.yaml does not exist'),
         (['law:=bang'], 'adaptive'),
         (['rviz:=true'], 'rviz2'),
-        (['steering:=true', 'mode:=indenter'], 'needs a needle that is steered'),
+        (['steering:=true', 'mode:=indenter'], 'needs a steered needle'),
     ],
 )
-def test_launch_refuses_before_a_node_starts(words: list[str], reason: str) -> None:
+def test_launch_rejects_invalid_arguments_before_starting_nodes(
+    words: list[str], reason: str
+) -> None:
     launch = start(*words)
     if reason == 'rviz2' and shutil.which('rviz2'):
         launch.kill()
@@ -113,8 +115,8 @@ def test_launch_refuses_before_a_node_starts(words: list[str], reason: str) -> N
     )
 
 
-def test_a_refused_node_ends_the_others_and_launch_fails() -> None:
-    """The carriage is not known for `paper_si`, so that the controller refuses its gains."""
+def test_failed_node_ends_the_others_and_launch() -> None:
+    """`paper_si` has no carriage, so that the controller rejects its gains."""
     launch = start('preset:=paper_si')
     said, _ = launch.communicate(timeout=120)
     assert launch.returncode != 0
@@ -123,7 +125,7 @@ def test_a_refused_node_ends_the_others_and_launch_fails() -> None:
 
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGKILL])
-def test_a_signal_to_launch_leaves_nothing_running(number: int) -> None:
+def test_signal_to_launch_ends_all_nodes(number: int) -> None:
     launch = start()
     assert launch.stdout is not None
     lines = []

@@ -1,4 +1,4 @@
-"""Plant and controller in lock-step over DDS: the same run every time, and the one of theory."""
+"""Plant and controller in lockstep over DDS: reproducible runs, and agreement with theory."""
 
 from collections import defaultdict
 from collections.abc import Iterator
@@ -38,17 +38,17 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 START, TARGET, DURATION, RATE = 0.02, 0.12, 10.0, 1000.0
 
-#: Critically damped at 1 rad/s: the error goes all the time, to 5e-4 of its start after 10 s.
+#: Critically damped at 1 rad/s: the error decreases to 5e-4 of its start within 10 s.
 KP, KV = 1.0, 2.0
 
-#: Friction is to be compensated as fully as the source has it: were the needle to stop for a
-#: moment at the end, the law would ask for a speed of 5e-8 m/s in the next period.
+#: Full friction compensation as in the source: after a stop near the end the law would request a
+#: velocity of 5e-8 m/s in the next period.
 BREAKAWAY = 1e-8
 
-#: A reader that may be slow.
+#: QoS of a slow subscriber.
 EVERY = QoSProfile(depth=20_000, reliability=ReliabilityPolicy.BEST_EFFORT)
 
-#: What a run consists of; /diagnostics tell of the machine.
+#: Streams of a run; /diagnostics depends on the machine.
 DATA = {
     '/joint_states', '/base_wrench', '/tip_deflection', '/ground_truth', '/wrench_command',
     '/reference', '/tracking_error', '/needle_shape', '/needle_poses', '/clock',
@@ -65,10 +65,10 @@ def drive(
     course: JointTrajectory | None = None,
 ) -> list[JointState]:
     """
-    Drive the needle to a target in lock-step; return what `tracking_error` said.
+    Drive the needle to a target in lockstep; return the messages of `tracking_error`.
 
-    Time begins when all nodes know of each other and the controller of its target, and the run
-    ends when so many seconds of it have passed.
+    Time starts when all nodes are discovered and the controller has its target, and the run ends
+    after a simulated duration [s].
     """
     heard = ['joint_states', 'base_wrench', 'tip_deflection', 'wrench_command', 'tracking_error']
     errors: list[JointState] = []
@@ -90,7 +90,7 @@ def drive(
         graph.start('controller', {'use_sim_time': True, **controller})
         if bag is not None:
             recorder = graph.start('recorder', {'path': str(bag)})
-        # Each of these but the tracking error is heard by one node of the loop.
+        # Each of these except the tracking error has one subscriber in the loop.
         graph.spin_until(
             lambda: all(map(probe.count_subscribers, heard)) and probe.count_publishers('/clock'),
             'the nodes',
@@ -107,8 +107,8 @@ def drive(
 
         graph.spin_until(aims, 'the target')
         if course is not None:
-            # To the plant, and to the controller, which leaves it alone.
-            graph.spin_until(lambda: move.get_subscription_count() >= 2, 'who takes the course')
+            # For the plant, and for the controller, which ignores it.
+            graph.spin_until(lambda: move.get_subscription_count() >= 2, 'the subscribers')
             move.publish(course)
         graph.wait_for(probe, 'plant')
         answer = pause.call_async(SetBool.Request(data=False))
@@ -125,9 +125,9 @@ def drive(
 
 def records_all(probe: Node) -> bool:
     """
-    Tell whether the recorder has subscribed to all that is published.
+    Return whether the recorder has subscribed to all published topics.
 
-    With Fast DDS 2.14 it may take 0.3 s to make one; what else comes meanwhile may be lost.
+    With Fast DDS 2.14 a subscription may take 0.3 s; earlier messages may be lost.
     """
     published = [
         name
@@ -144,7 +144,7 @@ def contents(bag: Path, until: float) -> dict[str, list[bytes]]:
     """
     Return the messages of each topic of a bag up to a stamp [s].
 
-    They are encoded anew: on the wire the gaps of the encoding hold what was in memory.
+    They are serialized again, because the padding on the wire contains uninitialized memory.
     """
     found = defaultdict(list)
     for batch in Bag(bag).batches(lambda topic: topic.name in DATA):
@@ -153,18 +153,18 @@ def contents(bag: Path, until: float) -> dict[str, list[bytes]]:
             stamp = message.clock if batch.topic.name == '/clock' else message.header.stamp
             if seconds(stamp) <= until:
                 found[batch.topic.name].append(encode(message))
-    # While the nodes find each other a sample may have to be repeated.
+    # During discovery a sample may have to be repeated.
     return {name: [data for data, _ in groupby(all_)] for name, all_ in found.items()}
 
 
 def exact(times: FloatArray) -> FloatArray:
-    """Return e_ddot + kv e_dot + kp e = 0 from rest: the law's own closed loop."""
+    """Solve e_ddot + kv e_dot + kp e = 0 from rest: the closed loop of the law."""
     return (TARGET - START) * (1.0 + times) * np.exp(-times)
 
 
 @pytest.mark.parametrize('preset', ['paper_si', 'paper_mm'])
-def test_the_continuous_loop_is_that_of_its_error_equation(preset: str) -> None:
-    """The source's law, solved as an ODE on the whole needle, has the error that it promises."""
+def test_continuous_loop_satisfies_its_error_equation(preset: str) -> None:
+    """The law of the source, solved as an ODE with the full needle model."""
     model = NeedleModel(NeedleParameters.preset(preset))
     law = ContinuousInverseDynamics(
         model=model, kp=[KP, KP], kv=[KV, KV], breakaway_speed=BREAKAWAY
@@ -182,18 +182,18 @@ def test_the_continuous_loop_is_that_of_its_error_equation(preset: str) -> None:
         atol=1e-10,
     )
     error = TARGET - (model.parameters.length - run.y[0])
-    # The tolerance of the solver, over what the error is at the end: 1e-8 m of 5e-5 m.
+    # Tolerance of the solver relative to the final error: 1e-8 m of 5e-5 m.
     assert np.abs(error / exact(times) - 1.0).max() < 1e-3
 
 
 @pytest.mark.parametrize('preset', ['paper_si', 'paper_mm'])
-def test_tracks_at_1_khz_as_the_continuous_loop_does(tmp_path: Path, preset: str) -> None:
+def test_tracking_at_1_khz_agrees_with_the_continuous_loop(tmp_path: Path, preset: str) -> None:
     """
-    From a step of 10 cm the depth error is within 10 % of the continuous one at every instant.
+    After a step of 10 cm the depth error is within 10 % of the continuous error at all times.
 
-    Time counts from the first measurement: the period until its answer acts is part of the
-    deviation. The needle is straight and the tissue as believed: a load of 1 uN, which is what
-    the noise of the sensors otherwise makes of it, is 0.5 mm / s^2 of the 2 g that move.
+    Time counts from the first measurement: the delay of one period is part of the deviation. The
+    needle is straight and the tissue equals the prior: sensor noise would otherwise cause a load
+    of 1 uN, which is 0.5 mm / s^2 of the moving 2 g.
     """
     common = {'model.preset': preset, 'rate': RATE}
     gains = {
@@ -205,7 +205,7 @@ def test_tracks_at_1_khz_as_the_continuous_loop_does(tmp_path: Path, preset: str
         'observer.irregularity': 0.0,
         'observer.initial_deflection': 1e-6,
         'observer.tip_noise': 1e-5,
-        # Nothing but the needle moves.
+        # Only the needle moves.
         'uncertainty.carriage': 0.0,
     }
     errors = drive(
@@ -226,14 +226,14 @@ def test_tracks_at_1_khz_as_the_continuous_loop_does(tmp_path: Path, preset: str
     error = np.array([message.position[0] for message in errors])
     time = stamps - 1.0 / RATE
     within = time <= DURATION
-    # The probe is no part of the loop: it may miss some.
+    # The probe is not part of the loop and may miss messages.
     assert within.sum() > 0.99 * RATE * DURATION
     deviation = np.abs(error[within] / exact(time[within]) - 1.0)
     assert deviation.max() < 0.1, f'at {time[deviation.argmax()]:.3f} s'
 
 
-def test_two_runs_with_one_seed_are_the_same(tmp_path: Path) -> None:
-    """Every message of the plant and of the controller has the same content in both bags."""
+def test_runs_with_the_same_seed_are_identical(tmp_path: Path) -> None:
+    """Every message of plant and controller has the same content in both bags."""
     bags = [tmp_path / name for name in ('one', 'two')]
     for bag in bags:
         drive(
@@ -251,11 +251,12 @@ def test_two_runs_with_one_seed_are_the_same(tmp_path: Path) -> None:
     assert one == two
 
 
-def test_a_steered_run_is_the_same_run_computed_again(tmp_path: Path) -> None:
+def test_steered_run_is_reproduced_by_replay(tmp_path: Path) -> None:
     """
-    The guide moves and the needle turns while the controller inserts it, all recorded.
+    The guide moves and the needle rotates during the insertion; all inputs are recorded.
 
-    The controller knows neither the force that cuts nor the guide, and arrives all the same.
+    The model of the controller contains neither cutting force nor guide; the needle still reaches
+    its target.
     """
     point = JointTrajectoryPoint(positions=[2e-3, -0.02, 1.5], time_from_start=Duration(sec=2))
     course = JointTrajectory(joint_names=['guide_x', 'guide_tilt_z', 'roll'], points=[point])
@@ -286,7 +287,7 @@ def test_a_steered_run_is_the_same_run_computed_again(tmp_path: Path) -> None:
     rows = run.recorded.rows
     assert len(rows['/tip_deflection'].values) > 6 * 40 - 10
     depth, x, _, _, tilt, roll = rows['/joint_states'].values[-1, :6]
-    # Half a tenth of a millimeter is what the law leaves of a force that it does not know.
+    # The law leaves an error of 0.05 mm for an unmodeled force.
     assert abs(depth - 0.05) < 5e-5
     np.testing.assert_allclose([x, tilt, roll], [2e-3, -0.02, 1.5], rtol=1e-4)
     _, tip_x, tip_z, tip_roll = rows['/ground_truth'].values[-1, :4]
@@ -298,8 +299,8 @@ def test_a_steered_run_is_the_same_run_computed_again(tmp_path: Path) -> None:
 
 @contextmanager
 def busy(number: int) -> Iterator[None]:
-    """Keep processors busy."""
-    # They end by themselves, too.
+    """Run busy processes."""
+    # They end on their own, too.
     work = 'from time import monotonic as now; end = now() + 300\nwhile now() < end: pass'
     processes = [subprocess.Popen([sys.executable, '-c', work]) for _ in range(number)]
     try:
@@ -344,8 +345,8 @@ def steer(folder: Path) -> Path:
     return bag
 
 
-def test_a_steered_run_is_the_same_on_a_busy_machine(tmp_path: Path) -> None:
-    """What three nodes and a user do depends on simulated time alone, and no message is lost."""
+def test_steered_run_is_identical_on_a_busy_machine(tmp_path: Path) -> None:
+    """Three nodes and a user depend on simulated time only, without message loss."""
     quiet = steer(tmp_path / 'quiet')
     with busy(os.cpu_count() or 1):
         loaded = steer(tmp_path / 'busy')

@@ -1,4 +1,4 @@
-"""Messages read and written as bytes are those of rmw, and nodes offer what the contract says."""
+"""Messages as bytes agree with rmw, and nodes offer the topics of the contract."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ lengths = st.tuples(*[st.integers(0, 3)] * 3)
 
 
 def content(message: Any) -> Reading:
-    """Return what a message of rclpy says."""
+    """Return stamp, frame, names and numbers of an rclpy message."""
     header = message.header
     names: Sequence[str] = ()
     values: tuple[Sequence[float], ...]
@@ -51,21 +51,21 @@ def content(message: Any) -> Reading:
 
 
 def check(type_name: str, template: Template, reading: Reading) -> Any:
-    """Compare with rmw, and with rosbags, which knows the length to the byte, both ways."""
+    """Compare with rmw, and with rosbags, which checks the length, in both directions."""
     data = template.serialize(reading.stamp, *chain(*reading.values))
     assert encode(deserialize(BagTopic('/t', type_name), data)) == data
     message = deserialize_message(data, message_class(type_name))
     assert Template.of(data, type_name).read(data) == template.read(data) == reading
-    # What rmw writes has anything in its gaps.
+    # rmw writes arbitrary bytes into padding.
     assert template.read(serialize_message(message)) == content(message) == reading
     return message
 
 
 @given(stamps, words, st.lists(words, max_size=3), lengths, numbers)
-def test_joint_states_are_those_of_rmw(
+def test_joint_states_agree_with_rmw(
     stamp: int, frame: str, names: list[str], counts: tuple[int, int, int], values: list[float]
 ) -> None:
-    """Whatever the lengths, which decide where fields are aligned."""
+    """All array lengths, which determine the alignment of fields."""
     ends = [sum(counts[:k]) for k in range(4)]
     blocks = tuple(tuple(values[ends[k] : ends[k + 1]]) for k in range(3))
     template = Template(JOINT_STATE, frame, names=names, counts=counts)
@@ -77,14 +77,13 @@ def test_joint_states_are_those_of_rmw(
 
 
 @given(stamps, words, numbers)
-def test_wrenches_and_points_are_those_of_rmw(stamp: int, frame: str, values: list[float]) -> None:
-    """Single numbers follow the header."""
+def test_wrenches_and_points_agree_with_rmw(stamp: int, frame: str, values: list[float]) -> None:
     for type_name, count in ((WRENCH, 6), (POINT, 3)):
         reading = Reading(stamp, frame, (), (tuple(values[:count]),))
         check(type_name, Template(type_name, frame), reading)
 
 
-#: The same template twice, others, and back; bytes that are no message.
+#: Same template twice, others, and back; invalid bytes.
 JOINTS = [
     JointState(name=names, position=[float(k)] * len(names), effort=[0.5] * (k % 3))
     for k, names in enumerate([['d'], ['a', 'bc'], ['d'], [], ['é→'], ['é→']])
@@ -99,10 +98,10 @@ JUNK = [b'', b'\0\1\0\0', b'\0\1\0\0' + b'\xff' * 40]
     [(JOINT_STATE, JOINTS), (WRENCH, WRENCHES), (POINT, POINTS)],
     ids=['joints', 'wrench', 'point'],
 )
-def test_a_node_reads_any_message(
+def test_node_parses_any_message(
     ros_graph: RosGraph, monkeypatch: pytest.MonkeyPatch, type_name: str, messages: list[Any]
 ) -> None:
-    """As rclpy writes them; a template is made when it changes. Invalid messages are counted."""
+    """As serialized by rclpy; a change creates a new template. Invalid messages are counted."""
     made = []
     of = Template.of
 
@@ -124,7 +123,7 @@ def test_a_node_reads_any_message(
     ros_graph.spin_until(lambda: len(taken) == len(twice), 'the messages')
     assert taken == [content(message) for message in twice]
     shapes = [(one.frame, one.names, [len(block) for block in one.values]) for one in taken]
-    # The first template is that of an empty message.
+    # The first template is an empty message.
     empty = ('', (), [0, 0, 0] if type_name == JOINT_STATE else [len(taken[0].values[0])])
     assert len(made) == sum(a != b for a, b in pairwise([empty, *shapes]))
     assert node.invalid['words'] == len(JUNK)
@@ -135,15 +134,17 @@ def test_a_node_reads_any_message(
     )
 
 
-def test_a_message_type_that_is_not_installed_is_named() -> None:
-    """It is an error of the suite, not of Python's import."""
+def test_missing_message_type_is_reported() -> None:
+    """As an error of the suite, not as an ImportError."""
     with pytest.raises(MessageError, match='lab_msgs/msg/Thing is not installed'):
         message_class('lab_msgs/msg/Thing')
 
 
 @pytest.mark.parametrize('name', NODES)
-def test_nodes_offer_what_the_contract_says(ros_graph: RosGraph, tmp_path: Any, name: str) -> None:
-    """Each topic of the contract with its type and quality of service, and no other topic."""
+def test_nodes_offer_the_topics_of_the_contract(
+    ros_graph: RosGraph, tmp_path: Any, name: str
+) -> None:
+    """Each topic with its type and QoS, and no other topic."""
     parameters: dict[str, dict[str, object]] = {
         'plant': {'publish_clock': True},
         'steering': {'use_sim_time': True},

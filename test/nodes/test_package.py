@@ -1,4 +1,4 @@
-"""The package as colcon, pip and rosdep see it."""
+"""Package for colcon, pip and rosdep."""
 
 import ast
 import json
@@ -24,19 +24,19 @@ import yaml
 
 DATA = ROOT / 'test/data'
 PATH = f'{Path(sys.executable).parent}:{os.environ["PATH"]}'
-#: Without PYTHONPATH: what is installed must not be hidden by this tree.
+#: Without PYTHONPATH, so that the installed package is not hidden by the source tree.
 ENVIRONMENT = {**os.environ, 'PATH': PATH, 'PYTHONPATH': ''}
 MANIFEST = ET.parse(ROOT / 'package.xml').getroot()  # noqa: S314
 
-#: rosdep keys by imported module, where they are not the module itself.
+#: rosdep keys by imported module, if they differ from the module name.
 KEYS = {
     'aiohttp': 'python3-aiohttp',
     'argcomplete': 'python3-argcomplete',
-    # Come with mcap.
+    # Installed with mcap.
     'lz4': 'mcap-ros2-support',
     'zstandard': 'mcap-ros2-support',
     'jinja2': 'python3-jinja2',
-    # Comes with jinja2.
+    # Installed with jinja2.
     'markupsafe': 'python3-jinja2',
     'matplotlib': 'python3-matplotlib',
     'mcap': 'mcap-ros2-support',
@@ -48,14 +48,14 @@ KEYS = {
     'yaml': 'python3-yaml',
 }
 
-#: Extras of setup.py, without a key: what needs one says how to install it.
+#: Extras of setup.py without a rosdep key; the code that needs them reports the installation.
 EXTRAS = {'distributed', 'gymnasium', 'pyarrow', 'pyigtl'}
 
 OWN = {path.parent.name for path in ROOT.glob('needle_*/__init__.py')}
 
 
 def imported() -> set[str]:
-    """Return the top-level modules that the shipped code imports from elsewhere."""
+    """Return the external top-level modules imported by the shipped code."""
     modules = set()
     sources = [*ROOT.glob('needle_*/**/*.py'), *ROOT.glob('launch/*.py')]
     for node in (n for path in sources for n in ast.walk(ast.parse(path.read_text()))):
@@ -66,15 +66,15 @@ def imported() -> set[str]:
     return {module.partition('.')[0] for module in modules} - OWN - sys.stdlib_module_names
 
 
-def test_every_import_is_declared_and_every_declaration_imported() -> None:
-    """The dependencies in package.xml are what the code imports, no more and no less."""
+def test_declared_dependencies_equal_imports() -> None:
+    """For package.xml."""
     found = imported()
     assert found >= EXTRAS
     assert {KEYS.get(module, module) for module in found - EXTRAS} == declared('exec_depend')
 
 
 def test_pip_and_ros_install_the_same_libraries() -> None:
-    """What pip installs without ROS is what package.xml asks rosdep for outside ROS."""
+    """Dependencies of pip without ROS equal the rosdep dependencies outside ROS."""
     text = (ROOT / 'setup.py').read_text()
     call = next(
         node
@@ -87,12 +87,12 @@ def test_pip_and_ros_install_the_same_libraries() -> None:
 
 
 def declared(*kinds: str) -> set[str]:
-    """Return the names that package.xml depends on."""
+    """Return the dependencies of package.xml."""
     return {item.text for kind in kinds for item in MANIFEST.iter(kind)}
 
 
 def complaints(text: str) -> list[str]:
-    """Say what is wrong with a manifest, by the schema and by the reader that rosdep uses."""
+    """Return the errors of a manifest, by the schema and by the parser of rosdep."""
     schema = etree.XMLSchema(etree.parse(DATA / 'package_format3.xsd'))
     schema.validate(etree.fromstring(text.encode()))
     found = [entry.message for entry in schema.error_log]
@@ -105,8 +105,8 @@ def complaints(text: str) -> list[str]:
     return found
 
 
-def test_the_manifest_is_valid() -> None:
-    """package.xml is what format 3 allows, without a warning."""
+def test_manifest_is_valid() -> None:
+    """package.xml satisfies format 3, without a warning."""
     assert complaints((ROOT / 'package.xml').read_text()) == []
 
 
@@ -122,15 +122,15 @@ def test_the_manifest_is_valid() -> None:
         ('<package format="3">', '<package format="2">'),
     ],
 )
-def test_a_manifest_that_is_not_valid_is_found_out(part: str, other: str) -> None:
-    """The check can fail: each slip is reported."""
+def test_invalid_manifest_is_reported(part: str, other: str) -> None:
+    """Each mutation is reported."""
     text = (ROOT / 'package.xml').read_text()
     changed = text.replace(part, other)
     assert changed != text
     assert complaints(changed)
 
 
-def test_rosdep_knows_every_name() -> None:
+def test_rosdep_resolves_every_dependency() -> None:
     """Each dependency is a package of the distribution or a key of rosdep."""
     tables = yaml.safe_load((DATA / 'rosdep.yaml').read_text())
     packages = {name for names in tables['jazzy/distribution.yaml'].values() for name in names}
@@ -160,7 +160,7 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def shell(folder: Path, *words: object) -> subprocess.CompletedProcess[str]:
-    """Run a command with the tools of this environment on the path, as its users have them."""
+    """Run a command with the tools of this environment on the path."""
     return subprocess.run(
         [str(word) for word in words],
         cwd=folder,
@@ -173,7 +173,7 @@ def shell(folder: Path, *words: object) -> subprocess.CompletedProcess[str]:
 
 @pytest.fixture(scope='module')
 def workspace(source: Path) -> Path:
-    """Return the colcon workspace, built."""
+    """Return the built colcon workspace."""
     folder = source.parent.parent
     linked = ('--build-base', 'linked/build', '--install-base', 'linked/install')
     built = shell(folder, 'colcon', 'build', '--symlink-install', *linked)
@@ -189,13 +189,13 @@ def test_ros2_run_finds_every_node(workspace: Path) -> None:
     command = f'source install/setup.bash && exec {sys.executable} -c "{look}"'
     found = shell(workspace, 'bash', '-c', command)
     folder = Path(found.stdout.strip()) / 'lib/needle_insertion'
-    # Each once, and nothing else.
+    # Each node once, and no other file.
     assert set(NODES) == {path.name for path in folder.iterdir() if os.access(path, os.X_OK)}
 
 
 @pytest.mark.parametrize('install', ['install', 'linked/install'])
-def test_the_command_is_found_in_a_sourced_workspace(workspace: Path, install: str) -> None:
-    """`needle` and the nodes by their own names are on the path."""
+def test_commands_are_on_the_path_of_a_sourced_workspace(workspace: Path, install: str) -> None:
+    """`needle` and the nodes by their own names."""
     script = f'source {install}/setup.bash && command -v needle needle-plant && needle --version'
     found = shell(workspace, 'bash', '-c', script)
     assert found.returncode == 0, found.stderr
@@ -205,10 +205,10 @@ def test_the_command_is_found_in_a_sourced_workspace(workspace: Path, install: s
 
 
 @pytest.mark.parametrize('name', NODES)
-def test_colcon_builds_what_ros2_run_finds(
+def test_built_nodes_start_and_end_normally(
     workspace: Path, ros_graph: RosGraph, name: str
 ) -> None:
-    """Each node is an executable where ros2 run looks for it, comes up, and ends well."""
+    """Each node is an executable in the folder of ros2 run."""
     executable = workspace / 'install/needle_insertion/lib/needle_insertion' / name
     probe = ros_graph.node('probe')
     parameters = {
@@ -226,15 +226,15 @@ def test_colcon_builds_what_ros2_run_finds(
     try:
         ros_graph.spin_until(lambda: probe.count_publishers(f'{name}/configuration'), name)
         node.send_signal(signal.SIGINT)
-        # A fresh installation compiles first, for ten seconds where nothing else runs.
+        # A fresh installation compiles first, for ten seconds on an idle machine.
         assert node.wait(120.0) == 0
     finally:
         node.kill()
         node.wait()
 
 
-def test_colcon_test_runs_tests_and_tells_when_one_fails(workspace: Path, source: Path) -> None:
-    """`colcon test` runs the tests that colcon.pkg names; a failing one fails `test-result`."""
+def test_colcon_test_reports_failures(workspace: Path, source: Path) -> None:
+    """`colcon test` runs the tests of colcon.pkg; a failing test fails `test-result`."""
     selection = json.loads((ROOT / 'colcon.pkg').read_text())['pytest-args']
     shell(workspace, 'colcon', 'test')
     result = shell(workspace, 'colcon', 'test-result')
@@ -249,7 +249,7 @@ def test_colcon_test_runs_tests_and_tells_when_one_fails(workspace: Path, source
     assert '1 failure' in result.stdout
 
 
-#: What a ROS package carries, below share/.
+#: Required files of a ROS package below share/.
 SHARED = [
     'ament_index/resource_index/packages/needle_insertion',
     'needle_insertion/package.xml',
@@ -262,15 +262,15 @@ SHARED = [
 ]
 
 
-def test_the_install_carries_what_a_ros_package_carries(workspace: Path) -> None:
-    """Manifest, index entry, configuration, layouts, policies and launch files are installed."""
+def test_installation_contains_the_files_of_a_ros_package(workspace: Path) -> None:
+    """Manifest, index entry, configuration, layouts, policies and launch files."""
     share = workspace / 'install/needle_insertion/share'
     assert [name for name in SHARED if not (share / name).is_file()] == []
 
 
 @pytest.fixture(scope='module')
 def environment(source: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a fresh virtual environment with what an sdist brings and our dependencies."""
+    """Return a fresh virtual environment with the installed sdist and the dependencies."""
     folder = tmp_path_factory.mktemp('fresh')
     build = f'from setuptools import build_meta; build_meta.build_sdist({str(folder)!r})'
     built = shell(source, sys.executable, '-c', build)
@@ -279,7 +279,7 @@ def environment(source: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     venv.create(folder / 'venv')
     python = folder / 'venv/bin/python'
     places = sysconfig.get_paths(vars={'base': str(folder / 'venv')})
-    # The dependencies of this environment, after what is installed in the fresh one.
+    # The dependencies of this environment, with lower priority than the fresh environment.
     Path(places['purelib'], 'dependencies.pth').write_text(sysconfig.get_paths()['purelib'])
     options = ('--no-index', '--no-deps', '--no-build-isolation', '--ignore-installed')
     pip = (sys.executable, '-m', 'pip', '--python', python)
@@ -288,10 +288,8 @@ def environment(source: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / 'venv'
 
 
-def test_an_sdist_installs_and_runs(
-    environment: Path, ros_graph: RosGraph, tmp_path: Path
-) -> None:
-    """From the archive alone: all files in place, the command simulates, a node comes up."""
+def test_sdist_installs_and_runs(environment: Path, ros_graph: RosGraph, tmp_path: Path) -> None:
+    """From the archive only: all files exist, the command simulates, and a node starts."""
     share = environment / 'share'
     assert [name for name in SHARED if not (share / name).is_file()] == []
     look = (
@@ -311,7 +309,7 @@ def test_an_sdist_installs_and_runs(
         env=ros_graph.environment,
     ) as node:
         try:
-            ros_graph.spin_until(lambda: probe.count_publishers('recorder/configuration'), 'it')
+            ros_graph.spin_until(lambda: probe.count_publishers('recorder/configuration'), 'node')
             node.send_signal(signal.SIGINT)
             assert node.wait(30.0) == 0
         finally:

@@ -1,4 +1,4 @@
-"""Parameters as a user gives them: dumped and loaded again, as text, shared, for other nodes."""
+"""Parameters from users: dumped and reloaded, as text, shared, and for other nodes."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ def arguments(file: Path) -> list[str]:
 
 
 @pytest.mark.parametrize('name', NODES)
-def test_what_is_dumped_can_be_loaded(ros_graph: RosGraph, tmp_path: Path, name: str) -> None:
-    """Also empty lists, which rcl reads as nothing: they stay empty."""
+def test_dumped_parameters_can_be_loaded(ros_graph: RosGraph, tmp_path: Path, name: str) -> None:
+    """Including empty lists, which rcl returns as None."""
     given: dict[str, object] = {'observer.cutoffs': []} if name == 'controller' else {}
     first = ros_graph.add(node_class(name), parameters=given, start=False)
     file = tmp_path / 'node.yaml'
@@ -36,11 +36,11 @@ def test_what_is_dumped_can_be_loaded(ros_graph: RosGraph, tmp_path: Path, name:
     assert second.configuration() == first.configuration()
 
 
-def test_values_that_stay_may_be_set_while_configured(ros_graph: RosGraph) -> None:
-    """So `ros2 param load` of a dumped file succeeds; what would change is still refused."""
+def test_unchanged_values_may_be_set_while_configured(ros_graph: RosGraph) -> None:
+    """`ros2 param load` of a dumped file succeeds; changes are still rejected."""
     node = ros_graph.add(ControllerNode)
     values = {name: value for name, value in node.values().items() if value != []}
-    # rclpy itself refuses to set what is read-only, whatever the value.
+    # rclpy rejects setting read-only parameters to any value.
     del values['model.preset']
     same = [Parameter(name, value=value) for name, value in values.items()]
     assert {r.reason for r in node.set_parameters(same)} == {''}
@@ -50,8 +50,8 @@ def test_values_that_stay_may_be_set_while_configured(ros_graph: RosGraph) -> No
     assert 'cannot change while configured' in refused.reason
 
 
-def test_text_that_is_a_number_counts_as_one(ros_graph: RosGraph) -> None:
-    """PyYAML reads 1e-3 as text, and so `ros2 param load` sends it."""
+def test_numeric_text_is_parsed_as_a_number(ros_graph: RosGraph) -> None:
+    """PyYAML parses 1e-3 as text, and `ros2 param load` sends it as text."""
     node = ros_graph.add(PlantNode, parameters={'model.tissue_damping': '1e1'})
     assert node.is_active
     node = ros_graph.add(PlantNode, parameters={'model.length': 'long'}, start=False)
@@ -62,16 +62,16 @@ def test_text_that_is_a_number_counts_as_one(ros_graph: RosGraph) -> None:
 @pytest.mark.parametrize(
     ('section', 'name', 'status', 'said'),
     [
-        ('/**', 'law', 0, 'parameters for several nodes that this one does not have: law'),
+        ('/**', 'law', 0, 'shared parameters that this node does not declare: law'),
         ('/plant', 'law', 2, "unknown parameter 'law'"),
         ('/**/plant', 'law', 2, "unknown parameter 'law'"),
         ('/plnat', 'rate', 0, 'has no parameters for /plant, only for /plnat'),
     ],
 )
-def test_whom_a_file_is_for_is_said(
+def test_unused_sections_of_parameter_files_are_reported(
     ros_graph: RosGraph, tmp_path: Path, section: str, name: str, status: int, said: str
 ) -> None:
-    """One file for all nodes serves each; a node that has no section in its file says so."""
+    """A file for all nodes is valid for each; a node without a section in its file warns."""
     file = tmp_path / 'all.yaml'
     file.write_text(f'{section}:\n  ros__parameters:\n    {name}: 500.0\n')
     log = tmp_path / 'log'

@@ -1,4 +1,4 @@
-"""The plant as the graph sees it."""
+"""The plant node in the graph."""
 
 from collections.abc import Callable
 from functools import partial
@@ -32,19 +32,18 @@ from support.ros_graph import RosGraph
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 import yaml
 
-#: Slow enough for a thread that also runs the test.
+#: Low rate for a thread that also runs the test.
 RATE = {'rate': 200.0}
 
 NOISE = ForceSensorParameters().per_axis('noise')[:3]
 
 
 def stamp_ns(message: Any) -> int:
-    """Return the stamp of a message in nanoseconds."""
+    """Return the stamp of a message [ns]."""
     return message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec
 
 
 def wrench(force: float) -> WrenchStamped:
-    """Return a wrench command."""
     message = WrenchStamped()
     message.wrench.force.y = force
     return message
@@ -64,7 +63,7 @@ def trajectory(
 
 
 class Bench:
-    """A plant in this process with a probe that listens to it and commands it."""
+    """A plant in this process, with a probe that subscribes and commands."""
 
     def __init__(self, ros_graph: RosGraph, **parameters: Any) -> None:
         self.graph = ros_graph
@@ -92,29 +91,29 @@ class Bench:
         self.graph.spin_until(condition, what)
 
     def further(self, count: int) -> list[WrenchStamped]:
-        """Spin until there are so many more readings of the force; return them."""
+        """Spin until a number of additional force readings; return them."""
         seen = len(self.wrenches)
         self.until(lambda: len(self.wrenches) >= seen + count, 'readings')
         return self.wrenches[seen:]
 
     @property
     def waited(self) -> float:
-        """How long simulated time has waited for this machine [s]."""
+        """Accumulated delay of simulated time by this machine [s]."""
         return float(self.plant.diagnose()[2]['waited for the machine [s]'])
 
     def zero(self) -> Trigger_Response:
-        """Ask for the tare; return the answer."""
+        """Call the tare service; return the response."""
         answer = self.tare.call_async(Trigger.Request())
         self.until(answer.done, 'the answer')
         return answer.result()
 
     def refused(self, count: int) -> None:
-        """Spin until so many commands have been refused."""
+        """Spin until a number of rejected commands."""
         self.until(lambda: self.plant.diagnose()[2]['commands refused'] == count, 'the refusal')
 
 
-def test_publishes_its_four_topics_in_step(ros_graph: RosGraph) -> None:
-    """Each sample appears on all four topics with one stamp, exactly one period after the last."""
+def test_four_topics_are_published_per_sample(ros_graph: RosGraph) -> None:
+    """With one stamp, exactly one period after the previous sample."""
     probe = ros_graph.node('probe')
     topics = {
         topic: ros_graph.listen(probe, kind, topic, SENSOR)
@@ -130,7 +129,7 @@ def test_publishes_its_four_topics_in_step(ros_graph: RosGraph) -> None:
     stamps = {topic: [stamp_ns(m) for m in messages] for topic, messages in topics.items()}
     common = set.intersection(*(set(s) for s in stamps.values()))
     assert len(common) >= 90
-    # Whole nanoseconds: the period may be off by the rounding of either stamp.
+    # Integer nanoseconds: the period may be off by the rounding of both stamps.
     assert set(np.diff(stamps['joint_states'])) <= {4_999_999, 5_000_000, 5_000_001}
     truth = topics['ground_truth'][-1]
     joints = next(m for m in topics['joint_states'] if stamp_ns(m) == stamp_ns(truth))
@@ -140,8 +139,8 @@ def test_publishes_its_four_topics_in_step(ros_graph: RosGraph) -> None:
     assert topics['base_wrench'][-1].header.frame_id == 'needle_base'
 
 
-def test_moves_under_a_command_and_stops_without_it(ros_graph: RosGraph) -> None:
-    """A push drives the needle at (f - mu_s) / mu_v, until the command is too old."""
+def test_moves_under_a_command_until_the_command_timeout(ros_graph: RosGraph) -> None:
+    """A constant force moves the needle at (f - mu_s) / mu_v, until the command is too old."""
     probe = ros_graph.node('probe')
     states = ros_graph.listen(probe, JointState, 'joint_states', SENSOR)
     commands = probe.create_publisher(WrenchStamped, 'wrench_command', COMMAND)
@@ -154,14 +153,14 @@ def test_moves_under_a_command_and_stops_without_it(ros_graph: RosGraph) -> None
 
     ros_graph.spin_until(pushed, 'motion')
     ros_graph.spin_until(lambda: pushed() and states[-1].position[0] > 0.022, 'depth')
-    # mu_v = 300 N s/m; friction is settled within microseconds.
+    # mu_v = 300 N s/m; friction settles within microseconds.
     assert states[-1].velocity[0] == pytest.approx(0.01, rel=1e-9)
     ros_graph.spin_until(lambda: states[-1].velocity[0] == 0.0, 'the stop after the timeout')
 
 
 @pytest.mark.parametrize('force', [float('nan'), float('inf'), -1e300])
-def test_a_command_that_no_robot_could_mean_is_no_force(ros_graph: RosGraph, force: float) -> None:
-    """NaN, infinity and absurd forces are refused, counted, and leave the needle where it is."""
+def test_invalid_force_commands_are_rejected(ros_graph: RosGraph, force: float) -> None:
+    """NaN, infinite and implausible forces are counted and do not move the needle."""
     probe = ros_graph.node('probe')
     states = ros_graph.listen(probe, JointState, 'joint_states', SENSOR)
     commands = probe.create_publisher(WrenchStamped, 'wrench_command', COMMAND)
@@ -174,8 +173,8 @@ def test_a_command_that_no_robot_could_mean_is_no_force(ros_graph: RosGraph, for
     assert states[-1].position[0] == states[0].position[0]
 
 
-def test_the_base_follows_a_trajectory_and_feels_friction(ros_graph: RosGraph) -> None:
-    """In mode robot the base is where the trajectory says, and the wrench is mu_s + mu_v u."""
+def test_base_follows_a_trajectory_with_friction_force(ros_graph: RosGraph) -> None:
+    """In mode robot; the wrench is mu_s + mu_v u."""
     probe = ros_graph.node('probe')
     states = ros_graph.listen(probe, JointState, 'joint_states', SENSOR)
     wrenches = ros_graph.listen(probe, WrenchStamped, 'base_wrench', SENSOR)
@@ -187,17 +186,17 @@ def test_the_base_follows_a_trajectory_and_feels_friction(ros_graph: RosGraph) -
     trajectories.publish(JointTrajectory(joint_names=['insertion'], points=[point]))
     ros_graph.spin_until(lambda: states[-1].position[0] > 0.10999, 'the end')
     ros_graph.spin_until(lambda: states[-1].velocity[0] == 0.0, 'rest')
-    # The last approach closes half the error per period: far below a micrometer at rest.
+    # The final approach halves the error per period: far below 1 um at rest.
     assert states[-1].position[0] == pytest.approx(0.11, abs=1e-6)
     speed = {stamp_ns(m): m.velocity[0] for m in states}
     steady = [m.wrench.force.y for m in wrenches if abs(speed.get(stamp_ns(m), 0.0) - 0.01) < 1e-6]
-    # Mean of at least 50 readings; the filter leaves a fifth of the noise; five sigma.
+    # Mean of at least 50 readings; the filter passes a fifth of the noise; five sigma.
     assert len(steady) > 50
     assert np.mean(steady) == pytest.approx(3.56, abs=5 * 0.2 * max(NOISE) / np.sqrt(50))
 
 
-def test_a_needle_pulled_out_stands_still_and_is_reported(ros_graph: RosGraph) -> None:
-    """Below the least inserted length the plant stops, and /diagnostics says why."""
+def test_needle_below_the_minimum_depth_stops(ros_graph: RosGraph) -> None:
+    """/diagnostics reports the reason."""
     probe = ros_graph.node('probe')
     reports = ros_graph.listen(probe, DiagnosticArray, '/diagnostics', 10)
     commands = probe.create_publisher(WrenchStamped, 'wrench_command', COMMAND)
@@ -211,8 +210,8 @@ def test_a_needle_pulled_out_stands_still_and_is_reported(ros_graph: RosGraph) -
     ros_graph.spin_until(reported, 'the report')
 
 
-def test_its_configuration_is_a_parameter_file(ros_graph: RosGraph) -> None:
-    """The latched configuration reaches who comes late and holds every parameter."""
+def test_configuration_is_a_latched_parameter_file(ros_graph: RosGraph) -> None:
+    """Late-joining subscribers receive all parameters."""
     ros_graph.add(PlantNode, parameters={**RATE, 'model.coulomb_friction': 1, 'depth': 0.03})
     late = ros_graph.listen(ros_graph.node('probe'), String, 'plant/configuration', LATCHED)
     ros_graph.spin_until(lambda: late, 'configuration')
@@ -223,10 +222,10 @@ def test_its_configuration_is_a_parameter_file(ros_graph: RosGraph) -> None:
 
 
 @pytest.mark.parametrize('kind', [PlantNode, ControllerNode])
-def test_its_configuration_makes_it_anew(
+def test_configuration_recreates_the_node(
     ros_graph: RosGraph, tmp_path: Path, kind: type[ControllerNode] | type[PlantNode]
 ) -> None:
-    """A node started from the configuration of another has the same configuration."""
+    """A node started from the configuration has the same configuration."""
     layers = {'model.layer_depths': [0.03, 0.06], 'model.layer_stiffnesses': [900.0, 200.0]}
     for parameters in ({}, layers):
         first = ros_graph.add(kind, parameters=parameters, start=False)
@@ -238,10 +237,9 @@ def test_its_configuration_makes_it_anew(
 
 
 @pytest.mark.parametrize('kind', [PlantNode, ControllerNode])
-def test_the_shipped_parameter_file_is_accepted(
+def test_shipped_parameter_file_is_valid(
     ros_graph: RosGraph, kind: type[ControllerNode] | type[PlantNode]
 ) -> None:
-    """Every name in config/insertion.yaml is known and every value valid."""
     file = Path(__file__).parents[2] / 'config' / 'insertion.yaml'
     node = ros_graph.add(kind, cli_args=['--ros-args', '--params-file', str(file)])
     given = yaml.safe_load(file.read_text())[f'/**/{node.get_name()}']['ros__parameters']
@@ -257,10 +255,10 @@ def test_the_shipped_parameter_file_is_accepted(
         ({'seed': -1}, 'seed out of range'),
     ],
 )
-def test_bad_parameters_end_the_process_with_one_line(
+def test_invalid_parameters_end_the_process(
     ros_graph: RosGraph, parameters: dict[str, Any], complaint: str
 ) -> None:
-    """A process that cannot be configured says why in its last line and exits with 2."""
+    """With a one-line error and status 2."""
     plant = ros_graph.start('plant', parameters)
     assert plant.process.wait(30) == 2
     assert complaint in plant.last_line
@@ -315,10 +313,10 @@ def test_bad_parameters_end_the_process_with_one_line(
         ),
     ],
 )
-def test_it_refuses_to_be_configured_and_says_why(
+def test_invalid_parameters_fail_configure(
     ros_graph: RosGraph, parameters: dict[str, Any], complaint: str
 ) -> None:
-    """The reason is one line that names the parameter; nothing is left half made."""
+    """The error names the parameter; no partial configuration remains."""
     node = ros_graph.add(PlantNode, parameters=parameters, start=False)
     assert not node.start()
     assert complaint in node.failure
@@ -328,15 +326,15 @@ def test_it_refuses_to_be_configured_and_says_why(
 @pytest.mark.parametrize(
     ('name', 'value'), [('model.density', -1.0), ('step', float('nan')), ('step', 1e-13)]
 )
-def test_a_value_out_of_its_range_is_refused(ros_graph: RosGraph, name: str, value: float) -> None:
-    """The range that the parameter is declared with holds from the start."""
+def test_value_out_of_range_is_rejected(ros_graph: RosGraph, name: str, value: float) -> None:
+    """The declared parameter range applies from the start."""
     with pytest.raises(InvalidParameterValueException, match=f'{name} out of range'):
         ros_graph.add(PlantNode, parameters={name: value})
 
 
 @pytest.mark.parametrize('name', [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_signals_end_it_well(ros_graph: RosGraph, name: Signals) -> None:
-    """Ctrl-C, a kill and a closed terminal end the process with 0 and without a traceback."""
+def test_signals_end_the_process_normally(ros_graph: RosGraph, name: Signals) -> None:
+    """Ctrl-C, SIGTERM and SIGHUP: status 0 without a traceback."""
     probe = ros_graph.node('probe')
     states = ros_graph.listen(probe, JointState, 'joint_states', SENSOR)
     plant = ros_graph.start('plant')
@@ -351,10 +349,8 @@ def test_signals_end_it_well(ros_graph: RosGraph, name: Signals) -> None:
     [['--params-file', 'missing.yaml'], ['-p', 'depth']],
     ids=['no such file', 'no value'],
 )
-def test_arguments_that_ros_cannot_read_end_in_one_line(
-    tmp_path: Path, arguments: list[str]
-) -> None:
-    """An unreadable command line is told in one line, with exit status 2."""
+def test_invalid_ros_arguments_end_the_process(tmp_path: Path, arguments: list[str]) -> None:
+    """One line, with exit status 2."""
     ended = subprocess.run(
         [sys.executable, '-m', 'needle_dynamics.plant_node', '--ros-args', *arguments],
         cwd=tmp_path,
@@ -367,8 +363,8 @@ def test_arguments_that_ros_cannot_read_end_in_one_line(
     assert 'Traceback' not in ended.stderr
 
 
-def test_beyond_its_range_without_hub_stop_it_stands_still(ros_graph: RosGraph) -> None:
-    """Pushed through by more than its length the plant stops and reports; it does not die."""
+def test_needle_beyond_its_length_stops_without_hub_stop(ros_graph: RosGraph) -> None:
+    """The plant stops the needle and reports; the node continues."""
     probe = ros_graph.node('probe')
     reports = ros_graph.listen(probe, DiagnosticArray, '/diagnostics', 10)
     commands = probe.create_publisher(WrenchStamped, 'wrench_command', COMMAND)
@@ -384,8 +380,8 @@ def test_beyond_its_range_without_hub_stop_it_stands_still(ros_graph: RosGraph) 
     ros_graph.spin_until(reported, 'the report')
 
 
-def test_the_preset_is_fixed_at_start(ros_graph: RosGraph) -> None:
-    """The defaults follow from the preset, so it cannot change afterwards."""
+def test_preset_is_read_only(ros_graph: RosGraph) -> None:
+    """The preset determines the defaults."""
     plant = ros_graph.add(PlantNode, start=False)
     changed = plant.set_parameters([Parameter('model.preset', value='paper_si')])[0]
     assert not changed.successful
@@ -393,18 +389,18 @@ def test_the_preset_is_fixed_at_start(ros_graph: RosGraph) -> None:
 
 @pytest.mark.parametrize('kind', [PlantNode, ControllerNode])
 @pytest.mark.parametrize('configured', [False, True])
-def test_it_can_be_shut_down_before_it_was_active(
+def test_shutdown_before_activation(
     ros_graph: RosGraph, kind: type[ControllerNode] | type[PlantNode], configured: bool
 ) -> None:
-    """Shutdown is granted from unconfigured and from inactive."""
+    """From unconfigured and from inactive."""
     node = ros_graph.add(kind, start=False)
     if configured:
         assert node.trigger_configure() == TransitionCallbackReturn.SUCCESS
     assert node.trigger_shutdown() == TransitionCallbackReturn.SUCCESS
 
 
-def test_a_trajectory_out_of_reach_is_refused(ros_graph: RosGraph) -> None:
-    """The base stays where it is when a point lies before the skin or beyond the hub."""
+def test_trajectory_out_of_range_is_rejected(ros_graph: RosGraph) -> None:
+    """The base does not move for a point in front of the skin or beyond the hub."""
     probe = ros_graph.node('probe')
     states = ros_graph.listen(probe, JointState, 'joint_states', SENSOR)
     trajectories = probe.create_publisher(JointTrajectory, 'joint_trajectory', COMMAND)
@@ -419,8 +415,8 @@ def test_a_trajectory_out_of_reach_is_refused(ros_graph: RosGraph) -> None:
     assert {message.position[0] for message in states[seen:]} == {0.1}
 
 
-def test_in_simulation_a_path_is_for_the_controller_alone(ros_graph: RosGraph) -> None:
-    """One subscriber, so that `ros2 topic pub --once` waits for the one that counts."""
+def test_only_the_controller_subscribes_to_paths_in_simulation(ros_graph: RosGraph) -> None:
+    """`ros2 topic pub --once` waits for one subscriber, the controller."""
     probe = ros_graph.node('probe')
     states = ros_graph.listen(probe, JointState, 'joint_states', SENSOR)
     ros_graph.add(PlantNode, parameters=RATE)
@@ -429,8 +425,8 @@ def test_in_simulation_a_path_is_for_the_controller_alone(ros_graph: RosGraph) -
     assert probe.count_subscribers('joint_trajectory') == 1
 
 
-def test_a_push_breaks_the_needle_away_and_a_motion_follows(ros_graph: RosGraph) -> None:
-    """An effort ramp moves the base from mu_s on; then positions count from where it is."""
+def test_push_then_motion(ros_graph: RosGraph) -> None:
+    """An effort ramp moves the base above mu_s; later positions are relative to it."""
     quiet = {'sensor.force_noise': 0.0, 'sensor.force_resolution': 0.0, 'sensor.filter': 0}
     bench = Bench(ros_graph, mode='robot', depth=0.1, **quiet)
     bench.course.publish(
@@ -444,12 +440,13 @@ def test_a_push_breaks_the_needle_away_and_a_motion_follows(ros_graph: RosGraph)
     at = [(force[stamp_ns(m)], m.velocity[0]) for m in pushed if stamp_ns(m) in force]
     moving = [f for f, speed in at if speed > 0.0]
     resting = [f for f, speed in at[: len(at) - len(moving)]]
-    # The force of a sample is the mean of its interval: 2 N/s over 5 ms between samples; the
-    # ramp itself is rounded.
+    # The force of a sample is the mean of its interval: 2 N/s over 5 ms between samples; the ramp
+    # itself is rounded.
     assert max(resting) <= 0.56 + 1e-12
     assert 0.56 - 1e-12 < min(moving) < 0.56 + 0.011
-    # mu_v = 300 N s/m; the speed is that of the last quarter of 5 ms, in which the force rises by
-    # 2.5 mN, the reading that at its end. After the largest force it brakes for the way back.
+    # mu_v = 300 N s/m; the velocity refers to the last quarter of 5 ms, in which the force rises
+    # by 2.5 mN, the reading to its end. After the largest force the base brakes before it
+    # reverses.
     last = max(range(len(at)), key=lambda i: at[i][0])
     steady = [(f - 0.56) / 300.0 - speed for f, speed in at[:last] if f > 0.56]
     assert len(steady) > 100
@@ -458,17 +455,17 @@ def test_a_push_breaks_the_needle_away_and_a_motion_follows(ros_graph: RosGraph)
 
 
 def has_refused_one(plant: PlantNode) -> bool:
-    """Tell whether the plant has refused one command."""
+    """Return whether the plant has rejected one command."""
     return plant.diagnose()[2]['commands refused'] == 1
 
 
 def has(messages: list[Any], count: int) -> bool:
-    """Tell whether so many messages have come."""
+    """Return whether a number of messages have arrived."""
     return len(messages) >= count
 
 
-def test_a_trajectory_sent_before_the_activation_begins_with_it(ros_graph: RosGraph) -> None:
-    """With the same seed two runs are then the same, sample by sample."""
+def test_trajectory_before_activation_starts_with_it(ros_graph: RosGraph) -> None:
+    """Two runs with the same seed are then identical for each sample."""
     runs = []
     for name in ('one', 'two'):
         probe = ros_graph.node(name)
@@ -486,7 +483,8 @@ def test_a_trajectory_sent_before_the_activation_begins_with_it(ros_graph: RosGr
         assert course.wait_for_all_acked(Duration(seconds=10))
         for _ in range(10):
             ros_graph.executor.spin_once(timeout_sec=0.02)
-        # Only the newest command counts: this one, refused, tells that the first was taken.
+        # Only the newest command applies: the rejection of the next command shows that the first
+        # was received.
         course.publish(trajectory(['insertion']))
         ros_graph.spin_until(partial(has_refused_one, plant), 'the refusal')
         (sender,) = (p for p in plant.publishers if p.topic_name.endswith('base_wrench'))
@@ -498,26 +496,26 @@ def test_a_trajectory_sent_before_the_activation_begins_with_it(ros_graph: RosGr
     assert runs[0] == runs[1]
 
 
-def test_the_encoder_counts_whole_micrometers(ros_graph: RosGraph) -> None:
-    """In mode robot the joint position is rounded to the encoder's resolution."""
+def test_encoder_resolution_of_a_micrometer(ros_graph: RosGraph) -> None:
+    """In mode robot the joint position is rounded to the encoder resolution."""
     bench = Bench(ros_graph, mode='robot', depth=0.1, **{'base.encoder_resolution': 1e-4})
     bench.course.publish(trajectory(['insertion'], (0.5, [0.102], [])))
     bench.until(lambda: bench.states[-1].position[0] >= 0.102, 'the end')
     counts = np.array([m.position[0] for m in bench.states]) / 1e-4
-    # Rounding of a quotient of the size of 1000.
+    # Rounding of a quotient of about 1000.
     assert np.abs(counts - np.round(counts)).max() < 1e-9
     assert len(set(np.round(counts))) == 21
 
 
-def test_the_end_effector_presses_the_tissue(ros_graph: RosGraph) -> None:
-    """In mode indenter the pose is where K(|F|) d = F, and the wrench is F; nothing else comes."""
+def test_end_effector_position_follows_the_tissue_stiffness(ros_graph: RosGraph) -> None:
+    """In mode indenter K(|F|) d = F, and the wrench is F; no other topic is published."""
     bench = Bench(ros_graph, mode='indenter')
     force = np.array([0.6, -1.2])
     bench.course.publish(trajectory(['z', 'x'], (0.5, [], [-1.2, 0.6]), (9.0, [], [-1.2, 0.6])))
     bench.until(lambda: bench.poses and bench.poses[-1].pose.position.z < -9e-4, 'the press')
     bench.until(lambda: bench.wrenches[-1].wrench.force.z < -1.1, 'the press')
     seen = len(bench.poses)
-    # The last of the ramp takes 0.1 s, 20 samples.
+    # The end of the ramp takes 0.1 s, 20 samples.
     readings = np.array([[m.wrench.force.x, m.wrench.force.z] for m in bench.further(150)[50:]])
     poses = [message.pose.position for message in bench.poses[seen + 50 :]]
     place = np.array([[p.x, p.z] for p in poses])
@@ -568,14 +566,14 @@ def test_the_end_effector_presses_the_tissue(ros_graph: RosGraph) -> None:
         ),
     ],
 )
-def test_trajectories_are_refused_with_their_reason(
+def test_invalid_trajectories_are_rejected_with_a_reason(
     ros_graph: RosGraph,
     capfd: pytest.CaptureFixture[str],
     mode: str,
     message: JointTrajectory,
     reason: str,
 ) -> None:
-    """With one line, in the log and in the answer to the sender; nothing moves."""
+    """One line in the log and in the answer; the base does not move."""
     bench = Bench(ros_graph, mode=mode, depth=0.1)
     bench.course.publish(message)
     bench.refused(1)
@@ -586,7 +584,7 @@ def test_trajectories_are_refused_with_their_reason(
 
 
 def test_tare_zeroes_the_readings_at_rest(ros_graph: RosGraph) -> None:
-    """After the tare the readings are about zero, and stay so after a deactivation."""
+    """After the tare the readings are about zero, also after a deactivation."""
     biased = {'sensor.force_bias': [1.0, -2.0, 3.0], 'sensor.torque_bias': 0.1}
     bench = Bench(ros_graph, **biased)
 
@@ -595,13 +593,13 @@ def test_tare_zeroes_the_readings_at_rest(ros_graph: RosGraph) -> None:
         return np.mean([[f.x, f.y, f.z, t.x, t.y, t.z] for f, t in parts], axis=0)
 
     offset = np.array([1.0, -2.0, 3.0, 0.1, 0.1, 0.1])
-    # Five sigma of the 20 readings of a tenth of a second and of 100 more.
+    # Five sigma of the 20 readings of 0.1 s and of 100 more.
     noise = np.repeat([0.2 * max(NOISE), 0.2 * 1.5e-3], 3)
     bound = 5 * noise * np.sqrt(1 / 20 + 1 / 100)
     assert np.all(np.abs(mean(bench.further(100)) - offset) < bound)
     answer = bench.zero()
     assert (answer.success, answer.message) == (True, 'the force sensor is zeroed')
-    # The readings on their way when the tare came are not zeroed.
+    # Readings published before the tare are not zeroed.
     assert np.all(np.abs(mean(bench.further(110)[10:])) < bound)
     bench.plant.trigger_deactivate()
     refused = bench.zero()
@@ -614,8 +612,8 @@ def test_tare_zeroes_the_readings_at_rest(ros_graph: RosGraph) -> None:
     assert np.all(np.abs(mean(bench.further(110)[10:]) - offset) < bound)
 
 
-def test_tare_is_refused_while_the_needle_moves(ros_graph: RosGraph) -> None:
-    """A moving needle cannot be zeroed, nor one that has just come to rest."""
+def test_tare_is_rejected_while_the_needle_moves(ros_graph: RosGraph) -> None:
+    """A moving needle cannot be zeroed, nor a needle that has just stopped."""
     bench = Bench(ros_graph)
 
     def pushed() -> bool:
@@ -636,14 +634,14 @@ def test_tare_is_refused_while_the_needle_moves(ros_graph: RosGraph) -> None:
     assert bench.zero().success
 
 
-def test_simulated_time_runs_faster(ros_graph: RosGraph) -> None:
-    """At ten times the pace 10 s of stamps pass in about 1 s; not one sample is missing."""
+def test_simulated_time_at_ten_times_real_time(ros_graph: RosGraph) -> None:
+    """10 s of stamps take about 1 s; no sample is missing."""
     bench = Bench(ros_graph, rate=100.0, real_time_factor=10.0)
     begin, first, waited = time.monotonic(), len(bench.states), bench.waited
     bench.until(lambda: len(bench.states) >= first + 1000, 'ten seconds')
     passed = time.monotonic() - begin
-    # Not faster, but for what a stall of the backlog has left to make up; slower only by what
-    # it has waited for this machine, and by the last messages on their way.
+    # Faster only by the backlog of a stall; slower only by the delay of this machine and by
+    # pending messages.
     assert passed > 0.5
     assert passed - (bench.waited - waited) < 2.0
     stamps = np.diff([stamp_ns(message) for message in bench.states])
@@ -651,19 +649,17 @@ def test_simulated_time_runs_faster(ros_graph: RosGraph) -> None:
 
 
 @pytest.mark.parametrize('factor', [1.0, 2.0])
-def test_after_a_stall_samples_are_given_up_or_simulated_time_waits(
-    ros_graph: RosGraph, factor: float
-) -> None:
-    """Stamps that are the node's clock skip what is beyond the backlog; others never skip."""
+def test_stall_drops_samples_or_delays_simulated_time(ros_graph: RosGraph, factor: float) -> None:
+    """Time of the node clock skips samples beyond the backlog; independent time does not."""
     bench = Bench(ros_graph, rate=100.0, real_time_factor=factor, backlog=0.05)
     bench.further(20)
-    # The stall: nobody spins the plant.
+    # A stall: the plant is not spun.
     time.sleep(0.5)
     bench.further(50)
     stamps = np.diff([stamp_ns(message) for message in bench.states])
     given_up = bench.plant.diagnose()[2]['samples given up']
     if factor == 1.0:
-        # 0.5 s, less the backlog.
+        # 0.5 s minus the backlog.
         assert given_up >= 44
         assert stamps.max() >= 0.44e9
     else:
@@ -672,8 +668,8 @@ def test_after_a_stall_samples_are_given_up_or_simulated_time_waits(
         assert set(stamps) <= {9_999_999, 10_000_000, 10_000_001}
 
 
-def test_its_clock_drives_a_node_with_simulated_time(ros_graph: RosGraph) -> None:
-    """A node with use_sim_time is never ahead of the newest sample, and goes with it."""
+def test_clock_topic_drives_a_node_with_simulated_time(ros_graph: RosGraph) -> None:
+    """A node with use_sim_time follows the newest sample and is never ahead of it."""
     follower = ros_graph.add(Node, 'follower', parameters={'use_sim_time': True})
     bench = Bench(ros_graph, rate=100.0, real_time_factor=10.0, publish_clock=True)
     bench.until(lambda: follower.get_clock().now().nanoseconds > 0, '/clock')
@@ -682,27 +678,27 @@ def test_its_clock_drives_a_node_with_simulated_time(ros_graph: RosGraph) -> Non
     bench.until(
         lambda: follower.get_clock().now().nanoseconds > before + 5 * 10**9, 'five seconds'
     )
-    # Ten times as fast as the clock on the wall, but for a machine that is busy.
+    # Ten times real time, less on a busy machine.
     assert time.monotonic() - begin - (bench.waited - waited) < 2.5
     now = follower.get_clock().now().nanoseconds
     bench.further(50)
     assert now in {stamp_ns(message) for message in bench.states}
 
 
-def test_a_command_ages_in_simulated_time(ros_graph: RosGraph) -> None:
-    """At five times the pace a command of 0.1 s counts for 0.02 s of the node's clock."""
+def test_command_age_is_measured_in_simulated_time(ros_graph: RosGraph) -> None:
+    """At five times real time a command of 0.1 s is valid for 0.02 s of the node clock."""
     bench = Bench(ros_graph, rate=1000.0, real_time_factor=5.0)
     bench.commands.publish(wrench(3.56))
     bench.until(lambda: any(m.velocity[0] > 0.0 for m in bench.states), 'motion')
     bench.until(lambda: bench.states[-1].velocity[0] == 0.0, 'rest')
     moving = [stamp_ns(m) for m in bench.states if m.velocity[0] > 0.0]
-    # By the node's clock it would be 0.5 s. When it comes, samples of a stall may still be due:
-    # those of the backlog, 0.05 s of five times the pace.
+    # 0.5 s by the node clock. On arrival, samples of a stall may still be due: the backlog of 0.05
+    # s at five times real time.
     assert 0.08e9 < moving[-1] - moving[0] < 0.1e9 + 5.0 * 0.05e9 + 0.02e9
 
 
-def test_friction_may_change_while_it_moves(ros_graph: RosGraph) -> None:
-    """A live change of friction alters the speed at once, and not the depth."""
+def test_friction_may_change_during_motion(ros_graph: RosGraph) -> None:
+    """The velocity changes immediately, the depth is continuous."""
     bench = Bench(ros_graph)
     configurations = bench.graph.listen(bench.probe, String, 'plant/configuration', LATCHED)
 
@@ -724,14 +720,14 @@ def test_friction_may_change_while_it_moves(ros_graph: RosGraph) -> None:
     bench.until(lambda: pushed() and len(bench.states) > slow + 40, 'further samples')
     speed = np.array([message.velocity[0] for message in bench.states])
     position = np.array([message.position[0] for message in bench.states])
-    # (3.56 - 2.06) N / 150 N s/m, friction being settled within 0.1 ms.
+    # (3.56 - 2.06) N / 150 N s/m; friction settles within 0.1 ms.
     assert set(np.round(speed[speed > 0.0], 9)) == {0.01}
     assert np.diff(position).max() <= 0.01 / 200.0 * (1.0 + 1e-9)
     bench.until(lambda: 'model.coulomb_friction: 2.06' in configurations[-1].data, 'configuration')
 
 
-def test_the_controller_takes_friction_live_if_its_gains_can_bear_it(ros_graph: RosGraph) -> None:
-    """Friction is checked as at the start; what is refused leaves the value, and says why."""
+def test_controller_friction_may_change_if_gains_stay_stable(ros_graph: RosGraph) -> None:
+    """The check is the same as at the start; a rejection keeps the value and gives the reason."""
     node = ros_graph.add(ControllerNode, parameters={**RATE, 'law': 'pid'})
     friction = [Parameter('model.viscous_friction', value=value) for value in (200.0, 0.3)]
     assert node.set_parameters(friction[:1])[0].successful
@@ -776,14 +772,14 @@ def test_the_controller_takes_friction_live_if_its_gains_can_bear_it(ros_graph: 
         ),
     ],
 )
-def test_what_cannot_change_live_is_refused(
+def test_read_only_parameters_are_rejected_while_active(
     ros_graph: RosGraph,
     kind: type[ControllerNode] | type[PlantNode],
     name: str,
     value: bool | float | str,
     reason: str,
 ) -> None:
-    """A refused change says why and leaves the value."""
+    """A rejection gives the reason and keeps the value."""
     node = ros_graph.add(kind, parameters=RATE)
     before = node.get_parameter(name).value
     answer = node.set_parameters([Parameter(name, value=value)])[0]

@@ -1,4 +1,4 @@
-"""The player publishes every message of a bag, byte for byte, in order, at the right time."""
+"""Playback of bags: every message, byte for byte, in order, at its time."""
 
 from collections.abc import Callable
 from functools import cache
@@ -36,27 +36,27 @@ MILLISECOND = 1_000_000
 #: Start of the recordings [ns].
 EPOCH = 1_700_000_000_123_456_789
 
-#: Everything that a topic can hold while the test is busy.
+#: Queue depth for a busy test.
 EVERYTHING = QoSProfile(depth=10_000, reliability=ReliabilityPolicy.RELIABLE)
 WEAK = QoSProfile(depth=10_000, reliability=ReliabilityPolicy.BEST_EFFORT)
 
-#: Nothing is lost while readers look for the player: the test lets it go.
+#: Start paused, so that no message is lost during discovery.
 HELD = {'delay': 0.0, 'paused': True}
 
 
 def text(data: str) -> bytes:
-    # Three letters, so that the middleware adds no padding at the end.
+    # Three letters, so that the middleware adds no padding.
     return serialize_message(String(data=data))
 
 
 @cache
 def joints(position: float) -> bytes:
-    # Only once: its padding has arbitrary bytes.
+    # Published once: its padding has arbitrary bytes.
     return serialize_message(JointState(name=['insertion'], position=[position]))
 
 
 def small_bag(path: Path, count: int = 20, step: int = 10, extra: str = '') -> Path:
-    """Write two topics, one message of each every ``step`` ms, and a latched topic before."""
+    """Write two topics with a message each every ``step`` ms, after a latched topic."""
     with BagWriter(path) as bag:
         bag.add_topic('/text', 'std_msgs/msg/String', [OfferedQos(depth=1)])
         offered = OfferedQos('best_effort', 'volatile', 'unknown', 0)
@@ -119,8 +119,7 @@ def call(
 ) -> tuple[bool, str]:
     client = ros_graph.node('caller').create_client(kind, f'player/{service}')
     ros_graph.spin_until(client.service_is_ready, service)
-    # An answer is lost if the server does not know the client yet: a harmless request
-    # first, until it is answered.
+    # A response to an undiscovered client is lost: repeat a harmless request until a response.
     probe = Trigger.Request() if kind is Trigger else SetBool.Request(data=True)
     if kind is SetBool:
         answers = []
@@ -136,7 +135,7 @@ def call(
 
 
 def go(ros_graph: RosGraph) -> None:
-    """Let a player that began paused play."""
+    """Start a player that is paused."""
     assert call(ros_graph, SetBool, 'pause', SetBool.Request(data=False))[0]
 
 
@@ -148,8 +147,10 @@ BOTH = {'text': (String, EVERYTHING), 'joints': (JointState, WEAK)}
 
 
 @pytest.mark.parametrize('rate', [0.0, 1.0, 20.0])
-def test_plays_every_byte_in_order(ros_graph: RosGraph, tmp_path: Path, rate: float) -> None:
-    """The messages arrive as they were written, in order within and across topics, at any rate."""
+def test_playback_is_identical_and_ordered(
+    ros_graph: RosGraph, tmp_path: Path, rate: float
+) -> None:
+    """In order within and across topics, at any rate."""
     bag = small_bag(tmp_path / 'bag')
     player = play(ros_graph, bag, rate=rate)
     listener = Listener(ros_graph, **BOTH)
@@ -161,10 +162,10 @@ def test_plays_every_byte_in_order(ros_graph: RosGraph, tmp_path: Path, rate: fl
     assert player.diagnose()[2]['messages'] == 42
 
 
-def test_a_recording_of_the_playback_equals_the_recording(
+def test_recording_of_the_playback_equals_the_original(
     ros_graph: RosGraph, tmp_path: Path
 ) -> None:
-    """Recorder, player, recorder: the second bag holds the bytes of the first."""
+    """Recorder, player, recorder: the second bag has the bytes of the first."""
     bag = small_bag(tmp_path / 'bag')
     play(ros_graph, bag, rate=2.0)
     topics = ['/text', '/joints', '/latched']
@@ -183,16 +184,14 @@ def test_a_recording_of_the_playback_equals_the_recording(
     for topic in ('/text', '/joints'):
         assert bytes_of(again, topic) == bytes_of(bag, topic)
     assert bytes_of(again, '/latched')[-1] == text('new')
-    # The player is never early: the second bag lasts as long as expected, except for the delivery
-    # of its first message.
+    # The player is never early: the duration of the second bag differs only by the delivery of its
+    # first message.
     times = [received for received, _ in read_topic(again, '/text')]
     assert times[-1] - times[0] > 0.5 * 190 * MILLISECOND / 2.0
 
 
 @pytest.mark.parametrize('rate', [0.5, 10.0])
-def test_plays_at_the_speed_of_the_recording(
-    ros_graph: RosGraph, tmp_path: Path, rate: float
-) -> None:
+def test_playback_timing(ros_graph: RosGraph, tmp_path: Path, rate: float) -> None:
     """No message is early; the player reports delays."""
     step = 20 if rate < 1.0 else 200
     bag = small_bag(tmp_path / 'bag', step=step)
@@ -212,8 +211,7 @@ def test_plays_at_the_speed_of_the_recording(
     )
 
 
-def test_a_latched_message_reaches_late_readers(ros_graph: RosGraph, tmp_path: Path) -> None:
-    """Late readers get the last latched message, as from the plant itself."""
+def test_latched_messages_reach_late_subscribers(ros_graph: RosGraph, tmp_path: Path) -> None:
     bag = small_bag(tmp_path / 'bag')
     player = ros_graph.add(PlayerNode, parameters={'path': str(bag), 'rate': 0.0, 'delay': 0.0})
     ros_graph.spin_until(lambda: player.diagnose()[2]['messages'] == 42, 'the end')
@@ -224,8 +222,8 @@ def test_a_latched_message_reaches_late_readers(ros_graph: RosGraph, tmp_path: P
     assert player.diagnose()[1] == f'at the end of {bag}'
 
 
-def test_offers_the_qos_of_the_recording(ros_graph: RosGraph, tmp_path: Path) -> None:
-    """Topics are offered as best effort, reliable or latched, as in the recording."""
+def test_qos_equals_the_recorded_qos(ros_graph: RosGraph, tmp_path: Path) -> None:
+    """Best effort, reliable or latched."""
     play(ros_graph, small_bag(tmp_path / 'bag'))
     probe = ros_graph.node('probe')
 
@@ -242,8 +240,8 @@ def test_offers_the_qos_of_the_recording(ros_graph: RosGraph, tmp_path: Path) ->
     assert latched.durability == DurabilityPolicy.TRANSIENT_LOCAL
 
 
-def test_plays_from_start_to_end(ros_graph: RosGraph, tmp_path: Path) -> None:
-    """Only messages between start and end are played; latched ones from before come first."""
+def test_playback_of_an_interval(ros_graph: RosGraph, tmp_path: Path) -> None:
+    """Messages between start and end, after the earlier latched messages."""
     play(ros_graph, small_bag(tmp_path / 'bag'), rate=0.0, start=0.05, end=0.1)
     listener = Listener(ros_graph, latched=(String, EVERYTHING), text=(String, EVERYTHING))
     listener.wait()
@@ -254,8 +252,7 @@ def test_plays_from_start_to_end(ros_graph: RosGraph, tmp_path: Path) -> None:
     assert listener.of('latched') == [text('new')]
 
 
-def test_loops(ros_graph: RosGraph, tmp_path: Path) -> None:
-    """With ``loop`` all messages are repeated, in order."""
+def test_loop_repeats_all_messages(ros_graph: RosGraph, tmp_path: Path) -> None:
     player = play(ros_graph, small_bag(tmp_path / 'bag', step=1), rate=10.0, loop=True)
     listener = Listener(ros_graph, text=(String, EVERYTHING))
     listener.wait()
@@ -265,8 +262,8 @@ def test_loops(ros_graph: RosGraph, tmp_path: Path) -> None:
     assert int(str(player.diagnose()[2]['loops'])) >= 3
 
 
-def test_pauses_steps_and_continues(ros_graph: RosGraph, tmp_path: Path) -> None:
-    """A step plays one message and names it; no other message comes while paused."""
+def test_pause_step_and_resume(ros_graph: RosGraph, tmp_path: Path) -> None:
+    """A step plays one message and returns its topic; no other message is played in a pause."""
     bag = small_bag(tmp_path / 'bag')
     play(ros_graph, bag, rate=0.0, publish_clock=True, topics=['/text', '/joints'])
     topics = {**BOTH, 'clock': (Clock, WEAK)}
@@ -282,7 +279,7 @@ def test_pauses_steps_and_continues(ros_graph: RosGraph, tmp_path: Path) -> None
     ros_graph.spin_until(lambda: last in listener.of('clock'), 'three messages and their times')
     assert listener.of('text') == [text('000')]
     assert listener.of('joints') == [joints(0.0), joints(1.0 / 3.0)]
-    # While it pauses a time may be repeated.
+    # During a pause the clock may be repeated.
     assert list(dict.fromkeys(listener.of('clock'))) == [
         serialize_message(Clock(clock=at)) for at in map(_time, (3, 4, 3 + 10 * MILLISECOND))
     ]
@@ -309,14 +306,14 @@ def _time(since: int) -> Time:
     return clock.clock
 
 
-def test_publishes_the_recorded_time_as_clock(ros_graph: RosGraph, tmp_path: Path) -> None:
+def test_recorded_time_is_published_as_clock(ros_graph: RosGraph, tmp_path: Path) -> None:
     """With ``publish_clock`` a node with `use_sim_time` has the time of the recording."""
     bag = small_bag(tmp_path / 'bag', extra='/clock')
     play(ros_graph, bag, rate=0.1, publish_clock=True)
     node = ros_graph.add(RosNode, 'follower', parameters={'use_sim_time': True})
     listener = Listener(ros_graph, clock=(Clock, WEAK))
     listener.wait()
-    # The player pauses, and tells the time all the same.
+    # The paused player still publishes the time.
     ros_graph.spin_until(lambda: node.get_clock().now().nanoseconds >= EPOCH, 'the clock')
     go(ros_graph)
     last = EPOCH + 190 * MILLISECOND + 4
@@ -324,17 +321,17 @@ def test_publishes_the_recorded_time_as_clock(ros_graph: RosGraph, tmp_path: Pat
         lambda: node.get_clock().now().nanoseconds >= last - 2 * MILLISECOND, 'the end'
     )
     assert node.get_clock().now().nanoseconds <= last
-    # The clock in the bag is zero and not played; the published one never goes back.
+    # The zero clock of the bag is not played; the published clock never goes back.
     times = [deserialize_message(data, Clock).clock for data in listener.of('clock')]
     stamps = [at.sec * 10**9 + at.nanosec for at in times]
     assert stamps[0] >= EPOCH
     assert all(late >= early for early, late in pairwise(stamps))
-    # Many more than the 20 times of messages: two seconds are 2000 ticks.
+    # Many more than the 20 message times: two seconds are 2000 ticks.
     assert len(stamps) > 100
 
 
-def test_the_rate_can_change_while_playing(ros_graph: RosGraph, tmp_path: Path) -> None:
-    """``rate`` can change at run time; an invalid rate is rejected."""
+def test_rate_may_change_during_playback(ros_graph: RosGraph, tmp_path: Path) -> None:
+    """An invalid rate is rejected."""
     player = play(ros_graph, small_bag(tmp_path / 'bag', step=60_000), rate=1.0)
     listener = Listener(ros_graph, text=(String, EVERYTHING))
     listener.wait()
@@ -345,14 +342,12 @@ def test_the_rate_can_change_while_playing(ros_graph: RosGraph, tmp_path: Path) 
     (fixed,) = player.set_parameters([Parameter('loop', value=True)])
     assert 'cannot change while configured' in fixed.reason
     ros_graph.spin_until(lambda: listener.heard, 'the first message')
-    # An hour of recording per second: 19 minutes last a third of a second.
+    # One hour of recording per second: 19 minutes take a third of a second.
     assert player.set_parameters([Parameter('rate', value=3600.0)])[0].successful
     ros_graph.spin_until(lambda: len(listener.heard) == 20, 'the rest')
 
 
-def test_a_recording_that_is_cut_off_is_played_as_far_as_it_goes(
-    ros_graph: RosGraph, tmp_path: Path
-) -> None:
+def test_truncated_recording_is_played_to_its_end(ros_graph: RosGraph, tmp_path: Path) -> None:
     """The readable part is played; the losses are reported at the end."""
     bag = small_bag(tmp_path / 'bag', count=600, step=1)
     file = bag / 'bag_0.mcap'
@@ -373,12 +368,12 @@ def test_a_recording_that_is_cut_off_is_played_as_far_as_it_goes(
     assert 'the recording was not closed' in said
 
 
-def test_plays_sqlite_and_bare_files(ros_graph: RosGraph, tmp_path: Path) -> None:
-    """Recordings of other tools are played, with the QoS that they stored."""
+def test_sqlite_and_single_files_are_played(ros_graph: RosGraph, tmp_path: Path) -> None:
+    """With their stored QoS."""
     store = get_typestore(Stores.ROS2_JAZZY)
     with Writer(tmp_path / 'bag', version=8, storage_plugin=StoragePlugin.SQLITE3) as writer:
         connection = writer.add_connection('/text', 'std_msgs/msg/String', typestore=store)
-        # The later message first: messages are played in order of time.
+        # The later message first: playback is ordered by time.
         for k in (1, 0, 2):
             writer.write(connection, EPOCH + k * MILLISECOND, text(f'{k:03d}'))
     play(ros_graph, next((tmp_path / 'bag').glob('*.db3')), rate=0.0)
@@ -389,7 +384,7 @@ def test_plays_sqlite_and_bare_files(ros_graph: RosGraph, tmp_path: Path) -> Non
     assert listener.of('text') == [text('000'), text('001'), text('002')]
 
 
-def test_a_type_that_is_not_installed_is_left_out_and_reported(
+def test_topic_of_a_missing_type_is_skipped_and_reported(
     ros_graph: RosGraph, tmp_path: Path
 ) -> None:
     """The other topics are played."""
@@ -404,7 +399,7 @@ def test_a_type_that_is_not_installed_is_left_out_and_reported(
 
 
 def foreign_bag(file: Path) -> None:
-    """Write a message of an installed type, and one of a type that is not installed."""
+    """Write a message of an installed type, and a message of a missing type."""
     with file.open('wb') as stream:
         writer = McapWriter(stream)
         writer.start('ros2')
@@ -415,8 +410,8 @@ def foreign_bag(file: Path) -> None:
         writer.finish()
 
 
-def test_another_publisher_of_a_topic_is_reported(ros_graph: RosGraph, tmp_path: Path) -> None:
-    """Readers get both: /diagnostics warns, and the topic is played."""
+def test_duplicate_publisher_is_reported(ros_graph: RosGraph, tmp_path: Path) -> None:
+    """The topic is still played; /diagnostics warns of duplicate messages."""
     probe = ros_graph.node('probe')
     probe.create_publisher(JointState, 'joints', SENSOR)
     player = play(ros_graph, small_bag(tmp_path / 'bag'))
@@ -442,14 +437,14 @@ def test_another_publisher_of_a_topic_is_reported(ros_graph: RosGraph, tmp_path:
         ({'publish_clock': True, 'use_sim_time': True}, 'cannot both be true'),
     ],
 )
-def test_rejects_invalid_parameters_at_start(
+def test_invalid_parameters_are_rejected_at_start(
     ros_graph: RosGraph,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     parameters: dict[str, Any],
     complaint: str,
 ) -> None:
-    """The reason is one line, and nothing is played."""
+    """With a one-line reason, without playback."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / 'empty').mkdir()
     small_bag(Path('bag'))
@@ -459,10 +454,9 @@ def test_rejects_invalid_parameters_at_start(
     assert '\n' not in node.failure
 
 
-def test_a_recording_of_unknown_types_only_is_rejected(
+def test_recording_without_installed_types_is_rejected(
     ros_graph: RosGraph, tmp_path: Path
 ) -> None:
-    """There is nothing to play, and the reason is given."""
     foreign_bag(tmp_path / 'bag.mcap')
     parameters = {'path': str(tmp_path / 'bag.mcap'), 'topics': ['/foreign']}
     node = ros_graph.add(PlayerNode, start=False, parameters=parameters)
@@ -471,7 +465,7 @@ def test_a_recording_of_unknown_types_only_is_rejected(
 
 
 def process(ros_graph: RosGraph, bag: Path, *settings: str) -> subprocess.Popen[str]:
-    """Start the player as ``ros2 run`` does."""
+    """Start the player like ``ros2 run``."""
     words = [f'path:={bag}', *settings]
     options = [word for setting in words for word in ('-p', setting)]
     return subprocess.Popen(
@@ -482,8 +476,8 @@ def process(ros_graph: RosGraph, bag: Path, *settings: str) -> subprocess.Popen[
     )
 
 
-def test_the_process_ends_when_all_is_delivered(ros_graph: RosGraph, tmp_path: Path) -> None:
-    """As `ros2 bag play`: exit status 0 at the end, and the reader has every message."""
+def test_process_ends_after_delivery(ros_graph: RosGraph, tmp_path: Path) -> None:
+    """Like `ros2 bag play`: exit status 0, and the subscriber has every message."""
     bag = small_bag(tmp_path / 'bag')
     listener = Listener(ros_graph, text=(String, EVERYTHING))
     with process(ros_graph, bag, 'rate:=5.0', 'paused:=true') as player:
@@ -497,8 +491,8 @@ def test_the_process_ends_when_all_is_delivered(ros_graph: RosGraph, tmp_path: P
     assert listener.of('text') == bytes_of(bag, '/text')
 
 
-def test_the_process_stays_without_exit_at_end(ros_graph: RosGraph, tmp_path: Path) -> None:
-    """Without ``exit_at_end`` latched messages remain available; SIGINT ends it with status 0."""
+def test_process_continues_without_exit_at_end(ros_graph: RosGraph, tmp_path: Path) -> None:
+    """Latched messages stay available; SIGINT ends the process with status 0."""
     bag = small_bag(tmp_path / 'bag')
     probe = ros_graph.node('probe')
     with process(ros_graph, bag, 'rate:=0.0', 'delay:=0.0', 'exit_at_end:=false') as player:
@@ -511,7 +505,7 @@ def test_the_process_stays_without_exit_at_end(ros_graph: RosGraph, tmp_path: Pa
     assert player.returncode == 0, said
 
 
-def test_the_process_reports_why_it_does_not_start(ros_graph: RosGraph, tmp_path: Path) -> None:
+def test_failed_start_of_the_process_is_reported(ros_graph: RosGraph, tmp_path: Path) -> None:
     """Exit status 2 and one line."""
     with process(ros_graph, tmp_path / 'none') as player:
         _, said = player.communicate(timeout=60.0)

@@ -1,4 +1,4 @@
-"""The bag holds the messages byte for byte, however the recorder ends."""
+"""Recording of messages byte for byte, with any end of the recorder."""
 
 from collections.abc import Callable, Iterator
 import errno
@@ -33,7 +33,7 @@ import yaml
 
 @pytest.fixture
 def record(ros_graph: RosGraph) -> Iterator[Callable[..., Any]]:
-    """Return a function that makes an active recorder; its bag is closed in the end."""
+    """Return a factory of active recorders, whose bags are closed at the end."""
     nodes = []
 
     def make(path: Path, **parameters: list[str]) -> RecorderNode:
@@ -53,10 +53,10 @@ def call(ros_graph: RosGraph, service: str) -> tuple[bool, str]:
     return answer.result().success, answer.result().message
 
 
-def test_records_each_topic_with_its_offered_qos(
+def test_topics_are_recorded_with_their_offered_qos(
     ros_graph: RosGraph, record: Callable[..., Any], tmp_path: Path
 ) -> None:
-    """Best effort, reliable and latched topics are all complete, to the byte."""
+    """Best effort, reliable and latched topics are complete, byte for byte."""
     probe = ros_graph.node('probe')
     publishers = {
         topic: probe.create_publisher(kind, topic, qos)
@@ -103,10 +103,10 @@ def test_records_each_topic_with_its_offered_qos(
     assert offered['/latched']['durability'] == 'transient_local'
 
 
-def test_measurements_are_recorded_best_effort(
+def test_measurements_are_subscribed_best_effort(
     ros_graph: RosGraph, record: Callable[..., Any], tmp_path: Path
 ) -> None:
-    """As our nodes hear them, whatever is offered; the bag has what was offered."""
+    """For any offered QoS; the bag contains the offered QoS."""
     probe = ros_graph.node('probe')
     topics = ('/lab/joint_states', '/lab/other')
     for topic in topics:
@@ -130,13 +130,13 @@ def test_measurements_are_recorded_best_effort(
     assert offered == {'reliable'}
 
 
-def test_stores_messages_byte_for_byte(
+def test_messages_are_stored_byte_for_byte(
     ros_graph: RosGraph,
     record: Callable[..., Any],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Nothing is decoded on the way to the bag."""
+    """Without decoding."""
     written = []
     monkeypatch.setattr(BagWriter, 'write', lambda _bag, *what: written.append(what))
     publisher = ros_graph.node('probe').create_publisher(String, 'text', COMMAND)
@@ -147,10 +147,10 @@ def test_stores_messages_byte_for_byte(
     assert written[0][:2] == ('/text', serialize_message(String(data='as it is')))
 
 
-def test_a_publisher_with_weaker_qos_is_recorded_too(
+def test_publisher_with_weaker_qos_is_recorded(
     ros_graph: RosGraph, record: Callable[..., Any], tmp_path: Path
 ) -> None:
-    """A best-effort publisher that joins a reliable topic makes the recorder request less."""
+    """A best-effort publisher on a reliable topic makes the recorder request less."""
     probe = ros_graph.node('probe')
     reliable = probe.create_publisher(String, 'text', COMMAND)
     node = record(tmp_path / 'bag', topics=['text'])
@@ -159,7 +159,7 @@ def test_a_publisher_with_weaker_qos_is_recorded_too(
     ros_graph.spin_until(weak.get_subscription_count, 'the new subscription')
 
     def both_recorded() -> bool:
-        # Repeatedly: each publisher finds the new subscription at another time.
+        # Repeated: each publisher discovers the new subscription at another time.
         weak.publish(String(data='weak'))
         reliable.publish(String(data='strong'))
         if not node.diagnose()[2]['messages']:
@@ -171,10 +171,10 @@ def test_a_publisher_with_weaker_qos_is_recorded_too(
     node.stop()
 
 
-def test_a_topic_of_an_unknown_type_is_left_out_and_named_once(
+def test_topic_of_an_unknown_type_is_reported_once(
     ros_graph: RosGraph, record: Callable[..., Any], tmp_path: Path
 ) -> None:
-    """A topic that cannot be recorded is reported once; the others are recorded."""
+    """The other topics are recorded."""
     probe = ros_graph.node('probe')
     logs = ros_graph.listen(probe, Log, '/rosout', 100)
     goals = probe.create_publisher(Goals, 'goals', COMMAND)
@@ -183,17 +183,17 @@ def test_a_topic_of_an_unknown_type_is_left_out_and_named_once(
     ros_graph.spin_until(text.get_subscription_count, 'subscription')
     reports = ros_graph.listen(probe, DiagnosticArray, '/diagnostics', 10)
     # The recorder checks the graph ten times a second.
-    ros_graph.spin_until(lambda: len(reports) >= 2, 'a few more looks')
+    ros_graph.spin_until(lambda: len(reports) >= 2, 'a few more checks')
     assert set(node.diagnose()[2]) == {'messages', 'bytes', '/text'}
     assert goals.get_subscription_count() == 0
     [said] = [log.msg for log in logs if 'left out' in log.msg]
     assert said.startswith('/goals left out: no definition of nav_msgs/msg/Goals')
 
 
-def test_a_second_recording_goes_to_a_new_folder(
+def test_services_stop_and_start_recordings(
     ros_graph: RosGraph, record: Callable[..., Any], tmp_path: Path
 ) -> None:
-    """Services end a recording, complete, and begin the next; again they change nothing."""
+    """Each recording has a new, complete folder; repeated calls have no effect."""
     record(tmp_path / 'bag')
     assert call(ros_graph, 'recorder/start') == (True, f'recording to {tmp_path / "bag"}')
     success, message = call(ros_graph, 'recorder/stop')
@@ -218,14 +218,13 @@ def test_a_second_recording_goes_to_a_new_folder(
         ),
     ],
 )
-def test_rejects_invalid_parameters_at_start(
+def test_invalid_parameters_are_rejected_at_start(
     ros_graph: RosGraph,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     parameters: dict[str, str],
     complaint: str,
 ) -> None:
-    """A recorder with invalid parameters does not become active."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / 'here').mkdir()
     node = ros_graph.add(RecorderNode, start=False, parameters=parameters)
@@ -233,13 +232,13 @@ def test_rejects_invalid_parameters_at_start(
     assert complaint in node.failure
 
 
-def test_a_disk_error_ends_the_recording_and_is_reported(
+def test_disk_error_ends_the_recording_and_is_reported(
     ros_graph: RosGraph,
     record: Callable[..., Any],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """A full disk stops the recording, not the node, and /diagnostics reports it."""
+    """The node continues, and /diagnostics reports the error."""
     probe = ros_graph.node('probe')
     publisher = probe.create_publisher(String, 'text', COMMAND)
     reports = ros_graph.listen(probe, DiagnosticArray, '/diagnostics', 10)
@@ -260,12 +259,12 @@ def test_a_disk_error_ends_the_recording_and_is_reported(
     assert not (tmp_path / 'bag' / 'metadata.yaml').exists()
 
 
-def test_a_full_disk_is_an_exit_status(ros_graph: RosGraph, tmp_path: Path) -> None:
-    """A script sees that the recording is not whole: status 1 after Ctrl-C, with a line why."""
+def test_full_disk_sets_the_exit_status(ros_graph: RosGraph, tmp_path: Path) -> None:
+    """Status 1 after Ctrl-C, with a one-line reason."""
     script = ROOT / 'scripts/recorder'
     node = subprocess.Popen(
         [
-            # No file may grow beyond 64 kB.
+            # Limit files to 64 kB.
             *('bash', '-c', f'ulimit -f 64; exec {sys.executable} {script} --ros-args "$@"', ''),
             *('-p', f'path:={tmp_path / "bag"}', '-p', 'compression:=none'),
         ],
@@ -285,10 +284,10 @@ def test_a_full_disk_is_an_exit_status(ros_graph: RosGraph, tmp_path: Path) -> N
     assert node.returncode == 1
 
 
-def test_later_publishers_and_all_of_their_qos_are_recorded(
+def test_qos_of_later_publishers_is_recorded(
     ros_graph: RosGraph, record: Callable[..., Any], tmp_path: Path
 ) -> None:
-    """Deadline, lifespan and lease too; the player offers what all publishers agree on."""
+    """Deadline, lifespan and lease too; the player offers a QoS common to all publishers."""
     probe = ros_graph.node('probe')
     timed = QoSProfile(
         depth=5,
@@ -322,13 +321,13 @@ def test_later_publishers_and_all_of_their_qos_are_recorded(
     assert {m.data for _, m in read_topic(tmp_path / 'bag', '/text')} == {'first', 'later'}
 
 
-def test_a_type_that_only_its_package_knows_is_recorded(
+def test_custom_message_type_is_recorded(
     ros_graph: RosGraph,
     record: Callable[..., Any],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """The definition, and those within it, come from .msg files of the sourced workspace."""
+    """Its definition and nested definitions are read from the sourced workspace."""
     for name, text in {
         'nav_msgs/msg/Goals': 'std_msgs/Header header\ngeometry_msgs/PoseStamped[] goals\n',
         'own_msgs/msg/Plan': 'nav_msgs/Goals[2] parts\nOther[<=3] others\n',
@@ -344,7 +343,7 @@ def test_a_type_that_only_its_package_knows_is_recorded(
     publisher.publish(Goals(goals=[PoseStamped(pose=Pose(position=Point(x=0.5)))]))
     ros_graph.spin_until(lambda: node.diagnose()[2].get('/goals') == 1, 'the message')
     node.stop()
-    # By the definition in the bag.
+    # Decoded with the definition in the bag.
     [(_, message)] = read_topic(tmp_path / 'bag', '/goals')
     assert message.goals[0].pose.position.x == 0.5
     definition, _ = definition_of('own_msgs/msg/Plan')
@@ -354,7 +353,7 @@ def test_a_type_that_only_its_package_knows_is_recorded(
 
 
 def publish(ros_graph: RosGraph, node: Node, count: int) -> None:
-    """Publish numbers on /text at 100 Hz, once the recorder listens."""
+    """Publish numbers on /text at 100 Hz, once the recorder has subscribed."""
     publisher = node.create_publisher(String, 'text', COMMAND)
     ros_graph.spin_until(publisher.get_subscription_count, 'the recorder')
     for i in range(count):
@@ -376,24 +375,24 @@ def test_recorded_messages_survive_kill_9(ros_graph: RosGraph, tmp_path: Path) -
 
 
 def test_ctrl_c_completes_the_bag(ros_graph: RosGraph, tmp_path: Path) -> None:
-    """SIGINT ends the recorder with every message and the metadata in place."""
+    """After SIGINT the bag has every message and its metadata."""
     process = ros_graph.start('recorder', {'path': str(tmp_path / 'bag')})
     probe = ros_graph.node('probe')
     reports = ros_graph.listen(probe, DiagnosticArray, '/diagnostics', 10)
     publish(ros_graph, probe, 50)
     counted = KeyValue(key='/text', value='50')
     ros_graph.spin_until(
-        lambda: any(counted in status.values for r in reports for status in r.status), 'all of it'
+        lambda: any(counted in status.values for r in reports for status in r.status), 'messages'
     )
     process.interrupt()
     assert (tmp_path / 'bag' / 'metadata.yaml').exists()
     assert message_counts(tmp_path / 'bag')['/text'] == 50
 
 
-def test_what_is_lost_is_counted_and_said(
+def test_lost_messages_are_counted_and_reported(
     ros_graph: RosGraph, record: Callable[..., Any], tmp_path: Path
 ) -> None:
-    """More than may wait while it is busy: by topic, in diagnostics, summary, and bag."""
+    """By topic, in diagnostics, summary and bag, after an overflow of the queue."""
     probe = ros_graph.node('probe')
     flood = probe.create_publisher(JointState, 'flood', SENSOR)
     calm = probe.create_publisher(String, 'calm', COMMAND)
@@ -412,7 +411,7 @@ def test_what_is_lost_is_counted_and_said(
     assert node.diagnose()[0] == DiagnosticStatus.OK
     sent = 20_000
     for _ in range(sent):
-        # Nobody takes them: the recorder is in this thread.
+        # The queue is full: the recorder is in this thread and is not spun.
         flood.publish(JointState())
     ros_graph.spin_until(lambda: node.diagnose()[0] == DiagnosticStatus.WARN, 'the warning')
     flood.publish(JointState())

@@ -1,4 +1,4 @@
-"""Requests over DDS: repeated when a message is lost, and answered once."""
+"""Requests over DDS: repeated after a lost message, and executed once."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from support.ros_graph import RosGraph
 
 
 def serve(node: Node, name: str) -> Node:
-    """Offer a service that answers by a name."""
+    """Offer a service that responds with a name."""
 
     def answer(_request: Any, response: Any) -> Any:
         response.success, response.message = True, name
@@ -25,11 +25,11 @@ def serve(node: Node, name: str) -> Node:
     return node
 
 
-def test_a_call_that_is_lost_is_repeated(ros_graph: RosGraph) -> None:
-    """The node that got the first one has ended; the next one answers."""
+def test_lost_call_is_repeated(ros_graph: RosGraph) -> None:
+    """The node that received the first call has ended; the next node responds."""
     caller = ros_graph.node('caller')
     calls, client = Calls(caller), caller.create_client(Trigger, 'server/act')
-    # It is not spun: so it takes no request.
+    # Without a spinning executor it receives no request.
     first = serve(Node('server', context=ros_graph.context), 'first')
     ros_graph.spin_until(client.service_is_ready, 'the service')
     answer = calls.call(client, Trigger.Request())
@@ -39,7 +39,7 @@ def test_a_call_that_is_lost_is_repeated(ros_graph: RosGraph) -> None:
     assert answer.result().message == 'second'
 
 
-def test_a_call_without_an_answer_ends_with_one_line(ros_graph: RosGraph) -> None:
+def test_call_without_response_times_out(ros_graph: RosGraph) -> None:
     operator = Operator(ros_graph.node('operator'))
     deaf = Node('controller', context=ros_graph.context)
     deaf.create_service(Trigger, 'controller/retract', lambda _request, response: response)
@@ -54,9 +54,9 @@ def test_a_call_without_an_answer_ends_with_one_line(ros_graph: RosGraph) -> Non
         deaf.destroy_node()
 
 
-def test_a_target_that_is_lost_is_sent_again(ros_graph: RosGraph) -> None:
+def test_lost_target_is_repeated(ros_graph: RosGraph) -> None:
     """The controller is started after the first message."""
-    # It compiles for seconds in the first of its kind.
+    # The first controller compiles for seconds.
     ros_graph.add(ControllerNode, namespace='another')
     operator = Operator(ros_graph.node('operator'))
     pending = operator.target(0.0, 0.05, 0.0)
@@ -74,7 +74,7 @@ def test_a_target_that_is_lost_is_sent_again(ros_graph: RosGraph) -> None:
         (0.05, True, 'controller: no answer to target within 6 s'),
     ],
 )
-def test_a_target_that_is_refused_is_never_under_way(
+def test_rejected_target_is_never_reported_as_active(
     ros_graph: RosGraph, depth: float, steered: bool, line: str
 ) -> None:
     operator = Operator(ros_graph.node('operator'))

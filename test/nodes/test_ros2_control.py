@@ -1,9 +1,9 @@
 """
-The plant as hardware: driven over DDS by what sends the messages of ros2_control's interface.
+The plant as ros2_control hardware, over DDS.
 
-ros2_control itself is in no wheel. `Driver` publishes what the source of
-joint_state_topic_hardware_interface 1.1.0 publishes: at a rate of its own, one array for each kind
-of interface, NaN for what nobody has set.
+ros2_control is not available as a wheel. `Driver` publishes the messages of
+joint_state_topic_hardware_interface 1.1.0: at its own rate, one array for each kind of interface,
+NaN for unset commands.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ STEERED: dict[str, Any] = {'steered': True, 'model.preset': 'bending_35mm', 'dep
 
 
 class Driver:
-    """Sends what controllers set, at its own rate, and knows the latest state of the joints."""
+    """Publishes controller commands at its own rate, and keeps the latest joint states."""
 
     def __init__(
         self,
@@ -61,13 +61,13 @@ class Driver:
         self.graph, self.node = graph, graph.node('needle_hardware')
         self.logs = folder / 'logs'
         self.interfaces = interfaces
-        #: What controllers have set, by joint and interface.
+        #: Commands of controllers by joint and interface.
         self.set: dict[tuple[str, str], float] = {}
         self.active, self.update = True, lambda: None
         self.state: dict[tuple[str, str], float] = {}
         self.health: dict[str, str] = {}
         self.complaint = ''
-        #: Every word of the plant on /diagnostics.
+        #: All diagnostics messages of the plant.
         self.words: set[str] = set()
         self.node.create_subscription(JointState, 'joint_states', self._on_state, HEARD)
         self.node.create_subscription(DiagnosticArray, '/diagnostics', self._on_health, 10)
@@ -89,7 +89,7 @@ class Driver:
                 self.health = {item.key: item.value for item in status.values}
 
     def write(self) -> None:
-        """Send a message as `JointStateTopicSystem::write` does with a threshold of -1."""
+        """Send a message like `JointStateTopicSystem::write` with a threshold of -1."""
         self.update()
         if not self.active:
             return
@@ -110,20 +110,20 @@ class Driver:
 
     @property
     def refused(self) -> int:
-        """How many commands the plant says that it has refused."""
+        """Number of rejected commands in the diagnostics of the plant."""
         return int(self.health.get('commands refused', 0))
 
     def at(self, joint: str = 'insertion') -> float:
         return self.state[joint, 'position']
 
     def further(self, seconds: float) -> None:
-        """Let time of this machine pass, with everything that happens."""
+        """Spin for a duration in real time."""
         end = self.node.get_clock().now().nanoseconds + seconds * 1e9
-        self.until(lambda: self.node.get_clock().now().nanoseconds > end, 'that time')
+        self.until(lambda: self.node.get_clock().now().nanoseconds > end, 'the duration')
 
 
 class Trajectory:
-    """Goes to a goal at a speed and sets an effort as insertion_effort does."""
+    """Moves to a goal at constant speed, with efforts like insertion_effort."""
 
     def __init__(self, driver: Driver, goal: float, speed: float) -> None:
         own = CONTROLLERS['/**/insertion_effort']['ros__parameters']['gains']['insertion']
@@ -153,7 +153,7 @@ PUSHED: dict[str, tuple[str, ...]] = {'insertion': ('effort',), 'rotation': ('ef
 CARRIED: dict[str, tuple[str, ...]] = {'insertion': ('position',)}
 
 
-# The launch file, read: what it starts is not in the wheels.
+# Launch file as source: its nodes are not available as wheels.
 
 
 def table(name: str) -> dict[str, ast.expr]:
@@ -169,8 +169,8 @@ def table(name: str) -> dict[str, ast.expr]:
     }
 
 
-def test_the_launch_file_asks_for_what_there_is(ros_graph: RosGraph) -> None:
-    """Each argument has a use; parameters, arguments of xacro and files exist."""
+def test_launch_file_refers_to_existing_items(ros_graph: RosGraph) -> None:
+    """Each argument is used; parameters, arguments of xacro and files exist."""
     asked = {
         ast.literal_eval(item.slice)
         for item in ast.walk(LAUNCH)
@@ -191,14 +191,14 @@ def test_the_launch_file_asks_for_what_there_is(ros_graph: RosGraph) -> None:
 
 
 @pytest.mark.parametrize('rate', [100.0, 200.0])
-def test_a_controller_of_efforts_brings_the_needle_to_its_goal(
+def test_effort_controller_reaches_its_goal(
     ros_graph: RosGraph, tmp_path: Path, rate: float
 ) -> None:
-    """With the gains that are shipped, slower than the plant samples; silence ends the force."""
+    """With the shipped gains, at a lower rate than the plant; a timeout ends the force."""
     driver = Driver(ros_graph, tmp_path, PUSHED, rate, mode='simulation', depth=0.02)
     start = driver.at()
     driver.further(0.3)
-    # What nobody has set is no force, and no fault.
+    # An unset command is zero force, without a fault.
     assert driver.at() == start
     driver.update = Trajectory(driver, 0.026, 0.01)
     driver.until(lambda: abs(driver.at() - 0.026) < 2e-4, 'the goal')
@@ -213,14 +213,14 @@ def test_a_controller_of_efforts_brings_the_needle_to_its_goal(
     assert driver.state['insertion', 'effort'] == 0.0
 
 
-def test_two_that_command_move_nothing(ros_graph: RosGraph, tmp_path: Path) -> None:
-    """Whichever topic the second one has; the first goes on when it is alone again."""
+def test_duplicate_commanders_move_nothing(ros_graph: RosGraph, tmp_path: Path) -> None:
+    """On either topic; the first continues when it is the only commander again."""
     driver = Driver(ros_graph, tmp_path, PUSHED, mode='simulation', depth=0.02)
     driver.set['insertion', 'effort'] = 1.0
     driver.until(lambda: driver.state['insertion', 'velocity'] > 1e-3, 'the push')
     for kind, topic in ((WrenchStamped, 'wrench_command'), (JointState, 'joint_commands')):
         rival = driver.node.create_publisher(kind, topic, COMMAND)
-        driver.until(lambda: driver.complaint == '2 nodes command', 'the word of it')
+        driver.until(lambda: driver.complaint == '2 nodes command', 'the report')
         driver.until(lambda: driver.state['insertion', 'velocity'] == 0.0, 'rest')
         before = driver.at()
         driver.further(0.3)
@@ -230,10 +230,10 @@ def test_two_that_command_move_nothing(ros_graph: RosGraph, tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize('value', [nan, float('inf'), 16.0])
-def test_an_effort_that_is_none_is_refused(
+def test_effort_that_becomes_nan_is_rejected(
     ros_graph: RosGraph, tmp_path: Path, value: float
 ) -> None:
-    """After it has been a number; it is said, and no force acts until it is one again."""
+    """It is reported, and the force is zero until the effort is a number again."""
     driver = Driver(ros_graph, tmp_path, PUSHED, mode='simulation', depth=0.02)
     driver.set['insertion', 'effort'] = 1.0
     driver.until(lambda: driver.state['insertion', 'velocity'] > 1e-3, 'the push')
@@ -245,8 +245,8 @@ def test_an_effort_that_is_none_is_refused(
     driver.until(lambda: driver.state['insertion', 'velocity'] > 1e-3, 'the push')
 
 
-def test_arrays_with_gaps_are_refused(ros_graph: RosGraph, tmp_path: Path) -> None:
-    """Which joint an entry is of cannot be told; the line says what to declare."""
+def test_arrays_of_wrong_length_are_rejected(ros_graph: RosGraph, tmp_path: Path) -> None:
+    """Entries cannot be assigned to joints; the message names the required interfaces."""
     driver = Driver(
         ros_graph, tmp_path, {'insertion': ('effort',), 'guide_x': ('position',)}, **STEERED
     )
@@ -261,8 +261,8 @@ def test_arrays_with_gaps_are_refused(ros_graph: RosGraph, tmp_path: Path) -> No
 # Mode robot, and the guide: positions.
 
 
-def test_a_controller_of_positions_is_followed(ros_graph: RosGraph, tmp_path: Path) -> None:
-    """One message behind at 100 Hz, to the end; then it rests, whoever goes on sending."""
+def test_position_controller_is_followed(ros_graph: RosGraph, tmp_path: Path) -> None:
+    """With a delay of one message at 100 Hz; the plant then rests despite further messages."""
     driver = Driver(ros_graph, tmp_path, CARRIED, mode='robot', depth=0.03)
     driver.further(0.3)
     assert driver.at() == pytest.approx(0.03, abs=1e-6)
@@ -283,10 +283,12 @@ def test_a_controller_of_positions_is_followed(ros_graph: RosGraph, tmp_path: Pa
     assert 'joint_commands: trajectory must stay in [0.001, 0.2] m, got [0.3] m' in said
 
 
-def test_two_that_say_where_to_go_are_not_followed(ros_graph: RosGraph, tmp_path: Path) -> None:
+def test_duplicate_position_commanders_are_not_followed(
+    ros_graph: RosGraph, tmp_path: Path
+) -> None:
     driver = Driver(ros_graph, tmp_path, CARRIED, mode='robot', depth=0.03)
     rival = driver.node.create_publisher(JointState, 'joint_commands', COMMAND)
-    driver.until(lambda: driver.complaint == '2 nodes command', 'the word of it')
+    driver.until(lambda: driver.complaint == '2 nodes command', 'the report')
     driver.set['insertion', 'position'] = 0.031
     driver.further(0.5)
     assert driver.at() == pytest.approx(0.03, abs=1e-6)
@@ -294,14 +296,14 @@ def test_two_that_say_where_to_go_are_not_followed(ros_graph: RosGraph, tmp_path
     driver.until(lambda: driver.at() > 0.0309, 'the goal')
 
 
-# What is recorded can be computed again.
+# Replay of recorded runs.
 
 
 @pytest.mark.parametrize('mode', ['robot', 'simulation', 'steered'])
-def test_a_run_that_was_driven_is_computed_anew(
+def test_commanded_run_is_reproduced_by_replay(
     ros_graph: RosGraph, tmp_path: Path, mode: str
 ) -> None:
-    """To the last bit: forces are in `ground_truth`, positions in the events of the plant."""
+    """Bit for bit: forces are in `ground_truth`, positions in the events of the plant."""
     probe = ros_graph.node('probe')
     recorder = ros_graph.start('recorder', {'path': str(tmp_path / 'bag')})
     kinds: dict[str, dict[str, tuple[str, ...]]] = {
@@ -349,17 +351,17 @@ def test_a_run_that_was_driven_is_computed_anew(
     assert set(run.topics) == {'/joint_states', '/base_wrench', '/tip_deflection', '/ground_truth'}
     assert run.recorded.rows['/joint_states'].values[-1, 0] > 0.0235
     driven = [note for note in run.notes if 'joint_commands' in note]
-    # Said once, of hundreds.
+    # Reported once for hundreds of messages.
     assert len(driven) == (mode != 'simulation')
     assert sum(map(len, run.recorded.commands.values())) > 50
 
 
-# Who listens.
+# Subscribers.
 
 
 @pytest.mark.parametrize('mode', ['simulation', 'indenter'])
-def test_a_reader_with_default_settings_gets_every_topic(ros_graph: RosGraph, mode: str) -> None:
-    """`create_subscription(type, topic, callback, 10)` asks for reliable delivery."""
+def test_default_qos_receives_every_topic(ros_graph: RosGraph, mode: str) -> None:
+    """`create_subscription(type, topic, callback, 10)` requests reliable delivery."""
     node = ros_graph.node('reader')
     indents = mode == 'indenter'
     there = {'base_wrench', 'end_effector_pose', '/clock'}
@@ -389,7 +391,7 @@ def test_a_reader_with_default_settings_gets_every_topic(ros_graph: RosGraph, mo
     assert len(heard) == (3 if indents else 9)
 
 
-#: Subscribes to a topic as most do, and says when the first message has come.
+#: Subscribes with default QoS, and prints a line at the first message.
 READER = """
 import rclpy, sys
 from sensor_msgs.msg import JointState
@@ -407,8 +409,8 @@ rclpy.spin(node)
 """
 
 
-def test_a_reader_that_stops_does_not_stop_the_plant(ros_graph: RosGraph) -> None:
-    """It asks for every message, and takes none: the plant does not wait for it."""
+def test_stopped_subscriber_does_not_block_the_plant(ros_graph: RosGraph) -> None:
+    """A reliable subscriber that takes no messages."""
     probe = ros_graph.node('probe')
     stamps: list[int] = []
 
@@ -428,8 +430,8 @@ def test_a_reader_that_stops_does_not_stop_the_plant(ros_graph: RosGraph) -> Non
         assert [reader.stdout.readline() for _ in range(2)] == ['heard\n'] * 2
         reader.send_signal(signal.SIGSTOP)
         seen = len(stamps)
-        # 6 s, far more than a publisher keeps. If it waited for the default 0.1 s at each, or at
-        # every tenth message, this would take minutes.
+        # 6 s, far more than a publisher keeps. With the default wait of 0.1 s for each or every
+        # tenth message, this would take minutes.
         ros_graph.spin_until(lambda: len(stamps) > seen + 3000, 'further samples', timeout=120.0)
         assert reader.poll() is None
     finally:
@@ -440,8 +442,8 @@ def test_a_reader_that_stops_does_not_stop_the_plant(ros_graph: RosGraph) -> Non
 # Transforms.
 
 
-def test_without_tf2_msgs_it_says_so(ros_graph: RosGraph) -> None:
-    """One line, and the process ends; a machine that has it publishes."""
+def test_missing_tf2_msgs_is_reported(ros_graph: RosGraph) -> None:
+    """One line, and the process ends; with the package the plant publishes."""
     if find_spec('tf2_msgs'):
         pytest.skip('tf2_msgs is installed here')
     plant = ros_graph.start('plant', {'publish_tf': True})
@@ -450,7 +452,7 @@ def test_without_tf2_msgs_it_says_so(ros_graph: RosGraph) -> None:
     assert plant.last_line.endswith(reason)
 
 
-def test_where_there_is_no_needle_there_is_no_tip(ros_graph: RosGraph) -> None:
+def test_publish_tf_is_rejected_without_a_needle(ros_graph: RosGraph) -> None:
     parameters = {'publish_tf': True, 'mode': 'indenter'}
     node = ros_graph.add(PlantNode, parameters=parameters, start=False)
     assert not node.start()
@@ -459,7 +461,7 @@ def test_where_there_is_no_needle_there_is_no_tip(ros_graph: RosGraph) -> None:
 
 @pytest.fixture(scope='module')
 def transforms(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    """Have tf2_msgs: made from its definition where it is not installed. Return its folder."""
+    """Return the folder of tf2_msgs, built from its definition if not installed."""
     if find_spec('tf2_msgs'):
         yield ''
         return
@@ -474,10 +476,8 @@ def transforms(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
 
 
 @pytest.mark.parametrize('steered', [False, True])
-def test_it_publishes_where_the_tip_is(
-    ros_graph: RosGraph, transforms: str, steered: bool
-) -> None:
-    """In `needle_base`, where `needle_poses` has its last pose; heard as tf listeners ask."""
+def test_tip_transform_is_published(ros_graph: RosGraph, transforms: str, steered: bool) -> None:
+    """In `needle_base`, equal to the last pose of `needle_poses`, with the QoS of tf listeners."""
     kind = import_module('tf2_msgs.msg').TFMessage
     reader = ros_graph.node('reader')
     heard = ros_graph.listen(reader, kind, '/tf', 100)
@@ -504,7 +504,7 @@ def test_it_publishes_where_the_tip_is(
     depth = STEERED['depth'] if steered else 0.05
     place, turn = one.transform.translation, one.transform.rotation
     assert (place.x, place.z) == (tip.position.x, tip.position.z)
-    # The base is at s - l; a needle that is bent moves it by some nanometers.
+    # The base is at s - l; a bent needle moves it by some nanometers.
     assert place.y == pytest.approx(tip.position.y - (depth - 0.2), abs=1e-6)
     assert turn == tip.orientation
     assert steered or place.z != 0.0

@@ -1,4 +1,4 @@
-"""`needle run`: nodes that a person, or a script, tells where to go."""
+"""`needle run` with typed commands and with scripts."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from needle_insertion.replay.rerun import verify
 import pytest
 from support.ros_graph import RosGraph
 
-#: Longest time for nodes to start and to do what a test wants, on a machine that is busy [s].
+#: Timeout of a start or a motion on a busy machine [s].
 _LONGEST = 120.0
 
 
-#: Lines that are not understood, or refused, and what is said of them.
+#: Invalid or rejected lines, and the expected messages.
 MISTAKES = [
     ('targte 0.05', "unknown word 'targte'; did you mean target? Valid are target, wait"),
     ('target', 'target takes DEPTH | X Y Z, got nothing'),
@@ -45,7 +45,7 @@ MISTAKES = [
 def command(ros_graph: RosGraph, folder: Path, *words: str) -> tuple[list[str], dict[str, str]]:
     """Return the command line, and the environment with the domain of the test."""
     line = [sys.executable, '-m', 'needle_insertion.cli', 'run', '-o', str(folder), *words]
-    # Slower than by default: tests run beside others.
+    # Below the default rate, because tests run in parallel.
     nodes = ('controller',) if '--hardware' in words else ('plant', 'controller')
     for node in nodes:
         line += ['-p', f'{node}.rate=200']
@@ -55,7 +55,7 @@ def command(ros_graph: RosGraph, folder: Path, *words: str) -> tuple[list[str], 
 def told(
     ros_graph: RosGraph, folder: Path, script: Sequence[str], *words: str
 ) -> tuple[int, str, str]:
-    """Run a script; return the status, and what was said and complained of."""
+    """Run a script; return status, output and errors."""
     line, environment = command(ros_graph, folder, *words)
     process = subprocess.Popen(
         line,
@@ -70,7 +70,7 @@ def told(
     process.stdin.close()
     process.stdin = None
     begin = time.monotonic()
-    # Nodes of this process go on meanwhile.
+    # Nodes of this process continue meanwhile.
     while process.poll() is None and time.monotonic() - begin < _LONGEST:
         ros_graph.executor.spin_once(timeout_sec=0.05)
     if process.poll() is None:
@@ -79,10 +79,8 @@ def told(
     return process.returncode, said, complained
 
 
-def test_a_script_inserts_changes_the_law_and_retracts(
-    ros_graph: RosGraph, tmp_path: Path
-) -> None:
-    """The recording has every sample, and can be computed again."""
+def test_script_inserts_changes_the_law_and_retracts(ros_graph: RosGraph, tmp_path: Path) -> None:
+    """The recording has every sample, and can be replayed."""
     status, said, complained = told(
         ros_graph,
         tmp_path / 'run',
@@ -110,7 +108,7 @@ def test_a_script_inserts_changes_the_law_and_retracts(
     )
     assert (status, complained) == (0, ''), said
     at = [float(found) for found in re.findall(r'^depth (\S+) mm', said, re.MULTILINE)]
-    # It settles within a second to a tenth of a millimeter or so, under both laws.
+    # It settles within 1 s to about 0.1 mm under both laws.
     assert at == pytest.approx([23.0, 25.0, 25.0, 20.0], abs=0.3), said
     assert re.search(r'^controller +(OK|WARN) ', said, re.MULTILINE)
     assert 'needle> quit\nrecorded to' in said
@@ -121,8 +119,8 @@ def test_a_script_inserts_changes_the_law_and_retracts(
     assert (tmp_path / 'run' / 'logs' / 'plant.log').is_file()
 
 
-def test_a_script_ends_with_what_cannot_be_done(ros_graph: RosGraph, tmp_path: Path) -> None:
-    """A rejected target is an error of the script: no command after it is executed."""
+def test_script_ends_at_a_rejected_target(ros_graph: RosGraph, tmp_path: Path) -> None:
+    """No further command is executed."""
     script = ['target 5', 'target 0.03', 'wait']
     status, said, complained = told(ros_graph, tmp_path / 'run', script, '--no-recording')
     assert status == 1
@@ -133,7 +131,7 @@ def test_a_script_ends_with_what_cannot_be_done(ros_graph: RosGraph, tmp_path: P
     assert not (tmp_path / 'run' / 'bag').exists()
 
 
-def test_a_robot_takes_the_place_of_the_plant(ros_graph: RosGraph, tmp_path: Path) -> None:
+def test_robot_replaces_the_plant(ros_graph: RosGraph, tmp_path: Path) -> None:
     ros_graph.add(PlantNode, parameters={'rate': 200.0, 'depth': 0.02})
     status, said, complained = told(
         ros_graph,
@@ -146,8 +144,8 @@ def test_a_robot_takes_the_place_of_the_plant(ros_graph: RosGraph, tmp_path: Pat
     assert 'depth 22.' in said or 'depth 21.9' in said
 
 
-def test_a_second_plant_is_refused(ros_graph: RosGraph, tmp_path: Path) -> None:
-    """Before anything moves."""
+def test_second_plant_is_rejected(ros_graph: RosGraph, tmp_path: Path) -> None:
+    """Before any motion."""
     ros_graph.add(PlantNode, parameters={'rate': 200.0})
     status, said, complained = told(ros_graph, tmp_path / 'run', ['target 0.05'])
     assert status == 1
@@ -156,7 +154,7 @@ def test_a_second_plant_is_refused(ros_graph: RosGraph, tmp_path: Path) -> None:
     assert 'needle> target' not in said
 
 
-def test_the_tip_is_steered_to_a_point(ros_graph: RosGraph, tmp_path: Path) -> None:
+def test_tip_is_steered_to_a_target(ros_graph: RosGraph, tmp_path: Path) -> None:
     status, said, complained = told(
         ros_graph,
         tmp_path / 'run',
@@ -179,7 +177,7 @@ class Typed:
         line, environment = command(ros_graph, folder)
         master, slave = pty.openpty()
         self.graph, self.master = ros_graph, master
-        # Its own terminal: Ctrl-C there is a signal.
+        # A separate terminal, in which Ctrl-C is a signal.
         self.process = subprocess.Popen(
             ['/usr/bin/setsid', '--ctty', *line],
             env={**environment, 'TERM': 'xterm'},
@@ -200,7 +198,7 @@ class Typed:
         os.close(self.master)
 
     def expect(self, pattern: str) -> None:
-        """Wait until it has written something, and forget what came up to there."""
+        """Wait for an output, and discard the output up to it."""
         begin = time.monotonic()
         while (found := re.search(pattern, self.seen)) is None:
             assert time.monotonic() - begin < _LONGEST, self.seen
@@ -211,14 +209,13 @@ class Typed:
         self.seen = self.seen[found.end() :]
 
     def type(self, text: str) -> None:
-        """Type."""
         os.write(self.master, text.encode())
 
 
-def test_typed_words_are_completed_and_errors_do_not_end_it(
+def test_typed_commands_are_completed_and_errors_are_not_fatal(
     ros_graph: RosGraph, tmp_path: Path
 ) -> None:
-    """Tab completes, a mistake is named, Ctrl-D ends it with a complete recording."""
+    """Tab completes, an error is reported, Ctrl-D ends the session with a complete recording."""
     with Typed(ros_graph, tmp_path / 'run') as typed:
         typed.expect('needle> ')
         typed.type('targ\t 5\n')
@@ -227,7 +224,7 @@ def test_typed_words_are_completed_and_errors_do_not_end_it(
         typed.type('target 21mm\n')
         typed.expect('controller: on its way')
         typed.type('wait\n')
-        # A line that changes while it goes.
+        # A line that is updated during the motion.
         typed.expect(r'\r\x1b\[Kdepth')
         typed.expect(r'depth 2[01]\.\d\d mm[^\n]*\r\n')
         typed.expect('needle> ')
@@ -237,8 +234,10 @@ def test_typed_words_are_completed_and_errors_do_not_end_it(
         assert list(read_topic(tmp_path / 'run' / 'bag', '/target'))
 
 
-def test_ctrl_c_ends_all_and_the_recording_is_whole(ros_graph: RosGraph, tmp_path: Path) -> None:
-    """So does a terminal that is closed; the status is that of an interrupt."""
+def test_ctrl_c_ends_the_session_with_a_complete_recording(
+    ros_graph: RosGraph, tmp_path: Path
+) -> None:
+    """A closed terminal too; the exit status is 130."""
     with Typed(ros_graph, tmp_path / 'run') as typed:
         typed.expect('needle> ')
         typed.type('target 100mm\n')
@@ -252,7 +251,7 @@ def test_ctrl_c_ends_all_and_the_recording_is_whole(ros_graph: RosGraph, tmp_pat
 
 
 def children(pid: int) -> list[int]:
-    """Return the processes that a process has started."""
+    """Return the child processes of a process."""
     return [int(one) for one in Path(f'/proc/{pid}/task/{pid}/children').read_text().split()]
 
 
@@ -261,8 +260,8 @@ def words_of(pid: int) -> str:
     return Path(f'/proc/{pid}/cmdline').read_text()
 
 
-def test_a_node_that_dies_ends_the_session(ros_graph: RosGraph, tmp_path: Path) -> None:
-    """With status 1 and the node's name; also while nothing is typed."""
+def test_killed_node_ends_the_session(ros_graph: RosGraph, tmp_path: Path) -> None:
+    """With status 1 and the name of the node, also without input."""
     with Typed(ros_graph, tmp_path / 'run') as typed:
         typed.expect('needle> ')
         (pid,) = [one for one in children(typed.process.pid) if 'controller_node' in words_of(one)]
@@ -271,8 +270,8 @@ def test_a_node_that_dies_ends_the_session(ros_graph: RosGraph, tmp_path: Path) 
         assert typed.process.wait(60.0) == 1
 
 
-def test_what_is_not_understood_is_named(ros_graph: RosGraph, tmp_path: Path) -> None:
-    """One line says what was given and what is valid; the session goes on."""
+def test_invalid_command_is_reported(ros_graph: RosGraph, tmp_path: Path) -> None:
+    """One line has the input and the valid commands; the session continues."""
     with Typed(ros_graph, tmp_path / 'run') as typed:
         typed.expect('needle> ')
         for line, complaint in MISTAKES:

@@ -1,4 +1,4 @@
-"""Who may do what in the graph: policies that fit the nodes, and nothing without credentials."""
+"""SROS2 policies match the nodes, and no node starts without credentials."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from support.ros_graph import RosGraph
 
 POLICIES = ROOT / 'config/security/policies.xml'
 
-#: Parameters that a node must have to start, and those that make it use all it may use.
+#: Parameters required by each node, and parameters that enable all of its topics.
 SETTINGS: Mapping[str, list[dict[str, object]]] = {
     'plant': [{'lockstep': True}, {'use_sim_time': True, 'mode': 'robot'}],
     'controller': [{'use_sim_time': True}, {'deflection_feedback': 'ground_truth'}],
@@ -34,18 +34,18 @@ SETTINGS: Mapping[str, list[dict[str, object]]] = {
     'slicer': [{'use_sim_time': True}],
 }
 
-#: What these may record or play depends on the other nodes.
+#: Topics that depend on the other nodes.
 FOR_ALL = {'recorder': 'subscribe', 'player': 'publish'}
 
-#: Published by every node, and recorded by none.
+#: Published by every node, and not recorded.
 NOT_RECORDED = {'/rosout', '/parameter_events'}
 
-#: Reports to a plant in lock-step, which are not recorded.
+#: Reports to a plant in lockstep, not recorded.
 REPORTS = {'/joint_states/_processed', '/joint_states/_recorded'}
 
 
 class Profile(NamedTuple):
-    """Names that a node may use, or uses."""
+    """Permitted or used names of a node."""
 
     publish: frozenset[str]
     subscribe: frozenset[str]
@@ -54,7 +54,7 @@ class Profile(NamedTuple):
 
 
 def policies() -> dict[str, Profile]:
-    """Read the policy file as sros2 does: includes first, then names."""
+    """Parse the policy file like sros2: includes first, then names."""
     tree = etree.parse(POLICIES)
     tree.xinclude()
     found = {}
@@ -76,7 +76,7 @@ POLICY = policies()
 
 
 def used(node: BaseNode) -> Profile:
-    """Return what a node offers and listens to, as the graph has it."""
+    """Return the publishers, subscriptions and services of a node in the graph."""
     name, namespace = node.get_name(), node.get_namespace()
     return Profile(
         *(
@@ -92,7 +92,7 @@ def used(node: BaseNode) -> Profile:
 
 
 def made(node: BaseNode) -> Profile:
-    """Return what a node has made itself; the graph comes to know it a moment later."""
+    """Return the created entities of a node, before their discovery."""
     return Profile(
         frozenset(item.topic_name for item in node.publishers),
         frozenset(item.topic_name for item in node.subscriptions),
@@ -102,12 +102,12 @@ def made(node: BaseNode) -> Profile:
 
 
 def is_seen(node: BaseNode) -> bool:
-    """Tell whether the graph knows all that a node has made."""
+    """Return whether all entities of a node are discovered."""
     return all(map(frozenset.issubset, made(node), used(node)))
 
 
 def filled(settings: Mapping[str, object], folder: Path) -> dict[str, object]:
-    """Return parameters with the name of a bag that may be made."""
+    """Return parameters with the name of a new bag."""
     return {
         key: str(folder / 'bag') if value == 'bag' else value for key, value in settings.items()
     }
@@ -115,15 +115,15 @@ def filled(settings: Mapping[str, object], folder: Path) -> dict[str, object]:
 
 def seen_in_graph(folder: Path, name: str, tries: int = 3) -> Profile:
     """
-    Return what a node uses with what rcl makes for every node, which the graph alone knows.
+    Return the entities of a node with those that rcl creates, known from the graph only.
 
-    On a machine that is busy Fast DDS 2.14 may lose one of a node's own topics for good, so that
-    another node has to show it.
+    On a busy machine Fast DDS 2.14 may permanently lose an own topic of a node, so that another
+    node has to observe it.
     """
     with RosGraph(folder) as graph:
         node = graph.add(node_class(name), parameters=filled(SETTINGS[name][0], folder))
         try:
-            graph.spin_until(partial(is_seen, node), 'all that it has made', timeout=20.0)
+            graph.spin_until(partial(is_seen, node), 'all entities', timeout=20.0)
             return used(node)
         except GraphError:
             if tries == 1:
@@ -135,10 +135,10 @@ def seen_in_graph(folder: Path, name: str, tries: int = 3) -> Profile:
 
 
 @pytest.mark.parametrize('name', NODES)
-def test_each_node_may_do_what_it_does_and_no_more(
+def test_policy_equals_the_entities_of_each_node(
     ros_graph: RosGraph, tmp_path: Path, name: str
 ) -> None:
-    """The policy names every topic and service that the node has, and none that it never has."""
+    """Every topic and service of the node, and no others."""
     uses = [seen_in_graph(tmp_path, name)]
     for settings in SETTINGS[name]:
         node = ros_graph.add(node_class(name), parameters=filled(settings, tmp_path))
@@ -151,24 +151,24 @@ def test_each_node_may_do_what_it_does_and_no_more(
             assert there == allowed, rule
 
 
-def test_all_that_nodes_say_can_be_recorded_and_played() -> None:
-    """Recorder and player know every topic of the others; each request has a node to answer."""
+def test_recorder_and_player_may_use_all_topics() -> None:
+    """Each request has a node that answers."""
     said = frozenset().union(*(profile.publish for profile in POLICY.values())) - NOT_RECORDED
     assert POLICY['recorder'].subscribe == said - REPORTS
     assert POLICY['player'].publish - NOT_RECORDED == said - REPORTS
     answered = frozenset().union(*(profile.reply for profile in POLICY.values()))
     for name, profile in POLICY.items():
         assert profile.request <= answered, name
-        # A name that nobody publishes is a slip.
+        # A name without a publisher is an error of the policy.
         assert profile.subscribe <= said, name
     commanding = {n for n, profile in POLICY.items() if '/wrench_command' in profile.publish}
     assert commanding == {'controller', 'player'}
 
 
-def test_no_node_starts_without_credentials_where_they_are_enforced(
+def test_enforced_security_rejects_nodes_without_credentials(
     ros_graph: RosGraph, tmp_path: Path
 ) -> None:
-    """A node that has none, or whose middleware cannot check them, ends before it runs bare."""
+    """Also with a middleware that cannot check them."""
     probe = ros_graph.node('probe')
     (tmp_path / 'enclaves').mkdir()
     ended = subprocess.run(
@@ -189,14 +189,14 @@ def test_no_node_starts_without_credentials_where_they_are_enforced(
     assert probe.count_publishers('joint_states') == 0
 
 
-def test_what_we_start_stays_on_this_machine(ros_graph: RosGraph) -> None:
-    """Range and transports of our processes; of nodes and launch unless the environment opens."""
+def test_started_nodes_stay_on_this_machine(ros_graph: RosGraph) -> None:
+    """Range and transports of all processes, unless the environment opens nodes and launch."""
     assert LOCAL.items() <= ros_graph.environment.items()
     closed: list[dict[str, str]] = [{}, {RANGE: 'LOCALHOST'}]
     left: list[dict[str, str]] = [
         {RANGE: 'SUBNET'},
         {RANGE: 'OFF'},
-        # What they say of transports is not ours to change.
+        # Transports of external profiles are not changed.
         {RANGE: 'LOCALHOST', PROFILES[0]: 'own.xml'},
         {RANGE: 'LOCALHOST', 'RMW_IMPLEMENTATION': 'rmw_cyclonedds_cpp'},
     ]
@@ -210,8 +210,8 @@ def test_what_we_start_stays_on_this_machine(ros_graph: RosGraph) -> None:
 
 
 @pytest.mark.parametrize('range_', ['LOCALHOST', 'SUBNET'])
-def test_neighbors_find_each_other(ros_graph: RosGraph, range_: str) -> None:
-    """A node of this machine that knows nothing of our profile hears the plant and finds it."""
+def test_local_nodes_discover_each_other(ros_graph: RosGraph, range_: str) -> None:
+    """A local node without the profile receives the plant topics, and is discovered."""
     ros_graph.start('plant')
     bare = {name: value for name, value in ros_graph.environment.items() if name not in LOCAL}
     neighbor = subprocess.run(
@@ -226,7 +226,7 @@ def test_neighbors_find_each_other(ros_graph: RosGraph, range_: str) -> None:
     assert (int(heard) > 0, found) == (True, '1')
 
 
-#: Waits until it hears the plant and has found it.
+#: Waits until it receives the plant topics and is discovered.
 NEIGHBOR = """
 import time
 import rclpy
@@ -242,7 +242,7 @@ while time.monotonic() - begin < 20.0 and not (heard and node.count_subscribers(
 print(len(heard), node.count_subscribers('wrench_command'))
 """
 
-#: Another machine: two network namespaces, joined by a cable.
+#: Another machine: two network namespaces connected by a virtual cable.
 CABLE = """
 link add {a} type veth peer name {b}
 link set {a} netns {a}
@@ -257,7 +257,8 @@ link set {b} netns {b}
 -n {b} route add default dev {b}
 """
 
-#: A stranger there pushes for some seconds, and says how many plants it has found.
+#: An external node there commands forces for some seconds, and prints the number of discovered
+#: plants.
 STRANGER = """
 import time
 from geometry_msgs.msg import WrenchStamped
@@ -278,7 +279,7 @@ print(found)
 
 @pytest.fixture
 def cable() -> Iterator[tuple[str, str]]:
-    """Return the names of two machines."""
+    """Return the names of two connected network namespaces."""
     ip = shutil.which('ip')
     if ip is None or os.geteuid() != 0:
         pytest.skip('making network namespaces needs root and ip')
@@ -302,7 +303,7 @@ def cable() -> Iterator[tuple[str, str]]:
 def test_another_machine_cannot_reach_the_plant(
     ros_graph: RosGraph, cable: tuple[str, str], opened: dict[str, str], found: str
 ) -> None:
-    """It names the plant's machine as its peer: that alone does not let it in. SUBNET does."""
+    """The address of the plant as its static peer is not sufficient. SUBNET is."""
     here, there = cable
     bare = {name: value for name, value in ros_graph.environment.items() if name not in LOCAL}
     plant = subprocess.Popen(
@@ -315,7 +316,7 @@ def test_another_machine_cannot_reach_the_plant(
     try:
         assert plant.stdout is not None
         assert any('active' in line for line in plant.stdout)
-        # Its own shared memory, as another machine has.
+        # Separate shared memory, as on another machine.
         script = f'mount -t tmpfs tmpfs /dev/shm && exec "{sys.executable}" -c "$0"'
         stranger = subprocess.run(
             [

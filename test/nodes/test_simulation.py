@@ -1,4 +1,4 @@
-"""Manners of the simulated plant: pause, step, reset, lock-step, stamps of commands, faults."""
+"""Simulation features of the plant: pause, step, reset, lockstep, command stamps, faults."""
 
 from collections.abc import Callable
 from time import sleep
@@ -25,17 +25,17 @@ PERIOD = 5_000_000
 
 
 def stamp_ns(message: PoseArray | JointState | Marker) -> int:
-    """Return the stamp of a message in nanoseconds."""
+    """Return the stamp of a message [ns]."""
     return message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec
 
 
 class Bench:
-    """A plant in this process, with a probe that listens, commands and calls its services."""
+    """A plant in this process, with a probe that subscribes, commands and calls services."""
 
     def __init__(self, ros_graph: RosGraph, **parameters: bool | float | str) -> None:
         self.graph = ros_graph
         self.probe = ros_graph.node('probe')
-        #: Force with which each sample is answered; None: not at all.
+        #: Force that answers each sample; None: no command.
         self.force: float | None = None
         self.states: list[JointState] = []
         self.probe.create_subscription(JointState, 'joint_states', self.on_state, SENSOR)
@@ -62,7 +62,6 @@ class Bench:
             self.command(self.force, stamp=message.header.stamp)
 
     def command(self, force: float, stamp: Time | None = None, frame: str = '') -> None:
-        """Publish a command."""
         message = WrenchStamped()
         message.header.frame_id = frame
         if stamp is not None:
@@ -75,20 +74,19 @@ class Bench:
         self.graph.spin_until(condition, what)
 
     def further(self, count: int) -> list[JointState]:
-        """Spin until there are so many more samples; return them."""
+        """Spin until a number of additional samples; return them."""
         seen = len(self.states)
         self.until(lambda: len(self.states) >= seen + count, 'samples')
         return self.states[seen:]
 
     def call(self, name: str, data: bool | None = None) -> tuple[bool, str]:
-        """Call a service; return whether it was granted and what it said."""
+        """Call a service; return success and message."""
         request = Trigger.Request() if data is None else SetBool.Request(data=data)
         answer = self.services[name].call_async(request)
         self.until(answer.done, 'the answer')
         return answer.result().success, answer.result().message
 
     def set(self, **values: float | str) -> None:
-        """Change parameters."""
         parameters = [
             Parameter(name.replace('__', '.'), value=value) for name, value in values.items()
         ]
@@ -96,27 +94,27 @@ class Bench:
         assert changed.successful, changed.reason
 
     def counts(self, name: str) -> int:
-        """Return a figure of the diagnostics."""
+        """Return a value of the diagnostics."""
         return self.plant.diagnose()[2][name]
 
     def quiet(self) -> None:
-        """Spin until nothing has come for ten periods."""
+        """Spin until no message has arrived for ten periods."""
         for _ in range(100):
             seen = len(self.states)
             for _ in range(10):
                 self.graph.executor.spin_once(timeout_sec=PERIOD * 1e-9)
             if len(self.states) == seen:
                 return
-        pytest.fail('samples come all the time')
+        pytest.fail('samples do not stop')
 
 
-def test_a_command_acts_from_the_sample_after_it(ros_graph: RosGraph) -> None:
-    """The answer to sample k moves the needle from k + 1 to k + 2: one period of delay."""
+def test_command_has_one_period_of_delay(ros_graph: RosGraph) -> None:
+    """The answer to sample k moves the needle from k + 1 to k + 2."""
     bench = Bench(ros_graph, lockstep=True, **{'model.preset': 'paper_mm'})
     forces = {}
 
     def answer(message: JointState) -> None:
-        # Friction is settled within microseconds: the speed tells the force.
+        # Friction settles within microseconds: the velocity indicates the force.
         k = round(stamp_ns(message) / PERIOD)
         forces[k] = 0.56 + 2.5 * (1 + k % 5)
         bench.command(forces[k], stamp=message.header.stamp)
@@ -129,8 +127,8 @@ def test_a_command_acts_from_the_sample_after_it(ros_graph: RosGraph) -> None:
         assert message.velocity[0] == pytest.approx((forces[k - 2] - 0.56) / 300.0, rel=1e-9)
 
 
-def test_in_a_pause_time_stands_and_steps_are_single_samples(ros_graph: RosGraph) -> None:
-    """Nothing comes in a pause but what is asked for; time goes on where it stood."""
+def test_pause_stops_time_and_steps_take_single_samples(ros_graph: RosGraph) -> None:
+    """No other sample is published in a pause; time then resumes at its value."""
     bench = Bench(ros_graph, publish_clock=True)
     clocks = ros_graph.listen(bench.probe, Clock, '/clock', SENSOR)
     bench.further(20)
@@ -151,11 +149,11 @@ def test_in_a_pause_time_stands_and_steps_are_single_samples(ros_graph: RosGraph
     first = bench.further(20)[0]
     assert stamp_ns(first) == before + 4 * PERIOD
     last = bench.states[-1].header.stamp
-    bench.until(lambda: any(message.clock == last for message in clocks), 'its time')
+    bench.until(lambda: any(message.clock == last for message in clocks), 'simulated time')
 
 
-def test_it_may_begin_paused(ros_graph: RosGraph) -> None:
-    """With `paused` nothing comes before time is let go on."""
+def test_start_in_pause(ros_graph: RosGraph) -> None:
+    """With `paused` no sample is published before time is resumed."""
     bench = Bench(ros_graph, paused=True)
     bench.quiet()
     assert not bench.states
@@ -163,8 +161,8 @@ def test_it_may_begin_paused(ros_graph: RosGraph) -> None:
     bench.further(10)
 
 
-def test_reset_puts_the_needle_back_while_time_goes_on(ros_graph: RosGraph) -> None:
-    """Depth, speed and noise are those of the start, stamps never go back, and it is not held."""
+def test_reset_restores_the_needle_and_keeps_time(ros_graph: RosGraph) -> None:
+    """Initial depth, velocity and noise; stamps never go back, and the needle is not held."""
     bench = Bench(ros_graph, lockstep=True, paused=True, tip_deflection=5e-4)
     bench.force = 3.56
     bench.call('pause', data=False)
@@ -183,28 +181,27 @@ def test_reset_puts_the_needle_back_while_time_goes_on(ros_graph: RosGraph) -> N
     assert again == first
 
 
-def test_reset_revives_a_plant_that_stands_still(ros_graph: RosGraph) -> None:
-    """A needle that left the tissue is back in it."""
+def test_reset_after_the_needle_left_the_tissue(ros_graph: RosGraph) -> None:
     bench = Bench(ros_graph, depth=0.002)
     bench.force = -3.0
     bench.until(lambda: 'minimum_depth' in bench.plant.diagnose()[1], 'the end')
     bench.force = 0.0
     bench.quiet()
     assert bench.call('reset')[0]
-    # As the state has it: 0.2 m less 0.198 m.
+    # State: 0.2 m minus 0.198 m.
     assert bench.further(5)[-1].position[0] == pytest.approx(0.002, abs=1e-15)
 
 
-def test_services_of_a_plant_that_is_not_active_are_refused(ros_graph: RosGraph) -> None:
-    """Each says why."""
+def test_services_of_an_inactive_plant_are_rejected(ros_graph: RosGraph) -> None:
+    """Each with a reason."""
     bench = Bench(ros_graph)
     bench.plant.trigger_deactivate()
     for name, data in (('pause', True), ('step', None), ('reset', None)):
         assert bench.call(name, data) == (False, f'{name} refused: the plant is not active')
 
 
-def test_in_lockstep_the_plant_waits_and_says_for_what(ros_graph: RosGraph) -> None:
-    """Without an answer time stands, the sample is repeated, and the diagnostics tell."""
+def test_lockstep_plant_waits_and_reports_the_reason(ros_graph: RosGraph) -> None:
+    """Without a command time stops, and the sample is repeated."""
     bench = Bench(ros_graph, lockstep=True)
     bench.until(lambda: len(bench.states) >= 2, 'the repeated sample')
     assert {stamp_ns(message) for message in bench.states} == {PERIOD}
@@ -217,8 +214,8 @@ def test_in_lockstep_the_plant_waits_and_says_for_what(ros_graph: RosGraph) -> N
     assert stamp_ns(bench.states[-1]) > 15 * PERIOD
 
 
-def test_as_fast_as_possible_is_faster_than_real_time(ros_graph: RosGraph) -> None:
-    """With a factor of 0 thirty seconds pass in fewer, by the plant's own account."""
+def test_maximum_speed_exceeds_real_time(ros_graph: RosGraph) -> None:
+    """With a factor of 0, 30 s of simulated time take less, by the report of the plant."""
     probe = ros_graph.node('probe')
     clock = ros_graph.latest(probe, Clock, '/clock', SENSOR)
     ros_graph.start('plant', {'rate': 100.0, 'real_time_factor': 0.0, 'publish_clock': True})
@@ -228,20 +225,19 @@ def test_as_fast_as_possible_is_faster_than_real_time(ros_graph: RosGraph) -> No
     assert (probe.get_clock().now() - begin).nanoseconds < 15e9
 
 
-def test_a_command_that_was_overtaken_is_not_taken(ros_graph: RosGraph) -> None:
-    """What is older than a newer command came too late."""
+def test_out_of_order_command_is_discarded(ros_graph: RosGraph) -> None:
     bench = Bench(ros_graph, command_timeout=60.0)
     *_, earlier, newest = bench.further(10)
     bench.command(0.0, stamp=newest.header.stamp)
-    # Only the newest message waits for the plant.
+    # Only the newest message is queued for the plant.
     bench.further(20)
     bench.command(3.56, stamp=earlier.header.stamp)
     bench.until(lambda: bench.counts('commands overtaken') == 1, 'the refusal')
     assert not any(message.velocity[0] for message in bench.further(20))
 
 
-def test_stale_and_foreign_commands_do_not_move_it(ros_graph: RosGraph) -> None:
-    """What is older than the timeout or in another frame is no force."""
+def test_stale_and_wrong_frame_commands_are_discarded(ros_graph: RosGraph) -> None:
+    """Commands older than the timeout, or in another frame."""
     bench = Bench(ros_graph)
     bench.further(5)
     old = bench.states[-1].header.stamp
@@ -256,20 +252,20 @@ def test_stale_and_foreign_commands_do_not_move_it(ros_graph: RosGraph) -> None:
     bench.until(lambda: bench.states[-1].position[0] > 0.0201, 'motion')
 
 
-def test_a_plant_that_cannot_keep_up_is_commanded_all_the_same(ros_graph: RosGraph) -> None:
-    """It leaves out samples rather than show old ones: those could not be answered in time."""
-    # 10^7 steps per second are more than any machine does.
-    # Where other processes have the machine too, an answer may take longer than 0.1 s.
+def test_overloaded_plant_accepts_commands(ros_graph: RosGraph) -> None:
+    """It drops samples instead of publishing stale samples, which have a command timeout."""
+    # 10^7 steps per second exceed any machine. On a busy machine, an answer may take longer than
+    # 0.1 s.
     bench = Bench(ros_graph, rate=1000.0, step=1e-7, command_timeout=2.0)
     bench.until(lambda: bench.counts('samples given up') > 300, 'the overload')
     bench.force = 8.0
     bench.until(lambda: bench.states[-1].position[0] > 0.03, 'motion')
     given_up = bench.counts('samples given up')
-    bench.until(lambda: bench.counts('samples given up') > given_up, 'more of it')
+    bench.until(lambda: bench.counts('samples given up') > given_up, 'more samples')
 
 
-def test_more_may_not_be_made_up_than_commands_may_be_old(ros_graph: RosGraph) -> None:
-    """Where samples have the time of the clock; others wait for it."""
+def test_backlog_is_limited_by_the_command_timeout(ros_graph: RosGraph) -> None:
+    """Where samples have the time of the clock; independent time waits."""
     reason = 'backlog must be at most half of command_timeout, 0.1 s, got 0.5 s'
     plant = ros_graph.add(PlantNode, parameters={'backlog': 0.5}, start=False)
     assert not plant.start()
@@ -278,8 +274,8 @@ def test_more_may_not_be_made_up_than_commands_may_be_old(ros_graph: RosGraph) -
         assert ros_graph.add(PlantNode, parameters={'backlog': 0.5, **valid}).is_active
 
 
-def test_two_commanders_are_none(ros_graph: RosGraph) -> None:
-    """While another node commands too no force is applied, and the diagnostics say so."""
+def test_duplicate_commanders_apply_no_force(ros_graph: RosGraph) -> None:
+    """The diagnostics report it."""
     bench = Bench(ros_graph)
     bench.force = 3.56
     bench.until(lambda: bench.states and bench.states[-1].velocity[0] > 0.0, 'motion')
@@ -291,8 +287,8 @@ def test_two_commanders_are_none(ros_graph: RosGraph) -> None:
     bench.until(lambda: bench.states[-1].velocity[0] > 0.0, 'motion')
 
 
-def test_its_shape_is_that_of_the_model(ros_graph: RosGraph) -> None:
-    """The line runs from the base through the entry point to the tip; the poses lie along it."""
+def test_needle_shape_equals_the_model_shape(ros_graph: RosGraph) -> None:
+    """The line from the base through the entry point to the tip; the poses are on it."""
     bench = Bench(ros_graph, depth=0.1, tip_deflection=0.005, **{'model.tissue_damping': 0.0})
     shapes = ros_graph.listen(bench.probe, Marker, 'needle_shape', SENSOR)
     poses = ros_graph.listen(bench.probe, PoseArray, 'needle_poses', SENSOR)
@@ -309,7 +305,7 @@ def test_its_shape_is_that_of_the_model(ros_graph: RosGraph) -> None:
     assert points[1:] == pytest.approx(model.shape(state, len(points) - 1), abs=1e-15)
     assert points[-1] == pytest.approx([0.1, model.tip_deflection(state)])
     assert [(p.position.y, p.position.z) for p in line.poses] == [tuple(p) for p in points[1:]]
-    # The pose's y is along the needle, to the second order of the distance of 5 mm.
+    # y of the pose is along the needle, to second order of the distance of 5 mm.
     tip, before = line.poses[-1], line.poses[-2]
     turn = 2.0 * np.arctan2(tip.orientation.x, tip.orientation.w)
     rise = (tip.position.z - before.position.z) / (tip.position.y - before.position.y)
@@ -317,8 +313,8 @@ def test_its_shape_is_that_of_the_model(ros_graph: RosGraph) -> None:
     assert (shape.header.frame_id, line.header.frame_id) == ('needle_entry', 'needle_entry')
 
 
-def test_a_steered_needle_shows_its_path(ros_graph: RosGraph) -> None:
-    """Beside its shape; poses point along it in both planes, and wrong trajectories are said."""
+def test_steered_needle_publishes_shape_and_path(ros_graph: RosGraph) -> None:
+    """Poses are tangential in both planes, and invalid trajectories are reported."""
     values: dict[str, bool | float | str] = {
         'mode': 'robot',
         'steered': True,
@@ -342,7 +338,7 @@ def test_a_steered_needle_shows_its_path(ros_graph: RosGraph) -> None:
     ]  # fmt: skip
     message.points[0].positions = [0.03, 9e-3, -5e-3]
     course.publish(message)
-    # The robot is content to rest within 10 nm of the end, taken ten times.
+    # The robot rests within 10 nm of the end, with a factor of ten.
     there = pytest.approx([0.03, 9e-3, -5e-3], abs=1e-7)
     bench.until(lambda: bench.states[-1].position.tolist()[:3] == there, 'the end of the course')
     seen = len(poses), len(lines)
@@ -353,11 +349,11 @@ def test_a_steered_needle_shows_its_path(ros_graph: RosGraph) -> None:
     tip = bench.tips[-1].point
     assert newest['needle'][-1] == pytest.approx((tip.x, tip.y, tip.z), abs=1e-6)
     assert newest['path'][0][1] == 0.0
-    # Between two points the needle goes as the poses there say, to the square of the way.
+    # Between two points the needle follows the poses, to second order of the distance.
     along = [np.array([p.position.x, p.position.y, p.position.z]) for p in poses[-1].poses]
     for k in (5, 15, 25):
         turn = poses[-1].poses[k].orientation
-        # The y axis, turned by the quaternion.
+        # y axis rotated by the quaternion.
         x, z, w = turn.x, turn.z, turn.w
         ahead = np.array([-2.0 * w * z, 1.0 - 2.0 * (x * x + z * z), 2.0 * w * x])
         step = along[k + 1] - along[k - 1]
@@ -365,8 +361,8 @@ def test_a_steered_needle_shows_its_path(ros_graph: RosGraph) -> None:
         assert turn.y == 0.0
 
 
-def test_faults_may_come_and_go_while_it_runs(ros_graph: RosGraph) -> None:
-    """A fault hits its stream alone, is told, and ends when it is taken back."""
+def test_faults_may_be_set_and_cleared_while_active(ros_graph: RosGraph) -> None:
+    """A fault affects its stream only, and is reported."""
     bench = Bench(ros_graph)
     bench.further(5)
     bench.set(fault__kind='bias', fault__topic='base_wrench', fault__size=20.0)
@@ -376,7 +372,7 @@ def test_faults_may_come_and_go_while_it_runs(ros_graph: RosGraph) -> None:
     bench.until(lambda: np.isnan(bench.states[-1].position[0]), 'the fault')
     bench.until(lambda: abs(bench.wrenches[-1].wrench.force.x) < 1.0, 'the end of the bias')
     bench.set(fault__kind='drop', fault__topic='tip_deflection')
-    # What was on its way.
+    # Messages in transit.
     bench.further(20)
     dropped = len(bench.tips)
     bench.further(20)
@@ -386,10 +382,10 @@ def test_faults_may_come_and_go_while_it_runs(ros_graph: RosGraph) -> None:
     assert 'fault' not in bench.plant.diagnose()[1]
 
 
-def test_a_late_reading_has_the_stamp_of_its_sample_also_over_a_stall(
+def test_delayed_reading_keeps_its_stamp_after_a_stall(
     ros_graph: RosGraph,
 ) -> None:
-    """After a stall samples are given up, and time jumps: stamps follow it."""
+    """A stall drops samples, and time jumps: stamps follow."""
     bench = Bench(ros_graph, **{'tip.delay': 0.1})
     bench.further(40)
     sleep(0.5)

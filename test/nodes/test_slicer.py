@@ -1,4 +1,4 @@
-"""The node that speaks with 3D Slicer: a plant, a peer by pyigtl, and what may go wrong."""
+"""Slicer node with a plant, a pyigtl peer, and faults."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ import pytest
 from sensor_msgs.msg import JointState
 from support.ros_graph import RosGraph
 
-#: A needle that bends, at rest 6 cm deep with its guide aside.
+#: A bent needle at rest, 6 cm deep, with a displaced guide.
 PLANT = {
     'model.preset': 'bending_35mm',
     'steered': True,
@@ -49,7 +49,7 @@ TARGET = (4e-3, 0.1, -2e-3)
 
 
 class Room:
-    """A graph with a node `slicer`, peers, and one who watches."""
+    """A graph with a node `slicer`, peers, and an observer."""
 
     def __init__(self, graph: RosGraph, folder: Path, stack: ExitStack) -> None:
         self.graph, self._folder, self._stack = graph, folder, stack
@@ -59,14 +59,14 @@ class Room:
         self.states = graph.listen(self.probe, DiagnosticArray, '/diagnostics', 10)
 
     def peer(self, target: Any = ()) -> Peer:
-        """Start a peer; it repeats a target [m] if it is given one."""
+        """Start a peer, which repeats an optional target [m]."""
         in_image = REGISTRATION.to_image(target).tolist() if len(target) else ()
         peer = Peer(self._folder, self.port, in_image)
         self._stack.callback(peer.kill)
         return peer
 
     def slicer(self, **parameters: Any) -> Any:
-        """Make the node in this process."""
+        """Create the node in this process."""
         node = self.graph.add(SlicerNode, parameters={'port': self.port, **IMAGES, **parameters})
         self._stack.callback(node.stop)
         return node
@@ -75,12 +75,12 @@ class Room:
         self.graph.spin_until(condition, what, timeout=240.0)
 
     def wait_for(self, peer: Peer, device: str, count: int = 1) -> list[Told]:
-        """Wait for so many messages of a device, and return all."""
+        """Wait for a number of messages of a device, and return all."""
         self.until(lambda: len(peer.told(device)) >= count, f'{device} at the peer')
         return peer.told(device)
 
     def state(self, name: str = '/slicer') -> str:
-        """Return what a node said last of its state."""
+        """Return the latest state of a node."""
         said = [one.message for a in self.states for one in a.status if one.name == name]
         return said[-1] if said else ''
 
@@ -92,19 +92,19 @@ def room(ros_graph: RosGraph, tmp_path: Path) -> Iterator[Room]:
 
 
 def shapes_at_20_hz(peer: Peer, count: int) -> bool:
-    """Return whether so many shapes have come in a row, 20 a second by their stamps."""
+    """Return whether a number of consecutive shapes have stamps at 20 Hz."""
     about = [(one.time, int(one.content.split(';')[1])) for one in peer.told('NeedleShapeHeader')]
     for begin in range(len(about) - count):
         (first, _), (last, _) = about[begin], about[begin + count]
         whole = all(b == a + 1 for (_, a), (_, b) in pairwise(about[begin : begin + count + 1]))
-        # The stamps are those of shapes that come at 30 Hz: off by 1/30 s at each end.
+        # Stamps of shapes published at 30 Hz: an error of 1/30 s at each end.
         if whole and abs(last - first - count / 20.0) < 0.1:
             return True
     return False
 
 
-def test_a_target_comes_in_and_the_needle_goes_out(room: Room) -> None:
-    """With the plant as a process: where they are, in both frames, and 20 times a second."""
+def test_target_is_received_and_needle_is_sent(room: Room) -> None:
+    """With the plant as a process: positions in both frames, at 20 Hz."""
     room.graph.start('plant', PLANT)
     room.graph.start('slicer', {'port': room.port, **IMAGES})
     poses = room.graph.latest(room.probe, PoseArray, 'needle_poses', SENSOR)
@@ -118,12 +118,12 @@ def test_a_target_comes_in_and_the_needle_goes_out(room: Room) -> None:
     # Messages have 24 bits: 6e-8 of 0.1 m, in three coordinates.
     np.testing.assert_allclose((at.x, at.y, at.z), TARGET, atol=1e-7)
 
-    # A window of 2 s; a machine that is busy may need another one.
+    # A window of 2 s; a busy machine may need another window.
     room.until(lambda: shapes_at_20_hz(peer, 40), '40 shapes at 20 Hz')
     room.until(lambda: poses.message and tips.message, 'the poses')
     there = [(p.position.x, p.position.y, p.position.z) for p in poses.message.poses]
     seen = peer.told('NeedleShapeZ')[-1]
-    # It rests, but for the creep of the guide to where it is sent: 1e-3 mm.
+    # At rest, except for the creep of the guide to its setpoint: 1e-3 mm.
     np.testing.assert_allclose(seen.content, REGISTRATION.to_image(there), atol=1e-3)
     assert peer.told('NeedleShapeHeader')[-1].content.endswith(f';{len(there)};image;{MEASURED}')
     tip = np.array(peer.told('NeedleTip')[-1].content)
@@ -134,7 +134,7 @@ def test_a_target_comes_in_and_the_needle_goes_out(room: Room) -> None:
         for axis in getattr(pose, name).get_fields_and_field_types():
             ours, theirs = getattr(getattr(pose, name), axis), getattr(getattr(last, name), axis)
             assert ours == pytest.approx(theirs, abs=1e-6)
-    # What the nodes say, in words; a plant on a machine that is busy warns of it.
+    # Diagnostics messages; a plant on a busy machine warns of delays.
     room.until(
         lambda: re.search(
             r'^plant \[\w+\]: .+\nslicer \[OK\]: connected with .+; shape: needle_poses$',
@@ -144,8 +144,8 @@ def test_a_target_comes_in_and_the_needle_goes_out(room: Room) -> None:
     )
 
 
-def test_it_goes_on_after_either_side_was_killed(room: Room) -> None:
-    """The peer connects anew to a new node, and a new peer to the node that is there."""
+def test_connection_recovers_after_a_kill_of_either_side(room: Room) -> None:
+    """The peer reconnects to a new node, and a new peer to the running node."""
     room.graph.start('plant', PLANT)
     node = room.graph.start('slicer', {'port': room.port, **IMAGES})
     first = room.peer(TARGET)
@@ -162,12 +162,12 @@ def test_it_goes_on_after_either_side_was_killed(room: Room) -> None:
     room.wait_for(second, 'NeedleShapeZ', 5)
     room.targets.clear()
     room.until(lambda: room.targets, 'the target after the peer was killed')
-    # With a peer that is connected, and no thread to wait for.
+    # With a connected peer, and without a thread to join.
     node.interrupt()
 
 
-def test_without_a_shape_it_is_a_line_that_says_so(room: Room) -> None:
-    """As on a robot without a sensor of the shape: where the guide and the tip are."""
+def test_needle_without_shape_sensor_is_a_line(room: Room) -> None:
+    """On a robot without needle_poses: from the guide to the tip; the state reports it."""
     room.slicer()
     peer = room.peer()
     joints = room.probe.create_publisher(JointState, 'joint_states', SENSOR)
@@ -192,12 +192,12 @@ def test_without_a_shape_it_is_a_line_that_says_so(room: Room) -> None:
     matrix = np.array(room.wait_for(peer, 'NeedleTip')[-1].content)
     np.testing.assert_allclose(matrix[:3, 1], way / np.linalg.norm(way), atol=1e-6)
     room.until(lambda: room.state().endswith(f'shape: {LINE}'), 'the state')
-    # When nothing comes any more nothing is told.
+    # Nothing is sent after the end of the inputs.
     room.until(lambda: 'shape: none, neither needle_poses' in room.state(), 'the end')
 
 
-def test_where_the_tip_is_expected_goes_out(room: Room) -> None:
-    """Also to a peer that comes later; what is no pose does not."""
+def test_predicted_tip_pose_is_sent(room: Room) -> None:
+    """Also to a later peer; an invalid pose is not sent."""
     node = room.slicer()
     expected = room.probe.create_publisher(PoseWithCovarianceStamped, 'tip_expected', COMMAND)
     room.until(expected.get_subscription_count, 'the node')
@@ -219,14 +219,14 @@ def test_where_the_tip_is_expected_goes_out(room: Room) -> None:
         peer.kill()
 
 
-def test_needles_that_are_none_are_refused_by_a_line(room: Room) -> None:
-    """The node lives on, and takes the next one."""
+def test_invalid_needle_poses_are_rejected(room: Room) -> None:
+    """With one line; the node sends the next valid needle."""
     node = room.slicer()
 
     def refused(complaint: str) -> bool:
         return complaint in node.diagnose()[2]['refused last']
 
-    # Best effort, as a driver may offer it.
+    # Best effort, as a driver may offer.
     poses = room.probe.create_publisher(PoseArray, 'needle_poses', SENSOR)
     room.until(poses.get_subscription_count, 'the node')
     good = PoseArray(poses=[Pose(), Pose()])
@@ -247,13 +247,13 @@ def test_needles_that_are_none_are_refused_by_a_line(room: Room) -> None:
     room.until(lambda: node.diagnose()[1].endswith(f'shape: {MEASURED}'), 'the shape')
 
 
-def test_a_flood_of_targets_is_a_line_and_the_newest_counts(
+def test_target_flood_is_reported_once_and_the_newest_is_used(
     room: Room, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """And so is one of nonsense; nothing is said more than once a second, and shapes go on."""
+    """Also for invalid targets: at most one line a second, and shapes continue."""
     node = room.slicer()
     room.until(lambda: room.state().startswith('waits for a peer'), 'the node')
-    # On the axis of the needle, ever deeper; 10 cm in the end.
+    # On the axis of the needle, increasing in depth to 10 cm.
     depths = [*np.linspace(0.01, 0.09, 2000).tolist(), *[float('nan')] * 2000, 0.1]
     flood = b''.join(
         pyigtl.StringMessage(' '.join(map(repr, at)), device_name='TARGET').pack()
@@ -271,9 +271,9 @@ def test_a_flood_of_targets_is_a_line_and_the_newest_counts(
 
         room.until(send, 'the flood')
         room.until(
-            lambda: room.targets and abs(room.targets[-1].point.y - 0.1) < 1e-6, 'the last one'
+            lambda: room.targets and abs(room.targets[-1].point.y - 0.1) < 1e-6, 'the last target'
         )
-    # Fewer than there were; the others were older than those of the same moment.
+    # Fewer than sent; superseded targets of the same moment are dropped.
     assert node.diagnose()[2]['targets passed on'] < 1000
     lines = capfd.readouterr().err.splitlines()
     for words in ('only the newest target counts', 'target refused: it must be three finite'):
@@ -282,11 +282,11 @@ def test_a_flood_of_targets_is_a_line_and_the_newest_counts(
         assert all(later - earlier > 0.9 for earlier, later in pairwise(times))
 
 
-def test_it_lives_on_where_the_port_is_in_use(room: Room) -> None:
-    """It says so on /diagnostics, and listens as soon as it can."""
+def test_port_in_use_is_reported_and_retried(room: Room) -> None:
+    """On /diagnostics; the node listens as soon as the port is free."""
     with closing(socket.create_server(('127.0.0.1', room.port))):
         room.slicer()
-        room.until(lambda: 'the port is in use' in room.state(), 'the complaint')
+        room.until(lambda: 'the port is in use' in room.state(), 'the error')
         levels = [s.level for a in room.states for s in a.status if 'in use' in s.message]
         assert DiagnosticStatus.ERROR in levels
     room.until(lambda: room.state().startswith('waits for a peer'), 'the port')
@@ -294,8 +294,8 @@ def test_it_lives_on_where_the_port_is_in_use(room: Room) -> None:
         room.until(lambda: room.state().startswith('connected with'), 'the peer')
 
 
-def test_slicer_ros2_can_listen(room: Room) -> None:
-    """SlicerROS2 asks for reliable topics, with a depth of 100 and nothing else."""
+def test_slicer_ros2_can_subscribe(room: Room) -> None:
+    """SlicerROS2 requests reliable topics, with a depth of 100."""
     room.graph.start('plant', PLANT)
     room.slicer()
     poses = room.graph.listen(room.probe, PoseArray, 'needle_poses', 100)
@@ -314,20 +314,20 @@ def test_slicer_ros2_can_listen(room: Room) -> None:
         ({'role': 'both'}, 'role must be one of server, client'),
     ],
 )
-def test_invalid_parameters_are_refused(
+def test_invalid_parameters_are_rejected(
     ros_graph: RosGraph, parameters: dict[str, Any], complaint: str
 ) -> None:
-    """In one line that names the parameter."""
+    """One line with the parameter."""
     node = ros_graph.add(SlicerNode, parameters=parameters, start=False)
     assert not node.start()
     assert complaint in node.failure
     assert '\n' not in node.failure
 
 
-def test_without_pyigtl_it_says_how_to_install_it(
+def test_missing_pyigtl_is_reported_with_its_installation(
     ros_graph: RosGraph, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """And is refused; the module itself can be imported, as all nodes can."""
+    """The node refuses to start; the module itself can be imported."""
     monkeypatch.setitem(sys.modules, 'pyigtl', None)
     node = ros_graph.add(SlicerNode, start=False)
     assert not node.start()

@@ -1,4 +1,4 @@
-"""The node that steers, over DDS: with a robot, with a controller, and with a sensor that lies."""
+"""Steering node over DDS: with a robot, with a controller, and with faulty sensors."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from support.installed import ROOT
 from support.ros_graph import RosGraph
 from trajectory_msgs.msg import JointTrajectory
 
-#: A needle of the paper in tissue that is softer than believed (k = 6.8e4 N/m^2), and its tracker.
+#: Needle of the paper in tissue softer than the prior (k = 6.8e4 N/m^2), and its tracker.
 PLANT = {
     'model.preset': 'bending_35mm',
     'steered': True,
@@ -30,7 +30,7 @@ PLANT = {
     'tip.noise': 1e-4,
     'guide.speed_limit': 0.1,
 }
-#: Few steps, short looks.
+#: Few steps, short measurements.
 STEERING = {
     'step_length': 0.01,
     'speed': 0.05,
@@ -38,7 +38,7 @@ STEERING = {
     'acceleration': 0.4,
     'look_time': 0.15,
     'settle_time': 0.02,
-    # A machine that is busy delays measurements.
+    # A busy machine delays measurements.
     'measurement_timeout': 5.0,
 }
 TARGET = (1.5e-3, 0.051, -1e-3)
@@ -63,8 +63,7 @@ class Bench:
         self.moves = graph.listen(self.user, JointTrajectory, f'{prefix}joint_trajectory', COMMAND)
         self.target = self.user.create_publisher(PointStamped, 'target', COMMAND)
         self.stop = self.user.create_client(Trigger, 'steering/stop')
-        # Where a controller moves the needle, each sample waits for its answer, however busy the
-        # machine is.
+        # With a controller, lockstep makes the run independent of the load of the machine.
         own = {
             'mode': mode,
             'lockstep': lockstep and mode == 'simulation',
@@ -92,23 +91,22 @@ class Bench:
 
     @property
     def said(self) -> str:
-        """What the node says of its state."""
+        """Latest state of the node."""
         return str(self.steering.diagnose()[1])
 
     def taken(self, topic: str) -> str:
-        """Return how many messages the node has taken."""
+        """Return the number of received messages."""
         return str(self.steering.diagnose()[2][f'input {topic}'])
 
     def send(self, point: tuple[float, float, float]) -> None:
-        """Send a target."""
         message = PointStamped()
         message.header.frame_id = 'needle_entry'
         message.point.x, message.point.y, message.point.z = point
         self.target.publish(message)
 
     def aim(self, point: tuple[float, float, float] = TARGET) -> None:
-        """Send a target once the sensors are there, and wait for the answer."""
-        self.until(lambda: self.target.get_subscription_count() >= self.takers, 'who takes it')
+        """Send a target when the sensors are available, and wait for the answer."""
+        self.until(lambda: self.target.get_subscription_count() >= self.takers, 'the subscriber')
         self.until(
             lambda: all(
                 ' 0 taken' not in self.taken(topic) for topic in ('joint_states', 'tip_deflection')
@@ -125,34 +123,35 @@ class Bench:
         )
 
     def at(self, name: str) -> float:
-        """Return where a joint is."""
+        """Return the position of a joint."""
         message = self.states.message
         return float(message.position[message.name.index(name)])
 
     @property
     def tip(self) -> Any:
-        """Where the tip is, x and z [m]."""
+        """Tip position, x and z [m]."""
         message = self.truth.message
         return np.array(
             [message.position[message.name.index(name)] for name in ('tip_x', 'tip_z')]
         )
 
 
-def test_it_brings_the_tip_to_its_target(ros_graph: RosGraph) -> None:
-    """A robot follows; after each look the node says where the tip will be, and it is there."""
+def test_tip_reaches_its_target(ros_graph: RosGraph) -> None:
+    """With a robot; the tip is within the predicted covariance after each tip measurement."""
     bench = Bench(ros_graph)
     bench.aim()
     bench.until(lambda: bench.said.startswith(('done', 'stopped')), 'the end')
     assert bench.said.startswith('done: the tip is at x = ')
-    # Six looks leave so much of what tissue and tilt may be; a guide at rest misses by 2 mm.
+    # Remaining uncertainty of tissue and tilt after six measurements; a fixed guide misses by 2
+    # mm.
     assert np.hypot(*(bench.tip - np.array(TARGET)[[0, 2]])) < 5e-4
-    bench.until(lambda: len(bench.expected) == 6, 'what it says')
+    bench.until(lambda: len(bench.expected) == 6, 'the predicted tip poses')
     last = bench.expected[-1]
     assert last.header.frame_id == 'needle_entry'
     assert last.pose.pose.position.y == TARGET[1]
     off = bench.tip - [last.pose.pose.position.x, last.pose.pose.position.z]
     spread = np.array(last.pose.covariance).reshape(6, 6)[np.ix_((0, 2), (0, 2))]
-    # 99.9 % of draws of two normal numbers.
+    # 99.9 % quantile of two normal numbers.
     assert off @ np.linalg.solve(spread, off) < 13.8
     first = np.array(bench.expected[0].pose.covariance)
     assert first.max() > 100.0 * spread.max()
@@ -161,8 +160,8 @@ def test_it_brings_the_tip_to_its_target(ros_graph: RosGraph) -> None:
     }
 
 
-def test_a_robot_may_have_its_own_topics(ros_graph: RosGraph) -> None:
-    """They are remapped; each trajectory names all joints of the robot and ends at rest."""
+def test_robot_topics_may_be_remapped(ros_graph: RosGraph) -> None:
+    """Each trajectory has all joints of the robot and ends at rest."""
     bench = Bench(ros_graph, prefix='arm/')
     bench.aim()
     bench.until(lambda: bench.said.startswith(('done', 'stopped')), 'the end')
@@ -173,8 +172,8 @@ def test_a_robot_may_have_its_own_topics(ros_graph: RosGraph) -> None:
         assert list(move.points[-1].velocities) == [0.0, 0.0, 0.0]
 
 
-def test_a_bevel_is_turned_by_roll_alone(ros_graph: RosGraph) -> None:
-    """The guide rests, the joint roll goes to and fro."""
+def test_bevel_steering_moves_only_the_roll(ros_graph: RosGraph) -> None:
+    """The guide rests, the joint roll alternates."""
     bench = Bench(
         ros_graph, bevel=1.0, guide_limit=0.0, turns=4, roll_speed=20.0, step_length=0.005,
         steering__bevel_load=[1.0], belief__tilt=5e-3, belief__frame=5e-3,
@@ -182,7 +181,7 @@ def test_a_bevel_is_turned_by_roll_alone(ros_graph: RosGraph) -> None:
     bench.aim((1e-3, 0.051, 0.0))
     bench.until(lambda: bench.said.startswith(('done', 'stopped')), 'the end')
     assert bench.said.startswith('done: the tip is at x = ')
-    # A bevel that always pushes to one side would bring it 5 mm aside.
+    # A constant bevel direction would deviate by 5 mm.
     assert np.hypot(*(bench.tip - [1e-3, 0.0])) < 1.5e-3
     rolls = {move.positions[3] for message in bench.moves for move in message.points[-1:]}
     assert 2 <= len(rolls) <= 5
@@ -193,8 +192,8 @@ def test_a_bevel_is_turned_by_roll_alone(ros_graph: RosGraph) -> None:
 
 
 @pytest.mark.parametrize('continuous', [False, True])
-def test_an_axis_law_moves_the_needle(ros_graph: RosGraph, continuous: bool) -> None:
-    """A controller that is steered follows the node, with or without rests, and no targets."""
+def test_steered_controller_follows_the_node(ros_graph: RosGraph, continuous: bool) -> None:
+    """With or without stops, and without targets of its own."""
     time: dict[str, Any] = {'use_sim_time': True}
     bench = Bench(ros_graph, mode='simulation', continuous=continuous, rate=50.0, **time)
     controller = ros_graph.add(
@@ -215,12 +214,12 @@ def test_an_axis_law_moves_the_needle(ros_graph: RosGraph, continuous: bool) -> 
     assert bench.said.startswith('done: the tip is at x = ')
     assert np.hypot(*(bench.tip - np.array(TARGET)[[0, 2]])) < 5e-4
     assert 'joint_trajectory' not in controller.diagnose()[2]['last complaint']
-    # It is at the end of the last path, not of a target.
+    # At the end of the last path, not at a target.
     assert bench.at('insertion') == pytest.approx(TARGET[1], abs=3e-4)
 
 
-def test_a_controller_that_is_steered_leaves_targets_alone(ros_graph: RosGraph) -> None:
-    """Nothing moves by the target, and nothing is said; by default it does."""
+def test_steered_controller_ignores_targets(ros_graph: RosGraph) -> None:
+    """Without motion or log; by default it follows targets."""
     probe = ros_graph.node('probe')
     target = probe.create_publisher(PointStamped, 'target', COMMAND)
     nodes = [
@@ -234,7 +233,7 @@ def test_a_controller_that_is_steered_leaves_targets_alone(ros_graph: RosGraph) 
     target.publish(message)
     free, steered = nodes
     ros_graph.spin_until(lambda: free.diagnose()[2]['target [m]'] == 0.1, 'the target')
-    # Both have had it by now: messages come in the order in which they were sent.
+    # Both have received it: messages arrive in order.
     message.point.y = 0.05
     target.publish(message)
     ros_graph.spin_until(lambda: free.diagnose()[2]['target [m]'] == 0.05, 'the next target')
@@ -242,8 +241,8 @@ def test_a_controller_that_is_steered_leaves_targets_alone(ros_graph: RosGraph) 
     assert steered.diagnose()[2]['inputs refused'] == 0
 
 
-def test_a_sensor_that_freezes_stops_it(ros_graph: RosGraph) -> None:
-    """The needle rests within a step, and the node says why."""
+def test_frozen_sensor_stops_the_insertion(ros_graph: RosGraph) -> None:
+    """The needle rests within a step, and the node reports the reason."""
     bench = Bench(ros_graph)
     bench.aim()
     bench.until(lambda: bench.at('insertion') > 0.025, 'half the way')
@@ -264,8 +263,8 @@ def test_a_sensor_that_freezes_stops_it(ros_graph: RosGraph) -> None:
 
 
 @pytest.mark.parametrize('how', ['service', 'deactivated'])
-def test_it_can_be_stopped(ros_graph: RosGraph, how: str) -> None:
-    """Needle and guide come to rest in the midst of a step."""
+def test_stop_service_during_a_step(ros_graph: RosGraph, how: str) -> None:
+    """Needle and guide stop."""
     bench = Bench(ros_graph, speed=0.01)
     bench.aim()
     bench.until(lambda: 0.012 < bench.at('insertion') < 0.019, 'the second step')
@@ -287,8 +286,8 @@ def test_it_can_be_stopped(ros_graph: RosGraph, how: str) -> None:
     assert depth - 1e-3 <= still[-1] <= depth + 4e-3
 
 
-def test_a_plan_does_not_block_the_node(ros_graph: RosGraph) -> None:
-    """Meanwhile `~/stop` is answered and measurements are taken; the stop cancels the plan."""
+def test_planning_does_not_block_the_node(ros_graph: RosGraph) -> None:
+    """The node answers `~/stop` and receives measurements; the stop cancels the plan."""
     bench = Bench(ros_graph, step_length=5e-4, depth_tolerance=1e-4)
     bench.until(lambda: ' 0 taken' not in bench.taken('tip_deflection'), 'the sensors')
     bench.send(TARGET)
@@ -304,10 +303,10 @@ def test_a_plan_does_not_block_the_node(ros_graph: RosGraph) -> None:
     bench.until(lambda: job.done, 'the end of the thread')
 
 
-def test_a_motion_that_the_controller_rejects_stops_it_with_its_reason(
+def test_rejected_motion_stops_the_insertion(
     ros_graph: RosGraph,
 ) -> None:
-    """Its reference may go at 10 mm/s, and `steering` asks for 50 mm/s."""
+    """The controller allows 10 mm/s, and `steering` requests 50 mm/s."""
     time: dict[str, Any] = {'use_sim_time': True}
     bench = Bench(ros_graph, mode='simulation', **time)
     controller = ros_graph.add(
@@ -331,8 +330,8 @@ def test_a_motion_that_the_controller_rejects_stops_it_with_its_reason(
     assert bench.at('insertion') == pytest.approx(0.001, abs=1e-4)
 
 
-def test_a_needle_that_no_node_moves_is_reported(ros_graph: RosGraph) -> None:
-    """The plant moves the guide, and there is no controller."""
+def test_missing_controller_is_reported(ros_graph: RosGraph) -> None:
+    """The plant moves the guide only."""
     bench = Bench(ros_graph, mode='simulation', lockstep=False)
     bench.aim()
     bench.until(lambda: bench.said.startswith(('done', 'stopped')), 'the end')
@@ -342,8 +341,8 @@ def test_a_needle_that_no_node_moves_is_reported(ros_graph: RosGraph) -> None:
     )
 
 
-def test_what_cannot_be_is_refused_by_name(ros_graph: RosGraph) -> None:
-    """A target out of reach, a needle that is too short, constants that are none."""
+def test_invalid_targets_and_parameters_are_rejected(ros_graph: RosGraph) -> None:
+    """A target out of range, a short needle, invalid constants."""
     bench = Bench(ros_graph)
     bench.aim((0.05, 0.051, 0.0))
     assert 'out of reach' in bench.steering.diagnose()[2]['last complaint']
@@ -360,13 +359,13 @@ def test_what_cannot_be_is_refused_by_name(ros_graph: RosGraph) -> None:
         assert complaint in node.failure
 
 
-def test_the_shipped_parameters_are_those_of_the_three_nodes(ros_graph: RosGraph) -> None:
-    """Each takes its part of config/steering.yaml, and together they begin to steer."""
+def test_shipped_parameters_start_the_three_nodes(ros_graph: RosGraph) -> None:
+    """Each node uses its section of config/steering.yaml."""
     file = ['--ros-args', '--params-file', str(ROOT / 'config/steering.yaml')]
     user = ros_graph.node('user')
     target = user.create_publisher(PointStamped, 'target', COMMAND)
     moves = ros_graph.listen(user, JointTrajectory, 'joint_trajectory', COMMAND)
-    # At the shipped 1 kHz the three would be too much for one thread.
+    # The shipped 1 kHz is too fast for three nodes in one thread.
     nodes = [
         ros_graph.add(kind, cli_args=file, parameters={'rate': 200.0})
         for kind in (PlantNode, ControllerNode)
@@ -388,8 +387,8 @@ def test_the_shipped_parameters_are_those_of_the_three_nodes(ros_graph: RosGraph
     assert 'target' not in steering.diagnose()[2]['last complaint']
 
 
-def test_when_it_is_killed_needle_and_guide_rest_within_the_step(ros_graph: RosGraph) -> None:
-    """A robot ends the motion that it was sent last; no other follows."""
+def test_needle_and_guide_rest_after_a_kill_of_the_node(ros_graph: RosGraph) -> None:
+    """A robot completes its last motion; no other follows."""
     ros_graph.add(PlantNode, parameters={**PLANT, 'mode': 'robot', 'steering.bevel_load': [0.1]})
     user = ros_graph.node('user')
     states = ros_graph.latest(user, JointState, 'joint_states', SENSOR)
@@ -410,7 +409,7 @@ def test_when_it_is_killed_needle_and_guide_rest_within_the_step(ros_graph: RosG
             return False
         stamp = states.message.header.stamp
         if not moves and stamp.sec > sent:
-            # What comes before the sensors is refused: again a second later.
+            # Targets before the first measurements are rejected: repeat after 1 s.
             sent = stamp.sec
             target.publish(message)
         return 0.012 < at('insertion') < 0.019

@@ -1,4 +1,4 @@
-"""`needle watch` on real nodes: frames arrive, buttons work or are refused, a browser shows it."""
+"""`needle watch` with real nodes: frames, buttons, rejections, and a browser."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from support.pages import BROWSER
 from support.ros_graph import RosGraph
 from support.watched import write_watched
 
-#: A needle that a controller moves; slow enough for a machine that is busy.
+#: A needle moved by a controller; low rate for a busy machine.
 PLANT = {'model.preset': 'bending_35mm', 'steered': True, 'rate': 100.0, 'depth': 0.02}
 CONTROLLER = {
     'model.preset': 'bending_35mm', 'rate': 100.0, 'deflection_feedback': 'none',
@@ -34,7 +34,7 @@ needs_browser = pytest.mark.skipif(BROWSER is None, reason='no Chromium on this 
 
 @contextmanager
 def watching(environment: dict[str, str], *words: str) -> Iterator[tuple[Any, str]]:
-    """Start `needle watch`; give its process and the URL of its page."""
+    """Start `needle watch`; return its process and the URL of its page."""
     running = subprocess.Popen(
         [sys.executable, '-m', 'needle_insertion.cli', 'watch', '--port', '0', *words],
         env={**environment, 'PYTHONPATH': str(ROOT)},
@@ -52,7 +52,7 @@ def watching(environment: dict[str, str], *words: str) -> Iterator[tuple[Any, st
 
 
 class Reader:
-    """Reads the frames of a page, and presses its buttons."""
+    """Reads the frames of a page, and sends its commands."""
 
     def __init__(self, stream: ClientWebSocketResponse, token: str) -> None:
         self._stream, self._token = stream, token
@@ -70,14 +70,14 @@ class Reader:
         return message
 
     async def until(self, condition: Callable[[dict[str, Any]], Any], what: str) -> None:
-        """Read frames until one is as it should be."""
+        """Read frames until a condition holds."""
         end = asyncio.get_running_loop().time() + 120.0
         while not (self.frame and condition(self.frame)):
             assert asyncio.get_running_loop().time() < end, (what, self.frame)
             await self._next()
 
     async def ask(self, what: str, **more: Any) -> dict[str, Any]:
-        """Press a button, and return the answer."""
+        """Send a command, and return the answer."""
         await self._stream.send_json({'ask': what, 'token': self._token, **more})
         while True:
             message = await self._next()
@@ -85,12 +85,12 @@ class Reader:
                 return message['answer']
 
     def level(self, node: str) -> int | None:
-        """Return the level of a node; None if it has not said anything, or is silent."""
+        """Return the level of a node; None without status or after a timeout."""
         found = [one for one in self.frame['nodes'] if one['name'] == node]
         return found[0]['level'] if found and not found[0]['silent'] else None
 
     def fine(self, node: str) -> bool:
-        """Tell whether a node works; on a machine that is busy it may warn of delays."""
+        """Return whether a node works; on a busy machine it may warn of delays."""
         return self.level(node) in (0, 1)
 
 
@@ -109,7 +109,7 @@ def begin(graph: RosGraph) -> None:
 
 
 async def ready(reader: Reader) -> None:
-    """Wait until both nodes and the shape are seen, and the controller has its measurements."""
+    """Wait until both nodes and the shape are received, and the controller has measurements."""
     await reader.until(
         lambda frame: (
             frame['shape'] == 'simulated'
@@ -123,8 +123,8 @@ async def ready(reader: Reader) -> None:
     )
 
 
-def test_buttons_move_the_needle_and_stop_it(ros_graph: RosGraph) -> None:
-    """A target by the page moves the needle; stop, clear, pause and retract do what they say."""
+def test_buttons_command_the_needle(ros_graph: RosGraph) -> None:
+    """Target, stop, clear, pause and retract."""
     begin(ros_graph)
 
     async def look(url: str) -> None:
@@ -140,7 +140,7 @@ def test_buttons_move_the_needle_and_stop_it(ros_graph: RosGraph) -> None:
             assert (await reader.ask('resume'))['success']
             await reader.until(lambda frame: frame['depth'] > 0.0295, 'the end')
             assert reader.frame['error'] == pytest.approx(0.0, abs=1e-3)
-            # What was cut is as long as what was inserted.
+            # The length of the cut path equals the insertion depth.
             assert reader.frame['path'][1][-1] == pytest.approx(reader.frame['depth'], abs=1e-3)
             said = await reader.ask('stop')
             assert said['success']
@@ -157,8 +157,8 @@ def test_buttons_move_the_needle_and_stop_it(ros_graph: RosGraph) -> None:
         assert running.wait(60.0) == 0
 
 
-def test_without_control_it_only_listens(ros_graph: RosGraph) -> None:
-    """Buttons are refused; what ends is shown as silent, and what comes back as there."""
+def test_read_only_page_rejects_commands(ros_graph: RosGraph) -> None:
+    """Ended nodes are shown as silent, restarted nodes as active."""
     ros_graph.start('controller', CONTROLLER)
     plant = ros_graph.start('plant', PLANT)
 
@@ -185,21 +185,19 @@ def test_without_control_it_only_listens(ros_graph: RosGraph) -> None:
         assert running.wait(60.0) == 0
 
 
-def test_who_only_looks_has_nothing_to_command_with(ros_graph: RosGraph) -> None:
-    """Its node publishes nothing of the contract, and asks for no service."""
+def test_read_only_node_has_no_publishers_or_clients(ros_graph: RosGraph) -> None:
+    """No topic of the contract, and no service client."""
     node = WatchNode(View(), ros_graph.context)
     try:
         assert {one.topic_name for one in node.publishers} <= {'/parameter_events'}
         assert not [*node.clients]
-        # Of rclpy, for tools.
+        # Publishers of rclpy for tools.
         assert {one.srv_name for one in node.services} <= {'watch/get_type_description'}
     finally:
         node.destroy_node()
 
 
-def test_a_button_without_nodes_says_so(ros_graph: RosGraph) -> None:
-    """Nobody takes a target, nobody can be stopped."""
-
+def test_button_without_nodes_is_reported(ros_graph: RosGraph) -> None:
     async def look(url: str) -> None:
         async with reading(url) as reader:
             await reader.until(lambda frame: frame['shape'] is None, 'a frame')
@@ -215,7 +213,7 @@ def test_a_button_without_nodes_says_so(ros_graph: RosGraph) -> None:
         asyncio.run(look(url))
 
 
-def test_a_domain_that_is_none_is_refused(ros_graph: RosGraph) -> None:
+def test_invalid_domain_is_rejected(ros_graph: RosGraph) -> None:
     """One line, and status 2."""
     done = subprocess.run(
         [sys.executable, '-m', 'needle_insertion.cli', 'watch', '--port', '0'],
@@ -232,7 +230,7 @@ def test_a_domain_that_is_none_is_refused(ros_graph: RosGraph) -> None:
 # In a browser.
 
 
-#: What the page shows, and whether it sticks out [pixels].
+#: Text of the page, and its overflow [pixels].
 LOOK = """({
   overflow: document.documentElement.scrollWidth - document.documentElement.clientWidth,
   text: document.body.innerText,
@@ -243,11 +241,11 @@ LOOK = """({
 
 
 async def shown(tab: Tab, url: str, width: int, picture: Path) -> dict[str, Any]:
-    """Open a page with a width, and return what is to be seen of it."""
+    """Open a page with a width, and return its content."""
     await tab.size(width, 1000)
     await tab.open(url)
     await tab.wait('window.needleWatch && needleWatch.drawn > 20', 'the page')
-    # Words follow the frames.
+    # The text is updated after the frames.
     await tab.wait("document.getElementById('state').dataset.level !== 'none'", 'the state')
     await tab.picture(picture)
     seen: dict[str, Any] = await tab.run(LOOK)
@@ -256,8 +254,8 @@ async def shown(tab: Tab, url: str, width: int, picture: Path) -> dict[str, Any]
 
 @needs_browser
 @pytest.mark.parametrize('width', [1400, 400])
-def test_a_browser_shows_what_is_live(ros_graph: RosGraph, tmp_path: Path, width: int) -> None:
-    """It draws, fits, asks nobody else for anything, and can be used by keyboard."""
+def test_browser_shows_live_data(ros_graph: RosGraph, tmp_path: Path, width: int) -> None:
+    """Drawing, layout, no external requests, and keyboard operation."""
     begin(ros_graph)
 
     async def look(url: str) -> None:
@@ -273,9 +271,9 @@ def test_a_browser_shows_what_is_live(ros_graph: RosGraph, tmp_path: Path, width
             begun = asyncio.get_running_loop().time()
             await tab.wait(f'needleWatch.drawn >= {count + 60}', 'frames')
             spent = asyncio.get_running_loop().time() - begun
-            # For whoever reads the output: it depends on the machine.
+            # Printed for information: the rate depends on the machine.
             sys.stdout.write(f'{60.0 / spent:.1f} frames a second at {width} pixels\n')
-            # The first that the keyboard leads to is what stops the needle.
+            # The first element in tab order is the stop button.
             await tab.press('Tab')
             assert await tab.run('document.activeElement.id') == 'stop'
             await tab.press('Enter')
@@ -296,8 +294,8 @@ def test_a_browser_shows_what_is_live(ros_graph: RosGraph, tmp_path: Path, width
 
 @needs_browser
 @pytest.mark.parametrize('width', [1400, 400])
-def test_a_browser_plays_a_recording(tmp_path: Path, width: int) -> None:
-    """The slider leads to a time; who wants less motion gets less; the end of it is told."""
+def test_browser_plays_a_recording(tmp_path: Path, width: int) -> None:
+    """Slider, reduced motion, and end of the recording."""
     write_watched(tmp_path / 'bag')
 
     async def look(running: Any, url: str) -> None:
@@ -319,7 +317,7 @@ def test_a_browser_plays_a_recording(tmp_path: Path, width: int) -> None:
             count = await tab.run('needleWatch.drawn')
             await tab.run("document.getElementById('play').click()")
             await tab.wait(f"{clock}.startsWith('4.0 of')", 'the end')
-            # Two a second of what has half a second.
+            # Two frames a second for a playback of half a second.
             assert await tab.run('needleWatch.drawn') - count < 12
             running.send_signal(signal.SIGINT)
             state = "document.getElementById('state').textContent"

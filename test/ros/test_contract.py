@@ -1,4 +1,4 @@
-"""The contract is the one that the documentation shows, and the one that the model needs."""
+"""The topic contract agrees with the documentation and the model."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ PAGE = Path(__file__).resolve().parents[2] / 'docs' / 'architecture.md'
 
 
 def row(name: str) -> str:
-    """Return the row of a topic as the table of the documentation has it."""
+    """Return the row of a topic in the table of the documentation."""
     topic = next(topic for topic in TOPICS if topic.name == name)
     joints = ', '.join(
         f'`{joint.name}` [{joint.unit}], [{joint.unit}/s]'
@@ -29,8 +29,8 @@ def row(name: str) -> str:
     )
 
 
-def test_the_documentation_has_the_table_of_topics() -> None:
-    """All of them, in the order of the contract; a difference shows the rows to copy."""
+def test_documented_topic_table_equals_the_contract() -> None:
+    """A failure prints the rows to copy."""
     table = [row(topic.name) for topic in TOPICS]
     page = PAGE.read_text(encoding='utf-8').splitlines()
     begin = next(k for k, line in enumerate(page) if line.startswith('| topic |')) + 2
@@ -38,8 +38,8 @@ def test_the_documentation_has_the_table_of_topics() -> None:
 
 
 @pytest.mark.parametrize('topic', TOPICS, ids=lambda topic: topic.name)
-def test_a_topic_names_each_of_its_numbers(topic: object) -> None:
-    """Its template has as many numbers, and what is not read from bytes has none."""
+def test_topic_quantities_match_its_template(topic: object) -> None:
+    """Topics of other types have no quantities."""
     topic = next(known for known in TOPICS if known is topic)
     assert len({known.name for known in TOPICS}) == len(TOPICS)
     if topic.type_name not in TYPES:
@@ -52,8 +52,8 @@ def test_a_topic_names_each_of_its_numbers(topic: object) -> None:
 
 
 @pytest.mark.parametrize('modes', [1, 2, 5])
-def test_the_ground_truth_has_the_coordinates_of_the_model(modes: int) -> None:
-    """Positions, velocities and, if it is commanded, efforts of each."""
+def test_ground_truth_has_the_coordinates_of_the_model(modes: int) -> None:
+    """Positions, velocities and, if commanded, efforts."""
     model = NeedleModel(NeedleParameters(modes=modes, minimum_depth=0.1))
     names = model.coordinate_names
     for commanded in (False, True):

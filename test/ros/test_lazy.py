@@ -1,4 +1,4 @@
-"""Importing a package is cheap: its public names are imported when they are first used."""
+"""Lazy import of the public names of the packages."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ PACKAGES = ['needle_dynamics', 'needle_identification']
 
 
 @pytest.mark.parametrize('package', PACKAGES)
-def test_importing_a_package_imports_no_other_library(package: str) -> None:
+def test_package_import_loads_no_slow_library(package: str) -> None:
     code = f'import sys, {package}; print(*sys.modules)'
     found = subprocess.run(
         [sys.executable, '-c', code], capture_output=True, text=True, check=True
@@ -21,7 +21,7 @@ def test_importing_a_package_imports_no_other_library(package: str) -> None:
     assert not {'numpy', 'scipy', 'numba', 'rclpy'} & set(found.stdout.split())
 
 
-def test_identification_from_a_bag_needs_no_slow_library() -> None:
+def test_identification_from_a_bag_loads_no_slow_library() -> None:
     bag = Path(__file__).parents[2] / 'bags' / 'friction_01'
     code = (
         'import sys; from needle_identification import identify_friction as identify; '
@@ -36,7 +36,7 @@ def test_identification_from_a_bag_needs_no_slow_library() -> None:
 
 
 @pytest.mark.parametrize('package', PACKAGES)
-def test_every_public_name_is_there(package: str) -> None:
+def test_every_exported_name_can_be_imported(package: str) -> None:
     module = import_module(package)
     assert set(module.__all__) <= set(dir(module))
     for name in module.__all__:

@@ -1,4 +1,4 @@
-"""A pool of processes: results, errors, and workers that are killed."""
+"""Process pool: results, errors, and killed workers."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ import psutil
 import pytest
 from support.jobs import die, divide, kill_once, LARGE, refuse, wait_for_ever
 
-#: Size of a result that a pipe cannot hold [bytes].
+#: Size of a result larger than a pipe buffer [bytes].
 SIZE = 4_000_000
 
 
-def test_results_are_in_order_and_errors_have_their_type_and_traceback() -> None:
+def test_results_are_ordered_and_errors_keep_type_and_traceback() -> None:
     before = len(workers(os.getpid()))
     with processes(2) as pool:
         assert list(pool.map(divide, range(6), [2.0] * 6)) == [0.0, 0.5, 1.0, 1.5, 2.0, 2.5]
@@ -33,7 +33,7 @@ def test_results_are_in_order_and_errors_have_their_type_and_traceback() -> None
         assert 'return a / b' in str(raised.value.__cause__)
         with pytest.raises(ParameterError, match=r'^value must be > 0, got -1$'):
             pool.submit(refuse, -1.0).result()
-        # Neither of these can be sent; the worker remains.
+        # Neither object can be pickled; the worker continues.
         with pytest.raises((AttributeError, TypeError), match='pickle'):
             pool.submit(lambda: 0).result()
         with pytest.raises((AttributeError, TypeError), match='pickle'):
@@ -44,16 +44,16 @@ def test_results_are_in_order_and_errors_have_their_type_and_traceback() -> None
 
 
 @pytest.mark.parametrize('delay', [0.0, 0.02, 0.04, 0.08])
-def test_a_job_whose_worker_is_killed_is_computed_again(tmp_path: Path, delay: float) -> None:
-    """Also if half of its result was sent."""
+def test_job_of_a_killed_worker_is_repeated(tmp_path: Path, delay: float) -> None:
+    """Also after a partly sent result."""
     with processes(2) as pool:
         others = pool.map(abs, range(20))
         assert pool.submit(kill_once, str(tmp_path / 'once'), delay).result() == bytes(LARGE)
         assert list(others) == list(range(20))
 
 
-def test_a_job_that_always_loses_its_worker_is_an_error() -> None:
-    """In one line; other jobs are not affected."""
+def test_job_that_always_kills_its_worker_fails() -> None:
+    """The job fails with a one-line error; other jobs are not affected."""
     with processes(2) as pool:
         lost, other = pool.submit(die), pool.submit(abs, -3)
         with pytest.raises(
@@ -63,12 +63,12 @@ def test_a_job_that_always_loses_its_worker_is_an_error() -> None:
         assert other.result() == 3
 
 
-def test_kills_at_random_times_change_nothing() -> None:
-    """A third of them hits a worker that starts; no job can lose ten workers by nine kills."""
+def test_results_are_complete_despite_random_kills() -> None:
+    """A third of the kills hits a starting worker; no job can lose ten workers."""
     rng, ended, ages = np.random.default_rng(1), Event(), list[float]()
 
     def kill() -> None:
-        # The moments are random: no condition is waited for.
+        # Random times: there is no condition to wait for.
         while len(ages) < 9 and not ended.wait(rng.uniform(0.0, rng.choice([0.05, 1.0, 1.0]))):
             age = kill_worker(os.getpid(), rng, youngest=True)
             if age is not None:
@@ -90,7 +90,7 @@ def test_kills_at_random_times_change_nothing() -> None:
     assert len(ages) == 9
 
 
-def test_jobs_that_run_are_ended_with_the_context(tmp_path: Path) -> None:
+def test_leaving_the_context_ends_running_jobs(tmp_path: Path) -> None:
     marker = tmp_path / 'runs'
     with processes(1) as pool:
         running, waiting = pool.submit(wait_for_ever, str(marker)), pool.submit(abs, -3)
@@ -104,8 +104,8 @@ def test_jobs_that_run_are_ended_with_the_context(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize('number', [signal.SIGKILL, signal.SIGINT])
-def test_workers_end_with_a_parent_that_is_killed(tmp_path: Path, number: int) -> None:
-    """SIGINT to all of them ends the parent, and the parent its workers; none prints anything."""
+def test_workers_end_with_a_killed_parent(tmp_path: Path, number: int) -> None:
+    """SIGINT to the process group ends the parent, and the parent its workers, without output."""
     marker = tmp_path / 'runs'
     script = (
         'from needle_ros.process_pool import processes\n'

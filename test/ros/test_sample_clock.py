@@ -1,4 +1,4 @@
-"""When samples are due."""
+"""Schedule of simulation samples."""
 
 from itertools import pairwise
 
@@ -9,7 +9,7 @@ from needle_ros.sample_clock import SampleClock
 from needle_ros.timing import NANOSECONDS
 import pytest
 
-#: A clock is never at zero.
+#: Initial time of the clock, which is never zero [ns].
 BEGIN = 1_700_000_000 * NANOSECONDS
 
 
@@ -20,14 +20,14 @@ def make(
     own: bool = False,
     lockstep: bool = False,
 ) -> SampleClock:
-    """Return a clock that has begun."""
+    """Return a started clock."""
     clock = SampleClock(rate, factor, backlog, own=own, lockstep=lockstep)
     clock.begin(BEGIN)
     return clock
 
 
 def take(clock: SampleClock, now: int) -> list[int]:
-    """Take what is due; return the stamps."""
+    """Take all due samples; return their stamps."""
     return [clock.take() for _ in range(clock.due(now))]
 
 
@@ -39,21 +39,21 @@ ticks = st.lists(st.integers(0, 300_000_000), min_size=1, max_size=60)
 def test_samples_are_at_multiples_of_the_period_and_never_early(
     steps: list[int], rate: float, factor: float
 ) -> None:
-    """However late the looks are, no sample is missing, twice, or of the future."""
+    """For any delay of the checks, no sample is missing, repeated, or early."""
     clock = make(rate, factor, own=True)
     now, stamps = BEGIN, []
     for step in steps:
         now += step
         stamps += take(clock, now)
     assert stamps == [BEGIN + round((k + 1) / rate * NANOSECONDS) for k in range(len(stamps))]
-    # A nanosecond of rounding.
+    # Rounding of 1 ns.
     assert not stamps or stamps[-1] <= BEGIN + (now - BEGIN) * factor + 1
 
 
 @given(ticks)
 @settings(max_examples=60)
-def test_the_clocks_time_skips_what_is_beyond_the_backlog(steps: list[int]) -> None:
-    """The newest stamp is within a period of the clock's now; every sample is taken or lost."""
+def test_samples_beyond_the_backlog_are_dropped(steps: list[int]) -> None:
+    """The newest stamp is within a period of now; each sample is taken or counted as lost."""
     clock = make(100.0, backlog=0.1)
     now, taken = BEGIN, 0
     for step in steps:
@@ -63,13 +63,13 @@ def test_the_clocks_time_skips_what_is_beyond_the_backlog(steps: list[int]) -> N
         for _ in range(due):
             taken += 1
             assert clock.take() <= now + 1
-    # A nanosecond of rounding for each time that samples were lost.
+    # Rounding of 1 ns at each loss of samples.
     assert now - clock.stamp < NANOSECONDS / 100.0 + len(steps) + 1
     assert taken + clock.lost == pytest.approx((now - BEGIN) / 1e7, abs=1.0)
 
 
-def test_a_time_of_its_own_waits_for_a_machine_that_stalls() -> None:
-    """After a stall of a second half of it is made up in bursts; the rest has been waited."""
+def test_independent_time_waits_after_a_stall() -> None:
+    """Half of a stall of 1 s is made up in bursts; the rest delays simulated time."""
     clock = make(own=True)
     stamps = []
     for k in range(1000):
@@ -79,8 +79,8 @@ def test_a_time_of_its_own_waits_for_a_machine_that_stalls() -> None:
     assert {b - a for a, b in pairwise(stamps)} == {1_000_000}
 
 
-def test_as_fast_as_possible_is_not_bound_to_the_clock() -> None:
-    """Without a clock samples are due at once, and as many as readers can bear."""
+def test_maximum_speed_is_independent_of_the_clock() -> None:
+    """Samples are due at once, limited to the burst size of subscribers."""
     clock = make(factor=0.0)
     stamps = [stamp for _ in range(10) for stamp in take(clock, BEGIN)]
     assert len(stamps) == 200
@@ -88,8 +88,8 @@ def test_as_fast_as_possible_is_not_bound_to_the_clock() -> None:
 
 
 @pytest.mark.parametrize('factor', [0.0, 1.0])
-def test_in_lockstep_each_sample_waits_for_its_answer(factor: float) -> None:
-    """Time begins at zero and goes on by a sample for every answer, if it is the right one."""
+def test_lockstep_waits_for_the_command_of_each_sample(factor: float) -> None:
+    """Time starts at zero and advances by one sample per matching command."""
     clock = make(factor=factor, lockstep=True)
     now = BEGIN
     for k in range(1, 50):
@@ -103,8 +103,8 @@ def test_in_lockstep_each_sample_waits_for_its_answer(factor: float) -> None:
     assert clock.lost == 0
 
 
-def test_in_lockstep_a_sample_waits_for_all_who_process_it() -> None:
-    """A command and each of two nodes, in any order; an answer that comes twice counts once."""
+def test_lockstep_waits_for_all_processing_nodes() -> None:
+    """A command and two nodes, in any order; a repeated response counts once."""
     clock = make(lockstep=True)
     clock.participants = 2
     (stamp,) = take(clock, BEGIN + 1_000_000)
@@ -120,13 +120,13 @@ def test_in_lockstep_a_sample_waits_for_all_who_process_it() -> None:
     clock.answered(stamp - 1_000_000, 'steering')
     assert clock.awaited == stamp
     assert clock.missing == '0 of 2 nodes have processed'
-    # Both have gone.
+    # Both nodes have left.
     clock.participants = 0
     assert take(clock, later + 1_000_000) == [stamp + 1_000_000]
 
 
-def test_in_lockstep_a_recorder_is_at_most_10_samples_behind() -> None:
-    """Time stands still until the recorder has more, or has ended."""
+def test_lockstep_recorder_lag_is_at_most_10_samples() -> None:
+    """Time waits until the recorder catches up or ends."""
     clock, now = make(factor=0.0, lockstep=True), BEGIN
     clock.recorded['recorder'] = 1
     stamps = []
@@ -147,8 +147,8 @@ def test_in_lockstep_a_recorder_is_at_most_10_samples_behind() -> None:
     assert len(stamps) == 121
 
 
-def test_in_lockstep_a_stall_is_made_up() -> None:
-    """Late samples follow each answer at once, as far back as the backlog."""
+def test_lockstep_makes_up_a_stall() -> None:
+    """Late samples follow each command at once, up to the backlog."""
     clock = make(lockstep=True, backlog=0.01)
     now = BEGIN + 5_000_000
     stamps = []
@@ -162,19 +162,18 @@ def test_in_lockstep_a_stall_is_made_up() -> None:
     assert clock.waited == NANOSECONDS - 10_000_000
 
 
-def test_in_lockstep_it_is_no_faster_than_its_pace() -> None:
-    """An answer that comes at once does not make time run faster."""
+def test_lockstep_does_not_exceed_the_real_time_factor() -> None:
+    """Immediate responses do not accelerate time."""
     clock = make(lockstep=True)
     for k in range(1, 3001):
-        # The clock is looked at ten times a period.
+        # Ten checks per period.
         for stamp in take(clock, BEGIN + k * 100_000):
             clock.answered(stamp)
     assert clock.stamp == 300_000_000
 
 
 @pytest.mark.parametrize('own', [False, True])
-def test_a_pause_ends_with_the_run(own: bool) -> None:
-    """Who begins again is not held by a pause of before."""
+def test_restart_clears_a_pause(own: bool) -> None:
     clock = make(own=own)
     clock.pause()
     clock.begin(BEGIN)
@@ -184,8 +183,8 @@ def test_a_pause_ends_with_the_run(own: bool) -> None:
 
 
 @pytest.mark.parametrize('own', [False, True])
-def test_in_a_pause_time_stands_still(own: bool) -> None:
-    """Afterwards a time of its own goes on where it stood, the clock's at the clock's now."""
+def test_time_stops_during_a_pause(own: bool) -> None:
+    """After the pause, an independent time continues at its value, other time at the clock."""
     clock = make(own=own)
     before = take(clock, BEGIN + 10_000_000)[-1]
     clock.pause()
@@ -199,8 +198,8 @@ def test_in_a_pause_time_stands_still(own: bool) -> None:
 
 
 @pytest.mark.parametrize('own', [False, True])
-def test_a_step_is_one_sample(own: bool) -> None:
-    """Each step is a period on in a time of its own, and the clock's now where that is time."""
+def test_step_takes_one_sample(own: bool) -> None:
+    """A step advances independent time by a period, and other time to the clock."""
     clock = make(own=own)
     with pytest.raises(JobError, match='time is not paused; pause first'):
         clock.step(BEGIN)
@@ -211,8 +210,8 @@ def test_a_step_is_one_sample(own: bool) -> None:
     assert clock.due(BEGIN + 4 * NANOSECONDS) == 0
 
 
-def test_a_step_in_lockstep_waits_for_the_answer_too() -> None:
-    """A second step is refused until the first sample has been answered."""
+def test_lockstep_step_waits_for_the_command() -> None:
+    """A second step is rejected until the first sample has been answered."""
     clock = make(lockstep=True)
     clock.pause()
     stamp = clock.step(BEGIN)
@@ -223,8 +222,8 @@ def test_a_step_in_lockstep_waits_for_the_answer_too() -> None:
 
 
 @pytest.mark.parametrize('own', [False, True])
-def test_a_clock_that_is_set_back_does_not_stop_it(own: bool) -> None:
-    """The clock's time follows; a time of its own goes on where it was."""
+def test_sampling_continues_after_the_clock_is_set_back(own: bool) -> None:
+    """Independent time continues at its value, other time follows the clock."""
     clock = make(own=own)
     newest = take(clock, BEGIN + 100_000_000)[-1] if not own else BEGIN
     back = BEGIN - 3600 * NANOSECONDS

@@ -1,4 +1,4 @@
-"""Settings from values: checked, with defaults, and errors that name what is wrong."""
+"""Construction of settings from values: checks, defaults, and error messages."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import pytest
 
 @dataclass(frozen=True, kw_only=True)
 class Robot:
-    """A robot."""
+    """Example of settings."""
 
     gain: float = constant(2.0, '1/s', 'gain', open_low=True, high=50.0)
     offset: float = constant(0.0, '1', 'offset', low=-1.0)
@@ -25,8 +25,8 @@ class Robot:
         check_constants(self)
 
 
-def test_values_are_taken_as_they_are_meant() -> None:
-    """Integers as floats, lists and arrays as tuples; what is not given has its default."""
+def test_values_are_converted_to_field_types() -> None:
+    """Integers to floats, lists and arrays to tuples; missing values get the default."""
     made = from_values(Robot, {'gain': 3, 'levels': [1, 2.5], 'law': 'pd'})
     assert made == Robot(gain=3.0, levels=(1.0, 2.5), law='pd')
     assert [type(number) for number in (made.gain, *made.levels)] == [float] * 3
@@ -34,8 +34,8 @@ def test_values_are_taken_as_they_are_meant() -> None:
     assert from_values(Robot, {}) == Robot()
 
 
-def test_an_empty_list_arrives_as_none() -> None:
-    """So rcl reads it from a parameter file; the default is not what the file says."""
+def test_none_is_an_empty_tuple() -> None:
+    """An empty list of a parameter file arrives from rcl as None."""
     assert from_values(Robot, {'levels': None, 'joints': None}) == Robot(levels=(), joints=())
 
 
@@ -60,14 +60,14 @@ def test_an_empty_list_arrives_as_none() -> None:
         ),
     ],
 )
-def test_what_is_not_valid_is_named(values: dict[str, Any], complaint: str) -> None:
-    """The name with its namespace, what was found, and what would be valid."""
+def test_error_names_the_invalid_value(values: dict[str, Any], complaint: str) -> None:
+    """The message has the qualified name, the value, and the valid range."""
     with pytest.raises(ParameterError) as caught:
         from_values(Robot, values, 'arm.')
     assert str(caught.value) == complaint
 
 
-def test_an_unknown_name_has_a_hint() -> None:
-    """The nearest name, or all of them."""
+def test_unknown_name_has_a_hint() -> None:
+    """The nearest name, or all names."""
     assert unknown_name('rat', ['rate', 'mode']) == "unknown parameter 'rat'; did you mean 'rate'?"
     assert unknown_name('q', ['rate', 'mode']) == "unknown parameter 'q'; valid: mode, rate"

@@ -1,4 +1,4 @@
-"""Numbers read from bytes are those that a general deserializer finds, message by message."""
+"""Parsing and serialization of CDR messages, compared with rosbags."""
 
 from __future__ import annotations
 
@@ -50,21 +50,21 @@ def decode(
 
 
 def first_two(template: Template) -> list[int]:
-    """Choose the first number of the first two arrays."""
+    """Select the first number of the first two arrays."""
     return [begin if length else -1 for begin, length in template.arrays[:2]]
 
 
 def second(template: Template) -> list[int]:
-    """Choose the second number of the first array."""
+    """Select the second number of the first array."""
     return [template.arrays[0][0] + 8]
 
 
 @settings(max_examples=150, deadline=None)
 @given(MESSAGES)
-def test_a_batch_has_the_numbers_that_rosbags_finds(
+def test_batch_values_equal_rosbags_values(
     drawn: list[tuple[int, list[str], list[float], list[float], bool]],
 ) -> None:
-    """In either byte order, whatever the names and lengths."""
+    """Both byte orders, any names and array lengths."""
     serialized, expected = [], []
     for stamp, names, position, velocity, little in drawn:
         serialized.append(joint_state(stamp, names, position, velocity, little_endian=little))
@@ -80,10 +80,10 @@ def test_a_batch_has_the_numbers_that_rosbags_finds(
 
 @settings(max_examples=150, deadline=None)
 @given(STAMPS, strategies.lists(TEXTS, max_size=3), FLOATS, FLOATS, strategies.booleans())
-def test_a_template_writes_and_reads_what_rosbags_does(
+def test_template_round_trip_matches_rosbags(
     stamp: int, names: list[str], position: list[float], velocity: list[float], little: bool
 ) -> None:
-    """A message is its own template, and one made from its description writes the same bytes."""
+    """The template of a message and a template from its description write the same bytes."""
     message = joint_state(stamp, names, position, velocity, little_endian=little)
     template = Template.of(message, MOTION)
     reading = template.read(message)
@@ -105,12 +105,11 @@ DESCRIPTIONS = strategies.tuples(
 
 
 @given(DESCRIPTIONS, DESCRIPTIONS, STAMPS)
-def test_a_template_reads_its_own_messages_only(
+def test_template_rejects_other_frames_joints_and_lengths(
     one: tuple[str, list[str], tuple[int, int, int]],
     other: tuple[str, list[str], tuple[int, int, int]],
     stamp: int,
 ) -> None:
-    """Another frame, joint or length is another template."""
     frame, names, counts = other
     data = Template(MOTION, frame, names=names, counts=counts).serialize(
         stamp, *[0.5] * sum(counts)
@@ -120,8 +119,8 @@ def test_a_template_reads_its_own_messages_only(
 
 
 @pytest.mark.parametrize('length', [0, 3, 12, 75])
-def test_a_template_does_not_read_a_message_cut_short(length: int) -> None:
-    """More bytes do not matter, nor do the options of the encapsulation."""
+def test_template_rejects_truncated_messages(length: int) -> None:
+    """Additional bytes and encapsulation options are ignored."""
     template = Template(WRENCH, 'needle_base')
     data = template.serialize(1, *[0.5] * 6)
     reading = template.read(data)
@@ -134,8 +133,8 @@ def test_a_template_does_not_read_a_message_cut_short(length: int) -> None:
 
 
 @pytest.mark.parametrize('count', [0, 5, 7])
-def test_a_wrong_number_of_values_is_refused(count: int) -> None:
-    """And does no harm to the messages that follow."""
+def test_wrong_number_of_values_is_rejected(count: int) -> None:
+    """The next message is serialized correctly."""
     template = Template(WRENCH, 'needle_base')
     with pytest.raises(ShapeError, match=f'has 6 values, got {count}'):
         template.serialize(1, *[0.5] * count)
@@ -145,7 +144,7 @@ def test_a_wrong_number_of_values_is_refused(count: int) -> None:
 
 
 def test_xcdr2_aligns_to_four_bytes() -> None:
-    """A batch and a single message are read alike."""
+    """Batch and single message give the same numbers."""
     body = struct.pack('<iII', 1, 2, 4) + b'abc\0' + struct.pack('<6d', *range(6))
     message = b'\x00\x07\x00\x00' + body
     read = decode([message], WRENCH, second, 1)
@@ -157,8 +156,8 @@ def test_xcdr2_aligns_to_four_bytes() -> None:
 
 @settings(max_examples=200, deadline=None)
 @given(strategies.binary(max_size=120), strategies.sampled_from([*wire.TYPES]))
-def test_any_bytes_are_invalid_or_have_numbers(data: bytes, type_name: str) -> None:
-    """Nothing else is raised, and an invalid message has a reason."""
+def test_random_bytes_are_valid_or_counted_as_invalid(data: bytes, type_name: str) -> None:
+    """No other error is raised, and an invalid message has a reason."""
     for message in (data, b'\x00\x01\x00\x00' + data):
         read = decode([message], type_name, first_two, 2)
         assert read.invalid + len(read.used) == 1
@@ -166,8 +165,8 @@ def test_any_bytes_are_invalid_or_have_numbers(data: bytes, type_name: str) -> N
 
 
 @pytest.mark.parametrize('size', range(76))
-def test_a_message_cut_anywhere_is_invalid(size: int) -> None:
-    """The message after it is read."""
+def test_truncated_message_is_invalid(size: int) -> None:
+    """The next message is parsed."""
     whole = wrench(10**18, 1.0)
     read = decode([whole[:size], whole], WRENCH, second, 1)
     assert (read.invalid, *read.used, *read.values) == (1, 1, 1.0)
@@ -175,22 +174,22 @@ def test_a_message_cut_anywhere_is_invalid(size: int) -> None:
         Template.of(whole[:size], WRENCH)
 
 
-def test_bytes_beyond_the_type_are_invalid() -> None:
-    """Up to three bytes are padding."""
+def test_trailing_bytes_are_invalid() -> None:
+    """Up to three bytes are accepted as padding."""
     whole = wrench(10**18, 1.0)
     assert Template.of(whole + bytes(3), WRENCH).read(whole + bytes(3)) is not None
-    with pytest.raises(MessageError, match="has 80 bytes, 76 are its type's"):
+    with pytest.raises(MessageError, match='has 80 bytes, 76 expected'):
         Template.of(whole + bytes(4), WRENCH)
 
 
-def test_many_kinds_of_message_are_read_one_by_one() -> None:
-    """Each has another joint."""
+def test_batch_with_many_templates() -> None:
+    """Each message has a different joint name."""
     messages = [joint_state(i, [f'joint {i}'], [float(i)]) for i in range(200)]
     read = decode(messages, MOTION, first_two, 2)
     assert_array_equal(read.values[:, 0], np.arange(200.0))
 
 
-def test_messages_that_are_not_wanted_are_left_out() -> None:
-    """They are neither used nor invalid."""
+def test_unselected_messages_are_skipped() -> None:
+    """They count neither as used nor as invalid."""
     read = decode([wrench(1, 1.0)], WRENCH, lambda _template: None, 2)
     assert (len(read.used), read.invalid) == (0, 0)

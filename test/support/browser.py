@@ -1,4 +1,4 @@
-"""A real browser, driven over the Chrome DevTools protocol."""
+"""Browser controlled over the Chrome DevTools protocol."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from typing import Any, Final
 from aiohttp import ClientSession, ClientWebSocketResponse, WSMsgType
 from support.pages import BROWSER
 
-#: Longest wait for the browser [s]: a machine that is busy takes its time.
+#: Timeout of the browser on a busy machine [s].
 _PATIENCE: Final = 120.0
 
 
@@ -25,12 +25,12 @@ class Tab:
 
     def __init__(self, stream: ClientWebSocketResponse) -> None:
         self._stream, self._numbers = stream, count(1)
-        #: Addresses that the page has asked for, and what went wrong in its script.
+        #: URLs requested by the page, and errors of its script.
         self.requests: list[str] = []
         self.faults: list[str] = []
 
     async def call(self, method: str, **parameters: Any) -> dict[str, Any]:
-        """Call a method of the protocol, and return its result."""
+        """Call a method of the protocol and return its result."""
         number = next(self._numbers)
         await self._stream.send_json({'id': number, 'method': method, 'params': parameters})
         while True:
@@ -61,29 +61,27 @@ class Tab:
 
     async def wait(self, script: str, what: str) -> Any:
         """Wait until the value of a script is true, and return it."""
-        # While a page loads, what is looked for may not be there.
+        # While a page loads, its elements may be missing.
         script = f'(() => {{ try {{ return {script} }} catch {{ return null }} }})()'
         for _ in range(round(_PATIENCE / 0.1)):
             if value := await self.run(script):
                 return value
             await asyncio.sleep(0.1)
-        raise AssertionError(f'{what} did not come; faults: {self.faults}')
+        raise AssertionError(f'timeout waiting for {what}; faults: {self.faults}')
 
     async def size(self, width: int, height: int) -> None:
-        """Give the page a size [pixels]."""
+        """Set the page size [pixels]."""
         await self.call(
             'Emulation.setDeviceMetricsOverride',
             width=width, height=height, deviceScaleFactor=1, mobile=width < 600,
         )  # fmt: skip
 
     async def open(self, url: str) -> None:
-        """Open a page."""
         for domain in ('Page', 'Network', 'Runtime', 'Log'):
             await self.call(f'{domain}.enable')
         await self.call('Page.navigate', url=url)
 
     async def press(self, key: str) -> None:
-        """Press a key."""
         text = {'Enter': '\r', ' ': ' '}.get(key, '')
         code = {'Tab': 9, 'Enter': 13, ' ': 32}[key]
         for kind in ('keyDown', 'keyUp'):
@@ -93,14 +91,14 @@ class Tab:
             )  # fmt: skip
 
     async def picture(self, path: Path) -> None:
-        """Write a picture of the whole page."""
+        """Save a screenshot of the whole page."""
         said = await self.call('Page.captureScreenshot', captureBeyondViewport=True)
         path.write_bytes(b64decode(said['data']))
 
 
 @asynccontextmanager
 async def browser() -> AsyncIterator[Tab]:
-    """Start a browser without a window; leaving it ends it."""
+    """Run a headless browser within the context."""
     with TemporaryDirectory(ignore_cleanup_errors=True) as scratch:
         running = subprocess.Popen(
             [

@@ -1,4 +1,4 @@
-"""The continuous closed loop as the right-hand side of an ODE, for any solver."""
+"""Continuous closed loop as the right-hand side of an ODE."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 def closed_loop(
     law: ContinuousLaw, plant: NeedleModel, goal: ArrayLike | Callable[[float], ArrayLike]
 ) -> Callable[[float, ArrayLike], FloatArray]:
-    """Return f(time, y) with y = [X, integral of the errors] for a law around a needle."""
+    """Return f(time, y) with y = [X, integral of the errors] for a law and a needle."""
     m = plant.coordinates
 
     def derivative(time: float, y: ArrayLike) -> FloatArray:

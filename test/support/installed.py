@@ -1,4 +1,4 @@
-"""What setup.py installs."""
+"""Nodes installed by setup.py."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ ROOT = Path(__file__).parent.parent.parent
 
 
 def node_class(name: str) -> type[BaseNode]:
-    """Return the class of the node that an executable runs."""
+    """Return the node class of an executable."""
     module = NODES[name]
     (kind,) = (
         item

@@ -1,4 +1,4 @@
-"""Jobs for worker processes, which can import this file."""
+"""Jobs for worker processes, in an importable file."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from threading import Event, Timer
 
 from needle_ros.errors import ParameterError
 
-#: Size of a result that takes some 0.02 s to write [bytes].
+#: Size of a result with a write time of about 0.02 s [bytes].
 LARGE = 50_000_000
 
 
@@ -22,7 +22,7 @@ def refuse(value: float) -> None:
 
 
 def kill_once(marker: str, delay: float) -> bytes:
-    """Return a large result; the first time the worker is killed after a delay [s]."""
+    """Return a large result; in the first call the worker is killed after a delay [s]."""
     if not Path(marker).exists():
         Path(marker).touch()
         Timer(delay, os.kill, (os.getpid(), signal.SIGKILL)).start()

@@ -1,4 +1,4 @@
-"""A page as a browser shows it: in a real one where there is one, else by its tags."""
+"""Content of a page, rendered by a browser if installed, else parsed from its tags."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ BROWSER = next(
     filter(None, map(shutil.which, ('chromium', 'chromium-browser', 'google-chrome'))), None
 )
 
-#: Shows the page in a frame as wide as a telephone, and says what it sees there. The page itself
-#: runs no script: this one reaches into it from outside.
+#: Loads the page in a frame with the width of a telephone, and extracts its content. The page
+#: itself has no script.
 _WRAPPER = """<!DOCTYPE html><meta charset="utf-8"><body>
 <iframe src="PAGE" style="width: 375px; height: 800px; border: 0"></iframe><script>
 document.querySelector('iframe').onload = (event) => {
@@ -42,17 +42,17 @@ document.querySelector('iframe').onload = (event) => {
 
 @dataclass(frozen=True)
 class Seen:
-    """What is to be seen of a page: text, images with widths, and what it asked for outside."""
+    """Content of a page: text, images with widths, and external requests."""
 
     text: str
     images: list[tuple[str, int]]
     requests: list[str]
-    #: How much wider than a telephone it is [pixels].
+    #: Excess of the page width over a telephone [pixels].
     overflow: int
 
 
 def look_at(page: Path) -> Seen:
-    """Open a page in a browser, or take it apart where there is none."""
+    """Load a page in a browser, or parse it without a browser."""
     return _in_browser(page, BROWSER) if BROWSER else _by_tags(page)
 
 
@@ -96,7 +96,7 @@ def _in_browser(page: Path, browser: str) -> Seen:
                 ],
                 capture_output=True,
                 text=True,
-                # Until then it hangs.
+                # Timeout of a hanging browser.
                 timeout=300,
                 check=True,
             )
@@ -117,7 +117,7 @@ def _in_browser(page: Path, browser: str) -> Seen:
 
 
 class _Tags(HTMLParser):
-    """Collects what a page shows and what it would load."""
+    """Collects the text, images and external requests of a page."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -135,7 +135,7 @@ class _Tags(HTMLParser):
                 image = b64decode(value.partition(',')[2])
                 self.images.append((given.get('alt') or '', int.from_bytes(image[16:20], 'big')))
             elif value and not value.startswith('#'):
-                # A place in the page itself is no request.
+                # A link within the page is not a request.
                 self.requests.append(value)
 
     def handle_endtag(self, tag: str) -> None:

@@ -1,4 +1,4 @@
-"""Recordings of presses in a plane, made up from a stiffness matrix."""
+"""Synthetic recordings of presses in a plane, from a stiffness matrix."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from support.samples import EPOCH, header, STORE, WRENCH
 
 POSE = 'geometry_msgs/msg/PoseStamped'
 
-#: Stiffness [N/m] by force [N]: softer under the larger force, and nearly symmetric.
+#: Stiffness [N/m] by force [N]: lower at the larger force, and nearly symmetric.
 STIFFNESS = {
     1.1: np.array([[1260.0, -20.0], [-40.0, 1010.0]]),
     1.5: np.array([[960.0, -15.0], [-35.0, 520.0]]),
@@ -37,7 +37,7 @@ def presses(seed: int) -> tuple[Any, Any, Any]:
 
 
 def write_presses(path: Path, seed: int = 0) -> None:
-    """Write such a recording as the indenter's topics would have been recorded."""
+    """Write a recording of presses with the topics of the indenter."""
     kinds = STORE.types
     point, turn = kinds['geometry_msgs/msg/Point'], kinds['geometry_msgs/msg/Quaternion']
     vector, pair = kinds['geometry_msgs/msg/Vector3'], kinds['geometry_msgs/msg/Wrench']

@@ -1,4 +1,4 @@
-"""A ROS graph for one test: nodes in the thread of the test, and processes."""
+"""ROS graph of a test: nodes in the thread of the test, and processes."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from needle_ros.base_node import BaseNode
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-#: What a node writes to its log when it compiles or loads a function while it is active.
+#: Log line of a node that compiles or loads a function in the active state.
 LATE = 'while the node is active'
 
 
 class RosGraph(Graph):
-    """The graph of one test: nodes in its own thread, and processes."""
+    """ROS graph of a test: nodes in the thread of the test, and processes."""
 
     def __enter__(self) -> RosGraph:
         super().__enter__()
@@ -29,11 +29,7 @@ class RosGraph(Graph):
         assert not late, f'functions were compiled or loaded in an active node: {late}'
 
     def add(self, kind: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
-        """
-        Make a node; a node of the suite is started unless ``start`` is False.
-
-        ``parameters`` are its parameters by name.
-        """
+        """Create a node with ``parameters`` by name, and start it unless ``start`` is False."""
         start = options.pop('start', True)
         parameters: Mapping[str, object] = options.pop('parameters', {})
         overrides = [Parameter(name, value=value) for name, value in parameters.items()]
@@ -43,7 +39,7 @@ class RosGraph(Graph):
         return node
 
     def listen(self, node: Node, kind: type, topic: str, qos: Any) -> list[Any]:
-        """Return a list that fills with the messages of a topic."""
+        """Subscribe to a topic; return the list of received messages."""
         received: list[Any] = []
         node.create_subscription(kind, topic, received.append, qos)
         return received

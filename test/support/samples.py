@@ -1,4 +1,4 @@
-"""Recordings to identify from: simulated, and written to bags."""
+"""Simulated recordings for identification, and their bags."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from rosbags.typesys import get_typestore, Stores
 WRENCH = 'geometry_msgs/msg/WrenchStamped'
 MOTION = 'sensor_msgs/msg/JointState'
 TEXT = 'std_msgs/msg/String'
-#: Start of the recordings [ns]: one that float64 seconds could not hold to the nanosecond.
+#: Start of the recordings [ns], not representable by float64 seconds.
 EPOCH = 1_700_000_000_123_456_789
 STORE = get_typestore(Stores.ROS2_JAZZY)
 TRUTH = NeedleParameters.preset('paper_mm')
@@ -23,7 +23,7 @@ IDEAL = ForceSensorParameters(
     force_noise=0.0, torque_noise=0.0, force_resolution=0.0, torque_resolution=0.0, filter=0
 )
 NOISY = ForceSensorParameters(filter=3)
-#: Speeds [m/s] there and back, each held for the time [s] that follows it.
+#: Velocities [m/s] of strokes in both directions, each followed by its duration [s].
 THERE_AND_BACK = tuple(
     leg
     for speed in (2e-3, 4e-3, 6e-3, 8e-3)
@@ -63,7 +63,7 @@ def text(data: str) -> bytes:
 def motion(
     legs: tuple[tuple[float, float], ...], rate: float, acceleration: float = 0.1
 ) -> tuple[Any, Any, Any]:
-    """Move the base of the simulated needle; return depth, speed and true axial force."""
+    """Move the base of the simulated needle; return depth, velocity and true axial force."""
     integrator = Integrator(TRUTH, [0.17, 0, 0, 0, 0, 0, 0, 0], step=1e-3)
     rows = []
     for speed, duration in legs:
@@ -98,7 +98,7 @@ def simulated(
 
 
 def write_bag(path: Path, recording: Recording, configuration: str = '') -> None:
-    """Write a recording as the plant's topics would have been recorded."""
+    """Write a recording with the topics of the plant."""
     assert recording.speed is not None
     with BagWriter(path) as bag:
         bag.add_topic('/base_wrench', WRENCH)

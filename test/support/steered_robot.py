@@ -1,4 +1,4 @@
-"""An outer loop with a simulated robot, its needle and its tracker, in simulated time."""
+"""Outer loop with a simulated robot, needle and tracker, in simulated time."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ import pytest
 
 NEEDLE, STEERING, _ = STEERING_PRESETS['bending_35mm']
 SETTINGS = OuterLoopSettings(look_time=0.2)
-#: A step of time of the robot, and of its tracker [ns].
+#: Period of the robot and its tracker [ns].
 PERIOD = 10_000_000
 SECOND = 100 * PERIOD
 TARGET = (2e-3, 0.06, -1e-3)
@@ -27,7 +27,7 @@ CONTINUOUS = replace(SETTINGS, continuous=True)
 
 
 class Robot:
-    """A loop, a robot and its needle in tissue that is softer than believed, and their time."""
+    """Outer loop, robot and needle in tissue softer than the prior."""
 
     def __init__(
         self, own: OuterLoopSettings = SETTINGS, belief: SteeringBelief | None = None
@@ -40,17 +40,17 @@ class Robot:
         self.needle = SteeredNeedle(softer, STEERING, tilt=(0.01, 0.02))
         self.now = 1000 * SECOND
         self.at = np.zeros(3)
-        #: How each joint moves: times [ns] and positions.
+        #: Motion of each joint: times [ns] and positions.
         self.ways = [(np.zeros(1), np.zeros(1)) for _ in NAMES]
         self.noise = np.random.default_rng(3)
-        #: What goes wrong: how the joints move, and what is said of them and of the tip.
+        #: Injected faults: joint motion, reported joint positions, and measured tip position.
         self.moves: Callable[[np.ndarray[Any, Any]], np.ndarray[Any, Any]] = lambda at: at
         self.says: Callable[[Any], Any] = lambda at: at
         self.sees: Callable[[Any], Any] = lambda tip: tip
         self.late = 0
         self.waiting: list[tuple[int, Any]] = []
         self.tracked: list[np.ndarray[Any, Any]] = []
-        #: Who moves which joints, and why a motion is rejected.
+        #: Joints by node, and reason of a rejected motion.
         self.moved = {'controller': NAMES[:1], 'plant': NAMES[1:]}
         self.logs = {
             name: RequestLog({JOINT_TRAJECTORY: joints}, steady=lambda: self.seconds)
@@ -58,11 +58,11 @@ class Robot:
         }
         self.rejects: Callable[[str, Move], str] = lambda _name, _move: ''
         self.paused = False
-        #: Stamps of the motions that were executed, by joint.
+        #: Stamps of the executed motions, by joint.
         self.begun: list[int] = []
 
     def tick(self, count: int = 1) -> None:
-        """Let time pass."""
+        """Advance time by a number of periods."""
         for _ in range(count):
             self.now += PERIOD
             self.seconds += 1e-9 * PERIOD
@@ -90,21 +90,21 @@ class Robot:
         return Reading(stamp, '', NAMES, (tuple(at), (0.0,) * 3, ()))
 
     def take(self, take: Callable[[Any, int], Move | None], message: Any) -> None:
-        """Pass a message to the loop, and send the motion that it returns."""
+        """Pass a message to the loop, and send the returned motion."""
         self.follow(take(message, self.now))
 
     def post(self, _topic: str, deliver: Callable[[], None]) -> None:
-        """Pass a message on: here at once."""
+        """Deliver a message; here immediately."""
         deliver()
 
     def follow(self, move: Move | None) -> None:
-        """Send a motion to all that move a joint."""
+        """Send a motion to all nodes with joints."""
         if move is not None:
             for name, log in self.logs.items():
                 self.post('joint_trajectory', partial(self.execute, name, log, move))
 
     def execute(self, name: str, log: RequestLog, move: Move) -> None:
-        """Begin a motion of the own joints, from where they are, and acknowledge it."""
+        """Start the motion of the own joints at their positions, and acknowledge it."""
         own = [joint for joint in move.joints if joint in self.moved[name]]
         if not own:
             return
@@ -120,27 +120,27 @@ class Robot:
         self.report()
 
     def report(self) -> None:
-        """Publish the status of all that move a joint."""
+        """Publish the status of all nodes with joints."""
         for name, log in self.logs.items():
             status = log.status(paused=self.paused)
             hear = partial(self.loop.hear, name)
             self.post('diagnostics', partial(self.take, hear, status))
 
     def aim(self, point: tuple[float, float, float] = TARGET, frame: str = '') -> str:
-        """Send a target; return why it was refused."""
+        """Send a target; return the reason of a rejection."""
         before = self.loop.journal.refused
         self.follow(self.loop.target(0, frame, point, self.now))
         return self.loop.journal.complaint if self.loop.journal.refused > before else ''
 
     def steer(self, ticks: int = 6000) -> None:
-        """Aim, and go on until the loop has nothing more to do."""
+        """Send a target, and run until the loop has finished."""
         self.tick(20)
         assert self.aim() == ''
         for _ in range(ticks):
             self.tick()
             if not self.loop.steers:
                 return
-        pytest.fail(f'it steers for ever: {self.loop.phase}')
+        pytest.fail(f'steering does not end: {self.loop.phase}')
 
     @property
     def miss(self) -> float:

@@ -1,4 +1,4 @@
-"""Recordings of strokes from the equations: friction, a base with limits, a sensor."""
+"""Synthetic recordings of strokes: friction, a base with limits, and a sensor."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from needle_identification import Recording
 import numpy as np
 from scipy.signal import butter, lfilter
 
-#: Step of the equations [s], and samples of it in one of the recording (250 Hz).
+#: Integration step [s], and steps per sample of the recording (250 Hz).
 STEP, EVERY = 1e-3, 4
 #: mu_s [N] and mu_v [N s/m].
 COULOMB, VISCOUS = 0.56, 300.0
@@ -20,7 +20,7 @@ NOISE = 0.02
 
 @lru_cache(maxsize=16)
 def motion(speeds: tuple[float, ...] = SPEEDS, push: float = 1.0) -> Any:
-    """Return speed [m/s] and force of a push [N] that rises for 1.5 s, before the strokes."""
+    """Return velocity [m/s] and force of an initial push [N] that rises for 1.5 s."""
     rise = np.maximum(np.arange(1, 1701) * STEP - 0.2, 0.0) / 1.5 * push
     rise = rise if push else rise[:0]
     pushed = np.maximum(rise - COULOMB, 0.0) / VISCOUS
@@ -32,7 +32,7 @@ def motion(speeds: tuple[float, ...] = SPEEDS, push: float = 1.0) -> Any:
         for _ in range(round(duration / STEP)):
             change = np.clip(target - speed, -ACCELERATION * STEP, ACCELERATION * STEP)
             speed = speed + change
-            # No rounding errors at rest.
+            # Avoid rounding errors at rest.
             speed = 0.0 if abs(speed) < 1e-12 else speed
             rows.append(speed)
     return np.concatenate([pushed, rows]), rise
@@ -51,20 +51,20 @@ def strokes(
     noise: float = NOISE,
     cutoff: float = 125.0,
 ) -> Recording:
-    """Record strokes; with a seed through a noisy sensor of second order, else exactly."""
+    """Record strokes; with a seed through a noisy second-order sensor, else exactly."""
     speed, rise = motion(speeds, push)
     time = np.asarray(STEP * np.arange(1, len(speed) + 1), float)
     more = 1.0 + (breakaway - 1.0) * np.exp(-((speed / 1e-3) ** 2))
     force = COULOMB * more * np.sign(speed) + VISCOUS * speed
     force = np.where(speed < 0.0, withdrawal, 1.0) * force + mass * np.gradient(speed, STEP)
-    # Until the needle moves, the sensor measures the push.
+    # Before the needle moves, the sensor measures the push.
     force[: len(rise)] = np.where(speed[: len(rise)] > 0.0, force[: len(rise)], rise)
     force = np.interp(time - lag, time, force) + offset
     if seed is not None:
         force = force + np.random.default_rng(seed).normal(scale=noise, size=len(force))
         b, a = butter(2, cutoff, fs=1.0 / STEP)
         force = np.round(lfilter(b, a, force) / 0.0025) * 0.0025
-    # The inserted length at the samples: half a step before the sum of speeds.
+    # Insertion depth at the samples: half a step before the sum of velocities.
     depth = 0.1 + STEP * (np.cumsum(speed) - 0.5 * speed)
     kept = slice(EVERY - 1, None, EVERY)
     return Recording(

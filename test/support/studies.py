@@ -1,4 +1,4 @@
-"""Studies that cannot be."""
+"""Checks of invalid studies."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def check_refused(
     folder: Path,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """Check that a study is refused in one line, with the file, and that nothing is written."""
+    """Check that a study is rejected in one line with the file name, without output files."""
     file = folder / 'study.yaml'
     file.write_text(yaml.safe_dump(document))
     assert main(['study', str(file), '-o', str(folder / 'new')]) == 2

@@ -1,8 +1,8 @@
 """
-Make the Python package `tf2_msgs`, which no wheel has, with the generators that wheels have.
+Build the Python package `tf2_msgs`, which is not available as a wheel, with rosidl generators.
 
-Run as ``python -m support.tf2_messages FOLDER``; the package is then in the folder. It takes a C
-and a C++ compiler and some seconds.
+Run as ``python -m support.tf2_messages FOLDER``; the package is written to the folder. It needs a
+C and a C++ compiler and takes some seconds.
 """
 
 from __future__ import annotations
@@ -17,19 +17,19 @@ from typing import Any
 
 import numpy as np
 
-#: The definition of tf2_msgs/msg/TFMessage, without its comments.
+#: Definition of tf2_msgs/msg/TFMessage, without comments.
 DEFINITION = 'geometry_msgs/TransformStamped[] transforms\n'
 
 PACKAGE, MESSAGE = 'tf2_msgs', 'TFMessage'
 PREFIX = Path(sys.prefix)
 
-#: Compiler by ending of the source.
+#: Compiler by source suffix.
 COMPILERS = {'.c': ('gcc',), '.cpp': ('g++', '-std=c++17')}
 
 
 def generate(folder: Path) -> Path:
-    """Write the sources, as `rosidl generate` does; return the folder of the package."""
-    # It finds the templates of the generators.
+    """Write the sources like `rosidl generate`; return the folder of the package."""
+    # Path of the generator templates.
     os.environ['AMENT_PREFIX_PATH'] = str(PREFIX)
     made = folder / PACKAGE
     (made / 'msg').mkdir(parents=True)
@@ -60,7 +60,7 @@ def generate(folder: Path) -> Path:
 
 
 def compile_all(folder: Path, made: Path) -> None:
-    """Compile the sources into the extension that the package imports, and its libraries."""
+    """Compile the sources into the extension module and its libraries."""
     includes = [folder, sysconfig.get_paths()['include'], np.get_include(), PREFIX / 'include']
     includes += [path for path in (PREFIX / 'include').iterdir() if path.is_dir()]
     options = ['-O1', '-fPIC', '-w', *(f'-I{path}' for path in includes)]
@@ -71,7 +71,7 @@ def compile_all(folder: Path, made: Path) -> None:
             words = [*COMPILERS[source.suffix], *options, '-c', source, '-o', target]
             subprocess.run(list(map(str, words)), check=True)
             objects[source.name] = target
-    # The middleware looks type supports up by the names of libraries: those that are loaded count.
+    # The middleware finds type supports by library name; loaded libraries have priority.
     stem = 'tf_message__'
     parts = {
         'generator_c': [f'{stem}functions.c', f'{stem}description.c'],

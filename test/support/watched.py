@@ -1,4 +1,4 @@
-"""A bag with everything that the page of `needle watch` shows, and a browser to look at it."""
+"""Bag with all topics of the page of `needle watch`, and a browser to view it."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from needle_ros import contract
 import numpy as np
 from support.samples import EPOCH
 
-#: Samples per second, and length [s].
+#: Sample rate [Hz], and duration [s].
 RATE: Final = 50
 DURATION: Final = 4.0
 
-#: Where the tip is aimed at [m].
+#: Target of the tip [m].
 TARGET: Final = (4e-3, 0.1, -2e-3)
 
 CONFIGURATIONS: Final = {
@@ -50,18 +50,17 @@ CONFIGURATIONS: Final = {
 
 
 def made(type_name: str, **values: Any) -> Any:
-    """Make a message."""
+    """Create a message."""
     return message_type(type_name)(**values)
 
 
 def header(stamp: int, frame: str = 'needle_entry') -> Any:
-    """Make a header."""
     time = made('builtin_interfaces/msg/Time', sec=stamp // 10**9, nanosec=stamp % 10**9)
     return made('std_msgs/msg/Header', stamp=time, frame_id=frame)
 
 
 def marker(name: str, points: Any, stamp: int = 0) -> Any:
-    """Make a line of `needle_shape`."""
+    """Create a line of `needle_shape`."""
     point, color = 'geometry_msgs/msg/Point', 'std_msgs/msg/ColorRGBA'
     zero = made(point, x=0.0, y=0.0, z=0.0)
     level = made('geometry_msgs/msg/Quaternion', x=0.0, y=0.0, z=0.0, w=1.0)
@@ -88,7 +87,7 @@ def marker(name: str, points: Any, stamp: int = 0) -> Any:
 def status(
     name: str, message: str, values: Mapping[str, str] | None = None, level: int = 0
 ) -> Any:
-    """Make what a node says of its state."""
+    """Create the DiagnosticStatus of a node."""
     pairs = [
         made('diagnostic_msgs/msg/KeyValue', key=key, value=value)
         for key, value in (values or {}).items()
@@ -100,7 +99,7 @@ def status(
 
 
 def expected(x: float, z: float, deviation: float, depth: float = TARGET[1]) -> Any:
-    """Make where the tip will be."""
+    """Create a predicted tip pose."""
     covariance = np.zeros(36)
     covariance[[0, 14]] = deviation**2
     pose = made(
@@ -116,14 +115,14 @@ def expected(x: float, z: float, deviation: float, depth: float = TARGET[1]) -> 
 
 
 def shape(depth: float) -> Any:
-    """Return points along a needle that bends, shape (k, 3) [m]."""
+    """Return points of a bent needle, shape (k, 3) [m]."""
     y = np.linspace(-0.04, depth, 60)
     inside = np.maximum(y, 0.0)
     return np.column_stack([0.4 * inside**2, y, -0.2 * inside**2])
 
 
 def write_watched(path: Path, space: str = '') -> None:
-    """Write an insertion to 8 cm, which nodes steer to a target, as its topics are recorded."""
+    """Write the bag of a steered insertion to 8 cm."""
     with BagWriter(path) as bag:
         for node, text in CONFIGURATIONS.items():
             bag.add_topic(f'{space}/{node}/configuration', contract.CONFIGURATION.type_name)
@@ -162,7 +161,7 @@ def write_watched(path: Path, space: str = '') -> None:
                 status('/controller', 'active', {'target [m]': 'None'}),
                 status('/steering', 'inserts', {'target x, y, z [m]': aim}, int(time > 2.5)),
             ]
-            # The controller has ended before.
+            # The controller has ended earlier.
             array = made(
                 'diagnostic_msgs/msg/DiagnosticArray',
                 header=header(stamp),
