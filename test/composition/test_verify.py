@@ -595,7 +595,7 @@ def test_differences_within_the_tolerance_are_no_difference(tmp_path: Path) -> N
             {},
             'holds nothing that was measured; record /base_wrench, /ground_truth, /joint_states',
         ),
-        (bool, {'depth': 5.0}, 'the parameters of /plant: inserted length'),
+        (bool, {'depth': 5.0}, 'the parameters of /plant: insertion depth'),
         (bool, {'mode': 'indenter'}, 'holds nothing'),
     ],
     ids=['parameters', 'measurements', 'value', 'mode'],

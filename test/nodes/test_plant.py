@@ -253,7 +253,7 @@ def test_the_shipped_parameter_file_is_accepted(
     [
         ({'model.lenght': 0.3}, "unknown parameter 'model.lenght'; did you mean 'model.length'"),
         ({'model.preset': 'steel'}, 'model.preset must be one of paper_si, paper_mm, phantom'),
-        ({'depth': 0.3}, 'inserted length 0.3 m is outside'),
+        ({'depth': 0.3}, 'insertion depth 0.3 m is outside'),
         ({'seed': -1}, 'seed out of range'),
     ],
 )
@@ -379,7 +379,7 @@ def test_beyond_its_range_without_hub_stop_it_stands_still(ros_graph: RosGraph) 
 
     def reported() -> bool:
         commands.publish(wrench(20.0))
-        return any('inserted length' in report.status[0].message for report in reports)
+        return any('insertion depth' in report.status[0].message for report in reports)
 
     ros_graph.spin_until(reported, 'the report')
 
