@@ -297,7 +297,7 @@ def test_bad_parameters_end_the_process_with_one_line(
         ),
         (
             {'lockstep': True, 'mode': 'robot'},
-            'lockstep must be false but in mode simulation, where commands answer samples, got',
+            'lockstep must be false except in mode simulation, where commands answer samples, got',
         ),
         (
             {'rate': 5.0},
