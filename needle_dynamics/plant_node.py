@@ -104,7 +104,7 @@ class PlantNode(ModelNode):
     its path, and its guide and roll follow ``joint_trajectory`` in both modes. In mode `indenter`
     the end-effector presses the tissue according to ``joint_trajectory`` (efforts of the joints
     `x` and `z`) and publishes ``base_wrench`` and ``end_effector_pose``. A trajectory starts on
-    arrival, or at the activation if it arrived earlier. ``joint_commands`` come from a driver of
+    arrival, or at the activation if it arrived earlier. ``joint_commands`` are sent by a driver of
     ros2_control: efforts in mode `simulation`, positions in mode `robot`. Only one node may
     publish commands, on one of the two topics.
 
@@ -208,8 +208,8 @@ class PlantNode(ModelNode):
         self._joint_commands = self.listen(
             contract.JOINT_COMMANDS, self._on_joint_commands, self._look_who_commands
         )
-        #: Number of publishers of commands matched by DDS, including dead ones, and time of change
-        #: [ns].
+        #: Number of publishers of commands matched by DDS, including stale entries, and time of
+        #: change [ns].
         self._matched, self._matched_at = 0, 0
         self._trajectories: Subscription | None = None
         #: Lock-step reports of nodes that have processed or recorded a sample.
@@ -455,7 +455,7 @@ class PlantNode(ModelNode):
             self._time.recorded.clear()
 
     def _count_matched(self) -> tuple[int, int]:
-        """Return the DDS-matched publishers of each command topic, including dead ones."""
+        """Return the DDS-matched publishers of each command topic, including stale entries."""
         return self._commands.get_publisher_count(), self._joint_commands.get_publisher_count()
 
     def _on_trajectory(self, message: JointTrajectory) -> None:

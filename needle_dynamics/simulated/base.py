@@ -41,21 +41,11 @@ def on_grid(value: float, resolution: float) -> float:
 
 class BaseMotion:
     """
-    Trajectory tracking of insertion depth, or pushing with a force, within limits.
+    Trajectory tracking of a joint position, or pushing with a force, within limits.
 
-    Parameters
-    ----------
-    parameters : BaseParameters
-        Limits.
-    depth : float
-        Insertion depth to hold until a trajectory arrives [m].
-    reach : tuple of float
-        Least and largest insertion depth [m].
-    force_limit : float
-        Largest push force [N].
-    what, unit : str
-        Name and unit of the controlled joint for messages, if it is not `insertion`.
-
+    ``depth`` is the insertion depth [m] to hold until a trajectory arrives, ``reach`` its range
+    [m], ``force_limit`` the largest push force [N]. ``what`` and ``unit`` name the joint in
+    messages.
     """
 
     def __init__(

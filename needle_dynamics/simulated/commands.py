@@ -43,20 +43,7 @@ class Commands:
     responds to this sample. After such a response, a force with any other stamp is from another
     node, however short its lifetime, and is rejected until the number of nodes changes.
 
-    Parameters
-    ----------
-    timeout : float
-        Largest age of a command [s].
-    force_limit : float
-        Largest valid force [N], either sign.
-    torque_limit : float
-        Largest valid torque [N m], either sign.
-    interval : float, optional
-        Sample interval [s].
-    force_rate_limit : float, optional
-        Largest growth rate of the force, either sign [N/s].
-    power_limit : float, optional
-        Largest energy supplied within a second [W].
+    Arguments are in s, N, N m, N/s and W; force and torque limits apply to either sign.
 
     Attributes
     ----------

@@ -42,22 +42,12 @@ class FaultParameters:
 
 class Fault:
     """
-    A fault of one measurement stream.
+    A fault of one measurement stream, with ``rate`` measurements per second [Hz].
 
-    Parameters
-    ----------
-    kind : str
-        Key of `FAULTS`: ``drop`` discards measurements, ``delay`` publishes them later,
-        ``duplicate`` publishes them twice, ``reorder`` after the next one, ``freeze`` repeats the
-        values of the first affected measurement with new stamps, ``bias`` adds to the values,
-        ``nan`` replaces them by NaN, ``saturate`` limits them.
-    parameters : FaultParameters
-        Probability, delay and size.
-    rate : float
-        Measurements per second [Hz].
-    seed : int
-        Seed of the random selection.
-
+    Kinds: ``drop`` discards measurements, ``delay`` publishes them later, ``duplicate`` publishes
+    them twice, ``reorder`` after the next one, ``freeze`` repeats the values of the first affected
+    measurement with new stamps, ``bias`` adds to the values, ``nan`` replaces them by NaN, and
+    ``saturate`` limits them.
     """
 
     def __init__(self, kind: str, parameters: FaultParameters, rate: float, seed: int) -> None:

@@ -378,9 +378,7 @@ def not_completed(model: NeedleModel, state: FloatArray, left: float) -> NeedleE
     state.
     """
     if isnan(left):
-        return NeedleError(
-            'the motion is not finite: constants, state or inputs have extreme ratios'
-        )
+        return NeedleError('the motion is not finite: constants, state or inputs are badly scaled')
     p, far = model.parameters, model.compiled.maximum_depth
     depth = p.length - float(state[0])
     limit = (

@@ -54,28 +54,10 @@ class Event(NamedTuple):
 
 class PlantRun:
     """
-    Simulated plant with commands and events.
+    Simulated plant with commands and events, built from parameters by name.
 
-    Parameters
-    ----------
-    values : Mapping[str, Any]
-        Parameters of the plant by name, see `PlantConstants.of`.
-    number : int
-        Number of samples taken before this run.
-
-    Attributes
-    ----------
-    constants : PlantConstants
-        Present constants.
-    plant : SimulatedPlant
-        Plant.
-    commands : Commands
-        Force commands.
-    number : int
-        Number of samples taken, including those before this run.
-    topics : dict
-        Published topics by name.
-
+    ``number`` is the number of samples taken, including samples before this run. The parameters
+    are described in `PlantConstants.of`; ``topics`` are the published topics by name.
     """
 
     def __init__(self, values: Mapping[str, Any], number: int = 0) -> None:

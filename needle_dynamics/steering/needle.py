@@ -114,9 +114,9 @@ def wandering(needle: NeedleParameters, steering: SteeringParameters, seed: int)
     """
     Draw the lateral tip loads in x and z [N] of the path noise, shape (cells, 2).
 
-    The loads are `noise_cell` apart in depth; without noise there are none. A load F turns the
-    path of a long needle by F lambda / (E I) per length. Loads correlated over the length of the
-    noise thus turn the path at random, and the variance of its direction grows with its length.
+    The loads are `noise_cell` apart in depth; none without noise. A load F turns the path
+    of a long needle by F lambda / (E I) per length. Loads correlated over the length of the noise
+    thus turn the path at random, and the variance of its direction grows with its length.
     """
     if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
         raise ParameterError(f'seed must be an integer >= 0, got {seed!r}')

@@ -95,7 +95,7 @@ def test_velocity_without_position_lasts_for_the_timeout() -> None:
     [
         ('simulation', False, (BOTH, (), (), (1.0,)), 'one for each of its 2 joints, got 1'),
         ('simulation', False, (('a', 'a'), (), (), (1.0, 1.0)), 'names a joint twice: a, a'),
-        ('simulation', False, (('insertion',), (0.1,)), 'position 0.1 of insertion.* for no joint'),
+        ('simulation', False, (('insertion',), (0.1,)), 'position 0.1 of insertion.* no joint'),
         ('robot', False, (('insertion',), (nan,), (), (2.0,)), 'effort 2 of insertion.* no joint'),
         ('robot', False, (BOTH, (0.1, 0.0)), 'position 0 of guide_x.* it for insertion'),
         ('indenter', False, (('x',), (), (), (1.0,)), 'effort 1 of x.* for no joint'),
