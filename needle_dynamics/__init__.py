@@ -1,7 +1,7 @@
 """
 Mathematics of a flexible needle in soft tissue, and the plant node around it.
 
-Units are SI throughout; signs and frames are those of docs/architecture.md.
+Units are SI throughout; signs and frames are defined in docs/architecture.md.
 """
 
 from typing import TYPE_CHECKING

@@ -1,11 +1,11 @@
-r"""
-Controllability and observability of the linearized model.
+"""
+Controllability and observability analysis of the linearized model.
 
-The rank of [B, AB, A^2 B, ...] in SI units says nothing here: its columns span more decades than
-double precision has digits. The tests below work on the pair in natural units
-(`LinearSystem.scaled`), with orthogonal transformations only: a staircase finds what the inputs
-reach, and the smallest singular value of the Hautus (PBH) pencil [A - lambda I, B] says how far
-that is from being lost.
+The rank of [B, AB, A^2 B, ...] in SI units is not meaningful: its columns span more decades than
+double precision has digits. The tests use the pair in natural units (`LinearSystem.scaled`) and
+orthogonal transformations only: a staircase algorithm finds the controllable subspace, and the
+smallest singular value of the Hautus (PBH) pencil [A - lambda I, B] gives the distance to
+uncontrollability.
 """
 
 from __future__ import annotations
@@ -24,33 +24,34 @@ from numpy.typing import ArrayLike, NDArray
 
 ComplexArray = NDArray[np.complex128]
 
-#: What couples by less than this part of the norm, in natural units, counts as not coupled.
+#: Relative tolerance of the rank decision, in natural units.
 RANK_TOLERANCE: Final = 1e-10
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Structure:
     """
-    The part of the state that inputs can steer, or that outputs can see.
+    Controllable or observable part of the state space.
 
     Attributes
     ----------
     order : int
         Number of states N.
     rank : int
-        Dimension of the part that is steered or seen.
+        Dimension of the controllable or observable part.
     lost : tuple of str
-        States that are not steered or seen at all.
+        States that are entirely uncontrollable or unobservable.
     combined : tuple of str
         States of which only combinations are lost.
     eigenvalues : ndarray, shape (N,)
         Eigenvalues of A, in its unit of time.
     distances : ndarray, shape (N,)
-        Smallest singular value of the PBH pencil at each of them.
+        Smallest singular value of the PBH pencil at each eigenvalue.
     margin : float
-        Least of these distances within the steered or seen part: the change that loses more.
+        Least distance within the controllable or observable part: the perturbation that reduces
+        the rank further.
     weakest : str
-        Leading state of what would be lost next.
+        Leading state of the direction with the least margin.
 
     """
 
@@ -65,17 +66,17 @@ class Structure:
 
     @property
     def deficiency(self) -> int:
-        """Number of dimensions that are lost."""
+        """Rank deficiency N - rank."""
         return self.order - self.rank
 
     @property
     def distance(self) -> float:
-        """Least of `distances`: at least the change of the pair that loses rank."""
+        """Least of `distances`: an upper bound of the perturbation that reduces the rank."""
         return float(self.distances.min())
 
     @property
     def loss(self) -> str:
-        """Names of the lost states and combinations; ``none`` if nothing is lost."""
+        """Names of the lost states and combinations, ``none`` at full rank."""
         words = [', '.join(self.lost)] if self.lost else []
         number = self.deficiency - len(self.lost)
         if number:
@@ -92,33 +93,11 @@ def controllability(
     scaled_names: tuple[str, ...] | None = None,
 ) -> Structure:
     """
-    Find which states the inputs of (A, B) steer, and the distance from losing more of them.
+    Find the controllable states of (A, B), shapes (N, N) and (N, M), and the PBH distances.
 
-    The pair must be in units in which its entries compare, as from `LinearSystem.scaled`.
-
-    Parameters
-    ----------
-    a : array_like, shape (N, N)
-        State matrix.
-    b : array_like, shape (N, M)
-        Input matrix.
-    names : tuple of str
-        Names of the N states in which the result is expressed.
-    transform : array_like, shape (N, N), optional
-        These states are ``transform`` times the states of the pair; the identity if not given.
-    scaled_names : tuple of str, optional
-        Names of the states of the pair, for `Structure.weakest`; ``names`` if not given.
-
-    Returns
-    -------
-    Structure
-        Rank, lost states, distances.
-
-    Raises
-    ------
-    ShapeError
-        If shapes do not fit or a number is not finite.
-
+    The pair must be in units in which its entries are comparable, see `LinearSystem.scaled`. The
+    states in ``names`` are ``transform`` (N, N) times the states of the pair, the identity by
+    default; ``scaled_names`` names the states of the pair for `Structure.weakest`.
     """
     a, b = np.asarray(a, dtype=float), np.asarray(b, dtype=float)
     order = len(names)
@@ -133,7 +112,7 @@ def controllability(
     kept, rest = _staircase(a, b)
     sizes = np.linalg.norm(rows, axis=1)
     reached = np.linalg.norm(rows @ kept, axis=1) > RANK_TOLERANCE * sizes
-    # w^T z with w in the rest is what no input changes: its coefficients on the named states.
+    # No input changes w^T z for w in the rest; these are its coefficients on the named states.
     shares = np.linalg.norm(np.linalg.solve(rows.T, rest), axis=1) * sizes
     involved = shares > RANK_TOLERANCE * shares.max(initial=0.0)
     eigenvalues, distances, directions = _hautus(a, b)
@@ -166,40 +145,18 @@ def observability(
     transform: ArrayLike | None = None,
     scaled_names: tuple[str, ...] | None = None,
 ) -> Structure:
-    """
-    Find which states the outputs of (A, C) see: `controllability` of the dual pair.
-
-    Parameters
-    ----------
-    a : array_like, shape (N, N)
-        State matrix.
-    c : array_like, shape (P, N)
-        Output matrix.
-    names, transform, scaled_names
-        As in `controllability`.
-
-    Returns
-    -------
-    Structure
-        Rank, lost states, distances.
-
-    Raises
-    ------
-    ShapeError
-        If shapes do not fit or a number is not finite.
-
-    """
+    """Find the observable states of (A, C), shapes as `controllability` of the dual pair."""
     dual = None if transform is None else np.linalg.inv(np.asarray(transform, dtype=float)).T
     a, c = np.asarray(a, dtype=float), np.asarray(c, dtype=float)
     return controllability(a.T, c.T, names, dual, scaled_names)
 
 
 def _staircase(a: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return orthonormal bases, as columns, of what the inputs reach and of the rest."""
+    """Return orthonormal bases (columns) of the controllable subspace and its complement."""
     kept = np.zeros((a.shape[0], 0))
     fresh, size, norm = b, np.linalg.norm(b), np.linalg.norm(a)
     while fresh.size:
-        for _ in range(2):  # twice is enough for orthogonality to rounding
+        for _ in range(2):  # two passes give orthogonality to rounding
             fresh = fresh - kept @ (kept.T @ fresh)
         left, sizes, _ = np.linalg.svd(fresh, full_matrices=False)
         step = left[:, sizes > RANK_TOLERANCE * size]
@@ -232,11 +189,11 @@ class Analysis:
     observed : Structure
         Observability from the tip deflection.
     output_controllable : bool
-        Whether the tip deflection can be steered. With one output the matrix
+        Whether the tip deflection is output controllable. With one output the matrix
         [CB, CAB, ..., D] needs rank 1: the number of outputs, not of inputs.
     output_gain : float
-        Tip deflection per base travel, the slope ``|w'(s)|`` of the needle at its tip: what a move
-        of the base does to the output before the bending answers.
+        Tip deflection per base travel, the slope ``|w'(s)|`` of the needle at its tip: the effect
+        of a base displacement on the output before the bending responds.
 
     """
 
@@ -253,16 +210,16 @@ def analyze(system: LinearSystem) -> Analysis:
     Parameters
     ----------
     system : LinearSystem
-        From `linearize`.
+        Result of `linearize`.
 
     Returns
     -------
     Analysis
-        The results; eigenvalues in rad/s.
+        Results, with eigenvalues in rad/s.
 
     Examples
     --------
-    The two inputs move depth and rotation. Neither bends a straight needle.
+    The two inputs move depth and rotation; neither bends a straight needle.
 
     >>> from needle_dynamics import analyze, linearize, NeedleModel, NeedleParameters
     >>> from needle_dynamics import operating_point
@@ -291,7 +248,7 @@ def analyze(system: LinearSystem) -> Analysis:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ControllabilityMap:
     """
-    `Analysis` over depth and tip deflection; all results have shape (depths, deflections).
+    Results of `Analysis` over depth and tip deflection.
 
     Attributes
     ----------
@@ -299,13 +256,13 @@ class ControllabilityMap:
         Constants.
     velocity : float
         Insertion velocity [m/s].
-    depths, deflections : ndarray
-        Inserted lengths and tip deflections [m].
-    rank, distance : ndarray
-        State controllability: rank, and distance from losing rank.
-    observed_rank, observed_margin : ndarray
-        Observability: rank, and distance from seeing less.
-    output_gain : ndarray
+    depths, deflections : ndarray, shapes (I,) and (J,)
+        Insertion depths and tip deflections [m].
+    rank, distance : ndarray, shape (I, J)
+        State controllability: rank, and distance to a loss of rank.
+    observed_rank, observed_margin : ndarray, shape (I, J)
+        Observability: rank, and distance to a further loss of rank.
+    output_gain : ndarray, shape (I, J)
         Tip deflection per base travel.
 
     """
@@ -331,35 +288,10 @@ def controllability_map(
     progress: Callable[[], object] | None = None,
 ) -> ControllabilityMap:
     """
-    Analyze every pair of a depth and a tip deflection.
+    Analyze all pairs of insertion depths (I,) and tip deflections (J,) [m] at a velocity [m/s].
 
-    Parameters
-    ----------
-    parameters : NeedleParameters
-        Constants.
-    depths, deflections : array_like, shapes (I,) and (J,)
-        Inserted lengths and tip deflections [m].
-    velocity : float
-        Insertion velocity [m/s], positive into the tissue.
-    sliding : str, optional
-        As in `linearize`.
-    force : float
-        Insertion force [N].
-    progress : callable, optional
-        Called after each depth.
-
-    Returns
-    -------
-    ControllabilityMap
-        Results, shape (I, J).
-
-    Raises
-    ------
-    ShapeError
-        If the depths or the deflections are not a list of finite numbers.
-    InsertedLengthError, ParameterError, StuckError
-        As `linearize`.
-
+    ``sliding`` is as in `linearize`, ``force`` is the insertion force [N]; ``progress`` is called
+    after each depth.
     """
     model = NeedleModel(parameters)
     depths, deflections = np.array(depths, dtype=float), np.array(deflections, dtype=float)

@@ -1,4 +1,4 @@
-"""The array types of all packages."""
+"""Array types shared by all packages."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ FloatArray: TypeAlias = NDArray[np.float64]
 #: NumPy array of complex numbers.
 ComplexArray: TypeAlias = NDArray[np.complex128]
 
-#: NumPy array of truth values.
+#: NumPy array of Booleans.
 BoolArray: TypeAlias = NDArray[np.bool_]
 
 #: NumPy array of integers.
@@ -21,26 +21,14 @@ IntArray: TypeAlias = NDArray[np.int64]
 
 
 class Shaped(NamedTuple):
-    """
-    Layout of an array that a compiled function takes: contiguous, in C order.
-
-    Attributes
-    ----------
-    dtype : type
-        Type of its elements.
-    dimensions : int
-        Number of its dimensions.
-    writable : bool
-        Whether it may be written to.
-
-    """
+    """Layout of an array argument of a compiled function: contiguous, in C order."""
 
     dtype: type
     dimensions: int
     writable: bool = True
 
 
-#: Arrays with a known number of dimensions, as compiled functions take them.
+#: Arrays with a fixed number of dimensions, for the signatures of compiled functions.
 Vector: TypeAlias = Annotated[FloatArray, Shaped(np.float64, 1)]
 Matrix: TypeAlias = Annotated[FloatArray, Shaped(np.float64, 2)]
 Array3: TypeAlias = Annotated[FloatArray, Shaped(np.float64, 3)]

@@ -1,4 +1,4 @@
-"""Euler's load of the part of the needle outside of the tissue."""
+"""Euler buckling loads of the part of the needle outside the tissue."""
 
 from __future__ import annotations
 
@@ -8,20 +8,20 @@ from typing import Final, NamedTuple
 from needle_dynamics.errors import InsertedLengthError
 from needle_dynamics.parameters import NeedleParameters
 
-#: First root of tan(x) = x: a column that is clamped at one end and pinned at the other.
+#: First root of tan(x) = x: column clamped at one end and pinned at the other.
 _PINNED: Final = 4.493409457909064
 
 
 class EulerLoads(NamedTuple):
     """
-    Axial forces at which the part outside buckles, clamped at the base [N].
+    Euler buckling loads of the part outside the tissue, clamped at the base [N].
 
     Attributes
     ----------
     free : float
-        With a free end, as before the tip has entered.
+        Free end, as before the tip has entered.
     pinned : float
-        Pinned at the entry, which may turn there but not move sideways.
+        Pinned at the entry point: rotation is free, lateral displacement is zero.
 
     """
 
@@ -31,26 +31,26 @@ class EulerLoads(NamedTuple):
 
 def euler_loads(parameters: NeedleParameters, depth: float) -> EulerLoads:
     """
-    Return Euler's loads of the part of the needle outside of the tissue.
+    Return the Euler buckling loads of the part of the needle outside the tissue.
 
-    A guide that holds the needle in between shortens the part that can buckle; it is not modeled.
+    A needle guide shortens the part that can buckle; it is not modeled.
 
     Parameters
     ----------
     parameters : NeedleParameters
         The needle.
     depth : float
-        Inserted length [m].
+        Insertion depth [m].
 
     Returns
     -------
     EulerLoads
-        Both loads [N]; infinite if nothing is outside.
+        Both loads [N]; infinite if the needle is fully inserted.
 
     Raises
     ------
     InsertedLengthError
-        If the inserted length is negative or not finite.
+        If the insertion depth is negative or not finite.
 
     Examples
     --------
@@ -61,7 +61,7 @@ def euler_loads(parameters: NeedleParameters, depth: float) -> EulerLoads:
 
     """
     if not 0.0 <= depth < inf:
-        raise InsertedLengthError(f'inserted length must be finite and >= 0, got {depth!r} m')
+        raise InsertedLengthError(f'insertion depth must be finite and >= 0, got {depth!r} m')
     outside = parameters.length - depth
     if outside <= 0.0:
         return EulerLoads(inf, inf)

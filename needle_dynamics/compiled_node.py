@@ -1,4 +1,4 @@
-"""Base class of the nodes that call compiled functions."""
+"""Base class of nodes that call compiled functions."""
 
 from __future__ import annotations
 
@@ -12,20 +12,21 @@ from needle_ros.preparation import imports, Progress
 
 class CompiledNode(BaseNode):
     """
-    A node that loads or compiles its kernels before it is configured.
+    Node that loads or compiles its kernels before it is configured.
 
-    To compile or load a function while the node is active is an error, and logged as such:
-    messages wait for it.
+    Compiling or loading a function while the node is active is an error and is logged as such,
+    because messages wait during that time.
 
     Attributes
     ----------
     late : list of str
         Functions that were compiled or loaded while the node was active.
+
     """
 
-    #: Numba imports these when it converts the first array.
+    #: Modules that numba imports at the conversion of the first array.
     IMPORTS = ('numba.core.boxing', 'numba.core.runtime.context')
-    #: Kernels that the node can call, in any mode and with any parameters: modules, or
+    #: Kernels that the node can call in any mode and with any parameters: modules or
     #: ``module:kernel``.
     KERNELS: ClassVar[tuple[str, ...]] = ()
 
@@ -46,7 +47,7 @@ class CompiledNode(BaseNode):
 
     def _on_function(self, function: str, loaded: bool, prepared: bool) -> None:
         if self.is_active:
-            # Another node of this process may be prepared now.
+            # Another node of this process may be preparing now.
             if not prepared:
                 self.late.append(function)
                 done = 'loaded' if loaded else 'compiled'
@@ -57,6 +58,6 @@ class CompiledNode(BaseNode):
             self._compiled += 1
 
     def destroy_node(self) -> None:
-        """Destroy the node, and end the report of compilations."""
+        """Destroy the node and stop listening to compilations."""
         self._listening.__exit__(None, None, None)
         super().destroy_node()

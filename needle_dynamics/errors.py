@@ -1,4 +1,4 @@
-"""Errors of the model."""
+"""Exceptions of the needle model."""
 
 from needle_ros.errors import NeedleError
 
@@ -8,4 +8,4 @@ class ToleranceError(NeedleError):
 
 
 class InsertedLengthError(NeedleError):
-    """The inserted length left the range in which the equations are regular."""
+    """The insertion depth left the range in which the equations are regular."""

@@ -1,4 +1,4 @@
-"""Friction between needle and tissue along the insertion axis: equation (15) and beyond."""
+"""Friction between needle and tissue along the insertion axis, including equation (15)."""
 
 from __future__ import annotations
 
@@ -17,30 +17,30 @@ from needle_ros.errors import ParameterError
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Friction:
     """
-    A friction law with its constants; the defaults are those of (15).
+    A friction law with its constants; the defaults are those in (15).
 
-    Only the laws listed here exist: the step of the integrator is compiled, and a Python object
-    cannot be called from it. To add a law, add a branch to `dry_friction` in
-    ``needle_dynamics/compiled/friction.py``; that file says how.
+    Only the laws listed here exist: the integrator step is compiled and cannot call a Python
+    object. To add a law, add a branch to `dry_friction` in
+    ``needle_dynamics/compiled/friction.py``, which documents the steps.
 
     Attributes
     ----------
     law : str
-        ``coulomb``: dry friction mu_s, set-valued at rest. ``stribeck``: falls from the
-        break-away value at rest to mu_s, set-valued at rest. ``tanh``: smooth through zero; a
-        needle at rest creeps.
+        ``coulomb``: dry friction mu_s, set-valued at rest. ``stribeck``: decreases from the
+        break-away value at rest to mu_s, set-valued at rest. ``tanh``: smooth through zero
+        velocity; a needle at rest creeps.
     coulomb : float
         Coulomb friction mu_s [N].
     viscous : float
         Viscous friction mu_v [N s/m].
     withdrawal : float
-        Friction on withdrawal over that on insertion.
+        Ratio of friction on withdrawal to friction on insertion.
     breakaway : float
-        Friction at rest over mu_s (``stribeck``).
+        Ratio of friction at rest to mu_s (``stribeck``).
     stribeck_speed : float
-        Speed over which friction falls to mu_s [m/s] (``stribeck``).
+        Speed scale over which friction decreases to mu_s [m/s] (``stribeck``).
     smoothing_speed : float
-        Speed over which friction changes its sign [m/s] (``tanh``).
+        Speed scale over which friction changes sign [m/s] (``tanh``).
 
     Raises
     ------
@@ -74,7 +74,7 @@ class Friction:
 
     @property
     def constants(self) -> FrictionConstants:
-        """The constants as compiled functions take them."""
+        """Constants in the layout of the compiled functions."""
         return FrictionConstants(
             FRICTION_LAWS.index(self.law),
             float(self.coulomb),
@@ -87,14 +87,14 @@ class Friction:
 
     def force(self, velocity: float, drive: float) -> float:
         """
-        Friction force on the needle.
+        Evaluate the friction force on the needle.
 
         Parameters
         ----------
         velocity : float
             Insertion velocity s_dot [m/s], positive into the tissue.
         drive : float
-            Sum of the other forces [N], positive into the tissue; it decides at rest.
+            Sum of the other forces [N], positive into the tissue; used at rest.
 
         Returns
         -------
@@ -106,14 +106,14 @@ class Friction:
 
     def slope(self, velocity: float, direction: float) -> float:
         """
-        Differentiate the friction force by the insertion velocity.
+        Evaluate the derivative of the friction force with respect to the insertion velocity.
 
         Parameters
         ----------
         velocity : float
             Insertion velocity [m/s].
         direction : float
-            Side of rest from which to differentiate: positive for insertion, else withdrawal.
+            Side of zero velocity: positive for insertion, otherwise withdrawal.
 
         Returns
         -------

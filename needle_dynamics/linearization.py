@@ -1,8 +1,8 @@
-r"""
-Linearization (19) of the model at an operating point, with its natural units.
+"""
+Linearization (19) of the model at an operating point, with natural units.
 
 The only equilibria of the model are straight needles. Elsewhere (19) holds along a motion, with
-its coefficients frozen at the instant of the operating point.
+coefficients frozen at the operating point.
 """
 
 from __future__ import annotations
@@ -18,18 +18,18 @@ from needle_ros.errors import NeedleError, ParameterError
 import numpy as np
 from numpy.typing import ArrayLike
 
-#: Ways to slide, with the sign of the insertion velocity.
+#: Sliding directions and the sign of the insertion velocity.
 SLIDING: Final = {'insertion': 1.0, 'withdrawal': -1.0}
 
 
 class StuckError(NeedleError):
-    """Friction has no derivative: the needle is at rest, and no direction of sliding is given."""
+    """The friction law has no derivative: the needle is at rest without a sliding direction."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LinearSystem:
     """
-    The linear system (19) at one operating point, SI units.
+    Linear system (19) at one operating point, SI units.
 
     With the deviations x of the state, u = [f_y, tau] of the inputs and y of the tip deflection,
     x_dot = drift + A x + B u and y = C x + D u. The order N is 2 (2 + n).
@@ -78,13 +78,13 @@ class LinearSystem:
 
     def scaled(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """
-        Return A, B, C in natural units, without dimension.
+        Return A, B and C in natural (dimensionless) units.
 
         The unit of time is 1 / omega_1 of the slowest mode of the inserted part. The unit of d and
-        of the deflection is the inserted length s. Angles are in radians. The units of force and
-        torque move needle and rotor by these within the unit of time. The bending is split into
-        its normal modes, displacement and rate in the norm of energy: the state of mode 1 is its
-        root mean square deflection over s.
+        of the tip deflection is the insertion depth s. Angles are in radians. One unit of force or
+        torque moves the needle or the rotor by one unit within the unit of time. The bending is
+        decomposed into its normal modes, displacement and rate in the energy norm: the state of
+        mode 1 is its root mean square deflection over s.
 
         Returns
         -------
@@ -112,9 +112,9 @@ def operating_point(
     model : NeedleModel
         The model.
     depth : float
-        Inserted length s [m].
+        Insertion depth s [m].
     tip_deflection : float
-        Tip deflection w(s) [m]; the shape is that of `NeedleModel.state_at`.
+        Tip deflection w(s) [m]; shape as in `NeedleModel.state_at`.
     velocity : float
         Insertion velocity s_dot [m/s], positive into the tissue.
 
@@ -160,18 +160,18 @@ def linearize(
     model : NeedleModel
         The model.
     state : array_like, shape (2 (2 + n),)
-        Operating point, SI units. At the border of two layers the lower layer counts.
+        Operating point, SI units. At a layer boundary the deeper layer applies.
     force : float
-        Insertion force f_y [N]. It enters the drift, and decides the direction in which a needle
-        at rest breaks away.
+        Insertion force f_y [N]. It enters the drift, and determines the direction in which a
+        needle at rest breaks away.
     torque : float
-        Torque tau [N m]; it enters the drift.
+        Torque tau [N m], part of the drift.
     time : float
-        Time [s] at which swelling tissue is frozen.
+        Time [s] at which the swelling is evaluated.
     sliding : str, optional
-        ``insertion`` or ``withdrawal``: the branch of the friction law to differentiate at rest,
-        the limit of slow motion in that direction. It is ignored if the needle moves, or breaks
-        away under the given forces.
+        ``insertion`` or ``withdrawal``: at rest, the branch of the friction law to differentiate
+        (the limit of slow motion in that direction). Ignored if the needle moves or breaks away
+        under the given forces.
 
     Returns
     -------
@@ -281,7 +281,7 @@ def linearize(
 def _friction(
     law: Friction, velocity: float, drive: float, sliding: str | None
 ) -> tuple[float, float]:
-    """Return the friction force [N] and its derivative by the insertion velocity [N s/m]."""
+    """Return the friction force [N] and its derivative with respect to velocity [N s/m]."""
     if sliding is not None and sliding not in SLIDING:
         raise ParameterError(f'sliding must be one of {", ".join(SLIDING)}, got {sliding!r}')
     if velocity != 0.0:
@@ -295,8 +295,8 @@ def _friction(
         direction = 1.0
     else:
         raise StuckError(
-            f'the needle is at rest and {drive:.3g} N does not move it: friction there, from '
-            f'{back:.3g} to {ahead:.3g} N, has no derivative; give a velocity, a force beyond it, '
+            f'the needle is at rest and {drive:.3g} N does not move it: static friction, from '
+            f'{back:.3g} to {ahead:.3g} N, has no derivative; give a velocity, a larger force, '
             f'or the branch to slide on ({" or ".join(SLIDING)})'
         )
     return (ahead if direction > 0.0 else back), law.slope(0.0, direction)

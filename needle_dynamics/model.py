@@ -1,11 +1,11 @@
-r"""
-Equations of motion of the needle in tissue, one method per equation.
+"""
+Equations of motion of a flexible needle in soft tissue, one method per equation.
 
 The generalized coordinates are q = [d, theta, q1, ..., qn] and the state is X = [q, q_dot]:
-eight numbers for n = 2. d is the length of needle outside the tissue, so that insertion
-decreases it; the insertion force f_y is positive into the tissue. The formulation `complete` has
-every term of Euler-Lagrange on T - V, equation (12). The formulation `as_printed` is the source's
-final form, which leaves out the row of d and what comes from dG/dt.
+eight numbers for n = 2. d is the length of needle outside the tissue and decreases during
+insertion; the insertion force f_y is positive into the tissue. The formulation `complete` has
+every term of the Euler-Lagrange equations of T - V, equation (12). The formulation `as_printed`
+is the final form in the source, which omits the row of d and the terms from dG/dt.
 """
 
 from __future__ import annotations
@@ -29,21 +29,21 @@ from needle_ros.errors import ParameterError, ShapeError
 import numpy as np
 from numpy.typing import ArrayLike
 
-#: Rounding of an inserted length, relative to the needle's length.
+#: Rounding tolerance of an insertion depth, relative to the needle length.
 ROUNDING: Final = 1e-12
 
 
 class _Instant(NamedTuple):
-    """A checked state with what the equations need at it, evaluated once."""
+    """A checked state and the quantities that the equations need at it."""
 
     state: FloatArray
     depth: float
-    #: Velocity of d, deflections q1..qn and their rates.
+    #: Velocity of d, modal coordinates q1..qn and their rates.
     d_rate: float
     modal: FloatArray
     rate: FloatArray
     at: ModeIntegrals
-    #: Stiffness of the tissue at the tip [N/m^2], and modal stiffness.
+    #: Tissue stiffness at the tip [N/m^2], and modal stiffness.
     tip_stiffness: float
     stiffness: FloatArray
 
@@ -51,16 +51,16 @@ class _Instant(NamedTuple):
 @dataclass(frozen=True)
 class NeedleModel:
     """
-    The Lagrangian model of needle and tissue for one set of constants.
+    Lagrangian model of needle and tissue for one set of constants.
 
     Attributes
     ----------
     parameters : NeedleParameters
-        Constants, SI units. For friction or tissue as objects, see `NeedleParameters.using`.
+        Constants, SI units. To pass friction or tissue objects, see `NeedleParameters.using`.
 
     Examples
     --------
-    A needle at rest, 5 cm inserted, its tip deflected by 1 mm:
+    A needle at rest at an insertion depth of 5 cm with a tip deflection of 1 mm:
 
     >>> from needle_dynamics import NeedleModel, NeedleParameters
     >>> model = NeedleModel(NeedleParameters.preset('phantom'))
@@ -92,7 +92,7 @@ class NeedleModel:
 
     @cached_property
     def compiled(self) -> Needle:
-        """The needle as compiled functions take it."""
+        """Needle constants in the layout of the compiled functions."""
         p = self.parameters
         return Needle(
             length=p.length,
@@ -125,7 +125,7 @@ class NeedleModel:
 
     def checked_state(self, state: ArrayLike) -> FloatArray:
         """
-        Return a state as an array, or say what is wrong with it.
+        Check a state and return it as an array.
 
         Parameters
         ----------
@@ -135,14 +135,14 @@ class NeedleModel:
         Returns
         -------
         ndarray, shape (2 (2 + n),)
-            A copy.
+            Copy of the state.
 
         Raises
         ------
         ShapeError
             If the shape is wrong or a number is not finite.
         InsertedLengthError
-            If the inserted length is outside its range.
+            If the insertion depth is outside its range.
 
         """
         try:
@@ -158,16 +158,16 @@ class NeedleModel:
         p = self.parameters
         depth = p.length - checked[0]
         high = self.modes.reach * p.length
-        # The inserted length is a difference: its ends are met up to rounding.
+        # The insertion depth is a difference, so its limits hold up to rounding.
         if not p.minimum_depth - ROUNDING * p.length <= depth <= high:
             raise InsertedLengthError(
-                f'inserted length {depth:.6g} m is outside [{p.minimum_depth:g}, {high:g}] m '
+                f'insertion depth {depth:.6g} m is outside [{p.minimum_depth:g}, {high:g}] m '
                 '(minimum_depth to the hub)'
             )
         return checked
 
     def _instant(self, state: ArrayLike, time: float = 0.0) -> _Instant:
-        """Check a state and evaluate the modes at it."""
+        """Check a state and evaluate the modes and stiffness at it."""
         x, m = self.checked_state(state), self.coordinates
         depth = self.parameters.length - x[0]
         at = self.modes.integrals(depth)
@@ -185,15 +185,16 @@ class NeedleModel:
         self, depth: float, tip_deflection: float = 0.0, modal: Sequence[float] = ()
     ) -> FloatArray:
         """
-        Return the state at rest with a given inserted length and tip deflection or shape.
+        Return the state at rest with a given insertion depth and tip deflection or shape.
 
-        With a tip deflection the shape is the one a lateral force at the tip would hold: the least
-        elastic energy for that deflection. (The source gives the deflection of the tip alone.)
+        With a tip deflection, the shape is the static shape under a lateral force at the tip,
+        which has the least elastic energy for that deflection. (The source gives only the tip
+        deflection.)
 
         Parameters
         ----------
         depth : float
-            Inserted length s [m].
+            Insertion depth s [m].
         tip_deflection : float
             w(s) [m].
         modal : sequence of float, shape (n,) or (0,)
@@ -209,7 +210,7 @@ class NeedleModel:
         InsertedLengthError
             If ``depth`` is outside its range.
         ShapeError
-            If a number is not finite, or the number of modal coordinates is another one.
+            If a number is not finite, or the number of modal coordinates is not n.
         ParameterError
             If both a tip deflection and modal coordinates are given.
 
@@ -222,7 +223,7 @@ class NeedleModel:
                 raise ShapeError(f'modal must have {self.modes.count} numbers, got {modal!r}')
             if tip_deflection != 0.0:
                 raise ParameterError(
-                    'modal and tip_deflection are two ways to say the same: '
+                    'modal and tip_deflection both define the shape: '
                     f'one must be empty or 0, got {modal!r} and {tip_deflection!r} m'
                 )
             state[2 : self.coordinates] = modal
@@ -239,9 +240,9 @@ class NeedleModel:
         Parameters
         ----------
         depth : float
-            Inserted length s [m].
+            Insertion depth s [m].
         time : float
-            Time [s], for tissue that swells.
+            Time [s], for swelling tissue.
 
         Returns
         -------
@@ -285,7 +286,7 @@ class NeedleModel:
         state : array_like, shape (2 (2 + n),)
             State.
         time : float
-            Time [s], for tissue that swells.
+            Time [s], for swelling tissue.
 
         Returns
         -------
@@ -323,7 +324,7 @@ class NeedleModel:
         torque : float
             Torque tau about x [N m].
         time : float
-            Time [s], for tissue that swells.
+            Time [s], for swelling tissue.
 
         Returns
         -------
@@ -345,7 +346,7 @@ class NeedleModel:
             raise ParameterError(f'force and torque must be finite, got {force!r} and {torque!r}')
         bias = self._bias(now)
         applied = np.zeros(self.coordinates)
-        # Q_d = -f_y: what pushes the needle in shortens d.
+        # Q_d = -f_y: a force into the tissue shortens d.
         applied[0] = self.friction.force(-now.d_rate, force + bias[0]) - force
         applied[1] = torque
         return np.asarray(np.linalg.solve(self._mass(now.at), applied - bias))
@@ -354,17 +355,17 @@ class NeedleModel:
         self, state: ArrayLike, acceleration: ArrayLike, time: float = 0.0
     ) -> FloatArray:
         """
-        Return the forces that bring about an acceleration, equation (16) the other way.
+        Inverse dynamics, equation (16): return the forces that produce an acceleration.
 
         Parameters
         ----------
         state : array_like, shape (2 (2 + n),)
             State.
         acceleration : array_like, shape (2 + n,)
-            q_ddot. From rest friction acts against the motion that begins. Held at rest, it
-            takes the value within its bounds that asks for the least force.
+            q_ddot. From rest, friction opposes the starting motion. If the needle stays at rest,
+            friction takes the value within its bounds that minimizes the required force.
         time : float
-            Time [s], for tissue that swells.
+            Time [s], for swelling tissue.
 
         Returns
         -------
@@ -383,7 +384,7 @@ class NeedleModel:
         if wanted.shape != (m,) or not np.isfinite(wanted).all():
             raise ShapeError(f'acceleration must be finite with shape ({m},), got {wanted}')
         forces = self._mass(now.at) @ wanted + self._bias(now)
-        # From rest an infinite drive gives the friction that opposes the motion which begins.
+        # From rest, an infinite drive gives the friction that opposes the starting motion.
         drive = -np.sign(wanted[0]) * np.inf if wanted[0] != 0.0 else forces[0]
         forces[0] = -forces[0] + self.friction.force(-now.d_rate, drive)
         return np.asarray(forces)
@@ -392,7 +393,7 @@ class NeedleModel:
         self, state: ArrayLike, force: float = 0.0, torque: float = 0.0, time: float = 0.0
     ) -> FloatArray:
         """
-        Return what the base exerts on the needle, by balance of momentum over the inserted part.
+        Return the base reaction on the needle from the momentum balance of the inserted part.
 
         Parameters
         ----------
@@ -403,7 +404,7 @@ class NeedleModel:
         torque : float
             Torque on the carriage [N m].
         time : float
-            Time [s], for tissue that swells.
+            Time [s], for swelling tissue.
 
         Returns
         -------
@@ -417,7 +418,7 @@ class NeedleModel:
         integrals = np.array([now.at.area, now.at.moment])
         above = np.array([layers.area[layer], layers.moment[layer]])
         held = tissue.growth(time) * (tissue.stiffnesses[layer] * integrals + above)
-        # The part that enters brings the momentum of the tip, at a lever of the depth.
+        # The entering part carries the momentum of the tip, with the depth as lever arm.
         entering = -now.d_rate * (now.at.value @ now.rate) * np.array([1.0, now.depth])
         inertia = p.linear_density * (integrals @ acceleration[2:] + entering)
         lateral, about_entry = inertia + held @ now.modal + p.tissue_damping * integrals @ now.rate
@@ -439,7 +440,7 @@ class NeedleModel:
         torque : float
             Torque tau about x [N m].
         time : float
-            Time [s], for tissue that swells.
+            Time [s], for swelling tissue.
 
         Returns
         -------
@@ -478,7 +479,7 @@ class NeedleModel:
         state : array_like, shape (2 (2 + n),)
             State.
         time : float
-            Time [s], for tissue that swells.
+            Time [s], for swelling tissue.
 
         Returns
         -------
@@ -498,7 +499,7 @@ class NeedleModel:
         state : array_like, shape (2 (2 + n),)
             State.
         time : float
-            Time [s], for tissue that swells.
+            Time [s], for swelling tissue.
 
         Returns
         -------

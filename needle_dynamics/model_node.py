@@ -1,4 +1,4 @@
-"""Base class of the nodes that hold the constants of the needle model as parameters."""
+"""Base class of nodes that declare the constants of the needle model as parameters."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from rcl_interfaces.msg import ParameterDescriptor
 
 
 class ModelNode(CompiledNode):
-    """A node whose parameters ``model.*`` are the constants of the needle and its tissue."""
+    """Node whose parameters ``model.*`` are the constants of needle and tissue."""
 
     def declare_model(self) -> None:
-        """Declare ``model.preset`` and, with its values as defaults, every model constant."""
-        # Fixed at start: the other defaults follow from it.
+        """Declare ``model.preset`` and, with the defaults of the preset, every model constant."""
+        # Read-only: the defaults of the other parameters depend on it.
         self.declare_parameter(
             'model.preset',
             DEFAULT_PRESET,
@@ -26,24 +26,6 @@ class ModelNode(CompiledNode):
         self.declare_settings('model.', NEEDLES.get(preset, NeedleParameters()))
 
     def model_parameters(self, changes: Mapping[str, Any] | None = None) -> NeedleParameters:
-        """
-        Read the model constants.
-
-        Parameters
-        ----------
-        changes : Mapping[str, Any], optional
-            Values to take instead of the parameters' own, by parameter name.
-
-        Returns
-        -------
-        NeedleParameters
-            The constants.
-
-        Raises
-        ------
-        ParameterError
-            If a constant is not valid; the message names the parameter.
-
-        """
+        """Read the model constants; ``changes`` overrides parameters by name."""
         self.text('model.preset', tuple(NEEDLES))
         return self.settings('model.', NeedleParameters, changes)

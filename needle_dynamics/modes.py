@@ -1,9 +1,9 @@
-r"""
+"""
 Shape modes of the needle, equations (10)-(11), and their integrals over the inserted part.
 
-Everything that the equations of motion need of the modes at an inserted length s has a closed
-form: values, curvatures, G, H and the first two moments. `needle_dynamics.compiled.integrals`
-evaluates them; the constants and series that it needs are made here.
+All mode quantities in the equations of motion have a closed form in the insertion depth s:
+values, curvatures, G, H and the first two moments. `needle_dynamics.compiled.integrals`
+evaluates them; this module computes the constants and series coefficients.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from needle_ros.errors import ParameterError
 import numpy as np
 from numpy.typing import ArrayLike
 
-#: The first term that a series leaves out is below this part of the sum.
+#: Relative truncation error of the series: first omitted term over the sum.
 _TRUNCATION: Final = 1e-17
 
 
@@ -41,8 +41,8 @@ class ModeShapes:
     count : int
         Number of modes n in (10); 2 in the source.
     reach : float
-        Largest inserted length over l for which integrals are wanted; above 1 the modes are
-        continued beyond the needle's length.
+        Largest insertion depth over l for which integrals are computed; above 1 the modes are
+        extended beyond the needle length.
 
     """
 
@@ -62,7 +62,7 @@ class ModeShapes:
 
     @cached_property
     def _rests(self) -> FloatArray:
-        """What the growing exponentials leave, (mu_i - 1) exp(k_i l); shape (n,)."""
+        """Coefficients (mu_i - 1) exp(k_i l) of the growing exponentials; shape (n,)."""
         x = self.arguments
         fall = np.exp(-x)
         # mu - 1 = (sin - cos - exp(-x)) / (cos + cosh), numerator and denominator times exp(x).
@@ -82,7 +82,7 @@ class ModeShapes:
 
     def values(self, y: ArrayLike) -> FloatArray:
         """
-        Mode shapes phi_i(y), equation (11) with the sign that makes them vanish at y = 0.
+        Evaluate the mode shapes phi_i(y), equation (11) with the sign for phi_i(0) = 0.
 
         Parameters
         ----------
@@ -105,7 +105,7 @@ class ModeShapes:
 
     def derivatives(self, y: ArrayLike, order: int) -> FloatArray:
         """
-        Differentiate the modes by y, without cancellation for high modes.
+        Evaluate derivatives of the modes in y, without cancellation for high modes.
 
         Parameters
         ----------
@@ -123,7 +123,7 @@ class ModeShapes:
         x = self.wavenumbers * np.asarray(y, dtype=float)[..., np.newaxis]
         sine, cosine = np.sin(x), np.cos(x)
         mu = self.ratios
-        # d/dx takes sin to cos and cos to -sin; exp(x) stays and exp(-x) changes sign.
+        # d/dx maps sin to cos, cos to -sin, exp(x) to itself and exp(-x) to -exp(-x).
         turned = (
             sine - mu * cosine,
             cosine + mu * sine,
@@ -141,7 +141,7 @@ class ModeShapes:
         Parameters
         ----------
         depth : float
-            Inserted length s [m], in [0, reach l].
+            Insertion depth s [m], in [0, reach l].
 
         Returns
         -------
@@ -151,12 +151,12 @@ class ModeShapes:
         Raises
         ------
         ParameterError
-            If ``depth`` is outside that range.
+            If ``depth`` is outside this range.
 
         """
         high = self.reach * self.length
         if not 0.0 <= depth <= high:
-            raise ParameterError(f'inserted length must be in [0, {high:g}] m, got {depth!r}')
+            raise ParameterError(f'insertion depth must be in [0, {high:g}] m, got {depth!r}')
         n, tables = self.count, self.tables
         grams, rows = np.empty((2, n, n)), np.empty((4, n))
         at = ModeIntegrals(grams[0], grams[1], rows[0], rows[1], rows[2], rows[3])
@@ -165,12 +165,12 @@ class ModeShapes:
 
     def condition(self, depth: float) -> float:
         """
-        Return the condition number of G: how hard the modes are to tell apart.
+        Return the condition number of G, which measures how well the modes are distinguishable.
 
         Parameters
         ----------
         depth : float
-            Inserted length s [m].
+            Insertion depth s [m].
 
         Returns
         -------
@@ -182,7 +182,7 @@ class ModeShapes:
 
     @cached_property
     def tables(self) -> ModeTables:
-        """What the compiled evaluation of the integrals takes."""
+        """Series and constants for the compiled evaluation of the integrals."""
         constants = np.array([self.arguments, self.ratios, self._rests, self.scales])
         tables = ModeTables(self.length, self._series(), self._needed(), constants)
         for table in tables[1:]:
@@ -200,21 +200,21 @@ class ModeShapes:
         for i in range(n):
             x, c, mu = self.arguments[i], self.scales[i], self.ratios[i]
             for m in range(terms):
-                # sin - sinh and cos - cosh keep one power in four of the exponential series.
+                # sin - sinh and cos - cosh retain every fourth power of the exponential series.
                 phi[i, 4 * m + 3] = -2.0 * c * x ** (4 * m + 3) / factorial(4 * m + 3)
                 phi[i, 4 * m + 2] = 2.0 * c * mu * x ** (4 * m + 2) / factorial(4 * m + 2)
             powers = np.arange(degree - 2)
             curvature[i, :-2] = phi[i, 2:] * (powers + 1) * (powers + 2) / self.length**2
 
         def integral(series: FloatArray, power: int = 0) -> FloatArray:
-            """Integrate series(xi) y^power over y; leading zeros keep the powers in place."""
+            """Integrate series(xi) y^power over y; leading zeros preserve the exponents."""
             exponents = np.arange(series.size) + power + 1
             return np.concatenate(
                 [np.zeros(power + 1), series / exponents * self.length ** (power + 1)]
             )
 
         pairs = [(i, j) for i in range(n) for j in range(i, n)]
-        # Each with the lowest power that it has, and how many in a row.
+        # Series, lowest nonzero power and number of consecutive powers.
         found = (
             *((integral(np.convolve(phi[i], phi[j])), 5, 3) for i, j in pairs),
             *((integral(np.convolve(curvature[i], curvature[j])), 1, 3) for i, j in pairs),
@@ -231,7 +231,7 @@ class ModeShapes:
         return np.ascontiguousarray(np.array(columns).T)
 
     def _needed(self) -> FloatArray:
-        """Return how many terms two modes need, by the relative inserted length."""
+        """Return the number of series terms for two modes, by relative insertion depth."""
         if self.count != 2:
             return np.zeros(1)
         steps = np.arange(1, round(self.reach * TERMS_PER_LENGTH) + 2)
@@ -243,7 +243,7 @@ class ModeShapes:
 @lru_cache(maxsize=32)
 def mode_shapes(length: float, count: int = 2, reach: float = 1.0) -> ModeShapes:
     """
-    Return the modes of a needle. Equal arguments give the same object.
+    Return the (cached) modes of a needle.
 
     Parameters
     ----------
@@ -252,7 +252,7 @@ def mode_shapes(length: float, count: int = 2, reach: float = 1.0) -> ModeShapes
     count : int
         Number of modes.
     reach : float
-        As in `ModeShapes`.
+        See `ModeShapes`.
 
     Returns
     -------
@@ -266,7 +266,7 @@ def mode_shapes(length: float, count: int = 2, reach: float = 1.0) -> ModeShapes
     >>> print(modes.arguments.round(4))
     [1.8751 4.6941]
 
-    The modes are orthonormal on the whole length, and vanish at the entry point:
+    The modes are orthonormal on the whole length and vanish at the entry point:
 
     >>> print(modes.integrals(0.2).gram.round(9) + 0.0)
     [[1. 0.]
@@ -288,5 +288,5 @@ def _root(i: int) -> float:
 
 
 def _terms(growth: float) -> int:
-    """Return after how many powers of (y/l)^4 a series that grows as growth^m / m! has ended."""
+    """Return the number of powers of (y/l)^4 for a series that grows as growth^m / m!."""
     return next(m for m in range(1, 99) if growth ** (4 * m) < _TRUNCATION * factorial(4 * m))

@@ -1,4 +1,4 @@
-"""Constants of the needle and tissue: one frozen value, checked when it is made."""
+"""Constants of needle and tissue, validated at construction."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from needle_dynamics.tissue import Tissue
 from needle_ros.errors import ParameterError
 from needle_ros.settings import check_constants, constant, from_values
 
-#: Formulations by name: every term of Euler-Lagrange, or the source's final form.
+#: Formulations: all terms of the Euler-Lagrange equations, or the final form in the source.
 FORMULATIONS: Final = ('complete', 'as_printed')
 
-#: Largest condition number of G: beyond it the modal state carries less than five digits.
+#: Largest condition number of G; above it the modal state has less than five valid digits.
 LARGEST_CONDITION: Final = 1e11
 
-#: Inserted length over l from which on cond(G) is at most that, for 1, 2, ... modes. G depends on
-#: this ratio alone. They are tabulated so that parameters can be checked without compiled code.
+#: Least insertion depth over l with cond(G) <= LARGEST_CONDITION, for 1, 2, ... modes. G depends
+#: only on this ratio. The table allows parameter checks without compiled code.
 _LEAST_RATIOS: Final = (
     0.0, 1.27099e-4, 0.0943411, 0.228479, 0.332967, 0.410300, 0.474010, 0.526876, 0.571028,
     0.608223, 0.639854, 0.667005,
 )  # fmt: skip
 
-#: Most modes: more of them can be told apart at large depths only.
+#: Maximum number of modes; more are distinguishable only at large insertion depths.
 MOST_MODES: Final = len(_LEAST_RATIOS)
 
 
@@ -42,8 +42,8 @@ class NeedleParameters:
     Raises
     ------
     ParameterError
-        If a constant is not a number or is outside its range. The message names the constant, the
-        value found and the valid range.
+        If a constant is not a number or is outside its range. The message contains the name, the
+        value and the valid range.
 
     References
     ----------
@@ -62,10 +62,10 @@ class NeedleParameters:
     rotary_inertia: float = constant(
         1.0626e-9, 'kg m^2', 'I_x, used as a mass moment of inertia about x', open_low=True
     )
-    carriage_mass: float = constant(0.0, 'kg', 'mass moved along with the needle base')
+    carriage_mass: float = constant(0.0, 'kg', 'mass that moves with the needle base')
     tissue_stiffness: float = constant(520.0, 'N/m^2', 'tissue stiffness k_a per length')
     layer_depths: tuple[float, ...] = field(
-        default=(), metadata={'description': 'depths at which further layers of tissue begin [m]'}
+        default=(), metadata={'description': 'depths at which further tissue layers begin [m]'}
     )
     layer_stiffnesses: tuple[float, ...] = field(
         default=(), metadata={'description': 'stiffness of each of these layers [N/m^2]'}
@@ -101,7 +101,7 @@ class NeedleParameters:
         default='complete', metadata={'description': f'one of {", ".join(FORMULATIONS)}'}
     )
     minimum_depth: float = constant(
-        1e-3, 'm', 'inserted length below which the model stops', open_low=True
+        1e-3, 'm', 'insertion depth below which the model stops', open_low=True
     )
     hub_stop: bool = field(
         default=True, metadata={'description': 'the hub stops on the skin (inelastic)'}
@@ -111,7 +111,7 @@ class NeedleParameters:
         check_constants(self)
         for item in fields(self):
             if 'unit' in item.metadata:
-                # An integer would have compiled functions compiled anew for it.
+                # An integer would cause compiled functions to be compiled for another type.
                 object.__setattr__(self, item.name, float(getattr(self, item.name)))
         if not isinstance(self.hub_stop, bool):
             raise ParameterError(f'hub_stop must be true or false, got {self.hub_stop!r}')
@@ -158,14 +158,14 @@ class NeedleParameters:
         least = _LEAST_RATIOS[n - 1] * self.length
         if self.minimum_depth < least:
             raise ParameterError(
-                f'{n} modes cannot be told apart at minimum_depth = {self.minimum_depth:g} m, '
+                f'{n} modes cannot be distinguished at minimum_depth = {self.minimum_depth:g} m, '
                 f'where cond(G) > {LARGEST_CONDITION:.0e}; valid: minimum_depth >= '
                 f'{ceil(1e4 * least) / 1e4:g} m, or fewer modes'
             )
 
     @property
     def tissue(self) -> Tissue:
-        """The tissue along the needle, as one value."""
+        """Tissue along the needle."""
         return Tissue(
             starts=(0.0, *self.layer_depths),
             stiffnesses=(self.tissue_stiffness, *self.layer_stiffnesses),
@@ -176,7 +176,7 @@ class NeedleParameters:
 
     @property
     def friction(self) -> Friction:
-        """The friction along the insertion axis, as one value."""
+        """Friction along the insertion axis."""
         return Friction(**{of: getattr(self, name) for of, name in _FRICTION_FIELDS.items()})
 
     @property
@@ -191,24 +191,24 @@ class NeedleParameters:
 
     @property
     def moving_mass(self) -> float:
-        """Mass that moves along the insertion axis, rho A l plus the carriage [kg]."""
+        """Mass moving along the insertion axis, rho A l plus the carriage [kg]."""
         return self.linear_density * self.length + self.carriage_mass
 
     @property
     def reach(self) -> float:
-        """Largest inserted length over l."""
-        # Without the stop the needle may overshoot the hub by as much as its length.
+        """Largest insertion depth over l."""
+        # Without the stop, the needle may overshoot the hub by its length.
         return 1.0 if self.hub_stop else 2.0
 
     @classmethod
     def preset(cls, name: str, **changes: Any) -> NeedleParameters:
         """
-        Return a named set of constants, with changes.
+        Return a preset of constants, with changed fields.
 
         Parameters
         ----------
         name : str
-            One of `PRESETS`.
+            Key of `PRESETS`.
         **changes : Any
             Fields to replace.
 
@@ -228,7 +228,7 @@ class NeedleParameters:
         >>> parameters.tissue_stiffness, parameters.viscous_friction
         (600.0, 300.0)
 
-        A value that is not valid is rejected:
+        An invalid value is rejected:
 
         >>> NeedleParameters.preset('phantom', length=-0.2)
         Traceback (most recent call last):
@@ -244,7 +244,7 @@ class NeedleParameters:
         self, *, friction: Friction | None = None, tissue: Tissue | None = None
     ) -> NeedleParameters:
         """
-        Return these constants with the friction or the tissue of another object.
+        Return these constants with another friction or tissue object.
 
         Parameters
         ----------
@@ -256,13 +256,13 @@ class NeedleParameters:
         Returns
         -------
         NeedleParameters
-            The constants. `friction` and `tissue` of them are equal to the objects given.
+            Constants whose `friction` and `tissue` equal the given objects.
 
         Raises
         ------
         ParameterError
-            If an object is of another class. The step of the integrator is compiled: it knows the
-            laws of `Friction` and the layers of `Tissue`, and cannot call an object of your own.
+            If an object has another class. The integrator step is compiled: it supports only the
+            laws of `Friction` and the layers of `Tissue`, and cannot call Python objects.
 
         Examples
         --------
@@ -296,7 +296,7 @@ class NeedleParameters:
         return replace(self, **changes)
 
 
-#: Field of the parameters by field of `Friction`.
+#: Field of `NeedleParameters` by field of `Friction`.
 _FRICTION_FIELDS: Final = {
     'law': 'friction_law',
     'coulomb': 'coulomb_friction',
@@ -310,14 +310,14 @@ _FRICTION_FIELDS: Final = {
 _PAPER_SI = NeedleParameters()
 _PAPER_MM = replace(_PAPER_SI, viscous_friction=300.0)
 
-#: Named sets of constants. Table 1 prints mu_v = 0.3 without a unit: `paper_si` reads it as
-#: 0.3 N s/m, `paper_mm` as 0.3 N s/mm. `phantom` adds the tissue damping that the paper leaves
-#: out: 30 % of critical for the first mode at full insertion (an assumption).
+#: Presets by name. Table 1 prints mu_v = 0.3 without a unit: `paper_si` assumes
+#: 0.3 N s/m, `paper_mm` 0.3 N s/mm. `phantom` adds the tissue damping that the paper
+#: omits: 30 % of critical for the first mode at full insertion (an assumption).
 PRESETS: Final[Mapping[str, NeedleParameters]] = {
     'paper_si': _PAPER_SI,
     'paper_mm': _PAPER_MM,
     'phantom': replace(_PAPER_MM, tissue_damping=1.6),
 }
 
-#: What nodes and commands take if nothing is said.
+#: Default preset of nodes and commands.
 DEFAULT_PRESET: Final = 'phantom'

@@ -1,4 +1,4 @@
-"""Node `plant`: the simulated needle, or a simulated robot that moves it or presses tissue."""
+"""Node `plant`: simulated needle, optionally moved by a simulated robot, or simulated indenter."""
 
 from __future__ import annotations
 
@@ -43,17 +43,17 @@ from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import JointTrajectory
 from visualization_msgs.msg import Marker
 
-#: Time between two looks at the graph [s]; looks after which an unanswered sample is repeated,
-#: and after which that is reported.
+#: Period of the graph checks [s]; number of checks after which an unanswered sample is repeated,
+#: and after which the missing answer is reported.
 _WATCH = 0.1
 _REPEAT, _LONG = 5, 20
 
-#: More commands per sample than this are reported.
+#: Commands per sample above which a warning is reported.
 _TOO_MANY = 3.0
 
 _NO_FAULT = 'none'
 
-#: Pictures of the needle per second, and width of its line and of that of its path [m].
+#: Rate of the visualization messages [Hz], and line widths of needle and path [m].
 _PICTURES = 30.0
 _WIDTH, _PATH_WIDTH = 1e-3, 5e-4
 
@@ -72,7 +72,7 @@ def _message(stamp: int) -> TimeMessage:
 
 
 def _line(name: str, width: float, shade: float) -> Marker:
-    """Return a line in the frame of the entry point."""
+    """Return a line marker in the frame of the entry point."""
     line = Marker(ns=name, type=Marker.LINE_STRIP)
     line.header.frame_id = contract.ENTRY
     line.pose.orientation.w = 1.0
@@ -83,7 +83,7 @@ def _line(name: str, width: float, shade: float) -> Marker:
 
 
 def _transform(seen: Outline, stamp: int) -> TransformStamped:
-    """Return where the tip is from the base."""
+    """Return the transform from the base to the tip."""
     (x, y, z), (i, j, k, w) = seen.tip
     made = TransformStamped(child_frame_id=contract.TIP)
     made.header.frame_id, made.header.stamp = contract.BASE, _message(stamp)
@@ -94,27 +94,27 @@ def _transform(seen: Outline, stamp: int) -> TransformStamped:
 
 class PlantNode(ModelNode):
     """
-    The needle, or the end-effector, with its sensors.
+    Simulated plant: the needle or the end-effector, with sensors.
 
     Lengths in m, forces in N, torques in N m, positive into the tissue. In mode `simulation`
     the needle moves under ``wrench_command`` (force.y, torque.x); in mode `robot` the base
     follows ``joint_trajectory`` (joint `insertion`: positions, or efforts for a push). Both
     publish ``joint_states``, ``base_wrench``, ``tip_deflection`` and ``ground_truth``, and for
-    people ``needle_shape`` and ``needle_poses``. With ``steered`` the needle bends and cuts its
-    path, and its guide and roll follow ``joint_trajectory`` in both modes. In mode `indenter`
-    the end-effector presses the tissue by ``joint_trajectory`` (efforts of the joints `x` and
-    `z`) and publishes ``base_wrench`` and ``end_effector_pose``. A trajectory begins when it
-    comes, or with the activation if it came before. ``joint_commands`` are those of a driver of
-    ros2_control: efforts in mode `simulation`, positions in mode `robot`. One node may command,
-    on either topic.
+    visualization ``needle_shape`` and ``needle_poses``. With ``steered`` the needle bends and cuts
+    its path, and its guide and roll follow ``joint_trajectory`` in both modes. In mode `indenter`
+    the end-effector presses the tissue according to ``joint_trajectory`` (efforts of the joints
+    `x` and `z`) and publishes ``base_wrench`` and ``end_effector_pose``. A trajectory starts on
+    arrival, or at the activation if it arrived earlier. ``joint_commands`` are sent by a driver of
+    ros2_control: efforts in mode `simulation`, positions in mode `robot`. Only one node may
+    publish commands, on one of the two topics.
 
     Samples are taken at exact multiples of the period of simulated time, see `SampleClock`; with
-    ``publish_clock`` or ``lockstep`` it is /clock. `Commands` decides which command acts from one
-    sample to the next. A command carries the stamp of the sample that it answers; with
-    ``lockstep`` the next sample waits for it, and for all nodes that report which sample they
-    have processed, such as `steering`. ``~/pause`` stops time, ``~/step`` takes one
-    sample, ``~/reset`` puts the needle and its noise back to their start while time goes on.
-    ``~/events`` says what was done beside commands, so that the run can be computed again.
+    ``publish_clock`` or ``lockstep`` this time is /clock. `Commands` selects the command that acts
+    from one sample to the next. A command carries the stamp of the sample to which it responds;
+    with ``lockstep`` the next sample waits for this command, and for all nodes that report
+    processed samples, such as `steering`. ``~/pause`` stops time, ``~/step`` takes one sample,
+    ``~/reset`` restores the initial state of needle and noise while time continues. ``~/events``
+    records every input other than commands, so that the run can be recomputed.
     """
 
     LIVE = frozenset(
@@ -144,10 +144,10 @@ class PlantNode(ModelNode):
         self.declare_text(
             'lockstep',
             False,
-            'each sample waits for the command that answers the one before it, and for the nodes '
-            'that process it',
+            'each sample waits for the command in response to the previous sample, and for all '
+            'nodes that process samples',
         )
-        self.declare_text('paused', False, 'begin with time paused')
+        self.declare_text('paused', False, 'start with time paused')
         self.declare_text(
             'publish_tf', False, f'publish {contract.TIP} in {contract.BASE} on {contract.TF.name}'
         )
@@ -160,7 +160,7 @@ class PlantNode(ModelNode):
             ),
         )
         self.declare_text(
-            'steered', False, 'the needle bends, cuts its own path, and has a guide that moves'
+            'steered', False, 'the needle bends, cuts its own path, and has a movable guide'
         )
         self.declare_model()
         preset = str(self.get_parameter('model.preset').value)
@@ -172,20 +172,20 @@ class PlantNode(ModelNode):
         self.declare_settings('fault.', FaultParameters())
 
         self._run: PlantRun | None = None
-        #: Samples taken before the plant was configured again.
+        #: Number of samples taken before the latest configuration.
         self._number = 0
         self._halted: str | None = None
         self._fault: Fault | None = None
         self._faulty = ''
-        #: Looks at the graph since the same sample has waited for its answers, and its stamp.
+        #: Graph checks during which the same sample has waited for its answers, and its stamp.
         self._looks = 0
         self._awaited: int | None = None
         self._sampled = self._made_up = self._saturated = 0
         self._refused_trajectories = 0
-        #: Joints that follow trajectories, and the answers to these.
+        #: Joints that follow trajectories, and the log of trajectory requests.
         self._moved: tuple[str, ...] = ()
         self._requests = RequestLog({})
-        #: By a steady clock.
+        #: On a steady clock.
         self._command_rate, self._sample_rate = RateCounter(), RateCounter()
 
         offer_lease(self, contract.MEASURER)
@@ -194,7 +194,7 @@ class PlantNode(ModelNode):
             contract.GROUND_TRUTH, contract.END_EFFECTOR_POSE,
         )  # fmt: skip
         self._streams = {topic.name: self.publisher(topic) for topic in streams}
-        #: What publishes the numbers of a sample, by topic.
+        #: Publish functions for the values of a sample, by topic.
         self._publish: dict[str, Callable[[int, list[float]], None]] = {}
         self._needle_shape = self.publisher(contract.NEEDLE_SHAPE)
         self._needle_poses = self.publisher(contract.NEEDLE_POSES)
@@ -208,10 +208,11 @@ class PlantNode(ModelNode):
         self._joint_commands = self.listen(
             contract.JOINT_COMMANDS, self._on_joint_commands, self._look_who_commands
         )
-        #: Publishers of commands that DDS has matched, dead ones too.
+        #: Number of publishers of commands matched by DDS, including stale entries, and time of
+        #: change [ns].
         self._matched, self._matched_at = 0, 0
         self._trajectories: Subscription | None = None
-        #: Reports of nodes that have processed or recorded a sample, in lock-step.
+        #: Lock-step reports of nodes that have processed or recorded a sample.
         self._reports: list[Subscription] = []
         self.create_service(Trigger, '~/tare', self._on_tare)
         self.create_service(SetBool, '~/pause', self._on_pause)
@@ -226,7 +227,7 @@ class PlantNode(ModelNode):
     # Transitions.
 
     def configure(self) -> None:
-        """Make the plant from the parameters."""
+        """Build the plant from the parameters."""
         plant_run = PlantRun(self.values(), self._number)
         constants = plant_run.constants
         own, mode = constants.own, constants.mode
@@ -239,7 +240,7 @@ class PlantNode(ModelNode):
             )
         if lockstep and mode != 'simulation':
             raise ParameterError(
-                'lockstep must be false but in mode simulation, where commands answer samples, '
+                'lockstep must be false except in mode simulation, where commands answer samples, '
                 f'got mode {mode!r}'
             )
         if mode == 'simulation' and own.command_timeout < 1.0 / own.rate:
@@ -251,29 +252,29 @@ class PlantNode(ModelNode):
         if mode == 'simulation' and real_time and own.backlog > 0.5 * own.command_timeout:
             raise ParameterError(
                 f'backlog must be at most half of command_timeout, {own.command_timeout:g} s, got '
-                f'{own.backlog:g} s: an overloaded plant would show samples that are too old to '
+                f'{own.backlog:g} s: an overloaded plant would send samples that are too old to '
                 'answer'
             )
         self._time = SampleClock(
             own.rate, own.real_time_factor, own.backlog, own=publishes, lockstep=lockstep
         )
         self._set_fault({})
-        # Compile, or load what was compiled, before time counts.
+        # Load or compile functions before the first sample.
         constants.make().take(0.0, 0.0)
         self._publish = {
             name: partial(self._write, self._streams[name], topic.template().serialize)
             for name, topic in plant_run.topics.items()
         }
         limits = constants.sensor.per_axis('range').tolist()
-        # Rounding to counts may leave a saturated reading just below.
+        # Rounding to counts may leave a saturated reading just below the limit.
         self._full_scale = [limit * (1.0 - 1e-9) for limit in limits]
         self._period = NANOSECONDS / own.rate
-        #: Of the latest samples: what is measured may leave later.
+        #: Stamps of the latest samples, for measurements that are published with a delay.
         self._stamps: deque[int] = deque(maxlen=ceil(constants.tip.delay * own.rate) + 1)
         self._patience = 0.25 * own.backlog * NANOSECONDS
         self._exhausted = (
-            f'commands have put in more than {own.power_limit:g} J within a second (power_limit); '
-            'no force is applied until it is half of that'
+            f'commands supplied more than {own.power_limit:g} J within a second (power_limit); '
+            'no force is applied until the energy is half of this'
         )
         if self.get_parameter('publish_tf').value:
             self._tf = self._offer_tf(mode)
@@ -285,18 +286,18 @@ class PlantNode(ModelNode):
                 self._hear(contract.PROCESSED, self._on_processed, self._on_participant)
             )
         if publishes or own.real_time_factor != 1.0:
-            # A time of its own waits for recorders.
+            # With simulated time, the plant waits for recorders.
             self._reports.append(
                 self._hear(contract.RECORDED, self._on_recorded, self._on_recorder)
             )
         if mode != 'simulation' or constants.steered:
-            # There `insertion` is the reference of a controller.
+            # In mode `simulation`, `insertion` is the reference of a controller.
             self._trajectories = self.subscribe(contract.JOINT_TRAJECTORY, self._on_trajectory)
             self._moved = _moved_joints(mode, steered=constants.steered)
             self._requests = RequestLog({contract.JOINT_TRAJECTORY: self._moved})
 
     def _offer_tf(self, mode: str) -> Publisher:
-        """Offer transforms, or say why not; no wheel has their message."""
+        """Create the publisher of transforms, or raise ParameterError if that is not possible."""
         try:
             if mode == 'indenter':
                 raise MessageError('there is no needle in mode indenter')
@@ -314,7 +315,7 @@ class PlantNode(ModelNode):
         publisher.publish(serialize(stamp, *values))
 
     def cleanup(self) -> None:
-        """Forget the plant."""
+        """Discard the plant."""
         if self._run is not None:
             self._number = self._run.number
         self._run = None
@@ -332,14 +333,14 @@ class PlantNode(ModelNode):
         self._reports = []
 
     def change(self, changes: Mapping[str, Any]) -> None:
-        """Go on with other friction, or another fault; the state stays."""
+        """Apply changed friction or fault parameters; the state is kept."""
         if self._run is not None:
             self._run.perform(Event(PARAMETERS, changes))
         if any(name.startswith('fault.') for name in changes):
             self._set_fault(changes)
 
     def _set_fault(self, changes: Mapping[str, Any]) -> None:
-        """Alter measurements from now on as the parameters say."""
+        """Set the fault of the measurements from the parameters."""
         kind = self.text('fault.kind', (_NO_FAULT, *FAULTS), changes)
         topic = self.text('fault.topic', tuple(FAULTY), changes)
         parameters = self.settings('fault.', FaultParameters, changes)
@@ -349,7 +350,7 @@ class PlantNode(ModelNode):
             self._fault = Fault(kind, parameters, float(rate), seed)
 
     def activate(self) -> None:
-        """Begin to sample now."""
+        """Start sampling."""
         if self._run is None:
             return
         self._halted = None
@@ -357,7 +358,7 @@ class PlantNode(ModelNode):
         self._run.begin()
         self._look_who_commands()
         own = self._run.constants.own
-        #: Samples from one picture to the next.
+        #: Samples between two visualization messages.
         self._picture = max(1, round(own.rate * max(1.0, own.real_time_factor) / _PICTURES))
         self._time.begin(self.now(), paused=bool(self.get_parameter('paused').value))
         self._timer = self.create_timer(self._time.tick, self._on_timer)
@@ -365,7 +366,7 @@ class PlantNode(ModelNode):
         self._watch = self.create_timer(_WATCH, self._on_watch, clock=steady)
 
     def about(self) -> str:
-        """Name mode, constants, rate and topics."""
+        """Describe mode, constants, rate and topics."""
         values = self.values()
         takes = [contract.JOINT_TRAJECTORY.name] if self._trajectories else []
         if values['mode'] == 'simulation':
@@ -397,13 +398,13 @@ class PlantNode(ModelNode):
         self._take_command(lambda plant_run, now: plant_run.command_joints(reading, now))
 
     def _take_command(self, offer: Callable[[PlantRun, int], tuple[bool, str]]) -> None:
-        """Take in a command of either topic."""
+        """Handle a command from either topic."""
         plant_run = self._run
         if plant_run is None or not self.is_active:
             return
         self._command_rate.add(monotonic_ns())
         if sum(self._count_matched()) != self._matched:
-            # Before its event, it seems: not one command of a second node may act.
+            # The match event may be pending: no command of a second node may act.
             self._look_who_commands()
         counts, complaint = offer(plant_run, self._time.simulated(self.now()))
         if complaint:
@@ -425,23 +426,23 @@ class PlantNode(ModelNode):
         )
 
     def _on_processed(self, message: Header) -> None:
-        """Take note that a node has processed a sample."""
+        """Record that a node has processed a sample."""
         if self.is_active:
             self._time.answered(nanoseconds(message.stamp), message.frame_id)
             self._on_timer()
 
     def _on_participant(self, event: Any) -> None:
-        """Count the nodes that each sample waits for."""
+        """Count the nodes for which each sample waits."""
         self._time.participants = event.current_count
         self.publish_diagnostics()
 
     def _on_recorded(self, message: Header) -> None:
-        """Take note of what a recorder has."""
+        """Record the newest sample of a recorder."""
         recorded, stamp = self._time.recorded, nanoseconds(message.stamp)
         before = len(recorded)
         recorded[message.frame_id] = stamp
         if not stamp:
-            # It has ended.
+            # A zero stamp marks the end of the recording.
             del recorded[message.frame_id]
         if len(recorded) != before:
             self.publish_diagnostics()
@@ -449,18 +450,18 @@ class PlantNode(ModelNode):
             self._on_timer()
 
     def _on_recorder(self, event: Any) -> None:
-        """Forget the recorders if one has gone; the others report again."""
+        """Discard the recorder list when a recorder disappears; the others report again."""
         if event.current_count_change < 0:
             self._time.recorded.clear()
 
     def _count_matched(self) -> tuple[int, int]:
-        """Return how many publishers of each topic of commands DDS has matched, dead ones too."""
+        """Return the DDS-matched publishers of each command topic, including stale entries."""
         return self._commands.get_publisher_count(), self._joint_commands.get_publisher_count()
 
     def _on_trajectory(self, message: JointTrajectory) -> None:
         """Execute a trajectory if it is new and valid, and acknowledge it."""
         stamp = nanoseconds(message.header.stamp)
-        # In mode `simulation` the insertion is for the controller.
+        # In mode `simulation`, `insertion` is addressed to the controller.
         moved = [name for name in message.joint_names if name in self._moved]
         now = self._time.simulated(self.now()) if self.is_active else stamp
         known = self._requests.check(contract.JOINT_TRAJECTORY, stamp, now, '', moved)
@@ -498,14 +499,14 @@ class PlantNode(ModelNode):
         )
 
     def _publish_answers(self) -> None:
-        """Publish answers to requests that no status contains yet."""
+        """Publish the status if it lacks results of requests."""
         if self._requests.due():
             self.publish_diagnostics()
 
     # Services.
 
     def _answer(self, response: Any, what: str, act: Callable[[PlantRun], str]) -> Any:
-        """Do what a service asks for, or say why not."""
+        """Execute a service request, or report the reason for its rejection."""
         try:
             if self._run is None or not self.is_active:
                 raise JobError('the plant is not active')
@@ -529,7 +530,7 @@ class PlantNode(ModelNode):
                 self._time.pause()
                 return f'paused at {self._time.stamp / NANOSECONDS:.6f} s'
             self._time.resume(self.now())
-            return 'time goes on'
+            return 'time resumed'
 
         return self._answer(response, 'pause', pause)
 
@@ -546,25 +547,25 @@ class PlantNode(ModelNode):
             self._requests.supersede(self._time.simulated(self.now()))
             self._halted = None
             self._set_fault({})
-            return 'needle and noise are reset; time continues'
+            return 'needle and noise reset; time continues'
 
         return self._answer(response, 'reset', reset)
 
     # Samples.
 
     def _on_timer(self) -> None:
-        """Take every sample that is due, each stamped with its own time."""
+        """Take all due samples, each stamped with its own time."""
         due = self._time.due(self.now())
         self._made_up += max(0, due - 1)
         end = monotonic_ns() + self._patience
         for _ in range(due):
             self._sample(self._time.take())
             if monotonic_ns() > end:
-                # Commands wait: a machine that cannot keep up must not let them become old.
+                # Commands are waiting: they must not become too old on an overloaded machine.
                 break
 
     def _on_watch(self) -> None:
-        """Look who commands, and ask again for an answer that does not come."""
+        """Check for command publishers, and repeat a sample that is not answered."""
         if self._run is None:
             return
         self._look_who_commands()
@@ -575,26 +576,26 @@ class PlantNode(ModelNode):
         if self._looks and self._looks % _REPEAT == 0 and not self._time.paused:
             stamp, (topic, _, values) = self._last
             if self._clock_topic is not None:
-                # An older one may have arrived late: then the sample would be ahead of the time.
+                # An older clock message may have arrived late: the sample would be ahead of time.
                 self._clock_topic.publish(Clock(clock=_message(stamp)))
             self._publish[topic](stamp, values)
         self.report_change()
 
     def _look_who_commands(self, came: int = 0) -> None:
-        """Let no force act while several nodes command."""
+        """Count the command publishers; no force acts while there are several."""
         matched, now = sum(self._count_matched()), monotonic_ns()
         before, several = self._matched, max(self._matched, matched) > 1
         if matched != before:
             self._matched, self._matched_at = matched, now
         if self._run is None:
             return
-        # One may have come and gone while this process had to wait.
+        # A publisher may have appeared and disappeared while this process was blocked.
         if (several and matched != before) or (before and came):
             self._run.commands.hush(self._time.simulated(self.now()))
-        # What came and went at once may be counted for ever; the graph knows better by then.
+        # DDS may count a short-lived publisher forever; after a second the graph is reliable.
         fresh = now - self._matched_at < NANOSECONDS
         wrenches, joints = self._count_matched() if fresh else (0, 0)
-        # A driver has no lease: it counts as long as the graph has it.
+        # A driver has no lease: it counts while it is in the graph.
         drivers = self.get_publishers_info_by_topic(contract.JOINT_COMMANDS.name)
         count = self._commanders.count(contract.WRENCH_COMMAND, wrenches)
         count += max(len(drivers), joints)
@@ -609,7 +610,7 @@ class PlantNode(ModelNode):
         """Take a sample and publish it."""
         plant_run = self._run
         if self._clock_topic is not None:
-            # Before the sample, so that who answers it has its time.
+            # Published before the sample, so that subscribers have the time of the sample.
             self._clock_topic.publish(Clock(clock=_message(stamp)))
         if plant_run is None or self._halted is not None:
             return
@@ -638,7 +639,7 @@ class PlantNode(ModelNode):
         stamps = self._stamps
         stamps.append(stamp)
         for topic, age, values in measured:
-            # Its own, also if time has jumped since: after a stall samples are given up.
+            # Own stamp, even after a time jump: samples are skipped after a stall.
             at = stamps[-1 - age] if age < len(stamps) else stamp - round(age * self._period)
             if fault is None or topic != faulty:
                 publish[topic](at, values)
@@ -647,7 +648,7 @@ class PlantNode(ModelNode):
                     publish[topic](late, left)
 
     def _tell(self, events: list[Event], stamp: int, number: int) -> None:
-        """Publish what was done to the plant, with the sample from which it counts."""
+        """Publish events with the number of the first sample that they affect."""
         array = DiagnosticArray()
         array.header.stamp = _message(stamp)
         for kind, content in events:
@@ -664,7 +665,7 @@ class PlantNode(ModelNode):
         self._events.publish(array)
 
     def _draw(self, plant_run: PlantRun, stamp: int) -> None:
-        """Show the shape of the needle from its base to its tip, and the path that it cut."""
+        """Publish the shape of the needle from base to tip, and the path that it cut."""
         lines = self._needle_shape.get_subscription_count()
         poses = self._needle_poses.get_subscription_count()
         wanted = lines or poses or self._tf is not None
@@ -694,7 +695,7 @@ class PlantNode(ModelNode):
         self._needle_shape.publish(line)
 
     def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
-        """Say where the needle is, how time goes, and what went wrong."""
+        """Report needle state, timing and errors."""
         if self._run is None:
             return super().diagnose()
         clock, rate, given = self._time, self._run.constants.own.rate, self._run.commands

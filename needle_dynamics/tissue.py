@@ -1,4 +1,4 @@
-"""Tissue along the needle: layers of elastic foundation, swelling, damping; equation (7)."""
+"""Tissue model along the needle: layered elastic foundation, swelling, damping; equation (7)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import numpy as np
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Tissue:
     """
-    An elastic foundation k(y, t), piecewise constant in depth, that may swell.
+    Elastic foundation k(y, t), piecewise constant in depth, optionally swelling.
 
     A single layer without swelling is the homogeneous tissue (8) of the source.
 
@@ -28,14 +28,14 @@ class Tissue:
     damping : float
         Damping c_a per length (Kelvin-Voigt) [N s/m^2].
     swelling : float
-        Growth of the stiffness in the long run, relative to its value at time 0.
+        Final relative increase of the stiffness over its value at time 0.
     swelling_time : float
-        Time constant of the growth [s].
+        Time constant of the swelling [s].
 
     Raises
     ------
     ParameterError
-        If the layers do not go down from 0, or a constant is outside its range.
+        If the layer depths do not increase from 0, or a constant is outside its range.
 
     """
 
@@ -49,13 +49,13 @@ class Tissue:
         ordered = all(low < high for low, high in pairwise(self.starts))
         if len(self.starts) != len(self.stiffnesses) or self.starts[:1] != (0.0,) or not ordered:
             raise ParameterError(
-                f'layers must start at 0 and go down, each with a stiffness, got starts '
+                f'layers must start at 0 and go deeper, with one stiffness each, got starts '
                 f'{self.starts} and stiffnesses {self.stiffnesses}'
             )
 
         for name, low in (('damping', 0.0), ('swelling', -1.0), ('swelling_time', 0.0)):
             value = getattr(self, name)
-            # Only damping may be at the end of its range.
+            # Only damping may equal its lower bound.
             if not low <= value < inf or (value == low and name != 'damping'):
                 raise ParameterError(f'{name} must be finite and above {low:g}, got {value!r}')
         if not all(0.0 <= value < inf for value in (*self.starts, *self.stiffnesses)):
@@ -66,7 +66,7 @@ class Tissue:
 
     def growth(self, time: float) -> float:
         """
-        Return the factor by which the tissue has grown stiffer.
+        Return the stiffness factor due to swelling.
 
         Parameters
         ----------
@@ -76,7 +76,7 @@ class Tissue:
         Returns
         -------
         float
-            Stiffness over that at time 0.
+            Ratio of the stiffness to its value at time 0.
 
         Raises
         ------
@@ -90,7 +90,7 @@ class Tissue:
 
     def layer(self, depth: float) -> int:
         """
-        Return the number of the layer that holds a depth; at a border the lower one.
+        Return the index of the layer at a depth; at a boundary the deeper layer.
 
         Parameters
         ----------
@@ -100,14 +100,14 @@ class Tissue:
         Returns
         -------
         int
-            Place in `starts`.
+            Index into `starts`.
 
         """
         return max(int(np.searchsorted(self.starts, depth, side='right')) - 1, 0)
 
     def stiffness(self, depth: float, time: float = 0.0) -> float:
         """
-        Stiffness k(y, t) of (7).
+        Evaluate the stiffness k(y, t) of (7).
 
         Parameters
         ----------
@@ -126,7 +126,7 @@ class Tissue:
 
     def layers(self, modes: ModeShapes) -> Layers:
         """
-        Return the layers with what those above each of them add to the integrals of the modes.
+        Return the layers with the contributions of the layers above to the mode integrals.
 
         Parameters
         ----------
@@ -136,7 +136,7 @@ class Tissue:
         Returns
         -------
         Layers
-            Arrays as compiled functions take them.
+            Arrays in the layout of the compiled functions.
 
         """
         n, m = modes.count, len(self.starts)

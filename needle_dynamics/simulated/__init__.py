@@ -1,1 +1,1 @@
-"""A needle, its tissue and its sensors in simulated time."""
+"""Simulated needle, tissue and sensors, advanced in simulated time."""

@@ -1,4 +1,4 @@
-"""A simulated plant from its parameters, as a node has them or a recording says them."""
+"""Construction of a simulated plant from the parameters of a node or a recording."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ from needle_dynamics.steering.parameters import NEEDLES, STEERING_PRESETS, Steer
 from needle_ros.errors import ParameterError
 from needle_ros.settings import check_constants, constant, from_values
 
-#: What is simulated: a needle that moves under commands, one that a robot moves, an end-effector.
+#: Modes: needle under force commands, needle moved by a robot, indenter.
 MODES: Final = ('simulation', 'robot', 'indenter')
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlantSettings:
-    """Time, start and limits of a simulated plant."""
+    """Timing, initial state and limits of a simulated plant."""
 
     rate: float = constant(
         1000.0, 'Hz', 'samples per second of simulated time', low=1.0, high=HIGHEST_RATE
@@ -41,28 +41,24 @@ class PlantSettings:
         1.0, '1', "simulated seconds per second of the node's clock; 0: as fast as possible",
         high=100.0,
     )  # fmt: skip
-    depth: float = constant(0.02, 'm', 'inserted length at the start', open_low=True)
-    tip_deflection: float = constant(
-        0.0, 'm', 'deflection of the tip at the start', low=-0.1, high=0.1
-    )
+    depth: float = constant(0.02, 'm', 'initial insertion depth', open_low=True)
+    tip_deflection: float = constant(0.0, 'm', 'initial tip deflection', low=-0.1, high=0.1)
     modal: tuple[float, ...] = field(
         default=(),
-        metadata={'description': 'q1 to qn at the start [m^3/2], instead of tip_deflection'},
+        metadata={'description': 'initial q1 to qn [m^3/2], instead of tip_deflection'},
     )
     step: float = constant(2e-5, 's', 'longest step of the integrator', low=1e-7, high=1e-2)
-    command_timeout: float = constant(
-        0.1, 's', 'age at which a command no longer counts', open_low=True
-    )
-    force_limit: float = constant(15.0, 'N', 'largest force that a command may ask for')
-    torque_limit: float = constant(1.0, 'N m', 'largest torque that a command may ask for')
+    command_timeout: float = constant(0.1, 's', 'age at which a command expires', open_low=True)
+    force_limit: float = constant(15.0, 'N', 'largest commanded force')
+    torque_limit: float = constant(1.0, 'N m', 'largest commanded torque')
     force_rate_limit: float = constant(
-        3e4, 'N/s', 'fastest growth of a commanded force; it may end at once', open_low=True
+        3e4, 'N/s', 'largest growth rate of a commanded force; it may end at once', open_low=True
     )
     power_limit: float = constant(
-        1.5, 'W', 'energy that commands may put in within a second', open_low=True
+        1.5, 'W', 'largest energy supplied by commands within a second', open_low=True
     )
     backlog: float = constant(
-        0.05, 's', 'longest delay after a stall whose samples are still computed', open_low=True
+        0.05, 's', 'longest stall after which all samples are still computed', open_low=True
     )
 
     def __post_init__(self) -> None:
@@ -74,10 +70,10 @@ class PlantSettings:
         object.__setattr__(self, 'modal', modal)
 
 
-#: Largest seed of the noise: parameters have 64 bits.
+#: Largest seed of the noise; integer parameters have 64 bits.
 LARGEST_SEED: Final = 2**62
 
-#: Parameters by namespace, as settings with their default values.
+#: Parameters by namespace, as settings with default values.
 SETTINGS: Final[Mapping[str, Any]] = {
     '': PlantSettings(),
     'model.': NeedleParameters(),
@@ -91,22 +87,7 @@ SETTINGS: Final[Mapping[str, Any]] = {
 
 
 def defaults_of(prefix: str, preset: str) -> Any:
-    """
-    Return the settings of a namespace that a preset has.
-
-    Parameters
-    ----------
-    prefix : str
-        One of the namespaces of `SETTINGS`.
-    preset : str
-        Name of the needle and the tissue, ``model.preset``.
-
-    Returns
-    -------
-    object
-        The settings.
-
-    """
+    """Return the default settings of a namespace in `SETTINGS` for a preset (``model.preset``)."""
     if prefix == 'model.' and preset in NEEDLES:
         return NEEDLES[preset]
     if prefix == 'steering.' and preset in STEERING_PRESETS:
@@ -126,13 +107,13 @@ class PlantConstants:
     seed : int
         Seed of all noise.
     own : PlantSettings
-        Time, start and limits.
+        Timing, initial state and limits.
     model : NeedleParameters
         Needle and tissue.
     sensor : ForceSensorParameters
         Force sensor.
     tip : TipParameters
-        Sensor of the tip.
+        Tip sensor.
     base : BaseParameters
         Robot of mode `robot`.
     indenter : IndenterParameters
@@ -140,9 +121,9 @@ class PlantConstants:
     steered : bool
         Whether the needle bends and cuts its own path.
     steering : SteeringParameters
-        What such a needle has beyond `model`.
+        Additional constants of a steered needle.
     guide : GuideParameters
-        What moves its guide and turns it.
+        Robot of the needle guide.
 
     """
 
@@ -161,25 +142,10 @@ class PlantConstants:
     @classmethod
     def of(cls, values: Mapping[str, Any]) -> PlantConstants:
         """
-        Take the constants from the parameters of a plant.
+        Read the constants from the parameters of a plant by name, such as ``sensor.rate``.
 
-        Parameters
-        ----------
-        values : Mapping[str, Any]
-            Parameters by name, such as ``sensor.rate``; others than those of a plant do not
-            matter. A constant that is not there has its default, in ``model.preset`` if there is
-            one.
-
-        Returns
-        -------
-        PlantConstants
-            The constants.
-
-        Raises
-        ------
-        ParameterError
-            If a value is not valid; the message names the parameter.
-
+        Other parameters are ignored. A missing constant has its default, from ``model.preset`` if
+        given. An error message contains the name of the parameter.
         """
         mode, preset = values.get('mode', MODES[0]), values.get('model.preset', 'paper_si')
         for name, value, valid in (('mode', mode, MODES), ('model.preset', preset, NEEDLES)):
@@ -202,22 +168,7 @@ class PlantConstants:
         return cls(mode=mode, seed=seed, steered=steered, **made)
 
     def make(self) -> SimulatedPlant:
-        """
-        Make the plant at its start.
-
-        Returns
-        -------
-        SimulatedPlant
-            A `Plant`, a `SteeredPlant` or an `Indenter`.
-
-        Raises
-        ------
-        ParameterError
-            If the constants do not go together.
-        InsertedLengthError
-            If the needle cannot be there.
-
-        """
+        """Build the plant in its initial state: a `Plant`, a `SteeredPlant` or an `Indenter`."""
         own, rate = self.own, self.own.rate
         sensor = ForceSensor(self.sensor, rate, self.seed)
         tip = TipSensor(self.tip, rate, self.seed, spatial=self.steered)
@@ -230,15 +181,7 @@ class PlantConstants:
         return Plant(integrator, sensor, rate, self._base(self.model.length), tip)
 
     def joint_commands(self) -> JointCommands:
-        """
-        Return what reads the messages of `joint_commands`.
-
-        Returns
-        -------
-        JointCommands
-            It knows the joints.
-
-        """
+        """Return the parser of `joint_commands` for the joints of this plant."""
         own = self.own
         return JointCommands(
             self.mode, steered=self.steered, shortest=1.0 / own.rate, longest=own.command_timeout
@@ -248,18 +191,17 @@ class PlantConstants:
         own = self.own
         if own.tip_deflection or own.modal:
             raise ParameterError(
-                'tip_deflection must be 0 and modal empty for a needle that is steered: it begins '
-                'straight'
+                'tip_deflection must be 0 and modal empty for a steered needle: it starts straight'
             )
         insertion = Insertion(
             self.model, self.steering, depth=own.depth, step=own.step, seed=self.seed
         )
-        # Short of the hub, on which a robot must not run.
+        # Less than the hub depth, which a robot must not reach.
         base = self._base(insertion.axis.reach - self.model.minimum_depth)
         return SteeredPlant(insertion, sensor, tip, own.rate, self.guide, self.base, base)
 
     def _base(self, deepest: float) -> BaseMotion | None:
-        """Return the robot of mode `robot`."""
+        """Return the robot in mode `robot`, otherwise None."""
         if self.mode != 'robot':
             return None
         depths = self.model.minimum_depth, deepest

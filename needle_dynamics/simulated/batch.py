@@ -1,4 +1,4 @@
-"""Many simulated insertions at once, on all cores."""
+"""Parallel simulation of many insertions on all cores."""
 
 from __future__ import annotations
 
@@ -22,25 +22,25 @@ from needle_ros.errors import ParameterError, ShapeError
 import numpy as np
 from numpy.typing import ArrayLike
 
-#: Most runs that a thread takes at once: enough to keep all lanes busy.
+#: Largest number of runs per task, enough to fill all vector lanes.
 _CHUNK: Final = 256
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Batch:
     """
-    Many simulated runs.
+    Result of many simulated runs.
 
     Attributes
     ----------
     parameters : tuple of NeedleParameters
         Constants of each run, or one for all.
-    time : ndarray, shape (k + 1,), or (1,) for the ends only
+    time : ndarray, shape (k + 1,), or (1,) for final states only
         Time of the samples [s].
-    states : ndarray, shape (runs, k + 1, 2 (2 + n)), or (runs, 1, ...) for the ends only
+    states : ndarray, shape (runs, k + 1, 2 (2 + n)), or (runs, 1, ...) for final states only
         States; NaN after a run has left its range.
     completed : ndarray, shape (runs,)
-        Time up to which each run is valid [s].
+        End of the valid part of each run [s].
 
     """
 
@@ -59,7 +59,7 @@ class Batch:
 
     @property
     def depth(self) -> FloatArray:
-        """Inserted lengths [m], shape (runs, k + 1)."""
+        """Insertion depths [m], shape (runs, k + 1)."""
         lengths = np.array([p.length for p in self.parameters])[:, np.newaxis]
         return np.asarray(lengths - self.states[:, :, 0])
 
@@ -70,7 +70,7 @@ class Batch:
 
     @property
     def tip_deflection(self) -> FloatArray:
-        """Deflections of the tip [m], shape (runs, k + 1)."""
+        """Tip deflections [m], shape (runs, k + 1)."""
         models = [NeedleModel(p) for p in self.parameters]
         if len(models) == 1:
             return models[0].tip_deflections(self.states)
@@ -93,7 +93,7 @@ def simulate_batch(
     progress: Callable[[], object] | None = None,
 ) -> Batch:
     """
-    Simulate many insertions at once on all cores; the result does not depend on how many.
+    Simulate many insertions in parallel; the result does not depend on the number of workers.
 
     Parameters
     ----------
@@ -108,12 +108,12 @@ def simulate_batch(
     graded : bool
         As in `Integrator`.
     keep : bool
-        Keep the states at all samples, or only at the end.
+        Keep the states at all samples, or only the final states.
     workers : int, optional
-        Threads; one per core if not given.
+        Threads; one per core by default.
     progress : callable, optional
-        Called after each run, from the thread that took it; for example ``update`` of a progress
-        bar of tqdm.
+        Called after each run, from its worker thread; for example ``update`` of a tqdm progress
+        bar.
 
     Returns
     -------
@@ -123,13 +123,13 @@ def simulate_batch(
     Raises
     ------
     ShapeError
-        If the numbers of runs do not agree.
+        If the numbers of runs are inconsistent.
     ParameterError, InsertedLengthError
         If a value is not valid.
 
     Examples
     --------
-    A hundred forces at once:
+    A hundred forces in parallel:
 
     >>> import numpy as np
     >>> from needle_dynamics import NeedleModel, NeedleParameters, simulate_batch
@@ -160,7 +160,7 @@ def simulate_batch(
     )
     if len(sizes) > 1 or 0 in sizes or not shaped:
         raise ShapeError(
-            f'parameters, states and inputs must be for one number of runs and inputs constant or '
+            f'parameters, states and inputs must have the same number of runs, inputs constant or '
             f'for {count} intervals, got {len(each)} parameters, states {starts.shape}, '
             f'forces {pushes.shape}, torques {turns.shape}'
         )
@@ -189,7 +189,7 @@ def _take(
     workers: int,
     progress: Callable[[], object],
 ) -> tuple[FloatArray, FloatArray]:
-    """Return states of all runs, and how many intervals each completed; overwrite ``states``."""
+    """Return the states and the completed intervals of all runs; overwrite ``states``."""
     runs, width = states.shape
     kept = np.full((runs, course.intervals + 1 if keep else 1, width), np.nan)
     completed = np.zeros(runs)
@@ -215,7 +215,7 @@ def _take(
         for _ in some:
             progress()
 
-    # A thread takes many runs at once: one task for each would cost more than short runs do.
+    # Several runs per task: the overhead of one task per run exceeds the cost of short runs.
     size = min(_CHUNK, -(-runs // workers))
     jobs = list[Callable[[], None]]()
     for reach, some in _groups(each, runs).items():
@@ -233,7 +233,7 @@ def _take(
 
 
 def _check(each: Sequence[NeedleParameters], starts: FloatArray) -> None:
-    """Refuse initial states as `NeedleModel.checked_state` does, only faster."""
+    """Reject initial states like `NeedleModel.checked_state`, but vectorized."""
     length, least, columns = np.array(
         [(p.length, p.minimum_depth, 4 + 2 * p.modes) for p in each]
     ).T
@@ -246,7 +246,7 @@ def _check(each: Sequence[NeedleParameters], starts: FloatArray) -> None:
 
 
 def _groups(each: Sequence[NeedleParameters], runs: int) -> dict[float | None, IntArray]:
-    """Return the runs that share a table of modes, by its reach; None for those that have none."""
+    """Group the runs by the reach of a shared mode table; None for runs without one."""
     reaches = [p.reach if _fits(p) else None for p in each]
     if len(each) == 1:
         return {reaches[0]: np.arange(runs)}
@@ -257,7 +257,7 @@ def _groups(each: Sequence[NeedleParameters], runs: int) -> dict[float | None, I
 
 
 def _fits(p: NeedleParameters) -> bool:
-    """Return whether a needle may share a vector register with others."""
+    """Return whether a needle can share a vector register with others."""
     return (
         p.modes == 2
         and p.formulation == 'complete'
@@ -268,7 +268,7 @@ def _fits(p: NeedleParameters) -> bool:
 
 
 def _constants(each: Sequence[NeedleParameters]) -> FloatArray:
-    """Return what `lanes.run` takes of each needle."""
+    """Return the needle constants for `lanes.run`."""
     return np.array(
         [
             lanes.Constants(

@@ -1,4 +1,4 @@
-"""Which commanded force acts on the needle, from one sample of the plant to the next."""
+"""Selection of the commanded force that acts on the needle from one sample to the next."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from needle_ros.timing import apart, NANOSECONDS
 
 class Command(NamedTuple):
     """
-    Forces on the needle.
+    Force command.
 
     Attributes
     ----------
     stamp : int
-        Time from which they count [ns].
+        Time from which the command is valid [ns].
     force : float
         Insertion force [N], positive into the tissue.
     torque : float
@@ -31,49 +31,36 @@ class Command(NamedTuple):
 
 class Commands:
     """
-    Decides from when, and how long, a command acts.
+    Zero-order hold of force commands with timeout, limits and detection of several sources.
 
-    The command that is newest when a sample is taken acts until the next sample: a zero-order
-    hold. A command counts if its stamp is within the timeout of now and not older than that of
-    the newest. It stands for no force if it is invalid, when it is older than the timeout, while
-    several nodes command, and while commands have put in too much energy. A force may end at
-    once, but grows no faster than it may.
+    The newest command at a sample acts until the next sample. A command is accepted if its stamp
+    is within the timeout of the present time and not older than the newest stamp. It counts as
+    zero force if it is invalid, when it exceeds the timeout, while several nodes publish commands,
+    and while commands have supplied too much energy. A force may end at once, but its growth rate
+    is limited.
 
-    Nothing else tells who sent a command: one whose stamp is that of a sample answers it. After
-    such an answer a force under another stamp is of another node, however short that lives, and
-    is refused until the number of nodes changes.
+    The stamp is the only identification of the sender: a command with the stamp of a sample
+    responds to this sample. After such a response, a force with any other stamp is from another
+    node, however short its lifetime, and is rejected until the number of nodes changes.
 
-    Parameters
-    ----------
-    timeout : float
-        Age at which a command no longer counts [s].
-    force_limit : float
-        Largest valid force [N], either sign.
-    torque_limit : float
-        Largest valid torque [N m], either sign.
-    interval : float, optional
-        Time from one sample to the next [s].
-    force_rate_limit : float, optional
-        Fastest growth of the force, either sign [N/s].
-    power_limit : float, optional
-        Energy that may be put in within a second [W].
+    Arguments are in s, N, N m, N/s and W; force and torque limits apply to either sign.
 
     Attributes
     ----------
     held : Command
-        The command that acts until the next sample.
+        Command that acts until the next sample.
     newest : Command
-        The command that will act from the next sample on, if it is not too old by then.
+        Command that acts from the next sample on, unless it exceeds the timeout by then.
     refused : int
         Number of invalid commands.
     stale : int
-        Number of commands that were too old, or too far in the future.
+        Number of commands with a stamp outside the timeout, past or future.
     overtaken : int
-        Number of commands that came after a newer one.
+        Number of commands that arrived after a newer one (out of order).
     rivals : int
-        Number of nodes that command beyond the one that may.
+        Number of nodes that publish commands in addition to the first.
     exhausted : bool
-        Whether commands have put in more energy than they may; they act again at half of it.
+        Whether commands have supplied more than the permitted energy; reset at half of it.
 
     """
 
@@ -89,55 +76,37 @@ class Commands:
     ) -> None:
         self._timeout = timeout * NANOSECONDS
         self._limits = force_limit, torque_limit
-        #: Most that a force may grow from one sample to the next [N].
+        #: Largest growth of the force from one sample to the next [N].
         self._growth = force_rate_limit * interval
-        #: Most energy [J], and what is left of it after a sample; a second is its time constant.
+        #: Largest energy [J], and its decay factor per sample with a time constant of 1 s.
         self._most_energy, self._left = power_limit, exp(-interval)
         self.refused = self.stale = self.overtaken = 0
         self.begin()
 
     def begin(self) -> None:
-        """Forget the commands and who gave them, as at an activation."""
+        """Discard all commands and their senders, as at an activation."""
         self.held = self.newest = Command()
         self.rivals = self._number = 0
         self._quiet = 0
-        #: Stamps of the samples that a command may answer, and whether commands do.
+        #: Stamps of the samples to which a command may respond, and whether commands do.
         self._samples: dict[int, None] = {}
         self._answers = False
         self.exhausted = False
-        #: Energy put in, less what is long ago [J].
+        #: Supplied energy with exponential decay [J].
         self._energy = 0.0
 
     def forget(self) -> None:
-        """Let no force act; commands older than the newest still do not count."""
+        """Reset the force to zero; commands older than the newest are still discarded."""
         self.held = self.newest = Command(self.newest.stamp)
 
     def offer(
         self, stamp: int, frame: str, force: float, torque: float, now: int
     ) -> tuple[bool, str]:
         """
-        Take in a command.
+        Process a command; return whether it is accepted, and the error message or ''.
 
-        Parameters
-        ----------
-        stamp : int
-            Its stamp [ns]; 0 stands for now.
-        frame : str
-            Its frame.
-        force : float
-            Insertion force [N].
-        torque : float
-            Torque [N m].
-        now : int
-            Simulated time [ns].
-
-        Returns
-        -------
-        counts : bool
-            Whether it counts; an invalid command counts as no force.
-        complaint : str
-            What is wrong with it, '' for nothing.
-
+        ``stamp`` and ``now`` in ns (stamp 0: now), ``force`` in N, ``torque`` in N m. An invalid
+        command is accepted as zero force.
         """
         answers = stamp in self._samples
         stamp = stamp or now
@@ -151,28 +120,28 @@ class Commands:
         if self._answers and not answers and (force or torque):
             self.refused += 1
             return False, (
-                'command ignored, its stamp is that of no sample: it is not from the node that '
-                'answers them'
+                'command ignored, its stamp matches no sample: it is not from the node that '
+                'answers samples'
             )
         self._answers |= answers
-        # A newest one from the future is of the time before the clock was set back.
+        # A newest stamp in the future dates from before the clock was set back.
         if stamp < self.newest.stamp <= now + self._timeout:
             self.overtaken += 1
             return False, ''
         complaint = self._complaint(frame, force, torque)
         if complaint:
             self.refused += 1
-        # While several nodes command none of them may; then what they said must be over.
+        # While several nodes publish commands no force acts, and their commands must expire.
         acts = not complaint and self.may_move(now)
         self.newest = Command(stamp, force, torque) if acts else Command(stamp)
         return True, complaint
 
     def _complaint(self, frame: str, force: float, torque: float) -> str:
-        """Return what is wrong with a command."""
+        """Return the error message for an invalid command, or ''."""
         if frame not in ('', BASE):
             return f'a command must be in {BASE}, got {frame!r}; no force is applied'
         largest, strongest = self._limits
-        # Written so that NaN is refused too.
+        # Written so that NaN is rejected too.
         if not (abs(force) <= largest and abs(torque) <= strongest):
             return (
                 f'a command must be within force_limit, {largest:g} N, and torque_limit, '
@@ -181,56 +150,26 @@ class Commands:
         return ''
 
     def refuse(self) -> None:
-        """Count a command that is invalid but for its force, which then does not act either."""
+        """Count an invalid command and set the force to zero."""
         self.refused += 1
         self.newest = Command(self.newest.stamp)
 
     def may_move(self, now: int) -> bool:
-        """
-        Tell whether what a command asks for may happen: who commands is alone.
-
-        Parameters
-        ----------
-        now : int
-            Simulated time [ns].
-
-        Returns
-        -------
-        bool
-            Whether nobody else commands, and nobody has come and gone within the timeout.
-
-        """
+        """Return whether commands may act at a time [ns], with a single sender."""
         return not self.rivals and now >= self._quiet
 
     def hush(self, now: int) -> None:
-        """
-        Let no command act for the timeout: one of a node that has come and gone may be among them.
-
-        Parameters
-        ----------
-        now : int
-            Simulated time [ns].
-
-        """
+        """Ignore commands for the timeout; a short-lived node may have sent some."""
         self._quiet = now + round(self._timeout)
         self._answers = False
         self.newest = Command(self.newest.stamp)
 
     def count_commanders(self, number: int) -> bool:
         """
-        Take note of how many nodes publish commands.
+        Update the number of command publishers; return whether the conflict state changed.
 
-        Parameters
-        ----------
-        number : int
-            Their number.
-
-        Returns
-        -------
-        bool
-            Whether it has changed from one to several or back; then no force acts until the next
-            command.
-
+        The conflict state changes from one publisher to several or back; then no force acts until
+        the next command.
         """
         rivals = max(0, number - 1)
         if number != self._number:
@@ -243,15 +182,10 @@ class Commands:
 
     def hold(self, stamp: int, distance: float = 0.0) -> None:
         """
-        Let the newest command act until the next sample, unless it is too old.
+        Hold the newest command until the next sample, unless it exceeds the timeout.
 
-        Parameters
-        ----------
-        stamp : int
-            Time of the sample that was just taken [ns].
-        distance : float, optional
-            How far the needle has moved under the command that was held [m].
-
+        ``stamp`` is the time of the present sample [ns], ``distance`` the displacement of the
+        needle under the command held before [m], for the supplied energy.
         """
         samples, before, newest = self._samples, self.held.force, self.newest
         samples[stamp] = None

@@ -1,4 +1,4 @@
-"""Faults of measurements, as a sensor, its cable or its driver may have."""
+"""Simulated measurement faults of a sensor, its cable or its driver."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ import numpy as np
 #: Stamp [ns] and values of a measurement.
 Reading: TypeAlias = tuple[int, list[float]]
 
-#: Topics that a fault can hit, and which of their values a bias or a saturation changes: the
-#: position, force and torque, and the deflection.
+#: Topics for fault injection, with the indices of the values changed by a bias or a saturation:
+#: position, force and torque, and deflection.
 FAULTY: Final[Mapping[str, Sequence[int]]] = {
     JOINT_STATES.name: (0,),
     BASE_WRENCH.name: range(6),
@@ -42,27 +42,12 @@ class FaultParameters:
 
 class Fault:
     """
-    One kind of fault of one stream of measurements.
+    A fault of one measurement stream, with ``rate`` measurements per second [Hz].
 
-    Parameters
-    ----------
-    kind : str
-        One of `FAULTS`: ``drop`` loses measurements, ``delay`` lets them leave later,
-        ``duplicate`` lets them leave twice, ``reorder`` after the next one, ``freeze`` repeats
-        the values of the first one that it hits under new stamps, ``bias`` adds to the values,
-        ``nan`` makes them not a number, ``saturate`` bounds them.
-    parameters : FaultParameters
-        How often, how late, how much.
-    rate : float
-        Measurements per second [Hz].
-    seed : int
-        Seed of what is hit.
-
-    Raises
-    ------
-    ParameterError
-        If the kind is unknown.
-
+    Kinds: ``drop`` discards measurements, ``delay`` publishes them later, ``duplicate`` publishes
+    them twice, ``reorder`` after the next one, ``freeze`` repeats the values of the first affected
+    measurement with new stamps, ``bias`` adds to the values, ``nan`` replaces them by NaN, and
+    ``saturate`` limits them.
     """
 
     def __init__(self, kind: str, parameters: FaultParameters, rate: float, seed: int) -> None:
@@ -71,31 +56,18 @@ class Fault:
         self._act = FAULTS[kind]
         self._parameters = parameters
         self._random = np.random.default_rng([seed, 2])
-        #: Calls until a delayed measurement leaves.
+        #: Number of calls until a delayed measurement is published.
         self._late = ceil(parameters.delay * rate * (1.0 - 1e-9))
         self._frozen: list[float] | None = None
         self._calls = 0
-        #: What leaves later, and at which call.
+        #: Delayed measurements, with the call at which they are published.
         self._waiting: deque[tuple[int, Reading]] = deque()
 
     def leaves(self, stamp: int, values: Sequence[float], biased: Sequence[int]) -> list[Reading]:
         """
-        Pass a measurement on.
+        Process a measurement (stamp in ns) and return the measurements to publish now.
 
-        Parameters
-        ----------
-        stamp : int
-            Its time [ns].
-        values : sequence of float
-            Its values.
-        biased : sequence of int
-            Which of the values a bias or saturation changes.
-
-        Returns
-        -------
-        list of tuple
-            What leaves now: stamps and values.
-
+        ``biased`` are the indices of the values changed by a bias or saturation.
         """
         self._calls += 1
         reading = stamp, list(values)
@@ -116,7 +88,7 @@ class Fault:
         return [reading, reading]
 
     def _reorder(self, reading: Reading, _biased: Sequence[int]) -> list[Reading]:
-        # What waits leaves after the next one, which then does not wait.
+        # A delayed measurement is published after the next one, which is not delayed.
         if self._waiting:
             return [reading]
         self._waiting.append((self._calls + 1, reading))
@@ -143,7 +115,7 @@ def _changed(reading: Reading, which: Sequence[int], change: Callable[[float], f
     return stamp, [change(value) if k in which else value for k, value in enumerate(values)]
 
 
-#: What a fault does to a measurement that it hits, by name.
+#: Functions that apply a fault to an affected measurement, by kind.
 FAULTS: Final[Mapping[str, Callable[[Fault, Reading, Sequence[int]], list[Reading]]]] = {
     'drop': Fault._drop,
     'delay': Fault._delay,

@@ -1,4 +1,4 @@
-"""The base force-torque sensor (a JR3 in the source): noise, drift, filters, counts, tare."""
+"""Force-torque sensor at the base (JR3 in the source): noise, drift, filters, resolution, tare."""
 
 from __future__ import annotations
 
@@ -13,34 +13,22 @@ from needle_ros.errors import JobError, ParameterError, ShapeError
 from needle_ros.settings import check_constants, constant
 import numpy as np
 
-#: Filters of the sensor; each is fed by the one before.
+#: Number of filters of the sensor, in cascade.
 MOST_FILTERS: Final = 6
 
 #: Highest sample rate of the sensor [Hz].
 HIGHEST_RATE: Final = 8000.0
 
-#: Time over which readings are averaged to zero the sensor [s].
+#: Averaging time of the tare [s].
 TARE_TIME: Final = 0.1
 
 
 def low_pass(cutoff: float, rate: float) -> FloatArray:
     """
-    Return a Butterworth low-pass of second order, by the bilinear transform.
+    Return a second-order Butterworth low-pass, coefficients b0 b1 b2 a0 a1 a2, shape (6,).
 
-    That of scipy.signal takes 0.6 s to import, in nodes that must be back at once.
-
-    Parameters
-    ----------
-    cutoff : float
-        Frequency at which it halves the power [Hz], below half the rate.
-    rate : float
-        Samples per second [Hz].
-
-    Returns
-    -------
-    ndarray, shape (6,)
-        Coefficients of z^0, z^-1, z^-2 of the numerator, then of the denominator.
-
+    Bilinear transform; ``cutoff`` (-3 dB) is below half the ``rate``, both in Hz. It replaces
+    scipy.signal, whose import takes 0.6 s.
     """
     warped = tan(pi * cutoff / rate)
     square, damping = warped * warped, sqrt(2.0) * warped
@@ -53,9 +41,9 @@ def low_pass(cutoff: float, rate: float) -> FloatArray:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ForceSensorParameters:
     """
-    Constants of the sensor; zero switches each imperfection off.
+    Constants of the sensor; zero disables an imperfection.
 
-    Those of forces and torques are one number, or three for x y z.
+    Constants of forces and torques are one number, or three for x y z.
     """
 
     rate: float = constant(
@@ -66,7 +54,7 @@ class ForceSensorParameters:
         default=2,
         metadata={
             'description': 'low-pass filter: 0 none, 1 with a cutoff of rate / 16 (500 Hz), '
-            f'each further one a quarter of that, up to {MOST_FILTERS}'
+            f'the cutoff of each further filter is a quarter, up to {MOST_FILTERS}'
         },
     )
     force_noise: float | tuple[float, ...] = constant(
@@ -120,7 +108,7 @@ class ForceSensorParameters:
 
     @property
     def cutoffs(self) -> tuple[float, ...]:
-        """Cutoffs of the filters that are in use, the first fed first [Hz]."""
+        """Cutoff frequencies of the active filters, in cascade order [Hz]."""
         return tuple(self.rate / (16.0 * 4.0**k) for k in range(self.filter))
 
     def per_axis(self, name: str) -> FloatArray:
@@ -130,12 +118,12 @@ class ForceSensorParameters:
         Parameters
         ----------
         name : str
-            Field without ``force_`` or ``torque_``, for example ``noise``.
+            Field name without ``force_`` or ``torque_``, for example ``noise``.
 
         Returns
         -------
         ndarray, shape (6,)
-            Its value for the forces x y z and the torques x y z.
+            Value for the forces x y z and the torques x y z.
 
         """
         pair = (getattr(self, f'{kind}_{name}') for kind in ('force', 'torque'))
@@ -144,11 +132,11 @@ class ForceSensorParameters:
 
 class ForceSensor:
     """
-    A force-torque sensor at the needle base: turns true wrenches into readings.
+    Force-torque sensor at the needle base: converts true wrenches to readings.
 
-    The sensor samples faster than it is read. Offset and noise are added to each sample, which
-    then saturates and passes a cascade of second-order Butterworth filters. A reading is the last
-    sample, less the value on which the sensor was zeroed, rounded to counts.
+    The internal sample rate is a multiple of the reading rate. Offset and noise are added to each
+    sample, which then saturates and passes a cascade of second-order Butterworth filters. A
+    reading is the last sample, minus the tare value, rounded to counts.
 
     Parameters
     ----------
@@ -162,12 +150,12 @@ class ForceSensor:
     Attributes
     ----------
     samples : int
-        Samples of the sensor between two readings.
+        Internal samples per reading.
 
     Raises
     ------
     ParameterError
-        If the sensor's rate is not a whole multiple of the rate of the readings.
+        If the internal rate is not a whole multiple of the reading rate.
 
     Examples
     --------
@@ -183,7 +171,7 @@ class ForceSensor:
 
     """
 
-    #: Random numbers drawn at once.
+    #: Size of a block of random numbers.
     _DRAWN = 16384
 
     def __init__(self, parameters: ForceSensorParameters, rate: float, seed: int) -> None:
@@ -211,7 +199,7 @@ class ForceSensor:
         self._sections = np.array([low_pass(cut, p.rate) for cut in p.cutoffs]).reshape(-1, 6)
         self._memory = np.zeros((p.filter, 2, 6))
         self._before: FloatArray | None = None
-        # One row more than samples: the step of the random walk.
+        # One more row than samples, for the step of the random walk.
         self._block = max(1, self._DRAWN // (6 * (samples + 1))), samples + 1, 6
         self._drawn = np.empty((0, samples + 1, 6))
         self._next = 0
@@ -226,13 +214,13 @@ class ForceSensor:
         Parameters
         ----------
         wrench : ndarray, shape (samples, 6) or (6,)
-            True force [N] and torque [N m], x y z each. With two dimensions: the mean wrench of
-            each sample. With one: the wrench of the last sample; the wrench then goes from that
-            of the reading before to it in a straight line.
+            True force [N] and torque [N m], x y z each. Two-dimensional: mean wrench of each
+            sample. One-dimensional: wrench of the last sample, with a linear change from the
+            previous reading.
         start : ndarray, shape (6,), optional
-            Wrench just after the reading before, if it jumped there; for a straight line.
+            Wrench just after the previous reading, in case of a jump; for a linear change.
         moving : bool
-            Whether the needle moves; such a reading is not used to zero the sensor.
+            Whether the needle moves; such a reading is not used for the tare.
 
         Returns
         -------
@@ -254,7 +242,7 @@ class ForceSensor:
             self._drawn = self._rng.standard_normal(self._block)
             self._next = 0
         if self._before is None:
-            # The filters start in the steady state of the first sample.
+            # Filters start in the steady state of the first sample.
             limit = self._constants[2]
             first = felt if felt.ndim == 1 else felt[0]
             value = np.clip(first + self._offset, -limit, limit)
@@ -286,7 +274,7 @@ class ForceSensor:
         Raises
         ------
         JobError
-            If there are not as many readings at rest since the last motion or zeroing.
+            If there are not as many readings at rest since the last motion or tare.
 
         """
         found, needed = len(self._resting), self._resting.maxlen

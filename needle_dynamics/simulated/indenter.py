@@ -1,4 +1,4 @@
-"""The end-effector that presses the tissue in the plane: section 3.2.2.3, simulated."""
+"""Simulated end-effector that indents the tissue in the plane: section 3.2.2.3."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from needle_ros.settings import check_constants, constant
 from needle_ros.trajectories import check_times, joint_values
 import numpy as np
 
-#: Joints of the indenter's trajectories, the axes of the plane.
+#: Joints of the indenter trajectories: the axes of the plane.
 JOINTS = ('x', 'z')
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class IndenterParameters:
     """
-    Tissue under the end-effector and the robot that presses it.
+    Constants of the tissue under the end-effector and of the robot.
 
-    The stiffness matrix depends on the magnitude of the force: linear between the levels,
+    The stiffness matrix depends on the magnitude of the force: linear between the levels and
     constant outside. The defaults are the means of Table 2.
     """
 
@@ -74,7 +74,7 @@ class IndenterParameters:
         if not levels or any(high <= low for low, high in pairwise(levels)):
             raise ParameterError(f'force_levels must increase, got {list(levels)} N')
         for level, matrix in zip(levels, self.matrices, strict=True):
-            # Then it is so at all forces between, and a press has one answer.
+            # Then this holds at all forces between, and the displacement is unique.
             if np.linalg.eigvalsh(matrix + matrix.T)[0] <= 0.0:
                 raise ParameterError(
                     f'stiffness_xx, ..., stiffness_zz must resist a press in every direction, '
@@ -91,12 +91,12 @@ class IndenterParameters:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Press:
     """
-    What the indenter shows at the end of one sample interval.
+    Measurements at the end of one sample interval.
 
     Attributes
     ----------
     position : ndarray, shape (3,)
-        Measured position of the end-effector x y z [m], zero where no force acts.
+        Measured position of the end-effector x y z [m], zero without force.
     force : ndarray, shape (2,)
         True force of the end-effector on the tissue along x and z [N].
     wrench : ndarray, shape (6,)
@@ -111,7 +111,7 @@ class Press:
 
 class Indenter:
     """
-    Presses the tissue with a commanded force in the plane, one sample at a time.
+    Indent the tissue with a commanded force in the plane, one sample at a time.
 
     Parameters
     ----------
@@ -128,7 +128,7 @@ class Indenter:
 
     """
 
-    #: No needle is inserted.
+    #: Insertion depth; there is no needle.
     depth = 0.0
 
     topics: tuple[Topic, ...] = (BASE_WRENCH, END_EFFECTOR_POSE)
@@ -147,7 +147,7 @@ class Indenter:
         self._levels = np.array(parameters.force_levels)
         self._entries = parameters.matrices.reshape(-1, 4).T
         self._sensor = sensor
-        # Not the sequence of the sensor's noise.
+        # Independent of the random sequence of the force sensor.
         self._rng = np.random.default_rng([seed, 1])
         self._force_limit = force_limit
         self._force = np.zeros(2)
@@ -158,7 +158,7 @@ class Indenter:
 
     @property
     def report(self) -> dict[str, object]:
-        """How it presses, for people."""
+        """Forces for the diagnostics."""
         return {
             f'force {axis} [N]': f'{f:.3f}' for axis, f in zip(JOINTS, self._force, strict=True)
         }
@@ -171,12 +171,12 @@ class Indenter:
         efforts: Sequence[Sequence[float]],
     ) -> None:
         """
-        Take a new course of forces, straight lines in time from the present force.
+        Start a new force trajectory, linear in time from the present force.
 
         Parameters
         ----------
         joints : sequence of str
-            Names of the joints, `x` and `z` among them.
+            Names of the joints, including `x` and `z`.
         times : sequence of float
             Time of each point from now [s].
         positions : sequence of sequence of float
@@ -187,7 +187,7 @@ class Indenter:
         Raises
         ------
         ParameterError
-            If times do not increase, or a point lacks a force or has one beyond the limit.
+            If times do not increase, or a force is missing or beyond the limit.
 
         """
         check_times(times)
@@ -195,7 +195,7 @@ class Indenter:
             raise ParameterError('the indenter takes efforts, not positions')
         forces = [joint_values(joint, joints, efforts) for joint in JOINTS]
         for values in forces:
-            # Written so that NaN is refused too.
+            # Written so that NaN is rejected too.
             if not all(f is not None and abs(f) <= self._force_limit for f in values):
                 raise ParameterError(
                     f'each point needs efforts of x and z within {self._force_limit:g} N, got '
@@ -220,28 +220,28 @@ class Indenter:
 
     def change(self, _parameters: NeedleParameters) -> None:
         """
-        Go on as before: there is no needle.
+        Ignore the constants: there is no needle.
 
         Parameters
         ----------
         _parameters : NeedleParameters
-            Constants of a needle.
+            Ignored.
 
         """
 
     def take(self, _force: float, _torque: float) -> list[Measurement]:
         """
-        Advance by one sample interval, and say what is published of it.
+        Advance by one sample interval and return the measurements to publish.
 
         Parameters
         ----------
         _force, _torque : float
-            Not used: commands do not act on the end-effector.
+            Ignored: commands do not act on the end-effector.
 
         Returns
         -------
         list of Measurement
-            Of each topic.
+            One per topic.
 
         """
         press = self.advance()
@@ -252,11 +252,11 @@ class Indenter:
         ]
 
     def outline(self) -> None:
-        """Return None: there is no needle to see."""
+        """Return None: there is no needle to display."""
 
     def displacement(self, force: FloatArray) -> FloatArray:
         """
-        Return where a force presses the tissue, ``F = K(|F|) d``.
+        Return the tissue displacement under a force, ``F = K(|F|) d``.
 
         Parameters
         ----------
@@ -266,7 +266,7 @@ class Indenter:
         Returns
         -------
         ndarray, shape (3,)
-            Displacement x y z [m]; y is off the plane.
+            Displacement x y z [m]; y is out of the plane.
 
         """
         x, z = force
@@ -288,7 +288,7 @@ class Indenter:
         Returns
         -------
         Press
-            What the sensors report at the end of the interval.
+            Measurements at the end of the interval.
 
         """
         p = self._parameters

@@ -1,4 +1,4 @@
-r"""
+"""
 Structure-preserving integrator of the needle: frozen-depth modal flow, exact friction flow.
 
 One step of length h from (s, u, q, p), u = s_dot and p = rho A G q_dot, is a symmetric
@@ -6,16 +6,17 @@ splitting of the Hamiltonian system:
 
 1. drift the depth to the middle of the step with the velocity at its start;
 2. with the depth frozen there, the modal part is linear: tissue damping and the rotation in the
-   eigenbasis of (E I_y H + k_a G, rho A G) are exact, whatever their frequency. With the
-   momenta as variables dG/dt needs no term. The impulse -dH/ds that the modes exert on the
-   insertion axis along that rotation is an exact integral too;
-3. insertion force and mean modal force being constant over the step, the insertion axis under
+   eigenbasis of (E I_y H + k_a G, rho A G) are exact for any frequency. With the momenta as
+   variables dG/dt needs no term. The impulse -dH/ds of the modes on the insertion axis along
+   this rotation is also an exact integral;
+3. with constant insertion force and mean modal force over the step, the insertion axis under
    viscous and set-valued Coulomb friction has an exact flow, including stops and sticking.
 
-It is of second order, symplectic without friction and damping (the total displacement then
-equals that of drift-kick-drift), sticks exactly, and has no stability limit from the modes nor
-from viscous friction. Source of the idea: E. Hairer, C. Lubich, G. Wanner, "Geometric Numerical
-Integration", 2nd ed., 2006, sections II.5 and XIII (splitting, highly oscillatory problems).
+The integrator is of second order, symplectic without friction and damping (the total
+displacement then equals drift-kick-drift), sticks exactly, and has no stability limit from the
+modes or from viscous friction. Source of the method: E. Hairer, C. Lubich, G. Wanner, "Geometric
+Numerical Integration", 2nd ed., 2006, sections II.5 and XIII (splitting, highly oscillatory
+problems).
 """
 
 from __future__ import annotations
@@ -33,39 +34,38 @@ from needle_ros.errors import NeedleError, ParameterError
 import numpy as np
 from numpy.typing import ArrayLike
 
-#: Default step [s]. The tip deflection of the source's open-loop run is then good to 2e-4.
+#: Default step [s], for a tip deflection error of 2e-4 in the open-loop run of the source.
 DEFAULT_STEP: Final = 1e-5
 
-#: Step at which a tolerance is given up, and shortest step taken [s]: rounding has taken over
-#: long before.
+#: Shortest step [s], below which a tolerance is not met: rounding errors dominate far above it.
 SHORTEST_STEP: Final = 1e-9
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Interval:
     """
-    Means and works over an interval, as sensors that average over it have them.
+    Mean values and work over an interval, for sensors that average over the interval.
 
     Attributes
     ----------
     tip_deflection : float
-        Mean deflection of the tip [m].
+        Mean tip deflection [m].
     axial_force : float
         Mean force of the base on the needle along y [N], positive into the tissue.
     lateral_force : float
-        Mean force of the base on the needle along z [N], by balance of momentum.
+        Mean force of the base on the needle along z [N], from the momentum balance.
     moment : float
-        Mean moment of the base on the needle about x at the base [N m], with the torque.
+        Mean moment of the base on the needle about x at the base [N m], including the torque.
     felt : ndarray, shape (parts, 3)
-        These three over each of the equal parts of the interval. Not compared by ``==``.
+        These three loads for each of the equal parts of the interval. Not compared by ``==``.
     friction_work, damping_work : float
-        Energy lost to friction and to tissue damping [J].
+        Energy dissipated by friction and tissue damping [J].
     input_work : float
-        Work done by force and torque [J].
+        Work of force and torque [J].
     impact_loss : float
-        Energy lost on the hub [J].
+        Energy dissipated by impacts of the hub [J].
     contact_time : float or None
-        Time of the last contact with the hub [s], on the integrator's clock.
+        Time of the last hub contact [s], on the clock of the integrator.
 
     """
 
@@ -83,29 +83,29 @@ class Interval:
 
 class Integrator:
     """
-    Advances one needle in time.
+    Time integrator of one needle.
 
     Parameters
     ----------
     parameters : NeedleParameters
-        Constants. For friction or tissue as objects, see `NeedleParameters.using`.
+        Constants. To pass friction or tissue objects, see `NeedleParameters.using`.
     state : array_like, shape (2 (2 + n),)
         Initial state, see `NeedleModel.state_at`.
     step : float
         Longest step [s].
     tolerance : float, optional
         If given, the step is halved until the estimated error of each call to `advance` is less
-        than this part of the state in the norm of energy, and of the needle's length.
+        than this fraction of the state in the energy norm, and of the needle length.
     graded : bool
-        Let the step grow with the inserted length once that exceeds a tenth of the needle's: the
-        modes slow down as its square.
+        Let the step grow with the insertion depth once it exceeds a tenth of the needle length:
+        the modal frequencies decrease with its square.
 
     Attributes
     ----------
     model : NeedleModel
         The needle.
     time : float
-        Time [s], 0 at first; it matters for tissue that swells.
+        Time [s], initially 0; used for swelling tissue.
 
     Raises
     ------
@@ -114,7 +114,7 @@ class Integrator:
     ShapeError, InsertedLengthError
         If the state is not valid.
     ToleranceError
-        By `advance`, if the tolerance cannot be met.
+        From `advance`, if the tolerance cannot be met.
 
     Examples
     --------
@@ -148,7 +148,7 @@ class Integrator:
 
     def change(self, parameters: NeedleParameters) -> None:
         """
-        Go on with other constants from the present state.
+        Change the constants and continue from the present state.
 
         Parameters
         ----------
@@ -158,7 +158,7 @@ class Integrator:
         Raises
         ------
         ShapeError, InsertedLengthError
-            If the state does not suit them; the old constants then stay.
+            If the state is invalid for the new constants; the old constants are kept.
 
         """
         model = NeedleModel(parameters)
@@ -173,7 +173,7 @@ class Integrator:
 
     @property
     def depth(self) -> float:
-        """Inserted length s [m]."""
+        """Insertion depth s [m]."""
         return float(self._needle.length - self._state[0])
 
     @property
@@ -190,26 +190,26 @@ class Integrator:
         Parameters
         ----------
         duration : float
-            Time to advance [s], taken in steps no longer than the step.
+            Time to advance [s], divided into steps no longer than ``step``.
         force : float
             Insertion force f_y [N], positive into the tissue.
         torque : float
             Torque tau about x [N m].
         parts : int
-            Number of equal parts of the interval for which to return what the base feels. Steps
-            end where these do.
+            Number of equal parts of the interval for which base loads are returned. Steps end at
+            the part boundaries.
 
         Returns
         -------
         Interval
-            Means and works over the interval.
+            Mean values and work over the interval.
 
         Raises
         ------
         ParameterError
             If the duration is not positive, or an input is not finite.
         InsertedLengthError
-            If the inserted length left its range; the state is the last valid one.
+            If the insertion depth left its range; the state is the last valid one.
         ToleranceError
             If the tolerance cannot be met.
 
@@ -218,7 +218,7 @@ class Integrator:
 
     def advance_moved(self, duration: float, velocity: float) -> Interval:
         """
-        Advance with the base brought evenly to a velocity, whatever force that takes.
+        Advance with a linear change of the base velocity, without a force limit.
 
         Parameters
         ----------
@@ -230,8 +230,8 @@ class Integrator:
         Returns
         -------
         Interval
-            Means over the interval; the axial force is what the motion took. While the base
-            rests, friction takes the value within its bounds that asks for the least force.
+            Mean values over the interval; the axial force is the force required by the motion. At
+            rest, friction takes the value within its bounds that minimizes this force.
 
         Raises
         ------
@@ -243,21 +243,21 @@ class Integrator:
 
     def advance_pushed(self, duration: float, force: float, speed_limit: float) -> Interval:
         """
-        Advance under a constant force of a base that goes no faster than a limit.
+        Advance under a constant base force with a speed limit of the base.
 
         Parameters
         ----------
         duration : float
             Time to advance [s].
         force : float
-            Insertion force that the base applies while it is slow enough [N].
+            Insertion force of the base below the speed limit [N].
         speed_limit : float
             Highest speed of the base at the end [m/s].
 
         Returns
         -------
         Interval
-            Means over the interval; at the limit the axial force is what that motion took.
+            Mean values; at the limit the axial force is the force required by the motion.
 
         Raises
         ------
@@ -270,10 +270,10 @@ class Integrator:
         try:
             seen = self.advance(duration, force)
         except InsertedLengthError:
-            # At the limit it may stay within.
+            # At the speed limit the depth may stay within its range.
             too_fast = True
         else:
-            # The hub may have stopped what went too fast.
+            # The hub may have stopped a motion that was too fast.
             gone = abs(self.depth - depth)
             too_fast = max(abs(self.velocity), gone / duration) > speed_limit
             way = self.velocity or force
@@ -288,7 +288,7 @@ class Integrator:
         for name in ('force', 'torque', 'velocity'):
             if not isfinite(getattr(inputs, name)):
                 raise ParameterError(f'{name} must be finite, got {getattr(inputs, name)!r}')
-        # An integer would have the step compiled anew for it.
+        # An integer would cause the step to be compiled for another type.
         duration, felt = float(duration), np.empty((parts, 3))
         if self.tolerance is None:
             sums = self._take(duration, inputs, self.step, felt)
@@ -310,7 +310,7 @@ class Integrator:
         )
 
     def _take(self, duration: float, inputs: Inputs, longest: float, felt: FloatArray) -> Sums:
-        """Take steps under constant inputs."""
+        """Integrate over the duration under constant inputs."""
         left, sums = advance(
             self._needle, self._state, self.time, inputs, longest, self.graded, duration, felt
         )
@@ -321,7 +321,7 @@ class Integrator:
         return sums
 
     def _refine(self, duration: float, inputs: Inputs, felt: FloatArray, tolerance: float) -> Sums:
-        """Halve the step until the end of the interval no longer depends on it."""
+        """Halve the step until the state at the end of the interval has converged."""
         start, clock = self._state.copy(), self.time
         longest = min(duration, self.step / self._refinement)
 
@@ -340,20 +340,20 @@ class Integrator:
                 self._state[:], self.time = start, clock
                 raise ToleranceError(f'tolerance {tolerance:g} cannot be met at any step')
             outcome = attempt(longest)
-            # The finer run is kept; second order makes its error a third of the difference.
+            # The finer run is kept; at second order its error is a third of the difference.
             change = self._distance(coarse, self._state) / 3.0
             if change <= tolerance and isinstance(outcome, Sums) == isinstance(before, Sums):
                 break
         if isinstance(outcome, InsertedLengthError):
             raise outcome
-        # The next interval begins with the step before the last one, or one more before where
-        # the error allows it: a step twice as long has four times the error.
+        # The next interval starts with the second last step, or a longer one if the error permits:
+        # twice the step has four times the error.
         growth = 4.0 if change < tolerance / 32.0 else 2.0
         self._refinement = max(1.0, self.step / (growth * longest))
         return outcome
 
     def _distance(self, one: FloatArray, two: FloatArray) -> float:
-        """Return how far apart two states are: energy of the difference, and depth."""
+        """Return the distance of two states: energy of the difference, and depth."""
         model, m = self.model, self.model.coordinates
         depth = model.parameters.length - two[0]
         gram = model.parameters.linear_density * model.modes.integrals(depth).gram
@@ -372,57 +372,25 @@ class Integrator:
 
 def not_completed(model: NeedleModel, state: FloatArray, left: float) -> NeedleError:
     """
-    Say why a motion was not completed.
+    Return the exception for a motion with ``left`` seconds remaining (NaN: not finite).
 
-    Parameters
-    ----------
-    model : NeedleModel
-        The needle.
-    state : ndarray, shape (2 (2 + n),)
-        Its last valid state.
-    left : float
-        Time left undone [s], or NaN, as from the compiled step.
-
-    Returns
-    -------
-    NeedleError
-        An `InsertedLengthError` if the needle would leave its range.
-
+    It is an `InsertedLengthError` if the needle would leave its range; ``state`` is the last valid
+    state.
     """
     if isnan(left):
-        return NeedleError(
-            'the motion is not finite: constants, state or inputs are out of proportion'
-        )
+        return NeedleError('the motion is not finite: constants, state or inputs are badly scaled')
     p, far = model.parameters, model.compiled.maximum_depth
     depth = p.length - float(state[0])
     limit = (
         f'minimum_depth = {p.minimum_depth:g} m while withdrawing'
         if depth - p.minimum_depth < far - depth
-        else f'the largest inserted length, {far:g} m'
+        else f'the largest insertion depth, {far:g} m'
     )
-    return InsertedLengthError(f'inserted length {depth:.6g} m reached {limit}')
+    return InsertedLengthError(f'insertion depth {depth:.6g} m reached {limit}')
 
 
 def checked_step(step: float) -> float:
-    """
-    Return a longest step as a float, or say what is wrong with it.
-
-    Parameters
-    ----------
-    step : float
-        Longest step [s].
-
-    Returns
-    -------
-    float
-        The step [s].
-
-    Raises
-    ------
-    ParameterError
-        If it is not a number, not finite, or too short.
-
-    """
+    """Check a longest step [s] and return it as a float."""
     if isinstance(step, bool) or not isinstance(step, (int, float)):
         raise ParameterError(f'step must be a number, got {step!r}')
     if not SHORTEST_STEP <= step < inf:

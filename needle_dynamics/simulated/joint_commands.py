@@ -1,4 +1,4 @@
-"""What a message of `joint_commands` asks for, as ros2_control fills it."""
+"""Parser of `joint_commands` messages from ros2_control."""
 
 from __future__ import annotations
 
@@ -20,17 +20,7 @@ _KINDS: Final = (_POSITION, _VELOCITY, _EFFORT)
 
 
 class Motion(NamedTuple):
-    """
-    Where joints shall go.
-
-    Attributes
-    ----------
-    goals : dict
-        Position [m or rad] by joint.
-    within : float
-        Time in which they shall be there [s].
-
-    """
+    """Target positions [m or rad] by joint, with the time to reach them [s]."""
 
     goals: dict[str, float]
     within: float
@@ -38,18 +28,18 @@ class Motion(NamedTuple):
 
 class Asked(NamedTuple):
     """
-    What a message asks for.
+    Content of a `joint_commands` message.
 
     Attributes
     ----------
     force, torque : float
-        Force along the needle [N] and torque [N m]; NaN if an effort that was a number is none.
+        Axial force [N] and torque [N m]; NaN if an effort that was a number is now NaN.
     motions : list of Motion
-        Where joints shall go, as far as the message says anything new.
+        Joint motions, only where the message has new values.
     stamp : int
-        Its time [ns].
+        Stamp of the message [ns].
     given : dict
-        Numbers given so far, by kind and joint.
+        Latest numbers by kind and joint.
 
     """
 
@@ -62,27 +52,18 @@ class Asked(NamedTuple):
 
 class JointCommands:
     """
-    Reads the messages of `joint_commands` one after the other.
+    Parser of successive `joint_commands` messages.
 
     The hardware interface sends all interfaces at its own rate, whether a controller sets them or
-    not: what nobody has set yet is NaN and asks for nothing. What has been a number must stay one.
-    A position is the end of a line that begins where the joint is and takes as long as it was
-    from the last message to this one. A velocity without a position lasts for the timeout.
-
-    Parameters
-    ----------
-    mode : str
-        Mode of the plant.
-    steered : bool
-        Whether its needle is steered.
-    shortest, longest : float
-        Period of the plant, and time after which a command is too old [s].
-
+    not: a value not yet set is NaN and has no effect. A value that has been a number must remain a
+    number. A position is the end of a linear motion from the present position with the duration
+    between the last message and this message. A velocity without a position lasts for the timeout.
+    ``shortest`` is the period of the plant, ``longest`` the command timeout [s].
     """
 
     def __init__(self, mode: str, *, steered: bool, shortest: float, longest: float) -> None:
         guide = tuple(joint.name for joint in STEERING_JOINTS) if steered else ()
-        #: Joints that take each kind of command.
+        #: Joints that accept each kind of command.
         self._takes: dict[str, tuple[str, ...]] = {_POSITION: (), _EFFORT: ()}
         if mode == 'simulation':
             self._takes = {
@@ -96,34 +77,17 @@ class JointCommands:
         self.forget()
 
     def forget(self) -> None:
-        """Forget all messages, as at an activation."""
+        """Discard all messages, as at an activation."""
         self._stamp: int | None = None
-        #: Numbers that were given last, by kind and joint.
+        #: Latest numbers by kind and joint.
         self._given: dict[tuple[str, str], float] = {}
 
     def read(self, reading: Reading, at: Mapping[str, float], now: int) -> Asked:
         """
-        Read the next message, which does not count before `accept`.
+        Parse the next message, without effect before `accept`.
 
-        Parameters
-        ----------
-        reading : Reading
-            The message.
-        at : Mapping[str, float]
-            Where the joints are [m or rad], zero for others.
-        now : int
-            Time that stands for a stamp of zero [ns].
-
-        Returns
-        -------
-        Asked
-            What it asks for.
-
-        Raises
-        ------
-        ParameterError
-            If values cannot be told apart, or a joint cannot do what it is asked for.
-
+        ``at`` are the joint positions [m or rad], zero by default; ``now`` replaces a zero stamp
+        [ns].
         """
         stamp = reading.stamp or now
         new = {
@@ -137,7 +101,7 @@ class JointCommands:
             before = self._given.get((kind, joint))
             if kind == _POSITION and value != before:
                 goals[joint] = value
-            # A joint that rests is told so once.
+            # A zero velocity is sent once.
             if kind == _VELOCITY and (_POSITION, joint) not in new and (value or before):
                 lasting[joint] = at.get(joint, 0.0) + value * self._longest
         motions = [Motion(goals, self._passed(stamp)), Motion(lasting, self._longest)]
@@ -150,19 +114,11 @@ class JointCommands:
         )
 
     def accept(self, asked: Asked) -> None:
-        """
-        Let a message count, so that the next one is compared with it.
-
-        Parameters
-        ----------
-        asked : Asked
-            What it asked for.
-
-        """
+        """Accept a message as reference for the next one."""
         self._stamp, self._given = asked.stamp, asked.given
 
     def _passed(self, stamp: int) -> float:
-        """Return the time since the message before [s], within what a motion may take."""
+        """Return the time since the previous message [s], limited to the range of motion times."""
         passed = self._longest if self._stamp is None else (stamp - self._stamp) / NANOSECONDS
         return min(max(passed, self._shortest), self._longest)
 
@@ -183,15 +139,15 @@ class JointCommands:
         return [dict(zip(names, values, strict=False)) for values in reading.values]
 
     def _is_asked(self, kind: str, joint: str, value: float) -> bool:
-        """Tell whether a value asks for anything, or raise ParameterError if it cannot be."""
+        """Return whether a value has an effect; it must be accepted by the joint."""
         if isnan(value) and (kind, joint) not in self._given:
             return False
         if joint in self._takes[kind]:
             return True
-        # What a controller leaves when it ends.
+        # Value left by a controller when it ends.
         if kind != _POSITION and not value:
             return False
         joints = ', '.join(self._takes[kind]) or 'no joint'
         raise ParameterError(
-            f'got the {kind} {value:g} of {joint}; in this mode the plant takes that of {joints}'
+            f'got the {kind} {value:g} of {joint}; in this mode the plant takes it for {joints}'
         )

@@ -1,4 +1,4 @@
-"""What all simulated plants have: what they take, and what they show."""
+"""Common interface of all simulated plants."""
 
 from __future__ import annotations
 
@@ -10,25 +10,25 @@ from needle_dynamics.parameters import NeedleParameters
 from needle_ros.contract import Topic
 import numpy as np
 
-#: What a plant publishes of a sample on one topic: name of the topic, sample intervals since the
-#: time of the stamp, and the numbers in the order of the message.
+#: Measurement for one topic: topic name, sample intervals since the time of the stamp, and values
+#: in the order of the message.
 Measurement: TypeAlias = tuple[str, int, list[float]]
 
 
 class Outline(NamedTuple):
     """
-    A needle as people see it, in the frame of the entry point.
+    Needle shape for display, in the frame of the entry point.
 
     Attributes
     ----------
     base : ndarray, shape (3,)
-        Its base [m].
+        Needle base [m].
     points : ndarray, shape (k, 3)
-        Points from where it bends to the tip [m].
+        Points from the start of the bending part to the tip [m].
     slopes : ndarray, shape (k, 2)
-        Slopes in x and z there.
+        Slopes in x and z at the points.
     path : ndarray, shape (m, 3)
-        The path that it cut [m]; none for a needle that does not cut.
+        Path cut by the tip [m]; empty for a needle that does not cut.
 
     """
 
@@ -39,7 +39,7 @@ class Outline(NamedTuple):
 
     @property
     def turns(self) -> FloatArray:
-        """Shortest turns that bring y along the needle, quaternions x, y, z, w; shape (k, 4)."""
+        """Shortest rotations from y to the needle axis, quaternions x, y, z, w; shape (k, 4)."""
         # From (0, 1, 0) to (slope_x, 1, slope_z): half the angle about their common normal.
         x, z = self.slopes.T
         length = np.sqrt(1.0 + x * x + z * z)
@@ -49,7 +49,7 @@ class Outline(NamedTuple):
 
     @property
     def tip(self) -> tuple[list[float], list[float]]:
-        """Where the tip is from the base [m], and how it is turned: x, y, z and x, y, z, w."""
+        """Tip position relative to the base [m] and orientation: x, y, z and x, y, z, w."""
         return (self.points[-1] - self.base).tolist(), self.turns[-1].tolist()
 
 
@@ -58,15 +58,15 @@ class SimulatedPlant(Protocol):
 
     @property
     def topics(self) -> tuple[Topic, ...]:
-        """Topics that it publishes on."""
+        """Published topics."""
 
     @property
     def depth(self) -> float:
-        """Inserted length [m]."""
+        """Insertion depth [m]."""
 
     @property
     def report(self) -> dict[str, object]:
-        """Where it is, for people."""
+        """State for the diagnostics."""
 
     def follow(
         self,
@@ -75,64 +75,16 @@ class SimulatedPlant(Protocol):
         positions: Sequence[Sequence[float]],
         efforts: Sequence[Sequence[float]],
     ) -> None:
-        """
-        Follow a trajectory from now.
-
-        Parameters
-        ----------
-        joints : sequence of str
-            Names of the joints.
-        times : sequence of float
-            Time of each point from now [s].
-        positions, efforts : sequence of sequence of float
-            Of each point, by joint [m or rad, N].
-
-        Raises
-        ------
-        ParameterError
-            If it cannot.
-
-        """
+        """Follow a trajectory from now on; units are s, m or rad, and N."""
 
     def tare(self) -> None:
         """Zero the force sensor, or raise JobError."""
 
     def change(self, parameters: NeedleParameters) -> None:
-        """
-        Go on with other constants of the needle.
-
-        Parameters
-        ----------
-        parameters : NeedleParameters
-            Constants.
-
-        Raises
-        ------
-        NeedleError
-            If they do not suit its state.
-
-        """
+        """Change the constants of the needle."""
 
     def take(self, force: float, torque: float) -> list[Measurement]:
-        """
-        Advance by one sample interval.
-
-        Parameters
-        ----------
-        force, torque : float
-            What acts [N, N m].
-
-        Returns
-        -------
-        list of Measurement
-            What is published of it, `joint_states` last.
-
-        Raises
-        ------
-        InsertedLengthError
-            If the needle left the tissue.
-
-        """
+        """Advance by one interval under a force [N] and torque [N m]; `joint_states` is last."""
 
     def outline(self) -> Outline | None:
-        """Return the needle as people see it; None if there is none."""
+        """Return the needle shape for display; None without a needle."""

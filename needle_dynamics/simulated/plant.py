@@ -1,4 +1,4 @@
-"""The plant as an object: needle, base and force sensor advanced one sample at a time."""
+"""Simulated plant: needle, base and force sensor, advanced one sample at a time."""
 
 from __future__ import annotations
 
@@ -28,23 +28,23 @@ from needle_ros.errors import JobError, ParameterError
 from needle_ros.trajectories import joint_values
 import numpy as np
 
-#: Parts of a sample interval in each of which the force of a push is constant: friction lets the
-#: velocity follow it at once, and a velocity of now beside a mean force would be half an interval
-#: late.
+#: Parts of a sample interval with constant push force: with friction the velocity follows the
+#: force at once, and a present velocity with a mean force would be delayed by half an interval.
 _PUSHES: Final = 4
 
-#: Points of an outline.
+#: Number of points of an outline.
 _POINTS: Final = 21
 
-#: Velocity below which the sensor may be zeroed [m/s].
+#: Velocity below which taring is permitted [m/s].
 AT_REST: Final = 1e-6
 
 
 def _friction_gained(friction: Friction, before: float, after: float) -> float:
     """
-    Return the friction at the end of an evenly accelerated interval over that of its middle.
+    Return the difference of friction between the end and the middle of an interval [N].
 
-    The mean over the interval would be the force of half an interval ago, beside a speed of now.
+    The velocity changes linearly. The mean friction over the interval would be delayed by half an
+    interval with respect to the velocity at its end.
     """
     if after == 0.0:
         return 0.0
@@ -53,24 +53,24 @@ def _friction_gained(friction: Friction, before: float, after: float) -> float:
 
 class Sample(NamedTuple):
     """
-    What the plant shows at the end of one sample interval.
+    Measurements at the end of one sample interval.
 
     Attributes
     ----------
     state : ndarray, shape (8,)
-        Whole state.
+        Complete state.
     depth, speed : float
-        Inserted length [m] and insertion speed [m/s].
+        Insertion depth [m] and insertion velocity [m/s].
     joint_position : float
-        Inserted length as the encoder has it [m].
+        Insertion depth measured by the encoder [m].
     force : float
         True axial force of the base on the needle [N], positive into the tissue.
     wrench : ndarray, shape (6,)
         Reading of the base sensor: force x y z [N], torque x y z [N m].
     tip_deflection : float
-        Mean deflection of the tip over the interval [m].
+        Mean tip deflection over the interval [m].
     tip : TipReading or None
-        What the sensor of the tip reports now.
+        Present output of the tip sensor.
 
     """
 
@@ -86,20 +86,20 @@ class Sample(NamedTuple):
 
 class Plant:
     """
-    The needle under a commanded wrench, or carried by a motion-controlled base.
+    The needle under a commanded wrench, or moved by a motion-controlled base.
 
     Parameters
     ----------
     integrator : Integrator
-        The needle in its tissue.
+        Needle in its tissue.
     sensor : ForceSensor
         Sensor at the needle base.
     rate : float
         Samples per second [Hz].
     base : BaseMotion, optional
-        The robot that moves the base; without it the commanded wrench does.
+        Robot that moves the base; by default the commanded wrench acts.
     tip : TipSensor, optional
-        Sensor of the tip; without it one that is perfect.
+        Tip sensor; ideal by default.
 
     """
 
@@ -120,7 +120,7 @@ class Plant:
         self._felt = np.zeros((sensor.samples, 6))
         self._count = 0
         modes = integrator.model.parameters.modes
-        #: Generalized forces on q1..qn: nothing commands them.
+        #: Generalized forces on q1..qn, which have no command.
         self._free = [0.0] * modes
         self.topics: tuple[Topic, ...] = (
             BASE_WRENCH, TIP_DEFLECTION, ground_truth(modes, commanded=base is None), JOINT_STATES,
@@ -128,12 +128,12 @@ class Plant:
 
     @property
     def depth(self) -> float:
-        """Inserted length [m]."""
+        """Insertion depth [m]."""
         return self.integrator.depth
 
     @property
     def report(self) -> dict[str, object]:
-        """Where the needle is, for people."""
+        """Needle state for the diagnostics."""
         return {'inserted length [m]': f'{self.integrator.depth:.6f}'}
 
     def follow(
@@ -144,7 +144,7 @@ class Plant:
         efforts: Sequence[Sequence[float]],
     ) -> None:
         """
-        Have the base follow a trajectory of the joint `insertion`, from now.
+        Follow a trajectory of the joint `insertion` with the base, from now on.
 
         Parameters
         ----------
@@ -153,7 +153,7 @@ class Plant:
         times : sequence of float
             Time of each point from now [s].
         positions, efforts : sequence of sequence of float
-            Inserted length [m] of each point, or force [N] where a push ends.
+            Insertion depth [m] of each point, or force [N] at the end of a push.
 
         Raises
         ------
@@ -188,7 +188,7 @@ class Plant:
 
     def change(self, parameters: NeedleParameters) -> None:
         """
-        Go on with other constants from the present state.
+        Change the constants and continue from the present state.
 
         Parameters
         ----------
@@ -198,24 +198,24 @@ class Plant:
         Raises
         ------
         ShapeError, InsertedLengthError
-            If the state does not suit them; the old constants then stay.
+            If the state is invalid for the new constants; the old constants are kept.
 
         """
         self.integrator.change(parameters)
 
     def take(self, force: float, torque: float) -> list[Measurement]:
         """
-        Advance by one sample interval, and say what is published of it.
+        Advance by one sample interval and return the measurements to publish.
 
         Parameters
         ----------
         force, torque : float
-            What acts [N, N m].
+            Force and torque that act on the needle [N, N m].
 
         Returns
         -------
         list of Measurement
-            Of each topic, `joint_states` last: who answers it has all the others.
+            One per topic, `joint_states` last, so that a responding node has all of them.
 
         Raises
         ------
@@ -236,7 +236,7 @@ class Plant:
             sample.joint_position, state[1], sample.speed, state[middle + 1], sample.force, torque,
         ]  # fmt: skip
         if self.base is None:
-            # Insertion makes d smaller.
+            # Insertion decreases d.
             state += [-force, torque, *self._free]
         measured.append((GROUND_TRUTH.name, 0, state))
         measured.append((JOINT_STATES.name, 0, joints))
@@ -244,12 +244,12 @@ class Plant:
 
     def outline(self) -> Outline:
         """
-        Return the needle as people see it.
+        Return the outline of the needle for display.
 
         Returns
         -------
         Outline
-            From its base through the entry point to its tip.
+            From the base through the entry point to the tip.
 
         """
         model = self.integrator.model
@@ -270,14 +270,14 @@ class Plant:
         Parameters
         ----------
         force : float
-            Commanded insertion force [N]; not used when a base moves the needle.
+            Commanded insertion force [N]; ignored when a base moves the needle.
         torque : float
             Commanded torque about x [N m]; likewise.
 
         Returns
         -------
         Sample
-            What the sensors report at the end of the interval.
+            Measurements at the end of the interval.
 
         Raises
         ------
@@ -307,7 +307,7 @@ class Plant:
             wrench = self._felt
             wrench[:, 1:4] = seen.felt
         else:
-            # Force and speed that are recorded beside each other shall be of one instant.
+            # Force and velocity that are recorded together must refer to one instant.
             wrench, start = np.zeros((2, 6))
             wrench[1:4] = start[1:4] = axial, seen.lateral_force, seen.moment
             start[1] -= 2.0 * late
@@ -324,7 +324,7 @@ class Plant:
         )
 
     def _pushed(self, base: BaseMotion, force: float) -> tuple[Interval, float]:
-        """Push, as the force changes; return means and what it is more at the end."""
+        """Push with a changing force; return mean values and the excess force at the end [N]."""
         needle, part = self.integrator, self.interval / _PUSHES
         limit = base.limits.speed_limit
         parts = [needle.advance_pushed(part, force, limit)]

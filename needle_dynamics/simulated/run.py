@@ -1,8 +1,8 @@
 """
-A run of a simulated plant: its samples, and what was done to it between them.
+Run of a simulated plant: samples and events, shared by the node and the replay.
 
-The node advances one, and so does a replay: what was done is an `Event`, which counts from the
-next sample on, and which a replay performs again.
+An `Event` is an input other than a command. It takes effect from the next sample on, and a replay
+performs it again.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from needle_ros.errors import ParameterError
 from needle_ros.timing import NANOSECONDS
 from needle_ros.wire import Reading
 
-#: Kinds of events.
+#: Event kinds.
 CONFIGURED: Final = 'configured'
 TIME: Final = 'time'
 TRAJECTORY: Final = 'trajectory'
@@ -27,24 +27,24 @@ PARAMETERS: Final = 'parameters'
 TARE: Final = 'tare'
 RESET: Final = 'reset'
 
-#: Stamps are rounded to nanoseconds, so that a period may be off by one [ns].
+#: Tolerance of the period due to the rounding of stamps [ns].
 _ROUNDING: Final = 2
 
 
 class Event(NamedTuple):
     """
-    What was done to a plant beside commands; it counts from the next sample on.
+    Input of a plant other than commands, effective from the next sample on.
 
     Attributes
     ----------
     kind : str
-        ``configured``: the plant was made from the parameters in ``content``. ``time``: the
-        sample is not one period after the one before. ``trajectory``: ``content`` has the
-        arguments of `Plant.follow`. ``motion``: likewise, from `joint_commands`.
-        ``parameters``: those in ``content`` changed. ``tare``: the force sensor was zeroed.
-        ``reset``: state, sensor and noise are at their start.
+        ``configured``: the plant was built from the parameters in ``content``. ``time``: the
+        sample is not one period after the previous one. ``trajectory``: ``content`` has the
+        arguments of `Plant.follow`. ``motion``: likewise, from `joint_commands`. ``parameters``:
+        the parameters in ``content`` changed. ``tare``: the force sensor was zeroed. ``reset``:
+        state, sensor and noise were reset to their start.
     content : Mapping[str, Any]
-        Values that JSON can hold.
+        JSON-compatible values.
 
     """
 
@@ -54,35 +54,10 @@ class Event(NamedTuple):
 
 class PlantRun:
     """
-    A simulated plant under commands and events.
+    Simulated plant with commands and events, built from parameters by name.
 
-    Parameters
-    ----------
-    values : Mapping[str, Any]
-        Parameters of the plant by name, see `PlantConstants.of`.
-    number : int
-        Number of samples that were taken before it.
-
-    Attributes
-    ----------
-    constants : PlantConstants
-        Its constants now.
-    plant : SimulatedPlant
-        The plant.
-    commands : Commands
-        The commands.
-    number : int
-        Number of samples taken, with those before it.
-    topics : dict
-        Topics that it publishes on, by name.
-
-    Raises
-    ------
-    ParameterError
-        If a parameter is not valid; the message names it.
-    InsertedLengthError
-        If the needle cannot be where it shall start.
-
+    ``number`` is the number of samples taken, including samples before this run. The parameters
+    are described in `PlantConstants.of`; ``topics`` are the published topics by name.
     """
 
     def __init__(self, values: Mapping[str, Any], number: int = 0) -> None:
@@ -102,37 +77,25 @@ class PlantRun:
         self.number = number
         self.topics: dict[str, Topic] = {topic.name: topic for topic in self.plant.topics}
         self._period = NANOSECONDS / own.rate
-        #: Time of the newest sample [ns].
+        #: Stamp of the newest sample [ns].
         self._stamp = -NANOSECONDS
         self._events = [Event(CONFIGURED, self._values)]
-        #: What was measured last.
+        #: Latest measurements.
         self._measured: list[Measurement] = []
 
     # Commands.
 
     def begin(self) -> None:
-        """Forget commands and who gave them, as at an activation."""
+        """Discard commands and their senders, as at an activation."""
         self.commands.begin()
         self._joint_commands.forget()
 
     def command_joints(self, reading: Reading, now: int) -> tuple[bool, str]:
         """
-        Take in a message of `joint_commands`, by the rules of all commands.
+        Process a `joint_commands` message at a time [ns], by the rules of `Commands`.
 
-        Parameters
-        ----------
-        reading : Reading
-            The message.
-        now : int
-            Simulated time [ns].
-
-        Returns
-        -------
-        counts : bool
-            Whether it counts; an invalid one counts as no force and no motion.
-        complaint : str
-            What is wrong with it, '' for nothing.
-
+        Returns whether it is accepted (an invalid message as zero force without motion), and the
+        error message or ''.
         """
         commands = self.commands
         try:
@@ -154,11 +117,11 @@ class PlantRun:
         return counts, complaint
 
     def _positions(self) -> dict[str, float]:
-        """Return where the joints are [m or rad], as the encoders have it."""
+        """Return the joint positions measured by the encoders [m or rad]."""
         if not self._measured or JOINT_STATES.name not in self.topics:
             return {INSERTION: self.plant.depth}
         joints = self.topics[JOINT_STATES.name].joints
-        # It is the last measurement, with the positions first.
+        # The last measurement, with the positions first.
         values = self._measured[-1][2]
         return {joint.name: value for joint, value in zip(joints, values, strict=False)}
 
@@ -166,20 +129,10 @@ class PlantRun:
 
     def perform(self, event: Event) -> None:
         """
-        Do something to the plant, for the first time or as it was recorded.
+        Apply an event to the plant, live or in a replay.
 
-        Parameters
-        ----------
-        event : Event
-            What to do.
-
-        Raises
-        ------
-        ParameterError
-            If the plant cannot follow the trajectory, or a parameter is not valid.
-        JobError
-            If the plant moves, or has not rested long enough, for a tare.
-
+        Raises ParameterError for an invalid trajectory or parameter, and JobError for a tare of a
+        plant that moves or has not rested long enough.
         """
         if event.kind in (TRAJECTORY, MOTION):
             self.plant.follow(**event.content)
@@ -195,7 +148,7 @@ class PlantRun:
         self._events.append(event)
 
     def _change(self, changes: Mapping[str, Any]) -> bool:
-        """Go on with other friction; return whether it is another."""
+        """Change the friction constants; return whether they differ."""
         values = {**self._values, **changes}
         before, self.constants = self.constants, PlantConstants.of(values)
         self._values = values
@@ -205,15 +158,7 @@ class PlantRun:
         return True
 
     def events(self) -> list[Event]:
-        """
-        Hand over the events since the last call.
-
-        Returns
-        -------
-        list of Event
-            Called after a sample: those that count from this sample on.
-
-        """
+        """Return and clear the events since the last call."""
         events, self._events = self._events, []
         return events
 
@@ -221,30 +166,15 @@ class PlantRun:
 
     def take(self, stamp: int, command: Command | None = None) -> list[Measurement]:
         """
-        Take a sample.
+        Take a sample with a stamp [ns] and return its measurements, `joint_states` last.
 
-        Parameters
-        ----------
-        stamp : int
-            Its time [ns].
-        command : Command, optional
-            What acted since the sample before, if that is known; otherwise the command held.
-
-        Returns
-        -------
-        list of Measurement
-            What the plant publishes, `joint_states` last: who answers it has all the others.
-
-        Raises
-        ------
-        InsertedLengthError
-            If the needle left the tissue.
-
+        ``command`` is the command that acted since the previous sample, by default the held
+        command.
         """
         acting = self.commands.held if command is None else command
         before = self.plant.depth
         measured = self.plant.take(acting.force, acting.torque)
-        # Whole nanoseconds first: a float has too few digits for a stamp.
+        # Integer difference first: a float has too few digits for a stamp.
         if abs(stamp - self._stamp - self._period) > _ROUNDING:
             self._events.append(Event(TIME))
         self._stamp = stamp

@@ -1,4 +1,4 @@
-"""The steered plant: a needle that bends and cuts, its guide, its roll, and its sensors."""
+"""Simulated plant with a steered needle, needle guide and sensors."""
 
 from __future__ import annotations
 
@@ -31,49 +31,32 @@ from needle_ros.settings import check_constants, constant
 from needle_ros.trajectories import check_times, joint_values
 import numpy as np
 
-#: Parts of a sample interval in each of which the force of a push is constant, as in `Plant`.
+#: Parts of a sample interval with constant push force, as in `Plant`.
 _PUSHES: Final = 4
 
-#: Names of the joints beside `insertion`, in the order of the message.
+#: Names of the joints other than `insertion`, in the order of the message.
 _JOINTS: Final = tuple(joint.name for joint in STEERING_JOINTS)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GuideParameters:
-    """Limits of the robot that moves the guide of a steered needle across, tilts and turns it."""
+    """Limits of the robot that moves, tilts and rolls the needle guide."""
 
     position_limit: float = constant(
-        0.02, 'm', 'farthest position of the guide along x and along z', open_low=True
+        0.02, 'm', 'largest position of the guide along x and z, either sign', open_low=True
     )
     tilt_limit: float = constant(0.2, 'rad', 'largest tilt of the guide', open_low=True)
     roll_limit: float = constant(100.0, 'rad', 'largest roll of the needle', open_low=True)
     speed_limit: float = constant(0.02, 'm/s', 'highest speed of the guide', open_low=True)
-    tilt_speed_limit: float = constant(0.2, 'rad/s', 'fastest change of the tilt', open_low=True)
-    roll_speed_limit: float = constant(10.0, 'rad/s', 'fastest roll', open_low=True)
-    rise_time: float = constant(
-        0.1, 's', 'time in which each reaches its highest speed', open_low=True
-    )
+    tilt_speed_limit: float = constant(0.2, 'rad/s', 'highest rate of the tilt', open_low=True)
+    roll_speed_limit: float = constant(10.0, 'rad/s', 'highest rate of the roll', open_low=True)
+    rise_time: float = constant(0.1, 's', 'time to accelerate to the highest speed', open_low=True)
 
     def __post_init__(self) -> None:
         check_constants(self)
 
     def motion(self, joint: str, gain: float) -> BaseMotion:
-        """
-        Return what follows the trajectory of a joint.
-
-        Parameters
-        ----------
-        joint : str
-            One of `STEERING_JOINTS`.
-        gain : float
-            Rate at which a position error is closed [1/s].
-
-        Returns
-        -------
-        BaseMotion
-            At rest at zero.
-
-        """
+        """Return the motion controller of a guide joint, at rest at zero; ``gain`` is in 1/s."""
         unit = next(one.unit for one in STEERING_JOINTS if one.name == joint)
         if joint == ROLL:
             reach, speed = self.roll_limit, self.roll_speed_limit
@@ -89,25 +72,10 @@ class GuideParameters:
 
 class SteeredPlant:
     """
-    A steered needle under a commanded force, or carried by a robot, with its guide and sensors.
+    Steered needle under a commanded force or moved by a robot, with guide and sensors.
 
-    Parameters
-    ----------
-    insertion : Insertion
-        The needle in its tissue.
-    sensor : ForceSensor
-        Sensor at the needle base.
-    tip : TipSensor
-        Sensor of the tip.
-    rate : float
-        Samples per second [Hz].
-    guide : GuideParameters
-        Limits of the guide.
-    robot : BaseParameters
-        Limits of the robot along the needle.
-    base : BaseMotion, optional
-        The robot that moves the needle along its axis; without it the commanded force does.
-
+    Without a ``base`` (robot along the needle axis) the commanded force acts; ``rate`` is the
+    sample rate [Hz].
     """
 
     def __init__(
@@ -129,31 +97,31 @@ class SteeredPlant:
         )  # fmt: skip
         self._sensor, self._tip_sensor = sensor, tip
         self._motions = {name: guide.motion(name, robot.position_gain) for name in _JOINTS}
-        #: Position and speed of the joints beside the insertion.
+        #: Position and velocity of the joints other than `insertion`.
         self._at = dict.fromkeys(_JOINTS, 0.0)
         self._speed = dict.fromkeys(_JOINTS, 0.0)
-        #: Joints that have not come to rest.
+        #: Joints in motion.
         self._moving: set[str] = set()
         self._resolution = robot.encoder_resolution if base is not None else 0.0
         self._felt = np.zeros((sensor.samples, 6))
-        # Part of each sample that falls into each push, shape (pushes, samples).
+        # Fraction of each sensor sample within each push interval, shape (pushes, samples).
         begins = np.arange(sensor.samples) * (_PUSHES / sensor.samples)
         pushes, longest = np.arange(_PUSHES)[:, np.newaxis], _PUSHES / sensor.samples
         common = np.minimum(begins + longest, pushes + 1) - np.maximum(begins, pushes)
         self._shares = np.maximum(common, 0.0) / longest
         self._tip = [*insertion.needle.tip.tolist(), insertion.needle.tip_roll]
-        #: What the guide does to the needle, in the order of its joints.
+        #: Load of the guide on the needle, in the order of the guide joints.
         self._load = [0.0] * len(_JOINTS)
         self._count = 0
 
     @property
     def depth(self) -> float:
-        """Inserted length [m]."""
+        """Insertion depth [m]."""
         return self.insertion.depth
 
     @property
     def report(self) -> dict[str, object]:
-        """Where the needle is, for people."""
+        """Needle state for the diagnostics."""
         x, y, z, roll = self._tip
         return {
             'inserted length [m]': f'{y:.6f}',
@@ -173,23 +141,12 @@ class SteeredPlant:
         efforts: Sequence[Sequence[float]],
     ) -> None:
         """
-        Have guide, roll and base follow a trajectory, from now; joints that it lacks go on.
+        Follow a trajectory of guide, roll and base from now on; omitted joints continue.
 
-        Parameters
-        ----------
-        joints : sequence of str
-            Names of the joints. `insertion` is that of the base, and nothing to a needle under
-            commands: there it is the reference of a controller.
-        times : sequence of float
-            Time of each point from now [s].
-        positions, efforts : sequence of sequence of float
-            Positions [m or rad] of each point; of `insertion`, or force [N] where a push ends.
-
-        Raises
-        ------
-        ParameterError
-            If there is another joint, or one cannot follow; then none does.
-
+        ``times`` are relative to now [s], ``positions`` in m or rad, ``efforts`` of `insertion` in
+        N at the end of a push. Without a base, `insertion` is ignored: it is the reference of a
+        controller. If a joint is unknown or cannot follow, ParameterError is raised and no joint
+        moves.
         """
         known = (INSERTION, *_JOINTS)
         if not joints or not set(joints) <= {*known} or len({*joints}) < len(joints):
@@ -213,15 +170,7 @@ class SteeredPlant:
         self._moving |= {*followed}
 
     def tare(self) -> None:
-        """
-        Zero the sensor on the mean of its latest readings.
-
-        Raises
-        ------
-        JobError
-            If the needle or its guide moves, or has not rested long enough.
-
-        """
+        """Zero the sensor on the mean of its latest readings; needle and guide must rest."""
         speed = self.insertion.velocity
         if abs(speed) > AT_REST:
             raise JobError(f'the needle moves at {1e3 * speed:.3g} mm/s; it must rest')
@@ -230,41 +179,14 @@ class SteeredPlant:
         self._sensor.tare()
 
     def change(self, parameters: NeedleParameters) -> None:
-        """
-        Go on with other friction.
-
-        Parameters
-        ----------
-        parameters : NeedleParameters
-            Constants.
-
-        Raises
-        ------
-        ParameterError
-            If they do not suit the needle.
-
-        """
+        """Change the friction constants."""
         self.insertion.change(parameters)
 
     def advance(self, force: float = 0.0) -> list[float]:
         """
-        Advance by one sample interval.
+        Advance by one sample interval and return the wrench of the base sensor [N, N m], xyz each.
 
-        Parameters
-        ----------
-        force : float
-            Commanded insertion force [N]; not used when a base moves the needle.
-
-        Returns
-        -------
-        list of float
-            Reading of the base sensor: force x y z [N], torque x y z [N m].
-
-        Raises
-        ------
-        InsertedLengthError
-            If the needle left the tissue.
-
+        The commanded insertion force [N] is ignored when a base moves the needle.
         """
         across = self._move_guide() if self._moving else {}
         felt = self._felt
@@ -277,13 +199,13 @@ class SteeredPlant:
         self.time = self._count * self.interval
         x, z, about_x, about_y, about_z = self.insertion.wrench.tolist()
         felt[:, 0], felt[:, 2:] = x, (z, about_x, about_y, about_z)
-        # The slope in z turns about x, that in x about z the other way.
+        # A slope in z turns about x; a slope in x turns about z in the opposite direction.
         self._load = [x, z, -about_z, about_x, about_y]
         moving = bool(self._moving) or abs(self.insertion.velocity) > AT_REST
         return list(self._sensor.measure(felt, moving=moving).tolist())
 
     def _carry(self, base: BaseMotion, across: dict[str, Any]) -> None:
-        """Have the base move the needle along its axis, or push it."""
+        """Move the needle along its axis with the base, or push it."""
         insertion, interval = self.insertion, self.interval
         part = interval / _PUSHES
         push = base.push(self.time, self.depth, part)
@@ -303,7 +225,7 @@ class SteeredPlant:
             )
 
     def _move_guide(self) -> dict[str, Any]:
-        """Move guide, tilt and roll on by an interval; return where they are then."""
+        """Advance guide, tilt and roll by one interval and return their positions."""
         at, speeds = self._at, self._speed
         for name in sorted(self._moving):
             motion, before = self._motions[name], speeds[name]
@@ -317,23 +239,9 @@ class SteeredPlant:
 
     def take(self, force: float, _torque: float) -> list[Measurement]:
         """
-        Advance by one sample interval, and say what is published of it.
+        Advance by one sample interval and return the measurements, `joint_states` last.
 
-        Parameters
-        ----------
-        force, _torque : float
-            What acts [N, N m]; a torque does nothing, the guide holds the needle.
-
-        Returns
-        -------
-        list of Measurement
-            Of each topic, `joint_states` last.
-
-        Raises
-        ------
-        InsertedLengthError
-            If the needle left the tissue.
-
+        The torque has no effect, because the guide holds the needle.
         """
         wrench = self.advance(force)
         needle, before = self.insertion.needle, self._tip
@@ -348,7 +256,7 @@ class SteeredPlant:
         outside = needle.needle.length - depth
         truth = [outside, x, z, tip[3], -speed, rates[0], rates[2], rates[3]]
         if self.base is None:
-            # Insertion makes d smaller; nothing commands the others.
+            # Insertion decreases d; the other coordinates have no command.
             truth += [-force, 0.0, 0.0, 0.0]
         measured.append((GROUND_TRUTH.name, 0, truth))
         joints = [
@@ -360,19 +268,11 @@ class SteeredPlant:
         return measured
 
     def outline(self) -> Outline:
-        """
-        Return the needle as people see it.
-
-        Returns
-        -------
-        Outline
-            From the base through the guide to the tip, and the path that it cut.
-
-        """
+        """Return needle (base, guide, tip) and path for display."""
         needle = self.insertion.needle
         shape, path = needle.shape, needle.path
         points = np.insert(shape.deflections, 1, shape.depths, axis=1)
-        # Behind the guide the needle is straight, as the guide holds it.
+        # Behind the guide the needle is straight, with the slope at the guide.
         rest = max(0.0, needle.needle.length - needle.depth - needle.steering.free_length)
         slope = np.array([shape.slopes[0, 0], 1.0, shape.slopes[0, 1]])
         return Outline(

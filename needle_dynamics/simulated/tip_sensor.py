@@ -1,4 +1,4 @@
-"""The sensor of the tip: a tracker or an imager, exposed, noisy, late, in a frame of its own."""
+"""Tip sensor: a tracker or imager with exposure time, noise, delay and its own frame."""
 
 from __future__ import annotations
 
@@ -14,22 +14,22 @@ import numpy as np
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TipParameters:
-    """What sees the tip: a tracker or imager, exposed all the time from one sample to the next."""
+    """Constants of a tracker or imager of the tip, exposed during the whole sample interval."""
 
-    rate: float = constant(0.0, 'Hz', 'samples per second; 0: one with every sample of the plant')
+    rate: float = constant(0.0, 'Hz', 'samples per second; 0: rate of the plant')
     noise: float = constant(1e-4, 'm', 'standard deviation of a sample')
     delay: float = constant(0.0, 's', 'time from a sample to its message', high=1.0)
     dropout: float = constant(0.0, '1', 'probability that a sample is lost', high=1.0)
     offset: tuple[float, ...] = constant(
-        (0.0, 0.0, 0.0), 'm', 'what it says of a tip at the entry point: x, y, z', low=-1.0,
+        (0.0, 0.0, 0.0), 'm', 'measurement of a tip at the entry point: x, y, z', low=-1.0,
         high=1.0,
     )  # fmt: skip
     turn: float = constant(
-        0.0, 'rad', 'angle about y by which its x and z are turned', low=-pi, high=pi
+        0.0, 'rad', 'rotation of the measured x and z about y', low=-pi, high=pi
     )
     slice: float = constant(
-        0.0, 'm', 'half the thickness of the slice y-z in which an imager sees the tip; it says '
-        'x = 0. 0: a tracker',
+        0.0, 'm', 'half the thickness of the y-z slice of an imager, which reports x = 0. '
+        '0: tracker',
     )  # fmt: skip
 
     def __post_init__(self) -> None:
@@ -40,18 +40,18 @@ class TipParameters:
 
 class TipReading(NamedTuple):
     """
-    A sample of the tip as it leaves its sensor.
+    Published sample of the tip sensor.
 
     Attributes
     ----------
     age : int
-        Samples of the plant since the end of its exposure.
+        Plant samples since the end of the exposure.
     depth : float
-        Inserted length then [m].
+        Insertion depth at that time [m].
     deflection : float
-        Mean deflection of the tip along z over the exposure, with noise [m].
+        Mean tip deflection along z over the exposure, with noise [m].
     across : float
-        The same along x.
+        Mean tip deflection along x.
 
     """
 
@@ -62,70 +62,46 @@ class TipReading(NamedTuple):
 
     @property
     def point(self) -> list[float]:
-        """Where the tip is, x, y, z [m]."""
+        """Tip position x, y, z [m]."""
         return [self.across, self.depth, self.deflection]
 
 
 class TipSensor:
     """
-    Turns mean deflections of the tip into what its sensor reports, and when.
+    Convert mean tip deflections to delayed, noisy measurements.
 
-    Parameters
-    ----------
-    parameters : TipParameters
-        Constants.
-    rate : float
-        Samples per second of the plant [Hz].
-    seed : int
-        Seed of the noise.
-    spatial : bool
-        Whether it measures all three coordinates, with noise, and averages the depth too. The
-        needle of the source bends in one plane: there it is the deflection that is measured.
-
-    Raises
-    ------
-    ParameterError
-        If the sensor is faster than the plant.
-
+    ``rate`` is the sample rate of the plant [Hz], at least the rate of the sensor. A ``spatial``
+    sensor measures all three coordinates with noise and averages the depth; otherwise only the
+    deflection in the plane of the source's needle is noisy.
     """
 
     def __init__(
         self, parameters: TipParameters, rate: float, seed: int, *, spatial: bool = False
     ) -> None:
         self._parameters, self._spatial = parameters, spatial
-        #: Samples of the plant in one of the sensor; it ends with the nearest one of the plant.
+        #: Plant samples per sensor sample; a sensor sample ends at the nearest plant sample.
         self._every = rate / parameters.rate if parameters.rate else 1.0
         if self._every < 1.0 - 1e-9:
             raise ParameterError(
                 f'tip.rate must be at most the rate of the plant {rate:g} Hz, got '
                 f'{parameters.rate:g} Hz'
             )
-        # A message leaves with the first sample of the plant that is late enough.
+        # A message is published with the first plant sample after the delay.
         self._late = ceil(parameters.delay * rate * (1.0 - 1e-9))
         self._random = np.random.default_rng([seed, 1])
         self._losses = np.random.default_rng([seed, 3])
         #: Sums over the exposure of x, depth and z.
         self._sums = [0.0, 0.0, 0.0]
-        #: Samples of the plant, and of the sensor.
+        #: Number of samples of the plant and of the sensor.
         self._count = self._taken = 0
         self._waiting: deque[tuple[int, float, float, float]] = deque()
 
     def measure(self, depth: float, deflection: float, across: float = 0.0) -> TipReading | None:
         """
-        Take in a sample of the plant.
+        Process a plant sample and return the reading to publish now, if any.
 
-        Parameters
-        ----------
-        depth : float
-            Inserted length now [m].
-        deflection, across : float
-            Mean deflection of the tip since the sample before, along z and along x [m].
-
-        Returns
-        -------
-        TipReading or None
-            What leaves the sensor now.
-
+        ``depth`` is the insertion depth [m], ``deflection`` and ``across`` the mean tip deflection
+        since the previous sample along z and x [m].
         """
         self._count += 1
         sums = self._sums
@@ -144,14 +120,14 @@ class TipSensor:
         return TipReading(age=self._count - taken, depth=y, deflection=z, across=x)
 
     def _see(self, x: float, y: float, z: float) -> None:
-        """Take a sample, in the frame of the sensor, unless it is lost."""
+        """Take a sample in the sensor frame, unless it is lost."""
         p = self._parameters
         if p.turn:
             c, s = cos(p.turn), sin(p.turn)
             x, z = c * x - s * z, s * x + c * z
         if any(p.offset):
             x, y, z = x + p.offset[0], y + p.offset[1], z + p.offset[2]
-        # What is not in the slice is not seen; that the tip is out of it is seen without noise.
+        # A tip outside the slice is not measured; this test is free of noise.
         seen = not p.slice or abs(x) <= p.slice
         if p.noise:
             z += p.noise * float(self._random.standard_normal())

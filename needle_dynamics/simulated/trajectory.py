@@ -1,4 +1,4 @@
-"""One simulated insertion under a given force."""
+"""Simulation of one insertion under a given force."""
 
 from __future__ import annotations
 
@@ -23,26 +23,26 @@ from needle_ros.errors import ParameterError, ShapeError
 import numpy as np
 from numpy.typing import ArrayLike
 
-#: Error of a run that nobody asked to be better, as in `Trajectory.error`.
+#: Default tolerance of a run, as in `Trajectory.error`.
 DEFAULT_TOLERANCE: Final = 1e-3
 
-#: Samples of a run of which nobody said how many.
+#: Default number of samples of a run.
 DEFAULT_SAMPLES: Final = 2000
 
-#: Most intervals of a run: more would not fit into memory.
+#: Largest number of intervals of a run, limited by memory.
 _MOST_INTERVALS: Final = 100_000_000
 
-#: A way counts as no shorter than this part of the needle.
+#: Least travel for relative errors, as a fraction of the needle length.
 _SHORTEST_WAY: Final = 1e-4
 
-#: Halvings of the steps without a smaller error, after which rounding is all that is left.
+#: Number of step halvings without a smaller error after which rounding dominates.
 _TRIES: Final = 3
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Trajectory:
     """
-    A simulated run, sampled evenly, that can be evaluated at any time.
+    A simulated run, sampled evenly, with dense output.
 
     Attributes
     ----------
@@ -55,13 +55,13 @@ class Trajectory:
     forces : ndarray, shape (k,)
         Force over each interval [N].
     steps : ndarray, shape (k,)
-        Longest step of the integrator in each interval, or the shortest, if they are not even [s].
+        Longest step of the integrator in each interval, or shortest if the steps vary [s].
     graded : bool
         As in `Integrator`.
     error : float
-        By how much the samples differ from those of a run whose steps are twice as long: in the
-        deflection of the tip, as a part of its largest, or in the inserted length, as a part of
-        the way, whichever is more. NaN if the step was given: nothing was compared then.
+        Difference of the samples from a run with steps twice as long: the larger of the tip
+        deflection error relative to its largest value and the depth error relative to the travel.
+        NaN if the step was given, since there is no comparison.
 
     """
 
@@ -82,7 +82,7 @@ class Trajectory:
 
     @property
     def depth(self) -> FloatArray:
-        """Inserted length at the samples [m], shape (k + 1,)."""
+        """Insertion depth at the samples [m], shape (k + 1,)."""
         return np.asarray(self.parameters.length - self.states[:, 0])
 
     @property
@@ -92,12 +92,12 @@ class Trajectory:
 
     @property
     def tip_deflection(self) -> FloatArray:
-        """Deflection of the tip at the samples [m], shape (k + 1,)."""
+        """Tip deflection at the samples [m], shape (k + 1,)."""
         return NeedleModel(self.parameters).tip_deflections(self.states)
 
     def at(self, time: float) -> FloatArray:
         """
-        State at any time of the run, by integrating on from the sample before (dense output).
+        Return the state at any time, integrated from the previous sample (dense output).
 
         Parameters
         ----------
@@ -141,12 +141,12 @@ def simulate(
     graded: bool = False,
 ) -> Trajectory:
     """
-    Simulate the needle under a force that is constant over each interval.
+    Simulate the needle under a piecewise constant force.
 
-    Steps are short where the needle vibrates fast and much. They are halved until the samples no
-    longer depend on them: the deflection of the tip changes by no more than ``tolerance`` of its
-    largest, and the inserted length by no more than ``tolerance`` of the way. The better of the
-    last two runs is returned; at second order its error is a third of that change.
+    Steps are short where the needle vibrates fast and strongly. They are halved until the samples
+    have converged: the tip deflection changes by no more than ``tolerance`` of its largest value,
+    and the insertion depth by no more than ``tolerance`` of the travel. The finer of the last two
+    runs is returned; at second order its error is a third of the change.
 
     Parameters
     ----------
@@ -155,17 +155,17 @@ def simulate(
     state : array_like, shape (2 (2 + n),)
         Initial state, see `NeedleModel.state_at`.
     force : float or callable
-        Insertion force [N], or a function of time [s] read at the start of each interval.
+        Insertion force [N], or a function of time [s] evaluated at the start of each interval.
     duration : float
         Time to simulate [s].
     interval : float, optional
-        Time between samples [s]; by default there are 2000 of them. A force that is a function
-        of time needs it.
+        Time between samples [s]; by default 2000 samples. Required if the force is a function of
+        time.
     tolerance : float, optional
         Largest `Trajectory.error`, by default 1e-3.
     step : float, optional
-        Longest step of the integrator [s], in the place of a tolerance: with it one run is made,
-        as `Integrator` and `simulate_batch` make it.
+        Longest step of the integrator [s], instead of a tolerance: a single run, as in
+        `Integrator` and `simulate_batch`.
     graded : bool
         As in `Integrator`, with ``step``.
 
@@ -200,7 +200,7 @@ def simulate(
     if tolerance is not None and step is not None:
         raise ParameterError('tolerance and step exclude each other')
     if graded and step is None:
-        raise ParameterError('graded is for a given step')
+        raise ParameterError('graded requires a step')
     tolerance = DEFAULT_TOLERANCE if tolerance is None else tolerance
     if not 0.0 < tolerance < inf:
         raise ParameterError(f'tolerance must be positive and finite, got {tolerance!r}')
@@ -237,7 +237,7 @@ def _refined(
     interval: float,
     tolerance: float,
 ) -> Trajectory:
-    """Halve the steps until the samples no longer depend on them."""
+    """Halve the steps until the samples have converged."""
     states, steps = np.empty((len(time), start.size)), np.empty(len(forces))
     before: tuple[int, FloatArray] | None = None
     finer, best, tries, error = 1, inf, 0, inf
@@ -262,7 +262,7 @@ def _refined(
 
 
 def _difference(model: NeedleModel, one: FloatArray, two: FloatArray) -> float:
-    """Return how far the samples of two runs differ, see `Trajectory.error`."""
+    """Return the difference of the samples of two runs, see `Trajectory.error`."""
     tips, others = model.tip_deflections(two), model.tip_deflections(one)
     ways, peak = np.abs(two[:, 0] - two[0, 0]), float(np.abs(tips).max())
     way = max(float(ways.max()), _SHORTEST_WAY * model.parameters.length)
@@ -271,27 +271,7 @@ def _difference(model: NeedleModel, one: FloatArray, two: FloatArray) -> float:
 
 
 def floats(name: str, values: object) -> FloatArray:
-    """
-    Return values as an array of floats, a copy.
-
-    Parameters
-    ----------
-    name : str
-        Name for the message.
-    values : object
-        Numbers.
-
-    Returns
-    -------
-    ndarray
-        The numbers.
-
-    Raises
-    ------
-    ShapeError
-        If they are not an array of numbers.
-
-    """
+    """Return a copy of the values as an array of floats; ``name`` is for the error message."""
     try:
         return np.array(values, dtype=float)
     except (TypeError, ValueError):
@@ -299,25 +279,7 @@ def floats(name: str, values: object) -> FloatArray:
 
 
 def count_of(duration: float, interval: float) -> int:
-    """
-    Return how many intervals a duration has.
-
-    Parameters
-    ----------
-    duration, interval : float
-        Times [s].
-
-    Returns
-    -------
-    int
-        Number of intervals.
-
-    Raises
-    ------
-    ParameterError
-        If it is not a whole number that fits into memory.
-
-    """
+    """Return the number of intervals in a duration [s], which must be a whole number."""
     if not 0.0 < interval <= duration < inf:
         raise ParameterError(
             f'interval and duration must be positive and finite with interval <= duration, got '
@@ -329,7 +291,7 @@ def count_of(duration: float, interval: float) -> int:
             f'{interval!r} s'
         )
     count = round(duration / interval)
-    # Rounding of the quotient.
+    # Tolerance for rounding of the quotient.
     if abs(count * interval - duration) > 1e-9 * duration:
         raise ParameterError(
             f'duration must be a whole number of intervals, got {duration!r} s and {interval!r} s'

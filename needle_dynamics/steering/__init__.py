@@ -1,1 +1,1 @@
-"""A needle that cuts its own path: its constants, its motion, many of them, and other models."""
+"""Steered needles: constants, motion, batches and reference models."""

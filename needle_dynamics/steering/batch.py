@@ -1,4 +1,4 @@
-"""Many needles that cut their paths at once, on all cores."""
+"""Parallel simulation of many steered needles on all cores."""
 
 from __future__ import annotations
 
@@ -29,35 +29,35 @@ def insert_batch(
     workers: int | None = None,
 ) -> FloatArray:
     """
-    Insert many needles at once; the result does not depend on the number of workers.
+    Insert many needles in parallel; the result does not depend on the number of workers.
 
     Parameters
     ----------
     needles : NeedleParameters or sequence of them
         Needle and tissue, for all runs or for each.
     steering : SteeringParameters or sequence of them
-        What they have beyond; all with the same length of noise.
+        Additional constants of a steered needle; the correlation length must be the same for all.
     depths : array_like, shape (k,) or (runs, k)
-        Depths of the tip [m]. Guide and roll change evenly between them.
+        Depths of the tip [m]. Guide and roll change linearly between depths.
     guides, tilts : array_like, shape (), (k, 2) or (runs, k, 2)
-        Position [m] and tilt of the guide in x and z; the first ones are those at which the tip
-        touches the skin.
+        Position [m] and tilt of the guide in x and z; the first values apply when the tip touches
+        the skin.
     rolls : array_like, shape (), (k,) or (runs, k)
         Roll of the base [rad].
     seeds : sequence of int
-        Seed of the noise of the path, for all runs or for each.
+        Seed of the path noise, for all runs or for each.
     workers : int, optional
-        Threads; one per core if not given.
+        Threads; one per core by default.
 
     Returns
     -------
     ndarray, shape (runs, k, 3)
-        Where the tips are, in x, y and z [m].
+        Tip positions in x, y and z [m].
 
     Raises
     ------
     ShapeError
-        If the numbers of runs or of poses do not agree.
+        If the numbers of runs or poses are inconsistent.
     ParameterError
         If a value is not valid.
 
@@ -100,7 +100,7 @@ def insert_batch(
     deep, reach = poses[:, :, 0].max(axis=1), values[:, 5] - values[:, 6]
     if (poses[:, :, 0] < 0.0).any() or (deep > reach).any():
         raise ParameterError(
-            f'depths must be in [0, {reach.min():g}] m, the length of the needle without its free '
+            f'depths must be in [0, {reach.min():g}] m, the length of the needle minus its free '
             f'length, got up to {deep.max():g} m'
         )
     layers = np.full((len(pairs), 3, max(len(n.starts) for n in constants)), np.inf)
@@ -127,7 +127,7 @@ def insert_batch(
 
 
 def _poses(depths: ArrayLike, guides: ArrayLike, tilts: ArrayLike, rolls: ArrayLike) -> FloatArray:
-    """Return the numbers of the poses, shape (runs or 1, k, 6)."""
+    """Return the poses as an array, shape (runs or 1, k, 6)."""
     depth, roll = floats('depths', depths), floats('rolls', rolls)
     guide, tilt = floats('guides', guides), floats('tilts', tilts)
     if depth.ndim not in (1, 2) or 0 in depth.shape:

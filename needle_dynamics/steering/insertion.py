@@ -1,4 +1,4 @@
-"""A needle that is pushed or carried into tissue along its axis, and bends across it."""
+"""Insertion of a steered needle: dynamics along the axis, quasi-static lateral bending."""
 
 from __future__ import annotations
 
@@ -19,32 +19,10 @@ DEFAULT_AXIS_STEP = 1e-4
 
 
 def axis_of(needle: NeedleParameters, steering: SteeringParameters) -> Axis:
-    """
-    Return the constants along the insertion axis.
-
-    Parameters
-    ----------
-    needle : NeedleParameters
-        Needle and tissue.
-    steering : SteeringParameters
-        What it has beyond.
-
-    Returns
-    -------
-    Axis
-        The constants.
-
-    Raises
-    ------
-    ParameterError
-        If the friction law is not Coulomb's, the hub does not stop, or there is not one value
-        for each layer.
-
-    """
+    """Return the constants along the insertion axis."""
     if needle.friction_law != 'coulomb':
         raise ParameterError(
-            f'friction_law must be coulomb for a needle that is steered, got '
-            f'{needle.friction_law!r}'
+            f'friction_law must be coulomb for a steered needle, got {needle.friction_law!r}'
         )
     if not needle.hub_stop:
         raise ParameterError(
@@ -75,34 +53,34 @@ def axis_of(needle: NeedleParameters, steering: SteeringParameters) -> Axis:
 
 class Insertion:
     """
-    A steered needle in time: dynamic along its axis, quasi-static across.
+    Time simulation of a steered needle: axial dynamics and quasi-static lateral bending.
 
-    Along the axis it has its mass, friction that may grow with the inserted length, and at the tip
-    the force that cuts and membranes that resist until they are punctured. Across it is a
-    `SteeredNeedle`: mass and damping do not act there, since at the speeds of an insertion what
-    they do is over in a few tens of milliseconds.
+    The axial dynamics include mass, friction that may grow with the inserted length, and at the
+    tip the cutting force and membranes that resist until they are punctured. The lateral motion is
+    a `SteeredNeedle`: lateral mass and damping are neglected, because their transients decay
+    within a few tens of milliseconds at the speeds of an insertion.
 
     Parameters
     ----------
     needle : NeedleParameters
-        Needle and tissue; Coulomb's friction, and no swelling.
+        Needle and tissue; Coulomb friction, no swelling.
     steering : SteeringParameters, optional
-        What it has beyond.
+        Additional constants of a steered needle.
     depth : float
-        Depth to which it has been inserted, straight [m]. Membranes above are punctured.
+        Initial insertion depth, straight [m]. Membranes above it are punctured.
     step : float
         Longest step along the axis [s].
     seed : int
-        Seed of the noise of the path.
+        Seed of the path noise.
 
     Attributes
     ----------
     needle : SteeredNeedle
-        The needle across.
+        Lateral model of the needle.
     axis : Axis
         Constants along the axis.
     time : float
-        Time [s], 0 at first.
+        Time [s], initially 0.
 
     Raises
     ------
@@ -150,22 +128,22 @@ class Insertion:
 
     @property
     def velocity(self) -> float:
-        """Insertion velocity against the guide [m/s]."""
+        """Insertion velocity relative to the guide [m/s]."""
         return float(self._state[SPEED] + self._drift)
 
     @property
     def punctured(self) -> tuple[bool, ...]:
-        """Which membranes are punctured, by depth."""
+        """Whether each membrane is punctured, by depth."""
         return tuple(bool(one) for one in self._punctured)
 
     def change(self, needle: NeedleParameters) -> None:
         """
-        Go on with other constants along the axis, such as friction.
+        Change the constants along the axis, such as friction.
 
         Parameters
         ----------
         needle : NeedleParameters
-            Needle and tissue; across, the needle stays what it was.
+            Needle and tissue; the lateral model is not changed.
 
         Raises
         ------
@@ -196,11 +174,11 @@ class Insertion:
         force : float
             Insertion force [N], positive into the tissue.
         speed_limit : float
-            Highest speed of what pushes [m/s]; where the needle would go faster, it is carried
-            with that speed.
+            Speed limit of the pushing device [m/s]; a needle that would move faster is carried at
+            this speed.
         guide, tilt, roll, tissue : optional
-            Where these are at the end, as in `SteeredNeedle.move`. The tissue moves evenly, guide
-            and roll evenly with the depth.
+            Values at the end, as in `SteeredNeedle.move`. The tissue moves linearly in time, guide
+            and roll linearly with the depth.
 
         Returns
         -------
@@ -242,7 +220,7 @@ class Insertion:
         tissue: Sequence[float] | None = None,
     ) -> float:
         """
-        Advance with the base brought evenly to a velocity, whatever force that takes.
+        Advance with a linear change of the base velocity, without a force limit.
 
         Parameters
         ----------
@@ -251,7 +229,7 @@ class Insertion:
         velocity : float
             Insertion velocity at the end [m/s].
         felt : ndarray, shape (parts,), optional
-            Overwritten with the mean force over each of the equal parts of the time [N].
+            Overwritten with the mean force over each of the equal parts of the duration [N].
         guide, tilt, roll, tissue : optional
             As in `push`.
 
@@ -265,7 +243,7 @@ class Insertion:
         ParameterError
             If a value is not valid.
         InsertedLengthError
-            If the needle left the tissue, or its hub reached the guide.
+            If the needle left the tissue or the hub reached the guide.
 
         """
         self._check(duration, 'velocity', velocity)
@@ -284,7 +262,7 @@ class Insertion:
         velocity: float,
         felt: FloatArray,
     ) -> float:
-        """Carry the axis on; return the time that is left when the needle left the tissue."""
+        """Carry the axis; return the remaining time when the needle left the tissue [s]."""
         speed = float(velocity) - self._drift
         return float(
             carry_on(self.axis, state, punctured, speed, float(duration), self._step, felt)
@@ -297,7 +275,7 @@ class Insertion:
             raise ParameterError(f'{name} must be finite, got {value!r}')
 
     def _drift_to(self, duration: float, shift: FloatArray) -> None:
-        """Have the tissue move evenly to where it is wanted: the axis is in its frame."""
+        """Move the tissue linearly to its new position: the axis is in the tissue frame."""
         drift = float(shift[1] - self._tissue[1]) / duration
         self._state[SPEED] += self._drift - drift
         self._drift = drift
@@ -324,14 +302,14 @@ class Insertion:
     @property
     def wrench(self) -> FloatArray:
         """
-        What the base does to the needle across: force x, z [N] and torque x, y, z [N m].
+        Lateral wrench of the base: force x, z [N] and torque x, y, z [N m]; shape (5,).
 
-        Shape (5,). The torque about y is what its windup takes, by the stiffness of a needle that
-        is held where the friction of its inserted length acts in the mean.
+        The torque about y is the windup torque, with the stiffness of a needle that is held at the
+        mean position of the friction of its inserted part.
         """
         across = self.needle
         (force_x, force_z), (moment_x, moment_z) = across.guide_load
         shaft = across.needle.length - 0.5 * across.depth
         twist = (across.roll - across.tip_roll) * across.steering.torsional_stiffness / shaft
-        # The slope in z turns about x; that in x turns about z the other way.
+        # A slope in z turns about x; a slope in x turns about z in the opposite direction.
         return np.array([-force_x, -force_z, -moment_z, twist, moment_x])

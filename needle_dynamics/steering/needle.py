@@ -1,4 +1,4 @@
-"""A needle that cuts its path, moved by its guide, its roll and its depth."""
+"""Needle that cuts its path, moved by guide, roll and insertion depth."""
 
 from __future__ import annotations
 
@@ -39,13 +39,13 @@ from needle_ros.errors import ParameterError, ShapeError
 import numpy as np
 from numpy.typing import ArrayLike
 
-#: Nodes per element of the needle: a path that begins anew takes one more.
+#: Nodes per element of the needle: a restarted path uses an additional node.
 _SPARE: Final = 2
 
 
 class NeedleShape(NamedTuple):
     """
-    The needle from the guide to the tip.
+    Shape of the needle from the guide to the tip.
 
     Attributes
     ----------
@@ -54,7 +54,7 @@ class NeedleShape(NamedTuple):
     deflections : ndarray, shape (k, 2)
         Deflections in x and z [m].
     slopes : ndarray, shape (k, 2)
-        Their derivatives by y.
+        Derivatives of the deflections in y.
 
     """
 
@@ -65,14 +65,14 @@ class NeedleShape(NamedTuple):
 
 class NeedlePath(NamedTuple):
     """
-    The path that the tip cut.
+    Path cut by the tip.
 
     Attributes
     ----------
     depths : ndarray, shape (k,)
         Distance y from the entry point [m].
     deflections : ndarray, shape (k, 2)
-        Where the path is in x and z [m].
+        Path position in x and z [m].
 
     """
 
@@ -84,28 +84,9 @@ def steered(
     needle: NeedleParameters, steering: SteeringParameters, wander: FloatArray | None = None
 ) -> Steered:
     """
-    Return the constants as compiled functions take them.
+    Return the constants in the layout of the compiled functions.
 
-    Parameters
-    ----------
-    needle : NeedleParameters
-        Needle and tissue.
-    steering : SteeringParameters
-        What it has beyond.
-    wander : ndarray, shape (cells, 2), optional
-        Lateral loads on the tip by depth [N], see `wandering`.
-
-    Returns
-    -------
-    Steered
-        The constants.
-
-    Raises
-    ------
-    ParameterError
-        If there is not one load of the bevel for each layer, the needle is too short, or the
-        tissue swells.
-
+    ``wander`` (cells, 2) are the lateral noise loads on the tip by depth [N], see `wandering`.
     """
     tissue = needle.tissue
     if steering.free_length >= needle.length:
@@ -113,9 +94,7 @@ def steered(
             f'free_length must be < length = {needle.length:g} m, got {steering.free_length:g} m'
         )
     if needle.swelling != 0.0:
-        raise ParameterError(
-            f'swelling must be 0 for a needle that is steered, got {needle.swelling:g}'
-        )
+        raise ParameterError(f'swelling must be 0 for a steered needle, got {needle.swelling:g}')
     return Steered(
         ei=needle.bending_stiffness,
         element=longest_element(needle, steering),
@@ -133,31 +112,11 @@ def steered(
 
 def wandering(needle: NeedleParameters, steering: SteeringParameters, seed: int) -> FloatArray:
     """
-    Draw the loads on the tip that make its path leave the one that the model expects.
+    Draw the lateral tip loads in x and z [N] of the path noise, shape (cells, 2).
 
-    A load F turns the path of a long needle by F lambda / (E I) per length. Loads that forget
-    themselves over the length of the noise thus turn it at random, and the variance of its
-    direction grows with its length.
-
-    Parameters
-    ----------
-    needle : NeedleParameters
-        Needle and tissue.
-    steering : SteeringParameters
-        With the noise of the path.
-    seed : int
-        Seed.
-
-    Returns
-    -------
-    ndarray, shape (cells, 2)
-        Loads in x and z by depth, `noise_cell` apart [N]; none without noise.
-
-    Raises
-    ------
-    ParameterError
-        If the seed is not an integer from 0 on.
-
+    The loads are `noise_cell` apart in depth; none without noise. A load F turns the path
+    of a long needle by F lambda / (E I) per length. Loads correlated over the length of the noise
+    thus turn the path at random, and the variance of its direction grows with its length.
     """
     if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
         raise ParameterError(f'seed must be an integer >= 0, got {seed!r}')
@@ -177,24 +136,7 @@ def wandering(needle: NeedleParameters, steering: SteeringParameters, seed: int)
 
 
 def empty_cut(length: float, element: float, layers: int) -> Cut:
-    """
-    Return room for the state of a needle.
-
-    Parameters
-    ----------
-    length : float
-        Length of the needle [m].
-    element : float
-        Longest element [m].
-    layers : int
-        Number of layers of the tissue.
-
-    Returns
-    -------
-    Cut
-        Zeros; ``start`` fills it.
-
-    """
+    """Allocate the state of a needle (lengths in m); ``start`` initializes it."""
     rows = _SPARE * (ceil(length / element) + layers) + 3
     springs = Springs(
         np.zeros(rows),
@@ -217,26 +159,26 @@ def empty_cut(length: float, element: float, layers: int) -> Cut:
 
 class SteeredNeedle:
     """
-    A needle between a guide and its tip, quasi-static across, that cuts its own path.
+    Needle between guide and tip that cuts its path; lateral bending is quasi-static.
 
-    The beam in each plane minimizes its energy: bending, the tissue about the path, the skin, and
-    the lateral load of the bevel. While the tip goes deeper than ever before it cuts: the path
-    then ends where the tip is. Out, and in again, the needle follows that path.
+    The beam in each plane minimizes its energy: bending, tissue around the path, skin, and the
+    lateral load of the bevel. While the tip moves beyond its greatest depth it cuts, and
+    the path ends at the tip. On withdrawal and reinsertion the needle follows this path.
 
     Parameters
     ----------
     needle : NeedleParameters
         Needle and tissue.
     steering : SteeringParameters, optional
-        What it has beyond.
+        Additional constants of a steered needle.
     guide : sequence of float
         Position of the guide in x and z when the tip touches the skin [m].
     tilt : sequence of float
-        Tilt of the guide, the slope of the needle there, in x and z.
+        Tilt of the guide (slope of the needle at the guide) in x and z.
     roll : float
         Roll of the needle, right-handed about y [rad]; at 0 the bevel pushes the tip along z.
     seed : int
-        Seed of the noise of the path.
+        Seed of the path noise.
 
     Raises
     ------
@@ -252,7 +194,7 @@ class SteeredNeedle:
     >>> print(f'{1e3 * needle.tip[2]:.2f} mm')
     5.93 mm
 
-    The guide moves the tip the other way at this depth:
+    At this depth the tip moves opposite to the guide:
 
     >>> print(f'{needle.authority[0, 0]:.2f}')
     -0.26
@@ -303,10 +245,10 @@ class SteeredNeedle:
         tissue: ArrayLike | None = None,
     ) -> None:
         """
-        Bring the needle to another pose; what is not given stays.
+        Move the needle to a new pose; omitted values are kept.
 
-        Guide and roll change evenly with the depth. To move the guide first and go in then, call
-        this twice.
+        Guide and roll change linearly with the depth. To move the guide before the insertion, call
+        this method twice.
 
         Parameters
         ----------
@@ -317,13 +259,13 @@ class SteeredNeedle:
         roll : float, optional
             Roll of the base [rad].
         tissue : array_like, optional
-            How far the tissue has moved in x, y and z [m], with its path; it moves before the
-            needle does.
+            Displacement of the tissue with its path in x, y and z [m]; it precedes the needle
+            motion.
 
         Raises
         ------
         ParameterError
-            If a value is not finite, or the needle does not reach so deep.
+            If a value is not finite, or the depth is out of range.
 
         """
         to = self.depth if depth is None else _finite('depth', depth)
@@ -332,7 +274,7 @@ class SteeredNeedle:
         if not shift[1] <= to <= reach:
             raise ParameterError(
                 f'depth must be in [{shift[1]:g}, {reach:g}] m, the length of the needle '
-                f'without its free length, got {to!r} m'
+                f'minus its free length, got {to!r} m'
             )
         self.bring(to, shift, given)
 
@@ -343,14 +285,14 @@ class SteeredNeedle:
         given: tuple[tuple[float, float], tuple[float, float], float],
     ) -> None:
         """
-        Bring the needle to a pose that is valid.
+        Move the needle to a valid pose.
 
         Parameters
         ----------
         depth : float
-            Depth s of the tip [m], within its reach.
+            Depth s of the tip [m], within the reach of the needle.
         shift, given
-            As `checked` returns them.
+            Return values of `checked`.
 
         """
         if shift is not self._shift and (shift != self._shift).any():
@@ -371,7 +313,7 @@ class SteeredNeedle:
         tissue: ArrayLike | None,
     ) -> tuple[FloatArray, tuple[tuple[float, float], tuple[float, float], float]]:
         """
-        Check what `move` takes beside the depth.
+        Check the arguments of `move` except the depth.
 
         Parameters
         ----------
@@ -381,9 +323,9 @@ class SteeredNeedle:
         Returns
         -------
         shift : ndarray, shape (3,)
-            How far the tissue has moved [m].
+            Displacement of the tissue [m].
         given : tuple
-            Guide, tilt and roll; the present ones where they are not given.
+            Guide, tilt and roll; present values where omitted.
 
         Raises
         ------
@@ -407,12 +349,12 @@ class SteeredNeedle:
 
     @property
     def deepest(self) -> float:
-        """Greatest depth so far, where the path ends [m]."""
+        """Greatest depth reached, at the end of the path [m]."""
         return float(self._cut.pose[DEEPEST] + self._shift[1])
 
     @property
     def tip(self) -> FloatArray:
-        """Where the tip is, in x, y and z [m]; shape (3,)."""
+        """Tip position in x, y and z [m]; shape (3,)."""
         (x, _), (z, _) = self._cut.tip
         return np.array([x + self._shift[0], self.depth, z + self._shift[2]])
 
@@ -433,7 +375,7 @@ class SteeredNeedle:
 
     @property
     def tip_roll(self) -> float:
-        """Roll of the tip, behind that of the base by its windup [rad]."""
+        """Roll of the tip, which lags the roll of the base by the windup [rad]."""
         return float(self._cut.pose[TIP_ROLL])
 
     @property
@@ -443,20 +385,20 @@ class SteeredNeedle:
 
     @property
     def compliance(self) -> FloatArray:
-        """Deflection [m] and slope of the tip per lateral force [N] and moment [N m] there."""
+        """Tip deflection [m] and slope per lateral force [N] and moment [N m]; shape (2, 2)."""
         c00, c01, c11 = place(self._constants, self._cut)
         return np.array([[c00, c01], [c01, c11]])
 
     @property
     def authority(self) -> FloatArray:
-        """Deflection [m] and slope of the resting tip per position [m] and tilt of the guide."""
+        """Deflection [m] and slope of the resting tip per guide position [m] and tilt; (2, 2)."""
         found = np.empty((2, 2))
         respond(self._constants, self._cut, found)
         return found
 
     @property
     def path(self) -> NeedlePath:
-        """The path that the tip cut, at its nodes and at its end."""
+        """Path cut by the tip, at its nodes and its end."""
         c = self._cut
         s, last = c.springs, int(c.counts[LAST])
         depths, values = s.depths[: last + 1], s.path[: last + 1, :, 0]
@@ -474,7 +416,7 @@ class SteeredNeedle:
 
     @property
     def shape(self) -> NeedleShape:
-        """The needle from the guide to the tip, at its nodes."""
+        """Shape of the needle from the guide to the tip, at its nodes."""
         c = self._cut
         last, found, _ = self._solve()
         whole = np.concatenate([c.guide[:, np.newaxis], found, c.tip[:, np.newaxis]], axis=1)
@@ -484,7 +426,7 @@ class SteeredNeedle:
 
     @property
     def guide_load(self) -> FloatArray:
-        """What the guide feels of the needle in x and z: forces [N], moments [N m]; (2, 2)."""
+        """Reaction of the needle on the guide in x and z: forces [N], moments [N m]; (2, 2)."""
         return self._solve()[2].T
 
 

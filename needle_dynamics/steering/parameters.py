@@ -1,4 +1,4 @@
-"""Constants of a needle that cuts its path, beyond those of the needle and the tissue."""
+"""Constants of a steered needle in addition to the needle and tissue constants."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from needle_ros.errors import ParameterError
 from needle_ros.settings import check_constants, constant
 import numpy as np
 
-#: Bending over torsional stiffness of a round needle of steel: E I / (G J) = 1 + nu.
+#: Ratio of bending to torsional stiffness of a round steel needle: E I / (G J) = 1 + nu.
 _STEEL: Final = 1.3
 
-#: Longest element over the bending length: the series of an element have ended there.
+#: Longest element over the bending length; the element series converges up to this value.
 _LONGEST: Final = 1.0
 
-#: Loads of the noise of the path per length over which it forgets itself.
+#: Loads of the path noise per correlation length.
 _CELLS: Final = 5
 
-#: Constants of `NeedleParameters` that a steered needle has; the others are of the paper's model.
+#: Constants of `NeedleParameters` used by a steered needle; the others belong to the paper model.
 NEEDLE_CONSTANTS: Final = (
     'length', 'density', 'area', 'youngs_modulus', 'area_moment', 'carriage_mass',
     'tissue_stiffness', 'layer_depths', 'layer_stiffnesses', 'coulomb_friction',
@@ -33,9 +33,9 @@ NEEDLE_CONSTANTS: Final = (
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SteeringParameters:
     """
-    What a needle that cuts its path has beyond `NeedleParameters`, SI units.
+    Constants of a needle that cuts its path, in addition to `NeedleParameters`, SI units.
 
-    A tuple has one value for each layer of the tissue, or a single one for all.
+    A tuple has one value for each tissue layer, or a single value for all layers.
 
     Raises
     ------
@@ -47,16 +47,16 @@ class SteeringParameters:
     free_length: float = constant(0.02, 'm', 'length L0 of the needle between guide and skin')
     skin_stiffness: float = constant(0.0, 'N/m', 'lateral stiffness k_skin of the skin')
     bevel_load: tuple[float, ...] = constant(
-        (0.0,), 'N', 'lateral load F_b of the bevel while it cuts, of each layer; 0 for a trocar'
+        (0.0,), 'N', 'lateral load F_b of the bevel during cutting, by layer; 0 for a trocar'
     )
     cutting_force: tuple[float, ...] = constant(
-        (0.0,), 'N', 'axial force on the tip that cuts, in each layer'
+        (0.0,), 'N', 'axial cutting force on the tip, by layer'
     )
     coulomb_per_length: tuple[float, ...] = constant(
-        (0.0,), 'N/m', 'Coulomb friction per inserted length, in each layer'
+        (0.0,), 'N/m', 'Coulomb friction per inserted length, by layer'
     )
     viscous_per_length: tuple[float, ...] = constant(
-        (0.0,), 'N s/m^2', 'viscous friction per inserted length, in each layer'
+        (0.0,), 'N s/m^2', 'viscous friction per inserted length, by layer'
     )
     membrane_depths: tuple[float, ...] = constant((), 'm', 'depths of membranes')
     membrane_strengths: tuple[float, ...] = constant(
@@ -66,10 +66,10 @@ class SteeringParameters:
         1e3, 'N/m', 'axial stiffness of a membrane until it is punctured', open_low=True
     )
     path_noise: float = constant(
-        0.0, 'rad^2/m', 'variance of the direction of the path that grows per length'
+        0.0, 'rad^2/m', 'growth of the variance of the path direction per length'
     )
     path_noise_length: float = constant(
-        5e-3, 'm', 'length over which that noise forgets itself', open_low=True
+        5e-3, 'm', 'correlation length of the path noise', open_low=True
     )
     torsional_friction: float = constant(
         0.0, 'N', 'friction torque on the shaft per inserted length'
@@ -93,7 +93,7 @@ class SteeringParameters:
 
 def bending_length(stiffness: float, tissue: float) -> float:
     """
-    Return the length over which a needle bends in tissue, lambda = (4 E I / k)^(1/4).
+    Return the bending length of a needle in tissue, lambda = (4 E I / k)^(1/4).
 
     Parameters
     ----------
@@ -105,48 +105,23 @@ def bending_length(stiffness: float, tissue: float) -> float:
     Returns
     -------
     float
-        The length [m].
+        Bending length [m].
 
     """
     return float((4.0 * stiffness / tissue) ** 0.25)
 
 
 def tissue_of(stiffness: float, length: float) -> float:
-    """
-    Return the stiffness of tissue in which a needle has a bending length.
-
-    Parameters
-    ----------
-    stiffness : float
-        Bending stiffness E I [N m^2].
-    length : float
-        Bending length lambda [m].
-
-    Returns
-    -------
-    float
-        Stiffness k per length [N/m^2].
-
-    """
+    """Return the tissue stiffness k [N/m^2] for a stiffness E I [N m^2] and bending length [m]."""
     return 4.0 * stiffness / length**4
 
 
 def turning_load(stiffness: float, tissue: float) -> float:
     """
-    Return the lateral load on the tip that turns the path of a long needle with 1/m.
+    Return the lateral tip load E I / lambda [N] for a path curvature of 1/m; 0 without tissue.
 
-    Parameters
-    ----------
-    stiffness : float
-        Bending stiffness E I [N m^2].
-    tissue : float
-        Stiffness k of the tissue per length [N/m^2].
-
-    Returns
-    -------
-    float
-        The load E I / lambda [N]; none where there is no tissue to turn in.
-
+    ``stiffness`` is the bending stiffness E I [N m^2], ``tissue`` the stiffness per length
+    [N/m^2].
     """
     return stiffness / bending_length(stiffness, tissue) if tissue > 0.0 else 0.0
 
@@ -154,26 +129,7 @@ def turning_load(stiffness: float, tissue: float) -> float:
 def with_lengths(
     needle: NeedleParameters, steering: SteeringParameters, length: float, skin: float = 1.0
 ) -> tuple[NeedleParameters, SteeringParameters]:
-    """
-    Return a needle that bends over other lengths, all layers alike.
-
-    Parameters
-    ----------
-    needle : NeedleParameters
-        Needle and tissue.
-    steering : SteeringParameters
-        What they have beyond.
-    length : float
-        Bending length over the present one.
-    skin : float
-        Stiffness of the skin over that of the tissue, over the present one.
-
-    Returns
-    -------
-    NeedleParameters, SteeringParameters
-        The needle in other tissue.
-
-    """
+    """Scale the bending length in all layers, and the ratio of skin to tissue stiffness."""
     stiffer = length**-4.0
     return (
         replace(
@@ -186,29 +142,7 @@ def with_lengths(
 
 
 def by_layer(name: str, values: tuple[float, ...], layers: int) -> FloatArray:
-    """
-    Return one value for each layer.
-
-    Parameters
-    ----------
-    name : str
-        Name of the constant, for the message.
-    values : tuple of float
-        One value for all, or one for each.
-    layers : int
-        Number of layers.
-
-    Returns
-    -------
-    ndarray, shape (layers,)
-        The values.
-
-    Raises
-    ------
-    ParameterError
-        If there are other numbers of them.
-
-    """
+    """Return a constant as one value per layer, shape (layers,); errors contain ``name``."""
     if len(values) not in (1, layers):
         raise ParameterError(
             f'{name} must have one value, or one for each of the {layers} layers of the tissue, '
@@ -219,21 +153,9 @@ def by_layer(name: str, values: tuple[float, ...], layers: int) -> FloatArray:
 
 def longest_element(needle: NeedleParameters, steering: SteeringParameters) -> float:
     """
-    Return the length of the elements.
+    Return the element length [m].
 
-    Parameters
-    ----------
-    needle : NeedleParameters
-        Needle and tissue.
-    steering : SteeringParameters
-        What is wanted.
-
-    Returns
-    -------
-    float
-        That wanted, or a shorter one [m]: at most the bending length in the stiffest layer, and
-        the distance between the loads of the noise.
-
+    It is at most the bending length in the stiffest layer and the distance of the noise loads.
     """
     longest = steering.element
     stiffest = max(needle.tissue.stiffnesses)
@@ -243,35 +165,22 @@ def longest_element(needle: NeedleParameters, steering: SteeringParameters) -> f
 
 
 def noise_cell(steering: SteeringParameters) -> float:
-    """
-    Return the distance between the lateral loads that stand for the noise of the path.
-
-    Parameters
-    ----------
-    steering : SteeringParameters
-        With that noise.
-
-    Returns
-    -------
-    float
-        The distance [m].
-
-    """
+    """Return the distance between the lateral loads of the path noise [m]."""
     return steering.path_noise_length / _CELLS
 
 
 class SteeringPreset(NamedTuple):
     """
-    A needle in tissue, and where its constants come from.
+    Constants of a needle in tissue, with their source.
 
     Attributes
     ----------
     needle : NeedleParameters
         Needle and tissue.
     steering : SteeringParameters
-        What it has beyond.
+        Additional constants of a steered needle.
     source : str
-        Where the constants come from.
+        Source of the constants.
 
     """
 
@@ -281,7 +190,7 @@ class SteeringPreset(NamedTuple):
 
 
 def _tube(outer: float, inner: float, modulus: float, tissue: float) -> NeedleParameters:
-    """Return a round needle of an outer and an inner diameter [m]."""
+    """Return a round needle with outer and inner diameter [m]."""
     return replace(
         PRESETS['phantom'],
         youngs_modulus=modulus,
@@ -305,12 +214,12 @@ def _phantom(length: float) -> SteeringPreset:
     return SteeringPreset(
         replace(needle, tissue_stiffness=tissue),
         SteeringParameters(free_length=0.04),
-        f"the paper's needle where it bends over {1e3 * length:g} mm, as stock needles do in "
+        f"the paper's needle with a bending length of {1e3 * length:g} mm, as stock needles in "
         'phantoms and in tissue ex vivo',
     )
 
 
-#: Needles in tissue by name. What a source does not give is that of the paper's needle.
+#: Needles in tissue by name. Constants missing in a source are taken from the paper's needle.
 STEERING_PRESETS: Final[Mapping[str, SteeringPreset]] = {
     'paper': SteeringPreset(
         PRESETS['phantom'], SteeringParameters(), 'Boroomand et al. 2014, Table 3'
@@ -325,7 +234,7 @@ STEERING_PRESETS: Final[Mapping[str, SteeringPreset]] = {
     'hollow_1.05mm': _literature(1.05e-3, 0.838e-3, 200e9, 2e4, 'ustk, needle of 19 gauge'),
 }
 
-#: Needles and tissues of all presets by name.
+#: Needle and tissue constants of all presets by name.
 NEEDLES: Final[Mapping[str, NeedleParameters]] = {
     **PRESETS,
     **{name: preset.needle for name, preset in STEERING_PRESETS.items()},

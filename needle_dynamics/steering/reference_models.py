@@ -1,10 +1,10 @@
-r"""
-Models of others beside `SteeredNeedle`: what they say about the tip, and what they leave out.
+"""
+Steering models from the literature, for comparison with `SteeredNeedle`.
 
-`unicycle` and `bicycle` of [Webster2006]_ know no tissue and no guide: the tip goes where it
-points and turns by its bevel. `intrinsic_curvature` of [Lezcano2020]_ is the shape of a needle at
-one depth, without the way there. `springs` of [Glozman2007]_ knows guide and tissue, but its
-tissue pulls the needle to the axis instead of the path that was cut.
+`unicycle` and `bicycle` of [Webster2006]_ have neither tissue nor guide: the tip moves along its
+axis and turns with its bevel. `intrinsic_curvature` of [Lezcano2020]_ is the shape of a needle at
+one depth, without insertion history. `springs` of [Glozman2007]_ includes guide and tissue, but
+the tissue pulls the needle to the axis instead of the cut path.
 
 References
 ----------
@@ -14,7 +14,6 @@ References
    needles for insertions into multi-layer tissue", IEEE Sensors, 2020.
 .. [Glozman2007] D. Glozman, M. Shoham, "Image-guided robotic flexible needle steering", IEEE
    Transactions on Robotics 23, 2007.
-
 """
 
 from __future__ import annotations
@@ -33,57 +32,23 @@ from numpy.typing import ArrayLike
 
 def unicycle(lengths: ArrayLike, rolls: ArrayLike, curvature: float) -> FloatArray:
     """
-    Tip of a needle that follows arcs of one curvature in the direction of its bevel.
+    Compute the tip path of a needle that follows arcs of constant curvature.
 
-    Parameters
-    ----------
-    lengths : array_like, shape (k,)
-        Inserted lengths, increasing from the first [m].
-    rolls : array_like, shape () or (k,)
-        Roll over the way to each of them, right-handed about y [rad]; at 0 the needle bends to z.
-    curvature : float
-        Curvature of the arcs [1/m].
-
-    Returns
-    -------
-    ndarray, shape (k, 3)
-        Where the tip is, in x, y and z [m]; it starts at zero, along y.
-
-    Raises
-    ------
-    ShapeError, ParameterError
-        If the lengths do not increase, or there is not one roll for each.
-
+    ``lengths`` (k,) are increasing insertion depths [m], ``rolls`` () or (k,) the roll over the
+    segment up to each depth, right-handed about y [rad]; at 0 the needle bends towards z. Returns
+    tip positions x, y, z [m], shape (k, 3), from zero along y.
     """
     return bicycle(lengths, rolls, curvature, 0.0)
 
 
 def bicycle(lengths: ArrayLike, rolls: ArrayLike, curvature: float, lead: float) -> FloatArray:
     """
-    Tip of a needle whose rear wheel follows arcs, with the tip ahead of it.
+    Compute the tip path of a bicycle model, with the tip ahead of a rear wheel that follows arcs.
 
-    Parameters
-    ----------
-    lengths : array_like, shape (k,)
-        Ways of the rear wheel, increasing from the first [m].
-    rolls : array_like, shape () or (k,)
-        As in `unicycle`.
-    curvature : float
-        Curvature of its arcs [1/m]: tan(phi) / l1 for a front wheel turned by phi at a distance
-        l1, see `bicycle_curvature`.
-    lead : float
-        Distance l2 of the tip from the rear wheel [m].
-
-    Returns
-    -------
-    ndarray, shape (k, 3)
-        Where the tip is, in x, y and z [m]; it starts at zero, with the needle along y.
-
-    Raises
-    ------
-    ShapeError, ParameterError
-        As `unicycle`.
-
+    ``lengths`` (k,) are the path lengths of the rear wheel [m], ``rolls`` as in `unicycle`. The
+    curvature of the arcs is tan(phi) / l1 for a front wheel at angle phi and wheelbase l1, see
+    `bicycle_curvature`; ``lead`` is the distance l2 of the tip from the rear wheel [m]. Returns
+    tip positions x, y, z [m], shape (k, 3), from zero with the needle along y.
     """
     ways = np.atleast_1d(np.array(lengths, dtype=np.float64))
     turns = np.array(rolls, dtype=np.float64)
@@ -98,7 +63,7 @@ def bicycle(lengths: ArrayLike, rolls: ArrayLike, curvature: float, lead: float)
     place, frame = np.array([0.0, -lead, 0.0]), np.eye(3)
     found = np.empty((len(ways), 3))
     for k, (step, roll) in enumerate(zip(steps, np.broadcast_to(turns, ways.shape), strict=True)):
-        # Along the frame's y, bending to the side that the roll has turned from z towards x.
+        # Along y of the frame, bending to the side that the roll turns from z towards x.
         side = np.array([np.sin(roll), 0.0, np.cos(roll)])
         angle = curvature * step
         ahead = step * np.sinc(angle / np.pi)
@@ -110,55 +75,23 @@ def bicycle(lengths: ArrayLike, rolls: ArrayLike, curvature: float, lead: float)
 
 
 def _turn(ahead: FloatArray, side: FloatArray, angle: float) -> FloatArray:
-    """Return the rotation by an angle that takes one direction towards another."""
+    """Return the rotation by an angle from one unit vector towards another."""
     both = np.outer(side, ahead) - np.outer(ahead, side)
     within = np.outer(ahead, ahead) + np.outer(side, side)
     return np.asarray(np.eye(3) + np.sin(angle) * both + (np.cos(angle) - 1.0) * within)
 
 
 def bicycle_curvature(wheelbase: float, angle: float) -> float:
-    """
-    Return the curvature of the way of the rear wheel of a bicycle.
-
-    Parameters
-    ----------
-    wheelbase : float
-        Distance l1 of the wheels [m].
-    angle : float
-        Angle phi of the front wheel [rad].
-
-    Returns
-    -------
-    float
-        Curvature [1/m].
-
-    """
+    """Return the path curvature [1/m] for a wheelbase l1 [m] and a front angle phi [rad]."""
     return tan(angle) / wheelbase
 
 
 def intrinsic_curvature(depth: float, curvature: float, at: ArrayLike = inf) -> FloatArray:
     """
-    Shape of a needle whose curvature falls with the square of the distance to the tip.
+    Evaluate the deflection [m] of a needle with kappa(y) = kappa_c (1 - y / L)^2.
 
-    Parameters
-    ----------
-    depth : float
-        Inserted length L [m].
-    curvature : float
-        Intrinsic curvature kappa_c at the entry [1/m]: kappa(y) = kappa_c (1 - y / L)^2.
-    at : array_like
-        Where to evaluate [m], in [0, L]; the tip if not given.
-
-    Returns
-    -------
-    ndarray
-        Deflection [m] for each, kappa_c L^2 / 4 at the tip.
-
-    Raises
-    ------
-    ParameterError
-        If the depth is not positive and finite.
-
+    ``depth`` is the insertion depth L [m], ``curvature`` the intrinsic curvature kappa_c at the
+    entry [1/m], ``at`` the position y [m], by default the tip, where it is kappa_c L^2 / 4.
     """
     if not 0.0 < depth < inf:
         raise ParameterError(f'depth must be positive and finite, got {depth!r} m')
@@ -171,31 +104,12 @@ def springs(
     needle: NeedleParameters, steering: SteeringParameters, depth: float
 ) -> tuple[FloatArray, FloatArray]:
     """
-    Tip of a needle on springs that pull it to the axis.
+    Return tip response and tip compliance of a needle on springs that pull it to the axis.
 
-    Parameters
-    ----------
-    needle : NeedleParameters
-        Needle and tissue.
-    steering : SteeringParameters
-        Its free length, skin and element.
-    depth : float
-        Depth of the tip [m].
-
-    Returns
-    -------
-    response : ndarray, shape (2, 2)
-        Deflection [m] and slope of the tip per position [m] and tilt of the guide.
-    compliance : ndarray, shape (2, 2)
-        Deflection and slope of the tip per lateral force [N] and moment [N m] there.
-
-    Raises
-    ------
-    ParameterError
-        If the needle does not reach so deep.
-
+    The response (2, 2) is deflection [m] and slope of the tip per guide position [m] and tilt, the
+    compliance (2, 2) per lateral force [N] and moment [N m] at the tip, at a tip depth [m].
     """
     one = SteeredNeedle(needle, replace(steering, bevel_load=(0.0,), path_noise=0.0))
-    # A straight path is the axis, whatever cut it.
+    # A straight path coincides with the axis.
     one.move(depth=depth)
     return one.authority, one.compliance

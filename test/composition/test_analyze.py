@@ -121,8 +121,8 @@ def test_map_is_written_as_csv_and_png(
 @pytest.mark.parametrize(
     ('words', 'complaint'),
     [
-        (('--depth', '0.3'), 'inserted length 0.3 m is outside'),
-        (('--depth', '0'), 'inserted length 0 m is outside'),
+        (('--depth', '0.3'), 'insertion depth 0.3 m is outside'),
+        (('--depth', '0'), 'insertion depth 0 m is outside'),
         (('--depth', 'nan'), 'must be finite'),
         (('--tip-deflection', 'inf'), 'must be finite'),
         (('--speed', 'nan'), 'must be finite'),

@@ -55,10 +55,10 @@ def test_json_contains_the_summary(capsys: pytest.CaptureFixture[str]) -> None:
 @pytest.mark.parametrize(
     ('words', 'complaint'),
     [
-        (['--set', 'modes=7'], '7 modes cannot be told apart'),
+        (['--set', 'modes=7'], '7 modes cannot be distinguished'),
         (['--set', 'mass=1'], "unknown parameter 'mass'"),
         (['--set', 'modes'], '--set takes NAME=VALUE'),
-        (['--depth', '0.3'], 'inserted length 0.3 m is outside'),
+        (['--depth', '0.3'], 'insertion depth 0.3 m is outside'),
         (['--interval', '0'], 'interval and duration must be positive'),
         (['-o', 'run.xlsx'], 'output must be .csv, .png or a folder'),
         (['--tolerance', '-1'], 'tolerance must be positive'),

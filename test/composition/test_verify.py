@@ -594,7 +594,7 @@ def test_differences_within_the_tolerance_are_accepted(tmp_path: Path) -> None:
             {},
             'holds no measurements; record /base_wrench, /ground_truth, /joint_states',
         ),
-        (bool, {'depth': 5.0}, 'the parameters of /plant: inserted length'),
+        (bool, {'depth': 5.0}, 'the parameters of /plant: insertion depth'),
         (bool, {'mode': 'indenter'}, 'holds no measurements'),
     ],
     ids=['parameters', 'measurements', 'value', 'mode'],

@@ -1,4 +1,4 @@
-"""What `simulate` says of its error holds, over depths, forces, modes, tissues and frictions."""
+"""Error estimate of `simulate` over depths, forces, modes, tissues and friction laws."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ preset = NeedleParameters.preset
 LAYERS = {'layer_depths': (0.03, 0.06), 'layer_stiffnesses': (2000.0, 100.0)}
 STRIBECK = {'friction_law': 'stribeck', 'breakaway_friction': 1.5, 'stribeck_speed': 0.5}
 
-#: Preset and changes, inserted length and deflection at the start [m], force [N], duration and
+#: Preset and changes, initial insertion depth and deflection [m], force [N], duration and
 #: interval [s].
 CASES: dict[str, tuple[str, dict[str, Any], float, float, float, float, float | None]] = {
     'phantom': ('phantom', {}, 0.02, 5e-4, 3.0, 1.0, None),
@@ -71,33 +71,33 @@ def go(name: str, **options: Any) -> Trajectory:
 
 
 def apart(one: Trajectory, exact: Trajectory) -> float:
-    """Return how far a run is from another one: of the peak of the tip, and of the way."""
+    """Return the relative difference of two runs, in peak tip deflection and in travel."""
     tips, depths = exact.tip_deflection, exact.depth
-    # The floor of the way is that of `Trajectory.error`.
+    # Least travel as in `Trajectory.error`.
     way = max(np.abs(depths - depths[0]).max(), 1e-4 * exact.parameters.length)
     tip = np.abs(one.tip_deflection - tips).max() / np.abs(tips).max()
     return float(max(tip, np.abs(one.depth - depths).max() / way))
 
 
 @pytest.mark.parametrize('name', CASES)
-def test_the_default_is_as_good_as_it_says(name: str) -> None:
+def test_default_run_meets_its_error_estimate(name: str) -> None:
     """
-    The error is below the tolerance, and below what the run says of itself.
+    The true error is below the tolerance and below the estimate of the run.
 
-    It is found by even steps of an eighth of the shortest step, which have a 64th of its error or
-    less: they are also that short where the run's are long.
+    The reference has even steps of an eighth of the shortest step, with at most a 64th of the
+    error: these steps are short everywhere.
     """
     run = go(name)
     assert 0.0 < run.error <= DEFAULT_TOLERANCE
     fine = go(name, step=float(run.steps.min()) / 8.0)
     assert np.isnan(fine.error)
-    # At second order a third of what it says; measured 0.02 to 0.34 of it, and 0.75 where few
-    # samples see the vibration.
+    # At second order a third of the estimate; measured 0.02 to 0.34 of it, and 0.75 where few
+    # samples resolve the vibration.
     assert apart(run, fine) < run.error
 
 
 @pytest.mark.parametrize('name', ['phantom', 'paper_si, layers', 'phantom, sampled often'])
-def test_a_smaller_tolerance_is_met_too(name: str) -> None:
+def test_smaller_tolerances_are_met(name: str) -> None:
     fine = go(name, tolerance=1e-8)
     assert fine.error <= 1e-8
     for tolerance in (1e-2, 1e-4, 1e-6):
@@ -106,26 +106,25 @@ def test_a_smaller_tolerance_is_met_too(name: str) -> None:
         assert apart(run, fine) < run.error + 1e-8
 
 
-def test_a_first_call_takes_few_steps() -> None:
-    """On the default preset, less than one in 30 us: at 0.3 us each, 100 times real time."""
+def test_default_run_needs_few_steps() -> None:
+    """Default preset: fewer than one step per 30 us, 100 times real time at 0.3 us per step."""
     for name in ('phantom', 'phantom, 10 cm', 'phantom, 15 N', 'phantom, withdrawn'):
         run = go(name)
         interval = run.time[1]
-        # Each run before takes half as many as the one after it.
+        # Each previous run takes half as many steps as the next.
         assert 2.0 * (interval / run.steps).sum() < run.time[-1] / 30e-6
         assert len(run.time) == DEFAULT_SAMPLES + 1
 
 
 def test_steps_become_longer_as_the_vibration_fades() -> None:
-    """With the root of its amplitude, down to two in an interval."""
+    """Step length follows the root of the amplitude, with at least two steps per interval."""
     run = go('phantom', tolerance=1e-2)
     early, late = run.steps[run.time[:-1] < 1e-3], run.steps[run.time[:-1] > 0.5]
     assert late.min() >= 20.0 * early.min()
     assert np.isclose(late, 0.5 * run.time[1]).all()
 
 
-def test_dense_output_goes_on_with_the_steps_of_the_run() -> None:
-    """Between samples it is as near to a finer run as the samples are."""
+def test_dense_output_has_the_accuracy_of_the_samples() -> None:
     run = go('paper_si')
     fine = go('paper_si', step=float(run.steps.min()) / 8.0)
     model = NeedleModel(run.parameters)
@@ -135,8 +134,7 @@ def test_dense_output_goes_on_with_the_steps_of_the_run() -> None:
         assert abs(tips[0] - tips[1]) < run.error * peak
 
 
-def test_a_given_step_is_taken_as_it_is() -> None:
-    """Bit for bit as the integrator does, also graded."""
+def test_given_step_matches_the_integrator_bit_for_bit() -> None:
     for graded in (False, True):
         run = go('phantom, 10 cm', step=2e-5, graded=graded)
         it = Integrator(run.parameters, run.states[0], 2e-5, graded=graded)
@@ -147,15 +145,15 @@ def test_a_given_step_is_taken_as_it_is() -> None:
             assert np.array_equal(it.state, run.states[k + 1])
 
 
-def test_a_tolerance_below_rounding_is_refused() -> None:
-    """Saying what can be had."""
+def test_tolerance_below_rounding_is_rejected() -> None:
+    """The error message contains the best reachable tolerance."""
     p = preset('paper_si')
     start = NeedleModel(p).state_at(0.05, 1e-3)
     with pytest.raises(ToleranceError, match=r'tolerance 1e-15 cannot be met .*; the best is'):
         simulate(p, start, 3.0, duration=1e-3, interval=1e-3, tolerance=1e-15)
 
 
-def test_a_needle_that_leaves_its_range_says_so_as_the_integrator_does() -> None:
+def test_leaving_the_depth_range_raises_the_error_of_the_integrator() -> None:
     p = preset('paper_si')
     start = NeedleModel(p).state_at(0.004, 1e-5)
     for step in (None, 1e-5):
@@ -168,11 +166,11 @@ def test_a_needle_that_leaves_its_range_says_so_as_the_integrator_does() -> None
     [
         ({'tolerance': 1e-3, 'step': 1e-5}, 'tolerance and step exclude each other'),
         ({'tolerance': 0.0}, 'tolerance must be positive and finite'),
-        ({'graded': True}, 'graded is for a given step'),
+        ({'graded': True}, 'graded requires a step'),
         ({'force': lambda _: 3.0}, 'interval must be given with a force that is a function'),
     ],
 )
-def test_what_contradicts_itself_is_refused(options: dict[str, Any], complaint: str) -> None:
+def test_contradictory_options_are_rejected(options: dict[str, Any], complaint: str) -> None:
     p = preset('phantom')
     words = {'force': 3.0, 'duration': 0.1, **options}
     with pytest.raises(ParameterError, match=complaint):

@@ -1,4 +1,4 @@
-"""Linearization (19), and what the inputs steer and the output shows."""
+"""Linearization (19), controllability and observability."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from scipy.integrate import solve_ivp
 
 preset = NeedleParameters.preset
 
-#: Least depth at which n modes are told apart.
+#: Least depth at which n modes are distinguishable.
 LEAST_DEPTH = {1: 0.001, 2: 0.001, 3: 0.03, 4: 0.05}
 
 LAYERS: dict[str, Any] = {
@@ -61,7 +61,7 @@ def at_point(of: NeedleModel, *point: float, sliding: str | None = None) -> Line
 
 
 def random_state(of: NeedleModel, rng: np.random.Generator) -> FloatArray:
-    """Draw a state in which every term counts: millimeters of each mode, and their rates."""
+    """Draw a state in which all terms contribute: millimeters of each mode, and rates."""
     low = max(0.01, 1.5 * of.parameters.minimum_depth)
     at = at_point(of, rng.uniform(low, 0.19), 0.0, 0.01)
     state = at.transform @ (0.01 * rng.normal(size=2 * of.coordinates))
@@ -72,7 +72,7 @@ def random_state(of: NeedleModel, rng: np.random.Generator) -> FloatArray:
 def field(
     of: NeedleModel, x: NDArray[Any], force: complex, torque: complex, time: float
 ) -> NDArray[Any]:
-    """Evaluate (18) from the text book: modes as in (11), integrals by quadrature, complex."""
+    """Evaluate (18) with the modes (11) and quadrature, for complex arguments."""
     p, n = of.parameters, of.parameters.modes
     depth, modal, d_rate, rate = p.length - x[0], x[2 : 2 + n], x[2 + n], x[4 + n :]
     k, root = of.modes.wavenumbers, 1.0 / np.sqrt(p.length)
@@ -131,7 +131,7 @@ def field(
 @pytest.mark.parametrize('modes', [1, 2, 3, 4])
 @pytest.mark.parametrize('friction', FRICTIONS, ids=['coulomb', 'stribeck', 'tanh'])
 @pytest.mark.parametrize('layers', [{}, LAYERS], ids=['uniform', 'layers'])
-def test_jacobians_are_those_of_the_complex_step(
+def test_jacobians_match_complex_step_derivatives(
     formulation: str, modes: int, friction: dict[str, Any], layers: dict[str, Any]
 ) -> None:
     """A and B equal complex-step derivatives of the equations by quadrature, at random states."""
@@ -147,14 +147,14 @@ def test_jacobians_are_those_of_the_complex_step(
             a[:, j] = field(of, x + 1j * tiny * axis, force, torque, time).imag / tiny
         b[:, 0] = field(of, x + 0j, force + 1j * tiny, torque, time).imag / tiny
         b[:, 1] = field(of, x + 0j, force, torque + 1j * tiny, time).imag / tiny
-        # Complex steps do not truncate. Both sides divide by G; in natural units rounding
-        # comes back times cond(G), of the largest entry.
+        # Complex steps have no truncation error. Both sides divide by G; in natural units rounding
+        # errors are amplified by cond(G), relative to the largest entry.
         rounding = 1e-14 * max(of.modes.condition(of.parameters.length - x[0]), 1e3)
         back = np.linalg.inv(found.transform)
         error = np.abs(back @ (a - found.A) @ found.transform).max()
         assert error < rounding * np.abs(back @ found.A @ found.transform).max()
         assert_allclose(found.B, b, rtol=1e-14, atol=0.0)
-        # The drift is the field itself.
+        # The drift is the vector field.
         exact = back @ field(of, x + 0j, force, torque, time).real
         assert_allclose(back @ found.drift, exact, atol=rounding * np.abs(exact).max(), rtol=0.0)
         assert np.all(found.D == 0.0)
@@ -162,8 +162,8 @@ def test_jacobians_are_those_of_the_complex_step(
 
 @pytest.mark.parametrize('formulation', ['complete', 'as_printed'])
 @pytest.mark.parametrize('modes', [1, 2, 3, 4])
-def test_jacobians_are_those_of_the_model(formulation: str, modes: int) -> None:
-    """A, B, C equal central differences of the model's own right-hand side and output."""
+def test_jacobians_match_finite_differences_of_the_model(formulation: str, modes: int) -> None:
+    """A, B, C equal central differences of the right-hand side and output of the model."""
     of = many(modes, formulation=formulation, **LAYERS)
     rng = np.random.default_rng(10 + modes)
     for _ in range(5):
@@ -171,7 +171,7 @@ def test_jacobians_are_those_of_the_model(formulation: str, modes: int) -> None:
         found = linearize(of, x, 1.0, 1e-6, 0.5)
         back = np.linalg.inv(found.transform)
         step = 1e-5
-        # Truncation, 1e-10 times up to (k s)^3 < 1e3; rounding of the field at states of 1e-2,
+        # Truncation: 1e-10 times up to (k s)^3 < 1e3. Rounding of the field for states of 1e-2:
         # 1e-2 eps cond(G), over the step.
         tolerance = 1e-6 + 1e-13 * of.modes.condition(of.parameters.length - x[0])
         for way in found.transform.T:
@@ -184,12 +184,12 @@ def test_jacobians_are_those_of_the_model(formulation: str, modes: int) -> None:
             size = np.abs(found.C @ found.transform).max()
             assert_allclose(rise / (2.0 * step), found.C[0] @ way, atol=1e-8 * size, rtol=0.0)
         push = of.derivative(x, 2.0, 1e-6, 0.5) - of.derivative(x, 1.0, 1e-6, 0.5)
-        # The field is linear in the force: rounding of the difference only.
+        # The field is linear in the force: only rounding of the difference.
         assert_allclose(push[of.coordinates], found.B[of.coordinates, 0], rtol=1e-9)
 
 
-def test_the_border_of_two_layers_counts_to_the_lower_one() -> None:
-    """At a border A is the limit from below, as k(s) of the model is."""
+def test_layer_boundary_belongs_to_the_deeper_layer() -> None:
+    """At a boundary A is the limit from the deeper side, like k(s) of the model."""
     of = many(**LAYERS)
     exact, below, above = (
         at_point(of, 0.11 + shift, 5e-4, 0.01).A for shift in (0.0, 1e-9, -1e-9)
@@ -200,8 +200,8 @@ def test_the_border_of_two_layers_counts_to_the_lower_one() -> None:
     assert np.any(np.abs(above - exact).max(axis=1) > 1e-3 * size)
 
 
-def test_friction_at_rest_has_a_derivative_only_where_it_says_so() -> None:
-    """A stuck needle is refused; a branch, a force beyond friction or a smooth law are not."""
+def test_friction_derivative_at_rest_requires_a_sliding_direction() -> None:
+    """A stuck needle is rejected unless a branch, a larger force or a smooth law is given."""
     of = model(friction_law='stribeck', breakaway_friction=2.0, withdrawal_friction=0.5)
     rest = of.state_at(0.1)
     with pytest.raises(StuckError, match=r'-0\.56 to 1\.12 N.*insertion or withdrawal'):
@@ -212,13 +212,13 @@ def test_friction_at_rest_has_a_derivative_only_where_it_says_so() -> None:
         found = linearize(of, rest, 0.1, sliding=branch)
         assert_allclose(found.A[m, m], -factor * viscous / mass, rtol=1e-14)
         assert_allclose(found.drift[m], (held - 0.1) / mass, rtol=1e-14)
-    # Beyond friction the needle goes where the force pulls, whatever branch is asked for.
+    # Beyond friction the needle moves in the direction of the force, for any branch.
     for force, factor in ((1.2, 1.0), (-0.6, 0.5)):
         for sliding in (None, 'insertion', 'withdrawal'):
             found = linearize(of, rest, force, sliding=sliding)
             assert_allclose(found.A[m, m], -factor * viscous / mass, rtol=1e-14)
             assert_allclose(found.drift, of.derivative(rest, force), rtol=1e-12)
-    # A smooth law, and none, have a derivative at rest.
+    # A smooth law and zero friction have a derivative at rest.
     smooth = linearize(model(friction_law='tanh'), rest)
     assert_allclose(smooth.A[m, m], -(0.56 / 1e-4 + viscous) / mass, rtol=1e-14)
     assert linearize(model(coulomb_friction=0.0), rest).A[m, m] < 0.0
@@ -226,8 +226,8 @@ def test_friction_at_rest_has_a_derivative_only_where_it_says_so() -> None:
         linearize(model(friction_law='tanh', withdrawal_friction=2.0), rest)
 
 
-def test_text_book_systems() -> None:
-    """Rank, lost states and distances of systems known by hand."""
+def test_textbook_systems() -> None:
+    """Rank, lost states and distances of systems with known analytic results."""
     names = ('x1', 'x2', 'x3')
     diagonal = np.diag([1.0, 2.0, 3.0])
     found = controllability(diagonal, [[1.0], [0.0], [1.0]], names)
@@ -239,13 +239,13 @@ def test_text_book_systems() -> None:
     companion = [[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [-6.0, -11.0, -6.0]]
     assert controllability(companion, [[0.0], [0.0], [1.0]], names).loss == 'none'
 
-    # Two equal eigenvalues need two inputs: x1 - x2 stays what it was.
+    # Two equal eigenvalues need two inputs: x1 - x2 is constant.
     twins = controllability(np.eye(2), [[1.0], [1.0]], names[:2])
     assert (twins.deficiency, twins.lost) == (1, ())
     assert twins.loss == '1 combination of x1, x2'
     assert controllability(np.eye(2), np.eye(2), names[:2]).deficiency == 0
 
-    # Double integrators: a chain driven at its wrong end; one driven by a part in a thousand.
+    # Double integrators: a chain driven at the wrong end; a chain with a weak input of 1e-3.
     chain = np.array([[0.0, 1.0], [0.0, 0.0]])
     assert controllability(chain, [[1.0], [0.0]], names[:2]).lost == ('x2',)
     weak = controllability(chain, [[0.0], [1e-3]], names[:2])
@@ -257,13 +257,13 @@ def test_text_book_systems() -> None:
     idle = controllability(diagonal, np.zeros((3, 1)), names)
     assert (idle.rank, idle.lost, idle.margin, idle.weakest) == (0, names, 0.0, 'none')
 
-    # A position shows its rate, a rate does not show its position.
+    # A position output makes its rate observable, a rate output does not make the position so.
     assert observability(chain, [[1.0, 0.0]], names[:2]).deficiency == 0
     assert observability(chain, [[0.0, 1.0]], names[:2]).lost == ('x1',)
 
 
 def test_constructed_loss_is_found_in_any_basis() -> None:
-    """What is decoupled on purpose is found and named through a change of basis."""
+    """A deliberately decoupled part is found and named after a change of basis."""
     rng = np.random.default_rng(3)
     names = tuple(f'x{i}' for i in range(7))
     for kept in range(1, 7):
@@ -277,15 +277,15 @@ def test_constructed_loss_is_found_in_any_basis() -> None:
         assert found.rank == kept
         # Rounding of the eigenvalues.
         assert found.distance < 1e-13 < 1e-4 < found.margin
-        # PBH counts the same: the eigenvalues of the decoupled part.
+        # PBH gives the same count: the eigenvalues of the decoupled part.
         assert np.count_nonzero(found.distances < 1e-12) == 7 - kept
-        # In the turned basis itself no state is lost alone.
+        # In the transformed basis no single state is lost.
         mixed = controllability(*turned, names)
         assert (mixed.rank, mixed.lost, mixed.combined) == (kept, (), names)
 
 
 def test_observability_is_the_dual_of_controllability() -> None:
-    """(A, C) shows what (A^T, C^T) steers: the same rank, distances and margin."""
+    """(A, C) and (A^T, C^T) have the same rank, distances and margin."""
     rng = np.random.default_rng(4)
     names = tuple('abcde')
     for rank in range(6):
@@ -295,7 +295,7 @@ def test_observability_is_the_dual_of_controllability() -> None:
         assert seen.rank == steered.rank == rank
         assert seen.lost == steered.lost == names[rank:]
         assert_allclose(np.sort(seen.distances), np.sort(steered.distances), atol=1e-13)
-        # Singular values of the pencil [A - lambda I; C] itself, at its own eigenvalues.
+        # Singular values of the pencil [A - lambda I; C] at its eigenvalues.
         for value, distance in zip(seen.eigenvalues, seen.distances, strict=True):
             pencil = np.vstack([a - value * np.eye(5), c])
             assert_allclose(np.linalg.svd(pencil)[1][-1], distance, atol=1e-13)
@@ -310,8 +310,10 @@ MODELS = [
 
 
 @pytest.mark.parametrize(('name', 'formulation'), MODELS)
-def test_straight_needle_loses_the_bending_and_hides_the_base(name: str, formulation: str) -> None:
-    """No deflection, moving: inputs miss q1, q2; the tip misses d, theta; output not steered."""
+def test_straight_needle_has_uncontrollable_bending_and_unobservable_base(
+    name: str, formulation: str
+) -> None:
+    """Uncontrollable are q1, q2 and the output; d and theta are unobservable."""
     of = model(name, formulation=formulation)
     for depth, speed in POINTS:
         found = analyze(at_point(of, depth, 0.0, speed))
@@ -321,16 +323,16 @@ def test_straight_needle_loses_the_bending_and_hides_the_base(name: str, formula
         assert found.observed.deficiency == 4
         assert not found.output_controllable
         assert found.output_gain == 0.0
-        # Rounding only, against margins of what is kept.
+        # Rounding only, compared with the margins of the remaining part.
         assert max(found.state.distance, found.observed.distance) < 1e-13
         assert min(found.state.margin, found.observed.margin) > 1e-2
 
 
 @pytest.mark.parametrize(('name', 'formulation'), MODELS)
-def test_deflected_needle_is_steered_and_hides_only_its_rotation(
+def test_deflected_needle_is_controllable_and_only_rotation_is_unobservable(
     name: str, formulation: str
 ) -> None:
-    """Half a millimeter off: all states and the output are steered; the tip misses theta."""
+    """Deflection of 0.5 mm: all states and the output are controllable; theta is unobservable."""
     of = model(name, formulation=formulation)
     for depth, speed in POINTS:
         found = analyze(at_point(of, depth, 5e-4, speed))
@@ -340,12 +342,12 @@ def test_deflected_needle_is_steered_and_hides_only_its_rotation(
         assert found.observed.deficiency == 2
         assert found.observed.margin > 1e-7
         assert found.output_controllable
-        # Little: the tip follows a move of the base by the slope of the needle, about 3 w / 2 s.
+        # Small gain: the tip follows a base motion by the slope of the needle, about 3 w / 2 s.
         assert 0.5 < found.output_gain / (5e-4 / depth) < 3.0
 
 
-def test_at_rest_the_verdicts_are_those_of_slow_motion() -> None:
-    """The branch of sliding at rest gives the ranks of a slowly moving needle."""
+def test_ranks_at_rest_equal_ranks_of_slow_motion() -> None:
+    """The sliding branch at rest gives the ranks of a slowly moving needle."""
     of = model()
     for deflection, rank, seen in ((0.0, 4, 4), (5e-4, 8, 6)):
         for sliding in ('insertion', 'withdrawal'):
@@ -354,8 +356,8 @@ def test_at_rest_the_verdicts_are_those_of_slow_motion() -> None:
 
 
 @pytest.mark.parametrize('modes', [1, 2, 3, 4])
-def test_verdicts_hold_for_any_number_of_modes(modes: int) -> None:
-    """Straight: the 2 n bending states are lost. Deflected: none; the tip misses theta alone."""
+def test_ranks_hold_for_any_number_of_modes(modes: int) -> None:
+    """Straight: the 2 n bending states are lost. Deflected: none; only theta is unobservable."""
     of = many(modes, **LAYERS)
     for depth in (0.06, 0.1, 0.2):
         straight, bent = (analyze(at_point(of, depth, w, 5e-3)) for w in (0.0, 5e-4))
@@ -366,18 +368,18 @@ def test_verdicts_hold_for_any_number_of_modes(modes: int) -> None:
         assert bent.observed.lost == ('theta', 'theta_dot')
 
 
-def test_straight_needle_stays_straight_whatever_the_inputs() -> None:
-    """Not of the linearization only: without deflection the bending has no acceleration."""
+def test_straight_needle_stays_straight_for_any_inputs() -> None:
+    """This holds for the nonlinear model: without deflection the bending has no acceleration."""
     of = model()
     for depth, speed, force in product((0.01, 0.1, 0.2), (-0.1, 0.1), (-50.0, 50.0)):
         state = operating_point(of, depth, 0.0, speed)
         assert np.all(of.acceleration(state, force, 1e-3)[2:] == 0.0)
-        # And there is no equilibrium off it: the bending is stiff in every direction.
+        # There is no bent equilibrium: the bending stiffness is positive definite.
         assert np.linalg.eigvalsh(of.stiffness_matrix(depth))[0] > 0.0
 
 
-def test_a_bending_mode_that_depth_does_not_reach_is_named() -> None:
-    """A shape in which d leaves the second normal mode alone loses it, by name: a combination."""
+def test_uncontrollable_bending_mode_is_reported() -> None:
+    """A shape in which d does not couple to the second normal mode loses it as a combination."""
     for formulation in ('complete', 'as_printed'):
         of = model(formulation=formulation)
         state = of.state_at(0.1)
@@ -398,7 +400,7 @@ def test_a_bending_mode_that_depth_does_not_reach_is_named() -> None:
 def in_other_units(
     p: NeedleParameters, length: float, mass: float, time: float
 ) -> NeedleParameters:
-    """Express constants in units of which there are so many to the meter, kilogram, second."""
+    """Convert constants to other units, given per meter, kilogram and second."""
     line = mass / (length * time**2)
     units = {
         'length': length,
@@ -417,15 +419,15 @@ def in_other_units(
 
 
 def kalman(system: LinearSystem) -> FloatArray:
-    """Return [B, AB, A^2 B, ...] as it stands."""
+    """Return [B, AB, A^2 B, ...] without scaling."""
     blocks = [system.B]
     for _ in system.names[1:]:
         blocks.append(system.A @ blocks[-1])
     return np.hstack(blocks)
 
 
-def test_results_do_not_depend_on_units_and_the_raw_rank_does() -> None:
-    """Millimeter, gram, millisecond: all figures stay, but for the rank of [B, AB, ...]."""
+def test_results_are_independent_of_units_unlike_the_raw_rank() -> None:
+    """In millimeter, gram, millisecond all results are equal, except the rank of [B, AB, ...]."""
     raw, conditions = [], []
     for units in ((1.0, 1.0, 1.0), (1e3, 1e3, 1e3), (1e2, 1.0, 1e6)):
         of = NeedleModel(in_other_units(preset('paper_si'), *units))
@@ -447,14 +449,14 @@ def test_results_do_not_depend_on_units_and_the_raw_rank_does() -> None:
         assert_allclose(figures, expected, rtol=1e-6)
         raw.append([int(np.linalg.matrix_rank(kalman(system))) for system in systems])
         conditions.append(np.linalg.cond(kalman(systems[3])))
-    # Rank 4 and 8 by turns. In SI units the numbers cannot tell; luck with the units can.
+    # Exact ranks alternate between 4 and 8. In SI units the numerical rank is wrong.
     assert not any(found == exact for found, exact in zip(raw[0], [4, 8] * 3, strict=True))
     assert conditions[0] > 1e19
     assert len({tuple(ranks) for ranks in raw}) == 3
 
 
-def test_the_raw_rank_of_one_output_never_is_two() -> None:
-    """As printed, output controllability asks a matrix of one row for rank 2."""
+def test_raw_rank_with_one_output_is_never_two() -> None:
+    """The printed criterion of output controllability requires rank 2 of a matrix with one row."""
     system = at_point(model(), 0.1, 5e-4, 5e-3)
     row = system.C @ kalman(system)
     assert row.shape == (1, 16)
@@ -462,7 +464,7 @@ def test_the_raw_rank_of_one_output_never_is_two() -> None:
     assert analyze(system).output_controllable
 
 
-def test_the_verdicts_hold_along_the_motion() -> None:
+def test_gramian_along_a_motion_has_the_rank_of_the_frozen_pair() -> None:
     """The Gramian of (19) along a real motion has the rank of the frozen pair at its start."""
     of = model()
     m, force = of.coordinates, of.parameters.coulomb_friction
@@ -484,12 +486,11 @@ def test_the_verdicts_hold_along_the_motion() -> None:
         # Half a period of the slowest mode.
         end = solve_ivp(flow, (0.0, np.pi), begin, method='LSODA', rtol=1e-8, atol=1e-12)
         sizes = np.linalg.eigvalsh(end.y[2 * m :, -1].reshape(2 * m, 2 * m))
-        # 1e-10: above the errors asked of the solver, far below what is steered.
+        # 1e-10: above the tolerance of the solver, well below the controllable directions.
         assert np.count_nonzero(sizes > 1e-10) == rank
 
 
-def test_map_is_the_analysis_at_each_of_its_points() -> None:
-    """Each entry of the map is that of the point alone, at its depth and deflection."""
+def test_map_equals_the_analysis_at_each_point() -> None:
     parameters = preset('phantom')
     depths, deflections = [0.05, 0.15], [0.0, 1e-4, 1e-3]
     found = controllability_map(parameters, depths, deflections, 5e-3)
@@ -502,17 +503,17 @@ def test_map_is_the_analysis_at_each_of_its_points() -> None:
         assert found.observed_rank[i, j] == point.observed.rank
         assert found.observed_margin[i, j] == point.observed.margin
         assert found.output_gain[i, j] == point.output_gain
-    # More deflection, more steering; the sign of the deflection does not count.
+    # The distance increases with the deflection; the sign of the deflection has no effect.
     assert np.all(np.diff(found.distance, axis=1) > 0.0)
     mirrored = controllability_map(parameters, depths, [-1e-3], 5e-3)
     assert_allclose(mirrored.distance[:, 0], found.distance[:, 2], rtol=1e-9)
 
 
 def test_distance_grows_with_the_deflection() -> None:
-    """For small deflections the distance from losing rank is in proportion to them."""
+    """For small deflections the distance to a loss of rank is proportional to the deflection."""
     of = model()
     small, large = (analyze(at_point(of, 0.1, w, 5e-3)).state.distance for w in (1e-5, 2e-5))
-    # Terms of second order are 1e-2 of the deflection over the depth.
+    # Second-order terms are 1e-2 of the ratio of deflection to depth.
     assert_allclose(large / small, 2.0, rtol=1e-3)
 
 
@@ -525,21 +526,21 @@ def test_distance_grows_with_the_deflection() -> None:
         ({'sliding': 'up'}, ParameterError, 'one of insertion, withdrawal'),
         ({'state': np.zeros(6)}, ShapeError, r'shape \(8,\), got \(6,\)'),
         ({'state': np.full(8, np.nan)}, ShapeError, 'must be finite'),
-        ({'state': np.array([0.2, *np.zeros(7)])}, InsertedLengthError, 'inserted length 0 m'),
+        ({'state': np.array([0.2, *np.zeros(7)])}, InsertedLengthError, 'insertion depth 0 m'),
     ],
 )
-def test_bad_points_are_refused(
+def test_invalid_operating_points_are_rejected(
     changes: dict[str, Any], error: type[NeedleError], complaint: str
 ) -> None:
-    """Each wrong argument is named, with what would be valid."""
+    """The message contains the wrong argument and the valid range."""
     of = model()
     arguments = {'state': operating_point(of, 0.1, 0.0, 5e-3), **changes}
     with pytest.raises(error, match=complaint):
         linearize(of, **arguments)
 
 
-def test_bad_systems_and_maps_are_refused() -> None:
-    """Shapes that do not fit and numbers that are not finite are named."""
+def test_invalid_systems_and_maps_are_rejected() -> None:
+    """The message contains wrong shapes and non-finite numbers."""
     names = ('x1', 'x2')
     with pytest.raises(ShapeError, match=r'got \(3, 3\) and \(3, 1\)'):
         controllability(np.eye(3), np.ones((3, 1)), names)

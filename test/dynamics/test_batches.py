@@ -1,4 +1,4 @@
-"""Batches: the same bits whatever the number of threads, and as one run after the other."""
+"""Batch simulation: bitwise independent of the number of threads and equal to single runs."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def batch(*arguments: Any, **options: Any) -> Batch:
 
 @pytest.mark.parametrize('n', [1, 2, 4])
 def test_bits_do_not_depend_on_the_number_of_workers(n: int) -> None:
-    """One thread, two, three or more than there are runs: the same bits."""
+    """One thread, two, three, or more than the number of runs."""
     arguments = study(n)
     first = batch(*arguments, workers=1)
     assert np.isfinite(first.states).all()
@@ -76,8 +76,7 @@ def test_bits_do_not_depend_on_the_number_of_workers(n: int) -> None:
 
 
 @pytest.mark.parametrize('n', [1, 2, 4])
-def test_a_batch_is_its_runs_one_by_one(n: int) -> None:
-    """Each run is what `simulate` gives for it, bit for bit, at every sample."""
+def test_batch_equals_single_simulations_bit_for_bit(n: int) -> None:
     constants, states, forces = study(n)
     found = batch(constants, states, forces)
     for i in range(RUNS):
@@ -99,20 +98,20 @@ def test_a_batch_is_its_runs_one_by_one(n: int) -> None:
         assert_allclose(found.completed[i], COUNT * INTERVAL, rtol=1e-15)
 
 
-def test_a_batch_is_the_integrator_stepped_through_its_intervals() -> None:
-    """The same against the integrator itself, whose clock adds up the intervals."""
+def test_batch_equals_the_integrator_over_its_intervals() -> None:
+    """The clock of the integrator is the sum of the intervals."""
     constants, states, forces = study()
     found = batch(constants, states, forces)
     for i in range(RUNS):
         it = Integrator(constants[i], states[i])
         for k in range(COUNT):
             it.advance(INTERVAL, forces[i, k])
-        # The sum of intervals differs from a multiple in the last bit, and with it the swelling.
+        # The sum of intervals differs from a multiple in the last bit, which affects the swelling.
         assert_allclose(it.state, found.states[i, -1], rtol=1e-9, atol=1e-15)
 
 
-def test_what_is_given_once_is_for_all_runs() -> None:
-    """One set of constants, one state or one force serves every run of the others."""
+def test_single_values_apply_to_all_runs() -> None:
+    """One set of constants, one state or one force is used for every run."""
     constants, states, forces = study()
     p, x = constants[0], states[0]
     assert batch(p, x, 3.0).states.shape == (1, COUNT + 1, 8)
@@ -127,8 +126,7 @@ def test_what_is_given_once_is_for_all_runs() -> None:
         assert np.array_equal(several.states[i], batch(constants[i], x, 3.0).states[0])
 
 
-def test_keep_false_gives_the_last_state_only() -> None:
-    """Memory grows with what is asked for: the end of each run, with its time."""
+def test_keep_false_returns_only_the_final_state() -> None:
     arguments = study()
     every, last = batch(*arguments), batch(*arguments, keep=False)
     assert last.states.shape == (RUNS, 1, 8)
@@ -138,10 +136,10 @@ def test_keep_false_gives_the_last_state_only() -> None:
 
 
 @pytest.mark.parametrize('workers', [1, 2])
-def test_a_run_that_leaves_its_range_is_no_number_from_there_and_harms_no_other(
+def test_run_outside_its_range_is_nan_without_effect_on_others(
     workers: int,
 ) -> None:
-    """Pulled out of the tissue, one run ends; what it was before and the others stay."""
+    """One run is pulled out of the tissue; its earlier samples and the other runs stay valid."""
     p = preset('paper_si')
     states = np.array([NeedleModel(p).state_at(s, 1e-5) for s in (0.05, 0.004, 0.06)])
     forces = np.array([3.0, -1.0, 2.0])
@@ -157,7 +155,7 @@ def test_a_run_that_leaves_its_range_is_no_number_from_there_and_harms_no_other(
     alone = simulate(
         p, states[1], -1.0, duration=valid * INTERVAL, interval=INTERVAL, step=DEFAULT_STEP
     )
-    # At 4 mm cond(G) is 1e9: what is left of the digits is in depth and velocity.
+    # At 4 mm cond(G) is 1e9: only depth and velocity have sufficient accuracy.
     assert_allclose(found.depth[1, : valid + 1], alone.depth, rtol=1e-6)
     for i in (0, 2):
         single = batch(p, states[i], forces[i])
@@ -165,8 +163,7 @@ def test_a_run_that_leaves_its_range_is_no_number_from_there_and_harms_no_other(
         assert_allclose(found.completed[i], COUNT * INTERVAL, rtol=1e-15)
 
 
-def test_the_last_state_of_a_run_that_left_its_range_is_no_number() -> None:
-    """Without samples, too, a run that did not reach the end has no state at the end."""
+def test_final_state_of_an_incomplete_run_is_nan() -> None:
     p = preset('paper_si')
     states = np.array([NeedleModel(p).state_at(s, 1e-5) for s in (0.05, 0.004)])
     found = batch(p, states, [3.0, -1.0], keep=False)
@@ -175,7 +172,7 @@ def test_the_last_state_of_a_run_that_left_its_range_is_no_number() -> None:
     assert 0.0 < found.completed[1] < COUNT * INTERVAL
 
 
-def test_what_is_given_is_left_alone() -> None:
+def test_arguments_are_not_modified() -> None:
     """Initial states and forces are not changed."""
     constants, states, forces = study()
     before = states.copy(), forces.copy()
@@ -201,8 +198,8 @@ def test_what_is_given_is_left_alone() -> None:
         ('constants', (0,)),
     ],
 )
-def test_shapes_that_do_not_fit_are_refused(which: str, shape: tuple[int, ...]) -> None:
-    """Numbers of runs, of intervals and of coordinates must agree; the message says what came."""
+def test_inconsistent_shapes_are_rejected(which: str, shape: tuple[int, ...]) -> None:
+    """Numbers of runs, intervals and coordinates must agree; the message has the shapes."""
     constants, states, forces = study()
     arguments: dict[str, Any] = {'constants': constants, 'states': states, 'forces': forces}
     arguments[which] = constants[: shape[0]] if which == 'constants' else np.full(shape, 0.1)
@@ -211,8 +208,7 @@ def test_shapes_that_do_not_fit_are_refused(which: str, shape: tuple[int, ...]) 
 
 
 @pytest.mark.parametrize('empty', ['constants', 'states', 'forces'])
-def test_no_runs_are_refused(empty: str) -> None:
-    """A batch of none, with all else given once, is refused like other shapes."""
+def test_empty_batches_are_rejected(empty: str) -> None:
     p = preset('paper_si')
     arguments: dict[str, Any] = {
         'constants': p,
@@ -238,15 +234,14 @@ def test_no_runs_are_refused(empty: str) -> None:
         {'workers': -1},
     ],
 )
-def test_values_that_are_none_are_refused(options: dict[str, float]) -> None:
-    """Step, interval, duration and workers are checked before anything runs."""
+def test_invalid_options_are_rejected(options: dict[str, float]) -> None:
+    """Step, interval, duration and workers are checked before the simulation."""
     with pytest.raises(ParameterError):
         batch(*study(), **options)
 
 
 @pytest.mark.parametrize('interval', [0.7e-3, 0.6e-3])
-def test_a_duration_of_broken_intervals_is_refused(interval: float) -> None:
-    """A run ends when it was asked to, not at the nearest sample."""
+def test_duration_must_be_a_whole_number_of_intervals(interval: float) -> None:
     p = preset('paper_si')
     start = NeedleModel(p).state_at(0.05)
     for call in (simulate, simulate_batch):
@@ -254,8 +249,8 @@ def test_a_duration_of_broken_intervals_is_refused(interval: float) -> None:
             call(p, start, 0.0, duration=1e-3, interval=interval)
 
 
-def test_numbers_that_are_none_are_refused() -> None:
-    """A force or state that is not finite, or a state out of range, never enters the loop."""
+def test_non_finite_values_are_rejected() -> None:
+    """Forces and states are checked before the simulation, also against the range."""
     constants, states, forces = study()
     for bad in (np.nan, np.inf):
         wrong = forces.copy()
@@ -273,7 +268,7 @@ def test_numbers_that_are_none_are_refused() -> None:
 
 
 def test_runs_of_one_batch_share_their_number_of_modes() -> None:
-    """States of one length cannot serve models of several."""
+    """The states of a batch have a single length."""
     constants, states, forces = study()
     constants[2] = preset('paper_si', modes=1)
     with pytest.raises(NeedleError, match=r'must have shape \(6,\), got \(8,\)'):

@@ -1,4 +1,4 @@
-"""Euler's loads of the part outside, against an energy method."""
+"""Euler buckling loads against an energy method."""
 
 from math import inf, nan
 
@@ -10,7 +10,7 @@ from scipy.linalg import eigh
 
 
 def least_load(length: float, stiffness: float, end: Polynomial) -> float:
-    """Minimize E I int w'' ^2 / int w' ^2 over polynomials that are clamped at zero (Ritz)."""
+    """Minimize E I int w'' ^2 / int w' ^2 over polynomials clamped at zero (Ritz method)."""
     shapes = [Polynomial([0.0, 0.0, 1.0]) * end * Polynomial([0.0, 1.0]) ** k for k in range(8)]
 
     def energy(order: int) -> np.ndarray:
@@ -21,21 +21,21 @@ def least_load(length: float, stiffness: float, end: Polynomial) -> float:
 
 
 @pytest.mark.parametrize('depth', [0.001, 0.02, 0.15])
-def test_loads_are_the_least_of_an_energy_method(depth: float) -> None:
+def test_loads_equal_the_minimum_of_the_energy_method(depth: float) -> None:
     needle = NeedleParameters.preset('phantom')
     found = euler_loads(needle, depth)
     free, pinned = (
         least_load(needle.length - depth, needle.bending_stiffness, end)
         for end in (Polynomial([1.0]), Polynomial([1.0, -1.0]))
     )
-    # Eight polynomials: the method is from above, and closer than 1e-8.
+    # Eight polynomials: upper bound with an error below 1e-8.
     assert found.free == pytest.approx(free, rel=1e-7)
     assert found.pinned == pytest.approx(pinned, rel=1e-7)
 
 
-def test_nothing_outside_does_not_buckle() -> None:
+def test_fully_inserted_needle_does_not_buckle() -> None:
     needle = NeedleParameters.preset('phantom')
     assert euler_loads(needle, needle.length) == (inf, inf)
     for depth in (-1e-3, nan, inf):
-        with pytest.raises(InsertedLengthError, match='inserted length must be finite'):
+        with pytest.raises(InsertedLengthError, match='insertion depth must be finite'):
             euler_loads(needle, depth)

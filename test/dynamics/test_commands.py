@@ -1,4 +1,4 @@
-"""From when and how long a command acts."""
+"""Zero-order hold, timeout and limits of force commands."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pytest
 
 PERIOD = 1_000_000
 BEYOND = 'must be within force_limit, 10 N, and torque_limit, 1 N m'
-#: A stamp that a float could not hold to the nanosecond.
+#: A stamp with more digits than a float can hold to the nanosecond.
 NOW = 1_700_000_000 * NANOSECONDS + 1
 
 
@@ -20,8 +20,8 @@ def made(**limits: float) -> Commands:
     return Commands(timeout=0.1, force_limit=10.0, torque_limit=1.0, **limits)
 
 
-def test_a_command_acts_from_the_next_sample_to_the_one_after() -> None:
-    """A zero-order hold: whatever comes between two samples, the newest acts after the second."""
+def test_command_acts_from_one_sample_to_the_next() -> None:
+    """Zero-order hold: the newest command between two samples acts after the second."""
     commands = made()
     commands.hold(NOW)
     assert commands.held == Command()
@@ -30,13 +30,13 @@ def test_a_command_acts_from_the_next_sample_to_the_one_after() -> None:
     assert commands.held == Command()
     commands.hold(NOW + PERIOD)
     assert commands.held == Command(NOW, 2.0, 0.2)
-    # Nothing newer has come: it goes on.
+    # No newer command: the command is held.
     commands.hold(NOW + 2 * PERIOD)
     assert commands.held == Command(NOW, 2.0, 0.2)
 
 
-def test_a_command_ends_at_the_timeout() -> None:
-    """It acts as long as a sample is within the timeout of its stamp, to the nanosecond."""
+def test_command_expires_at_the_timeout() -> None:
+    """It acts while the sample is within the timeout of its stamp, to the nanosecond."""
     commands = made()
     commands.offer(NOW, '', 2.0, 0.0, NOW)
     commands.hold(NOW + 100 * PERIOD)
@@ -45,16 +45,16 @@ def test_a_command_ends_at_the_timeout() -> None:
     assert commands.held == Command(NOW)
 
 
-def test_an_empty_stamp_is_now() -> None:
-    """A node that has no clock may command too."""
+def test_zero_stamp_means_now() -> None:
+    """Nodes without a clock can publish commands."""
     commands = made()
     commands.offer(0, '', 2.0, 0.0, NOW)
     assert commands.newest == Command(NOW, 2.0)
 
 
 @pytest.mark.parametrize('age', [100 * PERIOD + 1, -100 * PERIOD - 1])
-def test_a_command_that_is_too_old_or_early_does_not_count(age: int) -> None:
-    """It is counted, and the age is said; what acts goes on."""
+def test_commands_with_old_or_future_stamps_are_rejected(age: int) -> None:
+    """The command is counted and its age is reported; the held command continues."""
     commands = made()
     commands.offer(NOW, '', 1.0, 0.0, NOW)
     counts, complaint = commands.offer(NOW - age, '', 2.0, 0.0, NOW)
@@ -65,8 +65,8 @@ def test_a_command_that_is_too_old_or_early_does_not_count(age: int) -> None:
     assert (commands.stale, commands.refused, commands.overtaken) == (1, 0, 0)
 
 
-def test_a_command_that_was_overtaken_does_not_count() -> None:
-    """The order of stamps decides, not that of arrival; unless the newest is of the future."""
+def test_out_of_order_commands_are_discarded() -> None:
+    """The order of stamps applies, unless the newest stamp is in the future."""
     commands = made()
     commands.offer(NOW, '', 1.0, 0.0, NOW)
     assert commands.offer(NOW - PERIOD, '', 2.0, 0.0, NOW) == (False, '')
@@ -87,10 +87,10 @@ def test_a_command_that_was_overtaken_does_not_count() -> None:
         ('', -10.1, 0.0, f'{BEYOND}, got -10.1 N and 0.0 N m'),
     ],
 )
-def test_an_invalid_command_is_no_force(
+def test_invalid_command_sets_zero_force(
     frame: str, force: float, torque: float, complaint: str
 ) -> None:
-    """It counts, so that an older one does not act any longer."""
+    """It replaces an older command."""
     commands = made()
     commands.offer(NOW, '', 1.0, 0.0, NOW)
     said = f'a command {complaint}; no force is applied'
@@ -100,8 +100,8 @@ def test_an_invalid_command_is_no_force(
     assert commands.refused == 1
 
 
-def test_while_several_nodes_command_no_force_acts() -> None:
-    """From the time on that it is seen, until the next command of the last one."""
+def test_no_force_acts_with_several_command_publishers() -> None:
+    """From the detection until the next command of the remaining publisher."""
     commands = made()
     commands.offer(NOW, '', 1.0, 0.0, NOW)
     assert not commands.count_commanders(1)
@@ -117,8 +117,8 @@ def test_while_several_nodes_command_no_force_acts() -> None:
 
 
 @given(st.lists(st.floats(-10.0, 10.0), min_size=1, max_size=30))
-def test_a_force_grows_no_faster_than_it_may_and_ends_at_once(forces: list[float]) -> None:
-    """From one sample to the next; through zero it may go, and grow from there."""
+def test_force_growth_is_rate_limited_and_release_is_immediate(forces: list[float]) -> None:
+    """From one sample to the next; the force may cross zero and grow from there."""
     commands, growth = made(interval=1e-3, force_rate_limit=2000.0), 2.0
     before = 0.0
     for k, force in enumerate(forces):
@@ -140,8 +140,8 @@ def test_a_force_grows_no_faster_than_it_may_and_ends_at_once(forces: list[float
     assert commands.held.force == 0.0
 
 
-def test_no_force_acts_while_more_energy_was_put_in_than_may_be() -> None:
-    """5 N at 0.4 m/s are 2 W: after 1 J within less than a second, until it is half of that."""
+def test_no_force_acts_above_the_energy_limit() -> None:
+    """5 N at 0.4 m/s are 2 W: above 1 J within a second, until the energy is half of it."""
     commands = made(interval=1e-3, power_limit=1.0)
     acted, spent = [], 0.0
     for k in range(4000):
@@ -156,9 +156,9 @@ def test_no_force_acts_while_more_energy_was_put_in_than_may_be() -> None:
     # 2 W (1 - exp(-t)) is 1 J at ln 2; then it halves in ln 2.
     assert first == pytest.approx(693, abs=2)
     assert acted.index(True, first) - first == pytest.approx(693, abs=2)
-    # What is forgotten in a second is at most what may be put in.
+    # The decay within a second is at most the permitted energy.
     assert spent <= 1.0 + 4.0 * 1.0
-    # Being moved puts nothing in, nor does what the needle gives back.
+    # Motion of the needle against the force supplies no energy.
     commands = made(interval=1e-3, power_limit=1e-9)
     commands.offer(NOW, '', 5.0, 0.0, NOW)
     commands.hold(NOW, 0.0)
@@ -166,8 +166,8 @@ def test_no_force_acts_while_more_energy_was_put_in_than_may_be() -> None:
     assert not commands.exhausted
 
 
-def test_after_somebody_came_and_went_no_command_acts_for_the_timeout() -> None:
-    """What they said may come late, and is over by then."""
+def test_no_command_acts_for_the_timeout_after_a_short_lived_publisher() -> None:
+    """Its commands may arrive late, and expire within the timeout."""
     commands = made()
     commands.offer(NOW, '', 1.0, 0.0, NOW)
     commands.hush(NOW)
@@ -178,8 +178,8 @@ def test_after_somebody_came_and_went_no_command_acts_for_the_timeout() -> None:
         assert (commands.newest.force == 2.0) == acts
 
 
-def test_what_was_commanded_is_forgotten() -> None:
-    """At a reset older commands still do not count; at an activation nothing is known."""
+def test_reset_and_activation_discard_commands() -> None:
+    """After a reset older commands are still discarded; an activation starts without history."""
     commands = made()
     commands.offer(NOW, '', 1.0, 0.0, NOW)
     commands.hold(NOW)
@@ -190,21 +190,21 @@ def test_what_was_commanded_is_forgotten() -> None:
     assert commands.held == commands.newest == Command()
 
 
-def test_a_force_that_answers_no_sample_is_of_another_node() -> None:
-    """Until the number of nodes changes, or one has come and gone: so another may take over."""
+def test_force_without_the_stamp_of_a_sample_is_rejected() -> None:
+    """Until the number of publishers changes, so that another node may take over."""
     commands = made()
     commands.count_commanders(1)
-    # Nobody has answered yet: a user by hand may stamp as he likes.
+    # No response to a sample yet: manual commands may have any stamp.
     assert commands.offer(NOW + 5, '', 1.0, 0.0, NOW + 10) == (True, '')
     commands.hold(NOW + PERIOD)
     assert commands.offer(NOW + PERIOD, '', 2.0, 0.0, NOW + PERIOD + 10) == (True, '')
     for stamp in (0, NOW + PERIOD + 20):
         counts, complaint = commands.offer(stamp, '', 9.0, 0.0, NOW + PERIOD + 30)
         assert not counts
-        assert 'its stamp is that of no sample' in complaint
+        assert 'its stamp matches no sample' in complaint
     assert commands.newest.force == 2.0
     assert commands.refused == 2
-    # Letting go is nobody's harm: a stop is not of a sample.
+    # A release of the force is always accepted: a stop command needs no sample.
     assert commands.offer(0, '', 0.0, 0.0, NOW + PERIOD + 40) == (True, '')
     for change in (lambda: commands.count_commanders(0), lambda: commands.hush(NOW + PERIOD)):
         commands.hold(NOW + 2 * PERIOD)
@@ -214,8 +214,8 @@ def test_a_force_that_answers_no_sample_is_of_another_node() -> None:
         assert commands.offer(0, '', 3.0, 0.0, NOW + 2 * PERIOD + 30)[0]
 
 
-def test_samples_may_be_answered_for_the_timeout() -> None:
-    """An older answer is stale; one of a clock that was set back is no answer."""
+def test_samples_can_be_answered_within_the_timeout() -> None:
+    """An older response is stale; a response from before a clock reset is rejected."""
     commands = made()
     for k in range(300):
         commands.hold(NOW + k * PERIOD)

@@ -1,4 +1,4 @@
-"""Compiled functions: their types, their files on disk, and what several processes do to them."""
+"""Compiled functions: types, cache files and concurrent processes."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 
-#: Imports of compiled files that do not change machine code without a change of the sources that
-#: it is stamped with.
+#: Imports of compiled files whose effect on machine code is covered by the stamp of their
+#: sources.
 FREE = {'__future__', 'collections', 'math', 'needle_dynamics.arrays', 'numba', 'numpy', 'typing'}
 
-#: Files of the compiled folder that are not compiled.
+#: Modules of the compiled folder without compiled functions.
 MACHINERY = ('cache.py', 'held.py', 'signatures.py', 'store.py')
 
-#: Permissions of files then hold for root, too: PR_CAPBSET_DROP of CAP_DAC_OVERRIDE.
+#: Enforce file permissions also for root: PR_CAPBSET_DROP of CAP_DAC_OVERRIDE.
 WITHOUT_RIGHTS = """
 import ctypes, os, sys
 ctypes.CDLL(None).prctl(24, 1)
@@ -68,7 +68,7 @@ if __name__ == '__main__':
 
 @pytest.fixture
 def toy(tmp_path: Path) -> Path:
-    """Copy the machinery to a package with a kernel in one folder and a callee in another."""
+    """Copy the cache modules to a package with a kernel in one folder and a callee in another."""
     folder = tmp_path / 'toys' / 'needle_dynamics' / 'compiled'
     folder.mkdir(parents=True)
     for name in MACHINERY:
@@ -83,7 +83,7 @@ def toy(tmp_path: Path) -> Path:
 
 
 def start(folder: Path, *words: str, **variables: str) -> Any:
-    """Start the kernel in a process of its own."""
+    """Start the kernel in a new process."""
     environment = {**os.environ, 'PYTHONPATH': str(folder), 'PYTHONDONTWRITEBYTECODE': '1'}
     environment.pop('NUMBA_CACHE_DIR', None)
     environment['XDG_CACHE_HOME'] = str(folder.parent / 'home')
@@ -95,41 +95,41 @@ def start(folder: Path, *words: str, **variables: str) -> Any:
 
 
 def result(process: Any) -> tuple[list[float], str]:
-    """Return the results, the number of functions that were compiled, and standard error."""
+    """Return the results, the number of compiled functions, and standard error."""
     out, error = process.communicate(timeout=120.0)
     assert process.returncode == 0, error
     return [float(word) for word in out.split()], error
 
 
 def run(folder: Path, *words: str, **variables: str) -> tuple[list[float], str]:
-    """Run the kernel in a process of its own."""
+    """Run the kernel in a new process."""
     return result(start(folder, *words, **variables))
 
 
 def entries(folder: Path) -> list[Path]:
-    """Return the entries on disk."""
+    """Return the cache files."""
     return sorted(folder.rglob(f'*{SUFFIX}'))
 
 
-def test_a_change_of_a_called_function_renews_the_code_of_its_caller(toy: Path) -> None:
-    """Code is compiled once, with one line, and again when the file of a callee has changed."""
+def test_change_of_a_callee_recompiles_its_caller(toy: Path) -> None:
+    """Code is compiled once, with one log line, and again after a change of a callee."""
     found, error = run(toy)
     assert found == [4.0, 6.0, 2.0]
     assert error.count('compiling for this machine (once)') == 1
-    # From the disk: nothing is compiled.
+    # Loaded from disk without compilation.
     assert run(toy) == ([4.0, 6.0, 0.0], '')
     callee = toy / 'needle_dynamics' / 'compiled' / 'callee.py'
     times, before = callee.stat(), entries(toy)
     callee.write_text(CALLEE.format(added='2.0'))
-    # Size and time of the file are the same; its contents count.
+    # Size and time of the file are equal; the contents differ.
     os.utime(callee, ns=(times.st_atime_ns, times.st_mtime_ns))
     assert run(toy)[0] == [6.0, 8.0, 2.0]
-    # The entries of the earlier sources are gone.
+    # The cache files of the earlier sources are removed.
     assert len(entries(toy)) == len(before)
     assert not {*entries(toy)} & {*before}
 
 
-def test_a_copy_of_the_folder_is_compiled(toy: Path) -> None:
+def test_copied_installation_needs_no_compilation(toy: Path) -> None:
     """Machine code does not depend on the path of the installation."""
     run(toy)
     shutil.copytree(toy, toy.parent / 'elsewhere')
@@ -137,8 +137,7 @@ def test_a_copy_of_the_folder_is_compiled(toy: Path) -> None:
 
 
 @pytest.mark.parametrize('damage', ['cut', 'bit', 'empty'])
-def test_a_damaged_entry_counts_as_missing(toy: Path, damage: str) -> None:
-    """It is compiled again, and is good afterwards."""
+def test_damaged_cache_file_is_compiled_again(toy: Path, damage: str) -> None:
     run(toy)
     for path in entries(toy):
         content = bytearray(path.read_bytes())
@@ -150,19 +149,19 @@ def test_a_damaged_entry_counts_as_missing(toy: Path, damage: str) -> None:
     assert run(toy)[0] == [4.0, 6.0, 0.0]
 
 
-def test_processes_at_once_compile_each_function_once(toy: Path) -> None:
-    """The others wait for its file, and load it."""
+def test_concurrent_processes_compile_each_function_once(toy: Path) -> None:
+    """The other processes wait for the file and load it."""
     found = [result(process)[0] for process in [start(toy) for _ in range(4)]]
     assert [one[:2] for one in found] == 4 * [[4.0, 6.0]]
     assert sum(one[2] for one in found) == 2.0
     assert run(toy)[0] == [4.0, 6.0, 0.0]
 
 
-def test_a_killed_process_leaves_nothing_wrong(toy: Path) -> None:
-    """Its drafts are not read, and its locks have ended with it."""
+def test_killed_process_leaves_a_consistent_cache(toy: Path) -> None:
+    """Its partial files are not read, and its locks are released."""
     for count in range(1, 3):
         process = start(toy)
-        # Killed as soon as it has begun to write the next file.
+        # Killed when it starts to write the next file.
         while process.poll() is None and len([*toy.rglob(f'*{SUFFIX}*')]) < count:
             pass
         process.send_signal(signal.SIGKILL)
@@ -171,8 +170,8 @@ def test_a_killed_process_leaves_nothing_wrong(toy: Path) -> None:
     assert run(toy)[0] == [4.0, 6.0, 0.0]
 
 
-def test_other_processors_and_versions_have_entries_of_their_own(toy: Path) -> None:
-    """A folder may be shared by machines that differ, and survives an upgrade of Numba."""
+def test_other_processors_and_versions_have_separate_cache_files(toy: Path) -> None:
+    """Different machines can share a folder, also after an upgrade of Numba."""
     run(toy)
     assert run(toy, NUMBA_CPU_NAME='x86-64', NUMBA_CPU_FEATURES='')[0] == [4.0, 6.0, 2.0]
     assert run(toy, '0.0.1')[0] == [4.0, 6.0, 2.0]
@@ -186,15 +185,15 @@ def make_read_only(folder: Path) -> None:
         path.chmod(0o555 if path.is_dir() else 0o444)
 
 
-def test_a_read_only_installation_is_used(toy: Path) -> None:
-    """Entries that its owner has compiled are loaded by its users."""
+def test_cache_of_a_read_only_installation_is_used(toy: Path) -> None:
+    """Users load the files that the owner has compiled."""
     run(toy)
     make_read_only(toy)
     assert run(toy) == ([4.0, 6.0, 0.0], '')
 
 
-def test_a_user_of_a_read_only_installation_has_a_folder(toy: Path) -> None:
-    """Entries that are missing there are compiled once, to the cache folder of the user."""
+def test_missing_functions_of_a_read_only_installation_use_the_user_cache(toy: Path) -> None:
+    """Missing functions are compiled once, to the cache folder of the user."""
     make_read_only(toy)
     assert run(toy)[0] == [4.0, 6.0, 2.0]
     assert len(entries(toy.parent / 'home')) == len(entries(toy.parent)) == 2
@@ -202,7 +201,7 @@ def test_a_user_of_a_read_only_installation_has_a_folder(toy: Path) -> None:
 
 
 def test_without_a_writable_folder_each_start_compiles(toy: Path) -> None:
-    """It runs, and one line names the folders and the variable that helps."""
+    """The program runs, and one log line contains the folders and the environment variable."""
     make_read_only(toy)
     for _ in range(2):
         found, error = run(toy, XDG_CACHE_HOME='/proc/none')
@@ -213,8 +212,8 @@ def test_without_a_writable_folder_each_start_compiles(toy: Path) -> None:
         assert 'NUMBA_CACHE_DIR' in error
 
 
-def test_compiled_files_depend_on_compiled_files_only() -> None:
-    """Functions and constants that a compiled function uses are in the sources of its stamp."""
+def test_compiled_files_depend_only_on_compiled_files() -> None:
+    """The stamp covers all functions and constants that a compiled function uses."""
     shared = 'needle_dynamics.compiled'
     for path in sorted(ROOT.glob('needle_*/compiled/*.py')):
         own = '.'.join(path.relative_to(ROOT).parent.parts)
@@ -228,7 +227,7 @@ def test_compiled_files_depend_on_compiled_files_only() -> None:
 
 
 def test_every_kernel_is_in_the_list_of_modules() -> None:
-    """The command that compiles everything leaves nothing out."""
+    """The command that compiles all kernels is complete."""
     for path in sorted(ROOT.glob('needle_*/**/*.py')):
         if '\n@kernel' in path.read_text() and path.name not in MACHINERY:
             module = '.'.join(path.relative_to(ROOT).with_suffix('').parts)
@@ -251,10 +250,10 @@ SHAPES = st.lists(st.integers(0, 3), min_size=1, max_size=4)
 
 @settings(max_examples=50)
 @given(st.sampled_from([np.float64, np.complex128, np.int64, np.bool_]), SHAPES, st.booleans())
-def test_the_type_of_an_annotated_array_is_that_of_its_values(
+def test_annotated_array_type_matches_its_values(
     dtype: Any, shape: list[int], writable: bool
 ) -> None:
-    """An array with the layout of the annotation needs no further compilation."""
+    """An array with the annotated layout needs no further compilation."""
     from typing import Annotated
 
     from needle_dynamics.arrays import FloatArray, Shaped
@@ -268,7 +267,7 @@ def test_the_type_of_an_annotated_array_is_that_of_its_values(
 
 
 def test_an_annotation_without_a_type_is_rejected() -> None:
-    """The error names it."""
+    """The error message contains it."""
     from needle_dynamics.arrays import FloatArray
     from needle_dynamics.compiled.signatures import numba_type
 

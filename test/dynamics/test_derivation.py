@@ -1,4 +1,4 @@
-"""The equations of motion derived anew: Euler-Lagrange on T and V of (12), by SymPy."""
+"""Derivation of the equations of motion with SymPy: Euler-Lagrange on T and V of (12)."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import pytest
 from scipy.integrate import fixed_quad
 import sympy as sp
 
-#: The Lagrangian holds for needle and tissue alone; friction is added to it by (14).
+#: The Lagrangian covers needle and tissue only; (14) adds friction.
 MODEL = NeedleModel(NeedleParameters(coulomb_friction=0.0, viscous_friction=0.0))
 PRINTED = NeedleModel(
     NeedleParameters(coulomb_friction=0.0, viscous_friction=0.0, formulation='as_printed')
@@ -31,14 +31,14 @@ PAIRS = [(0, 0), (0, 1), (1, 1)]
 
 
 def lagrangian() -> Any:
-    """Return (12), with the mode functions left open and the integrals up to l - d."""
+    """Return (12) with undetermined mode functions and integrals up to l - d."""
     d_rate, turn, *modal_rate = RATES
     modal = COORDINATES[2:]
     w = sum(q * phi(Y) for q, phi in zip(modal, PHI, strict=True))
     w_rate = sum(v * phi(Y) for v, phi in zip(modal_rate, PHI, strict=True))
 
     def along(density: Any) -> Any:
-        """Integrate a quadratic form term by term, as (12) prints it."""
+        """Integrate a quadratic form term by term, as printed in (12)."""
         terms = sp.Add.make_args(sp.expand(density))
         total = sp.Integer(0)
         for term in terms:
@@ -70,14 +70,14 @@ def equations() -> tuple[Any, Any]:
     return mass, rest
 
 
-# Symbols of the numbers that the derivation leaves open.
+# Symbols for the quantities that remain open in the derivation.
 SHAPES = sp.symbols('G11 G12 G22 H11 H12 H22 phi1 phi2 bend1 bend2')
 PLACES = sp.symbols('x0:4')
 SPEEDS = sp.symbols('v0:4')
 
 
 def closed(expression: Any) -> Any:
-    """Name integrals, values at the tip, coordinates and rates by plain symbols."""
+    """Replace integrals, tip values, coordinates and rates by plain symbols."""
     names: dict[Any, Any] = {}
     for offset, order in ((0, 0), (3, 2)):
         for k, (i, j) in enumerate(PAIRS):
@@ -85,7 +85,7 @@ def closed(expression: Any) -> Any:
             names[sp.Integral(inside, (Y, 0, TIP))] = SHAPES[offset + k]
 
     def tip_value(x: Any) -> Any:
-        """Name phi and phi'' at l - d."""
+        """Replace phi and phi'' at l - d by symbols."""
         for i, phi in enumerate(PHI):
             if x == phi(TIP):
                 return SHAPES[6 + i]
@@ -106,14 +106,14 @@ def functions() -> tuple[Callable[..., Any], Callable[..., Any]]:
     matrices = [closed(matrix) for matrix in equations()]
     for matrix in matrices:
         known = {*SHAPES, *PLACES, *SPEEDS, L, RHO, EI, K, INERTIA}
-        # Nothing of the calculus is left: no integral, no derivative, no undefined function.
+        # No integral, derivative or undefined function remains.
         assert matrix.free_symbols <= known
         assert not matrix.atoms(sp.Integral, sp.Derivative, sp.Subs, sp.Function)
     return sp.lambdify(arguments, matrices[0]), sp.lambdify(arguments, matrices[1])
 
 
 def shapes(depth: float) -> FloatArray:
-    """Integrals by quadrature of (11) and its values at the tip, not by the code under test."""
+    """Integrals by quadrature of (11) and tip values, independent of the code under test."""
     modes = MODEL.modes
 
     def products(y: FloatArray) -> FloatArray:
@@ -125,7 +125,7 @@ def shapes(depth: float) -> FloatArray:
 
 
 def states() -> list[FloatArray]:
-    """Draw states whose kinetic and elastic energies in each mode are of one size."""
+    """Draw states with similar kinetic and elastic energy in each mode."""
     rng = np.random.default_rng(2014)
     found = []
     for _ in range(30):
@@ -149,7 +149,7 @@ def derived(x: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def test_derived_mass_matrix_has_the_structure_of_the_source() -> None:
-    """M is symmetric and block diagonal: d and theta stand alone, the modes share a block."""
+    """M is symmetric and block diagonal: d and theta are decoupled, the modes share a block."""
     mass, _ = equations()
     assert (mass - mass.T).is_zero_matrix
     assert mass[0, 0] == RHO * L
@@ -168,8 +168,8 @@ def test_derived_row_of_d_is_not_zero() -> None:
     assert sp.expand(closed(rest[0]) - expected / 2) == 0
 
 
-def test_derived_modal_rows_hold_the_rate_of_the_mass() -> None:
-    """The modal rows are (E I H + k G) q less rho d_dot phi phi^T q_dot, from dG/dt."""
+def test_derived_modal_rows_contain_the_rate_of_the_mass() -> None:
+    """The modal rows are (E I H + k G) q - rho d_dot phi phi^T q_dot, from dG/dt."""
     _, rest = equations()
     g11, g12, g22, h11, h12, h22, phi1, phi2, *_ = SHAPES
     gram, bends = sp.Matrix([[g11, g12], [g12, g22]]), sp.Matrix([[h11, h12], [h12, h22]])
@@ -179,15 +179,15 @@ def test_derived_modal_rows_hold_the_rate_of_the_mass() -> None:
     assert (found - expected).applyfunc(sp.expand).is_zero_matrix
 
 
-def test_model_is_the_derived_one() -> None:
-    """Mass matrix, bias forces and accelerations of `complete` are the derived ones."""
+def test_model_equals_the_derivation() -> None:
+    """Mass matrix, bias forces and accelerations of `complete` equal the derivation."""
     rng = np.random.default_rng(1)
     for x in states():
         mass, rest = derived(x)
-        # Quadrature of (11) cancels by 1 / (k s)^2 = 100 at 1 cm.
+        # The quadrature of (11) cancels by 1 / (k s)^2 = 100 at 1 cm.
         size = np.sqrt(np.outer(np.diag(mass), np.diag(mass)))
         assert_allclose(MODEL.mass_matrix(x) / size, mass / size, atol=1e-12)
-        # What the terms amount to: they cancel by up to sqrt(cond G) = 1e3.
+        # Magnitude of the terms: they cancel by up to sqrt(cond G) = 1e3.
         modal = np.abs(MODEL.stiffness_matrix(0.2 - x[0])) @ np.abs(x[2:4])
         at = shapes(0.2 - x[0])
         tip = (at[8:] @ x[2:4]) ** 2 * MODEL.parameters.bending_stiffness
@@ -195,18 +195,18 @@ def test_model_is_the_derived_one() -> None:
         assert_allclose(MODEL.bias_forces(x)[0], rest[0], atol=1e-8 * (abs(rest[0]) + tip))
         assert MODEL.bias_forces(x)[1] == rest[1] == 0.0
         force, torque = rng.normal(size=2) * [3.0, 1e-4]
-        # A push shortens d: Q_d = -f_y.
+        # A positive force shortens d: Q_d = -f_y.
         expected = np.linalg.solve(mass, [-force, torque, 0.0, 0.0] - rest)
         found = MODEL.acceleration(x, force, torque)
         assert_allclose(found[:2], expected[:2], rtol=1e-7)
-        # In coordinates of unit mass, where no mode is better than another.
+        # In coordinates of unit mass, for comparable modes.
         inertial = np.linalg.cholesky(mass[2:, 2:]).T
         size = np.abs(inertial @ expected[2:]).max()
         assert_allclose(inertial @ found[2:] / size, inertial @ expected[2:] / size, atol=1e-7)
 
 
-def test_printed_form_is_the_derived_one_less_two_terms() -> None:
-    """Without row d, and without what holds d_dot in the modal rows, N is the printed one."""
+def test_printed_form_is_the_derivation_without_two_terms() -> None:
+    """Without row d and the terms with d_dot in the modal rows, N equals the printed form."""
     _, rest = equations()
     printed = closed(rest)
     printed[0] = sp.Integer(0)
@@ -230,8 +230,8 @@ def test_printed_form_is_the_derived_one_less_two_terms() -> None:
         assert np.array_equal(PRINTED.mass_matrix(x), MODEL.mass_matrix(x))
 
 
-def test_derived_equations_keep_the_energy() -> None:
-    """Along the derived equations d(T + V)/dt is the power of force and torque, identically."""
+def test_derived_equations_conserve_energy() -> None:
+    """Along the derived equations d(T + V)/dt is identically the power of force and torque."""
     energy = lagrangian()
     kinetic = sum(rate * energy.diff(rate) for rate in RATES) / 2
     total = 2 * kinetic - energy
@@ -244,8 +244,8 @@ def test_derived_equations_keep_the_energy() -> None:
     assert sp.simplify(sp.together(closed(rate) - power)) == 0
 
 
-def test_half_of_equation_9_is_not_that_of_equation_12() -> None:
-    """(9) halves the tissue twice: int w dw is w^2 / 2, so its half makes a quarter; (12) is V."""
+def test_equation_9_halves_the_tissue_energy_twice() -> None:
+    """Integration of w dw gives w^2 / 2, so the factor in (9) gives a quarter; (12) is V."""
     w = sp.Symbol('w')
     ninth = sp.Rational(1, 2) * K * sp.integrate(w, w)
     seventh = sp.integrate(K * w, w)
@@ -256,11 +256,11 @@ def test_half_of_equation_9_is_not_that_of_equation_12() -> None:
     squared = at[0] * x[2] ** 2 + 2.0 * at[1] * x[2] * x[3] + at[2] * x[3] ** 2
     free = NeedleModel(NeedleParameters(tissue_stiffness=0.0))
     held = MODEL.potential_energy(x) - free.potential_energy(x)
-    # The tissue holds a part of V that is up to 1e3 times smaller than the bending.
+    # The tissue has a fraction of V that is up to 1e3 times smaller than the bending energy.
     assert_allclose(held, 0.5 * 520.0 * squared, rtol=1e-7)
 
 
-def test_turning_energy_is_a_quarter() -> None:
+def test_rotational_energy_has_the_factor_one_quarter() -> None:
     """T_R is half the integral of I theta_dot, a quarter of I theta_dot^2, so that M22 = I / 2."""
     turn = sp.Symbol('w')
     printed = sp.integrate(INERTIA * turn, turn) / 2
@@ -277,22 +277,22 @@ def test_turning_energy_is_a_quarter() -> None:
 
 @pytest.mark.parametrize('i', [0, 1])
 def test_derivative_of_the_integrals_is_the_integrand_at_the_tip(i: int) -> None:
-    """Leibniz, which the printed equations leave out: d/dd of G is -phi phi^T at l - d."""
+    """Leibniz rule, omitted in the printed equations: d/dd of G is -phi phi^T at l - d."""
     integral = sp.Integral(PHI[i](Y) ** 2, (Y, 0, TIP))
     assert integral.diff(COORDINATES[0]) == -(PHI[i](TIP) ** 2)
     assert integral.diff(T) == -(PHI[i](TIP) ** 2) * RATES[0]
 
 
 def test_gravity_is_not_in_the_equations() -> None:
-    """The derived equations hold the constants of needle and tissue only, and so does the code."""
+    """The derived equations contain only the constants of needle and tissue, as does the code."""
     mass, rest = equations()
     constants = (mass.free_symbols | rest.free_symbols) - {T, Y}
     assert constants == {L, RHO, EI, K, INERTIA}
     assert not [item.name for item in fields(NeedleParameters) if 'gravity' in item.name]
 
 
-def test_table_3_is_a_round_needle_but_for_one_row() -> None:
-    """A and I_y are those of a round needle of 1.27 mm; I_x is none of its moments."""
+def test_table_3_is_a_round_needle_except_for_one_row() -> None:
+    """A and I_y belong to a round needle of 1.27 mm; I_x is neither of its moments."""
     p, diameter = MODEL.parameters, 1.27e-3
     # Table 3 has three digits.
     assert_allclose(p.area, np.pi / 4.0 * diameter**2, rtol=5e-3)
@@ -302,12 +302,12 @@ def test_table_3_is_a_round_needle_but_for_one_row() -> None:
     about_base = p.linear_density * p.length**3 / 3.0
     for moment in (p.area_moment, polar, about_axis, about_base):
         assert not 0.5 < p.rotary_inertia / moment < 2.0
-    # Used as a mass moment: the acceleration under a torque is 2 tau / I_x, rad/s^2 of N m.
+    # Used as a mass moment: the acceleration under a torque is 2 tau / I_x, rad/s^2 per N m.
     assert_allclose(MODEL.mass_matrix(MODEL.state_at(0.1))[1, 1], 0.5 * 1.0626e-9, rtol=1e-15)
 
 
 def test_curl_of_a_linear_field_is_the_antisymmetric_part() -> None:
-    """Of F = -k x the curl is k_zx - k_xz: none for a symmetric k, constant for any other."""
+    """For F = -k x the curl is k_zx - k_xz: zero for a symmetric k, constant for any other."""
     x, z, kxx, kxz, kzx, kzz = sp.symbols('x z k_xx k_xz k_zx k_zz', real=True)
     stiffness = sp.Matrix([[kxx, kxz], [kzx, kzz]])
     force = -stiffness * sp.Matrix([x, z])

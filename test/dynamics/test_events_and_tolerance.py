@@ -1,4 +1,4 @@
-"""The hub as an event, the state between samples, and steps that follow a tolerance."""
+"""Hub contact as an event, dense output, and tolerance-controlled steps."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def moving(parameters: NeedleParameters, depth: float, tip: float, speed: float)
 
 
 def distance(model: NeedleModel, one: FloatArray, other: FloatArray) -> float:
-    """Difference of two states as the root of its energy over that of the state."""
+    """Return the difference of two states: root of its relative energy."""
     difference = one - other
     difference[0] = other[0]
     return float(np.sqrt(model.energy(difference) / model.energy(other)))
@@ -42,8 +42,8 @@ def distance(model: NeedleModel, one: FloatArray, other: FloatArray) -> float:
 # --- hub ------------------------------------------------------------------------------------
 
 
-def test_contact_of_a_straight_needle_has_its_closed_form() -> None:
-    """Pushed against Coulomb friction alone it lands after sqrt(2 m d / f), with that energy."""
+def test_contact_of_a_straight_needle_matches_the_closed_form() -> None:
+    """With Coulomb friction only: contact after sqrt(2 m d / f), with the known energy."""
     p = preset('paper_si', viscous_friction=0.0)
     it = Integrator(p, moving(p, 0.15, 0.0, 0.0))
     total = it.advance(0.02, PUSH)
@@ -58,8 +58,8 @@ def test_contact_of_a_straight_needle_has_its_closed_form() -> None:
 
 @pytest.mark.parametrize('law', FRICTION_LAWS)
 @pytest.mark.parametrize('formulation', ['complete', 'as_printed'])
-def test_contact_time_converges_to_that_of_an_ode_solver(formulation: str, law: str) -> None:
-    """Time and energy of the impact of a bent needle are those of an event, at order two."""
+def test_contact_time_converges_to_an_ode_solver(formulation: str, law: str) -> None:
+    """Time and energy of the impact of a bent needle converge at order two to an ODE event."""
     p = preset(
         'paper_si',
         formulation=formulation,
@@ -74,7 +74,7 @@ def test_contact_time_converges_to_that_of_an_ode_solver(formulation: str, law: 
         return float(x[0])
 
     hub.terminal = True  # type: ignore[attr-defined]
-    # Beyond the hub the solver looks for the event.
+    # Beyond the hub, for the event detection of the solver.
     free = NeedleModel(preset('paper_si', **{**p_changes(p), 'hub_stop': False}))
     solved = solve_ivp(
         lambda _, x: free.derivative(x, PUSH),
@@ -101,7 +101,7 @@ def test_contact_time_converges_to_that_of_an_ode_solver(formulation: str, law: 
 
 
 def p_changes(p: NeedleParameters) -> dict[str, Any]:
-    """Return what makes these constants out of `paper_si`."""
+    """Return the changes from `paper_si` to these constants."""
     names = ('formulation', 'friction_law', 'breakaway_friction', 'stribeck_speed')
     return {name: getattr(p, name) for name in (*names, 'smoothing_speed')}
 
@@ -109,7 +109,7 @@ def p_changes(p: NeedleParameters) -> dict[str, Any]:
 @pytest.mark.parametrize('name', ['paper_si', 'phantom'])
 @pytest.mark.parametrize('moved', [False, True])
 def test_impact_loss_closes_the_energy_balance(moved: bool, name: str) -> None:
-    """Over an impact, energy changes by input less friction, damping and what the hub takes."""
+    """Over an impact the energy changes by input - friction - damping - impact loss."""
     gaps = []
     for step in (4e-6, 2e-6, 1e-6):
         p = preset(name, carriage_mass=0.1)
@@ -123,25 +123,25 @@ def test_impact_loss_closes_the_energy_balance(moved: bool, name: str) -> None:
         spent = total.friction_work + total.damping_work + total.impact_loss
         gaps.append(abs(total.input_work - spent - change))
         size = total.impact_loss
-    # The exchange between modes and axis within the step of the impact depends on where in it
-    # the hub is: no clean order. Measured 4e-9 of the impact and less.
+    # The exchange between modes and axis within the step of the impact depends on the position of
+    # the contact in the step: no clean order. Measured 4e-9 of the impact and less.
     assert max(gaps) < 1e-7 * size
 
 
-def test_contact_time_counts_from_the_start_of_the_integrator() -> None:
-    """Each interval reports its own contact on one clock, and none if it had none."""
+def test_contact_time_is_on_the_clock_of_the_integrator() -> None:
+    """Each interval reports its own contact, or None."""
     p = preset('paper_si', viscous_friction=0.0)
     whole = Integrator(p, moving(p, 0.15, 0.0, 0.0)).advance(0.02, PUSH).contact_time
     it = Integrator(p, moving(p, 0.15, 0.0, 0.0))
     seen = [it.advance(1e-3, PUSH) for _ in range(20)]
     times = [part.contact_time for part in seen if part.contact_time is not None]
-    # Held on the hub there is no further contact.
+    # No further contact while the needle is held on the hub.
     assert len(times) == 1
     assert times[0] == pytest.approx(whole, rel=1e-9)
     assert [part.impact_loss > 0.0 for part in seen] == [
         part.contact_time is not None for part in seen
     ]
-    # Withdrawn and pushed in again, it lands again.
+    # Withdrawn and pushed in again: another contact.
     it.advance(2e-3, -PUSH)
     assert it.advance(1e-3, -PUSH).contact_time is None
     again = [it.advance(1e-3, PUSH) for _ in range(20)]
@@ -150,8 +150,8 @@ def test_contact_time_counts_from_the_start_of_the_integrator() -> None:
     assert later[0] > 0.023
 
 
-def test_a_needle_that_starts_on_the_hub_loses_its_speed_there() -> None:
-    """Against the hub from the first instant, its kinetic energy goes to the impact alone."""
+def test_needle_that_starts_on_the_hub_loses_its_speed() -> None:
+    """Contact at the start: the kinetic energy is dissipated by the impact."""
     p = preset('paper_si')
     for moved in (False, True):
         it = Integrator(p, moving(p, LENGTH, 0.0, 1.0))
@@ -173,7 +173,7 @@ def run(**options: Any) -> Trajectory:
 
 
 def test_dense_output_passes_through_the_samples() -> None:
-    """At a sample it is the sample, and just before one it is almost that."""
+    """At a sample it equals the sample, and just before a sample it is close to it."""
     seen = run()
     for k, time in enumerate(seen.time):
         assert np.array_equal(seen.at(time), seen.states[k])
@@ -185,8 +185,8 @@ def test_dense_output_passes_through_the_samples() -> None:
         assert distance(model, before, seen.states[k]) < 1e-5
 
 
-def test_dense_output_is_the_motion_between_the_samples() -> None:
-    """At any time it is the state of a run that goes there directly, bit for bit."""
+def test_dense_output_equals_a_direct_run_bit_for_bit() -> None:
+    """At any time it is the state of a run to that time."""
     seen = run(step=1e-5)
     for time in np.random.default_rng(3).uniform(0.0, 0.02, size=20):
         k = int(time // 1e-3)
@@ -197,7 +197,7 @@ def test_dense_output_is_the_motion_between_the_samples() -> None:
 
 
 def test_dense_output_agrees_with_an_ode_solver() -> None:
-    """Between samples the error is that of the integrator, not of an interpolation."""
+    """The error between samples is the integration error, without interpolation."""
     p = preset('paper_si')
     model = NeedleModel(p)
     start = model.state_at(0.05, 1e-3)
@@ -218,7 +218,7 @@ def test_dense_output_agrees_with_an_ode_solver() -> None:
 
 
 def test_dense_output_keeps_the_tolerance_of_the_run() -> None:
-    """A run under a tolerance is continued under it: no jump at the next sample."""
+    """A run with a tolerance has no jump at the next sample."""
     seen = run(tolerance=1e-9)
     model = NeedleModel(seen.parameters)
     gaps = [
@@ -230,8 +230,7 @@ def test_dense_output_keeps_the_tolerance_of_the_run() -> None:
 
 
 @pytest.mark.parametrize('time', [-1e-9, 0.0201, np.nan, np.inf])
-def test_times_outside_the_run_are_refused(time: float) -> None:
-    """Dense output is for the run only."""
+def test_times_outside_the_run_are_rejected(time: float) -> None:
     with pytest.raises(ParameterError, match=r'time must be in \[0, 0.02\] s, got'):
         run().at(time)
 
@@ -240,7 +239,7 @@ def test_times_outside_the_run_are_refused(time: float) -> None:
 
 
 def reference(model: NeedleModel, start: FloatArray, *times: float) -> FloatArray:
-    """Return states of a run by an ODE solver, far below any tolerance asked for here."""
+    """Return states from an ODE solver, with an error below all tested tolerances."""
     return np.asarray(
         solve_ivp(
             lambda _, x: model.derivative(x, PUSH),
@@ -263,8 +262,8 @@ def insertion() -> tuple[NeedleModel, FloatArray, FloatArray]:
 
 
 @pytest.mark.parametrize('formulation', ['complete', 'as_printed'])
-def test_a_call_meets_the_tolerance_asked_for(formulation: str) -> None:
-    """One call to advance ends within the tolerance of the exact end, in energy and in depth."""
+def test_each_call_meets_the_tolerance(formulation: str) -> None:
+    """One call to `advance` ends within the tolerance of the exact state, in energy and depth."""
     p = preset('paper_si', formulation=formulation)
     model = NeedleModel(p)
     start = moving(p, 0.05, 1e-3, 1.0)
@@ -274,15 +273,15 @@ def test_a_call_meets_the_tolerance_asked_for(formulation: str) -> None:
         it = Integrator(p, start, 1e-4, tolerance)
         it.advance(5e-3, PUSH)
         error = max(distance(model, it.state, exact), abs(it.state[0] - exact[0]) / LENGTH)
-        # The estimate is the difference of two runs over three: right at second order. The step
-        # comes in powers of two, so that the error found is from 1/16 of the tolerance up.
+        # The estimate is a third of the difference of two runs, correct at second order. The step
+        # is a power of two, so that the error is at least 1/16 of the tolerance.
         assert error < 1.1 * tolerance
         assert error <= before
         before = error
 
 
 def test_halving_the_tolerance_reduces_the_error_of_a_run() -> None:
-    """Over many calls errors add up; less tolerance never means more error, far from rounding."""
+    """Over many calls errors accumulate; a smaller tolerance never increases the error."""
     model, start, (exact, _) = insertion()
     errors = []
     for tolerance in 1e-4 / 4.0 ** np.arange(6):
@@ -290,15 +289,15 @@ def test_halving_the_tolerance_reduces_the_error_of_a_run() -> None:
         for _ in range(50):
             it.advance(3e-4, PUSH)
         errors.append(distance(model, it.state, exact))
-    # The step comes in powers of two: an error may stay, it does not grow.
+    # The step is a power of two: an error may be equal, but not larger.
     assert np.all(np.diff(errors) <= 1e-9)
     assert errors[-1] < 1e-2 * errors[0]
-    # Fifty calls, each within its tolerance; measured 5e-9, since errors of either sign meet.
+    # Fifty calls, each within its tolerance; measured 5e-9, since errors have both signs.
     assert errors[-1] < 50 * 1e-4 / 4.0**5
 
 
-def test_the_step_follows_the_needle() -> None:
-    """Steps are refined at shallow depth, where modes are fast, and taken back deeper in."""
+def test_step_adapts_to_the_depth() -> None:
+    """Steps are refined at shallow depth, where modes are fast, and enlarged at larger depth."""
     p = preset('paper_si')
     shallow, deep = (
         Integrator(p, moving(p, depth, 1e-3, 0.0), 1e-4, 1e-6) for depth in (0.01, 0.19)
@@ -314,13 +313,13 @@ def test_the_step_follows_the_needle() -> None:
         distance(one.model, two.state, one.state)
         for one, two in zip((shallow, deep), fixed, strict=True)
     ]
-    # A step of 0.1 ms is far off at 1 cm, where the first mode has 9 kHz, and fair at 19 cm.
+    # A step of 0.1 ms is inaccurate at 1 cm, where the first mode has 9 kHz, and fair at 19 cm.
     assert gaps[0] > 1e-2
     assert gaps[1] < 1e-2
 
 
 def test_graded_steps_are_of_second_order() -> None:
-    """Steps that grow with depth converge as even ones do, to the same end, with fewer steps."""
+    """Graded steps converge like even steps, to the same state, with fewer steps."""
     model, start, (_, exact) = insertion()
     errors: dict[bool, list[float]] = {}
     for graded in (False, True):
@@ -337,8 +336,8 @@ def test_graded_steps_are_of_second_order() -> None:
     assert errors[True][-1] < 1e-6
 
 
-def test_a_tolerance_is_kept_through_rest_and_impact() -> None:
-    """Sticking and the hub, where the motion has kinks, neither stall nor spoil the steps."""
+def test_tolerance_is_met_through_rest_and_impact() -> None:
+    """Sticking and hub contact, where the motion is not smooth, do not stall the step control."""
     p = preset('paper_si')
     it = Integrator(p, moving(p, 0.15, 1e-3, 0.0), tolerance=1e-8)
     assert it.advance(5e-3, 0.3).friction_work == 0.0
@@ -355,8 +354,8 @@ def test_a_tolerance_is_kept_through_rest_and_impact() -> None:
 
 
 @pytest.mark.parametrize('tolerance', [0.0, -1e-6, np.nan, np.inf])
-def test_a_tolerance_must_be_positive_and_finite(tolerance: float) -> None:
-    """What is no tolerance is refused by name and value, when the integrator is made."""
+def test_tolerance_must_be_positive_and_finite(tolerance: float) -> None:
+    """It is checked at construction; the message contains name and value."""
     p = preset('paper_si')
     with pytest.raises(ParameterError, match='tolerance must be positive and finite, got'):
         Integrator(p, NeedleModel(p).state_at(0.05), tolerance=tolerance)

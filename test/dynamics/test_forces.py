@@ -1,4 +1,4 @@
-"""Inverse dynamics, power of friction and reaction of the base, for every formulation."""
+"""Inverse dynamics, friction power and base reaction, for every formulation."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ kinds = pytest.mark.parametrize('changes', KINDS)
 
 
 def moving(model: NeedleModel, seed: int, speed: float) -> np.ndarray:
-    """Return a bent needle under way."""
+    """Return the state of a bent needle in motion."""
     rng = np.random.default_rng(seed)
     state = model.state_at(rng.uniform(0.04, 0.18), 5e-4)
     m = model.coordinates
@@ -38,20 +38,20 @@ def moving(model: NeedleModel, seed: int, speed: float) -> np.ndarray:
 
 @kinds
 @pytest.mark.parametrize('speed', [-0.3, 0.2])
-def test_inverse_dynamics_undoes_forward_dynamics(changes: dict[str, Any], speed: float) -> None:
-    """The forces that bring about the acceleration under some forces are those forces."""
+def test_inverse_dynamics_inverts_forward_dynamics(changes: dict[str, Any], speed: float) -> None:
+    """The forces required for an acceleration under given forces equal these forces."""
     model = NeedleModel(NeedleParameters.preset('paper_si', **changes))
     for seed in range(5):
         state = moving(model, seed, speed)
         forces = model.inverse_dynamics(state, model.acceleration(state, 1.7, 2e-3))
         expected = np.zeros(model.coordinates)
         expected[:2] = 1.7, 2e-3
-        # Rounding of the elastic forces, which are up to 100 N/m^1/2, through cond(G) = 1e5.
+        # Rounding of the elastic forces, up to 100 N/m^1/2, amplified by cond(G) = 1e5.
         assert_allclose(forces, expected, atol=1e-9)
 
 
 @pytest.mark.parametrize('sign', [-1.0, 1.0])
-def test_to_leave_rest_takes_what_friction_bears(sign: float) -> None:
+def test_breakaway_requires_friction_plus_inertia(sign: float) -> None:
     """From rest the force is mass times acceleration plus Coulomb friction, in its direction."""
     model = NeedleModel(NeedleParameters.preset('paper_si'))
     wanted = np.array([-sign * 3.0, 0.0, 0.0, 0.0])
@@ -60,20 +60,20 @@ def test_to_leave_rest_takes_what_friction_bears(sign: float) -> None:
 
 
 @kinds
-def test_friction_takes_power_either_way(changes: dict[str, Any]) -> None:
+def test_friction_dissipates_power_in_both_directions(changes: dict[str, Any]) -> None:
     """Friction opposes the motion, in and out of the tissue."""
     model = NeedleModel(NeedleParameters.preset('paper_si', **changes))
     for speed in (-0.2, -1e-6, 1e-6, 0.2):
         assert model.friction.force(speed, 0.0) * speed > 0.0
 
 
-# As printed the modes do not feel the change of depth that the balance of momentum contains.
+# As printed, the modes lack the effect of the depth rate in the momentum balance.
 @pytest.mark.parametrize('changes', [kind for kind in KINDS if 'formulation' not in kind])
 @pytest.mark.parametrize('speed', [-0.3, 0.2])
-def test_the_base_feels_what_the_integrator_averages(
+def test_base_reaction_matches_the_mean_of_the_integrator(
     changes: dict[str, Any], speed: float
 ) -> None:
-    """Over a short time the mean load of the base is that at its middle."""
+    """Over a short interval the mean base load equals the load at the middle."""
     model = NeedleModel(NeedleParameters.preset('paper_si', **changes))
     interval = 2e-7
     for seed in range(3):
@@ -89,24 +89,22 @@ def test_the_base_feels_what_the_integrator_averages(
         assert_allclose(seen.moment, moment, rtol=1e-4, atol=1e-6)
 
 
-def test_wrong_accelerations_are_refused() -> None:
-    """Shape and finiteness are checked."""
+def test_invalid_accelerations_are_rejected() -> None:
     model = NeedleModel(NeedleParameters())
     for wanted in (np.zeros(3), [0.0, np.nan, 0.0, 0.0]):
         with pytest.raises(ShapeError, match='acceleration must be finite with shape'):
             model.inverse_dynamics(model.state_at(0.1), wanted)
 
 
-def test_a_tolerance_that_rounding_forbids_is_said() -> None:
-    """What cannot be met is an error, not a silent best effort."""
+def test_unreachable_tolerance_raises_an_error() -> None:
     p = NeedleParameters.preset('paper_si')
     it = Integrator(p, NeedleModel(p).state_at(0.02, 5e-4), tolerance=1e-16)
     with pytest.raises(ToleranceError, match='cannot be met'):
         it.advance(1e-5, 3.0)
 
 
-def test_a_needle_held_at_rest_takes_what_friction_does_not() -> None:
-    """Without acceleration of the base friction bears the bent needle, up to its bound."""
+def test_holding_force_is_the_excess_over_friction() -> None:
+    """Without acceleration of the base, friction holds the bent needle up to its bound."""
     for tip, bends in ((1e-3, False), (6e-2, True)):
         model = NeedleModel(NeedleParameters.preset('paper_si'))
         state = model.state_at(0.05, tip)
@@ -118,8 +116,8 @@ def test_a_needle_held_at_rest_takes_what_friction_does_not() -> None:
         assert_allclose(held, -pull - np.clip(-pull, -0.56, 0.56), atol=1e-12)
 
 
-def test_an_error_leaves_the_integrator_where_it_was() -> None:
-    """After a tolerance that cannot be met, state and clock are those before the call."""
+def test_error_restores_the_integrator_state() -> None:
+    """After a tolerance error, state and clock are unchanged."""
     p = NeedleParameters.preset('paper_si')
     it = Integrator(p, NeedleModel(p).state_at(0.02, 5e-4), tolerance=1e-30)
     before = it.state
@@ -129,8 +127,8 @@ def test_an_error_leaves_the_integrator_where_it_was() -> None:
     assert it.time == 0.0
 
 
-def test_a_tolerance_is_not_fooled_by_a_step_that_leaves_the_range() -> None:
-    """A withdrawal that friction stops at once is not taken for one that leaves the tissue."""
+def test_coarse_step_outside_the_range_is_refined() -> None:
+    """A withdrawal that friction stops at once is not reported as leaving the tissue."""
     p = NeedleParameters.preset('paper_mm')
     start = NeedleModel(p).state_at(0.02)
     start[4] = 5.0
@@ -140,8 +138,8 @@ def test_a_tolerance_is_not_fooled_by_a_step_that_leaves_the_range() -> None:
 
 
 @pytest.mark.parametrize(('step', 'force'), [(1e-25, 3.0), (1e-5, 1e308)])
-def test_what_is_out_of_proportion_is_an_error(step: float, force: float) -> None:
-    """Steps below rounding and forces that overflow end in a typed error, not in a result."""
+def test_extreme_steps_and_forces_raise_an_error(step: float, force: float) -> None:
+    """Steps below rounding and forces that overflow raise a typed error."""
     p = NeedleParameters.preset('paper_si')
     with pytest.raises(NeedleError):
         Integrator(p, NeedleModel(p).state_at(0.02, 5e-4), step).advance(1e-3, force)

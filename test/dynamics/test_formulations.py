@@ -1,4 +1,4 @@
-"""Both formulations: what they share, what the printed one leaves out, and what that costs."""
+"""The formulations `complete` and `as_printed`: common terms, omitted terms and their effect."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def states(model: NeedleModel) -> list[FloatArray]:
 
 
 def normalized(model: NeedleModel, state: FloatArray) -> FloatArray:
-    """Modal rates in coordinates of unit mass, in which no mode is better than another."""
+    """Return modal rates in coordinates of unit mass, for comparable modes."""
     inertial = np.linalg.cholesky(model.mass_matrix(state)[2:, 2:])
     return np.asarray(inertial.T @ state[model.coordinates + 2 :])
 
@@ -55,7 +55,7 @@ def normalized(model: NeedleModel, state: FloatArray) -> FloatArray:
 
 
 def test_mass_matrix_and_energies_do_not_depend_on_the_formulation() -> None:
-    """The formulations share T, V, M and the output; they differ in N alone."""
+    """The formulations share T, V, M and the output; only N differs."""
     complete, printed = (needle(name) for name in FORMULATIONS)
     for x in states(complete):
         assert np.array_equal(complete.mass_matrix(x), printed.mass_matrix(x))
@@ -63,8 +63,8 @@ def test_mass_matrix_and_energies_do_not_depend_on_the_formulation() -> None:
         assert complete.tip_deflection(x) == printed.tip_deflection(x)
 
 
-def test_printed_bias_has_neither_the_row_of_d_nor_the_rate_of_the_mass() -> None:
-    """N as printed is [0, 0, (E I H + k G) q]; complete adds the row of d and -rho A d_dot g."""
+def test_printed_bias_omits_the_row_of_d_and_the_mass_rate() -> None:
+    """N as printed is [0, 0, (E I H + k G) q]; `complete` adds the row of d and -rho A d_dot g."""
     complete, printed = (conservative(name) for name in FORMULATIONS)
     for x in states(complete):
         p, depth = complete.parameters, complete.parameters.length - x[0]
@@ -82,15 +82,15 @@ def test_printed_bias_has_neither_the_row_of_d_nor_the_rate_of_the_mass() -> Non
 
 
 def test_with_a_frozen_base_both_have_the_same_modal_acceleration() -> None:
-    """While d does not change, what is left out does not act on the modes."""
+    """While d is constant, the omitted terms do not act on the modes."""
     complete, printed = (needle(name) for name in FORMULATIONS)
     for x in states(complete):
         x[4] = 0.0
         assert np.array_equal(complete.acceleration(x)[1:], printed.acceleration(x)[1:])
 
 
-def test_with_a_frozen_base_both_move_alike() -> None:
-    """A needle that friction holds vibrates the same in both formulations."""
+def test_with_a_frozen_base_both_have_the_same_motion() -> None:
+    """A needle at rest due to friction vibrates identically in both formulations."""
     ends = []
     for name in FORMULATIONS:
         model = needle(name, coulomb_friction=1e3, tissue_damping=1.6)
@@ -99,15 +99,15 @@ def test_with_a_frozen_base_both_move_alike() -> None:
         assert it.depth == model.parameters.length - ringing(model, 0.03, 0.0)[0]
         ends.append((normalized(model, it.state), it.state[2:4], total))
     (rates, shape, one), (other_rates, other_shape, other) = ends
-    # Momenta against rates: rounding of 2000 steps times cond(G) = 3e4.
+    # Momenta instead of rates: rounding of 2000 steps times cond(G) = 3e4.
     assert_allclose(other_rates, rates, atol=1e-9 * np.abs(rates).max())
     assert_allclose(other_shape, shape, atol=1e-9 * np.abs(shape).max())
     for quantity in ('lateral_force', 'moment', 'tip_deflection', 'damping_work'):
         assert_allclose(getattr(other, quantity), getattr(one, quantity), rtol=1e-7)
 
 
-def test_a_straight_needle_moves_alike() -> None:
-    """Without deflection nothing is left out: the same motion, bit for bit."""
+def test_straight_needle_has_the_same_motion_in_both() -> None:
+    """Without deflection the omitted terms are zero: bitwise equal motion."""
     ends = []
     for name in FORMULATIONS:
         model = needle(name)
@@ -117,8 +117,8 @@ def test_a_straight_needle_moves_alike() -> None:
     assert np.array_equal(ends[0], ends[1])
 
 
-def test_energy_rate_of_the_printed_form_is_what_it_leaves_out() -> None:
-    """dE/dt as printed is d_dot times the missing row with the kinetic sign turned."""
+def test_energy_rate_of_the_printed_form_equals_the_omitted_terms() -> None:
+    """dE/dt is d_dot times the omitted row, with opposite sign of the kinetic term."""
     model = conservative('as_printed')
     for x in states(model):
         p, tick = model.parameters, 1e-9
@@ -128,8 +128,8 @@ def test_energy_rate_of_the_printed_form_is_what_it_leaves_out() -> None:
         gained = p.linear_density * (at.value @ x[6:8]) ** 2
         gained += p.bending_stiffness * (at.curvature @ x[2:4]) ** 2
         gained += p.tissue_stiffness * (at.value @ x[2:4]) ** 2
-        # Elastic against inertial power cancels, omega E = 1e5 E / s each, with eps / (omega 1 ns)
-        # of rounding. Measured 6e-5 E / s, where what is left out amounts to 1 E / s.
+        # Elastic and inertial power cancel, omega E = 1e5 E / s each, with eps / (omega 1 ns) of
+        # rounding. Measured 6e-5 E / s, with omitted terms of 1 E / s.
         assert_allclose(rate, -0.5 * x[4] * gained, atol=3e-4 * model.energy(x))
         assert gained > 1e-2 * model.energy(x)
 
@@ -166,10 +166,10 @@ def test_order_two_against_an_ode_solver(formulation: str) -> None:
 
 def test_energy_of_a_full_insertion(capsys: pytest.CaptureFixture[str]) -> None:
     """
-    Through the whole length without friction, `complete` keeps its energy and `as_printed` not.
+    Over a full insertion without friction, `complete` conserves energy, `as_printed` does not.
 
-    The needle coasts from 2 cm to the hub with a deflection of 0.5 mm at first, at a tolerance
-    of 1e-8, the default of `needle simulate`, over each 0.2 ms.
+    The needle coasts from 2 cm to the hub with an initial deflection of 0.5 mm, at a tolerance of
+    1e-8, the default of `needle simulate`, over each 0.2 ms.
     """
     worst = {}
     for name in FORMULATIONS:
@@ -189,8 +189,8 @@ def test_energy_of_a_full_insertion(capsys: pytest.CaptureFixture[str]) -> None:
     assert worst['as_printed'] > 1.0
 
 
-def test_printed_form_moves_the_base_whatever_the_needle_does() -> None:
-    """As printed, d does not feel the deflection; with every term, a bent needle is drawn in."""
+def test_base_motion_of_the_printed_form_is_independent_of_deflection() -> None:
+    """As printed, the deflection does not act on d; in `complete`, a bent needle is drawn in."""
     ends = {}
     for name in FORMULATIONS:
         model = conservative(name)
@@ -201,12 +201,12 @@ def test_printed_form_moves_the_base_whatever_the_needle_does() -> None:
             ends[name, tip] = it.depth
     assert ends['as_printed', 0.0] == ends['as_printed', 5e-4]
     assert ends['complete', 0.0] == ends['as_printed', 0.0]
-    # 0.5 mm at 2 cm hold V = 1.2 mJ, which falls as s^-3: up to 3 V / s = 0.2 N of draw.
+    # 0.5 mm at 2 cm is V = 1.2 mJ, proportional to s^-3: a pulling force of up to 3 V / s = 0.2 N.
     assert ends['complete', 5e-4] > ends['complete', 0.0] + 5e-4
 
 
-def test_the_tip_runs_away_in_the_printed_form_only() -> None:
-    """In the open-loop run of section 3.2.8 the tip ends far beyond what energy allows."""
+def test_tip_deflection_diverges_only_in_the_printed_form() -> None:
+    """In the open-loop run of section 3.2.8 the deflection exceeds the energy limit."""
     last = {}
     for name in FORMULATIONS:
         model = needle(name)
@@ -214,13 +214,12 @@ def test_the_tip_runs_away_in_the_printed_form_only() -> None:
         seen = [it.advance(1e-4, 3.0).tip_deflection for _ in range(285)]
         assert 0.19 < it.depth < 0.2
         last[name] = np.abs(seen[-40:]).max()
-    # Measured: 1.2 mm, and 134 mm, of a deflection that began with 0.5 mm.
+    # Measured: 1.2 mm and 134 mm, from an initial deflection of 0.5 mm.
     assert last['complete'] < 2e-3
     assert last['as_printed'] > 0.1
 
 
 @pytest.mark.parametrize('name', ['', 'Complete', 'printed', None, 1])
-def test_unknown_formulation_is_refused(name: Any) -> None:
-    """A formulation that does not exist is refused when the constants are made."""
+def test_unknown_formulation_is_rejected(name: Any) -> None:
     with pytest.raises(ParameterError, match='formulation must be one of complete, as_printed'):
         NeedleParameters(formulation=name)

@@ -1,4 +1,4 @@
-"""The end-effector that presses the tissue: section 3.2.2.3."""
+"""Indenter: end-effector that presses the tissue, section 3.2.2.3."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ forces = st.floats(-3.0, 3.0)
 def indenter(
     seed: int = 0, sensor: ForceSensorParameters = PERFECT, limit: float = 1e3, **changes: Any
 ) -> Indenter:
-    """Make an indenter that is exact but for the changes."""
+    """Return an indenter that is ideal except for the changes."""
     parameters = IndenterParameters(**(EXACT | changes))
     return Indenter(parameters, ForceSensor(sensor, RATE, seed), RATE, seed, limit)
 
@@ -67,7 +67,7 @@ def stiffness(force: FloatArray) -> FloatArray:
 
 
 @given(forces, forces)
-def test_the_displacement_answers_the_force(x: float, z: float) -> None:
+def test_displacement_matches_the_stiffness_table(x: float, z: float) -> None:
     """F = K(|F|) d with K linear between the levels of Table 2 and constant outside."""
     force = np.array([x, z])
     moved = indenter().displacement(force)
@@ -76,17 +76,17 @@ def test_the_displacement_answers_the_force(x: float, z: float) -> None:
 
 
 @given(forces, forces, st.floats(-1e-3, 1e-3))
-def test_it_moves_off_the_plane_with_the_magnitude_of_the_force(
+def test_out_of_plane_motion_is_proportional_to_the_force(
     x: float, z: float, slope: float
 ) -> None:
-    """Y is the slope times |F|, whatever the direction."""
-    # Squares of what is below 1e-150 vanish.
+    """Y is the slope times |F|, for any direction."""
+    # Squares of numbers below 1e-150 vanish.
     moved = indenter(off_plane=slope).displacement(np.array([x, z]))
     assert_allclose(moved[1], slope * np.sqrt(x * x + z * z), rtol=1e-12, atol=1e-150)
 
 
-def test_the_force_follows_straight_lines_and_the_sensor_feels_it() -> None:
-    """From the present force to each point, then held; force x and z, no other component."""
+def test_force_trajectory_is_piecewise_linear_and_measured() -> None:
+    """From the present force to each point, then held; only the components x and z."""
     of = indenter()
     press(of, (0.5, 1.0, -0.5), (1.0, 0.0, 0.5))
     position, force, wrench = run(of, 1.5)
@@ -102,8 +102,8 @@ def test_the_force_follows_straight_lines_and_the_sensor_feels_it() -> None:
     assert_allclose(run(of, 0.2)[1][:, 0], 2.0 * time[:50], atol=1e-12)
 
 
-def test_the_rate_of_the_force_is_limited() -> None:
-    """A step of the command is a ramp of the force, its magnitude at the highest rate."""
+def test_force_rate_is_limited() -> None:
+    """A step command gives a ramp of the force magnitude at the highest rate."""
     of = indenter(force_rate=2.0)
     press(of, (0.0, 0.9, 1.2))
     _, force, _ = run(of, 1.0)
@@ -114,11 +114,11 @@ def test_the_rate_of_the_force_is_limited() -> None:
     assert np.array_equal(force[-1], [0.9, 1.2])
 
 
-def test_the_noise_of_the_position_is_as_stated() -> None:
-    """White, of one deviation on all three axes, and a function of the seed."""
+def test_position_noise_has_the_given_deviation() -> None:
+    """White noise with equal deviation on all three axes, determined by the seed."""
     count = 5000
     seen = run(indenter(seed=4, position_noise=2e-5), count / RATE)[0] / 2e-5
-    # Chi-square bounds at one in a million; the seed is fixed.
+    # Chi-square bounds with probability 1e-6; the seed is fixed.
     low, high = chi2.ppf([5e-7, 1.0 - 5e-7], count) / count
     assert np.all((low < np.mean(seen**2, axis=0)) & (np.mean(seen**2, axis=0) < high))
     # Five standard errors.
@@ -133,7 +133,7 @@ def test_the_noise_of_the_position_is_as_stated() -> None:
 
 
 def test_positions_are_whole_counts() -> None:
-    """Noise is rounded too: at most half a count is lost."""
+    """Noise is rounded too, with an error of at most half a count."""
     of = indenter(seed=1, position_noise=3e-5, encoder_resolution=1e-5)
     counts = run(of, 4.0)[0] / 1e-5
     # Rounding of the quotient of a few counts.
@@ -141,16 +141,15 @@ def test_positions_are_whole_counts() -> None:
     assert len(np.unique(np.round(counts))) > 10
 
 
-def test_a_stiffness_of_one_level_is_constant() -> None:
-    """With one level the tissue is linear."""
+def test_single_stiffness_level_is_linear() -> None:
     one: Any = dict.fromkeys(('stiffness_xx', 'stiffness_zz'), (1000.0,))
     none: Any = dict.fromkeys(('stiffness_xz', 'stiffness_zx'), (0.0,))
     of = indenter(force_levels=(1.0,), **one, **none)
     assert_allclose(of.displacement(np.array([3.0, -0.1]))[[0, 2]], [3e-3, -1e-4], rtol=1e-12)
 
 
-def test_the_sensor_is_zeroed_while_the_end_effector_rests() -> None:
-    """Refused while the force changes, and until a tenth of a second after."""
+def test_tare_requires_a_constant_force() -> None:
+    """Rejected while the force changes, and until a tenth of a second after."""
     of = indenter(sensor=ForceSensorParameters(force_bias=2.0))
     press(of, (0.2, 0.0, 1.0))
     run(of, 0.1)
@@ -162,7 +161,7 @@ def test_the_sensor_is_zeroed_while_the_end_effector_rests() -> None:
         of.tare()
     run(of, 0.2)
     of.tare()
-    # Five sigma of two means of 25 readings; the 1 N that acts is zeroed too.
+    # Five sigma of two means of 25 readings; the acting force of 1 N is zeroed too.
     assert np.abs(run(of, 0.1)[2][:, :3].mean(axis=0)).max() < 5 * 0.01 * np.sqrt(2 / 25)
 
 
@@ -178,8 +177,8 @@ def test_the_sensor_is_zeroed_while_the_end_effector_rests() -> None:
         ((JOINTS, [1.0], [[]], [[np.nan, 1.0]]), 'within 5 N'),
     ],
 )
-def test_what_it_cannot_follow_changes_nothing(message: Any, complaint: str) -> None:
-    """It is refused with its reason, and the course before goes on."""
+def test_invalid_trajectories_have_no_effect(message: Any, complaint: str) -> None:
+    """The trajectory is rejected with a reason, and the previous trajectory continues."""
     of = indenter(limit=5.0)
     press(of, (0.5, 1.0, 0.0))
     with pytest.raises(ParameterError, match=complaint):
@@ -200,7 +199,7 @@ def test_what_it_cannot_follow_changes_nothing(message: Any, complaint: str) -> 
         ({'position_noise': -1.0}, 'position_noise must be finite, >= 0 m'),
     ],
 )
-def test_tissue_that_is_none_is_refused(changes: dict[str, Any], complaint: str) -> None:
-    """The message names the field."""
+def test_invalid_tissue_parameters_are_rejected(changes: dict[str, Any], complaint: str) -> None:
+    """The message contains the name of the field."""
     with pytest.raises(ParameterError, match=complaint):
         IndenterParameters(**changes)

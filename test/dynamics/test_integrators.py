@@ -1,4 +1,4 @@
-"""The integrator: what it conserves, its order, friction, stops, and what sensors see of it."""
+"""Integrator: conservation laws, order, friction, stops, and sensor signals."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def needle(
     speed: float = 0.0,
     **changes: Any,
 ) -> Integrator:
-    """Make the integrator of a preset, at rest but for the insertion speed."""
+    """Return the integrator of a preset, at rest except for the insertion velocity."""
     parameters = preset(name, **changes)
     state = NeedleModel(parameters).state_at(depth, tip_deflection)
     state[4] = -speed
@@ -56,7 +56,7 @@ def frictionless(*args: Any, **changes: Any) -> Integrator:
 
 
 def ringing(it: Integrator, tip: float, energy: tuple[float, float]) -> Integrator:
-    """Give both normal modes kinetic energy [J] on top of a shape with this tip deflection."""
+    """Add kinetic energy [J] to both normal modes of a shape with this tip deflection."""
     model, state = it.model, it.state
     x = model.state_at(it.depth, tip)
     x[4] = state[4]
@@ -77,12 +77,12 @@ def order(steps: ArrayLike, errors: ArrayLike) -> float:
 # --- energy ---------------------------------------------------------------------------------
 
 
-def test_energy_neither_drifts_nor_strays_over_two_seconds() -> None:
+def test_energy_is_conserved_over_two_seconds() -> None:
     """
-    Without friction and damping, energy less input work stays within 1e-5 and does not drift.
+    Without friction and damping, energy minus input work is constant within 1e-5 without drift.
 
-    A steady pull balances the mean force with which the vibration draws the needle in, so that
-    the needle swings for 2 s (2e5 steps) about 2 cm, where the second mode has 22 kHz.
+    A constant pulling force balances the mean force of the vibration that draws the needle in, so
+    that the needle oscillates for 2 s (2e5 steps) about 2 cm, where the second mode has 22 kHz.
     """
     it = ringing(frictionless(), 4e-4, (1e-4, 3.5e-4))
     frequencies = np.sqrt(
@@ -96,7 +96,7 @@ def test_energy_neither_drifts_nor_strays_over_two_seconds() -> None:
     start = energy(it)
     pull = -2.0 * start / it.depth
     errors, depths, work = [], [], 0.0
-    # 0.17 ms: not a whole number of periods, so that samples see all phases.
+    # 0.17 ms: not a whole number of periods, so that samples cover all phases.
     for _ in range(12_000):
         work += it.advance(1.7e-4, pull).input_work
         errors.append((energy(it) - work) / start - 1.0)
@@ -105,8 +105,8 @@ def test_energy_neither_drifts_nor_strays_over_two_seconds() -> None:
     assert min(depths) > 0.018
     assert max(depths) < 0.022
     first, last = np.split(np.array(errors), 4)[::3]
-    # The error of a symplectic splitting is bounded by (omega h)^2 times the share of the
-    # energy that passes between axis and modes in a step: measured 1.7e-6.
+    # The error of a symplectic splitting is bounded by (omega h)^2 times the fraction of the
+    # energy exchanged between axis and modes in a step: measured 1.7e-6.
     assert np.abs(errors).max() < 1e-5
     # No drift: mean and spread of the error are the same in the first and the last quarter.
     # The mean of 3000 samples has a standard error of spread / 55.
@@ -114,8 +114,8 @@ def test_energy_neither_drifts_nor_strays_over_two_seconds() -> None:
     assert_allclose(last.std(), first.std(), rtol=0.05)
 
 
-def test_energy_error_falls_with_the_square_of_the_step() -> None:
-    """The energy error of a moving, ringing needle is of second order in the step."""
+def test_energy_error_is_of_second_order() -> None:
+    """The needle moves and vibrates."""
     steps = 1e-5 / 2.0 ** np.arange(4)
     worst = []
     for step in steps:
@@ -127,12 +127,12 @@ def test_energy_error_falls_with_the_square_of_the_step() -> None:
             seen.append(energy(it) / start - 1.0)
         worst.append(np.max(np.abs(seen)))
     assert it.depth > 0.05
-    # +-0.15: a maximum over samples, not an error at one time.
+    # +-0.15: maximum over samples instead of the error at one time.
     assert_allclose(order(steps, np.array(worst)), 2.0, atol=0.15)
 
 
 @pytest.mark.parametrize('name', ['paper_si', 'paper_mm', 'phantom'])
-def test_energy_lost_is_the_work_of_friction_and_damping(name: str) -> None:
+def test_energy_loss_equals_the_work_of_friction_and_damping(name: str) -> None:
     """E_end - E_start = input - friction - damping work, at the order of the integrator."""
     steps = 2.5e-6 / 2.0 ** np.arange(4)
     gaps: list[float] = []
@@ -144,14 +144,14 @@ def test_energy_lost_is_the_work_of_friction_and_damping(name: str) -> None:
         assert total.damping_work > 1e-4
         spent = total.friction_work + total.damping_work
         gaps.append(abs(energy(it) - before + spent - total.input_work))
-    # These steps resolve the 22 kHz mode: (omega h)^2 / 12 is 0.01, of the energy that passes
-    # between modes and axis. Measured: 3.5e-10 J of 5e-4 J (paper_mm) and 0.3 J (paper_si).
+    # These steps resolve the 22 kHz mode: (omega h)^2 / 12 is 0.01 of the energy exchanged between
+    # modes and axis. Measured: 3.5e-10 J of 5e-4 J (paper_mm) and 0.3 J (paper_si).
     assert gaps[0] < 1e-6 * total.input_work
     assert_allclose(order(steps, np.array(gaps)), 2.0, atol=0.1)
 
 
-def test_works_are_those_of_forces_along_the_path() -> None:
-    """Input work is force times travel plus torque times turn; friction work mu_s times travel."""
+def test_work_equals_force_times_travel() -> None:
+    """Input work includes torque times angle; friction work is mu_s times travel."""
     it = needle('paper_si', viscous_friction=0.0)
     before = it.state
     total = it.advance(0.01, PUSH, 2e-9)
@@ -167,7 +167,7 @@ def test_works_are_those_of_forces_along_the_path() -> None:
 
 @pytest.mark.parametrize('step', [1e-5, 1e-3])
 def test_modal_flow_is_exact_while_the_needle_sticks(step: float) -> None:
-    """At constant depth the undamped modes follow the matrix exponential, at any step."""
+    """At constant depth the undamped modes follow the matrix exponential, for any step."""
     it = ringing(needle(step=step), 3e-4, (1e-5, 1e-5))
     x, model = it.state, it.model
     mass, stiffness = model.mass_matrix(x)[2:, 2:], model.stiffness_matrix(it.depth)
@@ -177,13 +177,13 @@ def test_modal_flow_is_exact_while_the_needle_sticks(step: float) -> None:
     it.advance(0.01)
     expected = expm(0.01 * system) @ x[[2, 3, 6, 7]]
     assert it.depth == model.parameters.length - x[0]
-    # 1e4 rad of the second mode, each with the rounding of expm's squarings and of cond(G) 1e5.
+    # Phase of 1e4 rad of the second mode, with the rounding of expm (squarings) and cond(G) 1e5.
     size = np.abs(x[[2, 3, 6, 7]]).max() * np.array([1e-4, 1e-4, 1.0, 1.0])
     assert_allclose(it.state[[2, 3, 6, 7]] / size, expected / size, atol=1e-6)
 
 
 def test_tissue_damping_converges_to_the_damped_flow_at_second_order() -> None:
-    """At constant depth the damped modes converge to the matrix exponential, order two."""
+    """At constant depth the damped modes converge to the matrix exponential."""
     steps = 4e-6 / 2.0 ** np.arange(4)
     errors = []
     for step in steps:
@@ -201,7 +201,7 @@ def test_tissue_damping_converges_to_the_damped_flow_at_second_order() -> None:
         expected = x.copy()
         expected[[2, 3, 6, 7]] = expm(1e-3 * system) @ x[[2, 3, 6, 7]]
         difference = it.state - expected
-        # Measured in energy: no coordinate is better than another.
+        # Measured in energy, for comparable coordinates.
         errors.append(
             np.sqrt(model.energy(np.array([x[0], 0.0, *difference[2:4], 0, 0, *difference[6:]])))
         )
@@ -209,7 +209,7 @@ def test_tissue_damping_converges_to_the_damped_flow_at_second_order() -> None:
 
 
 def test_rotation_about_x_is_exact() -> None:
-    """I_x / 2 theta_ddot = tau: under constant torque theta is a parabola, whatever the rest."""
+    """I_x / 2 theta_ddot = tau: under constant torque theta is a parabola."""
     it = needle(**SECTION_328)
     for _ in range(10):
         it.advance(1e-3, PUSH, 4e-9)
@@ -220,7 +220,7 @@ def test_rotation_about_x_is_exact() -> None:
 
 
 def test_motion_without_friction_is_reversible() -> None:
-    """Advance, negate the rates, advance: the needle is back where it began."""
+    """Advance, negate the rates, advance: the needle is back at its initial state."""
     for push in (0.0, 0.5):
         it = ringing(frictionless(depth=0.05, speed=0.2), 5e-4, (1e-5, 1e-5))
         start = it.state
@@ -242,7 +242,7 @@ def test_motion_without_friction_is_reversible() -> None:
 
 
 def test_order_two_on_the_open_loop_run_of_the_paper() -> None:
-    """Depth, speed and tip deflection of the run of section 3.2.8 converge at order two."""
+    """Depth, velocity and tip deflection of the run of section 3.2.8 converge at order two."""
 
     def end(step: float) -> FloatArray:
         it = needle('paper_si', **SECTION_328, step=step)
@@ -254,7 +254,7 @@ def test_order_two_on_the_open_loop_run_of_the_paper() -> None:
     reference = end(1e-7)
     errors = np.abs([end(step) - reference for step in steps])
     # The reference is 12 times finer than the finest: its own error shifts the fit by 0.01.
-    # The speed is already good to 1e-9, where the next order still shows.
+    # The error of the velocity is already 1e-9, where the next order is visible.
     for name, column, wide in zip(
         ('depth', 'speed', 'tip'), errors.T, (0.1, 0.25, 0.1), strict=True
     ):
@@ -268,7 +268,7 @@ def test_order_two_on_the_open_loop_run_of_the_paper() -> None:
 def test_stiff_viscous_friction_does_not_reduce_the_order(
     name: str, pushes: tuple[float, ...]
 ) -> None:
-    """With mass / mu_v = 7 us, depth converges at order two from steps well above that."""
+    """With mass / mu_v = 7 us, depth converges at order two from much longer steps."""
 
     def end(step: float) -> float:
         it = needle(name, 0.05, 1e-3, step=step)
@@ -281,12 +281,12 @@ def test_stiff_viscous_friction_does_not_reduce_the_order(
     errors = np.array([abs(end(step) - reference) for step in steps])
     # Measured orders of the single halvings: 2.0 to 2.3.
     assert_allclose(order(steps, errors), 2.0, atol=0.25)
-    # At the default step the depth of a clinical insertion is good to a tenth of a nanometer.
+    # At the default step the depth error of a clinical insertion is a tenth of a nanometer.
     assert errors[2] < 1e-10
 
 
 def test_agrees_with_an_ode_solver_on_the_open_loop_run_of_the_paper() -> None:
-    """The tip is within 0.1 % of its peak of what DOP853 finds, as the default tolerance says."""
+    """The tip agrees with DOP853 within 0.1 % of its peak, the default tolerance."""
     p = preset('paper_si')
     model = NeedleModel(p)
     start = model.state_at(**SECTION_328)
@@ -305,17 +305,17 @@ def test_agrees_with_an_ode_solver_on_the_open_loop_run_of_the_paper() -> None:
     peak = np.abs(tips).max()
     # The default tolerance is 1e-3; a third of that at second order.
     assert np.abs(run.tip_deflection - tips).max() < 3e-4 * peak
-    # Depth: second order with (omega h)^2 of the modal force's share of the push.
+    # Depth: second order with (omega h)^2 of the modal part of the force.
     assert np.abs(run.states[:, 0] - solved.y[0]).max() < 1e-7
     assert np.abs(run.states[:, 4] - solved.y[4]).max() < 1e-5
 
 
-def test_one_long_advance_equals_many_short_ones() -> None:
-    """advance(T) and N times advance(T / N) agree within rounding, and so do their works."""
+def test_single_advance_equals_many_short_intervals() -> None:
+    """advance(T) and N times advance(T / N) agree within rounding, including the work."""
     one, many = needle(**SECTION_328), needle(**SECTION_328)
     whole = one.advance(0.02, PUSH, 1e-9)
     parts = [many.advance(1e-4, PUSH, 1e-9) for _ in range(200)]
-    # 200 changes between momenta and rates, each with cond(G) eps = 1e-11 at most.
+    # 200 conversions between momenta and rates, each with cond(G) eps = 1e-11 at most.
     assert_allclose(many.state, one.state, rtol=1e-9)
     for name in ('friction_work', 'damping_work', 'input_work'):
         summed = sum(getattr(part, name) for part in parts)
@@ -338,8 +338,8 @@ def test_two_runs_are_bit_identical() -> None:
     assert run() == run()
 
 
-def test_a_duration_of_whole_steps_takes_that_many_steps() -> None:
-    """Steps are equal, no longer than asked for, and rounding adds none."""
+def test_duration_is_divided_into_equal_steps() -> None:
+    """Steps are equal and no longer than ``step``; rounding does not add a step."""
     by_hundred, by_one = needle(**SECTION_328), needle(**SECTION_328)
     by_hundred.advance(100 * DEFAULT_STEP, PUSH)
     for _ in range(100):
@@ -357,8 +357,8 @@ def test_a_duration_of_whole_steps_takes_that_many_steps() -> None:
 
 
 @pytest.mark.parametrize('push', [-0.56, -0.3, 0.0, 0.56])
-def test_a_straight_needle_sticks_up_to_the_friction_bound(push: float) -> None:
-    """Up to |f| = mu_s the depth does not change by one bit in 1e5 steps."""
+def test_straight_needle_sticks_up_to_the_friction_bound(push: float) -> None:
+    """For |f| <= mu_s the depth is constant bit for bit over 1e5 steps."""
     it = needle(depth=0.0371)
     depth = it.depth
     total = it.advance(1e5 * DEFAULT_STEP, push)
@@ -368,16 +368,14 @@ def test_a_straight_needle_sticks_up_to_the_friction_bound(push: float) -> None:
 
 
 @pytest.mark.parametrize(('tip', 'push'), [(5e-4, 0.2), (6e-4, 0.0), (6e-4, -0.5)])
-def test_a_vibrating_needle_sticks_while_its_force_stays_within_the_bound(
-    tip: float, push: float
-) -> None:
-    """Modes that push with almost mu_s do not make the needle creep: bit for bit in 1e5 steps."""
+def test_vibrating_needle_sticks_within_the_friction_bound(tip: float, push: float) -> None:
+    """Modal forces close to mu_s do not cause creep: bit for bit over 1e5 steps."""
     it = needle(tip_deflection=tip)
     depth, drives = it.depth, []
     for _ in range(500):
         it.advance(1.7e-5, push)
         drives.append(push - (-it.model.bias_forces(it.state)[0]))
-    # The premise: the drive comes near the bound and stays within it.
+    # Precondition: the drive approaches the bound and remains within it.
     assert 0.3 < np.max(np.abs(drives)) < 0.56
     it.advance(1e5 * DEFAULT_STEP, push)
     assert it.depth == depth
@@ -386,16 +384,16 @@ def test_a_vibrating_needle_sticks_while_its_force_stays_within_the_bound(
 
 @pytest.mark.parametrize('sign', [-1.0, 1.0])
 def test_needle_breaks_away_just_above_the_bound(sign: float) -> None:
-    """A billionth more than mu_s moves the needle, by that excess alone."""
+    """A force of mu_s (1 + 1e-9) moves the needle, with the excess force alone."""
     it = needle(depth=0.1, viscous_friction=0.0)
     it.advance(0.1, sign * 0.56 * (1.0 + 1e-9))
     travel = sign * 0.5 * 0.56e-9 / it.model.parameters.moving_mass * 0.1**2
-    # 1e-6: the excess has 7 digits left; the depth near 0.1 m has 1e-17 m of rounding a step.
+    # 1e-6: the excess has 7 valid digits; the depth near 0.1 m has 1e-17 m of rounding per step.
     assert_allclose(it.depth - 0.1, travel, rtol=1e-6, atol=1e-12)
     assert it.velocity * sign > 0.0
 
 
-def test_a_moving_needle_comes_to_rest_and_stays() -> None:
+def test_moving_needle_stops_and_remains_at_rest() -> None:
     """Coulomb friction alone stops the needle after m u^2 / (2 mu_s)."""
     it = needle(depth=0.05, speed=1.0, viscous_friction=0.0)
     it.advance(0.05)
@@ -404,8 +402,8 @@ def test_a_moving_needle_comes_to_rest_and_stays() -> None:
     assert_allclose(it.depth - 0.05, it.model.parameters.moving_mass / (2.0 * 0.56), rtol=1e-11)
 
 
-def test_steady_speed_under_viscous_friction() -> None:
-    """With paper_mm a constant push settles at (f - mu_s) / mu_v, about 8 mm/s."""
+def test_steady_velocity_under_viscous_friction() -> None:
+    """With paper_mm a constant force gives (f - mu_s) / mu_v, about 8 mm/s."""
     it = needle('paper_mm')
     it.advance(1e-3, PUSH)
     # 1 ms is 148 time constants.
@@ -452,7 +450,7 @@ SLIDES = {
     'drive': st.floats(-5.0, 5.0),
     'mass': st.floats(1e-3, 1.0),
     'coulomb': st.just(0.0) | st.floats(0.01, 3.0),
-    # Viscous friction by its ratio to mass / t: from none to stiff.
+    # Viscous friction as a ratio to mass / t: from zero to stiff.
     'ratio': st.just(0.0) | st.floats(-7.0, 1.5).map(lambda exponent: 10.0**exponent),
     't': st.floats(1e-5, 1e-2),
 }
@@ -463,38 +461,38 @@ SLIDES = {
 def test_slide_is_the_exact_flow(
     u: float, drive: float, mass: float, coulomb: float, ratio: float, t: float
 ) -> None:
-    """Slide agrees with an ODE solver with events through stops, sticking and reversal."""
+    """`slide` agrees with an ODE solver with events through stops, sticking and reversal."""
     viscous = ratio * mass / t
     speed, distance = slide(u, drive, mass, coulomb, viscous, t)
     expected = exact_slide(u, drive, mass, coulomb, viscous, t)
     size = abs(u) + (abs(drive) + coulomb) * t / mass
-    # 1e-8: the solver's tolerance over up to a hundred steps, and its event's.
+    # 1e-8: the tolerances of solver and event detection over up to a hundred steps.
     assert_allclose(speed, expected[0], atol=1e-8 * size)
     assert_allclose(distance, expected[1], atol=1e-8 * size * t)
 
 
 @given(**SLIDES, part=st.floats(0.0, 1.0))
 @settings(deadline=None, derandomize=True, max_examples=300)
-def test_slide_is_a_flow(
+def test_slide_has_the_flow_property(
     u: float, drive: float, mass: float, coulomb: float, ratio: float, t: float, part: float
 ) -> None:
-    """Sliding for a part of the time and then for the rest is sliding for all of it."""
+    """Two successive intervals equal a single interval of the total duration."""
     viscous = ratio * mass / t
     speed, distance = slide(u, drive, mass, coulomb, viscous, t)
     middle, first = slide(u, drive, mass, coulomb, viscous, part * t)
     last, second = slide(middle, drive, mass, coulomb, viscous, (1.0 - part) * t)
     size = abs(u) + (abs(drive) + coulomb) * t / mass
-    # 1e-11: where exp gives way to its series, 1e-4, terms are equal to 1e-12 relative.
+    # 1e-11: at the transition from exp to its series, 1e-4, terms are equal to 1e-12 relative.
     assert_allclose(last, speed, atol=1e-11 * size)
     assert_allclose(first + second, distance, atol=1e-11 * size * t)
 
 
 @given(**SLIDES)
 @settings(deadline=None, derandomize=True, max_examples=300)
-def test_slide_mirrors(
+def test_slide_is_symmetric_in_direction(
     u: float, drive: float, mass: float, coulomb: float, ratio: float, t: float
 ) -> None:
-    """In and out are alike: negated speed and drive give the negated result, bit for bit."""
+    """Negated velocity and drive give the negated result, bit for bit."""
     viscous = ratio * mass / t
     speed, distance = slide(u, drive, mass, coulomb, viscous, t)
     assert slide(-u, -drive, mass, coulomb, viscous, t) == (-speed, -distance)
@@ -503,38 +501,38 @@ def test_slide_mirrors(
 @pytest.mark.parametrize('x', [0.0, 1e-9, 1e-6, 9.99e-5, 1.01e-4, 1e-2, 1.0, 40.0, 1e6])
 def test_decay_means_are_means_of_the_exponential(x: float) -> None:
     """Both are integrals of exp(-x r), also where the closed form cancels."""
-    # Fifty panels for the steep one; exp(-x r) over [0, 1] and (1 - r) exp(-x r).
+    # Fifty panels for the steep integrand; exp(-x r) over [0, 1] and (1 - r) exp(-x r).
     edges = np.concatenate([[0.0], np.geomspace(1e-8, 1.0, 50)])
     panels = list(pairwise(edges))
     mean = sum(fixed_quad(lambda r: np.exp(-x * r), *panel, n=20)[0] for panel in panels)
     ramp = sum(
         fixed_quad(lambda r: (1.0 - r) * np.exp(-x * r), *panel, n=20)[0] for panel in panels
     )
-    # Where exp takes over from the series, 1 - mean has lost eps / 1e-4 = 2e-12.
+    # At the transition from the series to exp, 1 - mean has lost eps / 1e-4 = 2e-12.
     assert_allclose(decay_means(x), (mean, ramp), rtol=1e-11)
 
 
 def test_limits_of_slide() -> None:
-    """Known motions: ballistic, stop within the interval, reversal, rest, terminal speed."""
+    """Known motions: ballistic, stop within the interval, reversal, rest, terminal velocity."""
     # Plain mechanics with two or three roundings: 1e-14.
     assert_allclose(slide(1.0, 2.0, 0.5, 0.0, 0.0, 0.1), (1.4, 0.12), rtol=1e-14)
     # 1 m/s against 2 N on 0.5 kg stops after 0.25 s and 0.125 m, and stays.
     assert slide(1.0, 0.0, 0.5, 2.0, 0.0, 1.0) == (0.0, 0.125)
-    # A millionth short of that, it still moves at a millionth of its speed.
+    # At a relative time of 1 - 1e-6 it still moves at 1e-6 of its velocity.
     assert_allclose(slide(1.0, 0.0, 0.5, 2.0, 0.0, 0.25 * (1.0 - 1e-6))[0], 1e-6, rtol=1e-9)
     # Stopped at 0.1 s by 3 + 2 N; then 3 - 2 N drive it back for the other 0.1 s.
     assert_allclose(slide(1.0, -3.0, 0.5, 2.0, 0.0, 0.2), (-0.2, 0.05 - 0.01), rtol=1e-13)
     assert slide(0.0, 2.0, 0.5, 2.0, 7.0, 1.0) == (0.0, 0.0)
     assert slide(0.0, -2.0, 0.5, 2.0, 0.0, 1.0) == (0.0, 0.0)
-    # b t = 1e9: terminal speed at once, no overflow.
+    # b t = 1e9: terminal velocity at once, no overflow.
     assert_allclose(slide(5.0, 3.0, 1e-6, 1.0, 1e3, 1.0), (2e-3, 2e-3), rtol=1e-5)
 
 
 # --- limits of travel -----------------------------------------------------------------------
 
 
-def test_hub_stops_the_needle_without_rebound_and_holds_it() -> None:
-    """The needle lands on d = 0 exactly, at rest, stays under any push, and can be withdrawn."""
+def test_hub_stops_the_needle_without_rebound() -> None:
+    """The needle stops exactly at d = 0, remains there under any push, and can be withdrawn."""
     it = needle('paper_si')
     it.advance(0.05, PUSH)
     for push in (PUSH, 0.0, -0.5):
@@ -547,16 +545,16 @@ def test_hub_stops_the_needle_without_rebound_and_holds_it() -> None:
     assert it.depth < 0.2
 
 
-def test_hub_takes_only_the_energy_of_insertion() -> None:
-    """Vibration outlives the impact: at the hub the modal energy stays what it is."""
+def test_hub_impact_dissipates_only_the_axial_energy() -> None:
+    """The modal energy is unchanged by the impact."""
     it = frictionless(depth=0.19, tip_deflection=1e-3, speed=1.0)
     depths = []
     while it.depth < 0.2:
         before = energy(it)
         it.advance(DEFAULT_STEP)
         depths.append(it.depth)
-    # The impact takes half m u^2 of about 1 mJ and leaves the modes alone. 1e-5 of that: the
-    # exchange between modes and axis within the step of the impact.
+    # The impact dissipates half m u^2 of about 1 mJ, without the modes. Tolerance 1e-5 of that:
+    # the exchange between modes and axis within the step of the impact.
     lost = before - energy(it)
     assert_allclose(lost, 0.5 * it.model.parameters.moving_mass, rtol=0.02)
     assert np.all(np.diff(depths) > 0.0)
@@ -568,8 +566,7 @@ def test_hub_takes_only_the_energy_of_insertion() -> None:
     assert_allclose(energy(it), kept, rtol=1e-10)
 
 
-def test_no_work_is_done_while_the_hub_holds() -> None:
-    """At rest on the skin nothing moves, so that neither input nor friction does work."""
+def test_no_work_is_done_at_rest_on_the_hub() -> None:
     it = needle('paper_si', depth=0.2)
     total = it.advance(0.05, PUSH)
     assert it.depth == 0.2
@@ -578,8 +575,8 @@ def test_no_work_is_done_while_the_hub_holds() -> None:
     assert total.axial_force == PUSH
 
 
-def test_input_work_counts_only_the_travel_up_to_the_hub() -> None:
-    """Input work is push times travel also in an interval that ends on the hub."""
+def test_input_work_includes_only_the_travel_up_to_the_hub() -> None:
+    """Also in the interval of the contact."""
     it = needle('paper_si')
     total = it.advance(0.05, PUSH)
     assert it.depth == 0.2
@@ -588,17 +585,17 @@ def test_input_work_counts_only_the_travel_up_to_the_hub() -> None:
 
 
 def test_without_hub_stop_the_needle_passes_the_hub() -> None:
-    """With hub_stop off, advance carries on to d < 0 and energy is kept."""
+    """Without hub_stop, the motion continues to d < 0 and energy is conserved."""
     it = frictionless(depth=0.19, tip_deflection=1e-3, speed=1.0, hub_stop=False)
     before = energy(it)
     it.advance(0.015)
     assert 0.2 < it.depth < 0.21
-    # (omega h)^2 with 42 Hz and 144 Hz is 1e-5, of the modal share of the energy.
+    # (omega h)^2 with 42 Hz and 144 Hz is 1e-5 of the modal part of the energy.
     assert_allclose(energy(it), before, rtol=1e-5)
 
 
-def test_hub_also_stops_a_moved_base() -> None:
-    """A base moved into the hub stays at d = 0."""
+def test_hub_stops_a_moved_base() -> None:
+    """The base stays at d = 0."""
     it = needle('paper_si', depth=0.19, speed=0.1)
     it.advance_moved(0.2, 0.1)
     assert it.depth == 0.2
@@ -609,8 +606,8 @@ def test_hub_also_stops_a_moved_base() -> None:
 
 
 @pytest.mark.parametrize('moved', [False, True])
-def test_withdrawal_below_the_minimum_raises_and_leaves_the_last_valid_state(moved: bool) -> None:
-    """The state left behind is the last one before the limit, and can be used again."""
+def test_withdrawal_below_the_minimum_keeps_the_last_valid_state(moved: bool) -> None:
+    """The last state before the limit can be used again."""
 
     def go(it: Integrator, duration: float) -> Interval:
         if moved:
@@ -626,12 +623,12 @@ def test_withdrawal_below_the_minimum_raises_and_leaves_the_last_valid_state(mov
             go(single, DEFAULT_STEP)
             taken += 1
     assert 100 < taken < 10_000
-    # The state is that of a run which ends with the last step before the limit. 1e-6: rounding
-    # of the step, times the phase of the second mode (1e5 rad) and cond(G) = 6e7 at 1 mm.
+    # The state equals that after the last step before the limit. 1e-6: rounding of the step, times
+    # the phase of the second mode (1e5 rad) and cond(G) = 6e7 at 1 mm.
     ended = needle(depth=4e-3, tip_deflection=1e-5)
     go(ended, taken * DEFAULT_STEP)
     assert_allclose(it.state, ended.state, rtol=1e-6)
-    # One more step would have crossed the limit.
+    # Another step would have crossed the limit.
     assert 1e-3 <= it.depth < 1e-3 - 1.1 * it.velocity * DEFAULT_STEP
     assert np.isfinite(it.model.acceleration(it.state)).all()
     last = it.state
@@ -639,7 +636,7 @@ def test_withdrawal_below_the_minimum_raises_and_leaves_the_last_valid_state(mov
         go(it, DEFAULT_STEP)
     # cond(G) eps once more, from rates to momenta and back.
     assert_allclose(it.state, last, rtol=1e-7)
-    # Brought to rest, the needle can go on from there.
+    # At rest, the needle can continue from there.
     last[4:] = 0.0
     halted = Integrator(it.model.parameters, last)
     halted.advance(2e-3, PUSH)
@@ -647,7 +644,7 @@ def test_withdrawal_below_the_minimum_raises_and_leaves_the_last_valid_state(mov
 
 
 def test_withdrawal_never_ends_below_the_minimum() -> None:
-    """Whatever fraction of a step is left to the limit, the last state is on its right side."""
+    """For any fraction of a step before the limit, the last state is valid."""
     for depth in np.linspace(1.2e-3, 1.3e-3, 25):
         it = needle(depth=depth, speed=-2.0, viscous_friction=0.0, coulomb_friction=0.0)
         with pytest.raises(InsertedLengthError):
@@ -656,7 +653,7 @@ def test_withdrawal_never_ends_below_the_minimum() -> None:
         assert 1e-3 <= it.depth < 1e-3 + 2e-5 + 1e-12
 
 
-# --- what sensors see -----------------------------------------------------------------------
+# --- sensor signals -------------------------------------------------------------------------
 
 
 def sampled(
@@ -693,10 +690,10 @@ def moments(model: NeedleModel, x: FloatArray, modal: slice) -> FloatArray:
     ],
     ids=['plain', 'carriage', 'layers', 'swelling', 'hub'],
 )
-def test_what_the_base_feels_in_parts_is_what_parts_by_themselves_tell(
+def test_base_loads_of_parts_equal_loads_of_single_intervals(
     modes: int, formulation: str, changes: dict[str, Any]
 ) -> None:
-    """Means over equal parts are those of intervals one after the other; their mean is known."""
+    """Means over equal parts equal those of successive intervals."""
     changes = {'minimum_depth': 0.03, **changes}
     parameters = preset('paper_si', modes=modes, formulation=formulation, **changes)
     state = NeedleModel(parameters).state_at(0.04, 1e-4)
@@ -707,7 +704,7 @@ def test_what_the_base_feels_in_parts_is_what_parts_by_themselves_tell(
     parts = [single.advance(4e-4, *inputs) for _ in range(5)]
     rows = [[part.axial_force, part.lateral_force, part.moment] for part in parts]
     size = np.abs(rows).max(axis=0)
-    # 1e-7: rounding of rates to momenta and back at each of the single intervals, cond(G) eps.
+    # 1e-7: conversion of rates to momenta and back in each single interval, cond(G) eps.
     assert_allclose(total.felt / size, rows / size, rtol=0.0, atol=1e-7)
     mean = [total.axial_force, total.lateral_force, total.moment]
     assert_allclose(total.felt.mean(axis=0), mean, rtol=0.0, atol=1e-14 * size.max())
@@ -725,12 +722,12 @@ def test_what_the_base_feels_in_parts_is_what_parts_by_themselves_tell(
 @pytest.mark.parametrize('moved', [False, True])
 def test_means_agree_with_fine_samples_of_the_motion(moved: bool, damping: float) -> None:
     """
-    Tip, lateral force and moment are what momentum balance over fine samples gives.
+    Tip, lateral force and moment match the momentum balance over fine samples.
 
     Force: d/dt of rho A int w_dot plus tissue reaction; moment about the base: the same with
     lever y + d.
     """
-    # A period and a bit of the second mode, so that its mean counts, too.
+    # Slightly more than a period of the second mode, so that its mean is included.
     step, steps = 1e-6, 230
 
     def make() -> Integrator:
@@ -748,36 +745,36 @@ def test_means_agree_with_fine_samples_of_the_motion(moved: bool, damping: float
     p = model.parameters
     shift = np.array([moments(model, x, slice(2, 4)) for x in states])
     rate = np.array([moments(model, x, slice(6, 8)) for x in states])
-    # At a frozen moment of time, Newton for a needle at rest in y: density of momentum changes.
+    # At a fixed time, Newton for a needle at rest in y: the momentum density changes.
     inertia = np.gradient(p.linear_density * rate, time, axis=0, edge_order=2)
     reaction = inertia + p.tissue_stiffness * shift + p.tissue_damping * rate
     lateral = reaction[:, 0]
     moment = reaction[:, 1] + states[:, 0] * lateral + (0.0 if moved else 1e-7)
     tips = np.array([model.tip_deflection(x) for x in states])
     duration = steps * step
-    # Second mode 5.5 kHz: differences and trapezoids err by (omega h)^2 / 6 = 2e-4 of the
-    # amplitude, and by less in the mean.
+    # Second mode 5.5 kHz: differences and trapezoids have an error of (omega h)^2 / 6 = 2e-4 of
+    # the amplitude, and less in the mean.
     for name, course in (('tip_deflection', tips), ('lateral_force', lateral), ('moment', moment)):
         mean = trapezoid(course, time) / duration
         assert_allclose(getattr(total, name), mean, atol=1e-3 * np.abs(course).max(), err_msg=name)
-        # The tolerance is far below what is measured.
+        # The tolerance is much smaller than the measured values.
         assert abs(mean) > 1e-2 * np.abs(course).max(), name
 
 
-def test_static_load_on_the_base_is_that_of_the_tissue() -> None:
+def test_static_base_load_equals_the_tissue_reaction() -> None:
     """
-    An overdamped needle relaxes without inertia: force and moment are those of the tissue alone.
+    An overdamped needle relaxes without inertia: the base load is the tissue reaction alone.
 
-    Then the base carries int (k_a w + c_a w_t) dy and int (y + d) (k_a w + c_a w_t) dy.
+    The base carries int (k_a w + c_a w_t) dy and int (y + d) (k_a w + c_a w_t) dy.
     """
     it = needle('phantom', depth=0.15, tip_deflection=2e-3, tissue_damping=1e5)
-    # A millisecond lets the rates follow the shape (time constant rho A / c_a = 0.1 us).
+    # After a millisecond the rates follow the shape (time constant rho A / c_a = 0.1 us).
     it.advance(1e-3)
     x = it.state
     seen = it.advance(DEFAULT_STEP)
     p = it.model.parameters
     middle = 0.5 * (x + it.state)
-    # Rates as the change of shape over the interval.
+    # Rates from the change of shape over the interval.
     middle[6:] = (it.state[2:4] - x[2:4]) / DEFAULT_STEP
     load = p.tissue_stiffness * moments(it.model, middle, slice(2, 4))
     load += p.tissue_damping * moments(it.model, middle, slice(6, 8))
@@ -788,20 +785,20 @@ def test_static_load_on_the_base_is_that_of_the_tissue() -> None:
 
 
 @pytest.mark.parametrize('push', [0.3, 3.0])
-def test_axial_force_is_the_push_when_nothing_is_carried(push: float) -> None:
-    """Without carriage the sensor at the base feels just what is applied, at rest or moving."""
+def test_axial_force_without_carriage_is_the_applied_force(push: float) -> None:
+    """The base sensor measures the applied force, at rest and in motion."""
     assert needle(**SECTION_328).advance(1e-3, push).axial_force == push
 
 
-def test_axial_force_leaves_out_what_accelerates_the_carriage() -> None:
-    """With a carriage the needle gets the push less carriage mass times acceleration."""
+def test_axial_force_excludes_the_inertia_of_the_carriage() -> None:
+    """The needle receives the applied force minus carriage mass times acceleration."""
     it = needle(carriage_mass=0.5, viscous_friction=0.0)
     seen = it.advance(0.01, PUSH)
     p = it.model.parameters
     acceleration = (PUSH - 0.56) / p.moving_mass
     assert_allclose(it.velocity, acceleration * 0.01, rtol=1e-12)
     assert_allclose(seen.axial_force, PUSH - 0.5 * acceleration, rtol=1e-11)
-    # The same by the needle alone.
+    # The same from the needle alone.
     needle_mass = p.linear_density * p.length
     assert_allclose(seen.axial_force, 0.56 + needle_mass * acceleration, rtol=1e-9)
 
@@ -812,7 +809,7 @@ def test_axial_force_leaves_out_what_accelerates_the_carriage() -> None:
 @given(start=st.floats(-0.2, 0.2), end=st.floats(-0.2, 0.2), tip=st.floats(-5e-4, 5e-4))
 @settings(deadline=None, derandomize=True, max_examples=50)
 def test_moved_base_has_exact_kinematics(start: float, end: float, tip: float) -> None:
-    """The base goes evenly from speed to speed, whatever the needle does."""
+    """The velocity of the base changes linearly, independent of the needle."""
     it = needle(depth=0.08, speed=start, tip_deflection=tip)
     it.advance_moved(0.01, end)
     # Sums over 1000 steps of numbers up to 0.1 m.
@@ -820,8 +817,8 @@ def test_moved_base_has_exact_kinematics(start: float, end: float, tip: float) -
     assert it.velocity == end
 
 
-def test_a_moved_base_that_shall_rest_does_so_exactly() -> None:
-    """Brought to rest, the base stays where it is bit for bit."""
+def test_stopped_base_rests_exactly() -> None:
+    """After a stop the position is constant bit for bit."""
     it = needle(depth=0.08, speed=0.0731, tip_deflection=5e-4)
     it.advance_moved(0.0123, 0.0)
     assert it.velocity == 0.0
@@ -833,20 +830,18 @@ def test_a_moved_base_that_shall_rest_does_so_exactly() -> None:
 
 @pytest.mark.parametrize('name', ['paper_si', 'paper_mm'])
 @pytest.mark.parametrize('speed', [-0.05, 0.05])
-def test_axial_force_of_a_straight_needle_moved_steadily_is_friction(
-    name: str, speed: float
-) -> None:
-    """At constant speed a straight needle takes mu_s + mu_v u, against the motion."""
+def test_axial_force_at_constant_velocity_is_friction(name: str, speed: float) -> None:
+    """At constant velocity a straight needle requires mu_s + mu_v u, against the motion."""
     it = needle(name, depth=0.1, speed=speed)
     seen = it.advance_moved(0.1, speed)
     viscous = it.model.parameters.viscous_friction
-    # The mean speed comes from a difference of depths near 0.1 m.
+    # The mean velocity is from a difference of depths near 0.1 m.
     assert_allclose(seen.axial_force, np.sign(speed) * 0.56 + viscous * speed, rtol=1e-12)
     assert seen.lateral_force == seen.moment == seen.tip_deflection == 0.0
 
 
-def test_axial_force_of_an_accelerated_base_adds_the_inertia_of_the_needle() -> None:
-    """While accelerating, the needle's own mass counts, not the carriage's."""
+def test_axial_force_of_an_accelerated_base_includes_needle_inertia() -> None:
+    """The mass of the needle is included, without the carriage."""
     accelerated = needle(depth=0.1, speed=0.1, carriage_mass=0.5)
     seen = accelerated.advance_moved(0.02, 0.1 + 4.0 * 0.02)
     mean_speed = 0.1 + 0.5 * 0.02 * 4.0
@@ -854,8 +849,8 @@ def test_axial_force_of_an_accelerated_base_adds_the_inertia_of_the_needle() -> 
     assert_allclose(seen.axial_force, 0.56 + 0.3 * mean_speed + 4.0 * mass, rtol=1e-12)
 
 
-def test_axial_force_of_a_base_that_reverses_is_the_mean_over_both_directions() -> None:
-    """Coulomb friction counts for the time spent in each direction."""
+def test_axial_force_during_a_reversal_is_the_mean_of_both_directions() -> None:
+    """Coulomb friction is weighted with the time in each direction."""
     it = needle(depth=0.1, speed=0.1)
     seen = it.advance_moved(0.01, -0.05)
     # Inwards for two thirds of the time, outwards for one third.
@@ -864,22 +859,22 @@ def test_axial_force_of_a_base_that_reverses_is_the_mean_over_both_directions() 
     assert_allclose(seen.axial_force, expected, rtol=1e-11)
 
 
-def test_base_at_rest_takes_no_force_that_friction_can_bear() -> None:
-    """Held at rest, a straight or weakly vibrating needle leaves the base without axial force."""
+def test_base_at_rest_needs_no_force_within_the_friction_bound() -> None:
+    """A straight or weakly vibrating needle at rest causes no axial base force."""
     for tip in (0.0, 3e-4):
         it = needle(tip_deflection=tip)
         assert it.advance_moved(0.01, 0.0).axial_force == 0.0
-    # A stronger one draws on the base with what friction cannot bear.
+    # A stronger vibration loads the base with the excess over friction.
     it = needle(tip_deflection=2e-3)
     seen = it.advance_moved(0.01, 0.0)
     mean = 2.0 * energy(it) / it.depth
     assert mean > 0.56
-    # A tenth: V of a tip load scales as s^-3 and its mean force differs from 2 E / s by that.
+    # 10 %: V of a tip load scales as s^-3, and its mean force differs from 2 E / s by that.
     assert_allclose(seen.axial_force, -(mean - 0.56), rtol=0.1)
 
 
-def test_force_of_a_moved_base_balances_the_energy() -> None:
-    """At constant speed, force times travel is the energy gained plus friction and damping."""
+def test_force_of_a_moved_base_satisfies_the_energy_balance() -> None:
+    """Force times travel is the energy gain plus friction and damping work."""
     for tip, damping in ((1e-3, 0.0), (1e-3, 1.6)):
         it = needle(depth=0.04, tip_deflection=tip, speed=0.5, tissue_damping=damping)
         before = energy(it)
@@ -896,8 +891,8 @@ def test_force_of_a_moved_base_balances_the_energy() -> None:
         )
 
 
-def test_works_of_a_moved_base_are_those_of_its_force() -> None:
-    """Friction work and input work are also right when the base is moved, by the same balance."""
+def test_work_of_a_moved_base_satisfies_the_energy_balance() -> None:
+    """Friction work and input work of a moved base."""
     it = needle(depth=0.1, speed=0.05)
     seen = it.advance_moved(0.1, 0.05)
     friction = (0.56 + 0.3 * 0.05) * 0.005
@@ -905,11 +900,11 @@ def test_works_of_a_moved_base_are_those_of_its_force() -> None:
     assert_allclose(seen.input_work, friction, rtol=1e-11)
 
 
-# --- simulate, and what is refused ----------------------------------------------------------
+# --- simulate, and invalid arguments --------------------------------------------------------
 
 
-def test_simulate_samples_the_same_motion_and_holds_the_force_over_each_interval() -> None:
-    """Samples are those of an integrator fed with the force at the start of each interval."""
+def test_simulate_equals_an_integrator_with_zero_order_hold() -> None:
+    """The force is evaluated at the start of each interval."""
     p = preset('phantom')
     start = NeedleModel(p).state_at(**SECTION_328)
     asked = []
@@ -931,7 +926,7 @@ def test_simulate_samples_the_same_motion_and_holds_the_force_over_each_interval
 
 
 def test_state_is_a_copy() -> None:
-    """Neither the state given nor the state returned is the one that moves."""
+    """Neither the given nor the returned state changes during the motion."""
     given_state = NeedleModel(preset('paper_si')).state_at(**SECTION_328)
     kept = given_state.copy()
     it = Integrator(preset('paper_si'), given_state)
@@ -945,13 +940,12 @@ def test_state_is_a_copy() -> None:
 
 @pytest.mark.parametrize('step', [0.0, -1e-5, np.nan, np.inf])
 def test_step_must_be_positive_and_finite(step: float) -> None:
-    """A step that is not positive and finite is refused by name and value."""
+    """The message contains name and value."""
     with pytest.raises(ParameterError, match='step must be finite and >= 1e-09 s, got'):
         needle(step=step)
 
 
-def test_a_state_that_is_not_valid_is_refused() -> None:
-    """The integrator takes only states of the model."""
+def test_invalid_states_are_rejected() -> None:
     p = preset('paper_si')
     with pytest.raises(ShapeError):
         Integrator(p, np.zeros(6))
@@ -972,10 +966,10 @@ def test_a_state_that_is_not_valid_is_refused() -> None:
         (1e-3, {'torque': np.inf}),
     ],
 )
-def test_inputs_that_are_not_valid_are_refused_and_leave_the_state(
+def test_invalid_inputs_are_rejected_without_effect(
     duration: float, inputs: dict[str, Any]
 ) -> None:
-    """Time must pass and inputs be finite; what is refused does not touch the state."""
+    """Durations must be positive and inputs finite; the state is not changed."""
     it = needle(**SECTION_328)
     before = it.state
     with pytest.raises(ParameterError):
@@ -984,8 +978,7 @@ def test_inputs_that_are_not_valid_are_refused_and_leave_the_state(
 
 
 @pytest.mark.parametrize('speed', [np.nan, np.inf])
-def test_speed_that_is_not_finite_is_refused_and_leaves_the_state(speed: float) -> None:
-    """A moved base needs a finite speed to go to."""
+def test_non_finite_velocity_is_rejected_without_effect(speed: float) -> None:
     it = needle(**SECTION_328)
     before = it.state
     with pytest.raises(ParameterError):

@@ -1,4 +1,4 @@
-"""What messages of `joint_commands` ask for, and what a plant makes of them."""
+"""Parsing of `joint_commands` messages and their effect on a plant."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def message(
     velocity: Values = (),
     effort: Values = (),
 ) -> Reading:
-    """Return a message as the hardware interface fills it."""
+    """Return a message as sent by the hardware interface."""
     return Reading(stamp, '', names, (position, velocity, effort))
 
 
@@ -37,7 +37,7 @@ def reader(mode: str, steered: bool = False) -> JointCommands:
 
 
 def asked(commands: JointCommands, *arguments: Any, at: float = 0.05) -> tuple[Any, ...]:
-    """Return force, torque and motions of a message that counts."""
+    """Return force, torque and motions of an accepted message."""
     found = commands.read(message(*arguments), {'insertion': at}, START)
     commands.accept(found)
     return found.force, found.torque, found.motions
@@ -46,8 +46,8 @@ def asked(commands: JointCommands, *arguments: Any, at: float = 0.05) -> tuple[A
 # Reading.
 
 
-def test_what_nobody_has_set_asks_for_nothing() -> None:
-    """Before a controller is active all is NaN; what has been a number must stay one."""
+def test_unset_values_have_no_effect() -> None:
+    """Before a controller is active all values are NaN; a number must remain a number."""
     commands = reader('simulation')
     names = ('insertion', 'rotation')
     assert asked(commands, START, names, (), (), (nan, nan)) == (0.0, 0.0, [])
@@ -59,8 +59,8 @@ def test_what_nobody_has_set_asks_for_nothing() -> None:
     assert asked(commands, START, names, (), (), (nan, nan)) == (0.0, 0.0, [])
 
 
-def test_a_position_is_reached_when_the_next_may_come() -> None:
-    """In the time from message to message, within a period of the plant and the timeout."""
+def test_position_is_reached_within_the_message_interval() -> None:
+    """The message interval is limited to a period of the plant and the timeout."""
     commands = reader('robot')
     steps = [(0, 0.1), (10 * PERIOD, 0.01), (10 * PERIOD, 1e-3), (900 * PERIOD, 0.1)]
     for k, (after, within) in enumerate(steps):
@@ -69,12 +69,12 @@ def test_a_position_is_reached_when_the_next_may_come() -> None:
         (motion,) = motions
         assert motion.goals == goal
         assert motion.within == pytest.approx(within)
-    # The same again asks for nothing new.
+    # A repeated position has no effect.
     assert asked(commands, START + 901 * PERIOD, ('insertion',), (0.05 + 3e-4,))[2] == []
 
 
-def test_a_velocity_without_a_position_lasts_for_the_timeout() -> None:
-    """From where the joint is; a joint that rests is told so once."""
+def test_velocity_without_position_lasts_for_the_timeout() -> None:
+    """The motion starts at the present position; a zero velocity is sent once."""
     commands = reader('robot')
     assert asked(commands, START, ('insertion',), (), (0.0,))[2] == []
     for _ in range(2):
@@ -85,7 +85,7 @@ def test_a_velocity_without_a_position_lasts_for_the_timeout() -> None:
     _, _, motions = asked(commands, START, ('insertion',), (), (0.0,))
     assert motions == [Motion({'insertion': 0.05}, 0.1)]
     assert asked(commands, START, ('insertion',), (), (0.0,))[2] == []
-    # Beside a position it says nothing more.
+    # With a position the velocity has no effect.
     _, _, motions = asked(commands, START, ('insertion',), (0.06,), (0.01,))
     assert [motion.goals for motion in motions] == [{'insertion': 0.06}]
 
@@ -95,22 +95,22 @@ def test_a_velocity_without_a_position_lasts_for_the_timeout() -> None:
     [
         ('simulation', False, (BOTH, (), (), (1.0,)), 'one for each of its 2 joints, got 1'),
         ('simulation', False, (('a', 'a'), (), (), (1.0, 1.0)), 'names a joint twice: a, a'),
-        ('simulation', False, (('insertion',), (0.1,)), 'position 0.1 of insertion.* of no joint'),
+        ('simulation', False, (('insertion',), (0.1,)), 'position 0.1 of insertion.* no joint'),
         ('robot', False, (('insertion',), (nan,), (), (2.0,)), 'effort 2 of insertion.* no joint'),
-        ('robot', False, (BOTH, (0.1, 0.0)), 'position 0 of guide_x.* that of insertion'),
-        ('indenter', False, (('x',), (), (), (1.0,)), 'effort 1 of x.* of no joint'),
-        ('simulation', True, (('rotation',), (), (), (0.1,)), 'effort 0.1 of ro.* of insertion'),
+        ('robot', False, (BOTH, (0.1, 0.0)), 'position 0 of guide_x.* it for insertion'),
+        ('indenter', False, (('x',), (), (), (1.0,)), 'effort 1 of x.* for no joint'),
+        ('simulation', True, (('rotation',), (), (), (0.1,)), 'effort 0.1 of ro.* for insertion'),
     ],
 )
-def test_what_cannot_be_done_is_said(
+def test_unsupported_commands_are_rejected(
     mode: str, steered: bool, arguments: tuple[Any, ...], complaint: str
 ) -> None:
     with pytest.raises(ParameterError, match=complaint):
         reader(mode, steered).read(message(START, *arguments), {}, START)
 
 
-def test_what_a_controller_leaves_at_its_end_asks_for_nothing() -> None:
-    """Zero where the plant takes nothing."""
+def test_zero_values_after_the_end_of_a_controller_have_no_effect() -> None:
+    """Zeros are accepted for interfaces that the plant does not use."""
     commands = reader('robot')
     assert asked(commands, START, ('insertion',), (nan,), (0.0,), (0.0,)) == (0.0, 0.0, [])
 
@@ -123,7 +123,7 @@ def run(**values: Any) -> PlantRun:
 
 
 def drive(plant: PlantRun, samples: int, every: int, say: Any) -> list[float]:
-    """Take samples, with a message after every so many; return the depth at each sample."""
+    """Take samples with a message every ``every`` samples; return the depth at each sample."""
     depths = []
     for k in range(samples):
         stamp = START + k * PERIOD
@@ -136,15 +136,15 @@ def drive(plant: PlantRun, samples: int, every: int, say: Any) -> list[float]:
 
 
 @pytest.mark.parametrize('every', [1, 5, 10, 50])
-def test_the_base_follows_at_any_rate(every: int) -> None:
-    """Positions that come slower than the plant samples: it is one message behind, and arrives."""
+def test_base_follows_positions_at_any_message_rate(every: int) -> None:
+    """At a message rate below the sample rate it lags by one message, and arrives."""
     speed, plant = 0.01, run(mode='robot')
 
     def say(now: int, time: float) -> Reading:
         return message(now, ('insertion',), (0.05 + speed * min(time, 1.0),))
 
     depths = drive(plant, 2000, every, say)
-    # In the middle, where it neither starts nor stops; friction does not matter to the base.
+    # In the middle, without start and stop; friction has no effect on the base.
     behind = [0.05 + speed * k / 1000.0 - depths[k] for k in range(500, 900)]
     assert min(behind) + 1e-6 >= 0.0
     assert max(behind) <= speed * (2 * every + 1) / 1000.0
@@ -153,18 +153,18 @@ def test_the_base_follows_at_any_rate(every: int) -> None:
     assert max(steps) < 1.2e-3 * speed
 
 
-def test_a_velocity_is_kept_and_ends_with_the_messages() -> None:
+def test_velocity_is_held_and_ends_after_the_last_message() -> None:
     plant = run(mode='robot')
     depths = drive(plant, 500, 10, lambda now, _: message(now, ('insertion',), (), (0.02,)))
     assert depths[499] - depths[399] == pytest.approx(0.002, rel=1e-3)
     depths = drive(plant, 1000, 1000, lambda now, _: message(now - 10**12, ('insertion',)))
-    # For the timeout of 0.1 s, and as far as it brakes.
+    # For the timeout of 0.1 s plus the braking distance.
     assert 0.001 < depths[-1] - depths[0] < 0.0025
     assert depths[-1] == pytest.approx(depths[-100], abs=1e-7)
 
 
-def test_a_force_is_held_to_the_next_and_ends_with_the_messages() -> None:
-    """At a tenth of the rate the needle goes (f - mu_s) / mu_v; then no force is applied."""
+def test_force_is_held_and_ends_after_the_last_message() -> None:
+    """At a tenth of the rate the velocity is (f - mu_s) / mu_v, and finally zero."""
     plant = run()
     names = ('insertion', 'rotation')
     drive(plant, 500, 10, lambda now, _: message(now, names, (), (), (3.56, nan)))
@@ -178,8 +178,8 @@ def test_a_force_is_held_to_the_next_and_ends_with_the_messages() -> None:
 
 
 @pytest.mark.parametrize('value', [nan, inf, -16.0])
-def test_a_force_that_nobody_means_is_none(value: float) -> None:
-    """It is refused, counted and said, and the force before it ends."""
+def test_invalid_forces_are_rejected(value: float) -> None:
+    """The force is counted and reported, and the previous force ends."""
     plant = run()
     plant.take(START)
     say = lambda force, k: plant.command_joints(  # noqa: E731
@@ -191,14 +191,14 @@ def test_a_force_that_nobody_means_is_none(value: float) -> None:
     assert counts
     assert 'must be within force_limit, 15 N' in complaint
     assert (plant.commands.newest.force, plant.commands.refused) == (0.0, 1)
-    # It is refused as long as it comes.
+    # It is rejected in every message.
     assert say(value, 3)[1]
     assert say(3.0, 4) == (True, '')
     assert plant.commands.newest.force == 3.0
 
 
-def test_a_position_out_of_reach_is_refused_and_the_force_with_it() -> None:
-    """A message counts as a whole; the guide stays where it is."""
+def test_position_out_of_range_rejects_the_whole_message() -> None:
+    """The force is rejected too, and the guide does not move."""
     plant = run(steered=True, **{'model.preset': 'bending_35mm'})
     plant.take(START)
     names, efforts = ('insertion', 'guide_x'), (2.0, nan)
@@ -216,8 +216,8 @@ def test_a_position_out_of_reach_is_refused_and_the_force_with_it() -> None:
     assert [event.content['positions'] for event in events] == [[[0.001]], [[0.002]]]
 
 
-def test_while_another_commands_nothing_moves() -> None:
-    """Neither a force nor a position; the position counts when the other has gone."""
+def test_nothing_moves_with_two_command_publishers() -> None:
+    """Neither force nor position acts; the position acts after the other publisher has gone."""
     plant = run(mode='robot')
     plant.take(START)
     plant.commands.count_commanders(2)
@@ -228,8 +228,7 @@ def test_while_another_commands_nothing_moves() -> None:
     assert [event.kind for event in plant.events()] == [MOTION]
 
 
-def test_after_a_reset_the_driver_is_followed_anew() -> None:
-    """What it says again is new to a needle that was put back."""
+def test_repeated_commands_act_again_after_a_reset() -> None:
     plant = run(mode='robot')
     say = lambda: plant.command_joints(  # noqa: E731
         message(START, ('insertion',), (0.06,)), START
@@ -253,12 +252,12 @@ def test_after_a_reset_the_driver_is_followed_anew() -> None:
     st.tuples(*[st.booleans()] * 3),
     st.sampled_from([('simulation', False), ('simulation', True), ('robot', True)]),
 )
-def test_any_numbers_give_a_finite_force_within_its_limit(
+def test_arbitrary_messages_give_finite_forces_and_positions_in_range(
     joints: list[tuple[str, float, float, float]],
     filled: tuple[bool, bool, bool],
     kind: tuple[str, bool],
 ) -> None:
-    """And where joints shall go is within their reach."""
+    """Forces stay within their limit and joint targets within their range."""
     plant = _PLANTS[kind]
     names, *columns = zip(*joints, strict=True) if joints else ((), (), (), ())
     values = tuple(

@@ -1,4 +1,4 @@
-"""Needles in the lanes of vector registers: each as if it were alone."""
+"""Needles in the lanes of vector registers: each equals a single simulation."""
 
 from __future__ import annotations
 
@@ -57,8 +57,8 @@ def batch(*arguments: Any, **options: Any) -> Batch:
 
 
 @pytest.mark.parametrize('graded', [False, True])
-def test_a_lane_is_a_simulation_alone(graded: bool) -> None:
-    """Pushed, held and pulled, with and without hub and damping: as `simulate` has it."""
+def test_lane_equals_a_single_simulation(graded: bool) -> None:
+    """Pushed, held and pulled, with and without hub and damping."""
     needles, states, forces = population(60)
     found = batch(needles, states, forces, graded=graded)
     stuck = moved = 0
@@ -73,18 +73,17 @@ def test_a_lane_is_a_simulation_alone(graded: bool) -> None:
             p, start, force, duration=whole * INTERVAL, interval=INTERVAL, step=1e-5, graded=graded
         )
         scale = np.abs(alone.states).max(axis=0)
-        # Rounding, enlarged by cond(G) of 1e5 at 3 cm, in the phases of a thousand steps.
+        # Rounding, amplified by cond(G) of 1e5 at 3 cm, in the phases of a thousand steps.
         assert_allclose(found.states[i, : whole + 1] / scale, alone.states / scale, atol=1e-7)
         stuck += bool((alone.velocity == 0.0).any())
         moved += bool((alone.velocity[1:] != 0.0).all())
-    # Both happen, or nothing of it is shown.
+    # Both cases must occur for a meaningful test.
     assert stuck > 5
     assert moved > 5
 
 
 @pytest.mark.parametrize('graded', [False, True])
-def test_company_changes_no_bit(graded: bool) -> None:
-    """Whoever shares its register, and however many they are, a needle moves to the same bits."""
+def test_result_is_independent_of_other_lanes_bit_for_bit(graded: bool) -> None:
     needles, states, forces = population(3 * LANES + 5)
     found = batch(needles, states, forces, workers=1, graded=graded)
     some = np.random.default_rng(5).permutation(len(needles))[: LANES + 3]
@@ -95,8 +94,8 @@ def test_company_changes_no_bit(graded: bool) -> None:
         assert np.array_equal(alone.states[0], found.states[i], equal_nan=True)
 
 
-def test_the_hub_stops_a_lane_and_a_force_takes_it_off_again() -> None:
-    """A needle pushed in to the hub rests there exactly, and is pulled out again."""
+def test_lane_stops_on_the_hub_and_can_be_withdrawn() -> None:
+    """A needle pushed to the hub rests there exactly, and is pulled out again."""
     p = preset('paper_si')
     start = NeedleModel(p).state_at(0.19, 1e-4)
     forces = np.array([[3.0] * 10 + [-3.0] * 4])
@@ -107,8 +106,8 @@ def test_the_hub_stops_a_lane_and_a_force_takes_it_off_again() -> None:
     assert np.isfinite(found.states).all()
 
 
-def test_steps_of_second_order() -> None:
-    """Half the step, a quarter of the error."""
+def test_lanes_are_of_second_order() -> None:
+    """Half the step gives a quarter of the error."""
     p = preset('paper_si', tissue_damping=1.0)
     start = NeedleModel(p).state_at(0.08, 5e-4)
 
@@ -117,12 +116,12 @@ def test_steps_of_second_order() -> None:
 
     exact = end(1e-7)
     errors = [abs(end(step) - exact)[[0, 2]] for step in (4e-5, 2e-5)]
-    # Rounding of 200,000 steps moves the depth by 1e-12 m, of an error of 4e-11 m.
+    # Rounding of 200,000 steps changes the depth by 1e-12 m, with an error of 4e-11 m.
     assert_allclose(errors[0] / errors[1], 4.0, rtol=0.03)
 
 
-def test_a_torque_turns_a_lane() -> None:
-    """The angle is that of a constant torque on the inertia, interval by interval."""
+def test_torque_rotates_a_lane() -> None:
+    """The angle matches a constant torque on the inertia in each interval."""
     p = preset('phantom')
     start = NeedleModel(p).state_at(0.05)
     torques = np.array([[1e-6, -2e-6]])
@@ -134,26 +133,26 @@ def test_a_torque_turns_a_lane() -> None:
 
 
 @given(st.floats(-1e6, 1e6))
-def test_sine_and_cosine(x: float) -> None:
-    """Those of the library, but for the last digits: of the argument, too."""
+def test_sine_and_cosine_match_the_library(x: float) -> None:
+    """Up to the last digits, also of the argument."""
     found = _sine_cosine(x)
     assert_allclose(found, (sin(x), cos(x)), rtol=0, atol=4e-16 + abs(x) * 1e-22)
 
 
 @given(st.floats(0.0, 200.0) | st.floats(0.0, 1e-3) | st.floats(1e2, 1e300))
 @settings(max_examples=300)
-def test_means_of_a_decay(x: float) -> None:
-    """Those that `oscillator` has; where it loses digits, their series."""
+def test_decay_means_match_the_oscillator(x: float) -> None:
+    """Where the closed form loses digits, they match the series."""
     mean, ramp = _decay_means(x)
     exact, other = decay_means(x)
     assert_allclose(mean, exact, rtol=1e-13)
-    # The other one is a difference over x, or a series that ends at 1e-13.
+    # The reference is a difference over x, or a series truncated at 1e-13.
     assert_allclose(ramp, other, rtol=2e-13 + 3e-16 / max(x, 1e-4))
     assert_allclose(1.0 - x * mean, exp(-x), rtol=0, atol=1e-15)
 
 
-def test_quarters_of_a_turn() -> None:
-    """At every multiple of a quarter turn, and beside it, the right sign."""
+def test_signs_at_quarter_turns() -> None:
+    """At every multiple of a quarter turn, and next to it, the sign is correct."""
     for k in range(-9, 10):
         for off in (-1e-3, 0.0, 1e-3):
             x = 0.25 * pi * k + off

@@ -30,7 +30,7 @@ from scipy.optimize import brentq
 LENGTH = 0.2
 EPS = np.finfo(float).eps
 COUNTS = range(1, MOST_MODES + 1)
-#: Depth from which on each count is allowed, with a margin.
+#: Least depth for each number of modes, with a margin.
 SHALLOWEST = {1: 1e-3, 2: 1e-3, 3: 0.02, 4: 0.05, 5: 0.07, 6: 0.085, 8: 0.11, 12: 0.14}
 
 
@@ -46,7 +46,7 @@ def frictionless(n: int, **changes: Any) -> NeedleParameters:
 def ringing(
     parameters: NeedleParameters, depth: float, speed: float, energy: float = 1e-4
 ) -> FloatArray:
-    """Return a moving needle with kinetic energy [J] in every normal mode of its pair."""
+    """Return a moving needle with kinetic energy [J] in every normal mode."""
     model = NeedleModel(parameters)
     state, m = model.state_at(depth, 5e-4), model.coordinates
     inertial = np.linalg.cholesky(model.mass_matrix(state)[2:, 2:])
@@ -70,7 +70,7 @@ def test_arguments_are_the_roots_of_the_frequency_equation() -> None:
 
 
 @pytest.mark.parametrize('i', [0, 1, 5, 11])
-def test_high_modes_keep_their_digits(i: int) -> None:
+def test_high_modes_keep_full_precision(i: int) -> None:
     """Values and curvatures agree with (11) in 60 digits, where doubles lose cosh(38) = 1e16."""
     modes = mode_shapes(LENGTH, MOST_MODES)
     places = np.linspace(0.0, LENGTH, 23)
@@ -92,7 +92,7 @@ def test_high_modes_keep_their_digits(i: int) -> None:
             )
             for z in turns
         ]  # fmt: skip
-    # Rounding of k y = 36 at most, in a function of order 1 / sqrt(l).
+    # Rounding of k y <= 36, in a function of order 1 / sqrt(l).
     size = 100 * EPS / np.sqrt(LENGTH)
     assert_allclose(modes.values(places)[:, i], value, atol=size)
     assert_allclose(
@@ -109,7 +109,7 @@ def test_modes_are_orthonormal(n: int) -> None:
     at = modes.integrals(LENGTH)
     assert_allclose(at.gram, np.eye(n), atol=1e-12)
     square = modes.wavenumbers**2
-    # 1e-12: cancellation of boundary values that are of order one.
+    # 1e-12: cancellation of boundary values of order one.
     assert_allclose(at.curvature_gram / np.outer(square, square), np.eye(n), atol=1e-12)
 
 
@@ -139,14 +139,14 @@ def test_integrals_agree_with_quadrature(n: int) -> None:
 
 @given(depth=st.floats(1e-3, 2.0 * LENGTH))
 @settings(deadline=None, derandomize=True, max_examples=100)
-def test_two_modes_are_the_same_by_the_general_path(depth: float) -> None:
-    """The path for any n gives for n = 2 what the special one gives, beyond the hub as well."""
+def test_general_path_matches_the_special_path_for_two_modes(depth: float) -> None:
+    """The integrals for n = 2 are equal on both paths, also beyond the hub."""
     modes = mode_shapes(LENGTH, 2, 2.0)
     special = modes.integrals(depth)
     general = ModeIntegrals(*(np.empty_like(part) for part in special))
     many_modes(modes.tables, depth, np.empty(modes.tables.series.shape[1] + 8), general)
-    # Diagonals of G and H bound the rest; the series of two modes at 2 l loses cosh(19) = 1e8 of
-    # what it sums, in a result that is as large.
+    # Diagonals of G and H bound the other entries; at 2 l the series of two modes loses cosh(19) =
+    # 1e8 of its terms, in a result of the same size.
     norm, bend = (np.sqrt(np.diag(x)) for x in (special.gram, special.curvature_gram))
     sizes = (
         np.outer(norm, norm),
@@ -162,7 +162,9 @@ def test_two_modes_are_the_same_by_the_general_path(depth: float) -> None:
 
 @pytest.mark.parametrize('formulation', ['complete', 'as_printed'])
 @pytest.mark.parametrize('depth', [2e-3, 0.02, 0.1, 0.2])
-def test_two_modes_rotate_the_same_by_the_general_path(depth: float, formulation: str) -> None:
+def test_general_modal_flow_matches_the_special_flow_for_two_modes(
+    depth: float, formulation: str
+) -> None:
     """State, impulse and every mean of one step agree between both compiled modal flows."""
     parameters = NeedleParameters.preset(
         'phantom', formulation=formulation, layer_depths=[0.05], layer_stiffnesses=[3e3]
@@ -213,8 +215,8 @@ def exact_compliance(parameters: NeedleParameters, depth: float) -> float:
     return float(2.0 * decay / k * top / (np.cosh(x) ** 2 + np.cos(x) ** 2))
 
 
-def test_closed_form_of_the_tip_load_solves_the_beam() -> None:
-    """The reference itself: the boundary value problem, solved by shooting, has this tip."""
+def test_closed_form_compliance_solves_the_beam_equation() -> None:
+    """The reference is checked against the boundary value problem, solved by shooting."""
     p, depth = NeedleParameters(), 0.15
 
     def end(moment: float, shear: float) -> FloatArray:
@@ -230,7 +232,7 @@ def test_closed_form_of_the_tip_load_solves_the_beam() -> None:
 
     ends = np.column_stack([end(1.0, 0.0), end(0.0, 1.0)])
     load = np.linalg.solve(p.bending_stiffness * ends[2:], [0.0, -1.0])
-    # The solver's tolerance.
+    # Tolerance of the solver.
     assert_allclose(exact_compliance(p, depth), ends[0] @ load, rtol=1e-9)
 
 
@@ -238,7 +240,7 @@ def test_closed_form_of_the_tip_load_solves_the_beam() -> None:
 def test_frequencies_converge_from_above_to_the_exact_beam(
     depth: float, most: int, good: float
 ) -> None:
-    """With every further mode the first three frequencies come down to the exact ones."""
+    """With every additional mode the first three frequencies approach the exact values."""
     exact = exact_frequencies(NeedleParameters(), depth, 3)
     before = np.full(3, np.inf)
     for n in range(1, most + 1):
@@ -261,7 +263,7 @@ def test_frequencies_converge_from_above_to_the_exact_beam(
 def test_static_tip_deflection_converges_from_below_to_the_exact_beam(
     depth: float, most: int, good: float
 ) -> None:
-    """A beam of few modes is too stiff under a tip load; each further mode softens it."""
+    """A beam with few modes is too stiff under a tip load."""
     exact = exact_compliance(NeedleParameters(), depth)
     before = 0.0
     for n in range(1, most + 1):
@@ -270,13 +272,13 @@ def test_static_tip_deflection_converges_from_below_to_the_exact_beam(
         now = float(value @ np.linalg.solve(model.stiffness_matrix(depth), value))
         assert before < now < exact * (1.0 + 1e-10)
         before = now
-    # Short of the full length convergence is geometric (measured 8e-11 and 1e-9); at full
-    # length no mode has shear at the tip, and the error falls as n^-3 only (measured 8e-5).
+    # Below the full length convergence is geometric (measured 8e-11 and 1e-9); at full length no
+    # mode has shear at the tip, and the error decreases only as n^-3 (measured 8e-5).
     assert before > exact * (1.0 - good)
 
 
 def test_at_full_insertion_the_modes_are_exact() -> None:
-    """At s = l each frequency is that of the beam, whatever the number of modes."""
+    """At s = l each frequency equals the beam frequency, for any number of modes."""
     for n in (1, 2, 5, 12):
         model = NeedleModel(NeedleParameters(modes=n, minimum_depth=0.19))
         stiffness = model.stiffness_matrix(LENGTH)
@@ -292,11 +294,11 @@ def test_at_full_insertion_the_modes_are_exact() -> None:
 
 @pytest.mark.parametrize(('n', 'depth'), [(1, 0.02), (3, 0.03), (6, 0.1)])
 def test_modal_flow_is_exact_while_the_needle_sticks(n: int, depth: float) -> None:
-    """At constant depth n undamped modes follow the matrix exponential, at any step."""
+    """At constant depth n undamped modes follow the matrix exponential, for any step."""
     p = needle(n, coulomb_friction=1e3)
     model, state, m = NeedleModel(p), ringing(p, depth, 0.0, 1e-6), 2 + n
     inertial = np.linalg.cholesky(model.mass_matrix(state)[2:, 2:])
-    # In coordinates of unit mass, in which no mode is better than another.
+    # In coordinates of unit mass, for comparable modes.
     stiffness = np.linalg.solve(inertial, model.stiffness_matrix(depth))
     stiffness = np.linalg.solve(inertial, stiffness.T)
     system = np.block([[np.zeros((n, n)), np.eye(n)], [-stiffness, np.zeros((n, n))]])
@@ -313,7 +315,7 @@ def test_modal_flow_is_exact_while_the_needle_sticks(n: int, depth: float) -> No
 
 @pytest.mark.parametrize('n', [1, 3, 5])
 def test_order_two_against_an_ode_solver(n: int) -> None:
-    """A moving, ringing needle of n modes converges at order two to what DOP853 finds."""
+    """A moving, vibrating needle of n modes converges at order two to DOP853."""
     p, depth = needle(n), 1.2 * SHALLOWEST[n] + 0.03
     model, start = NeedleModel(p), ringing(p, depth, 1.0, 1e-6)
     solved = solve_ivp(
@@ -338,8 +340,8 @@ def test_order_two_against_an_ode_solver(n: int) -> None:
 
 
 @pytest.mark.parametrize('n', [1, 3, 5])
-def test_energy_is_kept_at_second_order(n: int) -> None:
-    """Without friction the energy error of n modes falls with the square of the step."""
+def test_energy_error_is_of_second_order(n: int) -> None:
+    """Without friction, for n modes."""
     p, start_depth = frictionless(n), 1.2 * SHALLOWEST[n] + 0.03
     start = ringing(p, start_depth, 1.0, 1e-5)
     model = NeedleModel(p)
@@ -355,7 +357,7 @@ def test_energy_is_kept_at_second_order(n: int) -> None:
 
 
 def test_means_agree_with_fine_samples_of_the_motion() -> None:
-    """Tip, lateral force and moment of four modes are what momentum balance gives."""
+    """Tip, lateral force and moment of four modes match the momentum balance."""
     p = needle(4)
     model, step, steps = NeedleModel(p), 5e-7, 400
     whole, single = (Integrator(p, ringing(p, 0.08, 0.5, 1e-7), step) for _ in range(2))
@@ -386,8 +388,8 @@ def test_means_agree_with_fine_samples_of_the_motion() -> None:
 
 
 @pytest.mark.parametrize('n', COUNTS)
-def test_a_mode_count_that_the_basis_cannot_carry_is_refused_with_what_would_do(n: int) -> None:
-    """The message names cond(G), its limit and the least depth; taking its advice works."""
+def test_ill_conditioned_mode_counts_are_rejected_with_the_least_depth(n: int) -> None:
+    """The message contains cond(G), its limit and the least depth, which is valid."""
     if n <= 2:
         assert NeedleModel(NeedleParameters(modes=n)).coordinates == 2 + n
         return
@@ -395,7 +397,7 @@ def test_a_mode_count_that_the_basis_cannot_carry_is_refused_with_what_would_do(
         NeedleParameters(modes=n)
     message = str(caught.value)
     assert message.startswith(
-        f'{n} modes cannot be told apart at minimum_depth = 0.001 m, where cond(G) > 1e+11'
+        f'{n} modes cannot be distinguished at minimum_depth = 0.001 m, where cond(G) > 1e+11'
     )
     advice = float(message.partition('minimum_depth >= ')[2].partition(' m')[0])
     made = NeedleParameters(modes=n, minimum_depth=advice)
@@ -406,14 +408,13 @@ def test_a_mode_count_that_the_basis_cannot_carry_is_refused_with_what_would_do(
 
 
 @pytest.mark.parametrize('n', [0, -1, 13, 2.0, 2.5, True, '2', None, np.nan])
-def test_a_mode_count_that_is_none_is_refused(n: Any) -> None:
-    """Only whole numbers from 1 to 12 count modes."""
+def test_mode_count_must_be_an_integer_from_1_to_12(n: Any) -> None:
     with pytest.raises(ParameterError, match='modes must be an integer from 1 to 12, got'):
         NeedleParameters(modes=n)
 
 
-def test_condition_of_the_gram_matrix_falls_with_depth() -> None:
-    """cond(G) is one at full length and grows without bound as the needle comes out."""
+def test_condition_number_decreases_with_depth() -> None:
+    """cond(G) is one at full length and grows without bound at small depths."""
     for n in (2, 5, 8):
         modes = mode_shapes(LENGTH, n)
         found = [modes.condition(depth) for depth in (0.2, 0.17, 0.14, 0.11)]
@@ -422,8 +423,8 @@ def test_condition_of_the_gram_matrix_falls_with_depth() -> None:
 
 
 @pytest.mark.parametrize('n', [1, 3, 12])
-def test_state_has_two_numbers_for_each_coordinate(n: int) -> None:
-    """States are of shape (2 (2 + n),); any other is refused with both shapes."""
+def test_state_shape_depends_on_the_number_of_modes(n: int) -> None:
+    """Only shape (2 (2 + n),) is valid; the message contains both shapes."""
     model = NeedleModel(needle(n))
     assert model.coordinate_names == ('d', 'theta', *(f'q{i + 1}' for i in range(n)))
     assert model.state_at(0.15, 1e-3).shape == (4 + 2 * n,)

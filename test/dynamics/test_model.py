@@ -1,4 +1,4 @@
-"""Equations of motion: (12)-(18) against the Lagrangian they come from."""
+"""Equations of motion (12)-(18) against the Lagrangian."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def conservative(**changes: Any) -> NeedleModel:
 
 
 def random_state(of: NeedleModel, rng: np.random.Generator) -> FloatArray:
-    """Draw a state with about 1 mJ in each normal mode, so that every term counts."""
+    """Draw a state with about 1 mJ in each normal mode, so that every term contributes."""
     state = of.state_at(rng.uniform(0.01, 0.19))
     state[1], state[4], state[5] = rng.normal(size=3) * [0.1, 0.5, 30.0]
     elastic = np.linalg.cholesky(of.stiffness_matrix(of.parameters.length - state[0]))
@@ -46,14 +46,13 @@ def states(of: NeedleModel, count: int = 20) -> list[FloatArray]:
     return [random_state(of, rng) for _ in range(count)]
 
 
-def test_coordinates_are_named_in_order() -> None:
-    """The four coordinates are d, theta, q1, q2."""
+def test_coordinate_names_are_in_order() -> None:
     assert model().coordinates == len(model().coordinate_names) == 4
     assert model().coordinate_names == ('d', 'theta', 'q1', 'q2')
 
 
 def test_mass_matrix_is_symmetric_positive_definite_and_block_diagonal() -> None:
-    """M is symmetric positive definite with the zeros that the paper shows."""
+    """The zeros of M match the paper."""
     of = model(carriage_mass=0.3)
     p = of.parameters
     for state in states(of):
@@ -88,7 +87,7 @@ def test_energies_are_the_integrals_of_equation_12() -> None:
         assert of.energy(x) == of.kinetic_energy(x) + of.potential_energy(x)
 
 
-def test_equations_of_motion_are_those_of_the_lagrangian() -> None:
+def test_equations_of_motion_follow_from_the_lagrangian() -> None:
     """d/dt dL/dq_dot - dL/dq = Q in all four rows, for random states and inputs."""
     of = conservative()
     rng = np.random.default_rng(1)
@@ -123,19 +122,19 @@ def test_equations_of_motion_are_those_of_the_lagrangian() -> None:
         # d moves by 1e-5 of the depth (truncation 1e-9); the rest are quadratic forms.
         slope = gradient(x, 0, np.array([1e-7, 1.0, *np.abs(x[2:4])]))
         applied = np.array([-force, torque, 0.0, 0.0])
-        # What the terms of each row amount to: the measure of an error.
+        # Magnitude of the terms of each row, as the scale of an error.
         modal = of.stiffness_matrix(of.parameters.length - x[0]) @ np.diag(np.abs(x[2:4]))
         at = of.modes.integrals(of.parameters.length - x[0])
         tip = of.parameters.linear_density * (at.value @ x[6:8]) ** 2
         size = np.array([abs(force) + tip, abs(torque), *np.abs(modal).sum(axis=1)])
         assert np.all(size > 0.0)
         assert_allclose((rate - slope - applied) / size, 0.0, atol=1e-6)
-        # The terms that the paper drops are not lost in that tolerance.
+        # The terms omitted in the paper are larger than this tolerance.
         assert abs(slope[0]) > 1e-4 * size[0]
 
 
-def test_convective_term_of_the_momenta_counts() -> None:
-    """The modal rows hold the term -rho A d_dot phi phi^T q_dot that comes from dG/dt."""
+def test_modal_rows_contain_the_convective_term() -> None:
+    """The term is -rho A d_dot phi phi^T q_dot, from dG/dt."""
     of = conservative()
     for x in states(of):
         still = x.copy()
@@ -149,7 +148,7 @@ def test_convective_term_of_the_momenta_counts() -> None:
         assert np.abs(expected).max() > 1e-9 * size
 
 
-def test_a_push_shortens_the_outer_length() -> None:
+def test_positive_force_shortens_the_outer_length() -> None:
     """A positive force accelerates d downwards and a positive torque theta upwards."""
     of = conservative()
     acceleration = of.acceleration(of.state_at(0.05), force=1.0, torque=1e-6)
@@ -160,22 +159,22 @@ def test_a_push_shortens_the_outer_length() -> None:
 
 @pytest.mark.parametrize('speed', [-0.3, -1e-12, 1e-12, 0.3])
 def test_friction_opposes_motion(speed: float) -> None:
-    """Friction is mu_s sign(u) + mu_v u against the motion, whatever drives it."""
+    """Friction is mu_s sign(u) + mu_v u against the motion, for any drive."""
     of = model('paper_mm')
     expected = np.sign(speed) * 0.56 + 300.0 * speed
     for drive in (-5.0, 0.0, 5.0):
         assert_allclose(of.friction.force(speed, drive), expected, rtol=1e-15)
     state = of.state_at(0.05)
     state[4] = -speed
-    # d shortens while the needle goes in: friction lengthens it again.
+    # d decreases during insertion: friction increases it.
     assert np.sign(of.acceleration(state)[0]) == np.sign(speed)
     assert_allclose(of.acceleration(state)[0], expected / of.parameters.moving_mass, rtol=1e-14)
 
 
 @given(fraction=st.floats(-1.0, 1.0))
 @settings(deadline=None, derandomize=True)
-def test_friction_at_rest_holds_any_drive_up_to_its_bound(fraction: float) -> None:
-    """At rest a drive of at most mu_s is answered in full: no acceleration, no creep."""
+def test_friction_at_rest_balances_any_drive_within_its_bound(fraction: float) -> None:
+    """At rest a drive of at most mu_s causes neither acceleration nor creep."""
     of = model()
     drive = fraction * of.parameters.coulomb_friction
     assert of.friction.force(0.0, drive) == drive
@@ -183,7 +182,7 @@ def test_friction_at_rest_holds_any_drive_up_to_its_bound(fraction: float) -> No
 
 
 @pytest.mark.parametrize('sign', [-1.0, 1.0])
-def test_friction_at_rest_yields_beyond_its_bound(sign: float) -> None:
+def test_excess_over_static_friction_accelerates_the_needle(sign: float) -> None:
     """At rest only the excess over mu_s accelerates the needle."""
     of = model()
     acceleration = of.acceleration(of.state_at(0.05), force=sign * 0.66)[0]
@@ -192,15 +191,15 @@ def test_friction_at_rest_yields_beyond_its_bound(sign: float) -> None:
 
 
 def test_power_balance() -> None:
-    """dE/dt is input power less what friction and tissue damping take, for random states."""
+    """dE/dt is input power minus dissipation by friction and damping, for random states."""
     of = model('phantom', carriage_mass=0.1)
     p = of.parameters
     rng = np.random.default_rng(3)
     for x in states(of):
         force, torque = rng.normal(size=2) * [3.0, 1e-4]
         flow = of.derivative(x, force, torque)
-        # E is quadratic but for its dependence on depth, so that 1 ns is short enough
-        # (truncation 1e-12) and rounding is eps E / 1 ns = 1e-10 W, against watts.
+        # E is quadratic except for its dependence on depth: with 1 ns the truncation error is
+        # 1e-12 and rounding is eps E / 1 ns = 1e-10 W, compared with watts.
         tick = 1e-9
         rate = (of.energy(x + tick * flow) - of.energy(x - tick * flow)) / (2.0 * tick)
         speed, spin, modal = -x[4], x[5], x[6:8]
@@ -220,7 +219,7 @@ def test_power_balance() -> None:
 def test_state_at_gives_the_least_energy_shape_for_a_tip_deflection(
     depth: float, tip: float
 ) -> None:
-    """state_at rests at the asked depth and tip; any other shape with that tip costs energy."""
+    """Depth and tip are as given; any other shape with the same tip has more energy."""
     of = model()
     x = of.state_at(depth, tip)
     # 0.2 - (0.2 - depth) rounds once at 0.2; the rest are a few roundings.
@@ -241,7 +240,7 @@ def test_state_at_gives_the_least_energy_shape_for_a_tip_deflection(
 
 
 def test_both_ends_of_the_depth_range_are_valid() -> None:
-    """The range [minimum_depth, length] that the error message states is closed."""
+    """The range [minimum_depth, length] of the error message is closed."""
     for length in np.random.default_rng(5).uniform(0.05, 0.3, size=50):
         of = model(length=length, minimum_depth=0.07 * length)
         assert np.isfinite(of.acceleration(of.state_at(of.parameters.minimum_depth))).all()
@@ -262,8 +261,8 @@ def test_tip_deflection_is_the_end_of_the_shape() -> None:
 
 @given(shape=st.lists(st.integers(0, 9), max_size=3).filter(lambda s: s != [8]))
 @settings(deadline=None, derandomize=True, max_examples=50)
-def test_any_other_shape_is_refused(shape: list[int]) -> None:
-    """Only shape (8,) is a state; the message says what came."""
+def test_invalid_state_shapes_are_rejected(shape: list[int]) -> None:
+    """Only shape (8,) is valid; the message contains the given shape."""
     of = model()
     for call in (of.checked_state, of.acceleration, of.energy, of.tip_deflection, of.mass_matrix):
         with pytest.raises(ShapeError, match=r'must have shape \(8,\), got \('):
@@ -272,8 +271,7 @@ def test_any_other_shape_is_refused(shape: list[int]) -> None:
 
 @pytest.mark.parametrize('value', [np.nan, np.inf, -np.inf])
 @pytest.mark.parametrize('slot', range(8))
-def test_a_state_that_is_not_finite_is_refused(slot: int, value: float) -> None:
-    """No component of the state may be NaN or infinite."""
+def test_non_finite_states_are_rejected(slot: int, value: float) -> None:
     of = model()
     state = of.state_at(0.05)
     state[slot] = value
@@ -282,8 +280,8 @@ def test_a_state_that_is_not_finite_is_refused(slot: int, value: float) -> None:
 
 
 @pytest.mark.parametrize('depth', [-0.01, 0.0, 0.9e-3, 0.2 + 1e-9, 1.0])
-def test_depth_outside_its_range_is_refused(depth: float) -> None:
-    """Below minimum_depth, and beyond the hub where it stops, the state is not valid."""
+def test_depth_outside_its_range_is_rejected(depth: float) -> None:
+    """Invalid below minimum_depth, and beyond the hub with hub_stop."""
     of = model()
     state = of.state_at(0.05)
     state[0] = 0.2 - depth
@@ -294,14 +292,14 @@ def test_depth_outside_its_range_is_refused(depth: float) -> None:
 
 
 @pytest.mark.parametrize('depth', [0.05, np.nan])
-def test_state_at_refuses_what_is_not_a_number(depth: float) -> None:
-    """state_at never returns a state that the model itself would refuse."""
+def test_state_at_rejects_non_finite_values(depth: float) -> None:
+    """`state_at` returns only states that the model accepts."""
     with pytest.raises(NeedleError):
         model().state_at(depth, np.nan)
 
 
-def test_without_hub_stop_the_equations_hold_beyond_the_hub() -> None:
-    """With hub_stop off a state with d < 0 is valid in every method, and continuous at d = 0."""
+def test_without_hub_stop_the_equations_are_valid_beyond_the_hub() -> None:
+    """States with d < 0 are valid in every method, and continuous at d = 0."""
     of = conservative(hub_stop=False)
     x = of.state_at(0.2, 1e-3)
     x[4:] = [-0.1, 0.0, 0.2, 0.1]
@@ -314,7 +312,7 @@ def test_without_hub_stop_the_equations_hold_beyond_the_hub() -> None:
 
 
 def test_states_are_copied() -> None:
-    """checked_state and state_at hand out arrays of their own."""
+    """`checked_state` and `state_at` return new arrays."""
     of = model()
     state = of.state_at(0.05)
     checked = of.checked_state(state)

@@ -1,4 +1,4 @@
-"""Shape modes and their integrals: the laws that (10)-(11) and the analysis promise."""
+"""Shape modes (10)-(11) and their integrals."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ LENGTH = 0.2
 MODES = mode_shapes(LENGTH)
 EPS = np.finfo(float).eps
 DEPTHS = np.geomspace(1e-3, LENGTH, 40)
-#: Gauss points: the integrands are entire and turn less than twice, 40 points are exact.
+#: Gauss points: the integrands are entire with fewer than two oscillations, 40 points are exact.
 POINTS = 40
 
 
 def derivative(order: int, y: float) -> FloatArray:
-    """Return derivatives of (11) with the minus sign, written out once more for the test."""
+    """Return derivatives of (11) with the minus sign, implemented independently for the test."""
     x, k, mu = MODES.wavenumbers * y, MODES.wavenumbers, MODES.ratios
     bracket = {
         0: np.sin(x) - np.sinh(x) - mu * (np.cos(x) - np.cosh(x)),
@@ -39,14 +39,14 @@ def gauss(integrand: Callable[..., Any], depth: float) -> FloatArray:
 
 
 def outer(shapes: FloatArray) -> FloatArray:
-    """Products of two modes at many points, points last; shape (2, 2, points)."""
+    """Return products of two modes at many points, points last; shape (2, 2, points)."""
     return np.einsum('pi,pj->ijp', shapes, shapes)
 
 
 def sizes(
     at: ModeIntegrals, depth: float
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Cauchy-Schwarz bounds of G, H and both moments: what an error is relative to."""
+    """Return Cauchy-Schwarz bounds of G, H and both moments, as scales of the errors."""
     norm = np.sqrt(np.diag(at.gram))
     bend = np.sqrt(np.diag(at.curvature_gram))
     return (
@@ -59,7 +59,7 @@ def sizes(
 
 @pytest.mark.parametrize('length', [0.05, 0.2, 1.0])
 def test_modes_are_orthonormal_over_the_whole_needle(length: float) -> None:
-    """The Gram matrix of the modes on [0, l] is the identity, whatever the length."""
+    """The Gram matrix of the modes on [0, l] is the identity, for any length."""
     modes = mode_shapes(length)
     by_quadrature = gauss(lambda y: outer(modes.values(y)), length)
     # 1e-12: normalizing constants of order 1 / l from sums whose terms reach cosh(2 k l) = 6e3.
@@ -68,9 +68,9 @@ def test_modes_are_orthonormal_over_the_whole_needle(length: float) -> None:
 
 
 def test_wavenumbers_are_the_first_two_roots() -> None:
-    """K l solves cos(k l) cosh(k l) + 1 = 0 at the published first and second root."""
+    """cos(k l) cosh(k l) + 1 = 0 at the published first and second root."""
     x = MODES.wavenumbers * LENGTH
-    # cosh(k l) is 55 at the second root: rounding of k l is amplified that much.
+    # cosh(k l) is 55 at the second root and amplifies the rounding of k l.
     assert_allclose(np.cos(x) * np.cosh(x), -1.0, rtol=200 * EPS)
     assert_allclose(x, [1.875104068711961, 4.694091132974175], rtol=4 * EPS)
 
@@ -83,7 +83,7 @@ def test_base_is_clamped_and_tip_is_free() -> None:
     # phi is quadratic at 0: the difference quotient is at most max phi'' times the step.
     slope = MODES.values(step) / step
     assert np.all(np.abs(slope) <= 2.0 * np.abs(MODES.derivatives(0.0, 2)) * step)
-    # Bending moment and shear against those at the base; 1e-13: cancellation of cosh(k l) = 55.
+    # Bending moment and shear relative to the base; 1e-13: cancellation of cosh(k l) = 55.
     assert_allclose(MODES.derivatives(LENGTH, 2) / MODES.derivatives(0.0, 2), 0.0, atol=1e-13)
     assert_allclose(derivative(3, LENGTH) / (k**3 * MODES.scales), 0.0, atol=1e-12)
 
@@ -100,7 +100,7 @@ def test_curvature_is_the_second_derivative_of_the_value() -> None:
 
 
 def test_printed_sign_of_equation_11_is_a_misprint() -> None:
-    """The closed form of 1/c^2 is the norm of the bracket with - cosh, not of that with + cosh."""
+    """The closed form of 1/c^2 is the norm of the bracket with - cosh, not with + cosh."""
     for i in range(2):
         k, mu, l = MODES.wavenumbers[i], MODES.ratios[i], LENGTH
         x = k * l
@@ -125,7 +125,7 @@ def test_printed_sign_of_equation_11_is_a_misprint() -> None:
         # 1e-11: the closed form cancels cosh(2 k l) = 6e3 down to 1.
         assert_allclose(printed, minus, rtol=1e-11)
         assert abs(plus / printed - 1.0) > 0.1
-        # The entry point cannot deflect, yet the printed form moves it by 2 mu c.
+        # The deflection at the entry point is zero, but the printed form gives 2 mu c.
         assert bracket(0.0, -1.0) == 0.0
         assert_allclose(bracket(0.0, 1.0), -2.0 * mu)
         assert_allclose(MODES.scales[i], minus**-0.5, rtol=1e-11)
@@ -133,7 +133,7 @@ def test_printed_sign_of_equation_11_is_a_misprint() -> None:
 
 @pytest.mark.parametrize('depth', DEPTHS)
 def test_integrals_agree_with_quadrature(depth: float) -> None:
-    """G, H, both moments, phi and phi'' at s equal Gauss quadrature of the modes and the modes."""
+    """G, H and both moments equal Gauss quadrature; phi and phi'' equal the modes at s."""
     at = MODES.integrals(depth)
     gram, bend, area, moment = sizes(at, depth)
     # The direct form of phi in the reference cancels: eps / (k s)^2 relative, 2e-12 at 1 mm.
@@ -154,8 +154,8 @@ def test_integrals_agree_with_quadrature(depth: float) -> None:
 
 
 @pytest.mark.parametrize('depth', [0.1, 0.13, 0.17, 0.2])
-def test_integrals_agree_with_antiderivatives_in_boundary_values(depth: float) -> None:
-    """Since phi'''' = k^4 phi, every integral is a form in boundary values at s (Felgar 1950)."""
+def test_integrals_agree_with_antiderivatives(depth: float) -> None:
+    """With phi'''' = k^4 phi, every integral is a form in boundary values at s (Felgar 1950)."""
     at = MODES.integrals(depth)
     k4 = MODES.wavenumbers**4
     derivatives = [derivative(order, depth) for order in range(6)]
@@ -180,7 +180,7 @@ def test_integrals_agree_with_antiderivatives_in_boundary_values(depth: float) -
 
 @pytest.mark.parametrize('depth', DEPTHS[:-1])
 def test_rates_with_depth_are_the_integrands_at_the_tip(depth: float) -> None:
-    """dG/ds = phi phi^T, dH/ds = phi'' phi''^T, and the moments grow by phi and s phi."""
+    """dG/ds = phi phi^T, dH/ds = phi'' phi''^T; the moments have the derivatives phi and s phi."""
     h = min(1e-3 * depth, LENGTH - depth)
     at, before, after = (MODES.integrals(s) for s in (depth, depth - h, depth + h))
     # Truncation: G grows as s^7 at most, so (h/s)^2 7 6 5 / 6 = 4e-5 of G / s at h = s / 1000.
@@ -202,21 +202,20 @@ def test_gram_matrices_are_symmetric_positive_definite(depth: float) -> None:
     for matrix in (at.gram, at.curvature_gram):
         assert np.array_equal(matrix, matrix.T)
         eigenvalues = np.linalg.eigvalsh(matrix)
-        # More than a thousand roundings away from singular.
+        # More than a thousand roundings from singular.
         assert eigenvalues[0] > 1e3 * EPS * eigenvalues[1]
 
 
 def test_determinant_of_gram_at_small_depth_has_its_analytic_limit() -> None:
-    """As s -> 0 only y^2 and y^3 count: det G -> (a1 b2 - a2 b1)^2 s^12 / 1260."""
+    """For s -> 0 only y^2 and y^3 contribute: det G -> (a1 b2 - a2 b1)^2 s^12 / 1260."""
     depth = 1e-3
     a, b = derivative(2, 0.0) / 2.0, derivative(3, 0.0) / 6.0
     limit = (a[0] * b[1] - a[1] * b[0]) ** 2 * depth**12 / 1260.0
-    # 1e-5: the next power counts (k s)^4 = 3e-7 and rounding cond(G) eps = 1e-8.
+    # 1e-5: the next power contributes (k s)^4 = 3e-7, and rounding cond(G) eps = 1e-8.
     assert_allclose(np.linalg.det(MODES.integrals(depth).gram), limit, rtol=1e-5)
 
 
-def test_integrals_vanish_at_no_depth() -> None:
-    """Nothing is inserted at s = 0."""
+def test_integrals_vanish_at_zero_depth() -> None:
     at = MODES.integrals(0.0)
     for matrix in (at.gram, at.curvature_gram, at.value, at.area, at.moment):
         assert np.all(matrix == 0.0)
@@ -225,21 +224,21 @@ def test_integrals_vanish_at_no_depth() -> None:
 @given(shape=st.lists(st.integers(0, 4), max_size=3))
 @settings(deadline=None, derandomize=True, max_examples=30)
 def test_values_have_the_shape_of_their_argument(shape: list[int]) -> None:
-    """Values and curvatures add one axis of length 2 to whatever shape y has."""
+    """Values and curvatures append one axis of length 2 to the shape of y."""
     y = np.zeros(shape)
     assert MODES.values(y).shape == (*shape, 2)
     assert MODES.derivatives(y, 2).shape == (*shape, 2)
 
 
 @pytest.mark.parametrize('depth', [-1e-9, -1.0, 10.0 * LENGTH, np.inf, -np.inf, np.nan])
-def test_depth_outside_the_needle_is_refused(depth: float) -> None:
-    """An inserted length that is negative, far beyond the needle or no number is an error."""
-    with pytest.raises(ParameterError, match=r'inserted length must be in \[0, .*got'):
+def test_invalid_depths_are_rejected(depth: float) -> None:
+    """Negative depths, depths beyond the needle and NaN are errors."""
+    with pytest.raises(ParameterError, match=r'insertion depth must be in \[0, .*got'):
         MODES.integrals(depth)
 
 
-def test_modes_are_made_once_and_read_only() -> None:
-    """The same length gives the same object, and its table cannot be changed."""
+def test_modes_are_cached_and_read_only() -> None:
+    """Equal lengths give the same object, whose table is read-only."""
     assert mode_shapes(LENGTH) is mode_shapes(LENGTH)
     assert ModeShapes(LENGTH) == MODES
     with pytest.raises(ValueError, match='read-only'):

@@ -23,7 +23,7 @@ def positive_definite(rng: np.random.Generator, n: int) -> FloatArray:
 
 
 @pytest.mark.parametrize('n', [1, 2, 3, 6])
-def test_cholesky_and_triangular_solutions_are_those_of_numpy(n: int) -> None:
+def test_cholesky_and_triangular_solutions_match_numpy(n: int) -> None:
     """L L^T is the matrix; forward and backward solve with L and L^T."""
     rng = np.random.default_rng(n)
     matrix, x = positive_definite(rng, n), rng.standard_normal(n)
@@ -41,7 +41,7 @@ def test_cholesky_and_triangular_solutions_are_those_of_numpy(n: int) -> None:
 
 @pytest.mark.parametrize('n', [1, 2, 3, 6])
 def test_jacobi_finds_ascending_eigenvalues(n: int) -> None:
-    """The diagonal ascends, the vectors are orthonormal, and they give the matrix back."""
+    """The vectors are orthonormal, and the factors reproduce the matrix."""
     matrix = positive_definite(np.random.default_rng(n), n)
     left, vectors = matrix.copy(), np.empty((n, n))
     diagonalize(left, vectors)
@@ -54,7 +54,7 @@ def test_jacobi_finds_ascending_eigenvalues(n: int) -> None:
 
 @pytest.mark.parametrize(('n', 'depth'), [(2, 0.005), (2, 0.02), (2, 0.2), (3, 0.08), (5, 0.2)])
 def test_normal_modes_diagonalize_mass_and_stiffness(n: int, depth: float) -> None:
-    """N^T rho A G N = 1, N^T K N = omega^2, and the inverse is one."""
+    """N^T rho A G N = 1, N^T K N = omega^2, and `inverse` is the inverse of N."""
     p = NeedleParameters.preset('phantom', modes=n, minimum_depth=min(depth, 0.08))
     model = NeedleModel(p)
     at, stiffness = model.modes.integrals(depth), model.stiffness_matrix(depth)
@@ -67,7 +67,7 @@ def test_normal_modes_diagonalize_mass_and_stiffness(n: int, depth: float) -> No
     roots = np.sqrt(modes.squares)
     turned = modes.shapes.T @ stiffness @ modes.shapes / np.outer(roots, roots)
     assert_allclose(turned, np.eye(n), atol=rounding)
-    # The triangular form does not suffer from the condition.
+    # The triangular form is not affected by the condition number.
     assert_allclose(modes.inverse @ modes.shapes, np.eye(n), atol=1e-11)
     assert_allclose(modes.squares, eigh(stiffness, mass)[0], rtol=1e-7)
 
@@ -75,17 +75,17 @@ def test_normal_modes_diagonalize_mass_and_stiffness(n: int, depth: float) -> No
 @given(st.floats(0.0, 1e4), st.floats(0.0, 5.0).map(lambda e: 10.0**e), st.floats(1e-5, 1e-2))
 @settings(deadline=None, derandomize=True)
 def test_swing_is_the_matrix_exponential(damping: float, square: float, t: float) -> None:
-    """Position and velocity respond as the exponential of the system has it."""
+    """Position and velocity match the matrix exponential of the system."""
     exact = expm(t * np.array([[0.0, 1.0], [-square, -damping]]))
     pp, pv, vp, vv = swing(damping, square, t)
-    # Rounding of expm's squarings.
+    # Rounding of expm (squarings).
     assert_allclose((pp, pv), exact[0], rtol=1e-9, atol=1e-13)
     assert_allclose((vp, vv), exact[1], rtol=1e-9, atol=1e-12 * square)
 
 
 @pytest.mark.parametrize('excess', [-1e-9, 0.0, 1e-9])
-def test_swing_passes_through_critical_damping(excess: float) -> None:
-    """Near half damping = frequency the response goes to (1 + w t, t) exp(-w t)."""
+def test_swing_is_continuous_at_critical_damping(excess: float) -> None:
+    """Near half damping = frequency the response approaches (1 + w t, t) exp(-w t)."""
     w, t = 100.0, 0.02
     pp, pv, _, _ = swing(2.0 * w * (1.0 + excess), w * w, t)
     assert_allclose((pp, pv), ((1.0 + w * t) * exp(-w * t), t * exp(-w * t)), rtol=1e-7)
@@ -101,8 +101,8 @@ def test_glide_is_the_first_order_lag() -> None:
     assert decay_means(0.0) == (1.0, 0.5)
 
 
-def test_coupling_is_the_row_of_d() -> None:
-    """The force against insertion is that of the bias forces (13), with its sign turned."""
+def test_coupling_matches_the_row_of_d() -> None:
+    """The force against insertion is the bias force of d in (13) with opposite sign."""
     p = NeedleParameters.preset('phantom')
     model = NeedleModel(p)
     state = model.state_at(0.1, 2e-3)

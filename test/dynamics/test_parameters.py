@@ -1,4 +1,4 @@
-"""Constants: published values, ranges, and errors a person can act on."""
+"""Model constants: published values, ranges and error messages."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ MAY_BE_ZERO = [
     for item in fields(NeedleParameters)
     if 'unit' in item.metadata and item.metadata['low'] == 0.0 and not item.metadata['open_low']
 ]
-#: Ends of the ranges.
+#: Lower bounds of the ranges.
 LOWEST = {name: NeedleParameters.__dataclass_fields__[name].metadata['low'] for name in NUMBERS}
 
 #: Table 3 and section 3.2.8 of the paper, in SI units.
@@ -40,7 +40,7 @@ TABLE_3 = {
     ('name', 'viscous', 'damping'),
     [('paper_si', 0.3, 0.0), ('paper_mm', 300.0, 0.0), ('phantom', 300.0, 1.6)],
 )
-def test_presets_hold_the_published_values(name: str, viscous: float, damping: float) -> None:
+def test_presets_match_the_published_values(name: str, viscous: float, damping: float) -> None:
     """Presets are Table 3, with mu_v = 0.3 N s/m or 0.3 N s/mm, and the assumed damping."""
     values = asdict(NeedleParameters.preset(name))
     assert {key: values[key] for key in TABLE_3} == TABLE_3
@@ -50,14 +50,13 @@ def test_presets_hold_the_published_values(name: str, viscous: float, damping: f
     assert NeedleParameters.preset(name) == PRESETS[name]
 
 
-def test_presets_are_three_and_the_default_is_the_paper() -> None:
-    """The presets are these, and no argument means paper_si."""
+def test_there_are_three_presets_and_the_default_is_paper_si() -> None:
     assert list(PRESETS) == ['paper_si', 'paper_mm', 'phantom']
     assert NeedleParameters() == NeedleParameters.preset('paper_si')
 
 
 def test_damping_of_the_phantom_is_30_percent_of_critical() -> None:
-    """c_a = 1.6 is 0.3 times 2 rho A omega_1 at full insertion, as the preset says."""
+    """c_a = 1.6 is 0.3 times 2 rho A omega_1 at full insertion."""
     p = NeedleParameters.preset('phantom')
     # First clamped-free root; the tissue is a foundation of 520 N/m^2.
     stiffness = p.bending_stiffness * (1.8751040687 / p.length) ** 4 + p.tissue_stiffness
@@ -74,8 +73,8 @@ def test_derived_quantities() -> None:
     assert_allclose(p.moving_mass, 0.5 + 0.01016 * 0.2, rtol=1e-15)
 
 
-def test_every_number_declares_unit_meaning_and_range() -> None:
-    """What becomes a ROS parameter description is there, and defaults are within range."""
+def test_every_number_declares_unit_description_and_range() -> None:
+    """The metadata of the ROS parameter description exist, and defaults are within range."""
     for item in fields(NeedleParameters):
         assert item.metadata['description']
     for name in NUMBERS:
@@ -94,12 +93,12 @@ def test_every_number_declares_unit_meaning_and_range() -> None:
 
 
 def with_constant(name: str, value: Any) -> NeedleParameters:
-    """Make parameters with one constant other than its default."""
+    """Return parameters with one changed constant."""
     return NeedleParameters(**{name: value})
 
 
 def refusal(name: str, value: Any) -> str:
-    """Return why a constant is refused, made alone, from a mapping or in a preset."""
+    """Return the error message for a constant, set directly, from a mapping or in a preset."""
     complaints = set()
     for make in (
         lambda: with_constant(name, value),
@@ -114,8 +113,8 @@ def refusal(name: str, value: Any) -> str:
 
 
 @pytest.mark.parametrize('value', [np.nan, np.inf, -np.inf, -1.0, -1e-300])
-def test_no_constant_may_be_out_of_its_range(value: float) -> None:
-    """NaN, infinite and negative constants are refused by name; `settings` says the range."""
+def test_constants_out_of_range_are_rejected(value: float) -> None:
+    """NaN, infinite and negative constants are rejected; the message has name and range."""
     for name in NUMBERS:
         lowest = LOWEST[name]
         # Some ranges reach below zero.
@@ -135,13 +134,13 @@ def test_no_constant_may_be_out_of_its_range(value: float) -> None:
         ('area', True, 'area must be a number, got True'),
     ],
 )
-def test_a_refusal_says_what_would_be_valid(name: str, value: Any, complaint: str) -> None:
-    """Name, range with its unit, and the value found."""
+def test_error_message_contains_the_valid_range(name: str, value: Any, complaint: str) -> None:
+    """Name, range with its unit, and value."""
     assert refusal(name, value) == complaint
 
 
-def test_zero_is_valid_only_where_the_model_stays_regular() -> None:
-    """Friction, tissue and carriage may be switched off; geometry and inertia may not."""
+def test_zero_is_valid_only_where_the_model_is_regular() -> None:
+    """Friction, tissue and carriage may be zero; geometry and inertia may not."""
     for name in NUMBERS:
         if name in MAY_BE_ZERO or LOWEST[name] < 0.0:
             assert getattr(with_constant(name, 0.0), name) == 0.0
@@ -150,8 +149,8 @@ def test_zero_is_valid_only_where_the_model_stays_regular() -> None:
                 with_constant(name, 0.0)
 
 
-def test_what_may_be_zero() -> None:
-    """These and no other constants have zero as the end of their range."""
+def test_list_of_constants_that_may_be_zero() -> None:
+    """Only these constants have zero as the closed lower bound."""
     assert MAY_BE_ZERO == [
         'carriage_mass',
         'tissue_stiffness',
@@ -163,15 +162,14 @@ def test_what_may_be_zero() -> None:
 
 
 @pytest.mark.parametrize('value', [True, False, '0.1', None, [0.1], 1j])
-def test_what_is_not_a_number_is_refused_by_name(value: Any) -> None:
-    """Booleans, strings, None and the like are not numbers, whatever float() makes of them."""
+def test_non_numbers_are_rejected(value: Any) -> None:
+    """Booleans, strings and None are rejected even if float() converts them."""
     for name in NUMBERS:
         assert refusal(name, value) == f'{name} must be a number, got {value!r}'
 
 
 @pytest.mark.parametrize('value', [1, 0, 'yes', None, 1.0])
-def test_hub_stop_must_be_a_truth_value(value: Any) -> None:
-    """hub_stop takes True and False only."""
+def test_hub_stop_must_be_boolean(value: Any) -> None:
     with pytest.raises(ParameterError, match='hub_stop must be true or false, got'):
         NeedleParameters(hub_stop=value)
     assert NeedleParameters(hub_stop=False).hub_stop is False
@@ -179,13 +177,12 @@ def test_hub_stop_must_be_a_truth_value(value: Any) -> None:
 
 @pytest.mark.parametrize('value', [0.2, 0.3])
 def test_minimum_depth_must_be_less_than_the_length(value: float) -> None:
-    """There must be some range of depths left."""
     with pytest.raises(ParameterError, match=r'minimum_depth must be < length = 0\.2 m, got'):
         NeedleParameters(minimum_depth=value)
 
 
-def test_integers_are_taken_where_a_float_is_meant() -> None:
-    """A configuration file may say 8000 for 8000.0; the result is a float."""
+def test_integers_are_converted_to_floats() -> None:
+    """A configuration file may contain 8000 instead of 8000.0."""
     made = from_values(NeedleParameters, {'density': 8000, 'viscous_friction': 0})
     assert made == replace(NeedleParameters(), viscous_friction=0.0)
     assert type(made.density) is type(made.viscous_friction) is float
@@ -205,14 +202,13 @@ def test_integers_are_taken_where_a_float_is_meant() -> None:
 )
 @settings(deadline=None, derandomize=True)
 def test_mapping_round_trip(values: dict[str, Any]) -> None:
-    """from_mapping takes what it is given, defaults for the rest, and asdict gives it back."""
+    """`from_mapping` uses defaults for missing keys, and `asdict` is its inverse."""
     made = from_values(NeedleParameters, values)
     assert asdict(made) == asdict(NeedleParameters()) | values
     assert from_values(NeedleParameters, asdict(made)) == made
 
 
-def test_unknown_key_is_named_with_the_nearest_valid_one() -> None:
-    """A misspelled constant is not ignored: the message names it and what was meant."""
+def test_unknown_key_error_suggests_the_nearest_valid_key() -> None:
     with pytest.raises(ParameterError) as caught:
         from_values(NeedleParameters, {'viscous_fricton': 0.3})
     assert str(caught.value) == (
@@ -222,22 +218,21 @@ def test_unknown_key_is_named_with_the_nearest_valid_one() -> None:
         NeedleParameters.preset('phantom', desity=1.0)
 
 
-def test_unknown_key_like_no_other_lists_the_valid_ones() -> None:
-    """If nothing is near, all valid names are listed."""
+def test_unknown_key_error_lists_all_valid_keys() -> None:
+    """If there is no similar key."""
     with pytest.raises(ParameterError, match='xyzzy') as caught:
         from_values(NeedleParameters, {'xyzzy': 1.0})
     for item in fields(NeedleParameters):
         assert item.name in str(caught.value)
 
 
-def test_unknown_preset_lists_the_valid_ones() -> None:
-    """A preset that does not exist is named, with those that do."""
+def test_unknown_preset_error_lists_the_presets() -> None:
     with pytest.raises(ParameterError, match=r"'papper'.*paper_si, paper_mm, phantom"):
         NeedleParameters.preset('papper')
 
 
 def test_constants_are_frozen() -> None:
-    """Constants cannot be changed after they were checked, presets included."""
+    """Checked constants cannot be changed, including presets."""
     p = NeedleParameters()
     with pytest.raises(FrozenInstanceError):
         p.length = 0.3  # type: ignore[misc]
@@ -246,14 +241,13 @@ def test_constants_are_frozen() -> None:
     assert hash(p) == hash(NeedleParameters())
 
 
-def test_a_preset_with_changes_leaves_the_preset_alone() -> None:
-    """preset(name, key=value) is a new value."""
+def test_preset_with_changes_does_not_modify_the_preset() -> None:
     changed = NeedleParameters.preset('paper_mm', length=0.15)
     assert changed == replace(PRESETS['paper_mm'], length=0.15)
     assert PRESETS['paper_mm'].length == 0.2
 
 
 def test_errors_are_needle_errors_and_value_errors() -> None:
-    """Callers may catch our base class or Python's."""
+    """Callers can catch the base class of the project or ValueError."""
     assert issubclass(ParameterError, NeedleError)
     assert issubclass(ParameterError, ValueError)

@@ -1,4 +1,4 @@
-"""The plant as an object: a base that follows and pushes, constants that change, the zero."""
+"""Plant: base motions and pushes, changes of constants, tare, and tip sensor."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ PERFECT = ForceSensorParameters(
 def robot(
     parameters: NeedleParameters = PRESETS['phantom'], depth: float = DEPTH, **limits: Any
 ) -> Plant:
-    """Make a plant in mode robot with a perfect sensor."""
+    """Return a plant in mode robot with an ideal sensor."""
     state = NeedleModel(parameters).state_at(depth, 0.0)
     base = BaseMotion(
         BaseParameters(**limits), depth, (parameters.minimum_depth, parameters.length), 1e3
@@ -47,7 +47,7 @@ def robot(
 
 
 def follow(plant: Plant, *points: tuple[float, float | None, float | None]) -> None:
-    """Send a trajectory of points: time, inserted length or None, force or None."""
+    """Send a trajectory of points: time, insertion depth or None, force or None."""
     times, depths, forces = zip(*points, strict=True)
 
     def row(value: float | None) -> list[float]:
@@ -66,10 +66,10 @@ def column(samples: list[Sample], name: str) -> FloatArray:
 
 @pytest.mark.parametrize('way', [1.0, -1.0])
 @pytest.mark.parametrize('changes', [{}, {'coulomb_friction': 0.31}, {'carriage_mass': 0.5}])
-def test_a_ramp_moves_the_needle_exactly_when_it_exceeds_friction(
+def test_force_ramp_moves_the_needle_when_it_exceeds_friction(
     way: float, changes: dict[str, float]
 ) -> None:
-    """Up to mu_s nothing moves, bit for bit; beyond, the steady speed is (f - mu_s) / mu_v."""
+    """Up to mu_s the depth is constant bit for bit; above, the velocity is (f - mu_s) / mu_v."""
     parameters = NeedleParameters.preset('phantom', **changes)
     mu_s = parameters.coulomb_friction
     plant = robot(parameters)
@@ -87,40 +87,40 @@ def test_a_ramp_moves_the_needle_exactly_when_it_exceeds_friction(
     wrench = column(samples, 'wrench')[:, 1]
     assert_allclose(wrench[at_rest], felt[at_rest], rtol=1e-12)
     if not parameters.carriage_mass:
-        # M / mu_v = 7 us: settled to e^-70 within a quarter of an interval of 2 ms.
+        # M / mu_v = 7 us: transients decay to e^-70 within a quarter of an interval of 2 ms.
         assert_allclose(speed[~at_rest], (force[~at_rest] - way * mu_s) / 300.0, rtol=1e-9)
         assert_allclose(wrench[~at_rest], felt[~at_rest], rtol=1e-12)
 
 
 @pytest.mark.parametrize('preset', ['phantom', 'paper_si'])
 @pytest.mark.parametrize('force', [100.0, -100.0])
-def test_a_push_keeps_within_the_speed_limit(preset: str, force: float) -> None:
-    """However strong, a push does not exceed the limit, and the sensor feels what that took."""
+def test_push_respects_the_speed_limit(preset: str, force: float) -> None:
+    """For any force; at the limit the sensor measures the force required by the motion."""
     parameters = PRESETS[preset]
     plant = robot(parameters, speed_limit=0.03)
     follow(plant, (0.5, None, force))
     samples = run(plant, 1.0)
     speed = column(samples, 'speed')
-    # The speed is set, not approached: rounding only.
+    # The velocity is prescribed: rounding only.
     assert np.abs(speed).max() <= 0.03 * (1.0 + 1e-12)
     assert_allclose(speed[-250:], np.copysign(0.03, force), rtol=1e-12)
     felt = np.copysign(parameters.coulomb_friction + 0.03 * parameters.viscous_friction, force)
-    # The bent needle's share is nil: it was straight.
+    # No contribution of bending: the needle was straight.
     assert_allclose(column(samples, 'wrench')[-200:, 1], felt, rtol=1e-9)
 
 
-def test_a_push_that_leaves_the_tissue_only_without_its_limit_stays_in() -> None:
-    """A force that would throw the needle out within an interval is limited before."""
+def test_speed_limit_keeps_the_needle_in_the_tissue() -> None:
+    """A force that would pull the needle out within an interval is limited before."""
     plant = robot(PRESETS['paper_si'], depth=0.003, speed_limit=0.001)
     follow(plant, (0.0, None, -1000.0))
-    # The speed is reached evenly in the first quarter of the interval.
+    # The velocity is reached linearly in the first quarter of the interval.
     assert plant.advance().depth == pytest.approx(0.003 - 0.875 * 0.001 / RATE, rel=1e-9)
     with pytest.raises(InsertedLengthError, match='minimum_depth'):
         run(plant, 3.0)
 
 
-def test_a_motion_begins_where_the_push_has_left_the_base() -> None:
-    """After a push the line of inserted lengths starts there; it ends where it shall."""
+def test_motion_after_a_push_starts_at_the_actual_position() -> None:
+    """It ends at the commanded position."""
     plant = robot()
     follow(plant, (0.5, None, 2.0), (1.5, 0.11, None), (2.0, 0.11, None))
     pushed = run(plant, 0.5)[-1].depth
@@ -128,32 +128,31 @@ def test_a_motion_begins_where_the_push_has_left_the_base() -> None:
     back = run(plant, 1.0)
     slope = (0.11 - pushed) / 1.0
     line = pushed + slope * np.arange(1, len(back) + 1) / RATE
-    # The speed at the end of the push, (2 - 0.56) / 300 m/s, is braked at 0.5 m/s^2.
+    # The velocity at the end of the push, (2 - 0.56) / 300 m/s, is braked at 0.5 m/s^2.
     lead = (1.44 / 300.0) ** 2
     assert np.abs(column(back, 'depth') - line).max() < lead
     assert np.abs(np.diff(column(back, 'speed'))).max() <= 0.5 / RATE * (1.0 + 1e-12)
     assert run(plant, 0.5)[-1].depth == pytest.approx(0.11, abs=1e-7)
 
 
-def test_the_force_of_a_push_is_straight_between_points_and_held_after_the_last() -> None:
-    """Points of effort are joined by lines; the first starts at zero, the last goes on."""
+def test_push_force_is_piecewise_linear_and_held_at_the_end() -> None:
+    """The first segment starts at zero force."""
     plant = robot()
     follow(plant, (0.2, None, 0.4), (0.4, None, -0.2))
     ends = np.arange(1, 301) / RATE
     expected = np.interp(ends, [0.0, 0.2, 0.4], [0.0, 0.4, -0.2])
     assert_allclose(column(run(plant, 0.6), 'force'), expected, atol=1e-12)
-    # A new one begins with the force under way.
+    # A new push starts with the present force.
     follow(plant, (0.1, None, 0.3))
     ramp = np.interp(ends[:50], [0.0, 0.1], [-0.2, 0.3])
     assert_allclose(column(run(plant, 0.1), 'force'), ramp, atol=1e-12)
-    # After a motion a push begins at zero.
+    # After a motion a push starts at zero force.
     follow(plant, (0.1, DEPTH, None), (0.2, None, 0.5))
     run(plant, 0.1)
     assert_allclose(column(run(plant, 0.1), 'force'), 5.0 * ends[:50], atol=1e-12)
 
 
-def test_a_point_with_both_is_a_position() -> None:
-    """An effort beside a position does not count."""
+def test_position_overrides_effort_in_a_point() -> None:
     one, other = robot(), robot()
     follow(one, (0.5, 0.102, None), (0.7, 0.102, None))
     follow(other, (0.5, 0.102, 50.0), (0.7, 0.102, nan))
@@ -161,8 +160,8 @@ def test_a_point_with_both_is_a_position() -> None:
 
 
 @pytest.mark.parametrize('resolution', [0.0, 1e-6, 2.5e-5])
-def test_the_encoder_shows_the_nearest_count(resolution: float) -> None:
-    """The joint position is a whole number of counts, half a count off at most; zero is off."""
+def test_encoder_rounds_to_the_nearest_count(resolution: float) -> None:
+    """The error of the joint position is at most half a count; zero disables rounding."""
     plant = robot(encoder_resolution=resolution)
     follow(plant, (1.0, 0.103, None))
     samples = run(plant, 1.2)
@@ -187,10 +186,8 @@ def test_the_encoder_shows_the_nearest_count(resolution: float) -> None:
         ([(1.0, 0.1, None), (1.0, 0.1, None)], 'trajectory times must be >= 0 and increasing'),
     ],
 )
-def test_a_trajectory_that_cannot_be_followed_changes_nothing(
-    points: list[Any], complaint: str
-) -> None:
-    """It is refused with its reason, and the one before goes on."""
+def test_invalid_trajectories_have_no_effect(points: list[Any], complaint: str) -> None:
+    """The trajectory is rejected with a reason, and the previous trajectory continues."""
     plant = robot()
     follow(plant, (0.0, 0.101, None))
     with pytest.raises(ParameterError, match=complaint):
@@ -198,8 +195,7 @@ def test_a_trajectory_that_cannot_be_followed_changes_nothing(
     assert run(plant, 1.0)[-1].depth == pytest.approx(0.101, abs=1e-7)
 
 
-def test_a_needle_without_a_robot_follows_no_trajectory() -> None:
-    """In mode simulation there is nothing to follow it."""
+def test_trajectories_are_rejected_in_mode_simulation() -> None:
     parameters = PRESETS['phantom']
     needle = Integrator(parameters, NeedleModel(parameters).state_at(DEPTH, 0.0))
     plant = Plant(needle, ForceSensor(PERFECT, RATE, 0), RATE)
@@ -207,8 +203,8 @@ def test_a_needle_without_a_robot_follows_no_trajectory() -> None:
         follow(plant, (1.0, 0.1, None))
 
 
-def test_the_sensor_is_zeroed_at_rest_only() -> None:
-    """A moving needle is refused by its speed, one at rest after a tenth of a second not."""
+def test_tare_requires_rest() -> None:
+    """Rejected during motion and until a tenth of a second after."""
     plant = robot()
     follow(plant, (0.2, None, 0.5), (1.2, 0.11, None))
     run(plant, 0.7)
@@ -219,14 +215,14 @@ def test_the_sensor_is_zeroed_at_rest_only() -> None:
     rested = sum(1 for sample in samples if abs(sample.speed) <= 1e-6)
     assert rested >= 50
     plant.tare()
-    # At rest with the least force: nothing but the zero is left.
+    # At rest with the least force: only the tare value remains.
     assert abs(plant.advance().wrench[1]) < 1e-9
     with pytest.raises(JobError, match='1 of 50 readings at rest so far'):
         plant.tare()
 
 
-def test_a_push_below_the_limit_is_an_advance() -> None:
-    """Within the limit the result is that of the free needle under the force, bit for bit."""
+def test_push_below_the_speed_limit_equals_an_advance() -> None:
+    """The result equals the free needle under the force, bit for bit."""
     parameters = PRESETS['phantom']
     state = NeedleModel(parameters).state_at(0.05, 1e-3)
     one, other = Integrator(parameters, state), Integrator(parameters, state)
@@ -237,8 +233,8 @@ def test_a_push_below_the_limit_is_an_advance() -> None:
 
 
 @pytest.mark.parametrize('law', ['coulomb', 'stribeck', 'tanh'])
-def test_constants_change_without_a_jump(law: str) -> None:
-    """The state stays bit for bit; from there the motion is that under the new constants."""
+def test_change_of_constants_keeps_the_state(law: str) -> None:
+    """The state is equal bit for bit; the motion continues with the new constants."""
     parameters = NeedleParameters.preset('phantom', friction_law=law)
     changed = replace(parameters, coulomb_friction=0.8, viscous_friction=200.0)
     one = Integrator(parameters, NeedleModel(parameters).state_at(0.05, 1e-3))
@@ -253,8 +249,8 @@ def test_constants_change_without_a_jump(law: str) -> None:
         assert one.velocity == pytest.approx((3.0 - 0.8) / 200.0, rel=1e-3)
 
 
-def test_constants_that_do_not_suit_the_state_are_refused() -> None:
-    """Another number of modes or a shorter needle: an error, and the old constants stay."""
+def test_incompatible_constants_are_rejected() -> None:
+    """Another number of modes or a shorter needle is an error, and the old constants are kept."""
     parameters = PRESETS['phantom']
     state = NeedleModel(parameters).state_at(0.05, 1e-3)
     one, other = Integrator(parameters, state), Integrator(parameters, state)
@@ -266,8 +262,8 @@ def test_constants_that_do_not_suit_the_state_are_refused() -> None:
     assert one.advance(0.05, 3.0) == other.advance(0.05, 3.0)
 
 
-def test_same_seed_same_samples() -> None:
-    """The whole plant is a function of its seed and of what it is told."""
+def test_same_seed_gives_the_same_samples() -> None:
+    """The samples depend only on the seed and the inputs."""
 
     def seen(seed: int) -> FloatArray:
         parameters = PRESETS['phantom']
@@ -281,8 +277,8 @@ def test_same_seed_same_samples() -> None:
     assert not np.array_equal(seen(1), seen(2))
 
 
-def test_force_and_speed_of_a_carried_base_are_of_one_instant() -> None:
-    """(15) holds sample by sample while the base speeds up and slows down."""
+def test_force_and_velocity_of_a_moved_base_refer_to_one_instant() -> None:
+    """(15) holds for each sample during acceleration and braking."""
     plant = robot(acceleration_limit=0.1)
     parameters = plant.integrator.model.parameters
     follow(plant, (0.1, 0.1, None), (0.5, 0.112, None), (0.9, 0.1, None))
@@ -298,8 +294,8 @@ def test_force_and_speed_of_a_carried_base_are_of_one_instant() -> None:
     )
 
 
-def test_the_sensor_feels_the_needle_as_it_rings_within_a_sample() -> None:
-    """Under a commanded wrench each of its samples is the true mean over it: SciPy's cascade."""
+def test_sensor_resolves_vibration_within_a_sample() -> None:
+    """Under a commanded wrench each internal sample is the true mean over it (SciPy cascade)."""
     parameters = PRESETS['paper_mm']
     # Modes of 0.36 and 3.4 kHz.
     state = NeedleModel(parameters).state_at(0.05, 5e-4)
@@ -314,22 +310,22 @@ def test_the_sensor_feels_the_needle_as_it_rings_within_a_sample() -> None:
     start = sosfilt_zi(cascade)[:, :, np.newaxis] * true[0]
     felt, _ = sosfilt(cascade, true, axis=0, zi=start)
     wrench = column(samples, 'wrench')
-    # Rounding of rates to momenta and back in each part.
+    # Conversion of rates to momenta and back in each part.
     assert_allclose(wrench[:, 1:4], felt[7::8], rtol=0.0, atol=1e-8 * np.abs(true).max())
     assert np.all(wrench[:, [0, 4, 5]] == 0.0)
-    # It rings within the samples: their means would not do.
+    # The vibration within a sample matters: means over samples are not sufficient.
     means = true.reshape(40, 8, 3).mean(axis=1)
     assert np.abs(true[:, 1] - np.repeat(means[:, 1], 8)).max() > 0.1 * np.abs(true[:, 1]).max()
 
 
 def watched(rate: float = 0.0, noise: float = 0.0, delay: float = 0.0) -> list[TipReading | None]:
-    """Return what a sensor of the tip says of 40 samples at 100 Hz that count up from 1."""
+    """Return the readings of a tip sensor for 40 samples at 100 Hz that increase from 1."""
     sensor = TipSensor(TipParameters(rate=rate, noise=noise, delay=delay), 100.0, 1)
     return [sensor.measure(0.1 * k, float(k)) for k in range(1, 41)]
 
 
-def test_the_tip_is_seen_at_the_rate_and_delay_of_its_sensor() -> None:
-    """Each sample is the mean over its exposure and leaves when it is late enough."""
+def test_tip_sensor_has_its_own_rate_and_delay() -> None:
+    """Each reading is the mean over its exposure and is published after the delay."""
     assert [r.deflection for r in watched() if r] == list(range(1, 41))
     readings = watched(rate=10.0, delay=0.03)
     assert [k for k, r in enumerate(readings, 1) if r] == [13, 23, 33]
@@ -339,17 +335,17 @@ def test_the_tip_is_seen_at_the_rate_and_delay_of_its_sensor() -> None:
     assert_allclose([r.depth for r in seen], [1.0, 2.0, 3.0], rtol=1e-12)
 
 
-def test_noise_of_the_tip_is_of_the_size_asked_for_and_seeded() -> None:
+def test_tip_noise_has_the_given_deviation_and_seed() -> None:
     """The same seed gives the same noise."""
     noisy, again = watched(noise=0.5), watched(noise=0.5)
     assert noisy == again
     errors = [r.deflection - k for k, r in enumerate(noisy, 1) if r]
-    # 40 samples: the standard deviation is known to 11 %, taken three times.
+    # 40 samples: the standard deviation has an error of 11 %, taken three times.
     assert 0.33 < np.std(errors) < 0.67
 
 
-def test_a_rate_of_the_tip_need_not_divide_that_of_the_plant() -> None:
-    """Each exposure ends with the nearest sample of the plant, and none is left out or twice."""
+def test_tip_rate_need_not_divide_the_plant_rate() -> None:
+    """Each exposure ends at the nearest sample of the plant; no sample is omitted or repeated."""
     seen = [k for k, reading in enumerate(watched(rate=30.0), 1) if reading]
     # 100 Hz: every 10/3 samples.
     assert seen[:6] == [3, 7, 10, 13, 17, 20]
@@ -359,12 +355,12 @@ def test_a_rate_of_the_tip_need_not_divide_that_of_the_plant() -> None:
         watched(rate=150.0)
 
 
-def test_a_plant_may_start_from_modal_coordinates() -> None:
-    """As its parameter says; a deflection beside them, or no numbers, are refused."""
+def test_plant_can_start_from_modal_coordinates() -> None:
+    """An additional deflection, or values that are not numbers, are rejected."""
     plant = PlantConstants.of({'modal': [1e-5, 2e-6]}).make()
     assert isinstance(plant, Plant)
     assert plant.integrator.state[2:4].tolist() == [1e-5, 2e-6]
-    with pytest.raises(ParameterError, match='modal and tip_deflection are two ways'):
+    with pytest.raises(ParameterError, match='modal and tip_deflection both define'):
         PlantConstants.of({'modal': [1e-5, 2e-6], 'tip_deflection': 1e-3}).make()
     with pytest.raises(ParameterError, match='modal must be numbers'):
         PlantConstants.of({'modal': ['one', 'two']})

@@ -1,4 +1,4 @@
-"""A run of the plant: its samples, and the events that make it repeatable."""
+"""Plant run: samples, and events that make it repeatable."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from needle_dynamics.simulated.run import (
 )
 import pytest
 
-#: A stamp that a float could not hold to the nanosecond.
+#: A stamp with more digits than a float can hold to the nanosecond.
 BEGIN = 1_700_000_000_123_456_789
 #: The period is not a whole number of nanoseconds.
 VALUES: dict[str, Any] = {
@@ -42,12 +42,12 @@ def stamp(k: int) -> int:
 
 
 def truth(measured: list[Measurement]) -> list[float]:
-    """Return the numbers of `ground_truth`."""
+    """Return the values of `ground_truth`."""
     return next(values for name, _, values in measured if name == 'ground_truth')
 
 
-def test_samples_say_what_the_contract_has() -> None:
-    """Each topic with as many numbers as it has quantities, joint_states last."""
+def test_samples_match_the_topics_of_the_contract() -> None:
+    """Each topic has the declared number of values; `joint_states` is last."""
     for mode, steered, last in (
         ('simulation', False, 'joint_states'),
         ('robot', False, 'joint_states'),
@@ -63,8 +63,8 @@ def test_samples_say_what_the_contract_has() -> None:
             assert len(values) == len(plant.topics[name].quantities)
 
 
-def test_the_ground_truth_says_which_command_acted() -> None:
-    """To the last bit, though the needle feels its mean; insertion makes d smaller."""
+def test_ground_truth_contains_the_acting_command() -> None:
+    """To the last bit, in contrast to the measured mean; insertion decreases d."""
     plant = PlantRun(VALUES)
     force, torque = 1.0 / 3.0, 1e-9 / 7.0
     plant.commands.offer(stamp(0), '', force, torque, stamp(0))
@@ -76,8 +76,8 @@ def test_the_ground_truth_says_which_command_acted() -> None:
     assert len(truth(robot.take(stamp(1)))) == 8
 
 
-def test_time_is_an_event_only_when_it_jumps() -> None:
-    """Stamps at multiples of the period are none, however they are rounded."""
+def test_only_time_jumps_are_events() -> None:
+    """Stamps at rounded multiples of the period are not events."""
     plant = PlantRun(VALUES)
     kinds = []
     for k in range(1, 101):
@@ -89,8 +89,8 @@ def test_time_is_an_event_only_when_it_jumps() -> None:
     assert plant.number == 100
 
 
-def test_events_can_be_written_and_done_again() -> None:
-    """What a run hands over makes the same samples, after a way through JSON."""
+def test_events_can_be_serialized_and_replayed() -> None:
+    """Replayed events give the same samples after conversion to JSON."""
     first = PlantRun({**VALUES, 'mode': 'robot', 'seed': 5})
     done = {
         40: [Event(TARE), COURSE],
@@ -117,8 +117,8 @@ def test_events_can_be_written_and_done_again() -> None:
         assert second.take(stamp(k)) == measured
 
 
-def test_what_the_plant_refuses_is_no_event() -> None:
-    """The error is that of the plant, and nothing changes."""
+def test_rejected_inputs_are_not_events() -> None:
+    """The error of the plant is raised, and nothing changes."""
     plant = PlantRun({**VALUES, 'mode': 'robot'})
     plant.take(stamp(1))
     plant.events()
@@ -132,14 +132,14 @@ def test_what_the_plant_refuses_is_no_event() -> None:
             plant.perform(event)
     with pytest.raises(ParameterError, match='in the modes robot and indenter only'):
         PlantRun(VALUES).perform(Event(TRAJECTORY, COURSE.content))
-    # A fault alters measurements, not the plant.
+    # A fault changes measurements, not the plant.
     plant.perform(Event(PARAMETERS, {'fault.kind': 'drop'}))
     assert plant.events() == []
     assert plant.constants is constants or plant.constants == constants
 
 
-def test_constants_are_those_of_the_parameters() -> None:
-    """What is not given has its default, in the preset if there is one."""
+def test_constants_are_read_from_the_parameters() -> None:
+    """Missing values have their defaults, from the preset if given."""
     constants = PlantConstants.of({'model.preset': 'paper_mm', 'rate': 500, 'sensor.filter': 0})
     assert constants.model == NeedleParameters.preset('paper_mm')
     assert (constants.mode, constants.seed, constants.own.rate) == ('simulation', 1, 500.0)
@@ -160,8 +160,8 @@ def test_constants_are_those_of_the_parameters() -> None:
         ({'rate': 1e5}, 'rate must be finite, >= 1 and <= 8000 Hz, got 100000.0'),
     ],
 )
-def test_a_parameter_that_is_not_valid_is_named(values: dict[str, Any], complaint: str) -> None:
-    """With its namespace."""
+def test_invalid_parameters_are_rejected(values: dict[str, Any], complaint: str) -> None:
+    """The message contains the name with its namespace."""
     with pytest.raises(ParameterError) as caught:
         PlantConstants.of(values)
     assert str(caught.value).startswith(complaint)

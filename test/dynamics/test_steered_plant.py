@@ -1,4 +1,4 @@
-"""The steered plant: what its robot, its guide and its sensors make of a needle that cuts."""
+"""Steered plant: robot, guide and sensors of a needle that cuts its path."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def course(seconds: float, **ends: float) -> Event:
 def run(
     values: dict[str, Any], samples: int, *events: Event, force: float = 0.0
 ) -> tuple[PlantRun, list[dict[str, list[float]]]]:
-    """Perform events, take samples; return the numbers by topic."""
+    """Perform events, take samples; return the values by topic."""
     plant = PlantRun(values)
     for event in events:
         plant.perform(event)
@@ -68,8 +68,8 @@ def run(
     return plant, taken
 
 
-def test_the_tip_is_that_of_a_needle_moved_by_what_the_joints_say() -> None:
-    """Along the joints of the message the library's needle ends where the plant's does."""
+def test_tip_matches_a_needle_moved_along_the_joint_states() -> None:
+    """A `SteeredNeedle` moved along the published joints ends at the same tip."""
     move = course(2.0, insertion=0.05, guide_x=2e-3, guide_z=-1e-3, guide_tilt_x=0.02, roll=1.0)
     plant, taken = run({**VALUES, 'base.encoder_resolution': 0.0}, 1200, move)
     assert isinstance(plant.plant, SteeredPlant)
@@ -81,17 +81,17 @@ def test_the_tip_is_that_of_a_needle_moved_by_what_the_joints_say() -> None:
         alone.move(depth=depth, guide=(x, z), tilt=(tilt_x, tilt_z), roll=roll)
     truth = taken[-1]['ground_truth']
     assert_allclose(truth[0], told.model.length - 0.05, rtol=0.0, atol=1e-6)
-    # Rounding, of a thousand steps.
+    # Rounding of a thousand steps.
     assert_allclose(truth[1:4], [alone.tip[0], alone.tip[2], alone.tip_roll], atol=1e-12)
     assert_allclose(taken[-1]['tip_deflection'], alone.tip, atol=1e-12)
     assert abs(truth[1]) > 1e-4
     assert abs(truth[2]) > 1e-4
-    # It says so for people, too.
+    # The diagnostics contain it too.
     assert plant.plant.report['roll [rad]'] == '1.000000'
 
 
-def test_joints_keep_their_limits_and_arrive() -> None:
-    """Each no faster than its speed, none brought to it faster than said; the others rest."""
+def test_joints_respect_their_limits_and_arrive() -> None:
+    """Velocity and acceleration stay within the limits; other joints rest."""
     ends = {'guide_z': 6e-3, 'guide_tilt_z': -0.1, 'roll': 6.0}
     plant, taken = run(VALUES, 1000, course(0.01, **ends))
     states = np.array([sample['joint_states'] for sample in taken])
@@ -111,8 +111,8 @@ def test_joints_keep_their_limits_and_arrive() -> None:
     assert isinstance(plant.plant, SteeredPlant)
 
 
-def test_joints_that_a_trajectory_lacks_go_on() -> None:
-    """A roll does not stop the guide, nor the insertion."""
+def test_joints_missing_in_a_trajectory_continue() -> None:
+    """A roll trajectory stops neither the guide nor the insertion."""
     plant, taken = run(VALUES, 100, course(1.0, insertion=0.03, guide_x=2e-3))
     plant.perform(course(0.5, roll=0.4))
     for k in range(101, 801):
@@ -142,8 +142,8 @@ def test_joints_that_a_trajectory_lacks_go_on() -> None:
         ),
     ],
 )
-def test_what_cannot_be_followed_moves_nothing(change: dict[str, Any], complaint: str) -> None:
-    """Not even the joints that could: the message says what was found and what is valid."""
+def test_invalid_trajectories_move_no_joint(change: dict[str, Any], complaint: str) -> None:
+    """The message contains the given and the valid values."""
     plant, _ = run(VALUES, 1)
     content = {**course(1.0, guide_x=1e-3).content, **change}
     with pytest.raises(ParameterError, match=complaint):
@@ -152,24 +152,24 @@ def test_what_cannot_be_followed_moves_nothing(change: dict[str, Any], complaint
     assert [v[:6] for n, _, v in before if n == 'joint_states'] == [[0.01, *[0.0] * 5]]
 
 
-def test_under_commands_the_insertion_is_the_controllers() -> None:
-    """A trajectory of it is left to the controller; the force moves the needle."""
+def test_insertion_trajectory_is_ignored_under_force_commands() -> None:
+    """The controller uses the trajectory; the force moves the needle."""
     values = {**VALUES, 'mode': 'simulation', 'sensor.force_noise': 0.0, 'sensor.filter': 0}
     _, taken = run(values, 500, course(0.1, insertion=0.1, guide_z=1e-3), force=4.0)
     depth, speed = (taken[-1]['joint_states'][k] for k in (0, 6))
     told = PlantConstants.of(values).model
-    # Friction and cutting are what the force overcomes, at a speed that no longer changes.
+    # At constant velocity the force equals friction plus cutting force.
     held = told.coulomb_friction + 1.2
     assert_allclose(speed, (4.0 - held) / told.viscous_friction, rtol=1e-9)
     assert depth < 0.02
-    # The robot is content to rest within 10 nm of the end, taken twice.
+    # The robot rests within 10 nm of the end, taken twice.
     assert taken[-1]['joint_states'][2] == pytest.approx(1e-3, abs=2e-8)
     assert taken[-1]['ground_truth'][8] == -4.0
     assert_allclose(taken[-1]['base_wrench'][1], 4.0, atol=0.003)
 
 
-def test_the_sensor_feels_what_carries_the_needle() -> None:
-    """At constant speed friction and cutting; back, friction alone; bent, the guide's load."""
+def test_sensor_measures_friction_cutting_and_guide_load() -> None:
+    """Insertion: friction and cutting; withdrawal: friction; bent needle: guide load."""
     values = {**VALUES, 'sensor.force_noise': 0.0, 'sensor.torque_noise': 0.0}
     values |= {'sensor.force_resolution': 0.0, 'sensor.torque_resolution': 0.0, 'sensor.filter': 0}
     plant, taken = run(values, 1000, course(2.0, insertion=0.05))
@@ -178,7 +178,7 @@ def test_the_sensor_feels_what_carries_the_needle() -> None:
     assert_allclose(speed, 0.02, rtol=1e-6)
     expected = told.coulomb_friction + 1.2 + told.viscous_friction * speed
     assert_allclose(taken[800]['base_wrench'][1], expected, rtol=1e-6)
-    # What the sensor says is what the joints say, in the order of the message.
+    # The wrench of the sensor equals the joint efforts, in the order of the message.
     x, y, z, about_x, about_y, about_z = taken[900]['base_wrench']
     efforts = taken[900]['joint_states'][12:]
     assert_allclose([y, x, z, -about_z, about_x, about_y], efforts, rtol=1e-12)
@@ -192,10 +192,10 @@ def test_the_sensor_feels_what_carries_the_needle() -> None:
 
 
 @pytest.mark.parametrize('samples', [1, 2, 3, 4, 7])
-def test_readings_of_a_push_have_its_impulse(
+def test_readings_of_a_push_conserve_the_impulse(
     samples: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Whatever the rate of the sensor, the mean of its samples is that of all pushes."""
+    """For any sensor rate, the mean of the samples equals the mean of the pushes."""
     push = Event(
         TRAJECTORY,
         {'joints': ['insertion'], 'times': [0.02], 'positions': [[]], 'efforts': [[4.0]]},
@@ -213,15 +213,15 @@ def test_readings_of_a_push_have_its_impulse(
     assert len(felt) == samples
     assert len(forces) == 20
     assert (np.diff(forces) > 0.0).all()
-    # The same impulse, but for rounding; each reading is of the pushes in its time.
+    # Equal impulse except for rounding; each reading covers the pushes in its interval.
     assert felt.mean() == pytest.approx(np.mean(forces[-4:]), rel=1e-12)
     assert (np.diff(felt) >= 0.0).all()
     if samples == 2:
         assert felt.tolist() == pytest.approx([np.mean(forces[-4:-2]), np.mean(forces[-2:])])
 
 
-def test_a_push_ramps_up_and_is_no_faster_than_the_robot() -> None:
-    """The force of a push is the one that was asked for, until the speed is at its limit."""
+def test_push_force_ramps_up_within_the_speed_limit() -> None:
+    """The force equals the command until the velocity reaches its limit."""
     push = Event(
         TRAJECTORY,
         {'joints': ['insertion'], 'times': [1.0, 2.0], 'positions': [[], []],
@@ -230,7 +230,7 @@ def test_a_push_ramps_up_and_is_no_faster_than_the_robot() -> None:
     quiet = {'sensor.force_noise': 0.0, 'sensor.filter': 0}
     _, taken = run({**VALUES, **quiet}, 800, push)
     forces = [sample['base_wrench'][1] for sample in taken]
-    # A count, and the part of a period that a ramp takes.
+    # A count, and the part of a period covered by a ramp.
     assert_allclose(forces[:500], np.arange(500) * 4.0 / 500, atol=0.02)
     _, fast = run({**VALUES, **quiet, 'base.speed_limit': 1e-3}, 800, push)
     speeds = [sample['joint_states'][6] for sample in fast]
@@ -239,8 +239,8 @@ def test_a_push_ramps_up_and_is_no_faster_than_the_robot() -> None:
     assert fast[-1]['base_wrench'][1] < 3.0
 
 
-def test_the_sensor_is_zeroed_only_at_rest() -> None:
-    """A guide that moves loads it, too."""
+def test_tare_requires_needle_and_guide_at_rest() -> None:
+    """A moving guide loads the sensor."""
     plant, _ = run(VALUES, 100)
     plant.perform(Event(TARE))
     plant.perform(course(1.0, roll=0.5))
@@ -254,8 +254,8 @@ def test_the_sensor_is_zeroed_only_at_rest() -> None:
         plant.perform(Event(TARE))
 
 
-def test_a_recorded_run_is_the_same_run_again() -> None:
-    """Every number to the bit, after a way through JSON, with noise of path and sensors."""
+def test_recorded_run_can_be_replayed_bit_for_bit() -> None:
+    """After conversion to JSON, with noise of path and sensors."""
     noisy = {**VALUES, 'seed': 7, 'tip.noise': 1.8e-4, 'tip.rate': 40.0, 'tip.delay': 0.02}
     noisy |= {'tip.dropout': 0.1, 'steering.path_noise': 1e-3}
     done = {
@@ -273,7 +273,7 @@ def test_a_recorded_run_is_the_same_run_again() -> None:
         runs.append(samples)
     assert runs[0] == runs[1]
     lost = sum('tip_deflection' not in [name for name, _, _ in sample] for sample in runs[0])
-    # 40 of 500 a second, and a tenth of them lost.
+    # 40 of 500 per second, and 10 % of them lost.
     assert 600 - 48 < lost < 600 - 30
 
 
@@ -292,15 +292,13 @@ def test_a_recorded_run_is_the_same_run_again() -> None:
         ({'depth': 0.17}, r'depth must be in \[0, 0\.16\] m'),
     ],
 )
-def test_constants_that_do_not_go_together_are_named(
-    change: dict[str, Any], complaint: str
-) -> None:
+def test_inconsistent_constants_are_rejected(change: dict[str, Any], complaint: str) -> None:
     with pytest.raises(ParameterError, match=complaint):
         PlantConstants.of({**VALUES, **change}).make()
 
 
-def test_a_preset_brings_its_steering() -> None:
-    """Constants that are given count, the others are those of the preset."""
+def test_preset_includes_its_steering_constants() -> None:
+    """Given constants override the preset."""
     constants = PlantConstants.of({'steered': True, 'model.preset': 'bending_50mm'})
     assert constants.steering.free_length == 0.04
     changed = {'steered': True, 'model.preset': 'bending_50mm', 'steering.free_length': 0.03}
@@ -308,24 +306,24 @@ def test_a_preset_brings_its_steering() -> None:
     assert PlantConstants.of({'steered': True}).steering.free_length == 0.02
 
 
-def test_a_needle_drawn_out_is_said() -> None:
-    """The skin is the end, as `Insertion` has it."""
+def test_complete_withdrawal_is_an_error() -> None:
+    """The limit is the skin, as in `Insertion`."""
     with pytest.raises(InsertedLengthError, match='the needle reached the skin'):
         run({**VALUES, 'mode': 'simulation'}, 500, force=-15.0)
 
 
-def test_the_outline_goes_from_the_base_to_the_tip() -> None:
-    """As long as the needle, along its slopes, with the path that it cut."""
+def test_outline_runs_from_the_base_to_the_tip() -> None:
+    """It has the length and the slopes of the needle, and the cut path."""
     plant, taken = run(VALUES, 1500, course(2.0, insertion=0.08, guide_z=4e-3))
     seen = plant.plant.outline()
     assert seen is not None
     assert_allclose(seen.points[-1], taken[-1]['tip_deflection'], atol=1e-12)
     whole = np.vstack([seen.base, seen.points])
     length = np.linalg.norm(np.diff(whole, axis=0), axis=1).sum()
-    # Small slopes: along the needle it is longer than along y by half their square.
+    # Small slopes: the arc length exceeds the length along y by half their square.
     assert_allclose(length, 0.2, rtol=1e-3)
     assert_allclose(seen.points[0], [0.0, -0.04, 4e-3], atol=1e-6)
-    # The robot went a little too far and back; the path ends where it turned.
+    # The robot overshot slightly; the path ends at the deepest point.
     deepest = max((sample['tip_deflection'] for sample in taken), key=lambda tip: tip[1])
     assert_allclose(seen.path[-1], deepest, atol=1e-9)
     middle = 0.5 * (seen.slopes[1:] + seen.slopes[:-1])
@@ -335,41 +333,41 @@ def test_the_outline_goes_from_the_base_to_the_tip() -> None:
 
 
 def seen_by(readings: int = 2000, **constants: Any) -> np.ndarray:
-    """Return what a spatial sensor says of a tip at (2, 50, 1) mm; NaN where it says nothing."""
+    """Return spatial sensor readings of a tip at (2, 50, 1) mm; NaN if missing."""
     sensor = TipSensor(TipParameters(**{'noise': 0.0, **constants}), 100.0, 3, spatial=True)
     found = [sensor.measure(0.05, 1e-3, 2e-3) for _ in range(readings)]
     return np.array([(r.across, r.depth, r.deflection) if r else (np.nan,) * 3 for r in found])
 
 
-def test_a_tracker_has_noise_on_every_axis() -> None:
+def test_tracker_has_noise_on_every_axis() -> None:
     errors = seen_by(noise=1.8e-4) - (2e-3, 0.05, 1e-3)
-    # 2000 samples: a mean is known to 4 um, a deviation to 1.6 %, each taken four times.
+    # 2000 samples: errors of 4 um (mean) and 1.6 % (deviation), each taken four times.
     assert_allclose(errors.mean(axis=0), 0.0, atol=1.6e-5)
     assert_allclose(errors.std(axis=0), 1.8e-4, rtol=0.064)
-    # Independent: a correlation is known to 0.022.
+    # Independent: a correlation has an error of 0.022.
     assert np.abs(np.corrcoef(errors.T) - np.eye(3)).max() < 0.09
 
 
-def test_samples_get_lost_as_often_as_said() -> None:
+def test_dropout_has_the_given_probability() -> None:
     lost = np.isnan(seen_by(dropout=0.05)[:, 0]).mean()
-    # A standard deviation of 0.005.
+    # Standard deviation of 0.005.
     assert 0.03 < lost < 0.07
     assert np.isnan(seen_by(dropout=1.0)).all()
 
 
 @settings(max_examples=50, deadline=None)
 @given(turn=st.floats(-3.1, 3.1), offset=st.tuples(*[st.floats(-0.01, 0.01)] * 3))
-def test_a_frame_of_its_own_is_a_turn_and_an_offset(
+def test_sensor_frame_has_a_rotation_and_an_offset(
     turn: float, offset: tuple[float, float, float]
 ) -> None:
-    """Lengths across stay, and the way back gives the tip; an offset comes on top."""
+    """The inverse rotation gives the tip; the offset is added after the rotation."""
     ((x, y, z),) = seen_by(1, turn=turn, offset=offset) - offset
     c, s = np.cos(turn), np.sin(turn)
     # Rounding.
     assert_allclose([c * x + s * z, y, c * z - s * x], [2e-3, 0.05, 1e-3], atol=1e-15)
 
 
-def test_an_imager_sees_its_slice_only() -> None:
-    """It says x = 0 there, and nothing of a tip beside it."""
+def test_imager_measures_only_within_its_slice() -> None:
+    """It reports x = 0 within the slice, and nothing outside."""
     assert_allclose(seen_by(3, slice=2.5e-3), [[0.0, 0.05, 1e-3]] * 3)
     assert np.isnan(seen_by(3, slice=1.5e-3)).all()

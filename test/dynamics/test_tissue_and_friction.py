@@ -1,4 +1,4 @@
-"""Layers, swelling and friction laws: limits to the simple case, balances, exact thresholds."""
+"""Layers, swelling and friction laws: limiting cases, balances, exact thresholds."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def layered(depths: tuple[float, ...], stiffnesses: tuple[float, ...]) -> dict[s
 def end(
     parameters: NeedleParameters, pushes: tuple[float, ...] = PUSHES, step: float = 1e-5
 ) -> FloatArray:
-    """Return where a deflected needle is after 3 ms of each push."""
+    """Return the final state of a deflected needle after 3 ms of each push."""
     it = Integrator(parameters, NeedleModel(parameters).state_at(0.05, 1e-3), step)
     for push in pushes:
         it.advance(3e-3, push)
@@ -74,7 +74,7 @@ def by_layers(
     n=st.sampled_from([1, 2, 3]),
 )
 @settings(deadline=None, derandomize=True, max_examples=100)
-def test_tissue_matrix_is_the_integral_of_its_stiffness(
+def test_modal_tissue_stiffness_is_the_integral_over_layers(
     starts: list[float], stiffnesses: list[float], depth: float, n: int
 ) -> None:
     """The modal stiffness of the tissue is int k(y) phi phi^T dy, for any layers."""
@@ -84,15 +84,15 @@ def test_tissue_matrix_is_the_integral_of_its_stiffness(
         tissue, depth, lambda y: np.einsum('pi,pj->pij', modes.values(y), modes.values(y))
     )
     norm = np.sqrt(np.diag(modes.integrals(depth).gram))
-    # Layers add and subtract whole integrals: rounding of the stiffest of them.
+    # Sums and differences of integrals: rounding of the stiffest layer.
     size = max(tissue.stiffnesses) * np.outer(norm, norm) + 1e-300
     layer, above = tissue.layer(depth), tissue.layers(modes).gram
     found = tissue.stiffnesses[layer] * modes.integrals(depth).gram + above[layer]
     assert_allclose(found / size, expected / size, atol=1e-11)
 
 
-def test_stiffness_is_that_of_the_layer_that_begins_above() -> None:
-    """k(y) is piecewise constant; a boundary belongs to the layer that begins there."""
+def test_layer_boundary_belongs_to_the_deeper_layer() -> None:
+    """k(y) is piecewise constant."""
     tissue = Tissue(starts=(0.0, 0.02, 0.05), stiffnesses=(1.0, 2.0, 3.0))
     depths = [0.0, 0.0199, 0.02, 0.03, 0.0499, 0.05, 0.2]
     assert [tissue.stiffness(y) for y in depths] == [1.0, 1.0, 2.0, 2.0, 2.0, 3.0, 3.0]
@@ -113,8 +113,8 @@ def test_stiffness_matrix_grows_with_depth_by_the_stiffness_at_the_tip() -> None
         assert_allclose(slope / (2.0 * tick) / size, expected / size, atol=1e-6)
 
 
-def test_one_tissue_split_into_equal_layers_is_that_tissue() -> None:
-    """Boundaries between equal tissues change nothing, bit for bit."""
+def test_equal_layers_are_equivalent_to_one_layer() -> None:
+    """Boundaries between equal layers have no effect, bit for bit."""
     whole = end(preset('paper_si', tissue_stiffness=3e3))
     split = end(preset('paper_si', tissue_stiffness=3e3, **layered((0.055, 0.06), (3e3, 3e3))))
     assert whole[0] < 0.14
@@ -122,15 +122,15 @@ def test_one_tissue_split_into_equal_layers_is_that_tissue() -> None:
 
 
 @pytest.mark.parametrize('start', [0.11, 0.19, 0.2, 0.35])
-def test_a_layer_that_the_tip_never_reaches_does_not_count(start: float) -> None:
-    """Boundaries beyond the tip, or beyond the needle, change nothing, bit for bit."""
+def test_layers_beyond_the_tip_have_no_effect(start: float) -> None:
+    """Also beyond the needle, bit for bit."""
     whole = end(preset('paper_si'))
     assert LENGTH - whole[0] < 0.11
     assert np.array_equal(end(preset('paper_si', **layered((start,), (1e6,)))), whole)
 
 
-def test_a_thin_first_layer_vanishes() -> None:
-    """A layer at the entry point counts as its thickness cubed and more: nothing at 1 um."""
+def test_thin_first_layer_has_no_effect() -> None:
+    """Its effect is of third order in its thickness, negligible at 1 um."""
     thick = end(preset('paper_si', tissue_stiffness=9e3))
     thin = end(preset('paper_si', **layered((1e-6,), (9e3,))))
     assert_allclose(thin, thick, rtol=1e-9, atol=1e-300)
@@ -148,19 +148,19 @@ def crossing(step: float, depth: float) -> float:
     return abs(model.energy(it.state) / model.energy(start) - 1.0)
 
 
-def test_energy_is_kept_at_second_order_across_a_boundary() -> None:
-    """Wherever in a step the tip passes a boundary, the energy error is of order two."""
+def test_energy_error_across_a_boundary_is_of_second_order() -> None:
+    """For any position of the boundary within a step."""
     steps = 1e-5 / 2.0 ** np.arange(4)
     depths = 0.055 + 1.3e-6 * np.arange(12)
     errors = [max(crossing(step, depth) for depth in depths) for step in steps]
-    # Measured: slopes within 0.03 of 2, and 9e-9 at the last step; one force for the whole of a
-    # step across the boundary would give order one and 8e-8.
+    # Measured: slopes within 0.03 of 2, and 9e-9 at the last step; a constant force over a step
+    # across the boundary would give order one and 8e-8.
     assert_allclose(np.log2(np.array(errors[:-1]) / errors[1:]), 2.0, atol=0.15)
     assert errors[-1] < 2e-8
 
 
 def test_layers_agree_with_an_ode_solver() -> None:
-    """Through two boundaries depth and tip are what an ODE solver finds between them."""
+    """Through two boundaries, depth and tip agree with an ODE solver between them."""
     p = preset('paper_si', tissue_damping=1.6, **layered((0.06, 0.08), (2e4, 1e3)))
     model = NeedleModel(p)
     start = model.state_at(0.05, 2e-3)
@@ -181,7 +181,7 @@ def test_layers_agree_with_an_ode_solver() -> None:
             atol=1e-13,
             events=reached,
         )
-        # Past the boundary by less than rounding of the solver, in the next layer.
+        # Beyond the boundary by less than the rounding of the solver, in the next layer.
         state, time = solved.y[:, -1].copy(), solved.t[-1]
         state[0] -= 1e-12
     it = Integrator(p, start, 1e-6)
@@ -193,11 +193,11 @@ def test_layers_agree_with_an_ode_solver() -> None:
     assert_allclose(tips[0], tips[1], atol=1e-4 * 2e-3)
 
 
-def test_load_on_the_base_is_that_of_the_layers() -> None:
-    """Overdamped, the base carries int (k(y) w + c_a w_t) dy and its moment."""
+def test_static_base_load_is_the_integral_over_the_layers() -> None:
+    """Overdamped, the base load is int (k(y) w + c_a w_t) dy and its moment."""
     p = preset('phantom', tissue_damping=1e5, **layered((0.04, 0.1), (3e3, 50.0)))
     it = Integrator(p, NeedleModel(p).state_at(0.15, 2e-3))
-    # A millisecond lets the rates follow the shape (time constant rho A / c_a = 0.1 us).
+    # After a millisecond the rates follow the shape (time constant rho A / c_a = 0.1 us).
     it.advance(1e-3)
     before = it.state
     seen = it.advance(1e-5)
@@ -215,8 +215,8 @@ def test_load_on_the_base_is_that_of_the_layers() -> None:
 # --- swelling -------------------------------------------------------------------------------
 
 
-def test_growth_runs_from_one_to_its_limit() -> None:
-    """Swelling multiplies the stiffness by 1 at first, 1 + a in the long run, at a rate a / T."""
+def test_growth_increases_from_one_to_its_limit() -> None:
+    """The stiffness factor is 1 at first, 1 + a finally, with an initial rate a / T."""
     tissue = Tissue(starts=(0.0,), stiffnesses=(520.0,), swelling=0.7, swelling_time=30.0)
     assert tissue.growth(0.0) == 1.0
     assert tissue.growth(1e9) == 1.7
@@ -227,14 +227,14 @@ def test_growth_runs_from_one_to_its_limit() -> None:
 
 
 @pytest.mark.parametrize('time', [1e-9, 1.0, 1e9])
-def test_no_swelling_is_exactly_none(time: float) -> None:
-    """With swelling zero its time constant does not matter, bit for bit."""
+def test_zero_swelling_has_no_effect(time: float) -> None:
+    """The time constant then has no effect, bit for bit."""
     assert np.array_equal(end(preset('paper_si', swelling_time=time)), end(preset('paper_si')))
 
 
 @pytest.mark.parametrize('swelling', [-0.5, 0.5])
-def test_swollen_tissue_is_stiffer_tissue(swelling: float) -> None:
-    """Long after, the needle moves as in tissue with the final stiffness, bit for bit."""
+def test_swollen_tissue_equals_stiffer_tissue(swelling: float) -> None:
+    """After a long time the motion equals that with the final stiffness, bit for bit."""
     swollen = preset('paper_si', swelling=swelling, **layered((0.06,), (2e3,)))
     final = preset(
         'paper_si',
@@ -255,7 +255,7 @@ def test_swollen_tissue_is_stiffer_tissue(swelling: float) -> None:
 
 @pytest.mark.parametrize('swelling', [-0.9, 2.0])
 def test_work_of_swelling_closes_the_energy_balance(swelling: float) -> None:
-    """The tissue does the work int q^T (dK/dt) q / 2 dt, and energy changes by just that."""
+    """The work of the tissue is int q^T (dK/dt) q / 2 dt, equal to the change of energy."""
     p = frictionless(tissue_stiffness=2e4, swelling=swelling, swelling_time=2e-3)
     model, gaps = NeedleModel(p), []
     start = model.state_at(0.15, 1e-3)
@@ -266,7 +266,7 @@ def test_work_of_swelling_closes_the_energy_balance(swelling: float) -> None:
         for k in range(round(8e-3 / step)):
             before = it.state
             it.advance(step)
-            # Trapezoid: q and the factor before and after, by one part in 1e6 of each other.
+            # Trapezoid: q and the factor before and after, which differ by 1e-6.
             change = model.tissue.growth((k + 1) * step) - model.tissue.growth(k * step)
             held = [
                 float(2e4 * x[2:4] @ model.modes.integrals(LENGTH - x[0]).gram @ x[2:4])
@@ -282,7 +282,7 @@ def test_work_of_swelling_closes_the_energy_balance(swelling: float) -> None:
 
 
 def test_swelling_agrees_with_an_ode_solver() -> None:
-    """The time of the integrator is the time of the swelling."""
+    """The swelling uses the clock of the integrator."""
     p = preset('paper_si', tissue_stiffness=2e4, swelling=1.0, swelling_time=5e-3)
     model = NeedleModel(p)
     start = model.state_at(0.1, 1e-3)
@@ -297,7 +297,7 @@ def test_swelling_agrees_with_an_ode_solver() -> None:
     ).y[:, -1]
     it = Integrator(p, start, 2e-6)
     it.time = 2e-3
-    # Time goes on from call to call.
+    # The clock continues between calls.
     for _ in range(4):
         it.advance(1.5e-3, 2.0)
     assert_allclose(it.time, 8e-3, rtol=1e-15)
@@ -313,7 +313,7 @@ def test_swelling_agrees_with_an_ode_solver() -> None:
 
 @pytest.mark.parametrize('name', ['paper_si', 'paper_mm'])
 def test_stribeck_without_break_away_is_coulomb(name: str) -> None:
-    """A break-away of one is (15), bit for bit, through stops and reversals."""
+    """A break-away ratio of one gives (15), bit for bit, through stops and reversals."""
     coulomb = end(preset(name))
     stribeck = end(preset(name, friction_law='stribeck', breakaway_friction=1.0))
     assert np.array_equal(stribeck, coulomb)
@@ -321,7 +321,7 @@ def test_stribeck_without_break_away_is_coulomb(name: str) -> None:
 
 @pytest.mark.parametrize('law', FRICTION_LAWS)
 def test_equal_friction_both_ways_is_symmetric(law: str) -> None:
-    """With withdrawal = 1 a straight needle moves out as it moves in, bit for bit."""
+    """With withdrawal = 1 the motion of a straight needle is symmetric, bit for bit."""
     p = preset('paper_mm', friction_law=law, breakaway_friction=1.5)
     law_of, ends = p.friction.constants, []
     for sign in (-1.0, 1.0):
@@ -335,7 +335,7 @@ def test_equal_friction_both_ways_is_symmetric(law: str) -> None:
 
 
 def test_tanh_tends_to_coulomb() -> None:
-    """As its smoothing speed falls, the smooth law comes near the set-valued one."""
+    """As the smoothing speed decreases, the smooth law converges to the set-valued law."""
     reference, gaps = end(preset('paper_si'))[0], []
     for speed in (1e-1, 1e-2, 1e-3, 1e-4):
         smooth = preset('paper_si', friction_law='tanh', smoothing_speed=speed)
@@ -346,8 +346,8 @@ def test_tanh_tends_to_coulomb() -> None:
 
 
 @pytest.mark.parametrize('push', [-0.5, -0.1, 0.1, 0.5])
-def test_tanh_creeps_where_coulomb_rests(push: float) -> None:
-    """Below mu_s the smooth law moves on, at the speed where it balances the push."""
+def test_tanh_creeps_where_coulomb_sticks(push: float) -> None:
+    """Below mu_s the smooth law moves at the velocity at which it balances the force."""
     smooth = preset('paper_mm', friction_law='tanh')
     it = Integrator(smooth, NeedleModel(smooth).state_at(0.1))
     it.advance(0.01, push)
@@ -368,7 +368,7 @@ def test_tanh_creeps_where_coulomb_rests(push: float) -> None:
 def test_break_away_threshold_is_exact(
     sign: float, law: str, breakaway: float, withdrawal: float
 ) -> None:
-    """Rest bears the break-away force of its direction, and not a billionth more."""
+    """At rest friction balances the break-away force of its direction, but not 1e-9 more."""
     p = preset(
         'paper_si',
         friction_law=law,
@@ -385,8 +385,8 @@ def test_break_away_threshold_is_exact(
         assert (model.acceleration(model.state_at(0.1), part * bound)[0] == 0.0) != moves
 
 
-def test_stribeck_jumps_once_it_has_broken_away() -> None:
-    """Just above break-away the needle speeds up to where friction has fallen."""
+def test_stribeck_velocity_jumps_at_break_away() -> None:
+    """Just above break-away the needle accelerates to the branch of reduced friction."""
     p = preset(
         'paper_si',
         viscous_friction=30.0,
@@ -398,7 +398,7 @@ def test_stribeck_jumps_once_it_has_broken_away() -> None:
     push = 2.0 * 0.56 * (1.0 + 1e-4)
     it.advance(0.02, push)
     assert_allclose(it.velocity, (push - 0.56) / 30.0, rtol=1e-9)
-    # It goes on under a push that could not have moved it, and rests below mu_s.
+    # It continues under a force below break-away, and rests below mu_s.
     it.advance(0.02, 0.9)
     assert_allclose(it.velocity, (0.9 - 0.56) / 30.0, rtol=1e-9)
     it.advance(0.02, 0.5)
@@ -410,8 +410,10 @@ def test_stribeck_jumps_once_it_has_broken_away() -> None:
 @pytest.mark.parametrize('law', FRICTION_LAWS)
 @pytest.mark.parametrize('withdrawal', [0.5, 2.0])
 @pytest.mark.parametrize('sign', [-1.0, 1.0])
-def test_steady_speed_depends_on_the_direction(sign: float, withdrawal: float, law: str) -> None:
-    """Pushed or pulled by 3 N, the needle settles where friction of that direction is 3 N."""
+def test_steady_velocity_depends_on_the_direction(
+    sign: float, withdrawal: float, law: str
+) -> None:
+    """Under 3 N in either direction, friction of that direction is 3 N in steady state."""
     p = preset(
         'paper_mm',
         friction_law=law,
@@ -432,13 +434,13 @@ def test_steady_speed_depends_on_the_direction(sign: float, withdrawal: float, l
     # 2 ms are 150 time constants and more.
     assert_allclose(factor * (dry + 300.0 * u), 3.0, rtol=1e-10)
     assert_allclose(it.model.friction.force(it.velocity, 0.0), 3.0 * sign, rtol=1e-10)
-    # A base that is moved at that speed takes the same force.
+    # A base moved at this velocity requires the same force.
     moved = Integrator(p, it.state)
     assert_allclose(moved.advance_moved(1e-3, it.velocity).axial_force, 3.0 * sign, rtol=1e-9)
 
 
-def test_a_held_base_takes_what_friction_does_not() -> None:
-    """At rest the smooth law bears nothing: a vibrating needle draws on a base held by force."""
+def test_held_base_balances_the_excess_over_friction() -> None:
+    """At rest the smooth law has no friction: a vibrating needle loads a held base."""
     forces = {}
     for law in ('coulomb', 'tanh'):
         p = preset('paper_si', friction_law=law)
@@ -446,7 +448,7 @@ def test_a_held_base_takes_what_friction_does_not() -> None:
         forces[law] = Integrator(p, start).advance_moved(0.01, 0.0).axial_force
         mean = 2.0 * NeedleModel(p).energy(start) / 0.02
     assert forces['coulomb'] == 0.0
-    # The mean of the force differs from 2 E / s as the shape differs from a normal mode.
+    # The mean force differs from 2 E / s because the shape is not a normal mode.
     assert_allclose(forces['tanh'], -mean, rtol=0.1)
 
 
@@ -478,7 +480,7 @@ def axis(
 
 @given(**AXIS, u=st.floats(-1.0, 1.0), drive=st.floats(-10.0, 10.0))
 @settings(deadline=None, derandomize=True, max_examples=300)
-def test_friction_never_drives(
+def test_friction_power_is_never_positive(
     law: str,
     coulomb: float,
     viscous: float,
@@ -488,7 +490,7 @@ def test_friction_never_drives(
     u: float,
     drive: float,
 ) -> None:
-    """The power of friction is never positive on the needle, and at rest it only resists."""
+    """On a moving needle; at rest friction only resists."""
     friction = axis(law, coulomb, viscous, withdrawal, breakaway, turn).friction
     assert friction.force(u, drive) * u >= 0.0
     held = friction.force(0.0, drive)
@@ -503,7 +505,7 @@ def test_friction_never_drives(
     exponent=st.floats(-7.0, -3.0),
 )
 @settings(deadline=None, derandomize=True, max_examples=1000)
-def test_a_step_never_takes_energy_out_of_friction(
+def test_friction_never_supplies_energy_in_a_step(
     law: str,
     coulomb: float,
     viscous: float,
@@ -514,12 +516,12 @@ def test_a_step_never_takes_energy_out_of_friction(
     drive: float,
     exponent: float,
 ) -> None:
-    """Whatever the step, drive times travel exceeds the kinetic energy gained."""
+    """For any step, drive times travel is at least the gain of kinetic energy."""
     p = axis(law, coulomb, viscous, withdrawal, breakaway, turn)
     new, gone = friction_flow(p.friction.constants, p.moving_mass, u, drive, 10.0**exponent)
     kinetic = 0.5 * p.moving_mass * np.array([u * u, new * new])
     lost = drive * gone - (kinetic[1] - kinetic[0])
-    # Rounding of what is subtracted.
+    # Rounding of the terms of the difference.
     assert lost >= -1e-12 * (abs(drive * gone) + kinetic.sum())
 
 
@@ -532,10 +534,10 @@ def test_a_step_never_takes_energy_out_of_friction(
     exponent=st.floats(-7.0, -2.0),
 )
 @settings(deadline=None, derandomize=True, max_examples=300)
-def test_smooth_friction_ends_between_its_start_and_its_steady_speed(
+def test_smooth_friction_gives_monotonic_velocity(
     coulomb: float, viscous: float, withdrawal: float, u: float, drive: float, exponent: float
 ) -> None:
-    """Under the smooth law the speed goes monotonically to where friction balances the drive."""
+    """Under the smooth law the velocity approaches its steady value monotonically."""
     p = axis('tanh', coulomb, viscous, withdrawal, 1.0, 1e-4)
     new, gone = friction_flow(p.friction.constants, p.moving_mass, u, drive, 10.0**exponent)
     factor = 1.0 if drive > 0.0 else withdrawal
@@ -555,10 +557,10 @@ def test_smooth_friction_ends_between_its_start_and_its_steady_speed(
 @pytest.mark.parametrize(('law', 'turn'), [('coulomb', 1e-3), ('stribeck', 0.3), ('tanh', 0.3)])
 @pytest.mark.parametrize('withdrawal', [1.0, 0.6])
 @pytest.mark.parametrize('sign', [-1.0, 1.0])
-def test_every_law_is_of_second_order(
+def test_every_friction_law_is_of_second_order(
     sign: float, withdrawal: float, law: str, turn: float
 ) -> None:
-    """Moving one way with a bent needle, every law converges at order two to an ODE solver."""
+    """In one direction with a bent needle, each law converges at order two to an ODE solver."""
     p = preset(
         'paper_si',
         friction_law=law,
@@ -591,8 +593,8 @@ def test_every_law_is_of_second_order(
 
 
 @pytest.mark.parametrize('law', FRICTION_LAWS)
-def test_energy_lost_is_the_work_of_each_law(law: str) -> None:
-    """Through stops and reversals, energy changes by input work less friction work."""
+def test_energy_loss_equals_the_work_of_each_friction_law(law: str) -> None:
+    """Through stops and reversals, the energy changes by input work minus friction work."""
     p = preset(
         'paper_mm',
         friction_law=law,
@@ -613,12 +615,12 @@ def test_energy_lost_is_the_work_of_each_law(law: str) -> None:
     assert_allclose(it.model.energy(it.state) - before, balance, atol=1e-8 * turned)
 
 
-# --- what is refused ------------------------------------------------------------------------
+# --- invalid arguments ----------------------------------------------------------------------
 
 
 @pytest.mark.parametrize('law', ['', 'Coulomb', 'dahl', None, 0])
-def test_unknown_friction_law_is_refused(law: Any) -> None:
-    """A law that does not exist is refused when the constants, or the law itself, are made."""
+def test_unknown_friction_law_is_rejected(law: Any) -> None:
+    """By the constants and by the law object."""
     with pytest.raises(
         ParameterError, match='friction_law must be one of coulomb, stribeck, tanh'
     ):
@@ -652,15 +654,15 @@ def test_unknown_friction_law_is_refused(law: Any) -> None:
         ((0.05,), None, 'layer_stiffnesses must be a list of numbers'),
     ],
 )
-def test_layers_that_are_none_are_refused(depths: Any, stiffnesses: Any, complaint: str) -> None:
-    """Layers must begin below each other and each have a stiffness; the message says so."""
+def test_invalid_layers_are_rejected(depths: Any, stiffnesses: Any, complaint: str) -> None:
+    """Layers must have increasing depths and one stiffness each."""
     with pytest.raises(ParameterError, match=complaint):
         NeedleParameters(layer_depths=depths, layer_stiffnesses=stiffnesses)
 
 
 @pytest.mark.parametrize('starts', [(), (0.01,), (0.0, 0.05, 0.02), (0.0, 0.0)])
-def test_a_tissue_of_disordered_layers_is_refused(starts: tuple[float, ...]) -> None:
-    """The tissue itself begins at the entry point and goes down."""
+def test_tissue_with_unordered_layers_is_rejected(starts: tuple[float, ...]) -> None:
+    """The first layer starts at the entry point, the others deeper."""
     with pytest.raises(ParameterError):
         Tissue(starts=starts, stiffnesses=(1.0,) * len(starts))
     with pytest.raises(ParameterError):

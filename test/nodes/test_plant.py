@@ -251,7 +251,7 @@ def test_shipped_parameter_file_is_valid(
     [
         ({'model.lenght': 0.3}, "unknown parameter 'model.lenght'; did you mean 'model.length'"),
         ({'model.preset': 'steel'}, 'model.preset must be one of paper_si, paper_mm, phantom'),
-        ({'depth': 0.3}, 'inserted length 0.3 m is outside'),
+        ({'depth': 0.3}, 'insertion depth 0.3 m is outside'),
         ({'seed': -1}, 'seed out of range'),
     ],
 )
@@ -295,7 +295,7 @@ def test_invalid_parameters_end_the_process(
         ),
         (
             {'lockstep': True, 'mode': 'robot'},
-            'lockstep must be false but in mode simulation, where commands answer samples, got',
+            'lockstep must be false except in mode simulation, where commands answer samples, got',
         ),
         (
             {'rate': 5.0},
@@ -375,7 +375,7 @@ def test_needle_beyond_its_length_stops_without_hub_stop(ros_graph: RosGraph) ->
 
     def reported() -> bool:
         commands.publish(wrench(20.0))
-        return any('inserted length' in report.status[0].message for report in reports)
+        return any('insertion depth' in report.status[0].message for report in reports)
 
     ros_graph.spin_until(reported, 'the report')
 

@@ -371,7 +371,7 @@ def test_path_noise_spreads_the_tips() -> None:
     ('pose', 'error', 'words'),
     [
         ({'depth': -1e-3}, ParameterError, r'depth must be in \[0, 0\.58\] m'),
-        ({'depth': 0.59}, ParameterError, r'without its free length, got 0\.59 m'),
+        ({'depth': 0.59}, ParameterError, r'minus its free length, got 0\.59 m'),
         ({'depth': nan}, ParameterError, 'depth must be a finite number, got nan'),
         ({'depth': True}, ParameterError, 'depth must be a finite number, got True'),
         ({'roll': inf}, ParameterError, 'roll must be a finite number, got inf'),
