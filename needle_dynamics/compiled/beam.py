@@ -139,9 +139,7 @@ def element(ei: float, k: float, h: float) -> Element:
 
 @inlined
 def cross(e: Element, c00: float, c01: float, c11: float) -> Crossing:
-    """
-    Return the transfer of the spring, with compliance c00 to c11 at the start, over an element.
-    """
+    """Return the transfer over an element; c00, c01 and c11 are the compliance at its start."""
     a = e.k / e.ei
     # W = Phi_fx C + Phi_ff maps the loads at the start to the loads at the end.
     w00 = e.k * (e.p1 * c00 + e.p2 * c01) + e.p0
