@@ -25,7 +25,7 @@ class Response(NamedTuple):
     """
     Linear response of an axis over a time, under a constant force.
 
-    The final position is position + pv velocity + pf force, the final velocity vv velocity + vf force.
+    Final position = position + pv velocity + pf force, final velocity = vv velocity + vf force.
 
     Attributes
     ----------

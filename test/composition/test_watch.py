@@ -401,7 +401,7 @@ def test_a_recording_is_played() -> None:
 )
 def test_what_a_recording_does_not_know_is_refused(message: dict[str, Any]) -> None:
     """With what it takes."""
-    with pytest.raises(ParameterError, match='a recording takes'):
+    with pytest.raises(ParameterError, match='a recording accepts'):
         Playback(10.0).take(message)
 
 
@@ -435,7 +435,7 @@ class Buttons:
 
     async def target(self, x: float, y: float, z: float) -> tuple[bool, str]:
         if y > 1.0:
-            raise JobError('no node takes targets')
+            raise JobError('no node subscribes to target')
         self.done.append((x, y, z))
         return True, 'steering: target accepted'
 
@@ -562,7 +562,7 @@ async def test_commands_need_the_token_of_the_process() -> None:
             message = {'ask': 'stop'} if wrong is None else {'ask': 'stop', 'token': wrong}
             said = await page.tell(stream, message)
             assert said['success'] is False
-            assert 'open the URL that needle watch has printed' in said['words']
+            assert 'open the URL printed by needle watch' in said['words']
         assert buttons.done == []
         said = await page.tell(stream, {'ask': 'stop', 'token': token})
         assert said == {'asked': 'stop', 'success': True, 'words': 'stop it is'}
@@ -585,7 +585,7 @@ async def test_without_control_nothing_can_be_commanded() -> None:
         for token in ('', 'x'):
             said = await page.tell(stream, {'ask': 'stop', 'token': token})
             assert said['success'] is False
-            assert said['words'] == 'this page is for looking only: needle watch --control'
+            assert said['words'] == 'this page is read-only: use needle watch --control'
 
 
 @in_loop
@@ -603,7 +603,7 @@ async def test_a_command_that_is_none_is_refused() -> None:
             ({'ask': 'target', 'at': [0, '0.1', 0]}, 'a target is'),
             ({'ask': 'target', 'at': [0, True, 0]}, 'a target is'),
             ({'ask': 'target', 'at': [0, 10**400, 0]}, 'a target is'),
-            ({'ask': 'target', 'at': [0, 2.0, 0]}, 'no node takes targets'),
+            ({'ask': 'target', 'at': [0, 2.0, 0]}, 'no node subscribes to target'),
         ):  # fmt: skip
             said = await page.tell(stream, {**message, 'token': token})
             assert said['success'] is False
@@ -626,7 +626,7 @@ async def test_a_stop_does_not_wait_for_what_was_asked_before() -> None:
         for _ in range(20):
             await stream.send_json({'ask': 'retract', 'token': token})
         said = await answer(stream)
-        assert said['words'] == '8 commands are under way already'
+        assert said['words'] == '8 commands are already in progress'
         buttons.free.set()
 
 
@@ -776,7 +776,7 @@ async def test_an_open_page_is_found_by_address_only() -> None:
     """And its first lines say that others may look."""
     async with served(host='0.0.0.0') as page:  # noqa: S104
         said = page.server.words
-        assert 'other machines may look' in said[1]
+        assert 'read access for other machines' in said[1]
         for host, code in ((f'192.0.2.1:{page.port}', 200), (f'evil.example:{page.port}', 403)):
             async with page.session.get(page.url, headers={'Host': host}) as reply:
                 assert reply.status == code

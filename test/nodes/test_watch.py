@@ -151,7 +151,7 @@ def test_buttons_move_the_needle_and_stop_it(ros_graph: RosGraph) -> None:
             await reader.until(lambda frame: frame['depth'] < 0.025, 'the retreat')
 
     with watching(ros_graph.environment, '--control') as (running, url):
-        assert running.stdout.readline().startswith('whoever has this address may move')
+        assert running.stdout.readline().startswith('this address permits motion')
         asyncio.run(look(url))
         running.send_signal(signal.SIGINT)
         assert running.wait(60.0) == 0
@@ -168,7 +168,7 @@ def test_without_control_it_only_listens(ros_graph: RosGraph) -> None:
             for what in ('target', 'stop'):
                 said = await reader.ask(what, at=[0.0, 0.03, 0.0])
                 assert said['success'] is False
-                assert 'for looking only' in said['words']
+                assert 'this page is read-only' in said['words']
             plant.kill()
             await reader.until(lambda frame: 'joint_states' in frame['silent'], 'silence')
             await reader.until(lambda _: reader.level('/plant') is None, 'silence of the node')
@@ -204,7 +204,7 @@ def test_a_button_without_nodes_says_so(ros_graph: RosGraph) -> None:
         async with reading(url) as reader:
             await reader.until(lambda frame: frame['shape'] is None, 'a frame')
             said = await reader.ask('target', at=[0.0, 0.1, 0.0])
-            assert said['words'].startswith('no node takes targets')
+            assert said['words'].startswith('no node subscribes to target')
             said = await reader.ask('stop')
             assert said == {
                 'asked': 'stop', 'success': False,
@@ -267,7 +267,7 @@ def test_a_browser_shows_what_is_live(ros_graph: RosGraph, tmp_path: Path, width
             seen = await shown(tab, url, width, tmp_path / 'page.png')
             assert seen['overflow'] == 0
             assert seen['blank'] == []
-            for words in ('Inserted depth', 'limit ±100', 'commanded ±15', 'Stop', 'plant'):
+            for words in ('Insertion depth', 'limit ±100', 'commanded ±15', 'Stop', 'plant'):
                 assert words in seen['text']
             count = await tab.run('needleWatch.drawn')
             begun = asyncio.get_running_loop().time()
