@@ -65,7 +65,7 @@ class Steered(NamedTuple):
     twist : float
         Torsional compliance of the needle per length [rad/(N m^2)].
     turning : float
-        Friction torque per inserted length [N m/m].
+        Friction torque per length [N m/m].
     length : float
         Length of the needle [m].
     starts : ndarray, shape (layers,)
